@@ -9,6 +9,7 @@ from aerokit._internal.formatting import format_value
 if TYPE_CHECKING:
     from aerokit.events import Event
 
+_NOTES = {"DuplicateSender": "a second sender has the same ids, and is ignored"}
 _UNLABELLED = frozenset(("name", "message", "link", "peer", "text", "error"))
 _UNITS = {"_percent": " %", "_hz": " Hz", "_s": " s"}
 
@@ -32,4 +33,5 @@ def event_details(event: Event) -> str:
             suffix = next((suffix for suffix in _UNITS if name.endswith(suffix)), "")
             label = name.removesuffix(suffix).removesuffix("_id").replace("_", " ")
             parts.append(f"{label} {format_value(value)}{_UNITS.get(suffix, '')}")
-    return ", ".join(parts)
+    note = _NOTES.get(type(event).__name__)
+    return ", ".join(parts if note is None else [*parts, note])

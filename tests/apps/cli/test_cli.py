@@ -63,7 +63,6 @@ def read_rest(process: subprocess.Popen[str]) -> str:
 @pytest.mark.parametrize(
     "arguments",
     [
-        [],
         ["fly"],
         ["demo", "--connect", "nonsense"],
         ["demo", "--altitude", "-3"],

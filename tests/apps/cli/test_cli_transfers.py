@@ -72,7 +72,7 @@ def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ["mission", "show", "weather"],
         ["files", "get"],
         ["logs", "get", "one"],
-        ["logs", "get", "--to", "/there/is/no/such/directory"],
+        ["logs", "get", "--to", __file__],
     ],
     ids=" ".join,
 )

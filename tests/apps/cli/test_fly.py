@@ -38,7 +38,7 @@ def test_fly_flies_mission_to_end(copter: SimulatedCopter, capsys: pytest.Captur
     for text in (
         "mission: 4 items",
         "uploaded to vehicle",
-        "heading for item 2 of 4, NAV_WAYPOINT",
+        "to item 2, NAV_WAYPOINT",
         "mission finished: in AUTO",
     ):
         assert text in out

@@ -129,14 +129,14 @@ def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_record_interrupted_writes_all_frames(capsys: pytest.CaptureFixture[str]) -> None:
     async def scenario() -> int:
         async with simulated_link(SimulatedCopter(boot_time_s=0.0)) as link:
-            command = asyncio.create_task(run_on(link, "record", "flight.tlog", "--ask"))
+            command = asyncio.create_task(run_on(link, "record", "flight.tlog"))
             await anyio.sleep(5)
             ctrl_c()
             return await command
 
     assert run_virtual(scenario()) == 0
     received = sum(raw[5] == 1 for _, raw in read_tlog("flight.tlog"))  # the system id, of MAVLink 2
-    assert received > 100  # requested by --ask
+    assert received > 100  # requested by the command
     assert f"flight.tlog: {received} frames received from system 1 in" in capsys.readouterr().out
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
@@ -10,19 +11,27 @@ from typing import Any
 import anyio
 import pytest
 from flight_harness import Wire
+from rich.style import Style
 from textual.widgets import RichLog
 
 from aerokit.apps.cli import main
 from aerokit.apps.cli.listening import _event_text
 from aerokit.apps.monitor import app as monitor
 from aerokit.apps.monitor import model as model_module
-from aerokit.apps.monitor.app import ConfirmScreen, Monitor
-from aerokit.apps.monitor.lines import Canvas
-from aerokit.apps.monitor.model import MonitorModel, _event_line
+from aerokit.apps.monitor.app import ConfirmScreen, Monitor, Panel
+from aerokit.apps.monitor.lines import DANGER, LINK_STYLES, WARNING, Canvas, number
+from aerokit.apps.monitor.model import SEVERITY_STYLES, MonitorModel, _event_line
 from aerokit.connection.opening import open_connection
 from aerokit.connection.tasks import BackgroundTasks
 from aerokit.errors import LinkLost
-from aerokit.events import ArmedChanged, LandedStateChanged, ParameterChanged, VehicleSilent
+from aerokit.events import (
+    ArmedChanged,
+    DuplicateSender,
+    LandedStateChanged,
+    ParameterChanged,
+    StreamSlow,
+    VehicleSilent,
+)
 from aerokit.mavlink.enums import MavCmd, MavLandedState
 from aerokit.sim import SimulatedCopter, simulated_link
 from aerokit.vehicle.connect import vehicles_on
@@ -60,14 +69,14 @@ class Stage:
 
 
 @asynccontextmanager
-async def stage(count: int = 2) -> AsyncIterator[Stage]:
+async def stage(count: int = 2, size: tuple[int, int] = (80, 24)) -> AsyncIterator[Stage]:
     copters = [SimulatedCopter(system_id=1 + number, boot_time_s=0.0) for number in range(count)]
     async with simulated_link(copters) as link:
         wire = Wire(link)
         async with open_connection(wire) as connection, vehicles_on(connection) as vehicles:
             model, commands = MonitorModel(connection, vehicles), BackgroundTasks(connection.fail)
             app = Monitor(model, commands, "memory")
-            async with app.run_test(size=(80, 24)) as pilot:
+            async with app.run_test(size=size) as pilot:
                 await anyio.sleep(6)
                 app.update_view()
                 await pilot.pause()
@@ -120,10 +129,11 @@ async def test_refusal_and_old_values_are_shown() -> None:
         it.wire._link.close()  # the vehicle becomes silent
         await anyio.sleep(20)
         it.app.update_view()
-        await it.wait_drawn("old)")
-        assert "old)" in it.screen()
-        await it.wait_drawn("silent")
-        assert "silent" in it.screen()
+        await it.wait_drawn("values are from before")
+        screen = it.screen()
+        assert "; values are from before" in screen
+        assert "STABILIZE  disarmed" in screen
+        assert " old)" not in screen
 
 
 async def test_control_characters_in_texts_are_replaced() -> None:
@@ -175,12 +185,108 @@ def test_monitor_without_terminal_exits_with_code_2(capsys: pytest.CaptureFixtur
 
 def test_canvas_keeps_north_up_and_points_inside() -> None:
     canvas = Canvas(20, 5, [(0.0, 0.0), (100.0, 0.0), (0.0, -50.0)])
-    canvas.dot((0.0, -50.0), "red")
+    canvas.line([(0.0, -50.0), (50.0, -50.0)], "red")
     canvas.mark((100.0, 0.0), "↑1", "bold")
     lines = canvas.text().plain.split("\n")
     assert len(lines) == 5
     assert "↑1" in lines[0]
-    assert any(ord(character) > 0x2800 for character in lines[-1])
+    assert all(any(character > "\u2800" for character in lines[row]) for row in (2, 3))  # without gaps
+    assert lines[-1].endswith("▲N")
+
+
+@pytest.mark.parametrize("span_m", [20.0, 60.0, 333.0, 9000.0])
+def test_canvas_scale_bar_has_length_it_states(span_m: float) -> None:
+    columns = 61
+    canvas = Canvas(columns, 40, [(0.0, 0.0), (0.0, span_m)])
+    bar = canvas.text().plain.split("\n")[-1].removesuffix("▲N").rstrip()
+    assert bar.endswith(" m" if span_m < 1000 else " km")
+    length, unit = bar.rpartition("┤ ")[2].split()
+    metres = float(length) * (1000 if unit == "km" else 1)
+    assert metres / span_m == pytest.approx(len(bar.partition(" ")[0]) / columns, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(-0.04, "0.0 m/s"), (-0.06, "-0.1 m/s"), (0.04, "0.0 m/s"), (0.06, "+0.1 m/s"), (None, "—")],
+)
+def test_number_has_no_sign_for_zero(value: float | None, text: str) -> None:
+    assert number(value, 1, " m/s", "+") == text
+
+
+async def test_heading_is_shown_once_and_zero_without_sign() -> None:
+    async with stage(1) as it:
+        await it.wait_drawn("climb")
+        screen = it.screen()
+    assert "climb 0.0 m/s" in screen
+    assert "heading" in screen
+    assert "yaw" not in screen
+    assert "-0" not in screen.replace("-35", "")
+
+
+async def test_wide_terminal_shows_more_and_puts_texts_below_map() -> None:
+    async with stage(2, size=(200, 50)) as it:
+        await it.wait_drawn("throttle")
+        lines = it.screen().splitlines()
+    (texts,) = [line for line in lines if "texts and events" in line]
+    assert texts.index("texts and events") > 64
+    for label in ("home", "wind", "version", "ready"):
+        assert any(label in line for line in lines)
+    empty = sum(line[1:60].strip() == "" for line in lines)
+    assert empty < len(lines) / 3
+
+
+async def test_slow_streams_are_one_line_with_count() -> None:
+    async with stage(1) as it:
+        bus, texts = it.app._model.connection.bus, it.app.query_one("#texts", RichLog)
+        before = len(texts.lines)
+        for number_ in range(40):
+            bus.publish(StreamSlow(1.0, 1, f"MESSAGE_{number_}", 2.0, 0.5))
+        await it.press()
+        assert len(texts.lines) == before
+        assert str(texts.border_subtitle).startswith("40 × stream slow, last ")
+        assert str(texts.border_subtitle).endswith(" 1 MESSAGE_39 0.5 of 2 Hz")
+
+
+async def test_idle_monitor_draws_only_changed_rates(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with stage(2) as it:
+        await anyio.sleep(10)
+        it.app.update_view()
+        drawn: Counter[str | None] = Counter()
+        show = Panel.show
+
+        def count(panel: Panel, content: Any) -> None:
+            drawn[panel.id] += 1
+            show(panel, content)
+
+        monkeypatch.setattr(Panel, "show", count)
+        for _ in range(60):
+            await anyio.sleep(0.5)
+            it.app.update_view()
+    assert set(drawn) <= {"rates"}
+    assert drawn["rates"] <= 30  # the rates are counted once a second
+
+
+def test_text_styles_are_readable_on_light_and_dark_terminals() -> None:
+    """A background needs a foreground; without one, no colour that is as bright as white or as dark as black."""
+    styles = [DANGER, WARNING, *LINK_STYLES.values(), *SEVERITY_STYLES]
+    for style in map(Style.parse, styles):
+        if style.bgcolor is not None:
+            assert (style.color and style.color.name, style.bgcolor.name) in {
+                ("white", "red"),
+                ("black", "yellow"),
+            }
+        else:
+            assert style.color is None or style.color.name in {"red", "magenta", "green"}
+
+
+async def test_vehicles_behind_one_peer_are_not_heard_twice() -> None:
+    copters = [SimulatedCopter(system_id=1 + number_, boot_time_s=0.0) for number_ in range(3)]
+    async with simulated_link(copters) as link, open_connection(link) as connection, vehicles_on(connection):
+        events: list[DuplicateSender] = []
+        connection.bus.attach_event(DuplicateSender, events.append)
+        await anyio.sleep(60)
+        assert len(connection.heartbeats) == 3
+    assert events == []
 
 
 async def test_event_text_uses_enum_names() -> None:
@@ -190,4 +296,7 @@ async def test_event_text_uses_enum_names() -> None:
     assert _event_line(changed) == "parameter changed: WPNAV_SPEED, 1234 → 0.135, component 1"
     assert _event_line(ArmedChanged(1.0, 1, False)) == "armed changed: not armed"
     assert _event_text(landed) == "LandedStateChanged  ON_GROUND → TAKEOFF"
+    assert _event_line(DuplicateSender(1.0, 1, 1)) == (
+        "duplicate sender: component 1, a second sender has the same ids, and is ignored"
+    )
     assert _event_text(VehicleSilent(1.0, 1, 3.5)) == "VehicleSilent  silent for 3.5 s"

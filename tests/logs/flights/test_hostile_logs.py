@@ -14,9 +14,11 @@ import pytest
 
 from aerokit.errors import FileFormatError
 from aerokit.logs.convert import convert
+from aerokit.logs.convert.tables import CsvTable
 from aerokit.logs.flights import failsafes, read_flight
 from aerokit.logs.flights.flight import TimeSeries
 from aerokit.logs.flights.flight_controllers import BinReader
+from aerokit.logs.flights.records import TableColumn
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.message import Message
@@ -115,11 +117,84 @@ def test_newline_in_text_starts_no_csv_row(tmp_path: Path) -> None:
     assert b"\r\n" not in (tmp_path / "out" / "STATUSTEXT.csv").read_bytes()
 
 
-@pytest.mark.parametrize("text", ["well\rnot", "=1\r"])
-def test_carriage_return_in_csv_is_quoted(text: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("text", "cell"), [("well\rnot", '"well\rnot"'), ("=1\r", '"\'=1\r"')])
+def test_carriage_return_in_csv_is_quoted(text: str, cell: str, tmp_path: Path) -> None:
     log = write_tlog(tmp_path / "log.tlog", [(1, m.Statustext(severity=4, text=text))])
     convert(log, tmp_path / "out")
-    assert f'"{text}"' in (tmp_path / "out" / "STATUSTEXT.csv").read_bytes().decode()
+    assert cell in (tmp_path / "out" / "STATUSTEXT.csv").read_bytes().decode()
+
+
+@pytest.mark.parametrize(
+    ("text", "cell"),
+    [
+        ("=cmd|' /C calc'!A0", "'=cmd|' /C calc'!A0"),
+        ('+HYPERLINK("http://x","y")', '\'+HYPERLINK("http://x","y")'),
+        ("-2+3", "'-2+3"),
+        ("@SUM(A1)", "'@SUM(A1)"),
+        ("\t=1", "'\t'=1"),
+        ("\r=1", "'\r=1"),
+        (" =1", "' =1"),
+        ("a;=1", "a;'=1"),
+        ("\uff1d1", "'\uff1d1"),
+        ("EKF3 lane 1 - fine", "EKF3 lane 1 - fine"),
+    ],
+)
+def test_text_in_csv_is_no_formula(text: str, cell: str, tmp_path: Path) -> None:
+    messages = [
+        m.Statustext(4, text),
+        m.ParamValue(text[:16], -1.5, 9, 1, 0),
+        m.Attitude(1, -0.25, 0, 0, 0, 0, 0),
+    ]
+    convert(write_tlog(tmp_path / "log.tlog", [(1, each) for each in messages]), tmp_path / "out")
+    rows = {}
+    for name in ("STATUSTEXT", "PARAM_VALUE", "ATTITUDE"):
+        with (tmp_path / "out" / f"{name}.csv").open(encoding="utf-8", newline="") as file:
+            (rows[name],) = csv.DictReader(file)
+    assert rows["STATUSTEXT"]["text"] == cell
+    assert rows["PARAM_VALUE"]["param_id"] == cell[: len(rows["PARAM_VALUE"]["param_id"])]
+    assert float(rows["PARAM_VALUE"]["param_value"]) == -1.5  # a number, and no text after an apostrophe
+    assert float(rows["ATTITUDE"]["roll_rad"]) == -0.25
+
+
+def test_column_name_in_csv_is_no_formula(tmp_path: Path) -> None:
+    table = CsvTable(tmp_path / "out.csv", [TableColumn("=1+1", "a", "str"), TableColumn("b", "b", "int")])
+    table.close()
+    assert (tmp_path / "out.csv").read_text() == "'=1+1,b\n"
+
+
+def test_recording_of_fast_simulation_says_so(tmp_path: Path) -> None:
+    def notes(boot_ms: Iterable[int]) -> str:
+        messages = [(1, m.Attitude(ms, 0, 0, 0, 0, 0, 0)) for ms in boot_ms]
+        return " ".join(read_flight(write_tlog(tmp_path / "log.tlog", messages)).notes)
+
+    assert "simulation at 20 times real speed" in notes(range(0, 600_000, 20_000))
+    assert "simulation at 0.5 times real speed" in notes(range(0, 60_000, 500))
+    assert "simulation" not in notes(range(0, 60_000, 1000))
+    # Reboots and delayed messages are no sign of another speed.
+    assert "simulation" not in notes([*range(0, 60_000, 1000), *range(0, 60_000, 1000)])
+    assert "simulation" not in notes([second * 1000 + second % 3 * 300 for second in range(60)])
+
+
+def test_progress_begins_before_first_record(tmp_path: Path) -> None:
+    """Also for a log that takes long to index, a bar is on the screen at once."""
+    log = write_tlog(tmp_path / "log.tlog", [(1, place()) for _ in range(40_000)])
+    seen: list[int] = []
+    read_flight(log, on_progress=lambda progress: seen.append(progress.done))
+    assert (seen[0], seen[-1]) == (0, log.stat().st_size)
+    assert seen == sorted(seen)
+    assert len(seen) > 3
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".ulg"])
+def test_progress_of_controller_log_begins_at_zero(suffix: str, tmp_path: Path) -> None:
+    for package in ("pyulog", "pymavlink"):
+        pytest.importorskip(package)
+    path = tmp_path / f"log{suffix}"
+    (log_files.write_bin if suffix == ".bin" else log_files.write_ulog)(path)
+    seen: list[int] = []
+    read_flight(path, on_progress=lambda progress: seen.append(progress.done))
+    assert (seen[0], seen[-1]) == (0, path.stat().st_size)
+    assert len(seen) > 3
 
 
 @pytest.mark.parametrize("suffix", [".gpx", ".kml"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import math
 import re
 import shutil
 import subprocess
@@ -19,7 +20,7 @@ import aerokit
 from aerokit import messages as m
 from aerokit.apps.cli import main
 from aerokit.logs.flights import FlightLog, TimeSeries, failsafes, read_flight
-from aerokit.logs.flights.flight import LoggedText, Waypoint
+from aerokit.logs.flights.flight import FailsafeEvidence, LoggedText, ModeChange, Waypoint
 from aerokit.logs.report import report_html
 from aerokit.logs.report.charts import points, rows_to_draw
 from aerokit.logs.report.statistics import clock, length, span
@@ -32,6 +33,15 @@ pytest.importorskip("plotly")
 
 RECORDINGS = Path(__file__).parents[2] / "recordings"
 HOSTILE = "<script>alert(1)</script><img src=x onerror=alert(2)>"
+HOSTILE_TEXTS = (
+    HOSTILE,
+    "\"' onmouseover='alert(3)' x=\"",
+    "</script><svg onload=alert(4)>",
+    "\x1b[31mred\x1b[0m\x07\x08\x7f\x85 bell",
+    "\u202egnirts sdrawkcab\u2066 bidi\u200f",
+    "colour:mode0",
+    "&lt;b&gt; &amp; {{7*7}} ${7*7}",
+)
 
 
 class Page(HTMLParser):
@@ -45,7 +55,7 @@ class Page(HTMLParser):
         self.scripts: list[str] = []
         self.text = ""
         self._script: dict[str, str | None] | None = None
-        self.charts: dict[str, Any] = {}
+        self.data: dict[str, Any] = {}
         self.html = path.read_text(encoding="utf-8")
         self.feed(self.html)
 
@@ -60,8 +70,12 @@ class Page(HTMLParser):
     def handle_endtag(self, tag: str) -> None:
         if tag == "script" and self._script is not None:
             if self._script.get("id") == "charts":
-                self.charts = json.loads(self.scripts.pop())
+                self.data = json.loads(self.scripts.pop())
             self._script = None
+
+    @property
+    def charts(self) -> dict[str, Any]:
+        return self.data["charts"]  # type: ignore[no-any-return]
 
     def handle_data(self, data: str) -> None:
         if self._script is not None:
@@ -146,14 +160,22 @@ def test_report_loads_nothing_and_allows_two_scripts(page: Page) -> None:
 
 @pytest.fixture
 def hostile_log(tmp_path: Path) -> Path:
-    path, encoder = tmp_path / f"{HOSTILE.replace('/', '')[:40]}.tlog", FrameEncoder(1, 1)
+    # On Linux, a name may also have bytes that are no text.
+    path, encoder = tmp_path / f"{HOSTILE.replace('/', '')[:40]}\u202e\udcff.tlog", FrameEncoder(1, 1)
     with TlogWriter(path) as writer:
         for i in range(30):
             for message in (
                 m.Heartbeat(2, 3, 81 + 128 * (i > 3), 0xFFFF_FFF0 + i // 10, 4, 3),
-                m.Statustext(2, HOSTILE[:50]),
+                *(m.Statustext(2, text[:50]) for text in HOSTILE_TEXTS),
                 m.Statustext(1, f"Battery failsafe {HOSTILE}"[:50]),
                 m.ParamValue("<b>&\"'</script>", float(i), 9, 1, 0),
+                m.ParamValue("\u202e\x1b[1m'\"><i>", float(i), 9, 1, 0),
+                m.ParamValue("FENCE_ENABLE", 1.0, 9, 1, 0),
+                m.ParamValue("FENCE_TYPE", [2.0, math.nan, math.inf][i % 3], 9, 1, 0),
+                m.ParamValue("FENCE_RADIUS", [math.inf, 1e38, -1.0][i % 3], 9, 1, 0),
+                m.Attitude(i, math.inf, math.nan, -3e38, 0, 0, 0),
+                m.Vibration(i, math.inf, 3e38, math.nan, 0, 0, 0),
+                m.EkfStatusReport(0, math.nan, math.inf, -math.inf, 3e38, 0, 0),
                 m.GlobalPositionInt(i, 470000000 + i, 80000000, 500000, 1000 * i, 0, 0, 0, 0),
                 m.MissionItemInt(1, 1, 0, 3, 60000, 0, 1, 0, 0, 0, 0, 470000000, 80000000, float("nan")),
             ):
@@ -169,10 +191,13 @@ def test_hostile_log_text_is_escaped(hostile_log: Path, tmp_path: Path) -> None:
         assert HOSTILE[:30] in page.text
         assert page.tags.count("script") == 3
         assert not page.handlers
-        assert not {"img", "b"} & set(page.tags)
-        texts = json.dumps(page.charts)
+        assert not {"img", "b", "i", "svg"} & set(page.tags)
+        unprintable = {each for each in page.text if not each.isprintable() and each != "\n"}
+        assert not unprintable
+        texts = json.dumps(page.data)
         assert "alert" not in texts
         assert "</" not in target.read_text().split('id="charts">')[1].split("</script>")[0]
+    assert '"charts":{}' not in target.read_text()
 
 
 def test_missing_data_is_stated(tmp_path: Path) -> None:
@@ -206,7 +231,7 @@ def test_two_flights_are_compared(flown: dict[str, Any], tmp_path: Path, capsys:
     assert f"{highest[0]:.1f}\n{highest[1]:.1f}\n{highest[1] - highest[0]:+.1f}" in page.text
     assert [trace["name"] for trace in page.charts["both-height"]["traces"]] == ["A", "B"]
     east = [x for trace in page.charts["maps"]["traces"] for x in trace["x"] if x is not None]
-    least, greatest = page.charts["maps"]["layout"]["xaxis"]["autorangeoptions"]["include"]
+    least, greatest = page.charts["maps"]["layout"]["xaxis"]["range"]
     assert (least < min(east), greatest > max(east)) == (True, True)
     assert "COM_LOW_BAT_ACT" in page.text
     assert "missing" in page.text
@@ -252,7 +277,7 @@ def test_downsampling_keeps_peaks_and_gaps() -> None:
     assert min(value for value in values if value is not None) == -7.0
     assert None in values
     assert all(value is None for time, value in zip(times, values, strict=True) if 3001 < time < 3999)
-    assert rows_to_draw(3, (columns["value"],)) == [0, 1, 2]
+    assert rows_to_draw(columns["value"][:3]) == [0, 1, 2]
 
 
 @pytest.mark.parametrize(
@@ -279,23 +304,70 @@ def chromium() -> str:
     return found
 
 
-def test_offline_browser_draws_all_charts(page: Page, chromium: str, tmp_path: Path) -> None:
-    target = tmp_path / "page.html"
-    target.write_text(page.html, encoding="utf-8")
-    dumped = subprocess.run(
+def browse(chromium: str, target: Path, *options: str) -> str:
+    """Open a page without a network, and return what the browser prints."""
+    return subprocess.run(
         [
             *(chromium, "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run"),
             *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
-            *(f"--user-data-dir={tmp_path / 'browser'}", "--host-resolver-rules=MAP * ~NOTFOUND"),
-            *("--virtual-time-budget=4000", "--window-size=900,7000", "--dump-dom", target.as_uri()),
+            *(f"--user-data-dir={target.parent / 'browser'}", "--host-resolver-rules=MAP * ~NOTFOUND"),
+            *("--virtual-time-budget=4000", "--window-size=900,7000", *options, target.as_uri()),
         ],
         capture_output=True,
         text=True,
         timeout=100,
         check=True,
     ).stdout
+
+
+def test_offline_browser_draws_all_charts(page: Page, chromium: str, tmp_path: Path) -> None:
+    target = tmp_path / "page.html"
+    target.write_text(page.html, encoding="utf-8")
+    dumped = browse(chromium, target, "--dump-dom")
     assert dumped.count('class="main-svg"') >= len(page.charts)
-    assert dumped.count('class="chart js-plotly-plot"') == len(page.charts)
+    assert set(re.findall('data-title="([^"]*)"', dumped)) == {
+        *("Download plot as a PNG", "Pan", "Reset axes", "Zoom"),  # and none that uploads the chart
+    }
+    assert len(re.findall(r'class="chart[^"]* js-plotly-plot"', dumped)) == len(page.charts)
+
+
+ZOOM = """
+setTimeout(function () {
+  const places = Array.from(document.querySelectorAll("[data-chart]"));
+  const range = (place) => place.dataset.chart + "=" + place.layout.xaxis.range.map(Math.round);
+  Plotly.relayout(places[3], { "xaxis.range[0]": 20, "xaxis.range[1]": 30 }).then(function () {
+    setTimeout(function () { document.body.dataset.ranges = places.map(range).join(" "); }, 500);
+  });
+}, 1500);
+"""
+
+
+def test_timelines_zoom_together_in_browser(page: Page, chromium: str, tmp_path: Path) -> None:
+    target = tmp_path / "page.html"
+    html = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", page.html)
+    target.write_text(html.replace("</body>", f"<script>{ZOOM}</script></body>"), encoding="utf-8")
+    dumped = browse(chromium, target, "--dump-dom")
+    found = re.search(r'data-ranges="([^"]*)"', dumped)
+    assert found is not None
+    ranges = dict(each.split("=") for each in found[1].split())
+    assert ranges.pop("map") != "20,30"
+    assert len(ranges) == len(page.charts) - 1 > 10
+    assert set(ranges.values()) == {"20,30"}
+
+
+def test_printed_report_has_few_pages(chromium: str, tmp_path: Path) -> None:
+    """Also for a long log, because content that cannot be read on paper is not printed."""
+    flight = read_flight(RECORDINGS / "ardupilot-copter.tlog")
+    flight.texts = [LoggedText(i / 10, 6, f"text {i}") for i in range(1000)]
+    flight.modes = [ModeChange(i / 3, f"MODE{i % 5}") for i in range(300)]
+    flight.parameters = {f"PARAMETER_{i}": float(i) for i in range(1349)}
+    flight.failsafe_evidence = [FailsafeEvidence(10.0 * i, "battery", f"low {i}") for i in range(500)]
+    flight.armed, flight.ends_at = [(0.0, 5000.0)], flight.begins_at + 5000.0
+    target = tmp_path / "page.html"
+    target.write_text(report_html(flight), encoding="utf-8")
+    browse(chromium, target, f"--print-to-pdf={tmp_path / 'page.pdf'}")
+    pages = len(re.findall(rb"/Type\s*/Page\b", (tmp_path / "page.pdf").read_bytes()))
+    assert 2 <= pages <= 8
 
 
 def test_unknown_log_suffix_raises_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -328,7 +400,7 @@ def test_summary_of_unarmed_log_mentions_no_flight(tmp_path: Path) -> None:
     assert "0:02.0\nerror\nbad" in page.text
     axis = page.charts["gps-fix_type"]["layout"]["yaxis"]
     assert (axis["tickvals"], axis["ticktext"]) == ([3, 6, 42], ["3D", "RTK fixed", "42"])
-    least, greatest = page.charts["map"]["layout"]["xaxis"]["autorangeoptions"]["include"]
+    least, greatest = page.charts["map"]["layout"]["xaxis"]["range"]
     assert least <= -1
     assert 16.1 < greatest < 17  # 15.2 m of track, and 1 m
 

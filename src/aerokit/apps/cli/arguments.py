@@ -81,9 +81,9 @@ def integer(low: int, high: int, what: str) -> Callable[[str], int]:
     return parse
 
 
-count: Callable[[str], int] = integer(1, 250, "a number of vehicles")
-port: Callable[[str], int] = integer(0, 65535, "a port number")
-system_id: Callable[[str], int] = integer(1, 255, "a system id")
+count = integer(1, 250, "a number of vehicles")
+port = integer(0, 65535, "a port number")
+system_id = integer(1, 255, "a system id")
 
 
 def wind(text: str) -> tuple[float, ...]:
@@ -171,9 +171,11 @@ def log_file(text: str) -> str:
 
 
 def directory(text: str) -> Path:
+    """Parse the path of a directory, which the command makes if it does not exist."""
     path = Path(text)
-    if not path.is_dir():
-        raise ArgumentTypeError(f"{text!r} is not an existing directory")
+    for place in (path, *path.parents):
+        if place.exists() and not place.is_dir():
+            raise ArgumentTypeError(f"{text!r} cannot be made: {str(place)!r} is a file")
     return path
 
 
@@ -187,3 +189,10 @@ def add_vehicle_kind(command: argparse.ArgumentParser, kinds: str) -> None:
 def add_baud(command: argparse._ActionsContainer) -> None:
     help_text = "baud rate of serial ports whose address has none (57600)"
     command.add_argument("--baud", type=int, default=57600, help=help_text)
+
+
+def add_record(command: argparse._ActionsContainer) -> None:
+    """Add ``--record FILE``; see `aerokit.apps.cli.output.new_recording`."""
+    command.add_argument(
+        "--record", type=log_file, metavar="FILE", help="record all messages to a new file: flight.tlog"
+    )

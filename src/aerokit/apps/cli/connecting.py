@@ -174,13 +174,15 @@ def confirm_blocking(question: str) -> bool:
 
 def command_action(
     name: str,
+    text: str,
     action: Callable[[Any, argparse.Namespace], Awaitable[object]],
     target: Callable[[argparse.Namespace], AbstractAsyncContextManager[Any]] | None = None,
 ) -> Callable[[argparse.Namespace], Awaitable[int]]:
-    """Return a ``run`` function that performs one action, and prints the ``done`` record.
+    """Return a ``run`` function that performs one action, and says so in one line.
 
     Args:
         name: the name of the action in the record; may contain names of options in braces.
+        text: the line that is printed without ``--json``; likewise.
         action: called with the target and the options.
         target: opens the target, by default the vehicle.
     """
@@ -188,7 +190,7 @@ def command_action(
     async def run(options: argparse.Namespace) -> int:
         async with target(options) if target else connected(options, changes=True) as opened_target:
             await action(opened_target, options)
-        emit_done(options, name.format(**vars(options)))
+        emit_done(options, name.format(**vars(options)), text.format(**vars(options)))
         return DONE
 
     return run

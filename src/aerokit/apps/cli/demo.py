@@ -86,7 +86,7 @@ async def _connect_and_fly(options: argparse.Namespace, interrupts: InterruptSta
         vehicle = await stack.enter_async_context(
             connect_to(options, address, changes=is_real, record=options.record, signing=signing)
         )
-        report = FlightReport(vehicle, options)
+        report = FlightReport(vehicle, options, 1.0 if is_real else options.speedup)
         async with report.running():
             code = await _SquareFlight(vehicle, report, interrupts).fly_square(options.altitude, options.side)
         report.print_summary(options.record)

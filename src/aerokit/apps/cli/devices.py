@@ -43,14 +43,19 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     photo.add_argument(
         "--interval", type=number(0.1, 3600), default=2.0, metavar="S", help="seconds between pictures (2)"
     )
-    photo.add_argument("--to", type=directory, metavar="DIRECTORY", help="download the pictures to this directory")
-    record = command_action("camera video {what}", _record_video, _camera)
+    photo.add_argument(
+        "--to",
+        type=directory,
+        metavar="DIRECTORY",
+        help="download the pictures to this directory, which is made if needed",
+    )
+    record = command_action("camera video {what}", "video {what}: done", _record_video, _camera)
     video = add_action(actions, "video", record, "Start or stop video recording.")
     video.add_argument("what", choices=("start", "stop"), help="start or stop")
-    set_mode = command_action("camera mode", lambda camera, o: camera.set_mode(o.mode), _camera)
+    set_mode = command_action("camera mode", "mode {mode}", lambda camera, o: camera.set_mode(o.mode), _camera)
     mode = add_action(actions, "mode", set_mode, "Change the camera's mode.")
     mode.add_argument("mode", choices=("photo", "video", "survey"), help="camera mode")
-    zoom_to = command_action("camera zoom", lambda camera, o: camera.zoom_to(o.percent), _camera)
+    zoom_to = command_action("camera zoom", "zoom {percent:g} %", lambda camera, o: camera.zoom_to(o.percent), _camera)
     zoom = add_action(actions, "zoom", zoom_to, "Zoom.")
     zoom.add_argument("percent", type=number(0, 100), metavar="PERCENT", help="of the zoom range, 0 to 100")
     streams = add_action(actions, "streams", _streams, "List the video streams with their addresses.")
@@ -90,6 +95,8 @@ async def _info(options: argparse.Namespace) -> int:
 async def _photo(options: argparse.Namespace) -> int:
     is_complete = True
     async with _camera(options) as camera:
+        if options.to is not None:
+            options.to.mkdir(parents=True, exist_ok=True)
         if options.count == 1:
             is_complete = await _show(options, camera, await camera.take_photo())
         else:
@@ -173,7 +180,7 @@ async def _format(options: argparse.Namespace) -> int:
 def add_gimbal_arguments(command: argparse.ArgumentParser) -> None:
     actions = command.add_subparsers(required=True, metavar="ACTION", title="actions")
     info = add_action(actions, "info", _gimbal_info, "Show model, limits and attitude.")
-    run = command_action("gimbal point", _point, _gimbal)
+    run = command_action("gimbal point", "pointing at pitch {pitch:g}°, yaw {yaw:g}°", _point, _gimbal)
     point = add_action(actions, "point", run, "Point the gimbal, and hold the direction.")
     point.add_argument(
         "pitch",
@@ -190,14 +197,16 @@ def add_gimbal_arguments(command: argparse.ArgumentParser) -> None:
         default="vehicle",
         help="yaw from north, or from the nose (vehicle)",
     )
-    run = command_action("gimbal look", _look_at, _gimbal)
+    run = command_action("gimbal look", "looking at {latitude:g} {longitude:g} {altitude:g} m", _look_at, _gimbal)
     look = add_action(actions, "look", run, "Keep the gimbal pointed at a position.")
     look.add_argument("latitude", type=number(-90, 90), metavar="LATITUDE", help="degrees")
     look.add_argument("longitude", type=number(-180, 180), metavar="LONGITUDE", help="degrees")
     look.add_argument("altitude", type=number(-500, 10_000), metavar="ALTITUDE", help="metres above home")
-    run = command_action("gimbal neutral", lambda gimbal, o: gimbal.neutral(timeout=o.patience), _gimbal)
+    run = command_action(
+        "gimbal neutral", "in neutral position", lambda gimbal, o: gimbal.neutral(timeout=o.patience), _gimbal
+    )
     neutral = add_action(actions, "neutral", run, "Turn the gimbal to its neutral position.")
-    run = command_action("gimbal release", lambda gimbal, o: gimbal.release(), _gimbal)
+    run = command_action("gimbal release", "control returned to the pilot", lambda gimbal, o: gimbal.release(), _gimbal)
     release = add_action(actions, "release", run, "Return control of the gimbal to the pilot.")
     for action in (info, point, look, neutral, release):
         action.add_argument(

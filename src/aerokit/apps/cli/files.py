@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
@@ -14,9 +15,10 @@ from aerokit.apps.cli.terminal import progress_bar
 from aerokit.errors import InvalidArgument
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Awaitable, Callable, Sequence
 
     from aerokit.vehicle.files.logs import LogEntry
+    from aerokit.vehicle.vehicle import Vehicle
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
@@ -29,10 +31,14 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     put = add_action(actions, "put", _put, "Upload a file.")
     put.add_argument("file", help="local file")
     put.add_argument("path", help="path on the vehicle")
-    remove = command_action("files rm", lambda v, o: v.files.remove(o.path, idle_timeout_s=o.patience))
-    rmdir = command_action("files rmdir", lambda v, o: v.files.remove_directory(o.path, idle_timeout_s=o.patience))
-    mkdir = command_action("files mkdir", lambda v, o: v.files.make_directory(o.path, idle_timeout_s=o.patience))
-    rename = command_action("files mv", lambda v, o: v.files.rename(o.path, o.new_path, idle_timeout_s=o.patience))
+    remove = command_action("files rm", "removed {path}", _call("remove"))
+    rmdir = command_action("files rmdir", "removed {path}", _call("remove_directory"))
+    mkdir = command_action("files mkdir", "created {path}", _call("make_directory"))
+    rename = command_action(
+        "files mv",
+        "renamed {path} to {new_path}",
+        lambda v, o: v.files.rename(o.path, o.new_path, idle_timeout_s=o.patience),
+    )
     for name, run, text in (
         ("rm", remove, "Remove a file."),
         ("rmdir", rmdir, "Remove an empty directory."),
@@ -43,6 +49,10 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     move = add_action(actions, "mv", rename, "Rename a file or directory.")
     move.add_argument("path", help="path on the vehicle")
     move.add_argument("new_path", help="path on the vehicle")
+
+
+def _call(method: str) -> Callable[[Vehicle, argparse.Namespace], Awaitable[object]]:
+    return lambda vehicle, o: getattr(vehicle.files, method)(o.path, idle_timeout_s=o.patience)
 
 
 def _size(path: str | os.PathLike[str]) -> int:
@@ -104,7 +114,7 @@ def add_logs_arguments(command: argparse.ArgumentParser) -> None:
         type=directory,
         default=Path(),
         metavar="DIRECTORY",
-        help="directory to write them to (this directory)",
+        help="directory to write them to, which is made if needed (this directory)",
     )
     get.add_argument("--method", choices=("auto", "ftp", "log"), default="auto", help="download method (auto)")
     erase = add_action(actions, "erase", _erase, "Erase all flight logs.")
@@ -122,6 +132,7 @@ async def _list_logs(options: argparse.Namespace) -> int:
 async def _get_logs(options: argparse.Namespace) -> int:
     async with connected(options) as vehicle:
         entries = await vehicle.logs.list(idle_timeout_s=options.patience)
+        options.to.mkdir(parents=True, exist_ok=True)
         for entry in _chosen(entries, options):
             to = options.to / f"log{entry.id:05}{vehicle.autopilot.log_suffix}"
             with progress_bar(to.name, "B") as show:
@@ -130,7 +141,9 @@ async def _get_logs(options: argparse.Namespace) -> int:
                 )
             size = _size(to)
             emit(options, "fetched_log", {"id": entry.id, "file": to, "bytes": size}, f"{to}: {size} bytes")
-    return DONE
+    if not entries:
+        print("aerokit: the vehicle has no logs", file=sys.stderr)
+    return DONE if entries else FAILED
 
 
 def _chosen(entries: Sequence[LogEntry], options: argparse.Namespace) -> Sequence[LogEntry]:

@@ -7,11 +7,18 @@ from contextlib import AsyncExitStack, suppress
 from typing import TYPE_CHECKING, cast
 
 from aerokit import events
-from aerokit.apps.cli.arguments import number, vehicle_kind
+from aerokit.apps.cli.arguments import add_record, number, vehicle_kind
 from aerokit.apps.cli.completion import kinds, offer
 from aerokit.apps.cli.connecting import add_vehicle, connect_to, default_address, signing_of
 from aerokit.apps.cli.mission import PARTS, emit_items, read_plan, upload_parts
-from aerokit.apps.cli.output import DONE, FAILED, INTERRUPTED, add_json, emit
+from aerokit.apps.cli.output import (
+    DONE,
+    FAILED,
+    INTERRUPTED,
+    add_json,
+    emit,
+    new_recording,
+)
 from aerokit.apps.cli.supervised_flight import INTERRUPT_ACTIONS, FlightReport, SupervisedFlight
 from aerokit.apps.cli.terminal import InterruptStack, confirm, is_interactive, on_interrupt
 from aerokit.errors import AerokitError, InvalidArgument, NotSupported, OperationRejected
@@ -121,18 +128,16 @@ class PlanFlight(SupervisedFlight):
     async def _follow(self) -> None:
 
         with (
-            self._vehicle.subscribe(events.MissionCurrentChanged, events.MissionItemReached, capacity=100) as progress,
+            self._vehicle.subscribe(events.MissionCurrentChanged, capacity=100) as progress,
             suppress(AerokitError),
         ):
             async for event in progress:
-                if isinstance(event, events.MissionItemReached):
-                    self._print(f"reached item {event.item}")
-                elif isinstance(event, events.MissionCurrentChanged) and event.after is not None:
-                    self._print(f"heading for item {event.after}{self._name_of(event.after)}")
+                if event.after is not None:
+                    self._print(f"to item {event.after}{self._name_of(event.after)}")
 
     def _name_of(self, index: int) -> str:
         items = self._plan.mission.items
-        return f" of {len(items)}, {items[index].name}" if index < len(items) else ""
+        return f", {items[index].name}" if index < len(items) else ""
 
     async def _finish(self) -> int:
         vehicle = self._vehicle
@@ -173,6 +178,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     simulated.add_argument(
         "--speedup", type=number(0.1, 100), default=10.0, metavar="X", help="simulation speed factor (10)"
     )
+    add_record(command)
     add_vehicle(command)
     add_json(command)
     command.set_defaults(run=run_fly, connect=None)
@@ -213,6 +219,7 @@ async def _connect_and_fly(
     options: argparse.Namespace, plan: Plan, interrupts: InterruptStack, flights: list[PlanFlight]
 ) -> int:
     async with AsyncExitStack() as stack:
+        stack.enter_context(new_recording(options.record))
         link: str | Link = options.connect or default_address()
         if options.sim:
             link = await _simulated(options, plan, stack)
@@ -220,12 +227,14 @@ async def _connect_and_fly(
         if not options.sim:
             emit(options, "connecting", {"address": address}, f"connecting to {address}")
         signing = None if options.sim else signing_of(options)
-        vehicle = await stack.enter_async_context(connect_to(options, link, changes=not options.sim, signing=signing))
-        report = FlightReport(vehicle, options)
+        vehicle = await stack.enter_async_context(
+            connect_to(options, link, changes=not options.sim, signing=signing, record=options.record)
+        )
+        report = FlightReport(vehicle, options, options.speedup if options.sim else 1.0)
         async with report.running():
             flights.append(PlanFlight(vehicle, plan, report, interrupts, options))
             code = await flights[-1].fly()
-        report.print_summary()
+        report.print_summary(options.record)
     return code
 
 

@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING
 
 import anyio
 
-from aerokit._internal.formatting import did_you_mean
-from aerokit.apps.cli.arguments import add_baud, address, log_file, number
+from aerokit.apps.cli.arguments import add_baud, add_record, address, number
 from aerokit.apps.cli.completion import addresses, offer
 from aerokit.apps.cli.connecting import SIGNING_KEY_VARIABLE, add_signing_key, signing_of
-from aerokit.apps.cli.output import DONE, INTERRUPTED, add_json, create_recording, emit, remove_if_empty
+from aerokit.apps.cli.output import DONE, INTERRUPTED, add_json, emit, new_recording, suggestion
 from aerokit.apps.cli.terminal import on_interrupt
 from aerokit.errors import InvalidArgument
 
@@ -46,9 +45,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     _add_names(command, "--signed", "sign what is sent there, and accept only signed messages")
     add_signing_key(command, f"key for --signed (${SIGNING_KEY_VARIABLE})")
     add_baud(command)
-    command.add_argument(
-        "--record", type=log_file, metavar="FILE", help="record every frame once, to a new file: flight.tlog"
-    )
+    add_record(command)
     command.add_argument(
         "--every", type=number(0.1, 1e6), default=10.0, metavar="S", help="seconds between statistics (10)"
     )
@@ -101,10 +98,9 @@ async def _hub(options: argparse.Namespace) -> int:
     stop = asyncio.Event()
     hub = Hub(endpoints)
     hub.on_event(lambda event: _emit_hub_event(options, event))
-    with on_interrupt(stop.set):
+    with on_interrupt(stop.set), new_recording(options.record):
         async with hub:
             if options.record is not None:
-                create_recording(options.record)
                 hub.record(options.record)
             record = {"endpoints": [endpoint.address for endpoint in hub.endpoints], "file": options.record}
             emit(
@@ -120,8 +116,6 @@ async def _hub(options: argparse.Namespace) -> int:
                     if not stop.is_set():
                         _emit_statistics(options, hub)
             _emit_statistics(options, hub)
-        if options.record is not None:
-            remove_if_empty(options.record)
     return INTERRUPTED if stop.is_set() and options.seconds is not None else DONE
 
 
@@ -163,9 +157,7 @@ def _for(name: str, filters: Sequence[tuple[str, tuple[str, ...]]]) -> tuple[str
 
 def _check_known(name: str, names: list[str]) -> None:
     if name not in names:
-        raise InvalidArgument(
-            f"no endpoint is named {name!r}{did_you_mean(name, names)}; endpoints: {', '.join(names)}"
-        )
+        raise InvalidArgument(f"no endpoint is named {name!r}{suggestion(name, names)}; endpoints: {', '.join(names)}")
 
 
 def _emit_hub_event(options: argparse.Namespace, event: HubEvent) -> None:

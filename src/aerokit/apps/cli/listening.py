@@ -12,7 +12,7 @@ from contextlib import AsyncExitStack, ExitStack, suppress
 from datetime import datetime, timezone
 from typing import TYPE_CHECKING
 
-from aerokit.apps.cli.arguments import log_file
+from aerokit.apps.cli.arguments import add_record, log_file
 from aerokit.apps.cli.connecting import (
     SIGNING_KEY_VARIABLE,
     add_address,
@@ -30,6 +30,7 @@ from aerokit.apps.cli.output import (
     create_recording,
     emit,
     import_extra,
+    new_recording,
     remove_if_empty,
 )
 from aerokit.apps.cli.terminal import on_interrupt, waiting
@@ -59,9 +60,9 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("file", type=log_file, metavar="FILE", help="new file, flight.tlog; directly after ADDRESS")
     add_seconds(command, "stop after S seconds (at Ctrl-C)")
     command.add_argument(
-        "--ask",
+        "--as-is",
         action="store_true",
-        help="request aerokit's default message rates; without it, nothing is requested",
+        help="request nothing; by default, request aerokit's usual message rates",
     )
 
 
@@ -98,7 +99,7 @@ async def run_record(options: argparse.Namespace) -> int:
 
 
 async def _record(connection: Connection, options: argparse.Namespace) -> bool:
-    if not options.ask:
+    if options.as_is:
         return await await_end(connection, options.seconds)
     from aerokit.vehicle.connect import vehicles_on
 
@@ -126,8 +127,8 @@ def _emit_counts(options: argparse.Namespace, counts: Counter[tuple[int, int]], 
     sources = f" from system{'s' if len(systems) > 1 else ''} {', '.join(map(str, systems))}" if systems else ""
     details = ", ".join(f"{name} {number}" for name, number in messages.most_common(5))
     text = f"{options.file}: {sum(counts.values())} frames received{sources} in {seconds:.1f} s, {size} bytes"
-    if set(messages) == {"HEARTBEAT"} and not options.ask:
-        details += "; no other messages: --ask requests position, attitude and other messages"
+    if set(messages) == {"HEARTBEAT"} and options.as_is:
+        details += "; no other messages: without --as-is, position, attitude and other messages are requested"
     emit(options, "recorded", record, f"{text}\n  {details}" if details else f"{text}: nothing was received")
 
 
@@ -204,6 +205,7 @@ def add_monitor_arguments(command: argparse.ArgumentParser) -> None:
     command.set_defaults(run=run_monitor)
     add_address(command)
     add_signing_key(command, f"signing key of the vehicles (${SIGNING_KEY_VARIABLE})")
+    add_record(command)
 
 
 async def run_monitor(options: argparse.Namespace) -> int:
@@ -223,10 +225,12 @@ async def run_monitor(options: argparse.Namespace) -> int:
             end.start()
             stack.callback(end.cancel)
 
+        stack.enter_context(new_recording(options.record))
         return await run(
             options.address,
             baud=options.baud,
             signing=signing_of(options),
+            record=options.record,
             on_start=lambda app: stack.enter_context(on_interrupt(app.exit, end_soon)),
         )
 

@@ -11,9 +11,17 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from aerokit._internal.formatting import did_you_mean
 from aerokit._internal.imports import installation_problem
-from aerokit.apps.cli.output import FAILED, NotInstalled, emit_error, exit_code, exit_codes_help, import_extra
+from aerokit.apps.cli.output import (
+    DONE,
+    FAILED,
+    NotInstalled,
+    emit_error,
+    exit_code,
+    exit_codes_help,
+    import_extra,
+    suggestion,
+)
 from aerokit.errors import AerokitError
 
 if TYPE_CHECKING:
@@ -133,6 +141,16 @@ COMMANDS = (
 )
 
 
+GROUPS = {
+    "without a vehicle": ("sim", "demo", "doctor", "report", "convert", "completion"),
+    "watch vehicles": ("status", "monitor", "serve", "events", "record"),
+    "fly": ("fly", "mission", RUN),
+    "parameters, files, devices": ("params", "files", "logs", "camera", "gimbal"),
+    "connect programs": ("hub", "bridge"),
+}
+"""Commands by task, for the help."""
+
+
 class Parser(argparse.ArgumentParser):
     """An ArgumentParser that accepts negative coordinates and suggests corrections. Subparsers have the same class."""
 
@@ -162,14 +180,37 @@ class Parser(argparse.ArgumentParser):
 
     def _fail_unrecognized(self, unknown: Sequence[str]) -> NoReturn:
         options = [argument for argument in unknown if argument.startswith("-")]
-        hint = did_you_mean(options[0].partition("=")[0] if options else None, self._option_string_actions)
+        hint = suggestion(options[0].partition("=")[0], self._option_string_actions) if options else ""
         self.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
 
     def error(self, message: str) -> NoReturn:
         """Print the usage and the message, and exit with code 2."""
         if found := re.search(r"invalid choice: '(.*)' \(choose from (.*)\)", message):
-            message += did_you_mean(found[1], re.findall(r"[\w.-]+", found[2]))
+            hint = suggestion(found[1], re.findall(r"[\w.-]+", found[2]))
+            is_command = message.startswith("argument COMMAND:")
+            message = f"unknown command {found[1]!r}{hint}; `aerokit` lists them" if is_command else message + hint
         super().error(message)
+
+
+class _TopParser(Parser):
+    """The parser of ``aerokit`` itself, whose help lists the commands by task."""
+
+    def format_help(self) -> str:
+        *options, commands = self._actions
+        assert isinstance(commands, argparse._SubParsersAction)
+        listed = {action.dest: action for action in commands._get_subactions()}
+        formatter = self._get_formatter()
+        formatter.add_usage(self.usage, self._actions, self._mutually_exclusive_groups)
+        formatter.add_text(self.description)
+        for title, names in GROUPS.items():
+            formatter.start_section(title)
+            formatter.add_arguments(listed[name] for name in names)
+            formatter.end_section()
+        formatter.start_section("options")
+        formatter.add_arguments(options)
+        formatter.end_section()
+        formatter.add_text(self.epilog)
+        return formatter.format_help()
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -187,7 +228,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         from aerokit.dronekit.runner import main as run_program
 
         return run_program(arguments[1:], "aerokit run")
-    options = make_parser(arguments[0] if arguments else "").parse_args(arguments)
+    if not arguments:
+        print(make_parser("").format_help(), end="")
+        return DONE
+    options = make_parser(arguments[0]).parse_args(arguments)
     try:
         code: int = asyncio.run(options.run(options))
     except BrokenPipeError:
@@ -223,9 +267,13 @@ def make_parser(only: str | None = None) -> argparse.ArgumentParser:
     """
     from aerokit import __version__
 
-    parser = Parser(prog="aerokit", description="Control drones over MAVLink.", epilog=exit_codes_help())
+    parser = _TopParser(
+        prog="aerokit",
+        description="Control drones over MAVLink. First flight: aerokit demo",
+        epilog=f"aerokit COMMAND --help explains a command. {exit_codes_help()}",
+    )
     parser.add_argument("--version", action="version", version=f"aerokit {__version__}")
-    subparsers = parser.add_subparsers(required=True, metavar="COMMAND", title="commands")
+    subparsers = parser.add_subparsers(required=True, metavar="COMMAND", title="commands", parser_class=Parser)
     for command in COMMANDS:
         subparser = subparsers.add_parser(command.name, help=command.help, description=command.description)
         if only in (command.name, None):

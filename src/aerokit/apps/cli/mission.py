@@ -6,12 +6,12 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from aerokit._internal.formatting import did_you_mean
 from aerokit.apps.cli.arguments import writable_file
 from aerokit.apps.cli.completion import offer
 from aerokit.apps.cli.connecting import add_action, command_action, connected
-from aerokit.apps.cli.output import DONE, add_force, check_not_existing, emit
+from aerokit.apps.cli.output import DONE, add_force, check_not_existing, emit, suggestion
 from aerokit.apps.cli.terminal import progress_bar
+from aerokit.errors import InvalidArgument
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -100,9 +100,9 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     check = add_action(actions, "check", _check, "Check a file without a vehicle.", connects=False)
     check.add_argument("file")
     _add_parts(add_action(actions, "clear", _clear, "Clear the vehicle's mission, fence or rally points."))
-    start = command_action("mission start", lambda vehicle, _: vehicle.mission.start())
-    pause = command_action("mission pause", lambda vehicle, _: vehicle.mission.pause())
-    resume = command_action("mission resume", lambda vehicle, _: vehicle.mission.resume())
+    start = command_action("mission start", "mission started", lambda vehicle, _: vehicle.mission.start())
+    pause = command_action("mission pause", "mission paused", lambda vehicle, _: vehicle.mission.pause())
+    resume = command_action("mission resume", "mission resumed", lambda vehicle, _: vehicle.mission.resume())
     add_action(actions, "start", start, "Start the mission.")
     add_action(actions, "pause", pause, "Pause the mission and hold.")
     add_action(actions, "resume", resume, "Resume the mission.")
@@ -122,7 +122,7 @@ def _add_parts(action: argparse.ArgumentParser) -> None:
 
 def _part(text: str) -> str:
     if text not in PARTS:
-        hint = did_you_mean(text, PARTS)
+        hint = suggestion(text, PARTS)
         raise argparse.ArgumentTypeError(f"{text!r} is not one of {', '.join(PARTS)}{hint}")
     return text
 
@@ -155,6 +155,8 @@ async def _download(options: argparse.Namespace) -> int:
 
 async def _upload(options: argparse.Namespace) -> int:
     plan = read_plan(options.file)
+    if not any(getattr(plan, part).to_items() for part in PARTS):
+        raise InvalidArgument(f"{options.file} has no items; nothing was uploaded")
     async with connected(options, changes=True) as vehicle:
         await upload_parts(vehicle, plan, options)
     return DONE
@@ -164,6 +166,8 @@ async def _check(options: argparse.Namespace) -> int:
     plan = read_plan(options.file)
     for part in PARTS:
         emit_items(options, part, getattr(plan, part).to_items(), "in the file")
+    if not options.json:
+        print(f"{options.file} has no errors")
     return DONE
 
 

@@ -7,6 +7,7 @@ import errno
 import json
 import os
 import sys
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,7 +24,7 @@ from aerokit.errors import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Iterator, Mapping
 
 
 def add_json(command: argparse._ActionsContainer) -> None:
@@ -61,7 +62,7 @@ def _print(text: str) -> None:
         print(text.encode("ascii", "replace").decode(), flush=True)
 
 
-def emit_done(options: argparse.Namespace, action: str, text: str | None = None) -> None:
+def emit_done(options: argparse.Namespace, action: str, text: str) -> None:
     """Print the ``done`` record of an action that has no other result; without ``--json`` print only ``text``."""
     emit(options, "done", {"action": action}, text)
 
@@ -83,6 +84,8 @@ def _text(error: BaseException) -> str:
 
 DONE, FAILED, WRONG_ARGUMENTS, NO_VEHICLE, TIMED_OUT, REFUSED, UNREADABLE, NOT_INSTALLED = range(8)
 INTERRUPTED = 130
+# Of two names, by difflib: one wrong letter of four.
+_MIN_LIKENESS = 0.75
 
 _MEANINGS = {
     DONE: "done",
@@ -138,6 +141,27 @@ def import_extra(module: str, extra: str) -> Any:
         ) from None
 
 
+def near_names(name: str, known: Iterable[str], count: int = 1) -> list[str]:
+    """Return the known names that ``name`` begins, or that differ from it by a letter or two, the nearest first."""
+    from difflib import SequenceMatcher
+
+    bare, ratios = name.strip("-").upper(), dict[str, float]()
+    for other in known:
+        plain_other = other.strip("-").upper()
+        is_beginning = len(bare) >= 3 and plain_other.startswith(bare)
+        matcher = SequenceMatcher(None, bare, plain_other)
+        if is_beginning or (matcher.real_quick_ratio() >= _MIN_LIKENESS and matcher.quick_ratio() >= _MIN_LIKENESS):
+            ratios[other] = 1.0 if is_beginning else matcher.ratio()
+    near = (other for other in ratios if ratios[other] >= _MIN_LIKENESS)
+    return sorted(near, key=lambda other: (-ratios[other], len(other), other))[:count]
+
+
+def suggestion(name: str, known: Iterable[str], count: int = 1) -> str:
+    """Return ``" (did you mean 'status'?)"``, or "" if no known name is near."""
+    names = " or ".join(map(repr, near_names(name, known, count)))
+    return f" (did you mean {names}?)" if names else ""
+
+
 def add_force(command: argparse.ArgumentParser) -> None:
     command.add_argument("--force", action="store_true", help="replace an existing file")
 
@@ -169,3 +193,16 @@ def remove_if_empty(path: str) -> None:
     """Delete a recording that received nothing."""
     if not os.path.getsize(path):
         os.unlink(path)
+
+
+@contextmanager
+def new_recording(path: str | None) -> Iterator[None]:
+    """Create the recording of ``--record``, and delete it after the block if it is empty; None: do nothing."""
+    if path is None:
+        yield
+        return
+    create_recording(path)
+    try:
+        yield
+    finally:
+        remove_if_empty(path)

@@ -7,11 +7,10 @@ import fnmatch
 import sys
 from typing import TYPE_CHECKING
 
-from aerokit._internal.formatting import did_you_mean
 from aerokit.apps.cli.arguments import assignment, writable_file
 from aerokit.apps.cli.completion import assignments, offer, parameter_names
 from aerokit.apps.cli.connecting import add_action, connected
-from aerokit.apps.cli.output import DONE, FAILED, add_force, check_not_existing, emit
+from aerokit.apps.cli.output import DONE, FAILED, add_force, check_not_existing, emit, suggestion
 from aerokit.apps.cli.terminal import progress_bar
 from aerokit.errors import ParameterRejected, ParameterTimeout
 
@@ -61,7 +60,7 @@ async def _list(options: argparse.Namespace) -> int:
     found = [value for name, value in table.items() if fnmatch.fnmatch(name, options.pattern.upper())]
     _emit_parameters(options, found)
     if not found and options.pattern != "*":
-        hint = did_you_mean(options.pattern, table)
+        hint = suggestion(options.pattern.strip("*"), table, 3)
         print(f"aerokit: none of {len(table)} parameters matches {options.pattern!r}{hint}", file=sys.stderr)
         return FAILED
     return DONE
@@ -103,7 +102,7 @@ async def _diff(options: argparse.Namespace) -> int:
 async def _set(options: argparse.Namespace) -> int:
     async with connected(options, changes=True) as vehicle:
         results = await vehicle.parameters.set_many(dict(options.values), idle_timeout_s=options.patience)
-    return _emit_results(options, results.values())
+    return _emit_results(options, results.values(), vehicle)
 
 
 async def _load(options: argparse.Namespace) -> int:
@@ -115,8 +114,11 @@ async def _load(options: argparse.Namespace) -> int:
         with progress_bar("parameters", "parameter") as show:
             results = await vehicle.parameters.upload(wanted, idle_timeout_s=options.patience, on_progress=show)
     if options.json:
-        return _emit_results(options, results.values())
-    return _emit_results(options, (result for result in results.values() if result.outcome != "unchanged"))
+        return _emit_results(options, results.values(), vehicle)
+    changed = [result for result in results.values() if result.outcome != "unchanged"]
+    code = _emit_results(options, changed, vehicle)
+    print(f"{len(results)} parameters in {options.file}, {len(changed)} of them differed")
+    return code
 
 
 async def _download(vehicle: Vehicle, options: argparse.Namespace) -> ParameterTable:
@@ -128,15 +130,17 @@ async def _read(vehicle: Vehicle, name: str, options: argparse.Namespace) -> Par
     try:
         return await vehicle.parameters.read(name, idle_timeout_s=options.patience)
     except (ParameterRejected, ParameterTimeout) as error:
-        if suggestion := _suggestion(name, error):
-            print(f"aerokit: could not read parameter {name!r}{suggestion}", file=sys.stderr)
+        if hint := _hint(name, error, vehicle):
+            print(f"aerokit: could not read parameter {name!r}{hint}", file=sys.stderr)
         raise
 
 
-def _suggestion(name: str, error: Exception) -> str:
-    """Suggest a similar name among the simulated vehicles' parameters, unless the error does so already."""
-    names = parameter_names()
-    return "" if "did you mean" in str(error) or name in names else did_you_mean(name, names)
+def _hint(name: str, error: Exception, vehicle: Vehicle) -> str:
+    """Suggest names of the simulated vehicles' parameters, or how to find one, unless the error does so already."""
+    names = parameter_names(vehicle.autopilot.name)
+    if "did you mean" in str(error) or name.upper() in names:
+        return ""
+    return suggestion(name, names, 3) or "; `aerokit params list` shows all names"
 
 
 def _emit_parameters(options: argparse.Namespace, parameters: Iterable[Parameter]) -> None:
@@ -147,14 +151,14 @@ def _emit_parameters(options: argparse.Namespace, parameters: Iterable[Parameter
         emit(options, "parameter", _record(parameter), text)
 
 
-def _emit_results(options: argparse.Namespace, results: Iterable[ParameterWrite]) -> int:
+def _emit_results(options: argparse.Namespace, results: Iterable[ParameterWrite], vehicle: Vehicle) -> int:
     """Print a line for each. Return FAILED if a value differs from the requested one by more than rounding."""
     code = DONE
     for result in results:
         if result.error is None:
             text = f"{result.name:16} {_text(result.value):<12} {result.outcome} {result.note}".rstrip()
         else:
-            text = f"{result.name:16} not set: {result.error}{_suggestion(result.name, result.error)}"
+            text = f"{result.name:16} not set: {result.error}{_hint(result.name, result.error, vehicle)}"
         emit(options, "parameter_write", _record(result), text)
         if result.error is not None or result.outcome == "clamped":
             code = FAILED

@@ -8,17 +8,19 @@ import sys
 from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
 from typing import TYPE_CHECKING, Any
 
-from aerokit.apps.cli.arguments import count, port
+from aerokit.apps.cli.arguments import add_record, count, port
 from aerokit.apps.cli.connecting import SIGNING_KEY_VARIABLE, add_address, add_signing_key, signing_of
-from aerokit.apps.cli.output import DONE, FAILED, add_json, emit, import_extra
+from aerokit.apps.cli.output import DONE, FAILED, add_json, emit, import_extra, new_recording
 from aerokit.apps.cli.terminal import on_interrupt
 from aerokit.errors import LinkOpenError
+from aerokit.parameters import load_metadata
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
 
     from aerokit.apps.serve import ServeApp
     from aerokit.connection.connection import Connection
+    from aerokit.parameters import Metadata
 
 _LOOPBACK = "127.0.0.1"
 
@@ -30,6 +32,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         "--sim", nargs="?", type=count, const=1, metavar="N", help="serve N simulated copters (1) instead"
     )
     add_signing_key(command, f"signing key of the vehicles (${SIGNING_KEY_VARIABLE})")
+    add_record(command)
     _add_web(command)
     add_json(command)
 
@@ -51,6 +54,11 @@ def _add_web(command: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help="host name that browsers may use, besides localhost and IP addresses (repeatable)",
     )
+    web.add_argument(
+        "--metadata",
+        metavar="FILE",
+        help="parameter metadata of the firmware, for units, ranges and descriptions (apm.pdef.xml or parameters.json)",
+    )
     web.add_argument("--tiles", metavar="URL", help="map tiles: https://tiles.example/{z}/{x}/{y}.png (none)")
     web.add_argument("--attribution", default="", metavar="TEXT", help="attribution of the tiles, shown on the map")
 
@@ -58,8 +66,16 @@ def _add_web(command: argparse.ArgumentParser) -> None:
 async def _run(options: argparse.Namespace) -> int:
     uvicorn = import_extra("uvicorn", "serve")
     import_extra("websockets", "serve")
+    metadata = None if options.metadata is None else load_metadata(options.metadata)
     serve = import_extra("aerokit.apps.serve", "serve")
+    with new_recording(options.record):
+        return await _serve_vehicles(uvicorn, serve, options, metadata)
+
+
+async def _serve_vehicles(uvicorn: Any, serve: Any, options: argparse.Namespace, metadata: Metadata | None) -> int:
     async with _connection(options) as connection:
+        if options.record is not None:
+            connection.record(options.record)
         app = serve.make_app(
             connection,
             token=_token(options.token_file),
@@ -68,6 +84,7 @@ async def _run(options: argparse.Namespace) -> int:
             hosts=[*options.allow_host, options.host],
             tiles=options.tiles,
             attribution=options.attribution,
+            metadata=metadata,
         )
         async with app:
             return await _serve(uvicorn, app, options)

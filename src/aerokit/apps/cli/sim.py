@@ -27,7 +27,15 @@ from aerokit.apps.cli.connecting import add_signing_key
 from aerokit.apps.cli.output import add_json, emit
 from aerokit.apps.cli.terminal import on_interrupt
 from aerokit.errors import InvalidArgument
-from aerokit.sim import SimulatedVehicle, SimulatedWind, SimulatorServer
+from aerokit.mavlink.enums import MavComponent, MavType
+from aerokit.sim import (
+    ExtraComponent,
+    SimulatedCamera,
+    SimulatedGimbal,
+    SimulatedVehicle,
+    SimulatedWind,
+    SimulatorServer,
+)
 from aerokit.sim.kinds import scale_timeouts
 from aerokit.sim.motion import HOME
 from aerokit.transport import create_link
@@ -35,8 +43,9 @@ from aerokit.transport.address import parse_address
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Sequence
+    from collections.abc import Callable, Iterable, Sequence
 
+    from aerokit.sim import AttachableComponent
     from aerokit.testing.track import Track
 
 # Scheme of a simulator's address, and the scheme with which a client connects to it.
@@ -76,10 +85,11 @@ def simulated_fleet(
     home: tuple[float, float, float] | None = None,
     spacing_m: float = 5.0,
     seed: int = 0,
+    components: Callable[[], Iterable[AttachableComponent]] = tuple,
     **options: Any,
 ) -> list[SimulatedVehicle]:
     """Create ``count`` vehicles in a row eastwards from ``home`` (`aerokit.sim.HOME`), with consecutive system ids
-    and seeds.
+    and seeds. ``components`` makes the components of one vehicle.
 
     With the name of a .tlog file, return the one vehicle of that recording; other options do not apply.
     """
@@ -99,6 +109,7 @@ def simulated_fleet(
             home=(place.latitude_e7 / 1e7, place.longitude_e7 / 1e7, home[2]),
             system_id=system_id + number,
             seed=seed + number,
+            components=components(),
             **options,
         )
         for number, place in enumerate(places)
@@ -164,7 +175,42 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         help="eastward distance between vehicles in metres (5)",
     )
     command.add_argument("--seed", type=int, default=0, help="random seed of the first vehicle (0)")
+    _add_devices(command)
     _add_conditions(command)
+
+
+_DEVICES: dict[str, tuple[int, Callable[[int], AttachableComponent], str]] = {
+    "camera": (6, lambda number: SimulatedCamera(100 + number), "camera (component 100 to 105)"),
+    "gimbal": (
+        6,
+        lambda number: SimulatedGimbal(170 + number if number else 154),
+        "gimbal (component 154, 171 to 175)",
+    ),
+    "companion": (
+        4,
+        lambda number: ExtraComponent(MavComponent.ONBOARD_COMPUTER + number, MavType.ONBOARD_CONTROLLER),
+        "companion computer (component 191 to 194), which sends heartbeats",
+    ),
+}
+
+
+def _add_devices(command: argparse.ArgumentParser) -> None:
+    for name, (most, _, text) in _DEVICES.items():
+        command.add_argument(
+            f"--{name}",
+            action="count",
+            default=0,
+            help=f"fit each vehicle with a {text}; repeatable, up to {most}",
+        )
+
+
+def _devices(options: argparse.Namespace) -> list[AttachableComponent]:
+    components = []
+    for name, (most, make, _) in _DEVICES.items():
+        if (count := getattr(options, name)) > most:
+            raise InvalidArgument(f"--{name} is given {count} times; a vehicle has {most} at most")
+        components += [make(number) for number in range(count)]
+    return components
 
 
 def _add_conditions(command: argparse.ArgumentParser) -> None:
@@ -175,7 +221,7 @@ def _add_conditions(command: argparse.ArgumentParser) -> None:
         default=[],
         dest="parameters",
         metavar="NAME=VALUE",
-        help="parameter value instead of its default (repeatable): MNT1_TYPE=1 adds a gimbal to the copter",
+        help="parameter value instead of its default (repeatable): MNT1_TYPE=1 gives the copter's autopilot a gimbal",
     )
     offer(parameters, assignments)
     command.add_argument(
@@ -242,6 +288,7 @@ def _fleet(options: argparse.Namespace) -> list[SimulatedVehicle]:
         seed=options.seed,
         boot_text=True,
         parameters=dict(options.parameters),
+        components=lambda: _devices(options),
         **{name: value for name, value in optional.items() if value is not None},
     )
 
@@ -277,10 +324,10 @@ def _emit(server: SimulatorServer, options: argparse.Namespace) -> None:
         text = f"{_systems(vehicles)} on {address}, speed {options.speedup:g}x"
         emit(options, "simulated", record, text)
     if not options.json:
-        print(
-            f"try: aerokit demo --connect {_client_address(server.addresses[0], options.addresses[0])}",
-            flush=True,
-        )
+        vehicles = server.vehicles_on[0]
+        place = _client_address(server.addresses[0], options.addresses[0])
+        choice = f" --system-id {vehicles[0].system_id}" if len(vehicles) > 1 else ""
+        print(f"try: aerokit demo --connect {place}{choice}", flush=True)
 
 
 def _systems(vehicles: Sequence[SimulatedVehicle]) -> str:

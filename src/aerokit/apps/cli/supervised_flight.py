@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+import re
+import shlex
 import sys
 from abc import ABC, abstractmethod
 from contextlib import asynccontextmanager, suppress
@@ -46,6 +48,8 @@ INTERRUPT_ACTIONS: dict[str, str] = {
 """Choices of ``--on-interrupt``, and the text that is printed."""
 _AUTO_DISARM_TIMEOUT_S = 30.0
 _WARNING = 4
+# ArduPilot announces each mission item in texts that repeat what the commands print.
+_MISSION_TEXT = re.compile(r"Mission: \d+ |Reached command #\d+")
 # After this time without output, print a status line.
 _STATUS_INTERVAL_S = 5.0
 
@@ -201,10 +205,15 @@ class SupervisedFlight(ABC):
 
 
 class FlightReport:
-    """Prints the progress of a flight and the vehicle's texts, and measures the track."""
+    """Prints the progress of a flight and the vehicle's texts, and measures the track.
 
-    def __init__(self, vehicle: Vehicle, options: argparse.Namespace) -> None:
-        self._vehicle, self._options = vehicle, options
+    ``speedup``: of the simulation; 1.0 for a real vehicle. Durations are those of a real flight.
+    """
+
+    def __init__(self, vehicle: Vehicle, options: argparse.Namespace, speedup: float) -> None:
+        self._vehicle, self._options, self._speedup = vehicle, options, speedup
+        self._armed_at: float | None = None
+        self._armed_s = 0.0
         self._started = self._last_line = vehicle.connection.now()
         self._highest_m = self._fastest_m_s = self._flown_m = 0.0
         self._before: Position | None = None
@@ -217,19 +226,23 @@ class FlightReport:
         altitude = None if here is None else here.altitude_relative_m
         height = "     -" if altitude is None else f"{round(altitude, 1) + 0.0:6.1f}"
         self._last_line = self._vehicle.connection.now()
-        seconds = self._last_line - self._started
+        seconds = self._speedup * (self._last_line - self._started)
         record = {"seconds": seconds, "altitude_relative_m": altitude, "text": text.strip()}
         self._emit("flight", record, f"{seconds:6.1f} s {height} m  {text}")
 
     @asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
         """Within the block, print the vehicle's texts, mode changes and status lines."""
-        detach = self._vehicle.position.observe(self._on_position)
+        detach_all = [
+            self._vehicle.position.observe(self._on_position),
+            self._vehicle.armed.observe(self._on_armed),
+        ]
         tasks = [asyncio.create_task(coroutine) for coroutine in (self._print_events(), self._print_status())]
         try:
             yield
         finally:
-            detach()
+            for detach in detach_all:
+                detach()
             for task in tasks:
                 task.cancel()
             with anyio.CancelScope(shield=True):
@@ -239,7 +252,8 @@ class FlightReport:
         """Print the statistics of the flight, the link and the batteries."""
         vehicle = self._vehicle
         received, lost = vehicle.connection.counts(vehicle.system_id)
-        seconds = vehicle.connection.now() - self._started
+        seconds = self._speedup * (vehicle.connection.now() - self._started)
+        self._on_armed(None, False)
         version = vehicle.version.latest
         batteries = vehicle.batteries.latest or ()
         record = {
@@ -247,6 +261,7 @@ class FlightReport:
             "firmware": vehicle.autopilot.firmware,
             "version": None if version is None else str(version),
             "seconds": seconds,
+            "armed_seconds": self._armed_s,
             "flown_m": self._flown_m,
             "highest_m": self._highest_m,
             "fastest_m_s": self._fastest_m_s,
@@ -258,16 +273,30 @@ class FlightReport:
             "recorded_in": recorded_in,
         }
         lines = [
-            f"\n{vehicle.autopilot.firmware} {version or '(unknown version)'}, {seconds:.0f} s:"
+            f"\n{vehicle.autopilot.firmware} {version or '(unknown version)'},"
+            f" armed for {_duration(self._armed_s)}{self._rehearsal()}:"
             f" flown {self._flown_m:.0f} m, max height {self._highest_m:.1f} m, max speed {self._fastest_m_s:.1f} m/s",
             *(
-                f"battery {battery.id}: {_number(battery.voltage_v, 'V')},"
+                f"battery {battery.id + 1}: {_number(battery.voltage_v, 'V')},"
                 f" {_number(battery.remaining_percent, '%')} left"
                 for battery in batteries
             ),
             f"{received} frames received, {lost} lost" + (f"; recorded in {recorded_in}" if recorded_in else ""),
+            f"next: aerokit report {shlex.quote(recorded_in)}"
+            if recorded_in
+            else "next time: --record FILE.tlog records the flight for `aerokit report FILE.tlog`",
         ]
         self._emit("flight_summary", record, "\n".join(lines))
+
+    def _rehearsal(self) -> str:
+        real = self._armed_s / self._speedup
+        return "" if self._speedup == 1.0 else f" (simulated in {_duration(real)}, {self._speedup:g}x)"
+
+    def _on_armed(self, before: bool | None, is_armed: bool) -> None:
+        now = self._vehicle.connection.now()
+        if self._armed_at is not None:
+            self._armed_s += self._speedup * (now - self._armed_at)
+        self._armed_at = now if is_armed else None
 
     async def _print_events(self) -> None:
         with (
@@ -277,7 +306,7 @@ class FlightReport:
             async for event in messages:
                 if isinstance(event, events.ModeChanged):
                     self.print_line(f"  mode {event.after}")
-                elif isinstance(event, events.StatusTextReceived):
+                elif isinstance(event, events.StatusTextReceived) and not _MISSION_TEXT.match(event.text):
                     self.print_line(f"  {'! ' if event.severity <= _WARNING else ''}{event.text}")
 
     async def _print_status(self) -> None:
@@ -304,6 +333,11 @@ class FlightReport:
             emit(self._options, kind, record, text)
         except OSError:
             sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - used until the process ends
+
+
+def _duration(seconds: float) -> str:
+    whole = round(seconds)
+    return f"{whole} s" if whole < 60 else f"{whole // 60} min {whole % 60:02} s"
 
 
 def _number(value: float | None, unit: str) -> str:

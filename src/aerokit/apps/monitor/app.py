@@ -9,12 +9,13 @@ from rich.table import Table
 from rich.text import Text
 from textual.app import App
 from textual.binding import Binding
-from textual.containers import Horizontal, Vertical
+from textual.containers import Container, Horizontal, Vertical
 from textual.screen import ModalScreen
-from textual.widgets import Button, Footer, Label, OptionList, RichLog, Static
+from textual.widget import Widget
+from textual.widgets import Button, Footer, Label, OptionList, RichLog
 from textual.widgets.option_list import Option
 
-from aerokit.apps.monitor.lines import ARROWS, UNKNOWN, Canvas, list_row, state_lines
+from aerokit.apps.monitor.lines import ARROWS, LINK_STYLES, UNKNOWN, Canvas, VehicleText, number
 from aerokit.apps.monitor.model import MonitorModel
 from aerokit.connection.opening import OBSERVER_SYSTEM_ID, explain_no_vehicle, open_connection
 from aerokit.connection.tasks import BackgroundTasks
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
     from textual.app import ComposeResult
     from textual.binding import BindingType
+    from textual.events import Resize
 
     from aerokit.mavlink.signing import Signing
     from aerokit.transport.link import Link
@@ -34,8 +36,12 @@ if TYPE_CHECKING:
 
 __all__ = ["ConfirmScreen", "Monitor", "run_monitor"]
 
-REFRESH_INTERVAL_S = 0.25
-TRACK_STYLES = ("cyan", "magenta", "yellow", "green", "blue", "red")
+REFRESH_INTERVAL_S = 0.5
+WIDE = 120, 30
+"""Columns and rows from which on more is shown."""
+ANSI_THEMES = ("ansi-dark", "textual-ansi", "textual-dark")
+"""Themes with the terminal's own colours, light or dark; their name depends on the version of Textual."""
+TRACK_STYLES = ("green", "magenta", "red", "blue", "cyan", "yellow")
 KEY_COMMANDS = {"hold": "HOLD", "land": "LAND", "return_to_launch": "RETURN TO LAUNCH"}
 """Vehicle methods that keys call, and their names in the question."""
 
@@ -50,8 +56,8 @@ class ConfirmScreen(ModalScreen[bool]):
         ("right", "app.focus_next", "Other"),
     ]
     CSS: ClassVar[str] = """
-    ConfirmScreen { align: center middle; }
-    ConfirmScreen Vertical { width: 50; height: auto; border: heavy $warning; background: $surface; padding: 1 2; }
+    ConfirmScreen { align: center middle; background: transparent; }
+    ConfirmScreen Vertical { width: 50; height: auto; border: heavy; padding: 1 2; }
     ConfirmScreen Label { width: 100%; text-align: center; text-style: bold; }
     ConfirmScreen Horizontal { height: auto; align: center middle; margin-top: 1; }
     ConfirmScreen Button { margin: 0 2; }
@@ -83,6 +89,26 @@ class ConfirmScreen(ModalScreen[bool]):
         self.dismiss(yes)
 
 
+class Panel(Widget):
+    """A widget that shows a text or table. A new content is laid out again only if its height differs."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(id=name)
+        self._content: Text | Table = Text()
+        self._height = 0
+
+    def show(self, content: Text | Table) -> None:
+        """Show a new content."""
+        height = content.plain.count("\n") if isinstance(content, Text) else content.row_count
+        self._content = content
+        self.refresh(layout=height != self._height)
+        self._height = height
+
+    def render(self) -> Text | Table:
+        """Return the content."""
+        return self._content
+
+
 class Monitor(App[None]):
     """Shows a :class:`~aerokit.apps.monitor.model.MonitorModel`. Commands go to the vehicle named in the question."""
 
@@ -97,22 +123,24 @@ class Monitor(App[None]):
     ]
 
     def __init__(self, model: MonitorModel, commands: BackgroundTasks, name: str) -> None:
-        super().__init__()
+        super().__init__(ansi_color=True)
+        self.theme = next(name for name in ANSI_THEMES if name in self.available_themes)
         self._model, self._commands, self._name = model, commands, name
         self._began_at = model.connection.now()
         self._listed: list[int] = []
+        self._shown: dict[str, object] = {}
+        self._is_wide = False
 
     def compose(self) -> ComposeResult:
         """Yield the vehicle list, state and map, texts and rates."""
-        yield Static(id="title", markup=False)
+        yield Panel("title")
         yield OptionList(id="vehicles")
-        with Horizontal(id="middle"):
-            yield Static(id="state", markup=False)
-            yield Static(id="map", markup=False)
-        with Horizontal(id="bottom"):
+        with Container(id="panels"):
+            yield Panel("state")
+            yield Panel("map")
             yield RichLog(id="texts", wrap=True, min_width=1, max_lines=500)
             with Vertical(id="rates_box"):
-                yield Static(id="rates", markup=False)
+                yield Panel("rates")
         yield Footer()
 
     def on_mount(self) -> None:
@@ -125,6 +153,20 @@ class Monitor(App[None]):
         self.update_view()
         self.set_interval(REFRESH_INTERVAL_S, self.update_view)
 
+    def on_resize(self, event: Resize) -> None:
+        """Use the width: the messages go below the state, and the texts below the map."""
+        is_wide = event.size.width >= WIDE[0] and event.size.height >= WIDE[1]
+        if is_wide == self._is_wide:
+            return
+        self._is_wide = is_wide
+        base = self.screen_stack[0]
+        base.set_class(is_wide, "wide")
+        panels, rates, texts = (base.query_one(f"#{name}") for name in ("panels", "rates_box", "texts"))
+        if is_wide:
+            panels.move_child(rates, before=texts)
+        else:
+            panels.move_child(rates, after=texts)
+
     @property
     def selected(self) -> Vehicle | None:
         """The highlighted vehicle; None if there is none."""
@@ -132,16 +174,32 @@ class Monitor(App[None]):
         return None if place is None else self._model.vehicles[self._listed[place]]
 
     def update_view(self) -> None:
-        """Update all widgets from the model."""
+        """Update the widgets whose content has changed in the model."""
         self._model.update()
         base = self.screen_stack[0]
         self._list(base.query_one("#vehicles", OptionList))
-        views = {"title": self._title, "state": self._state, "map": self._map, "rates": self._rates}
-        for name, make_view in views.items():
-            base.query_one(f"#{name}", Static).update(make_view())
+        self._show("title", self._title())
+        rows = self._state_rows()
+        if self._is_new("state", rows):
+            base.query_one("#state", Panel).show(_table(rows) if isinstance(rows, list) else rows)
+        self._show_map(base.query_one("#map", Panel))
+        self._show("rates", self._rates())
         texts = base.query_one("#texts", RichLog)
         while self._model.lines:
             texts.write(self._model.lines.popleft())
+        if self._is_new("slow", self._model.slow_streams):
+            texts.border_subtitle = self._model.slow_streams
+
+    def _is_new(self, name: str, content: object) -> bool:
+        """Return True if the content differs from what is on the screen: drawing is expensive."""
+        if self._shown.get(name) == content:
+            return False
+        self._shown[name] = content
+        return True
+
+    def _show(self, name: str, content: Text) -> None:
+        if self._is_new(name, content):
+            self.screen_stack[0].query_one(f"#{name}", Panel).show(content)
 
     def on_option_list_option_highlighted(self) -> None:
         """Show the newly selected vehicle."""
@@ -175,51 +233,52 @@ class Monitor(App[None]):
         for system_id in vehicles:
             if system_id not in self._listed:
                 self._listed.append(system_id)
-                options.add_option(Option(list_row(vehicles[system_id]), id=str(system_id)))
+                options.add_option(Option("", id=str(system_id)))
         if self._listed and options.highlighted is None:
             options.highlighted = 0
         for place, system_id in enumerate(self._listed):
-            options.replace_option_prompt_at_index(place, list_row(vehicles[system_id]))
+            is_selected = place == options.highlighted
+            row = VehicleText(vehicles[system_id]).row(is_selected=is_selected, more=self._is_wide)
+            if self._is_new(f"row {place}", row):
+                options.replace_option_prompt_at_index(place, row)
 
     def _title(self) -> Text:
         connection, count = self._model.connection, len(self._model.vehicles)
         state = connection.link_state.latest
-        text = Text(f"{self._name}  ", "bold", no_wrap=True, overflow="ellipsis")
-        text.append(f"link {state.value if state else UNKNOWN}  {count} vehicle{'s' if count != 1 else ''}")
-        return text
+        text = Text(f"{self._name}  link ", "bold", no_wrap=True, overflow="ellipsis")
+        text.append(state.value if state else UNKNOWN, LINK_STYLES[state] if state else "")
+        return text.append(f"  {count} vehicle{'s' if count != 1 else ''}")
 
-    def _state(self) -> Table | Text:
+    def _state_rows(self) -> list[tuple[str, Text]] | Text:
         vehicle = self.selected
-        if vehicle is None:
-            waited = self._model.connection.now() - self._began_at
-            return Text(
-                f"waiting for a vehicle's heartbeat on {self._name} ({waited:.0f} s)\n\n"
-                f"{explain_no_vehicle(self._model.connection, None)}"
-            )
-        table = Table.grid(padding=(0, 1))
-        for label, text in state_lines(vehicle):
-            table.add_row(Text(label, "dim"), text)
-        return table
+        if vehicle is not None:
+            return VehicleText(vehicle).rows(more=self._is_wide)
+        waited = self._model.connection.now() - self._began_at
+        return Text(
+            f"waiting for a vehicle's heartbeat on {self._name} ({waited:.0f} s)\n\n"
+            f"{explain_no_vehicle(self._model.connection, None)}"
+        )
 
-    def _map(self) -> Text:
-        model, widget = self._model, self.screen_stack[0].query_one("#map", Static)
+    def _show_map(self, widget: Panel) -> None:
+        model, size = self._model, widget.content_size
         homes = [
-            (home, vehicle)
+            model.metres(home.latitude_deg, home.longitude_deg)
             for vehicle in model.vehicles.values()
             if (home := vehicle.home.latest) is not None and model.tracks.get(vehicle.system_id)
         ]
-        marks = [(model.metres(home.latitude_deg, home.longitude_deg), "H", "bold green") for home, _ in homes]
-        points = [point for track in model.tracks.values() for point in track] + [mark[0] for mark in marks]
+        marks = [*((home, "H", "bold") for home in homes), *map(self._mark_of, model.tracks)]
+        if not self._is_new("map", (size, marks, [len(track) for track in model.tracks.values()])):
+            return
+        points = [point for track in model.tracks.values() for point in track] + homes
         if not points:
-            return Text("no position known", "dim")
-        canvas = Canvas(widget.content_size.width, widget.content_size.height, points)
+            widget.show(Text("no position known", "dim"))
+            return
+        canvas = Canvas(size.width, size.height, points)
         for system_id, track in model.tracks.items():
-            for point in track:
-                canvas.dot(point, self._style_of(system_id))
-        for mark in [*marks, *map(self._mark_of, model.tracks)]:
+            canvas.line(track, self._style_of(system_id))
+        for mark in marks:
             canvas.mark(*mark)
-        widget.border_subtitle = f"{canvas.width_m:.0f} m wide, north up"
-        return canvas.text()
+        widget.show(canvas.text())
 
     def _mark_of(self, system_id: int) -> tuple[tuple[float, float], str, str]:
         vehicle = self._model.vehicles[system_id]
@@ -235,8 +294,17 @@ class Monitor(App[None]):
         vehicle = self.selected
         if vehicle is None:
             return Text(UNKNOWN, "dim")
-        lines = [Text(f"{hz:5.1f} {name}") for name, hz in self._model.rates(vehicle.system_id)]
-        return Text("\n", no_wrap=True, overflow="ellipsis").join(lines) if lines else Text(UNKNOWN, "dim")
+        rates = [(number(hz, 0 if hz >= 3 else 1), name) for name, hz in self._model.rates(vehicle.system_id) if hz]
+        rates.sort(key=lambda rate: (-float(rate[0]), rate[1]))
+        lines = "\n".join(f"{rate if '.' in rate else rate + '  ':>5} {name}" for rate, name in rates)
+        return Text(lines, no_wrap=True, overflow="ellipsis") if lines else Text(UNKNOWN, "dim")
+
+
+def _table(rows: list[tuple[str, Text]]) -> Table:
+    table = Table.grid(padding=(0, 1))
+    for label, text in rows:
+        table.add_row(Text(label, "dim"), text)
+    return table
 
 
 async def run_monitor(
@@ -244,6 +312,7 @@ async def run_monitor(
     *,
     baud: int = 57600,
     signing: Signing | None = None,
+    record: str | None = None,
     on_start: Callable[[Monitor], object] | None = None,
 ) -> int:
     """Show the vehicles on a link until the user quits.
@@ -252,6 +321,7 @@ async def run_monitor(
         address: of the link; a lost link is reopened.
         baud: baud rate of a serial port whose address has none.
         signing: as in :func:`aerokit.open_connection`.
+        record: a .tlog file for everything that is sent and received.
         on_start: called with the application before it runs.
 
     Returns:
@@ -271,6 +341,8 @@ async def run_monitor(
         app = Monitor(model, commands, str(link.link.address))
         detach = link.on_end(lambda error: app.exit())
         try:
+            if record is not None:
+                link.record(record)
             if on_start is not None:
                 on_start(app)
             await app.run_async()

@@ -1,7 +1,12 @@
-"""Text of a vehicle's state for the terminal: old values are dimmed and show their age, unknown values are "—"."""
+"""Text of a vehicle's state for the terminal: old values are dimmed and show their age, unknown values are "—".
+
+Colours are readable on light and dark terminals: those with a background name both, others are dark enough for white
+and light enough for black.
+"""
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 from rich.text import Text
@@ -10,7 +15,7 @@ from aerokit._internal.formatting import printable
 from aerokit.events import SILENT_AFTER_S, LinkState
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Iterable, Sequence
 
     from aerokit.connection.cells import StateCell
     from aerokit.vehicle.vehicle import Vehicle
@@ -18,124 +23,193 @@ if TYPE_CHECKING:
 UNKNOWN = "—"
 MAX_AGE_S = SILENT_AFTER_S
 FIXES = ("no receiver", "no fix", "2D", "3D", "DGPS", "RTK float", "RTK fixed")
-LINK_STYLES = {LinkState.CONNECTED: "green", LinkState.SILENT: "bold yellow", LinkState.LOST: "bold red"}
+DANGER, WARNING = "bold white on red", "black on yellow"
+LINK_STYLES = {LinkState.CONNECTED: "", LinkState.SILENT: WARNING, LinkState.LOST: DANGER}
 ARROWS = "↑↗→↘↓↙←↖"
 """Arrows by heading, clockwise from north."""
 _DOTS = ((0x01, 0x08), (0x02, 0x10), (0x04, 0x20), (0x40, 0x80))
 _MIN_SPAN_M = 20.0
 
 
-def number(value: float | None, form: str = ".1f", unit: str = "") -> str:
-    return UNKNOWN if value is None else f"{value:{form}}{unit}"
-
-
-def cell_text(cell: StateCell[Any], show: Callable[[Any], str], style: str = "") -> Text:
-    if not cell.is_known:
-        return Text(UNKNOWN, "dim")
-    if cell.age <= MAX_AGE_S:
-        return Text(printable(show(cell.value)), style)
-    return Text(f"{printable(show(cell.value))} ({age(cell.age)} old)", "dim italic")
+def number(value: float | None, digits: int = 1, unit: str = "", sign: str = "-") -> str:
+    """Format a number, without a sign for what rounds to 0; ``sign`` as in format specifications."""
+    if value is None:
+        return UNKNOWN
+    rounded = round(value, digits) + 0.0  # -0.0 + 0.0 is 0.0
+    return f"{rounded:{sign if rounded else '-'}.{digits}f}{unit}"
 
 
 def age(seconds: float) -> str:
     return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
 
 
-def state_lines(vehicle: Vehicle) -> list[tuple[str, Text]]:
-    armed = vehicle.armed
-    style = "bold red" if armed.latest else "green"
-    modes = cell_text(vehicle.mode, lambda mode: str(mode.name), "bold")
-    modes.append("  ")
-    modes.append_text(cell_text(armed, lambda is_armed: "ARMED" if is_armed else "disarmed", style))
-    speeds = cell_text(vehicle.ground_speed_m_s, lambda speed: f"{speed:.1f} m/s")
-    speeds.append("  climb ")
-    speeds.append_text(cell_text(vehicle.climb_m_s, lambda climb: f"{climb:+.1f} m/s"))
-    positions = cell_text(vehicle.position, lambda p: f"{p.latitude_deg:.6f} {p.longitude_deg:.6f}")
-    positions.append("  heading ")
-    positions.append_text(cell_text(vehicle.heading_deg, lambda heading: f"{heading:.0f}°"))
-    return [
-        ("mode", modes),
-        ("missing", missing_text(vehicle)),
-        ("attitude", cell_text(vehicle.attitude, _attitude)),
-        ("altitude", cell_text(vehicle.position, _altitude)),
-        ("position", positions),
-        ("speed", speeds),
-        ("battery", cell_text(vehicle.batteries, lambda batteries: " · ".join(map(_battery, batteries)))),
-        ("GPS", cell_text(vehicle.gps, lambda receivers: " · ".join(map(_gps, receivers)))),
-        ("link", link_line(vehicle)),
-    ]
+class VehicleText:
+    """Texts of one vehicle. While it is silent, its values are dimmed, and one line says since when."""
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        self._vehicle = vehicle
+        self._link_state = vehicle.link_state.latest
+        is_silent = self._link_state not in (LinkState.CONNECTED, None)
+        self._silent_s = vehicle.heartbeat_age if is_silent else 0.0
+
+    def cell(self, cell: StateCell[Any], show: Callable[[Any], str], style: str = "") -> Text:
+        if not cell.is_known:
+            return Text(UNKNOWN, "dim")
+        text, older_s = printable(show(cell.value)), cell.age - self._silent_s
+        if older_s > MAX_AGE_S:
+            return Text(f"{text} ({age(cell.age if not self._silent_s else older_s)} old)", "dim italic")
+        return Text(text, "dim" if self._silent_s else style)
+
+    def rows(self, *, more: bool = False) -> list[tuple[str, Text]]:
+        """Return labels and values. ``more``: there is room for values of secondary importance."""
+        vehicle, cell = self._vehicle, self.cell
+        rows = [
+            ("mode", Text("  ").join([cell(vehicle.mode, _name, "bold"), self._armed()])),
+            ("link" if self._silent_s else "missing", self.silence() or self._missing()),
+            ("attitude", cell(vehicle.attitude, _attitude)),
+            ("altitude", cell(vehicle.position, _altitude)),
+            ("position", cell(vehicle.position, _place)),
+            ("heading", cell(vehicle.heading_deg, lambda heading: f"{heading % 360:.0f}°")),
+            (
+                "speed",
+                Text.assemble(cell(vehicle.ground_speed_m_s, _speed), "  climb ", cell(vehicle.climb_m_s, _climb)),
+            ),
+            ("battery", cell(vehicle.batteries, lambda each: " · ".join(map(_battery, each)))),
+            ("GPS", cell(vehicle.gps, lambda receivers: " · ".join(map(_gps, receivers)))),
+        ]
+        if not self._silent_s:
+            rows.append(("link", self._link()))
+        return rows + self._more_rows() if more else rows
+
+    def _more_rows(self) -> list[tuple[str, Text]]:
+        vehicle, cell = self._vehicle, self.cell
+        return [
+            ("home", self._home()),
+            ("mission", cell(vehicle.mission_current, lambda mission: f"item {number(mission.current, 0)}")),
+            ("airspeed", cell(vehicle.air_speed_m_s, _speed)),
+            ("throttle", cell(vehicle.throttle_percent, lambda percent: number(percent, 0, " %"))),
+            ("wind", cell(vehicle.wind, lambda w: f"{number(w.speed_m_s)} m/s from {w.direction_deg:.0f}°")),
+            ("version", cell_of_constant(vehicle.version)),
+        ]
+
+    def row(self, *, is_selected: bool, more: bool) -> Text:
+        """Return the line of the list of vehicles."""
+        vehicle, cell = self._vehicle, self.cell
+        text = Text("▸" if is_selected else " ", no_wrap=True, overflow="ellipsis")
+        text.append(f"{vehicle.system_id:>3} ", "bold")
+        columns = [
+            (10, Text(vehicle.autopilot.name)),
+            (12, cell(vehicle.mode, _name)),
+            (9, self._armed()),
+            (9, cell(vehicle.position, lambda place: number(place.altitude_relative_m, 1, " m"))),
+            (6, cell(vehicle.batteries, lambda each: number(each[0].remaining_percent, 0, " %"))),
+        ]
+        if more:
+            columns += [
+                (10, cell(vehicle.ground_speed_m_s, _speed)),
+                (6, cell(vehicle.heading_deg, lambda heading: f"{heading % 360:.0f}°")),
+                (40, cell(vehicle.gps, lambda receivers: _gps(receivers[0]))),
+            ]
+        if not self._silent_s and more:
+            columns.append((0, self._missing() if vehicle.missing_for_flight() else Text("ready")))
+        for width, column in columns:
+            column.pad_right(width - len(column))
+            text.append_text(column)
+            text.append(" ")
+        return text.append_text(self.silence(is_short=True))
+
+    def silence(self, *, is_short: bool = False) -> Text:
+        if self._link_state is None or not self._silent_s:
+            return Text()
+        note = "" if is_short else "; values are from before"
+        text = f"{self._link_state.value} for {age(self._silent_s)}{note}"
+        return Text(text, LINK_STYLES[self._link_state])
+
+    def _armed(self) -> Text:
+        style = DANGER if self._vehicle.armed.latest else ""
+        return self.cell(self._vehicle.armed, lambda is_armed: "ARMED" if is_armed else "disarmed", style)
+
+    def _speeds(self) -> Text:
+        ground, climb = self._vehicle.ground_speed_m_s, self._vehicle.climb_m_s
+        return Text.assemble(self.cell(ground, _speed), "  climb ", self.cell(climb, _climb))
+
+    def _home(self) -> Text:
+        home, place = self._vehicle.home.latest, self._vehicle.position.latest
+        if home is None or place is None:
+            return Text(UNKNOWN, "dim")
+        away = place.distance_to(home.position)
+        bearing = f", bearing {place.bearing_to(home.position):.0f}°" if away >= 1.0 else ""
+        return Text(f"{number(away, 0)} m away{bearing}")
+
+    def _link(self) -> Text:
+        quality, state = self._vehicle.link_quality, self._link_state
+        text = Text() if state is None else Text(f"{state.value}  ", LINK_STYLES[state])
+        text.append("loss ").append_text(self.cell(quality, lambda report: number(report.loss_percent, 1, " %")))
+        text.append("  round trip ")
+        return text.append_text(
+            self.cell(quality, lambda report: number(report.round_trip_s and report.round_trip_s * 1000, 0, " ms"))
+        )
+
+    def _missing(self) -> Text:
+        missing = self._vehicle.missing_for_flight()
+        if not missing:
+            return Text("nothing")
+        more = f" (and {len(missing) - 1} more)" if len(missing) > 1 else ""
+        return Text(printable(f"{missing[0]}{more}"), WARNING)
 
 
-def link_line(vehicle: Vehicle) -> Text:
-    state = vehicle.link_state.latest
-    text = Text()
-    if state is not None:
-        text.append(state.value, LINK_STYLES[state])
-        if state is not LinkState.CONNECTED:
-            text.append(f" for {age(vehicle.heartbeat_age)}", "bold")
-    quality = vehicle.link_quality
-    text.append("  loss ")
-    text.append_text(cell_text(quality, lambda report: number(report.loss_percent, ".1f", " %")))
-    text.append("  round trip ")
-    text.append_text(
-        cell_text(quality, lambda report: number(report.round_trip_s and report.round_trip_s * 1000, ".0f", " ms"))
-    )
-    return text
+def cell_of_constant(cell: StateCell[Any]) -> Text:
+    """Return the text of a value that does not age."""
+    return Text(printable(str(cell.value))) if cell.is_known else Text(UNKNOWN, "dim")
 
 
-def missing_text(vehicle: Vehicle) -> Text:
-    missing = vehicle.missing_for_flight()
-    if not missing:
-        return Text("nothing", "green")
-    more = f" (and {len(missing) - 1} more)" if len(missing) > 1 else ""
-    return Text(printable(f"{missing[0]}{more}"), "yellow")
-
-
-def list_row(vehicle: Vehicle) -> Text:
-    state = vehicle.link_state.latest
-    text = Text(f"{vehicle.system_id:>3} ", "bold", no_wrap=True, overflow="ellipsis")
-    text.append(f"{vehicle.autopilot.name} ")
-    text.append_text(cell_text(vehicle.mode, lambda mode: str(mode.name)))
-    text.append(" ")
-    style = "bold red" if vehicle.armed.latest else ""
-    text.append_text(cell_text(vehicle.armed, lambda is_armed: "ARMED" if is_armed else "disarmed", style))
-    text.append(" ")
-    text.append_text(cell_text(vehicle.position, lambda place: number(place.altitude_relative_m, ".1f", " m")))
-    text.append(" ")
-    text.append_text(cell_text(vehicle.batteries, lambda each: number(each[0].remaining_percent, "", " %")))
-    if state is not LinkState.CONNECTED and state is not None:
-        text.append(f" {state.value} {age(vehicle.heartbeat_age)}", LINK_STYLES[state])
-    return text
+def _name(mode: Any) -> str:
+    return str(mode.name)
 
 
 def _attitude(attitude: Any) -> str:
-    return f"roll {attitude.roll_deg:+.0f}° pitch {attitude.pitch_deg:+.0f}° yaw {attitude.yaw_deg:+.0f}°"
+    return f"roll {number(attitude.roll_deg, 0, '°', '+')} pitch {number(attitude.pitch_deg, 0, '°', '+')}"
 
 
 def _altitude(place: Any) -> str:
     above_home, above_sea = place.altitude_relative_m, place.altitude_amsl_m
-    return f"{number(above_home, '.1f', ' m')} above home, {number(above_sea, '.0f', ' m')} AMSL"
+    return f"{number(above_home, 1, ' m')} above home, {number(above_sea, 0, ' m')} AMSL"
+
+
+def _speed(speed: float) -> str:
+    return number(speed, 1, " m/s")
+
+
+def _climb(climb: float) -> str:
+    return number(climb, 1, " m/s", "+")
+
+
+def _place(place: Any) -> str:
+    return f"{place.latitude_deg:.6f} {place.longitude_deg:.6f}"
 
 
 def _battery(battery: Any) -> str:
     parts = (
-        number(battery.remaining_percent, "", " %"),
-        number(battery.voltage_v, ".1f", " V"),
-        number(battery.current_a, ".1f", " A"),
+        number(battery.remaining_percent, 0, " %"),
+        number(battery.voltage_v, 1, " V"),
+        number(battery.current_a, 1, " A"),
     )
     return " ".join(parts)
 
 
 def _gps(receiver: Any) -> str:
     fix = FIXES[receiver.fix_type] if 0 <= receiver.fix_type < len(FIXES) else f"fix {receiver.fix_type}"
-    return f"{fix}, {number(receiver.satellites, '')} satellites, HDOP {number(receiver.hdop)}"
+    return f"{fix}, {number(receiver.satellites, 0)} satellites, HDOP {number(receiver.hdop)}"
 
 
 class Canvas:
-    """A map of ``columns`` by ``rows`` characters that fits all ``points`` (metres north, east); north is up."""
+    """A map of ``columns`` by ``rows`` characters that fits all ``points`` (metres north, east).
+
+    The last row has a scale bar and a north arrow.
+    """
 
     def __init__(self, columns: int, rows: int, points: Iterable[tuple[float, float]]) -> None:
-        self._columns, self._rows = max(columns, 2), max(rows, 2)
+        self._columns, self._rows = max(columns, 2), max(rows - 1, 2)
         norths, easts = zip(*(list(points) or [(0.0, 0.0)]), strict=True)
         self._middle = (max(norths) + min(norths)) / 2, (max(easts) + min(easts)) / 2
         across, up = 2 * (self._columns - 1), 4 * (self._rows - 1)
@@ -146,21 +220,31 @@ class Canvas:
         self._styles: dict[tuple[int, int], str] = {}
         self._marks: dict[tuple[int, int], tuple[str, str]] = {}
 
-    @property
-    def width_m(self) -> float:
-        return 2 * self._columns * self._metres_per_dot
-
-    def dot(self, point: tuple[float, float], style: str) -> None:
-        across, down = self._place(point)
-        cell = down // 4, across // 2
-        self._dots[cell] = self._dots.get(cell, 0) | _DOTS[down % 4][across % 2]
-        self._styles[cell] = style
+    def line(self, points: Sequence[tuple[float, float]], style: str) -> None:
+        """Draw a line through the points."""
+        places = [self._place(point) for point in points]
+        for (x, y), (to_x, to_y) in zip(places, places[1:] or places, strict=False):
+            steps = max(abs(to_x - x), abs(to_y - y), 1)
+            for step in range(steps + 1):
+                across, down = x + round((to_x - x) * step / steps), y + round((to_y - y) * step / steps)
+                cell = down // 4, across // 2
+                self._dots[cell] = self._dots.get(cell, 0) | _DOTS[down % 4][across % 2]
+                self._styles[cell] = style
 
     def mark(self, point: tuple[float, float], text: str, style: str) -> None:
         """Write characters at a point, over dots and earlier marks."""
         across, down = self._place(point)
         for number, character in enumerate(text):
             self._marks[down // 4, across // 2 + number] = character, style
+
+    def _scale(self) -> str:
+        """Return a bar of 1, 2 or 5 times a power of ten metres, at most a third of the map wide."""
+        column_m = 2 * self._metres_per_dot
+        most_m = max(self._columns / 3, 3) * column_m
+        power = 10.0 ** math.floor(math.log10(most_m))
+        length_m = max(factor * power for factor in (1, 2, 5) if factor * power <= most_m)
+        bar = "─" * max(round(length_m / column_m) - 2, 0)
+        return f"├{bar}┤ {f'{length_m / 1000:g} km' if length_m >= 1000 else f'{length_m:g} m'}"
 
     def text(self) -> Text:
         text = Text(no_wrap=True)
@@ -174,8 +258,7 @@ class Canvas:
                 else:
                     text.append(" ")
             text.append("\n")
-        text.right_crop(1)
-        return text
+        return text.append(f"{self._scale():{self._columns - 2}}▲N", "bold")
 
     def _place(self, point: tuple[float, float]) -> tuple[int, int]:
         across = self._columns + round((point[1] - self._middle[1]) / self._metres_per_dot)

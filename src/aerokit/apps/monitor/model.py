@@ -13,7 +13,8 @@ from rich.text import Text
 from aerokit._internal import geo
 from aerokit._internal.formatting import printable
 from aerokit.apps.event_text import event_details
-from aerokit.events import Event, LinkReport, LoopBlocked, StatusTextReceived
+from aerokit.apps.monitor.lines import DANGER
+from aerokit.events import Event, LinkReport, LoopBlocked, StatusTextReceived, StreamSlow
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -29,7 +30,7 @@ MIN_POINT_DISTANCE_M = 0.5
 MAX_MESSAGE_TYPES = 2000
 """Limits memory, because senders can make up any number of ids."""
 RATE_WINDOW_S = 5.0
-SEVERITY_STYLES = ("bold white on red", "bold red", "bold red", "red", "yellow", "cyan", "", "dim")
+SEVERITY_STYLES = (DANGER, DANGER, DANGER, "bold red", "bold magenta", "bold", "", "dim")
 """Styles by MAV_SEVERITY, emergency first."""
 
 
@@ -41,6 +42,9 @@ class MonitorModel:
         self.vehicles: Mapping[int, Vehicle] = vehicles
         self.lines: deque[Text] = deque(maxlen=MAX_LINES)
         """Texts and events that are not displayed yet, the oldest first."""
+        self.slow_streams: str = ""
+        """One line for all events of slow streams: how many, and the last; they do not push out other lines."""
+        self._slow_count = 0
         self.tracks: dict[int, deque[tuple[float, float]]] = defaultdict(lambda: deque(maxlen=MAX_TRACK_POINTS))
         """System id → metres north and east of ``reference``."""
         self.reference: tuple[float, float] | None = None
@@ -92,10 +96,13 @@ class MonitorModel:
 
     def add_line(self, system_id: int, text: str, style: str = "") -> None:
         """Add a line with the current time."""
-        line = Text(time.strftime("%H:%M:%S ", time.localtime(self.connection.unix_time())), "dim")
+        line = Text(f"{self._time()} ", "dim")
         line.append(f"{system_id} " if system_id else "link ", "bold")
         line.append(printable(text).replace("\n", " "), style)
         self.lines.append(line)
+
+    def _time(self) -> str:
+        return time.strftime("%H:%M:%S", time.localtime(self.connection.unix_time()))
 
     def _count(self, frame: Frame, _peer: object) -> None:
         kind = frame.system_id, frame.message_id
@@ -106,6 +113,12 @@ class MonitorModel:
         if isinstance(event, StatusTextReceived):
             style = SEVERITY_STYLES[event.severity] if 0 <= event.severity < 8 else ""
             self.add_line(event.system_id, event.text, style)
+        elif isinstance(event, StreamSlow):
+            self._slow_count += 1
+            self.slow_streams = (
+                f"{self._slow_count} × stream slow, last {self._time()} {event.system_id} {event.message}"
+                f" {event.achieved_hz:g} of {event.requested_hz:g} Hz"
+            )
         elif not isinstance(event, (LinkReport, LoopBlocked)):
             self.add_line(event.system_id, _event_line(event), "italic")
 

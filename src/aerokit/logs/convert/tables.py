@@ -60,8 +60,22 @@ class _UnixLines:
         self._file.write(row[:-2] + "\n")
 
 
+# Where spreadsheets find a formula in a text (owasp.org/www-community/attacks/CSV_Injection): at its beginning, also
+# after white space, and after separators of other locales, for which quoting does not help.
+_FORMULA = re.compile(r"(^|[;\t])(?=[\s\0]*[=+\-@\uff1d\uff0b\uff0d\uff20])|^(?=[\t\r\n\0])")
+
+
+def _csv_cell(value: Any) -> Any:
+    if isinstance(value, str):
+        return _FORMULA.sub(r"\1'", value)
+    return "" if value != value else value  # NaN
+
+
 class CsvTable:
-    """A CSV file: UTF-8, comma-separated, with a header; unknown values are empty."""
+    """A CSV file: UTF-8, comma-separated, with a header; unknown values are empty.
+
+    An apostrophe keeps spreadsheets from executing a text as a formula; numbers stay as they are.
+    """
 
     SUFFIX = ".csv"
 
@@ -69,11 +83,11 @@ class CsvTable:
         self._file = path.open("w", encoding="utf-8", newline="")
         # With this line terminator, csv quotes values that contain "\r" or "\n".
         self._writer = csv.writer(_UnixLines(self._file), lineterminator="\r\n")
-        self._writer.writerow([column.name for column in columns])
+        self._writer.writerow([_csv_cell(column.name) for column in columns])
 
     def add(self, unix_s: float, values: Sequence[Any]) -> None:
         """Add a row; the time is ISO 8601 in UTC with microseconds."""
-        shown = ["" if value != value else value for value in values]  # NaN
+        shown = [_csv_cell(value) for value in values]
         self._writer.writerow([_utc(unix_s).isoformat(timespec="microseconds"), *shown])
 
     def close(self) -> None:

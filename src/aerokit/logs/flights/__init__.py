@@ -82,6 +82,7 @@ def read_flight(
         if on_progress is not None:
             on_progress(TransferProgress(min(done, total), total, time.monotonic() - started))
 
+    show(0)
     flight = FlightLog(path)
     read(flight, system_id, show)
     _complete(flight)

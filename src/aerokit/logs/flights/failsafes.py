@@ -7,7 +7,7 @@ import re
 from typing import TYPE_CHECKING
 
 from aerokit._internal.values import Snapshot
-from aerokit.logs.flights.flight import FailsafeEvidence, TangentPlane
+from aerokit.logs.flights.flight import FailsafeEvidence, TangentPlane, battery_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -141,12 +141,15 @@ def evidence_in_texts(texts: Iterable[LoggedText]) -> list[FailsafeEvidence]:
 def failsafes(flight: FlightLog) -> list[Failsafe]:
     """Return the failsafes and problems while the vehicle was armed, the oldest first."""
     groups: list[list[FailsafeEvidence]] = []
+    recent: list[list[FailsafeEvidence]] = []
     for evidence in flight.failsafe_evidence:
         if not any(begin - 1 <= evidence.time_s <= end + 2 for begin, end in flight.armed):
             continue
-        group = next((group for group in reversed(groups) if _belongs(evidence, group)), None)
+        recent = [group for group in recent if evidence.time_s - group[-1].time_s <= _SAME_KIND_GAP_S]
+        group = next((group for group in reversed(recent) if _belongs(evidence, group)), None)
         if group is None:
             groups.append([evidence])
+            recent.append(groups[-1])
         else:
             group.append(evidence)
     return [_explain(flight, group) for group in groups]
@@ -228,7 +231,7 @@ def _battery_context(flight: FlightLog, time_s: float) -> list[str]:
         now, before = battery.at("voltage_v", time_s), battery.at("voltage_v", time_s - 60, not_older_s=30)
         if now != now:
             continue
-        text = f"battery {number + 1}: {now:.2f} V"
+        text = f"{battery_name(number)}: {now:.2f} V"
         if before == before:
             text += f", {before:.2f} V one minute before"
         for name, form in (

@@ -115,6 +115,11 @@ class TangentPlane:
         )
 
 
+def battery_name(number: int) -> str:
+    """Return the name for people: they count batteries from 1, as ArduPilot's texts and parameters do."""
+    return f"battery {number + 1}"
+
+
 class ModeChange(Snapshot):
     """A change to a mode."""
 
@@ -202,7 +207,7 @@ class FlightLog:
     velocity_target: TimeSeries = field(default_factory=lambda: TimeSeries("north_m_s", "east_m_s", "down_m_s"))
     attitude_target: TimeSeries = field(default_factory=lambda: TimeSeries("roll_deg", "pitch_deg", "yaw_deg"))
     batteries: dict[int, TimeSeries] = field(default_factory=dict)
-    """By battery number: ``voltage_v``, ``current_a``, ``used_mah``, ``remaining_percent``."""
+    """By battery number, from 0: ``voltage_v``, ``current_a``, ``used_mah``, ``remaining_percent``."""
     gps: dict[int, TimeSeries] = field(default_factory=dict)
     """By receiver number: ``fix_type`` (GPS_FIX_TYPE), ``satellites``, ``hdop``, ``accuracy_m``."""
     vibration: TimeSeries = field(default_factory=lambda: TimeSeries("x_m_s2", "y_m_s2", "z_m_s2", "clips"))
@@ -252,7 +257,8 @@ class FlightLog:
 
     def mode_at(self, time_s: float) -> str:
         """Return the mode at this time; empty if unknown."""
-        return next((change.name for change in reversed(self.modes) if change.time_s <= time_s), "")
+        index = bisect_right(self.modes, time_s, key=lambda change: change.time_s)
+        return self.modes[index - 1].name if index else ""
 
     def mode_spans(self) -> list[tuple[ModeChange, float]]:
         """Return each mode change with its end."""

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from aerokit.logs.flights.flight import FlightLog
 
 NAN = math.nan
-_CHUNK = 1 << 14
+_CHUNK = 1 << 9  # more rows at once keep the garbage collector busy with their tuples
 # Unknown charge: AP_BattMonitor_Logging.cpp writes -1 as a byte.
 _NO_PERCENT = 255
 _FIRMWARES = {

@@ -33,6 +33,8 @@ _NULL_ISLAND_E7 = 100_000
 _HEARTBEAT, _MAX_SEQUENCE_GAP = b"\0\0\0", 200
 # A mode change within this time of a command was commanded.
 _COMMAND_MAX_AGE_S = 5.0
+# Clocks of vehicles and computers differ by less, and delays of a link average out in this time.
+_MAX_CLOCK_DRIFT, _MIN_CLOCK_COMPARISON_S, _MAX_CLOCK_GAP_S = 0.2, 1.0, 10.0
 # Bits of a type mask: these fields are ignored.
 _NO_POSITION, _NO_VELOCITY = 0x7, 0x38
 _MODE_COMMANDS = frozenset(
@@ -96,6 +98,7 @@ class _Reader:
         self._has_battery_status = False
         self._position = self._local = (NAN, NAN, NAN)
         self._relative_m = NAN
+        self._clocks = _ClockComparison()
         self._is_breached = False
         self._destinations = TimeSeries(*flight.position_target.names)
         self._link = _LinkCounter(flight)
@@ -126,7 +129,7 @@ class _Reader:
                 if not count:
                     begins_at = unix_s
                 count += 1
-                if not count & 0xFFFF:
+                if not count & 0x3FFF:
                     on_bytes(file.tell())
                 if unix_s > ends_at:
                     ends_at = unix_s
@@ -166,6 +169,12 @@ class _Reader:
         flight.mission = [self._items[number] for number in sorted(self._items)]
         if damaged:
             flight.notes.append(f"{damaged} messages are damaged and were skipped")
+        speed = self._clocks.speed
+        if abs(math.log(speed)) > _MAX_CLOCK_DRIFT:
+            flight.notes.append(
+                f"this is a simulation at {speed:.3g} times real speed, because the vehicle's clock differs from the"
+                f" recording's: 1 s in this report is {speed:.3g} s of the flight"
+            )
         if self._others:
             others = ", ".join(map(str, sorted(self._others)))
             flight.notes.append(
@@ -198,9 +207,7 @@ class _Reader:
             m.Heartbeat: self._heartbeat,
             m.GlobalPositionInt: self._global_position,
             m.LocalPositionNed: self._local_position,
-            m.Attitude: lambda t, x: flight.attitude.add(
-                t, math.degrees(x.roll), math.degrees(x.pitch), math.degrees(x.yaw)
-            ),
+            m.Attitude: self._attitude,
             m.VfrHud: lambda t, x: flight.air.add(t, x.airspeed, x.throttle),
             m.Statustext: lambda t, x: self._add_texts(t, self._texts.receive(x, t)),
             m.SysStatus: self._sys_status,
@@ -327,7 +334,14 @@ class _Reader:
             self._flight.failsafe_evidence.append(FailsafeEvidence(time_s, "fence", "outside the fence (FENCE_STATUS)"))
         self._is_breached = bool(message.breach_status)
 
+    def _attitude(self, time_s: float, message: m.Attitude) -> None:
+        self._clocks.compare(time_s, message.time_boot_ms)
+        self._flight.attitude.add(
+            time_s, math.degrees(message.roll), math.degrees(message.pitch), math.degrees(message.yaw)
+        )
+
     def _global_position(self, time_s: float, message: m.GlobalPositionInt) -> None:
+        self._clocks.compare(time_s, message.time_boot_ms)
         if abs(message.lat) < _NULL_ISLAND_E7 and abs(message.lon) < _NULL_ISLAND_E7:
             return
         if abs(message.lat) > 90 * _E7 or abs(message.lon) > 180 * _E7:
@@ -425,9 +439,9 @@ def _key(kind: type[Message]) -> bytes:
 
 def _decoded(raw: bytes, unix_s: float) -> Message | None:
     """Return the message of a record; None if its checksum is wrong."""
-    if raw[0] == MAGIC_V2 and not raw[2]:
-        frame = Frame()  # same as `Frame.parse`, but faster
-        frame.body, frame.checksum = raw[1:-2], raw[-2] | raw[-1] << 8
+    if raw[0] == MAGIC_V2:
+        frame, end = Frame(), 10 + raw[1]  # same as `Frame.parse`, but faster; a signature may follow
+        frame.body, frame.checksum = raw[1:end], raw[end] | raw[end + 1] << 8
         frame.system_id, frame.component_id = raw[5], raw[6]
         frame.message_id, frame.received_at = raw[7] | raw[8] << 8 | raw[9] << 16, unix_s
     else:
@@ -435,6 +449,29 @@ def _decoded(raw: bytes, unix_s: float) -> Message | None:
     if x25(frame.body + STANDARD.extras[frame.message_id]) != frame.checksum:
         return None
     return STANDARD.decode(frame)
+
+
+class _ClockComparison:
+    """Compares the vehicle's time since boot with the time of the recording."""
+
+    def __init__(self) -> None:
+        self._before: tuple[float, int] = (-math.inf, 0)
+        self._recorded_s = self._vehicle_s = 0.0
+
+    def compare(self, time_s: float, boot_ms: int) -> None:
+        before_s, before_ms = self._before
+        self._before = time_s, boot_ms
+        # Skips reboots, and pauses of the recording or its clock.
+        if boot_ms >= before_ms and 0 <= time_s - before_s < _MAX_CLOCK_GAP_S:
+            self._recorded_s += time_s - before_s
+            self._vehicle_s += (boot_ms - before_ms) / 1e3
+
+    @property
+    def speed(self) -> float:
+        """Vehicle seconds for one recorded second; 1 if the log is too short."""
+        if min(self._recorded_s, self._vehicle_s) < _MIN_CLOCK_COMPARISON_S:
+            return 1.0
+        return self._vehicle_s / self._recorded_s
 
 
 class _LinkCounter:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import sys
 from array import array
@@ -16,6 +17,7 @@ from aerokit.logs.flights.flight import FailsafeEvidence, LoggedText, TangentPla
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
+    from pathlib import Path
 
     from aerokit.logs.flights.flight import FlightLog, TimeSeries
 
@@ -70,6 +72,7 @@ _FLAGS = {
 }
 _WARNINGS = {1: "low", 2: "critical", 3: "emergency", 4: "failed"}
 _LOADING_SHARE = 0.9  # of the total time
+_BUFFER = 1 << 20
 
 
 def read_ulog_flight(flight: FlightLog, system_id: int | None, on_bytes: Callable[[int], object]) -> None:
@@ -82,8 +85,11 @@ def read_ulog_flight(flight: FlightLog, system_id: int | None, on_bytes: Callabl
     core = import_module("pyulog")
     try:
         # pyulog prints damage to stdout, which may carry our output.
-        with flight.path.open("rb") as file, redirect_stdout(sys.stderr):
-            log = core.ULog(_ProgressFile(file, flight.path.stat().st_size, on_bytes), list(_TOPICS))
+        with (
+            io.BufferedReader(_ProgressFile(flight.path, on_bytes), _BUFFER) as file,
+            redirect_stdout(sys.stderr),
+        ):
+            log = core.ULog(file, list(_TOPICS))
     except Exception as error:  # pyulog raises arbitrary errors for other files
         raise FileFormatError(f"{flight.path} is not a PX4 log: {error}") from error
     if not log.data_list and not log.logged_messages:
@@ -96,27 +102,17 @@ def read_ulog_flight(flight: FlightLog, system_id: int | None, on_bytes: Callabl
     _Reader(flight, log).read()
 
 
-class _ProgressFile:
-    """A file that reports how far it was read."""
+class _ProgressFile(io.FileIO):
+    """A file that reports how far it was read, for a buffer around it."""
 
-    def __init__(self, file: Any, size: int, on_bytes: Callable[[int], object]) -> None:
-        self._read, self._seek, self._tell, self._on_bytes = file.read, file.seek, file.tell, on_bytes
-        self._calls = 0
-        self.close = file.close
-        self._size = size
+    def __init__(self, path: Path, on_bytes: Callable[[int], object]) -> None:
+        super().__init__(path)
+        self._on_bytes = on_bytes
 
-    def read(self, count: int = -1) -> bytes:
-        self._calls += 1
-        if not self._calls & 0xFFFF:
-            self._on_bytes(round(_LOADING_SHARE * self._tell()))
-        data: bytes = self._read(count)
-        return data
-
-    def seek(self, *place: int) -> int:
-        return int(self._seek(*place))
-
-    def tell(self) -> int:
-        return int(self._tell())
+    def readinto(self, buffer: Any) -> int | None:
+        count = super().readinto(buffer)
+        self._on_bytes(round(_LOADING_SHARE * self.tell()))
+        return count
 
 
 class _Topic:

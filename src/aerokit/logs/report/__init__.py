@@ -11,6 +11,7 @@ from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument
 from aerokit.logs.flights import check_log_name, read_flight
 from aerokit.logs.flights.failsafes import failsafes
+from aerokit.logs.report.charts import COLOURS, timeline_shapes
 from aerokit.logs.report.comparing import NAMES, comparison
 from aerokit.logs.report.page import page
 from aerokit.logs.report.sections import SECTIONS
@@ -95,14 +96,14 @@ def _render(flights: list[FlightLog], statistics: list[FlightStatistics], summar
     if len(flights) == 1:
         flight = flights[0]
         sections = [section for make in SECTIONS if (section := make(flight)) is not None]
-        return page(flight.path.name, [(_heading(flight), summaries[0])], sections)
+        return page(flight.path.name, [(_heading(flight), summaries[0])], sections, COLOURS, timeline_shapes(flight))
     one, other = flights
     headed = [
         (f"{name}: {flight.path.name}, {_heading(flight)}", sentences)
         for name, flight, sentences in zip(NAMES, flights, summaries, strict=True)
     ]
     sections = comparison((one, other), (statistics[0], statistics[1]))
-    return page(f"{one.path.name} and {other.path.name}", headed, sections)
+    return page(f"{one.path.name} and {other.path.name}", headed, sections, COLOURS)
 
 
 def _heading(flight: FlightLog) -> str:

@@ -1,71 +1,115 @@
-"""Plotly charts of a flight: a map without tiles, and lines over time with mode bands."""
+"""Plotly charts of a flight: a map without tiles, and timelines with mode bands."""
 
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 from aerokit.logs.flights.failsafes import failsafes
-from aerokit.logs.flights.flight import TangentPlane
-from aerokit.logs.report.page import Chart
+from aerokit.logs.flights.flight import ModeChange, TangentPlane
+from aerokit.logs.report.page import Chart, Paragraphs
+from aerokit.logs.report.simplification import MAX_COORDINATE, simplify
 from aerokit.logs.report.statistics import clock, metres_from_home
 from aerokit.missions.item import command_name
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from aerokit.logs.flights.flight import FlightLog, TimeSeries
+    from aerokit.logs.report.page import Part
 
 MAX_POINTS = 2000
-"""Maximum number of points of a line."""
-COLOURS = ("#1f77b4", "#e4572e", "#2ca02c", "#a05eb5", "#d69e00", "#17a2b8", "#8c564b", "#e377c2")
-_MAX_BANDS = 80
-_MAX_POINTS = 6000
+"""Maximum number of points of a line over time."""
+MAX_TRACK_POINTS = 6000
+"""Number of points of a track above which its tolerance grows."""
+_TRACK_TOLERANCE_M = 0.1
+_ROUNDING_M = 0.01
+_MAX_FENCE_M = 1e6
+
+# Each palette has a contrast of 3:1 on its paper, and stays distinguishable without red, green or blue cones.
+_MODES = {
+    "light": ("#4477aa", "#cb6471", "#4b7700", "#aa2f71", "#b8860b", "#0d9ba5", "#6a3d25", "#7a5add"),
+    "dark": ("#77aadd", "#f98c53", "#00ce98", "#d262a1", "#eedd88", "#69ddee", "#b07d5c", "#9685ff"),
+}
+_SERIES = {
+    "light": ("#0072b2", "#b94900", "#0d9f7a", "#882255", "#bc8300", "#222288"),
+    "dark": ("#39cdfd", "#e69f00", "#2cc295", "#c767ac", "#f0e442", "#8888ee"),
+}
+_OTHERS = {
+    "light": {
+        "ink": "#222222",
+        "paper": "#ffffff",
+        "soft": "#5f666d",
+        "grid": "#e3e3e3",
+        "failsafe": "#c62828",
+        "home": "#1b7a32",
+        "set-point": "#767676",
+        "mission": "#555555",
+    },
+    "dark": {
+        "ink": "#d8dee6",
+        "paper": "#14181d",
+        "soft": "#97a3b0",
+        "grid": "#39424d",
+        "failsafe": "#ff7b72",
+        "home": "#4fd06d",
+        "set-point": "#a5adb5",
+        "mission": "#b5bcc4",
+    },
+}
+COLOURS = {
+    theme: {
+        **others,
+        **{f"mode{number}": colour for number, colour in enumerate(_MODES[theme])},
+        **{f"series{number}": colour for number, colour in enumerate(_SERIES[theme])},
+    }
+    for theme, others in _OTHERS.items()
+}
+"""Theme → name → colour; in charts, a name follows ``colour:``."""
+_SETPOINT, _FAILSAFE = "colour:set-point", "colour:failsafe"
+
+
+def series_colour(number: int) -> str:
+    return f"colour:series{number % len(_SERIES['light'])}"
 
 
 def points(columns: TimeSeries, name: str, digits: int = 3) -> tuple[list[float], list[float | None]]:
     """Return times and values of a column for drawing; None is a gap."""
     values, times = columns[name], columns.times
-    rows = rows_to_draw(len(values), (values,))
+    rows = rows_to_draw(values)
     return (
         [round(times[row], 2) for row in rows],
         [round(value, digits) if math.isfinite(value := values[row]) else None for row in rows],
     )
 
 
-def rows_to_draw(count: int, columns: Sequence[Any], max_rows: int = MAX_POINTS) -> list[int]:
-    """Select rows that preserve all peaks and gaps of these columns."""
+def rows_to_draw(values: Sequence[float], max_rows: int = MAX_POINTS) -> list[int]:
+    """Select rows that preserve all peaks and gaps of a column."""
+    count = len(values)
     if count <= max_rows:
         return list(range(count))
-    pieces = max(max_rows // (2 * len(columns)), 1)
+    pieces = max(max_rows // 2, 1)
     found = {0, count - 1}
     for piece in range(pieces):
         begin, end = count * piece // pieces, count * (piece + 1) // pieces
-        for values in columns:
-            known = [row for row in range(begin, end) if values[row] == values[row]]
-            if len(known) < end - begin:
-                unknown = next(row for row in range(begin, end) if values[row] != values[row])
-                if not known or _is_gap(values, begin, end):
-                    found.add(unknown)
-            if known:
-                found.add(min(known, key=values.__getitem__))
-                found.add(max(known, key=values.__getitem__))
+        part = values[begin:end]
+        known = part
+        if math.isnan(sum(part)):
+            known = [value for value in part if value == value]
+            # Single unknown values are not drawn as gaps.
+            if len(known) * 2 < len(part):
+                found.add(next(row for row in range(begin, end) if values[row] != values[row]))
+        if known:
+            found.add(begin + part.index(min(known)))
+            found.add(begin + part.index(max(known)))
     return sorted(found)
-
-
-def _is_gap(values: Any, begin: int, end: int) -> bool:
-    """Return True if more than half of a segment is unknown; single unknown values are not drawn as gaps."""
-    unknown = sum(1 for row in range(begin, end) if values[row] != values[row])
-    return unknown * 2 > end - begin
-
-
-_SETPOINT_COLOUR, _FAILSAFE_COLOUR = "#999999", "#d62728"
 
 
 def mode_colours(flight: FlightLog) -> dict[str, str]:
     names = dict.fromkeys(change.name for change in flight.modes)
-    return {name: COLOURS[number % len(COLOURS)] for number, name in enumerate(names)}
+    return {name: f"colour:mode{number % len(_MODES['light'])}" for number, name in enumerate(names)}
 
 
 def line(name: str, columns: TimeSeries, column: str, digits: int = 3, **style: Any) -> dict[str, Any] | None:
@@ -78,7 +122,7 @@ def line(name: str, columns: TimeSeries, column: str, digits: int = 3, **style: 
 
 def setpoint_line(name: str, columns: TimeSeries, column: str, digits: int = 3) -> dict[str, Any] | None:
     """Return a line of set-points, in the style that distinguishes them from measured values."""
-    found = line(name, columns, column, digits, line={"color": _SETPOINT_COLOUR, "dash": "dot", "width": 1.5})
+    found = line(name, columns, column, digits, line={"color": _SETPOINT, "dash": "dot", "width": 1.5})
     if found is not None:
         found["connectgaps"] = True
     return found
@@ -87,112 +131,136 @@ def setpoint_line(name: str, columns: TimeSeries, column: str, digits: int = 3) 
 def over_time(
     flight: FlightLog, name: str, unit: str, traces: Sequence[dict[str, Any] | None], **layout: Any
 ) -> Chart | None:
-    """Return a chart over time with mode bands and failsafe lines; None without lines."""
+    """Return a timeline of a flight; None without lines. Lines without a colour get those of series."""
     drawn = [trace for trace in traces if trace is not None]
     if not drawn:
         return None
     height = layout.pop("height", 300)
-    full_layout = {
-        "xaxis": {"title": {"text": "seconds since the start of the log"}},
-        "yaxis": {"title": {"text": unit}, **layout.pop("yaxis", {})},
-        "shapes": [*_bands(flight), *_failsafe_lines(flight), *layout.pop("shapes", [])],
-        **layout,
+    times = {
+        "title": {"text": "seconds since the start of the log"},
+        "range": time_range(0.0, flight.duration_s),
     }
-    return Chart(name, drawn, full_layout, height, f"{unit} over time: {', '.join(t['name'] for t in drawn)}")
+    full_layout = {"xaxis": times, "yaxis": {"title": {"text": unit}, **layout.pop("yaxis", {})}, **layout}
+    for number, trace in enumerate(trace for trace in drawn if "line" not in trace):
+        trace["line"] = {"color": series_colour(number), "width": 1.6}
+    label = f"{unit} over time: {', '.join(t['name'] for t in drawn)}"
+    return Chart(name, drawn, full_layout, height, label, is_timeline=True)
 
 
-def _vertical(kind: str, x0: float, x1: float, **style: Any) -> dict[str, Any]:
-    span = {"x0": round(x0, 2), "x1": round(x1, 2), "y0": 0, "y1": 1}
-    return {"type": kind, "xref": "x", "yref": "paper", **span, **style}
+def time_range(begin_s: float, end_s: float) -> list[float]:
+    """Return the range of a time axis, with margins."""
+    margin = max(0.02 * (end_s - begin_s), 0.5)
+    return [round(begin_s - margin, 2), round(end_s + margin, 2)]
 
 
-def _bands(flight: FlightLog) -> list[dict[str, Any]]:
-    colours, style = mode_colours(flight), {"layer": "below", "line": {"width": 0}, "opacity": 0.1}
-    return [
-        _vertical("rect", change.time_s, end, fillcolor=colours[change.name], **style)
-        for change, end in flight.mode_spans()[:_MAX_BANDS]
+def timeline_shapes(flight: FlightLog) -> list[dict[str, Any]]:
+    """Return Plotly's shapes for all timelines: bands of each mode, and lines at failsafes."""
+    spans: dict[str, list[str]] = {}
+    for change, end in flight.mode_spans():
+        band = f"M{change.time_s:.2f},0H{end:.2f}V1H{change.time_s:.2f}Z"
+        spans.setdefault(change.name, []).append(band)
+    colours = mode_colours(flight)
+    bands = [
+        _path(paths, fillcolor=colours[name], opacity=0.16, line={"width": 0}, layer="below")
+        for name, paths in spans.items()
     ]
+    found = failsafes(flight)
+    for acted, dash in ((True, "solid"), (False, "dot")):
+        paths = [f"M{failsafe.time_s:.2f},0V1" for failsafe in found if failsafe.acted is acted]
+        if paths:
+            bands.append(_path(paths, line={"color": _FAILSAFE, "width": 1.5, "dash": dash}))
+    return bands
 
 
-def _failsafe_lines(flight: FlightLog) -> list[dict[str, Any]]:
-    return [
-        _vertical(
-            "line",
-            failsafe.time_s,
-            failsafe.time_s,
-            line={"color": _FAILSAFE_COLOUR, "width": 1.5, "dash": "solid" if failsafe.acted else "dot"},
-        )
-        for failsafe in failsafes(flight)[:_MAX_BANDS]
-    ]
+def _path(paths: Sequence[str], **style: Any) -> dict[str, Any]:
+    return {"type": "path", "xref": "x", "yref": "paper", "path": "".join(paths), **style}
 
 
-def track_chart(flight: FlightLog) -> Chart | None:
-    """Return the track from above, in metres from home, with a colour for each mode; None without positions."""
+def track_parts(flight: FlightLog) -> list[Part]:
+    """Return the track from above, in metres from home, with a colour for each mode; empty without positions."""
     places = metres_from_home(flight)
     if not places or flight.home is None:
-        return None
+        return []
     plane = TangentPlane(flight.home.latitude_deg, flight.home.longitude_deg)
+    lines, deviation_m = _track_lines(flight, places)
     traces = [
         *_setpoint_path(flight, plane),
         *_mission(flight, plane),
         *_fence(flight),
-        *_track_lines(flight, places),
-        _marker("home", [(0.0, 0.0)], "circle", "#2ca02c", 11),
+        *lines,
+        _marker("home", [(0.0, 0.0)], "circle", "colour:home", 11),
         *_failsafe_markers(flight, places),
     ]
-    layout = map_layout([place[1] for place in places], constrain="domain")
-    return Chart("map", traces, layout, 520, "the track from above, north is up")
+    layout = map_layout(traces)
+    chart = Chart("map", traces, layout, 520, "the track from above, north is up")
+    return [chart, *simplification_note(deviation_m)]
 
 
-def map_layout(east: Sequence[float], **xaxis: Any) -> dict[str, Any]:
-    """Return the layout of a map that shows these eastings."""
-    include = {"autorangeoptions": {"include": _with_margin(east)}}
-    return {
-        "xaxis": {"title": {"text": "metres east of home"}, **include, **xaxis},
-        "yaxis": {"title": {"text": "metres north of home"}, "scaleanchor": "x", "scaleratio": 1},
-        "hovermode": "closest",
-    }
-
-
-def _with_margin(values: Sequence[float]) -> list[float]:
-    """Return minimum and maximum with a margin, which Plotly omits at the ends of lines in x."""
-    known = [value for value in values if math.isfinite(value)]
-    if not known:
+def simplification_note(deviation_m: float) -> list[Part]:
+    """Return how far a drawn line is from the track; empty if it has all points."""
+    if not deviation_m:
         return []
-    margin = max(0.05 * (max(known) - min(known)), 1.0)
-    return [round(min(known) - margin, 1), round(max(known) + margin, 1)]
+    return [Paragraphs([f"The line is simplified: no recorded position is more than {deviation_m:.2f} m from it."])]
 
 
-def _track_lines(flight: FlightLog, places: Sequence[tuple[float, float]]) -> list[dict[str, Any]]:
-    track, colours, found = flight.track, mode_colours(flight), []
-    north = [place[0] for place in places]
-    east = [place[1] for place in places]
-    rows = rows_to_draw(len(places), (north, east), _MAX_POINTS)
-    heights = track["altitude_relative_m"]
-    changes = [(change.time_s, change.name) for change in flight.modes] or [(0.0, "")]
-    changes[0] = (-math.inf, changes[0][1])
-    named: set[str] = set()
-    for (begin, name), (end, _) in pairwise([*changes, (math.inf, "")]):
-        part = [row for row in rows if begin <= track.times[row] < end]
-        after = next((row for row in rows if track.times[row] >= end), None)
-        part += [] if after is None else [after]
-        if not part:
-            continue
-        found.append(
-            {
-                "x": [rounded(east[row]) for row in part],
-                "y": [rounded(north[row]) for row in part],
-                "text": [_here(track.times[row], heights[row]) for row in part],
-                "mode": "lines",
-                "name": name or "track",
-                "legendgroup": name,
-                "showlegend": name not in named,
-                "line": {"color": colours.get(name, COLOURS[0]), "width": 2.5},
-                "hovertemplate": "%{text}<br>%{x:.1f} m east, %{y:.1f} m north",
-            }
-        )
-        named.add(name)
-    return found
+def drawn_track(
+    places: Sequence[tuple[float, float]], max_points: int = MAX_TRACK_POINTS, keep: Iterable[int] = ()
+) -> tuple[list[int], float]:
+    """Select the rows of a track to draw. Return them, and the largest distance of any row from the drawn line."""
+    if len(places) <= MAX_POINTS:
+        has_known = any(rounded(north) is not None and rounded(east) is not None for north, east in places)
+        return list(range(len(places))) if has_known else [], 0.0
+    rows, deviation_m = simplify(places, max_points, _TRACK_TOLERANCE_M, keep)
+    return rows, math.ceil((deviation_m + _ROUNDING_M) * 100) / 100 if deviation_m else 0.0
+
+
+def map_layout(traces: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return the layout of a map that shows these traces."""
+    axes: dict[str, dict[str, Any]] = {}
+    for name, direction in (("x", "east"), ("y", "north")):
+        values = [value for trace in traces for value in trace[name] if value is not None]
+        margin = max(0.05 * (max(values) - min(values)), 1.0)
+        axes[f"{name}axis"] = {
+            "title": {"text": f"metres {direction} of home"},
+            "range": [round(min(values) - margin, 1), round(max(values) + margin, 1)],
+            "constrain": "domain",
+        }
+    axes["yaxis"].update(scaleanchor="x", scaleratio=1)
+    return {**axes, "hovermode": "closest"}
+
+
+def _track_lines(flight: FlightLog, places: Sequence[tuple[float, float]]) -> tuple[list[dict[str, Any]], float]:
+    """Return a line for each mode, and the largest distance of the track from them."""
+    times, heights = flight.track.times, flight.track["altitude_relative_m"]
+    changes = flight.modes or [ModeChange(0.0, "")]
+    starts = [0, *(bisect_left(times, change.time_s) for change in changes[1:]), len(places)]
+    rows, deviation_m = drawn_track(places, keep=(row for row in starts if row < len(places)))
+    drawn: dict[str, list[int | None]] = {}
+    for (start, end), change in zip(pairwise(starts), changes, strict=True):
+        # The line continues to the first position of the next mode.
+        part = rows[bisect_left(rows, start) : bisect_left(rows, end) + 1] if start < end else []
+        if part:
+            of_mode = drawn.setdefault(change.name, [])
+            of_mode += [None, *part] if of_mode else part
+    colours = mode_colours(flight)
+    lines = [
+        {
+            **_coordinates(None if row is None else places[row] for row in of_mode),
+            "text": ["" if row is None else _here(times[row], heights[row]) for row in of_mode],
+            "mode": "lines",
+            "name": name or "track",
+            "line": {"color": colours.get(name, "colour:mode0"), "width": 2.5},
+            "hovertemplate": "%{text}<br>%{x:.1f} m east, %{y:.1f} m north",
+        }
+        for name, of_mode in drawn.items()
+    ]
+    return lines, deviation_m
+
+
+def _coordinates(places: Iterable[tuple[float, float] | None]) -> dict[str, list[float | None]]:
+    """Return x and y of Plotly for metres north and east; None is a gap."""
+    pairs = [(math.nan, math.nan) if place is None else place for place in places]
+    return {"x": [rounded(east) for _, east in pairs], "y": [rounded(north) for north, _ in pairs]}
 
 
 def _here(time_s: float, height_m: float) -> str:
@@ -200,7 +268,8 @@ def _here(time_s: float, height_m: float) -> str:
 
 
 def rounded(value: float) -> float | None:
-    return round(value, 2) if math.isfinite(value) else None
+    """Return a coordinate for drawing; None, a gap, if it is unknown or damaged."""
+    return round(value, 2) if abs(value) <= MAX_COORDINATE else None
 
 
 def _setpoint_path(flight: FlightLog, plane: TangentPlane) -> list[dict[str, Any]]:
@@ -212,15 +281,13 @@ def _setpoint_path(flight: FlightLog, plane: TangentPlane) -> list[dict[str, Any
     ]
     if not places:
         return []
-    north, east = [place[0] for place in places], [place[1] for place in places]
-    rows = rows_to_draw(len(places), (north, east), _MAX_POINTS // 2)
+    rows, _ = drawn_track(places, MAX_TRACK_POINTS // 2)
     return [
         {
-            "x": [rounded(east[row]) for row in rows],
-            "y": [rounded(north[row]) for row in rows],
+            **_coordinates(places[row] for row in rows),
             "mode": "lines",
             "name": "set-point",
-            "line": {"color": _SETPOINT_COLOUR, "width": 1.5, "dash": "dot"},
+            "line": {"color": _SETPOINT, "width": 1.5, "dash": "dot"},
             "hoverinfo": "skip",
         }
     ]
@@ -234,20 +301,21 @@ def _mission(flight: FlightLog, plane: TangentPlane) -> list[dict[str, Any]]:
         "mission",
         [plane.metres(item.latitude_deg, item.longitude_deg) for item in items],
         "diamond-open",
-        "#555555",
+        "colour:mission",
         9,
         [f"{item.number} {command_name(item.command)}" for item in items],
     )
-    return [{**found, "mode": "markers+lines", "line": {"color": "#888888", "width": 1, "dash": "dash"}}]
+    return [{**found, "mode": "markers+lines", "line": {"color": "colour:mission", "width": 1, "dash": "dash"}}]
 
 
 def _fence(flight: FlightLog) -> list[dict[str, Any]]:
     """Return the circular fence from the parameters. Logs do not contain polygons."""
     end, value = flight.duration_s, flight.parameter_at
     radius = value("GF_MAX_HOR_DIST", end)
-    if value("FENCE_ENABLE", end) >= 1 and int(value("FENCE_TYPE", end)) & 2:
+    kinds = value("FENCE_TYPE", end)
+    if value("FENCE_ENABLE", end) >= 1 and math.isfinite(kinds) and int(kinds) & 2:
         radius = value("FENCE_RADIUS", end)
-    if not radius > 0:
+    if not 0 < radius < _MAX_FENCE_M:
         return []
     angles = [math.tau * number / 90 for number in range(91)]
     return [
@@ -257,7 +325,7 @@ def _fence(flight: FlightLog) -> list[dict[str, Any]]:
             "mode": "lines",
             "name": "fence",
             "hoverinfo": "skip",
-            "line": {"color": _FAILSAFE_COLOUR, "width": 1, "dash": "dash"},
+            "line": {"color": _FAILSAFE, "width": 1, "dash": "dash"},
         }
     ]
 
@@ -269,7 +337,7 @@ def _failsafe_markers(flight: FlightLog, places: Sequence[tuple[float, float]]) 
         if row >= 0 and places[row][0] == places[row][0]:
             found.append(places[row])
             names.append(f"{failsafe.title}, {clock(failsafe.time_s)}")
-    return [_marker("failsafe", found, "x", _FAILSAFE_COLOUR, 12, names)] if found else []
+    return [_marker("failsafe", found, "x", _FAILSAFE, 12, names)] if found else []
 
 
 def _marker(
@@ -281,8 +349,7 @@ def _marker(
     texts: Sequence[str] = (),
 ) -> dict[str, Any]:
     return {
-        "x": [rounded(east) for _, east in places],
-        "y": [rounded(north) for north, _ in places],
+        **_coordinates(places),
         "mode": "markers",
         "name": name,
         "text": list(texts) or [name] * len(places),

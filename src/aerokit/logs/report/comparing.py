@@ -4,10 +4,18 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from aerokit.logs.report.charts import COLOURS, map_layout, points, rounded, rows_to_draw
+from aerokit.logs.report.charts import (
+    drawn_track,
+    map_layout,
+    points,
+    rounded,
+    series_colour,
+    simplification_note,
+    time_range,
+)
 from aerokit.logs.report.page import Chart, Paragraphs, Section, Table
-from aerokit.logs.report.sections import failsafe_section
-from aerokit.logs.report.statistics import metres_from_home, span
+from aerokit.logs.report.sections import failsafe_section, mode_table
+from aerokit.logs.report.statistics import metres_from_home
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -77,6 +85,10 @@ def _first(by_number: dict[int, TimeSeries]) -> TimeSeries | None:
     return by_number[min(by_number)] if by_number else None
 
 
+def _armed_at(flight: FlightLog) -> float:
+    return flight.armed[0][0] if flight.armed else 0.0
+
+
 def _differences(found: tuple[FlightStatistics, FlightStatistics]) -> Section:
     rows = []
     for field, (name, digits) in _STATISTICS.items():
@@ -90,29 +102,27 @@ def _differences(found: tuple[FlightStatistics, FlightStatistics]) -> Section:
 
 def _maps(flights: Sequence[FlightLog]) -> Section:
     traces = []
-    all_east: list[float] = []
+    deviations: list[float] = []
     for number, flight in enumerate(flights):
         places = metres_from_home(flight)
-        all_east += [place[1] for place in places]
-        north, east = [place[0] for place in places], [place[1] for place in places]
-        rows = rows_to_draw(len(places), (north, east), 4000)
+        rows, deviation_m = drawn_track(places)
+        deviations.append(deviation_m)
         if rows:
-            traces.append(
-                {
-                    "x": [rounded(east[row]) for row in rows],
-                    "y": [rounded(north[row]) for row in rows],
-                    **_look(number),
-                }
-            )
+            x, y = ([rounded(places[row][axis]) for row in rows] for axis in (1, 0))
+            traces.append({"x": x, "y": y, **_look(number)})
     title, missing = "Tracks", "Neither log has positions."
     if not traces:
         return Section(title, missing=missing)
-    chart = Chart("maps", traces, map_layout(all_east), 520, "both tracks from above, north is up")
-    return Section(title, [chart], "From above, relative to each flight's home; north is up.")
+    chart = Chart("maps", traces, map_layout(traces), 520, "both tracks from above, north is up")
+    return Section(
+        title,
+        [chart, *simplification_note(max(deviations))],
+        "From above, relative to each flight's home; north is up.",
+    )
 
 
 def _look(number: int) -> dict[str, Any]:
-    return {"mode": "lines", "name": NAMES[number], "line": {"color": COLOURS[number], "width": 1.8}}
+    return {"mode": "lines", "name": NAMES[number], "line": {"color": series_colour(number), "width": 1.8}}
 
 
 def _overlaid(
@@ -129,22 +139,26 @@ def _overlaid(
             lacking.append(NAMES[number])
             continue
         times, values = points(columns, column)
-        begin = flight.armed[0][0] if flight.armed else 0.0
+        begin = _armed_at(flight)
         traces.append({"x": [round(time - begin, 2) for time in times], "y": values, **_look(number)})
     if not traces:
         return Section(title, missing="Neither log contains this.")
-    layout = {"xaxis": {"title": {"text": "seconds since arming"}}, "yaxis": {"title": {"text": unit}}}
-    chart = Chart("both-" + title.lower().replace(" ", "-"), traces, layout, 240, f"{unit}, both flights")
+    begin = min(-_armed_at(flight) for flight in flights)
+    end = max(flight.duration_s - _armed_at(flight) for flight in flights)
+    axis = {"title": {"text": "seconds since arming"}, "range": time_range(begin, end)}
+    layout = {"xaxis": axis, "yaxis": {"title": {"text": unit}}}
+    name = "both-" + title.lower().replace(" ", "-")
+    chart = Chart(name, traces, layout, 240, f"{unit}, both flights", is_timeline=True)
     missing = [Paragraphs([f"The log of {lacking[0]} does not contain this."])] if lacking else []
     return Section(title, [chart, *missing])
 
 
 def _modes(flights: Sequence[FlightLog]) -> Section:
-    texts = []
+    parts: list[Part] = []
     for name, flight in zip(NAMES, flights, strict=True):
-        modes = (f"{change.name} ({span(end - change.time_s)})" for change, end in flight.mode_spans())
-        texts.append(f"{name}: {' → '.join(modes) or 'not texts'}")
-    return Section("Modes", [Paragraphs(texts)])
+        known = bool(flight.modes)
+        parts += [Paragraphs([f"{name}:"]), mode_table(flight)] if known else [Paragraphs([f"{name}: not logged"])]
+    return Section("Modes", parts)
 
 
 def _parameters(flights: Sequence[FlightLog]) -> Section:
@@ -158,7 +172,7 @@ def _parameters(flights: Sequence[FlightLog]) -> Section:
         if not _same(one.get(name), other.get(name))
     ]
     parts: list[Part] = [
-        Table(("parameter", *NAMES), rows, f"{len(rows)} differ" if len(rows) > 40 else "")
+        Table(("parameter", *NAMES), rows, f"{len(rows)} differ")
         if rows
         else Paragraphs([f"None: all {len(one)} are the same."])
     ]

@@ -9,10 +9,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from html import escape
 from importlib import import_module, resources
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from aerokit._internal.formatting import printable
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
 
 @dataclass(frozen=True)
@@ -25,21 +27,30 @@ class Paragraphs:
 
 @dataclass(frozen=True)
 class Table:
-    """A table of texts."""
+    """A table of texts. A long one is collapsed."""
 
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
-    folded: str = ""
-    """Title of the collapsed table; empty: not collapsible."""
+    title: str = ""
+    """Title of the collapsed table; empty: the number of rows."""
     marks: Sequence[str] = ()
     """Class of each row: "", "warning" or "bad"."""
+
+
+@dataclass(frozen=True)
+class Collapsed:
+    """Parts that are shown on demand, and never printed."""
+
+    title: str
+    parts: Sequence[Part]
 
 
 @dataclass(frozen=True)
 class Chart:
     """A Plotly chart.
 
-    Names must not come from a log, because Plotly interprets some HTML in texts.
+    Texts must not come from a log, because Plotly interprets some HTML in them. Colours are names of
+    `charts.COLOURS`, after ``colour:``.
     """
 
     name: str
@@ -49,9 +60,15 @@ class Chart:
     height: int = 300
     label: str = ""
     """Text alternative for screen readers."""
+    is_timeline: bool = False
+    """True if the page's shapes are drawn behind it, and it zooms together with the other timelines."""
 
 
-Part = Paragraphs | Table | Chart
+Part: TypeAlias = "Paragraphs | Table | Collapsed | Chart"
+MAX_OPEN_ROWS = 15
+"""Longer tables are collapsed."""
+MAX_PRINTED_ROWS = 60
+"""Longer tables are not printed."""
 
 
 @dataclass(frozen=True)
@@ -64,8 +81,17 @@ class Section:
     missing: str = ""
 
 
-def page(title: str, summaries: Sequence[tuple[str, Sequence[str]]], sections: Sequence[Section]) -> str:
-    """Return the HTML; ``summaries`` has a heading and sentences for each flight.
+def page(
+    title: str,
+    summaries: Sequence[tuple[str, Sequence[str]]],
+    sections: Sequence[Section],
+    colours: Mapping[str, Mapping[str, str]],
+    shapes: Sequence[dict[str, Any]] = (),
+) -> str:
+    """Return the HTML.
+
+    ``summaries`` has a heading and sentences for each flight, ``colours`` the colours by theme ("light", "dark") and
+    name, ``shapes`` Plotly's shapes for all timelines.
 
     The Content-Security-Policy allows only the two included scripts, and no network access. It is a second
     barrier after escaping, for hostile logs.
@@ -75,19 +101,22 @@ def page(title: str, summaries: Sequence[tuple[str, Sequence[str]]], sections: S
     """
     scripts = [import_module("plotly.offline").get_plotlyjs(), _resource("draw.js")]
     hashes = " ".join(f"'sha256-{_hash(script)}'" for script in scripts)
-    policy = f"default-src 'none'; script-src {hashes}; style-src 'unsafe-inline'; img-src data: blob:"
+    policy = (
+        f"default-src 'none'; script-src {hashes}; style-src 'unsafe-inline'; img-src data: blob:;"
+        " form-action 'none'; base-uri 'none'"
+    )
     charts = [part for section in sections for part in section.parts if isinstance(part, Chart)]
     lines = [
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">',
         f'<meta http-equiv="Content-Security-Policy" content="{policy}">',
         '<meta name="viewport" content="width=device-width, initial-scale=1">',
-        f"<title>{escape(title)}</title>",
+        f"<title>{_escape(title)}</title>",
         f"<style>{_resource('page.css')}</style></head><body>",
-        f"<h1>{escape(title)}</h1>",
+        f"<h1>{_escape(title)}</h1>",
         *_summary(summaries),
         _contents(sections),
         *(line for number, section in enumerate(sections) for line in _section(number, section)),
-        f'<script type="application/json" id="charts">{_json(charts)}</script>',
+        f'<script type="application/json" id="charts">{_json(charts, colours, shapes)}</script>',
         *(f"<script>{script}</script>" for script in scripts),
         "</body></html>\n",
     ]
@@ -104,32 +133,46 @@ def _hash(script: str) -> str:
     return base64.b64encode(hashlib.sha256(data).digest()).decode()
 
 
-def _json(charts: Sequence[Chart]) -> str:
+def _escape(text: str) -> str:
+    """Escape text for HTML. Characters that could disguise it (control, bidirectional, invisible) become U+FFFD."""
+    return escape(printable(text.replace("\t", " ").replace("\xa0", " ")))
+
+
+def _json(charts: Sequence[Chart], colours: Mapping[str, Mapping[str, str]], shapes: Sequence[dict[str, Any]]) -> str:
     """Serialize the charts by name; no text can end the surrounding script element."""
-    content = {chart.name: {"traces": chart.traces, "layout": chart.layout, "height": chart.height} for chart in charts}
+    by_name = {
+        chart.name: {
+            "traces": chart.traces,
+            "layout": chart.layout,
+            "height": chart.height,
+            "timeline": chart.is_timeline,
+        }
+        for chart in charts
+    }
+    content = {"colours": colours, "shapes": shapes, "charts": by_name}
     text = json.dumps(content, separators=(",", ":"), allow_nan=False)
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
 def _summary(summaries: Sequence[tuple[str, Sequence[str]]]) -> Iterator[str]:
     for heading, sentences in summaries:
-        yield f'<p class="soft">{escape(heading)}</p>'
+        yield f'<p class="soft">{_escape(heading)}</p>'
         yield '<div class="summary">'
-        yield from (f"<p>{escape(sentence)}</p>" for sentence in sentences)
+        yield from (f"<p>{_escape(sentence)}</p>" for sentence in sentences)
         yield "</div>"
 
 
 def _contents(sections: Sequence[Section]) -> str:
-    links = (f'<a href="#s{number}">{escape(section.title)}</a>' for number, section in enumerate(sections))
+    links = (f'<a href="#s{number}">{_escape(section.title)}</a>' for number, section in enumerate(sections))
     return f"<nav>{' '.join(links)}</nav>"
 
 
 def _section(number: int, section: Section) -> Iterator[str]:
-    yield f'<section id="s{number}"><h2>{escape(section.title)}</h2>'
+    yield f'<section id="s{number}"><h2>{_escape(section.title)}</h2>'
     if section.missing:
-        yield f'<p class="missing">{escape(section.missing)}</p>'
+        yield f'<p class="missing">{_escape(section.missing)}</p>'
     elif section.explanation:
-        yield f'<p class="soft">{escape(section.explanation)}</p>'
+        yield f'<p class="soft">{_escape(section.explanation)}</p>'
     for part in section.parts:
         yield from _part(part)
     yield "</section>"
@@ -137,28 +180,35 @@ def _section(number: int, section: Section) -> Iterator[str]:
 
 def _part(part: Part) -> Iterator[str]:
     if isinstance(part, Chart):
+        size = " large" if part.height > 400 else ""
         yield (
-            f'<div class="chart" data-chart="{escape(part.name)}" style="min-height:{part.height}px"'
-            f' role="img" aria-label="{escape(part.label)}"><noscript>{escape(part.label)}</noscript></div>'
+            f'<div class="chart{size}" data-chart="{_escape(part.name)}" style="min-height:{part.height}px"'
+            f' role="img" aria-label="{_escape(part.label)}"><noscript>{_escape(part.label)}</noscript></div>'
         )
     elif isinstance(part, Paragraphs):
         tag = "li" if part.is_list else "p"
-        yield from (f"<{tag}>{escape(line)}</{tag}>" for line in part.lines)
+        yield from (f"<{tag}>{_escape(line)}</{tag}>" for line in part.lines)
+    elif isinstance(part, Collapsed):
+        yield f'<details data-print="no"><summary>{_escape(part.title)}</summary>'
+        for inner in part.parts:
+            yield from _part(inner)
+        yield "</details>"
     else:
         yield from _table(part)
 
 
 def _table(table: Table) -> Iterator[str]:
-    if table.folded:
-        is_long = ' data-print="no"' if len(table.rows) > 300 else ""
-        yield f"<details{is_long}><summary>{escape(table.folded)}</summary>"
+    count = len(table.rows)
+    if count > MAX_OPEN_ROWS:
+        is_long = ' data-print="no"' if count > MAX_PRINTED_ROWS else ""
+        yield f"<details{is_long}><summary>{_escape(table.title or f'{count} rows')}</summary>"
     yield '<div class="wide"><table><thead><tr>'
-    yield "".join(f"<th>{escape(name)}</th>" for name in table.header)
+    yield "".join(f"<th>{_escape(name)}</th>" for name in table.header)
     yield "</tr></thead><tbody>"
     for number, row in enumerate(table.rows):
         mark = table.marks[number] if number < len(table.marks) else ""
-        cells = "".join(f"<td>{escape(cell)}</td>" for cell in row)
+        cells = "".join(f"<td>{_escape(cell)}</td>" for cell in row)
         yield f'<tr class="{mark}">{cells}</tr>' if mark else f"<tr>{cells}</tr>"
     yield "</tbody></table></div>"
-    if table.folded:
+    if count > MAX_OPEN_ROWS:
         yield "</details>"

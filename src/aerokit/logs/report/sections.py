@@ -6,8 +6,9 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from aerokit.logs.flights.failsafes import failsafes
-from aerokit.logs.report.charts import line, over_time, setpoint_line, track_chart
-from aerokit.logs.report.page import Paragraphs, Section, Table
+from aerokit.logs.flights.flight import battery_name
+from aerokit.logs.report.charts import line, over_time, setpoint_line, track_parts
+from aerokit.logs.report.page import Collapsed, Paragraphs, Section, Table
 from aerokit.logs.report.statistics import clock, date, span
 from aerokit.missions.item import command_name
 
@@ -22,6 +23,7 @@ _SEVERITIES = ("emergency", "alert", "critical", "error", "warning", "notice", "
 # GPS_FIX_TYPE, for the values that have the same meaning in MAVLink, ArduPilot's logs and PX4's.
 _FIXES = ("no receiver", "no fix", "2D", "3D", "DGPS", "RTK float", "RTK fixed")
 _MAX_TEXTS, _MAX_CHANGES, _MAX_PARAMETERS = 2000, 2000, 5000
+_MAX_OPEN_FAILSAFES = 10
 # Parts of the names of parameters that the autopilot writes itself.
 _AUTOPILOT_WRITTEN = (
     "STAT_",
@@ -48,7 +50,7 @@ def _map(flight: FlightLog) -> Section:
         " because they would need network access.",
         missing="The log contains no positions.",
     )
-    return _with_parts(title, track_chart(flight))
+    return _with_parts(title, *track_parts(flight))
 
 
 def _heights(flight: FlightLog) -> Section:
@@ -69,14 +71,17 @@ def _heights(flight: FlightLog) -> Section:
 def _modes(flight: FlightLog) -> Section:
     if not flight.modes:
         return Section("Modes", missing="The log contains no modes.")
+    armed = [(clock(begin), clock(end), span(end - begin)) for begin, end in flight.armed]
+    times = Table(("armed", "disarmed", "duration"), armed, f"armed {len(armed)} times")
+    return Section("Modes", [mode_table(flight), times if armed else Paragraphs(["never armed"])])
+
+
+def mode_table(flight: FlightLog) -> Table:
     rows = [
         (clock(change.time_s), change.name, span(end - change.time_s), change.reason)
         for change, end in flight.mode_spans()
     ]
-    armed = [f"armed {clock(begin)} to {clock(end)} ({span(end - begin)})" for begin, end in flight.armed] or [
-        "never armed"
-    ]
-    return Section("Modes", [Table(("time", "mode", "duration", "reason"), rows), Paragraphs(["; ".join(armed)])])
+    return Table(("time", "mode", "duration", "reason"), rows, f"{len(rows)} modes")
 
 
 def failsafe_section(flight: FlightLog) -> Section:
@@ -87,19 +92,21 @@ def failsafe_section(flight: FlightLog) -> Section:
             "Failsafes",
             [Paragraphs(["None: no text, mode, error or flag indicates a failsafe while armed."])],
         )
-    parts: list[Part] = []
-    for failsafe in found:
-        parts += _failsafe(failsafe)
+    tables = [_failsafe(failsafe) for failsafe in found]
+    parts: list[Part] = [*tables[:_MAX_OPEN_FAILSAFES]]
+    if len(tables) > len(parts):
+        more = tables[len(parts) :]
+        parts.append(Collapsed(f"{len(more)} more", more))
     explanation = "Each with its evidence, the values measured before it, and the parameters that configure it."
     return Section("Failsafes", parts, explanation)
 
 
-def _failsafe(failsafe: Failsafe) -> list[Part]:
+def _failsafe(failsafe: Failsafe) -> Table:
     kind, mark = ("failsafe", "bad") if failsafe.acted else ("warning", "warning")
     head = f"{clock(failsafe.time_s)} {failsafe.title} ({kind}): {failsafe.reaction}"
     rows = [("evidence", f"{clock(item.time_s)} {item.text}") for item in failsafe.evidence]
     rows += [("context", text) for text in failsafe.context]
-    return [Table((kind, head), rows, marks=[mark] * len(failsafe.evidence))]
+    return Table((kind, head), rows, head, [mark] * len(failsafe.evidence))
 
 
 def _attitude(flight: FlightLog) -> Section:
@@ -158,7 +165,7 @@ def _batteries(flight: FlightLog) -> Section:
         ("remaining_percent", "% remaining", 1),
     ):
         lines = [
-            line(f"battery {number + 1}", battery, name, digits) for number, battery in sorted(flight.batteries.items())
+            line(battery_name(number), battery, name, digits) for number, battery in sorted(flight.batteries.items())
         ]
         charts.append(over_time(flight, f"battery-{name}", unit, lines, height=220))
     return _with_parts(title, *charts)
@@ -194,7 +201,7 @@ def _estimator(flight: FlightLog) -> Section:
         "estimator",
         "ratio",
         [line(name.replace("_", " "), flight.estimator, name) for name in flight.estimator],
-        shapes=[{**limit, "line": {"color": "#d62728", "width": 1}}],
+        shapes=[{**limit, "line": {"color": "colour:failsafe", "width": 1}}],
     )
     return _with_parts(title, chart)
 
@@ -275,11 +282,7 @@ def _parameters(flight: FlightLog) -> Section:
         for change in changed[:_MAX_CHANGES]
     ]
     parts: list[Part] = [
-        Table(
-            ("time", "parameter", "before", "after"),
-            rows,
-            f"{len(changed)} changes" if len(rows) > 20 else "",
-        )
+        Table(("time", "parameter", "before", "after"), rows, f"{len(changed)} changes")
         if rows
         else Paragraphs(["No parameter changed during the log."])
     ]
@@ -313,13 +316,7 @@ def _mission(flight: FlightLog) -> Section | None:
     ]
     return Section(
         "Mission",
-        [
-            Table(
-                ("item", "command", "position", "altitude"),
-                rows,
-                f"{len(rows)} item{'' if len(rows) == 1 else 's'}",
-            )
-        ],
+        [Table(("item", "command", "position", "altitude"), rows, f"{len(rows)} items")],
     )
 
 

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 # Shorter steps are noise of a stationary vehicle.
 _STEP_M = 1.0
 _A_YEAR_S = 365 * 86_400.0
+_MAX_LISTED = 5
 
 
 class FlightStatistics(Snapshot):
@@ -131,8 +132,9 @@ class _ArmedSpans:
             yield from range(bisect_left(columns.times, begin), bisect_right(columns.times, end))
 
     def known(self, columns: TimeSeries, name: str) -> list[float]:
-        values = columns[name]
-        return [values[row] for row in self.rows(columns) if math.isfinite(values[row])]
+        times, values = columns.times, columns[name]
+        parts = (values[bisect_left(times, begin) : bisect_right(times, end)] for begin, end in self._spans)
+        return [value for part in parts for value in part if math.isfinite(value)]
 
 
 def _battery(flight: FlightLog, spans: _ArmedSpans, name: str) -> list[float]:
@@ -218,13 +220,18 @@ def _failsafes_sentence(flight: FlightLog) -> str:
     warnings = [failsafe for failsafe in found if not failsafe.acted]
     text = f"{len(acted) or 'No'} failsafe{'' if len(acted) == 1 else 's'}"
     if acted:
-        text += ": " + "; ".join(
-            f"{failsafe.title} at {clock(failsafe.time_s)} ({failsafe.reaction})" for failsafe in acted
+        text += ": " + _first_few(
+            [f"{failsafe.title} at {clock(failsafe.time_s)} ({failsafe.reaction})" for failsafe in acted]
         )
     if warnings:
         text += f". {len(warnings)} warning{'' if len(warnings) == 1 else 's'} without a known reaction: "
-        text += "; ".join(f"{failsafe.title} at {clock(failsafe.time_s)}" for failsafe in warnings)
+        text += _first_few([f"{failsafe.title} at {clock(failsafe.time_s)}" for failsafe in warnings])
     return text + "."
+
+
+def _first_few(texts: list[str]) -> str:
+    more = [f"{len(texts) - _MAX_LISTED} more"] if len(texts) > _MAX_LISTED else []
+    return "; ".join([*texts[:_MAX_LISTED], *more])
 
 
 def _warnings_sentence(statistics: FlightStatistics) -> str:
