@@ -10,6 +10,7 @@ from served_copter import served
 from wrong_types import Misuse, misuses, misuses_of, refusal_of
 
 import aerokit.sync
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages as m
 from aerokit.sim import SimulatedCopter
 from aerokit.testing.journal import Journal
@@ -68,3 +69,11 @@ def test_wrong_types_are_rejected_and_nothing_sent(owner: str, flight: tuple[aer
 def test_wrong_types_open_no_link(function: Callable[..., Any]) -> None:
     wrong = [refusal_of(each, misuse_it(each)) for each in misuses_of(function, function.__name__)]
     assert not (found := list(filter(None, wrong))), "\n".join(found)
+
+
+def test_fleet_checks_literals_by_value() -> None:
+    options: dict[str, Any] = {"on_error": "land_others", "on_error_by_group": {"": "continue_others"}}
+    with pytest.raises(InvalidArgument, match="count = 0"):  # the arguments before are accepted
+        aerokit.sync.fleet("udp:127.0.0.1:0", count=0, min_distance_m=5, on_too_close="report", **options)
+    with pytest.raises(InvalidArgument, match="on_error = 'land' is not allowed: one of hold_others, land_others"):
+        aerokit.sync.fleet("udp:127.0.0.1:0", on_error="land")  # type: ignore[arg-type]

@@ -94,7 +94,7 @@ async def change_armed(vehicle: AsyncVehicle, value: bool) -> None:
     except CommandRejected:
         raise
     except (OperationRejected, OperationTimeout) as error:
-        error.args = (f"{error}; it may still be carried out",)
+        error.args = (f"{error}; it may still be carried out, and is not monitored",)
         raise
 
 

@@ -155,12 +155,15 @@ class CommandExchange(Exchange[CommandAck]):
     HEARTBEAT that shows that it has neither taken effect nor ended, so it is never sent to a silent vehicle.
 
     Args:
-        message: the command. own_system: our system id. own_component: our component id. attempts: maximum number of
-        sendings; None: four, or one for an order in `UNREPEATABLE_COMMANDS`. attempt_timeout: seconds for each attempt;
-        None: one, or four for an order in `UNREPEATABLE_COMMANDS`. progress_timeout: seconds without any answer, after
-        IN_PROGRESS, until the command fails. on_progress: called with each progress report. earlier_answers: number of
-        acknowledgements to ignore, because they belong to an earlier, abandoned command of the
-            same number. Once this command is repeated, because they did not arrive, every acknowledgement counts.
+        message: the command.
+        own_system: our system id.
+        own_component: our component id.
+        attempts: maximum number of sendings; None: four, or one for an order in `UNREPEATABLE_COMMANDS`.
+        attempt_timeout: seconds for each attempt; None: one, or four for an order in `UNREPEATABLE_COMMANDS`.
+        progress_timeout: seconds without any answer, after IN_PROGRESS, until the command fails.
+        on_progress: called with each progress report.
+        earlier_answers: number of acknowledgements to ignore, because they belong to an earlier, abandoned command of
+            the same number. Once this command is repeated, because they did not arrive, every acknowledgement counts.
         acks_per_sending: number of acknowledgements that the vehicle sends for each sending; the first one counts.
         min_timeout_s: lower limit of ``attempt_timeout``, for slow links.
         order_status: the state of the order; None for a request.

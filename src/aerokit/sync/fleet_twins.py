@@ -12,7 +12,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from aerokit._internal.arguments import checked
+from aerokit.fleets.opening import TooCloseAction
 from aerokit.fleets.opening import fleet as fleet_async
+from aerokit.fleets.policy import PolicyName
 from aerokit.sync.blocks import BlockTwin
 from aerokit.sync.fleet_blocks import FleetTwin, SelectionTwin, opened_fleet
 from aerokit.sync.twins import Connection, Subscription, Vehicle
@@ -29,8 +31,7 @@ if TYPE_CHECKING:
     from aerokit.fleets.formation import Following as AsyncFollowing
     from aerokit.fleets.formation import Formation
     from aerokit.fleets.members import Member
-    from aerokit.fleets.opening import TooCloseAction
-    from aerokit.fleets.policy import FleetResult, MemberFailure, PolicyDecision, PolicyName
+    from aerokit.fleets.policy import FleetResult, MemberFailure, PolicyDecision
     from aerokit.fleets.separation import Deconfliction
     from aerokit.fleets.show import Show
     from aerokit.fleets.show_flight import ShowReport

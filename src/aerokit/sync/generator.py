@@ -20,7 +20,7 @@ import inspect
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, get_origin
 
 from aerokit.sync.originals import (
     TWINS,
@@ -190,6 +190,15 @@ class Page:
         where = self._homes.setdefault(where[1] or name, where)  # several modules may export a name
         (self.at_run_time if at_run_time else self.for_types).add(where)
 
+    def need_literals(self, node: ast.AST | None, module: str) -> None:
+        """Import Literals at run time: ``checked`` knows classes by their names, but needs the values of a Literal."""
+        for each in ast.walk(node) if node is not None else ():
+            where = imports_of(module).get(each.id, (module, each.id)) if isinstance(each, ast.Name) else ("", "")
+            if where[0].startswith("aerokit."):
+                found = getattr(importlib.import_module(where[0]), where[1], None)
+                if get_origin(found) is Literal:
+                    self.at_run_time.add(where)
+
     def returned(self, expression: str, returns: ast.expr | None) -> str:
         """Return the expression, wrapped in a twin if its type has one."""
         name, maybe = outer(returns), outer(optional(returns))
@@ -295,6 +304,7 @@ def _opener(page: Page, path: str) -> str:
     node = function_node(module, name)
     for argument in (*node.args.args, *node.args.kwonlyargs, node.args.vararg):
         page.need(argument.annotation if argument else None, (module,))
+        page.need_literals(argument.annotation if argument else None, module)
     for default in (*node.args.defaults, *node.args.kw_defaults):
         page.need(default, (module,), at_run_time=True)
     assert isinstance(node.returns, ast.Subscript)

@@ -1,4 +1,4 @@
-"""Reboots, silence, loss, round trips, order_status still: the rules by themselves, on a clock of the test's own."""
+"""Reboots, silence, loss, round trips, standing still: the rules by themselves, on a clock of the test's own."""
 
 from __future__ import annotations
 
@@ -292,7 +292,7 @@ def test_loss_and_rates_of_a_second() -> None:
     assert (report.loss_percent, report.frames_per_s) == (100.0, 0.0)
 
 
-# ------------------------------------------------------------------------------- order_status still
+# ------------------------------------------------------------------------------- standing still
 
 
 class Standing:

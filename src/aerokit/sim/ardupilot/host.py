@@ -300,7 +300,7 @@ class ArduPilotHost(SimulatedAutopilot):
     GIT_HASH: ClassVar[bytes] = b"5ae20c17"
 
     parameters: SimParameters
-    """SimParameters by name. A test may change them; they survive a reboot."""
+    """Parameters by name. A test may change them; they survive a reboot."""
     timeline: BootTimeline
     uid: bytes
     battery: SimulatedBattery

@@ -103,7 +103,7 @@ def is_navigation(item: MissionItem) -> bool:
 
 
 class MissionRun:
-    """CommandProgress in the mission. Index 0 is home (meaning no command), 1 the first command."""
+    """Progress in the mission. Index 0 is home (meaning no command), 1 the first command."""
 
     def __init__(self, vehicle: ArduPilotHost, mode: MissionMode) -> None:
         self._vehicle, self._mode = vehicle, mode

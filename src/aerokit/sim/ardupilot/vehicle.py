@@ -105,7 +105,7 @@ class ArduPilotVehicle(ArduPilotHost):
         signing_key: SigningKey | None = None,
     ) -> None:
         self.parameters: SimParameters = parameters_of(self.KIND, parameter_count)
-        """SimParameters by name. A test may change them; they survive a reboot."""
+        """Parameters by name. A test may change them; they survive a reboot."""
         self.parameters["MAV_SYSID"] = system_id
         self.parameters.change(parameters or {})
         super().__init__(

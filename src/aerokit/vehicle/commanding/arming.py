@@ -211,7 +211,7 @@ class ArmingActions(VehicleBase):
         await self._wait_until_armable()
         self._sender.raise_if_ended(order)
         if self._arbiter.arming_orders != count:
-            raise OperationRejected("arm(): superseded by another arm or disarm command; nothing was sent")
+            raise OperationRejected("arm(): superseded by another arm or disarm command; the arm command was not sent")
         if not self._arbiter.is_known:
             raise HeartbeatTimeout(f"arm(): {self._session.describe_link()}; the arm command was not sent")
 

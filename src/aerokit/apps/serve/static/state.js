@@ -2,7 +2,7 @@
 
 import { age, element, number, SEVERITIES, show, spelled, staleness, UNKNOWN, unitOf } from "./dom.js";
 
-const UNREPEATABLE_COMMANDS = new Set(["home", "origin", "version", "capabilities", "status_text", "mission_reached", "mission_current"]);
+const REPORTED_ONCE = new Set(["home", "origin", "version", "capabilities", "status_text", "mission_reached", "mission_current"]);
 
 // Current age of a value in seconds; it increases while nothing is received.
 export const ageOf = (entry, receivedAt) =>
@@ -87,7 +87,7 @@ export class StateTable {
       this.rows.set(name, cells);
       this.body.append(element("tr", {}, ...cells));
     }
-    const old = ageOf(entry, receivedAt), kind = UNREPEATABLE_COMMANDS.has(name) ? "" : staleness(old);
+    const old = ageOf(entry, receivedAt), kind = REPORTED_ONCE.has(name) ? "" : staleness(old);
     show(cells[1], inWords(name, entry.value), "value");
     show(cells[2], age(old), `age ${kind}`);
   }
