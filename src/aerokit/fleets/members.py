@@ -151,7 +151,7 @@ class Member:
             self._ignored_failsafe = None
         elif state is not None and is_worse(state, self._ignored_failsafe):
             return f"it is in a failsafe (MAV_STATE {MavState(state).name})"
-        has_ended_mission = "mission" in vars(vehicle) and vehicle.mission.has_ended
+        has_ended_mission = "mission" in vars(vehicle) and vehicle.mission.explains_mode
         if has_ended_mission or self._current_control() == self._control_when_reclaimed:
             return ""
         armed_elsewhere = vehicle.is_armed and vehicle._arbiter.current is None

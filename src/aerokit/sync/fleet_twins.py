@@ -276,13 +276,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
         """
         return Following(
             self._loop,
-            self._loop.call(
-                self.aio.following,
-                formation,
-                leader=leader,
-                rate_hz=rate_hz,
-                max_speed_m_s=max_speed_m_s,
-            ),
+            self._loop.call(self.aio.following, formation, leader=leader, rate_hz=rate_hz, max_speed_m_s=max_speed_m_s),
         )
 
     def upload(
@@ -379,14 +373,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
         Raises:
             InvalidArgument: there is no such action, or an argument is wrong. Nothing was sent.
         """
-        return self._loop.run(
-            self.aio.do,
-            action,
-            *arguments,
-            timeout=timeout,
-            stagger_s=stagger_s,
-            **options,
-        )
+        return self._loop.run(self.aio.do, action, *arguments, timeout=timeout, stagger_s=stagger_s, **options)
 
     def wait_ready(self, *, timeout: float = 90.0) -> FleetResult:
         """Wait until each member is ready to fly; see :meth:`aerokit.Vehicle.wait_ready`.
@@ -413,13 +400,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
         """
         return self._loop.run(self.aio.disarm, timeout=timeout)
 
-    def take_off(
-        self,
-        altitude_m: float,
-        *,
-        timeout: float = 60.0,
-        stagger_s: float | None = None,
-    ) -> FleetResult:
+    def take_off(self, altitude_m: float, *, timeout: float = 60.0, stagger_s: float | None = None) -> FleetResult:
         """Take off and climb to ``altitude_m`` above home; see :meth:`aerokit.Vehicle.take_off`.
 
         Args:
@@ -441,12 +422,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
         """
         return self._loop.run(self.aio.land, timeout=timeout, stagger_s=stagger_s)
 
-    def return_to_launch(
-        self,
-        *,
-        timeout: float | None = 600.0,
-        stagger_s: float | None = None,
-    ) -> FleetResult:
+    def return_to_launch(self, *, timeout: float | None = 600.0, stagger_s: float | None = None) -> FleetResult:
         """Return to launch; see :meth:`aerokit.Vehicle.return_to_launch`. A failure does not stop the other members.
 
         Args:
@@ -490,13 +466,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
         """
         return self._loop.run(self.aio.barrier, condition, timeout=timeout, description=description)
 
-    def wait_at_altitude(
-        self,
-        altitude_m: float,
-        *,
-        tolerance_m: float = 1.0,
-        timeout: float = 60.0,
-    ) -> FleetResult:
+    def wait_at_altitude(self, altitude_m: float, *, tolerance_m: float = 1.0, timeout: float = 60.0) -> FleetResult:
         """Wait until all members are at an altitude above their homes.
 
         Args:
@@ -507,12 +477,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
         Raises:
             FleetError: a member did not get there.
         """
-        return self._loop.run(
-            self.aio.wait_at_altitude,
-            altitude_m,
-            tolerance_m=tolerance_m,
-            timeout=timeout,
-        )
+        return self._loop.run(self.aio.wait_at_altitude, altitude_m, tolerance_m=tolerance_m, timeout=timeout)
 
     def __getitem__(self, pattern: str) -> Selection:
         return Selection(self._loop, self.aio.__getitem__(pattern))
@@ -594,10 +559,7 @@ class Fleet(FleetTwin, Selection):
         Raises:
             InvalidArgument: a type is not an event.
         """
-        return Subscription(
-            self._loop,
-            self._loop.call(self.aio.events, *types, capacity=capacity, overflow=overflow),
-        )
+        return Subscription(self._loop, self._loop.call(self.aio.events, *types, capacity=capacity, overflow=overflow))
 
     def states(
         self,
@@ -619,13 +581,7 @@ class Fleet(FleetTwin, Selection):
         """
         return Subscription(
             self._loop,
-            self._loop.call(
-                self.aio.states,
-                *names,
-                every_arrival=every_arrival,
-                capacity=capacity,
-                overflow=overflow,
-            ),
+            self._loop.call(self.aio.states, *names, every_arrival=every_arrival, capacity=capacity, overflow=overflow),
         )
 
 

@@ -35,7 +35,7 @@ from aerokit.sync.originals import (
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-WIDTH = 110  # the line length of `ruff format`, whose style the output follows
+WIDTH = 120  # the line length of `ruff format`, whose style the output follows
 
 
 def outer(annotation: ast.expr | None) -> str:

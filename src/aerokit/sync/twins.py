@@ -108,13 +108,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.parameters.parameters import Parameters as AsyncParameters
     from aerokit.vehicle.parameters.parameters import ParameterSource
     from aerokit.vehicle.parameters.writing import ParameterWrite
-    from aerokit.vehicle.state.condition import (
-        EstimatorHealth,
-        MissionProgress,
-        SensorHealth,
-        StatusText,
-        SystemTime,
-    )
+    from aerokit.vehicle.state.condition import EstimatorHealth, MissionProgress, SensorHealth, StatusText, SystemTime
     from aerokit.vehicle.state.equipment import (
         Battery,
         GimbalAttitude,
@@ -371,13 +365,7 @@ class Connection(ConnectionTwin):
         """
         return Subscription(
             self._loop,
-            self._loop.call(
-                self.aio.subscribe,
-                *types,
-                system_id=system_id,
-                capacity=capacity,
-                overflow=overflow,
-            ),
+            self._loop.call(self.aio.subscribe, *types, system_id=system_id, capacity=capacity, overflow=overflow),
         )
 
     @property
@@ -446,13 +434,7 @@ class Guided(TwinOf["AsyncGuided"]):
         """Stream velocities over ground (SET_POSITION_TARGET_LOCAL_NED)."""
         return SetpointStream(
             self._loop,
-            self._loop.call(
-                self.aio.velocity,
-                initial,
-                rate_hz=rate_hz,
-                valid_for_s=valid_for_s,
-                max_lag_s=max_lag_s,
-            ),
+            self._loop.call(self.aio.velocity, initial, rate_hz=rate_hz, valid_for_s=valid_for_s, max_lag_s=max_lag_s),
         )
 
     def body_velocity(
@@ -526,13 +508,7 @@ class Guided(TwinOf["AsyncGuided"]):
         """Stream global positions (SET_POSITION_TARGET_GLOBAL_INT)."""
         return SetpointStream(
             self._loop,
-            self._loop.call(
-                self.aio.position,
-                initial,
-                rate_hz=rate_hz,
-                valid_for_s=valid_for_s,
-                max_lag_s=max_lag_s,
-            ),
+            self._loop.call(self.aio.position, initial, rate_hz=rate_hz, valid_for_s=valid_for_s, max_lag_s=max_lag_s),
         )
 
     def attitude(
@@ -546,13 +522,7 @@ class Guided(TwinOf["AsyncGuided"]):
         """Stream attitudes with thrust (SET_ATTITUDE_TARGET)."""
         return SetpointStream(
             self._loop,
-            self._loop.call(
-                self.aio.attitude,
-                initial,
-                rate_hz=rate_hz,
-                valid_for_s=valid_for_s,
-                max_lag_s=max_lag_s,
-            ),
+            self._loop.call(self.aio.attitude, initial, rate_hz=rate_hz, valid_for_s=valid_for_s, max_lag_s=max_lag_s),
         )
 
 
@@ -743,13 +713,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
             OperationTimeout: it did not get there in time; the text has the last attitude.
             HeartbeatTimeout: the vehicle fell silent.
         """
-        self._loop.run(
-            self.aio.look_at_system,
-            system_id,
-            wait=wait,
-            tolerance_deg=tolerance_deg,
-            timeout=timeout,
-        )
+        self._loop.run(self.aio.look_at_system, system_id, wait=wait, tolerance_deg=tolerance_deg, timeout=timeout)
 
     def stop_looking(self) -> None:
         """End :meth:`look_at` (MAV_CMD_DO_SET_ROI_NONE). The manager decides where the gimbal turns then.
@@ -991,16 +955,7 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
 
         All else as for :meth:`command`.
         """
-        self._loop.run(
-            self.aio.command_int,
-            command,
-            *params,
-            frame=frame,
-            x=x,
-            y=y,
-            z=z,
-            component_id=component_id,
-        )
+        self._loop.run(self.aio.command_int, command, *params, frame=frame, x=x, y=y, z=z, component_id=component_id)
 
     def set_mode(self, mode: Mode, *, timeout: float = 5.0, component_id: int | None = None) -> None:
         """Order a mode and wait until HEARTBEAT reports the order's effect.
@@ -1117,13 +1072,7 @@ class Files(TwinOf["AsyncFiles"]):
         """
         return self._loop.run(self.aio.list, path, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
-    def crc32(
-        self,
-        path: str,
-        *,
-        idle_timeout_s: float = IDLE_TIMEOUT_S,
-        timeout: float | None = None,
-    ) -> int:
+    def crc32(self, path: str, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None) -> int:
         """Return the CRC-32 of a file as computed by the vehicle: polynomial 0x04C11DB7, nothing inverted.
 
         That is ``zlib.crc32(data, 0xFFFFFFFF) ^ 0xFFFFFFFF``.
@@ -1199,13 +1148,7 @@ class Files(TwinOf["AsyncFiles"]):
         """Cut a file to ``size`` bytes, or extend it with zeros. Supported by PX4, not by ArduPilot."""
         self._loop.run(self.aio.truncate, path, size, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
-    def remove(
-        self,
-        path: str,
-        *,
-        idle_timeout_s: float = IDLE_TIMEOUT_S,
-        timeout: float | None = None,
-    ) -> None:
+    def remove(self, path: str, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None) -> None:
         """Remove a file; on ArduPilot also an empty directory."""
         self._loop.run(self.aio.remove, path, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
@@ -1252,12 +1195,7 @@ class Logs(TwinOf["AsyncLogs"]):
     exceeds the size in its entry, logger "aerokit" reports it (INFO).
     """
 
-    def list(
-        self,
-        *,
-        idle_timeout_s: float = IDLE_TIMEOUT_S,
-        timeout: float | None = None,
-    ) -> tuple[LogEntry, ...]:
+    def list(self, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None) -> tuple[LogEntry, ...]:
         """Return the logs on the vehicle, oldest first; an empty tuple if there are none.
 
         Raises:
@@ -1465,23 +1403,11 @@ class Parameters(TwinOf["AsyncParameters"]):
             on_progress=on_progress,
         )
 
-    def get(
-        self,
-        name: str,
-        *,
-        idle_timeout_s: float = IDLE_TIMEOUT_S,
-        timeout: float | None = None,
-    ) -> int | float:
+    def get(self, name: str, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None) -> int | float:
         """Request one value; for arguments and errors see :meth:`read`."""
         return self._loop.run(self.aio.get, name, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
-    def read(
-        self,
-        name: str,
-        *,
-        idle_timeout_s: float = IDLE_TIMEOUT_S,
-        timeout: float | None = None,
-    ) -> Parameter:
+    def read(self, name: str, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None) -> Parameter:
         """Request one parameter from the vehicle; ``table[name]`` has the local copy.
 
         Raises:
@@ -1810,12 +1736,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         """
         self._loop.run(self.aio.resume, timeout=timeout)
 
-    def wait_finished(
-        self,
-        *,
-        timeout: float | None = None,
-        max_silence_s: float | None = MAX_SILENCE_S,
-    ) -> None:
+    def wait_finished(self, *, timeout: float | None = None, max_silence_s: float | None = MAX_SILENCE_S) -> None:
         """Wait until the mission has been flown to its end; for one that ends with landing, until it has landed.
 
         A :meth:`pause` by another task does not end the wait. Cancelling this call does not stop the vehicle.
@@ -1833,12 +1754,12 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         self._loop.run(self.aio.wait_finished, timeout=timeout, max_silence_s=max_silence_s)
 
     @property
-    def has_ended(self) -> bool:
+    def explains_mode(self) -> bool:
         """True if the vehicle holds, returns or lands because its mission has ended.
 
         This requires that the mission was the last order, and is complete or at its last item.
         """
-        return self.aio.has_ended
+        return self.aio.explains_mode
 
 
 class FenceControl(TwinOf["AsyncFenceControl"]):
@@ -2183,15 +2104,7 @@ class Camera(TwinOf["AsyncCamera"]):
         """
         self._loop.run(self.aio.track_point, x, y, radius=radius, status_hz=status_hz)
 
-    def track_rectangle(
-        self,
-        left: float,
-        top: float,
-        right: float,
-        bottom: float,
-        *,
-        status_hz: float = 5.0,
-    ) -> None:
+    def track_rectangle(self, left: float, top: float, right: float, bottom: float, *, status_hz: float = 5.0) -> None:
         """Track the object in a rectangle of the image (MAV_CMD_CAMERA_TRACK_RECTANGLE) until :meth:`stop_tracking`.
 
         Args:
@@ -2618,23 +2531,11 @@ class Settings(TwinOf["AsyncSettings"]):
             on_progress=on_progress,
         )
 
-    def get(
-        self,
-        name: str,
-        *,
-        idle_timeout_s: float = IDLE_TIMEOUT_S,
-        timeout: float | None = None,
-    ) -> SettingValue:
+    def get(self, name: str, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None) -> SettingValue:
         """Request one value; for arguments and errors see :meth:`read`."""
         return self._loop.run(self.aio.get, name, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
-    def read(
-        self,
-        name: str,
-        *,
-        idle_timeout_s: float = IDLE_TIMEOUT_S,
-        timeout: float | None = None,
-    ) -> Setting:
+    def read(self, name: str, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None) -> Setting:
         """Request one setting from the component; ``table[name]`` has the local copy.
 
         Raises:
@@ -2791,13 +2692,7 @@ class Component(TwinOf["AsyncComponent"]):
         """
         return Subscription(
             self._loop,
-            self._loop.call(
-                self.aio.subscribe,
-                *types,
-                capacity=capacity,
-                overflow=overflow,
-                rate_hz=rate_hz,
-            ),
+            self._loop.call(self.aio.subscribe, *types, capacity=capacity, overflow=overflow, rate_hz=rate_hz),
         )
 
     def message(self, message_type: type[MessageT], *, rate_hz: float | None = None) -> StateCell[MessageT]:
@@ -3166,13 +3061,7 @@ class Vehicle(VehicleTwin):
         """
         return Subscription(
             self._loop,
-            self._loop.call(
-                self.aio.subscribe,
-                *types,
-                capacity=capacity,
-                overflow=overflow,
-                rate_hz=rate_hz,
-            ),
+            self._loop.call(self.aio.subscribe, *types, capacity=capacity, overflow=overflow, rate_hz=rate_hz),
         )
 
     def rate(self, message_type: type[Message], rate_hz: float) -> AbstractContextManager[None]:
@@ -3610,12 +3499,7 @@ class Vehicle(VehicleTwin):
         """
         self._loop.run(self.aio.land, timeout=timeout, max_silence_s=max_silence_s)
 
-    def return_to_launch(
-        self,
-        *,
-        timeout: float | None = 600.0,
-        max_silence_s: float | None = MAX_SILENCE_S,
-    ) -> None:
+    def return_to_launch(self, *, timeout: float | None = 600.0, max_silence_s: float | None = MAX_SILENCE_S) -> None:
         """Return to launch; returns on the ground, or above it if the autopilot does not land by itself.
 
         Raises the same errors as :meth:`land`.

@@ -284,7 +284,7 @@ class MissionControl(VehiclePlan["Mission"]):
             )
 
     @property
-    def has_ended(self) -> bool:
+    def explains_mode(self) -> bool:
         """True if the vehicle holds, returns or lands because its mission has ended.
 
         This requires that the mission was the last order, and is complete or at its last item.
