@@ -36,7 +36,7 @@ async def test_assignment_error_names_method(grounded: Flight, name: str, value:
 @pytest.mark.anyio
 async def test_vehicle_attributes_are_read_only(grounded: Flight) -> None:
     objects = [grounded.vehicle, *(getattr(grounded.vehicle, part) for part in PARTS[:-1])]
-    assert [assigned for each in objects for assigned in assignable(each)] == []
+    assert [assigned for thing in objects for assigned in assignable(thing)] == []
 
 
 def test_blocking_vehicle_attributes_are_read_only() -> None:
@@ -48,7 +48,7 @@ def test_blocking_vehicle_attributes_are_read_only() -> None:
             vehicle.position.latitude_deg  # type: ignore[attr-defined]  # noqa: B018
         assert copy.copy(vehicle.position).latest is not None
         objects = [vehicle, *(getattr(vehicle, part) for part in PARTS)]
-        assert [assigned for each in objects for assigned in assignable(each)] == []
+        assert [assigned for thing in objects for assigned in assignable(thing)] == []
 
 
 def assignable(thing: Any) -> list[str]:

@@ -143,7 +143,7 @@ async def _attempt(
         outcome.seconds = loop.time() - begun
         outcome.heard = program.radio.incoming.frames - heard
         outcome.left = await _what_is_left(program, held, leftovers)
-        outcome.sent = Counter(type(each).NAME for _, each in program.wire.sent if not isinstance(each, OWN_LIFE))
+        outcome.sent = Counter(type(message).NAME for _, message in program.wire.sent if not isinstance(message, OWN_LIFE))
     return outcome
 
 

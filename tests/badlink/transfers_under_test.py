@@ -320,7 +320,7 @@ def check_upload(_: Any, copter: SimulatedCopter, sizes: Sizes) -> None:
 
 
 def check_folder(entries: Any, copter: SimulatedCopter, sizes: Sizes) -> None:
-    assert [(each.name, each.size) for each in entries] == copter.files.entries(FOLDER)
+    assert [(entry.name, entry.size) for entry in entries] == copter.files.entries(FOLDER)
 
 
 def pages(copter: SimulatedCopter, sizes: Sizes) -> int:
@@ -333,7 +333,7 @@ async def know_logs(program: Program) -> None:
 
 
 def check_logs(entries: Any, copter: SimulatedCopter, sizes: Sizes) -> None:
-    assert [(each.id, each.size, each.time_utc.timestamp()) for each in entries] == [
+    assert [(entry.id, entry.size, entry.time_utc.timestamp()) for entry in entries] == [
         (number, log.size, log.time_utc) for number, log in enumerate(copter.storage.logs.logs, start=1)
     ]
 

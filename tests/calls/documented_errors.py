@@ -19,9 +19,9 @@ FOR_ALL = re.compile(r"(Every method raises:|All methods take|NotSupported is\s+
 
 def documented() -> set[tuple[str, str]]:
     """(call, error) for everything that is promised."""
-    known = {each.qualified: each for each in members()}
-    pairs = {(name, error) for name, each in known.items() for error in _of(each, known, set())}
-    return pairs | {(each.__name__, error) for each in CLASSES for error in _of_class(each)}
+    known = {member.qualified: member for member in members()}
+    pairs = {(name, error) for name, member in known.items() for error in _of(member, known, set())}
+    return pairs | {(cls.__name__, error) for cls in CLASSES for error in _of_class(cls)}
 
 
 def _of(member: Member, known: dict[str, Member], seen: set[str]) -> set[str]:

@@ -149,7 +149,7 @@ def _actions() -> Table:
         ("Vehicle.set_heading", "InvalidArgument"): P(_method("set_heading", 999), airborne),
         ("Vehicle.set_home", "OperationTimeout"): P(
             _method("set_home", timeout=1),
-            before=lambda s: [accepted(each)(s) for each in (Cmd.DO_SET_HOME, Cmd.REQUEST_MESSAGE)],
+            before=lambda s: [accepted(command)(s) for command in (Cmd.DO_SET_HOME, Cmd.REQUEST_MESSAGE)],
         ),
         ("Vehicle.look_at", "ValueUnknownError"): P(_look_north, airborne, _forget("home"), on="px4"),
         ("Vehicle.look_at", "OperationRejected"): later(

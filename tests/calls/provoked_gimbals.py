@@ -31,8 +31,8 @@ def _fitted(*troubles: Trouble) -> Trouble:
 
     def before(stage: Stage) -> None:
         stage.simulated.parameters["MNT1_TYPE"] = 1.0
-        for each in troubles:
-            each(stage)
+        for trouble in troubles:
+            trouble(stage)
 
     return before
 

@@ -34,8 +34,8 @@ def _camera(*troubles: Callable[[SimulatedCamera], object]) -> Callable[[Stage],
     def before(stage: Stage) -> None:
         camera = camera_of(stage)
         settings_of(stage)._forget()
-        for each in troubles:
-            each(camera)
+        for trouble in troubles:
+            trouble(camera)
 
     return before
 

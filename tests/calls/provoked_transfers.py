@@ -37,7 +37,7 @@ def _of(part: str, name: str, *args: Any, **options: Any) -> Do:
     """A method of a part of the vehicle; arguments that are functions are given the stage."""
 
     def do(stage: Stage) -> Any:
-        given = [each(stage) if callable(each) else each for each in args]
+        given = [arg(stage) if callable(arg) else arg for arg in args]
         return getattr(getattr(stage.vehicle, part), name)(*given, **options)
 
     return do
@@ -267,7 +267,7 @@ def _flown() -> Table:
 
 
 def _both(*troubles: Callable[[Stage], object]) -> Callable[[Stage], object]:
-    return lambda stage: [each(stage) for each in troubles]
+    return lambda stage: [trouble(stage) for trouble in troubles]
 
 
 # ---------------------------------------------------------------------------------- files and logs

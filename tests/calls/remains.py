@@ -41,7 +41,7 @@ def _all(stage: Stage) -> Iterator[str]:
     make_parts(vehicle)
     yield from _tasks()
     yield from _timers()
-    talks = [vehicle._session, *(each._session for each in vehicle._components._by_id.values())]
+    talks = [vehicle._session, *(component._session for component in vehicle._components._by_id.values())]
     streams = [stream for session in talks for stream in session.rates._streams.values()]
     counters = [stream.on_frame for stream in streams]  # they stay, one for each stream
     for key, sinks in connection.bus._sinks.items():
@@ -61,7 +61,7 @@ def _all(stage: Stage) -> Iterator[str]:
     yield from _times("sending", vehicle._arbiter._sent)
     yield from _times("held parameter", vehicle.parameters._registry._blocks)
     closing = vehicle.files._channel._closing.values()
-    yield from _times("file that is being closed", [each for each in closing if not each.ended.is_set()])
+    yield from _times("file that is being closed", [file for file in closing if not file.ended.is_set()])
     yield from _times("open session", range(stage.simulated.ftp.open_sessions))
     yield from _times("log on its way", range(stage.simulated.storage.logs.is_busy))
     yield from _times("set-point stream", range(vehicle._flight_cleanup.stop_stream is not None))

@@ -39,7 +39,7 @@ def test_public_coroutines_are_all_in_table() -> None:
 def test_public_classes_are_all_covered(tmp_path: Path) -> None:
     async def look_for_them() -> None:
         async with open_stage("ardupilot", tmp_path) as stage:
-            assert [each for each in own_classes_in(stage.vehicle) if each not in CLASSES] == []
+            assert [cls for cls in own_classes_in(stage.vehicle) if cls not in CLASSES] == []
 
     run_virtual(look_for_them())
 

@@ -60,13 +60,13 @@ async def faults_of(pairs: list[tuple[str, str]], folder: Path) -> list[str]:
     """Return the errors that were not provoked; calls on one autopilot share a flight."""
     found = []
     for on in ("ardupilot", "px4"):
-        together = [each for each in pairs if PROVOCATIONS[each].on == on and not PROVOCATIONS[each].alone]
-        alone = [[each] for each in pairs if PROVOCATIONS[each].on == on and PROVOCATIONS[each].alone]
+        together = [pair for pair in pairs if PROVOCATIONS[pair].on == on and not PROVOCATIONS[pair].alone]
+        alone = [[pair] for pair in pairs if PROVOCATIONS[pair].on == on and PROVOCATIONS[pair].alone]
         for group in filter(None, [together, *alone]):
             async with AsyncExitStack() as stack:
                 stage = await stack.enter_async_context(open_stage(on, folder))
                 for pair in group:
-                    found += [f"{pair}: {each}" for each in await fault_of(stage, *pair)]
+                    found += [f"{pair}: {fault}" for fault in await fault_of(stage, *pair)]
     return found
 
 
@@ -101,8 +101,8 @@ def is_it(raised: Exception, name: str, error: str) -> bool:
     """This error, or a special case of it that is not promised by itself."""
     known = {cls.__name__ for cls in type(raised).__mro__} & NAMES
     return error in known and not any(
-        (name, each) in PROMISED and each != error and issubclass(getattr(errors, each, OSError), _class(error))
-        for each in known
+        (name, member) in PROMISED and member != error and issubclass(getattr(errors, member, OSError), _class(error))
+        for member in known
     )
 
 

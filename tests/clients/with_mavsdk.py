@@ -74,8 +74,8 @@ async def fly(kind: str, port: int) -> None:
     await insist(lambda: raw.upload_mission(items))
     steps.done("upload", len(items))
     back = await raw.download_mission()
-    assert [each.command for each in back] == [each.command for each in items], back
-    assert [each.x for each in back[1:]] == [each.x for each in items[1:]], back
+    assert [item.command for item in back] == [item.command for item in items], back
+    assert [item.x for item in back[1:]] == [item.x for item in items[1:]], back
     steps.done("download", len(back))
 
     await telemetry.set_rate_position(5.0)  # ArduPilot streams no position unasked, and MAVSDK does not ask

@@ -249,7 +249,7 @@ async def our_client() -> list[bool]:
 
         async def interval() -> str:
             async with camera.photo_interval(0.5, count=3) as captures:
-                return f"{[each.index async for each in captures]}"
+                return f"{[capture.index async for capture in captures]}"
 
         async def video() -> str:
             async with camera.video():

@@ -167,8 +167,8 @@ OURS = ("link_state", "link_quality", "links")
 def every_cell(vehicle: aerokit.Vehicle) -> list[StateCell[Any]]:
     """All cells of a vehicle, its parts and its devices; `make_parts` has made them."""
     gc.collect()
-    cells = [each for each in gc.get_objects() if isinstance(each, StateCell)]
-    return [each for each in cells if each.name not in OURS and each._closed_by is None]
+    cells = [thing for thing in gc.get_objects() if isinstance(thing, StateCell)]
+    return [cell for cell in cells if cell.name not in OURS and cell._closed_by is None]
 
 
 async def test_cells_after_pause_are_as_old_as_their_message(grounded: Flight) -> None:

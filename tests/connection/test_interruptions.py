@@ -109,7 +109,7 @@ class Cable:
 
     def asked_for(self, kind: type[m.Attitude]) -> int:
         """Number of requests to the vehicle for this message."""
-        return sum(each.command == MavCmd.SET_MESSAGE_INTERVAL and each.param1 == kind.ID for each in self.sent)
+        return sum(message.command == MavCmd.SET_MESSAGE_INTERVAL and message.param1 == kind.ID for message in self.sent)
 
 
 @asynccontextmanager

@@ -83,8 +83,8 @@ def test_unproven_link_is_never_used(
             if before is not None and before.is_alive(now):
                 assert reason in ("better", "cheaper")
         elif choice.used is before and before is not None and not before.is_alive(now):
-            others = [each for each in choice.candidates.values() if each is not before and each.is_proven]
-            assert not any(each.is_alive(now) for each in others), "a living link was not taken"
+            others = [candidate for candidate in choice.candidates.values() if candidate is not before and candidate.is_proven]
+            assert not any(other.is_alive(now) for other in others), "a living link was not taken"
 
 
 @given(st.floats(0.2, 20.0), st.floats(-1e5, 1e5), st.lists(st.floats(0.0, 0.4), min_size=3, max_size=30))

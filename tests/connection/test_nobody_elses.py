@@ -159,7 +159,7 @@ async def test_ignored_sender_gets_no_counters(link: KeptPeers) -> None:
             link.hear(f"{port}@late", (251, 1), ATTITUDE)
         for component_id in range(100, 200):
             link.hear("0@swarm", (1, component_id), COPTER)
-        counted = [source for each in connection.statistics() for source in each.sources]
+        counted = [source for link in connection.statistics() for source in link.sources]
         assert len(counted) == MAX_PEERS + 100
 
 
@@ -170,7 +170,7 @@ async def test_evicted_peer_frees_its_counters(link: KeptPeers) -> None:
                 link.hear(f"{port}@swarm", (1 + port % 250, component_id + 8 * (port // 250)), ATTITUDE)
         for port in range(100):
             link.hear(f"{port}@new", (251, 1), ATTITUDE)
-        counted = sum(len(each.sources) for each in connection.statistics())
+        counted = sum(len(link.sources) for link in connection.statistics())
         assert counted == MAX_SENDERS - 100 * 8 + 99  # the first new one came when all places were taken
 
 
@@ -201,7 +201,7 @@ async def test_heartbeats_of_many_senders_fill_no_table(link: KeptPeers) -> None
                 connection.bytes_received(encoder.encode(COPTER), f"{component_id}@stranger")
         assert len(connection.heartbeats) <= MAX_ROUTES
         assert len(connection._routes._routes) <= MAX_ROUTES
-        assert sum(len(each.sources) for each in connection.statistics()) <= MAX_SENDERS
+        assert sum(len(link.sources) for link in connection.statistics()) <= MAX_SENDERS
         await copter.live("14550@copter", 2)
         assert connection.counts(1)[1] == 0
         assert peer_of(vehicle, link) == "14550@copter"
@@ -234,7 +234,7 @@ async def test_foreign_host_cannot_take_route_after_silence(link: KeptPeers, cap
             await intruder.live("666@stranger", 10, DISARMED)
         assert is_armed(vehicle)
         assert vehicle.is_silent
-        kinds = [type(each) for each in heard]
+        kinds = [type(message) for message in heard]
         assert kinds == [events.DuplicateSender, events.RouteChangeRefused]
         assert heard[1] == events.RouteChangeRefused(heard[1].at, 1, 1, "666@stranger")
         assert "frames from 666@stranger under the same ids are refused" in caplog.text
@@ -272,7 +272,7 @@ async def test_other_host_that_continues_stream_takes_route_after_silence(link: 
         await copter.live("14550@mobile", 8)
         assert peer_of(vehicle, link) == "14550@mobile"
         assert not vehicle.is_silent
-        assert [type(each) for each in heard] == [events.DuplicateSender, events.RouteChanged]
+        assert [type(message) for message in heard] == [events.DuplicateSender, events.RouteChanged]
 
 
 async def test_known_clock_must_continue(link: KeptPeers) -> None:
@@ -296,7 +296,7 @@ async def test_other_port_that_continues_stream_takes_route_at_once(link: KeptPe
         heard, begun = told(vehicle.connection), vehicle.connection.now()
         await copter.live("14999@copter", 1)
         assert peer_of(vehicle, link) == "14999@copter"
-        assert [type(each) for each in heard] == [events.RouteChanged]
+        assert [type(message) for message in heard] == [events.RouteChanged]
         assert heard[0].at - begun < 1
 
 
@@ -310,7 +310,7 @@ async def test_two_programs_on_one_host_do_not_alternate(link: KeptPeers) -> Non
             second.say("14999@copter", DISARMED)
             await anyio.sleep(0.25)
         assert is_armed(vehicle)
-        assert [type(each) for each in heard] == [events.DuplicateSender]
+        assert [type(message) for message in heard] == [events.DuplicateSender]
 
 
 async def test_reboot_on_same_host_takes_route_after_silence(link: KeptPeers) -> None:
@@ -375,8 +375,8 @@ async def test_two_vehicles_behind_one_peer_do_not_flap(link: KeptPeers) -> None
         async with anyio.create_task_group() as group:
             group.start_soon(copter.live, "14550@copter", 20, ARMED)
             group.start_soon(other.live, "14550@copter", 20, DISARMED)
-        assert events.DuplicateSender in [type(each) for each in heard]
-        assert len([each for each in heard if isinstance(each, events.DuplicateSender)]) == 1
+        assert events.DuplicateSender in [type(message) for message in heard]
+        assert len([message for message in heard if isinstance(message, events.DuplicateSender)]) == 1
         assert max(changes) <= 3
         assert len(changes) <= 3
         assert is_armed(vehicle)

@@ -61,7 +61,7 @@ async def test_unfed_heartbeat_pauses_and_resumes(caplog: pytest.LogCaptureFixtu
 async def test_heartbeat_has_the_configured_type() -> None:
     async with open_flight(heartbeat=OwnHeartbeat(type=MavType.ONBOARD_CONTROLLER)) as flight:
         await anyio.sleep(2.0)
-        assert {each.type for each in flight.wire.all(m.Heartbeat)} == {MavType.ONBOARD_CONTROLLER}
+        assert {heartbeat.type for heartbeat in flight.wire.all(m.Heartbeat)} == {MavType.ONBOARD_CONTROLLER}
 
 
 @pytest.mark.anyio

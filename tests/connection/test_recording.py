@@ -214,7 +214,7 @@ def test_full_disk_is_reported_once(caplog: pytest.LogCaptureFixture, end: str) 
     recording.write(frame, 2.0)
     recording.flush()
     recording.close()
-    errors = [each.getMessage() for each in caplog.records if each.levelno == logging.ERROR]
+    errors = [record.getMessage() for record in caplog.records if record.levelno == logging.ERROR]
     assert errors == ["recording to /dev/full has ended: No space left on device"]
 
 

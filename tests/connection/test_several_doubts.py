@@ -218,7 +218,7 @@ async def test_link_lost_while_another_opens_does_not_end_connection() -> None:
             await anyio.sleep(1)
             assert connection.is_open
             assert connection.links is not None
-            assert [each.state for each in connection.links.value] == [LinkState.LOST, LinkState.CONNECTED]
+            assert [link.state for link in connection.links.value] == [LinkState.LOST, LinkState.CONNECTED]
 
 
 async def test_links_all_lost_while_opening_raise() -> None:
@@ -264,9 +264,9 @@ async def test_link_opened_late_ends_the_interruption() -> None:
         news = EventLog(connection, events.LinkInterrupted, events.LinkRestored)
         far.close()
         await anyio.sleep(0.1)
-        assert [type(each) for each in news.all] == [events.LinkInterrupted]
+        assert [type(event) for event in news.all] == [events.LinkInterrupted]
         await anyio.sleep(20)
-        assert [type(each) for each in news.all] == [events.LinkInterrupted, events.LinkRestored]
+        assert [type(event) for event in news.all] == [events.LinkInterrupted, events.LinkRestored]
         late._lose("gone")
         assert not connection.is_open
 

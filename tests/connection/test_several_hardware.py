@@ -63,7 +63,7 @@ async def test_vehicle_with_other_hardware_id_is_reported_and_refused(
             async with aerokit.connect(connection) as flying:
                 await flying.wait_ready()
                 await anyio.sleep(10)
-                assert [(each.system_id, type(each)) for each in doubts.all] == [(1, events.DuplicateSender)]
+                assert [(event.system_id, type(event)) for event in doubts.all] == [(1, events.DuplicateSender)]
                 twins.told.messages.clear()
                 twins.radios.cut(0)
                 await anyio.sleep(8)
@@ -72,7 +72,7 @@ async def test_vehicle_with_other_hardware_id_is_reported_and_refused(
                 assert not twins.theirs.is_armed
                 assert [index for index, _ in twins.told.of(m.CommandLong) if index == 1] == []
                 assert choice_of(connection).candidates[1].is_doubted
-    warnings = [each.getMessage() for each in caplog.records if "hardware id" in each.getMessage()]
+    warnings = [record.getMessage() for record in caplog.records if "hardware id" in record.getMessage()]
     assert len(warnings) == 1
     assert "another vehicle with system id 1 was received over" in warnings[0]
 
@@ -95,7 +95,7 @@ async def test_both_links_are_probed_without_vehicle_object() -> None:
     twins = Twins(b"A" * 18, b"B" * 18)
     async with twins.connected() as connection:
         await anyio.sleep(5)
-        asked = [index for index, each in twins.told.of(m.CommandLong) if getattr(each, "command", 0) == 512]
+        asked = [index for index, message in twins.told.of(m.CommandLong) if getattr(message, "command", 0) == 512]
         assert sorted(asked) == [0, 1]
         assert choice_of(connection).candidates[1].is_doubted
 
@@ -106,8 +106,8 @@ async def test_second_radio_is_asked_once_for_hardware() -> None:
     async with over(radios, copter(b"A" * 18)) as connection, aerokit.connect(connection) as flying:
         await flying.wait_ready()
         await anyio.sleep(5)
-        asked = [each for index, each in told.of(m.CommandLong) if index == 1]
-        assert [(getattr(each, "command", 0), getattr(each, "param1", 0)) for each in asked] == [(512, 148)]
+        asked = [message for index, message in told.of(m.CommandLong) if index == 1]
+        assert [(getattr(request, "command", 0), getattr(request, "param1", 0)) for request in asked] == [(512, 148)]
         assert choice_of(connection).candidates[1].is_proven
 
 

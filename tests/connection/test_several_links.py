@@ -71,7 +71,7 @@ async def test_flight_continues_when_the_used_link_fails(vehicle: SimulatedVehic
         assert connection.now() - cut_at > 3, "it was cut on the way"
         await flying.land()
         assert flying.heartbeat_age < 2
-    assert [each for each in news.all if not isinstance(each, events.LinkSelected)] == []
+    assert [event for event in news.all if not isinstance(event, events.LinkSelected)] == []
     orders = told.of(m.CommandLong, m.CommandInt, m.SetMode, m.SetPositionTargetGlobalInt)
     assert orders[0][0] == 0
     assert orders[-1][0] == 1
@@ -86,8 +86,8 @@ async def test_command_is_sent_once_over_one_link() -> None:
         told.messages.clear()
         await flying.arm()
         await flying.take_off(5)
-        orders = [each for each in told.of(m.CommandLong) if getattr(each[1], "command", 0) in (400, 22)]
-        assert [getattr(each, "command", 0) for _, each in orders] == [400, 22]
+        orders = [entry for entry in told.of(m.CommandLong) if getattr(entry[1], "command", 0) in (400, 22)]
+        assert [getattr(order, "command", 0) for _, order in orders] == [400, 22]
         assert len({index for index, _ in orders}) == 1
         await anyio.sleep(3)
         heartbeats = told.of(m.Heartbeat)
@@ -105,7 +105,7 @@ async def test_shared_stream_is_delivered_once() -> None:
             await anyio.sleep(10)
             came.clear()
             await anyio.sleep(20)
-        times = [each.time_boot_ms for each in came]
+        times = [message.time_boot_ms for message in came]
         assert len(set(times)) == len(times), "nothing came twice"
         assert times == sorted(times), "nothing older came after something newer"
         assert 0.65 < len(times) / 400 < 0.85, "three of four arrive by one of the two"
@@ -123,7 +123,7 @@ async def test_copies_leave_no_gap_when_one_radio_fails() -> None:
             came.clear()
             radios.cut(0 if used else 1)
             await anyio.sleep(5)
-        times = [each.time_boot_ms for each in came]
+        times = [message.time_boot_ms for message in came]
         gaps = [after - before for before, after in pairwise(times)]
         assert max(gaps) <= 60
         assert [reason for _, reason in news.chosen] == ["silent"]
@@ -152,7 +152,7 @@ async def test_costly_link_is_used_only_while_other_fails() -> None:
         async with aerokit.connect(connection):
             await anyio.sleep(10)
             cheap, costly = radios.links[1].address, radios.links[0].address
-            used = [each.link for each in news.all if isinstance(each, events.LinkSelected)][-1]
+            used = [event.link for event in news.all if isinstance(event, events.LinkSelected)][-1]
             assert used == cheap
             radios.cut(1)
             await anyio.sleep(3)
@@ -203,7 +203,7 @@ async def test_other_vehicle_with_same_id_is_never_accepted() -> None:
             with pytest.raises(AerokitError):
                 await flying.arm()
             assert not another.is_armed
-            to_it = [each for index, each in told.of(m.CommandLong) if index == 1]
+            to_it = [message for index, message in told.of(m.CommandLong) if index == 1]
             assert to_it == []
 
 
@@ -218,7 +218,7 @@ async def test_component_behind_other_link_is_reached_there() -> None:
         for _ in range(3):
             radios.far[1].write(camera.encode(m.Heartbeat(30, 8, 0, 0, 4)))
             await anyio.sleep(1)
-        assert len([each for each in heard if each.autopilot == 8]) == 3
+        assert len([message for message in heard if message.autopilot == 8]) == 3
         told.messages.clear()
         connection.send(m.CommandLong(1, 100, 512, 0, 259.0, 0, 0, 0, 0, 0, 0))
         connection.send(m.CommandLong(1, 1, 512, 0, 148.0, 0, 0, 0, 0, 0, 0))
@@ -234,7 +234,7 @@ async def test_own_frames_forwarded_by_vehicle_are_ignored() -> None:
             radios.far[1].write(ours.encode(m.Heartbeat(6, 8, 0, 0, 4)))
             await anyio.sleep(1)
         assert connection.links is not None
-        assert all(each.systems == (1,) for each in connection.links.value)
+        assert all(link.systems == (1,) for link in connection.links.value)
         assert (connection.source_system, connection.source_component) not in connection.heartbeats
 
 
@@ -292,7 +292,7 @@ async def test_closed_link_is_left_and_all_closed_end_connection() -> None:
         radios.far[used].close()
         await anyio.sleep(0.2)
         assert [reason for _, reason in news.chosen] == ["lost"]
-        changed = [each for each in news.all if isinstance(each, events.MemberLinkStateChanged)]
+        changed = [event for event in news.all if isinstance(event, events.MemberLinkStateChanged)]
         assert (changed[0].link, changed[0].after) == (radios.links[used].address, LinkState.LOST)
         radios.far[1 - used].close()
         await anyio.sleep(0.2)
@@ -354,7 +354,7 @@ async def test_ground_station_shares_all_links() -> None:
         used = 0 if connection.links.value[0].used_for else 1  # type: ignore[union-attr]
         told.messages.clear()
         await station.arm()
-        arming = [index for index, each in told.of(m.CommandLong) if getattr(each, "command", 0) == 400]
+        arming = [index for index, message in told.of(m.CommandLong) if getattr(message, "command", 0) == 400]
         assert arming == [used]
         found: list[int] = []
 
@@ -405,7 +405,7 @@ async def test_link_that_fails_after_reboot_is_left(seconds: float, hiccups: int
 
 def used_of(connection: Connection) -> int:
     assert connection.links is not None
-    return next(index for index, each in enumerate(connection.links.value) if each.used_for)
+    return next(index for index, link in enumerate(connection.links.value) if link.used_for)
 
 
 async def stand_still(copter: SimulatedCopter, radios: Radios, *, is_silent: bool) -> None:

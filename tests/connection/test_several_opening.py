@@ -83,12 +83,12 @@ async def test_failed_member_link_is_reported_once(failures: int, caplog: pytest
         async with open_connection(together) as connection:
             news = EventLog(connection, events.MemberLinkOpenFailed, events.MemberLinkStateChanged)
             await anyio.sleep(30)
-            told = [each for each in news.all if isinstance(each, events.MemberLinkOpenFailed)]
-            assert [each.link for each in told] == ["memory:away"] * (failures > 1)
-            assert all(isinstance(each.error, LinkOpenError) for each in told)
+            told = [event for event in news.all if isinstance(event, events.MemberLinkOpenFailed)]
+            assert [event.link for event in told] == ["memory:away"] * (failures > 1)
+            assert all(isinstance(event.error, LinkOpenError) for event in told)
             last = news.all[-1]
             assert isinstance(last, events.MemberLinkStateChanged)
             assert (last.link, last.after) == ("memory:away", LinkState.CONNECTED)
-    warnings = [each.getMessage() for each in caplog.records if "memory:away" in each.getMessage()]
+    warnings = [record.getMessage() for record in caplog.records if "memory:away" in record.getMessage()]
     assert len(warnings) == 1
     assert "refused" in warnings[0]

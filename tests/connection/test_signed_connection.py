@@ -321,7 +321,7 @@ async def test_refused_frames_are_reported_once_per_reason(tmp_path: Path) -> No
             told = [await refused.get() for _ in range(3)]
             assert (await heard.get()) == HEARTBEAT
             assert refused.missed == heard.missed == 0
-        assert [(each.system_id, each.reason) for each in told] == [
+        assert [(event.system_id, event.reason) for event in told] == [
             (7, Refusal.UNSIGNED.value),
             (8, Refusal.WRONG_SIGNATURE.value),
             (1, Refusal.REPLAYED.value),
@@ -329,7 +329,7 @@ async def test_refused_frames_are_reported_once_per_reason(tmp_path: Path) -> No
         assert tapped == [1, 51]
         assert list(connection.heartbeats) == [(1, 1)]
     assert signing.refused == {**dict.fromkeys(Refusal, 2), Refusal.TOO_OLD: 0}
-    received = [each for _, each in read_tlog(path) if each[5] != 255]
+    received = [frame for _, frame in read_tlog(path) if frame[5] != 255]
     assert received[0] == good
     assert len(received) == 2
 
@@ -346,10 +346,10 @@ async def test_forwarded_frames_keep_signature_and_keys_are_not_recorded(
         await anyio.sleep(0.01)
         assert [frame.message_id for frame in far.frames].count(SetupSigning.ID) == 2
         assert theirs in [frame.raw for frame in far.frames]
-    recorded = [each for _, each in read_tlog(path)]
+    recorded = [frame for _, frame in read_tlog(path)]
     assert theirs in recorded
     assert KEY.secret not in path.read_bytes()
-    assert all(Signing(KEY).has_signed(Frame.parse(each)) for each in recorded if each[5] == 255)
+    assert all(Signing(KEY).has_signed(Frame.parse(frame)) for frame in recorded if frame[5] == 255)
 
 
 async def test_unknown_message_is_verified() -> None:

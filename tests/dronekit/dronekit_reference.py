@@ -136,7 +136,7 @@ SIGNATURES: dict[str, dict[str, Any]] = {
     "mavlink.MAVConnection.reset": {},
     "mavlink.MAVConnection.start": {},
     "mavlink.MAVConnection.stop_threads": {},
-    **{f"{owner}.{name}": each for owner in ("Vehicle", "Locations") for name, each in OBSERVERS.items()},
+    **{f"{owner}.{name}": observer for owner in ("Vehicle", "Locations") for name, observer in OBSERVERS.items()},
 }
 """Arguments in their order, with their defaults; ``...`` where there is none."""
 

@@ -190,8 +190,8 @@ def row_36_download(stage: Stage) -> Any:
         (len(commands), commands.count),
         (first.seq, first.command, first.x, first.y, first.z, first.frame),
         [caught(lambda: commands[3]), caught(lambda: commands["a"])],
-        [each.seq for each in commands[0:2]],
-        [each.seq for each in commands],
+        [command.seq for command in commands[0:2]],
+        [command.seq for command in commands],
         str(home),
         [name for _, name, _ in events],
     )
@@ -204,7 +204,7 @@ def waypoint(stage: Stage, item: Item) -> Any:
 def kept(stage: Stage) -> list[tuple[int, float, float, float]]:
     """The mission on the vehicle; home as its command only."""
     home, *rest = stage.fc.missions.items
-    return [(home.command, 0, 0, 0), *((each.command, each.x, each.y, each.z) for each in rest)]
+    return [(home.command, 0, 0, 0), *((item.command, item.x, item.y, item.z) for item in rest)]
 
 
 UPLOADED = [(16, 0, 0, 0), (22, 0.0, 0.0, 10.0), (16, -35.75, 149.25, 21.0)]
@@ -219,7 +219,7 @@ def row_37_upload(stage: Stage) -> Any:
         commands.add(waypoint(stage, item))
     stage.vehicle.commands.upload()
     first = kept(stage)
-    seen = [(each.seq, each.command) for each in downloaded(stage)]
+    seen = [(item.seq, item.command) for item in downloaded(stage)]
     return first, len(commands), seen, kept(stage)
 
 

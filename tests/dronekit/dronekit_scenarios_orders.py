@@ -171,7 +171,7 @@ def row_13_speeds(stage: Stage) -> Any:
     ground = stage.commands_of(stage.assign("groundspeed", 7))
     air = stage.commands_of(stage.assign("airspeed", 8.5))
     vehicle = stage.vehicle
-    return [each[:4] for each in ground], [each[:4] for each in air], vehicle.groundspeed, vehicle.airspeed
+    return [frame[:4] for frame in ground], [frame[:4] for frame in air], vehicle.groundspeed, vehicle.airspeed
 
 
 @scenario(

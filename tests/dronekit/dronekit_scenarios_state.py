@@ -56,7 +56,7 @@ def row_02_no_rate_asks_for_no_streams(stage: Stage) -> Any:
 def row_02_rate_and_source(stage: Stage) -> Any:
     stream = stage.fc.wait_for("REQUEST_DATA_STREAM")
     stage.fc.wait_for("HEARTBEAT")
-    return stream.req_message_rate, sorted({(each.system, each.component) for each in stage.fc.received()})
+    return stream.req_message_rate, sorted({(frame.system, frame.component) for frame in stage.fc.received()})
 
 
 # --------------------------------------------------------------------------------------- values

@@ -66,7 +66,7 @@ class Stage:
         count, quiet = -1, 0
         while quiet < QUIET:
             self._round_trip()
-            before, count = count, len([each for each in self.fc.received() if each.name not in ALWAYS])
+            before, count = count, len([frame for frame in self.fc.received() if frame.name not in ALWAYS])
             quiet = quiet + 1 if count == before else 0
 
     def _round_trip(self) -> None:

@@ -253,8 +253,8 @@ class FlightController:
                 ready = select.select(listened, [], [], beats_in)[0]
             except (OSError, ValueError):  # dropped meanwhile
                 continue
-            for each in ready:
-                self._read(each)
+            for ready_socket in ready:
+                self._read(ready_socket)
             if self.heartbeat_s and time.monotonic() >= next_beat:
                 next_beat = time.monotonic() + (self.heartbeat_s if self._log else UNHEARD_S)
                 self.beat()
@@ -360,7 +360,7 @@ def message_of(name: str, **fields: Any) -> Message:
     assert not unknown, f"{name} has no {unknown}"
     lengths = dict(zip(kind.ordered_fieldnames, kind.array_lengths, strict=True))
     kinds = dict(zip(kind.fieldnames, kind.fieldtypes, strict=True))
-    return kind(*(fields.get(each, _zero(kinds[each], lengths[each])) for each in kind.fieldnames))
+    return kind(*(fields.get(name, _zero(kinds[name], lengths[name])) for name in kind.fieldnames))
 
 
 def _zero(kind: str, length: int) -> Any:

@@ -21,8 +21,8 @@ def main(names: list[str]) -> None:
     import dronekit  # type: ignore[import-not-found, unused-ignore]
 
     logging.getLogger().addHandler(logging.NullHandler())
-    kept = [each for each in dronekit_scenarios.SCENARIOS if each.is_kept and (not names or each.name in names)]
-    print(json.dumps({each.name: _observed(dronekit, each) for each in kept}))  # noqa: T201
+    kept = [scenario for scenario in dronekit_scenarios.SCENARIOS if scenario.is_kept and (not names or scenario.name in names)]
+    print(json.dumps({scenario.name: _observed(dronekit, scenario) for scenario in kept}))  # noqa: T201
 
 
 def _observed(dronekit: Any, each: Scenario) -> Any:

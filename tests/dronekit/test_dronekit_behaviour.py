@@ -26,8 +26,8 @@ from flight_controller import FlightController
 import aerokit.dronekit as dronekit
 
 DRONEKIT_PYTHON = os.environ.get("AEROKIT_DRONEKIT_PYTHON", "")
-QUICK = [each for each in SCENARIOS if not each.is_slow]
-SLOW = [each for each in SCENARIOS if each.is_slow]
+QUICK = [scenario for scenario in SCENARIOS if not scenario.is_slow]
+SLOW = [scenario for scenario in SCENARIOS if scenario.is_slow]
 
 
 @pytest.fixture
@@ -40,7 +40,7 @@ def copter() -> Iterator[Stage]:
 def waiting(request: pytest.FixtureRequest) -> Iterator[dict[str, Future[Any]]]:
     """Run slow scenarios in the background while other tests run; each collects its own log records."""
     slow: dict[str, Callable[[], Any]] = {
-        f"test_slow_scenario[{each.name}]": partial(play, dronekit, each) for each in SLOW
+        f"test_slow_scenario[{scenario.name}]": partial(play, dronekit, scenario) for scenario in SLOW
     }
     slow["test_row_40_silence"] = silence
     with contextlib.ExitStack() as stack:
@@ -67,7 +67,7 @@ def test_dronekit_itself_matches_reference() -> None:
     program = [DRONEKIT_PYTHON, str(here / "real_dronekit.py")]
     output = subprocess.run(program, capture_output=True, text=True, timeout=300, check=True).stdout
     observed = json.loads(output.splitlines()[-1])
-    expected = {each.name: as_json(each.expected) for each in SCENARIOS if each.is_kept}
+    expected = {scenario.name: as_json(scenario.expected) for scenario in SCENARIOS if scenario.is_kept}
     assert observed == expected
 
 

@@ -39,12 +39,12 @@ def nothing_else_is_open() -> Iterator[None]:
     """Close connections that a failed test left open."""
     with mavlink.created_connections() as connections:
         yield
-        for each in tuple(connections):
-            each.close()
+        for connection in tuple(connections):
+            connection.close()
 
 
 def own_threads() -> list[str]:
-    return [each.name for each in threading.enumerate() if each.name.startswith(("aerokit", "dronekit"))]
+    return [thread.name for thread in threading.enumerate() if thread.name.startswith(("aerokit", "dronekit"))]
 
 
 def eventually(is_true: Callable[[], object]) -> None:
@@ -85,7 +85,7 @@ def test_dropped_vehicle_is_closed_and_frees_its_link(
         dronekit.connect(address, wait_ready=["attitude"]) as vehicle,
     ):
         assert vehicle.attitude.pitch is not None
-    notified = [(each.name, each.levelname, each.getMessage()) for each in caplog.records if CLOSED in each.message]
+    notified = [(record.name, record.levelname, record.getMessage()) for record in caplog.records if CLOSED in record.message]
     assert notified == [("dronekit", "WARNING", f"the connection to {address} was closed: {CLOSED}")]
 
 

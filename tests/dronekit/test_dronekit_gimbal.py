@@ -51,7 +51,7 @@ def tell_device(
 
 def params(frame: Received) -> tuple[int, tuple[float | None, ...]]:
     """Number and parameters without the zeros at their end; None for NaN."""
-    values = [None if math.isnan(each) else round(each, 4) for each in frame.params]
+    values = [None if math.isnan(param) else round(param, 4) for param in frame.params]
     while values and values[-1] == 0:
         values.pop()
     return frame.command, tuple(values)

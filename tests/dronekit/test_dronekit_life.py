@@ -40,7 +40,7 @@ def vehicle(address: str) -> Iterator[dronekit.Vehicle]:
 
 
 def own_threads() -> list[str]:
-    return sorted(each.name for each in threading.enumerate() if each.name.startswith(("aerokit", "dronekit")))
+    return sorted(thread.name for thread in threading.enumerate() if thread.name.startswith(("aerokit", "dronekit")))
 
 
 def open_sockets() -> int:
@@ -125,8 +125,8 @@ def test_close_ends_waiting_calls_of_other_threads(vehicle: dronekit.Vehicle) ->
         lambda: vehicle.wait_for_alt(1000),
     ]
     threads = [threading.Thread(target=wait, args=(call,)) for call in calls]
-    for each in threads:
-        each.start()
+    for thread in threads:
+        thread.start()
     vehicle.close()
     for each in threads:
         each.join(LIMIT_S)

@@ -41,7 +41,7 @@ def notified(observed: HasObservers, thread: ListenerThread, *values: Any, name:
 
 def test_listener_thread_starts_with_first_call_and_keeps_order() -> None:
     thread = ListenerThread("late")
-    assert all(each.name != "late" for each in threading.enumerate())
+    assert all(thread.name != "late" for thread in threading.enumerate())
     seen: list[int] = []
     for number in range(100):
         thread.post(seen.append, number)
@@ -49,7 +49,7 @@ def test_listener_thread_starts_with_first_call_and_keeps_order() -> None:
     assert seen == list(range(100))
     thread.stop()
     thread.join()
-    assert all(each.name != "late" for each in threading.enumerate())
+    assert all(thread.name != "late" for thread in threading.enumerate())
     thread.post(seen.append, -1)
     assert -1 not in seen
 
@@ -161,8 +161,8 @@ def test_raising_listener_is_logged_and_others_run(
     observed.add_attribute_listener("heading", lambda _, name, value: seen.append(value))
     notified(observed, thread, 1, 2, name="heading")
     assert seen == [1, 2]
-    records = [each for each in caplog.records if each.levelno == logging.ERROR]
-    assert [(each.name, each.message) for each in records] == [
+    records = [record for record in caplog.records if record.levelno == logging.ERROR]
+    assert [(record.name, record.message) for record in records] == [
         ("dronekit", "Exception in attribute handler for heading")
     ] * 2
     assert records[0].exc_info is not None
@@ -234,7 +234,7 @@ def test_listeners_without_thread_run_on_notifying_thread() -> None:
 def test_notify_without_listeners_starts_no_thread() -> None:
     thread = ListenerThread("unused")
     HasObservers(thread)._dk_listeners.notify("x", 1)
-    assert all(each.name != "unused" for each in threading.enumerate())
+    assert all(thread.name != "unused" for thread in threading.enumerate())
 
 
 def test_blocked_listener_does_not_block_notify(thread: ListenerThread) -> None:
@@ -276,10 +276,10 @@ def test_notify_does_not_deadlock() -> None:
 
     one.post(time.sleep, 0.05)
     asyncio.run(notify())
-    for each in threads:
-        each.call(lambda: None)
-        each.stop()
-        each.join()
+    for thread in threads:
+        thread.call(lambda: None)
+        thread.stop()
+        thread.join()
     assert ended == ["called", "called", "from a coroutine"]
 
 
@@ -293,8 +293,8 @@ def test_listeners_added_from_many_threads_are_all_kept() -> None:
             observed.add_attribute_listener("x", lambda *_: None)
 
     adders = [threading.Thread(target=add) for _ in range(4)]
-    for each in adders:
-        each.start()
+    for adder in adders:
+        adder.start()
     for each in adders:
         each.join(LIMIT_S)
     assert len(observed._attribute_listeners["x"]) == 800

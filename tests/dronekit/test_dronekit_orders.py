@@ -70,7 +70,7 @@ def test_background_call_failure_is_logged_and_in_future(loop: LoopThread, caplo
     future = BackgroundCalls(loop).start("arm", fail)
     with pytest.raises(ValueError, match="said no"):
         future.result(LIMIT_S)
-    assert [(each.name, each.levelname, each.message) for each in caplog.records] == [
+    assert [(record.name, record.levelname, record.message) for record in caplog.records] == [
         ("dronekit", "WARNING", "arm: the vehicle said no")
     ]
 

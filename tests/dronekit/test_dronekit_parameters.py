@@ -131,7 +131,7 @@ def test_integer_parameters_cut_off_fractions(vehicle: dronekit.Vehicle, fc: Fli
     assert parameters.set("THR_MIN", True)
     assert parameters["THR_MIN"] == 1.0
     parameters.update({"FOO": 7}, bar=8)
-    sent = [(each.param_id, each.param_value, each.param_type) for each in fc.received("PARAM_SET")]
+    sent = [(frame.param_id, frame.param_value, frame.param_type) for frame in fc.received("PARAM_SET")]
     assert sent[0] == ("THR_MIN", 99.0, INT16)
     assert ("THR_MIN", -2.0, INT16) in sent
     assert ("BAR", 8.0, 9) in sent
@@ -168,7 +168,7 @@ def test_rejected_parameter_returns_false_and_logs_error(
     fc.parameters.adjust = lambda _, wanted: min(wanted, 10.0)
     assert not vehicle.parameters.set(name, value)
     vehicle.parameters[name] = value
-    records = [each for each in caplog.records if each.levelno == logging.ERROR]
+    records = [record for record in caplog.records if record.levelno == logging.ERROR]
     assert len(records) == 2
     assert f"could not set parameter {name} to " in records[0].getMessage()
     assert reason in records[0].getMessage()
@@ -352,7 +352,7 @@ def test_failed_parameter_download_is_repeated_while_waiting(
     with connected(fc, wait_ready=["parameters"]) as vehicle:
         assert len(attempts) == 3
         assert dict(vehicle.parameters) == {"FOO": 1.0, "BAR": 2.5, "THR_MIN": 130.0}
-    lines = [each.getMessage() for each in caplog.records if each.levelno == logging.WARNING]
+    lines = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
     assert lines == ["the parameters could not be downloaded: 2 of 3 parameters are missing"]
 
 

@@ -96,13 +96,13 @@ def test_signature(path: str) -> None:
         found(path)(*[1] * len(wanted))
         return
     own = [
-        each
-        for name, each in inspect.signature(found(path)).parameters.items()
-        if name != "self" and each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)
+        parameter
+        for name, parameter in inspect.signature(found(path)).parameters.items()
+        if name != "self" and parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD)
     ]
-    by_position = [each for each in own if each.kind is not each.KEYWORD_ONLY]
+    by_position = [name for name in own if name.kind is not name.KEYWORD_ONLY]
     assert [each.name for each in by_position[: len(wanted)]] == list(wanted)
-    assert all(each.default is not each.empty for each in own[len(wanted) :])
+    assert all(name.default is not name.empty for name in own[len(wanted) :])
     for each in by_position[: len(wanted)]:
         default = ... if each.default is each.empty else getattr(each.default, "__name__", each.default)
         assert default == wanted[each.name], each.name
@@ -188,7 +188,7 @@ def test_capabilities(notified: Stage) -> None:
     )
     for bit, name in enumerate(names):
         one = dronekit.Capabilities(1 << bit)
-        assert [each for each in names if getattr(one, each)] == [name]
+        assert [name for name in names if getattr(one, name)] == [name]
         assert getattr(one, name) is True
     assert notified.vehicle.capabilities.mission_int is True
     assert notified.vehicle.capabilities.ftp is False

@@ -119,7 +119,7 @@ def test_upload_answers_both_request_types_exactly(copter: Stage, asks_int: bool
 def test_lost_mission_items_are_requested_again(copter: Stage) -> None:
     copter.fc.missions.items = [HOME, FIRST, SECOND, THIRD]
     copter.fc.missions.lost = {1: 1, 3: 1}
-    assert [each.seq for each in downloaded(copter)] == [1, 2, 3]
+    assert [item.seq for item in downloaded(copter)] == [1, 2, 3]
 
 
 @pytest.mark.parametrize("autopilot", [3, 12], ids=["ArduPilot", "PX4"])

@@ -29,7 +29,7 @@ pytestmark = pytest.mark.anyio
 
 
 def copters(*ids: int) -> list[SimulatedCopter]:
-    return [SimulatedCopter(system_id=each, boot_time_s=0.0, seed=each) for each in ids]
+    return [SimulatedCopter(system_id=system_id, boot_time_s=0.0, seed=system_id) for system_id in ids]
 
 
 async def test_fleet_accepts_connections_vehicles_and_links() -> None:
@@ -248,7 +248,7 @@ async def test_fleet_methods_wrong_types_are_rejected_and_nothing_sent() -> None
                 if isinstance(done, FleetResult):
                     done.raise_for_errors()
             errors = caught.value.errors.values() if isinstance(caught.value, FleetError) else ()
-            assert all(isinstance(each, (InvalidArgument, OperationRejected)) for each in errors), name
+            assert all(isinstance(error, (InvalidArgument, OperationRejected)) for error in errors), name
         assert not stage.orders_to("north/1")
         assert not stage.orders_to("north/2")
 

@@ -106,9 +106,9 @@ def fuzz_camera_definition(data: bytes) -> None:
         camera = parse_definition(data)
     except FileFormatError:
         return
-    values = {name: each.options[-1].value for name, each in camera.settings.items() if each.options}
+    values = {name: setting.options[-1].value for name, setting in camera.settings.items() if setting.options}
     for told in ({}, values):
-        for name, each in camera.localized("de").settings.items():
+        for name, setting in camera.localized("de").settings.items():
             assert name not in camera.dependencies(name)
             for value in (
                 0,
@@ -121,7 +121,7 @@ def fuzz_camera_definition(data: bytes) -> None:
             ):
                 with suppress(InvalidArgument):
                     sent = camera.checked(name, value, told)
-                    assert setting_value(setting_bytes(sent, each.wire_type), each.wire_type) == sent
+                    assert setting_value(setting_bytes(sent, setting.wire_type), setting.wire_type) == sent
 
 
 def fuzz_dialect(data: bytes) -> None:

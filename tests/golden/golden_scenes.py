@@ -104,7 +104,7 @@ async def connected(
 def north_of(vehicle: aerokit.Vehicle, *metres: float) -> list[aerokit.Position]:
     home = vehicle.home.value
     place = aerokit.Position(home.latitude_deg, home.longitude_deg, altitude_relative_m=10.0)
-    return [place.offset(north_m=each) for each in metres]
+    return [place.offset(north_m=distance) for distance in metres]
 
 
 def mission(vehicle: aerokit.Vehicle) -> Mission:
@@ -500,9 +500,9 @@ def dronekit_script() -> str:
             vehicle.close()
     orders = (m.CommandLong, m.CommandInt, m.SetMode, m.SetPositionTargetGlobalInt)
     lines = [
-        f"{each.message.NAME} {text_of(each.message)}"
-        for each in journal.messages
-        if isinstance(each.message, orders) and getattr(each.message, "command", 0) not in REQUESTS
+        f"{message.message.NAME} {text_of(message.message)}"
+        for message in journal.messages
+        if isinstance(message.message, orders) and getattr(message.message, "command", 0) not in REQUESTS
     ]
     return "".join(f"{line}\n" for line in dict.fromkeys(lines))
 

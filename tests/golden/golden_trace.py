@@ -187,7 +187,7 @@ def _text_of_command(message: CommandLong | CommandInt) -> str:
         params += [message.param5, message.param6, message.param7]
     while len(params) > 1 and params[-1] == 0:
         params.pop()
-    text = f"{_in_enum('MAV_CMD', message.command)}({', '.join(_plain(each, '') for each in params)})"
+    text = f"{_in_enum('MAV_CMD', message.command)}({', '.join(_plain(param, '') for param in params)})"
     if isinstance(message, CommandInt):
         place = f"x={_plain(message.x, 'x')} y={_plain(message.y, 'y')} z={message.z:.4g}"
         return f"{text} {_in_enum('MAV_FRAME', message.frame)} {place}"

@@ -97,8 +97,8 @@ COMPONENTS_BLOCKING: dict[str, Callable[[Any], object]] = {
 def _with(*troubles: Callable[[SimulatedCamera], object]) -> Callable[[Stage], None]:
     def before(stage: Stage) -> None:
         camera = camera_of(stage)
-        for each in troubles:
-            each(camera)
+        for trouble in troubles:
+            trouble(camera)
 
     return before
 

@@ -34,17 +34,17 @@ class Stage:
 
     @property
     def modes(self) -> dict[str, str]:
-        return {name: each.mode.name for name, each in self.copters.items()}
+        return {name: copter.mode.name for name, copter in self.copters.items()}
 
     def orders_to(self, name: str) -> list[tuple[float, m.CommandLong | m.CommandInt]]:
         """Return the commands that change what the member does, with their times."""
         network, _, number = name.partition("/")
         return [
-            (at, each)
-            for at, each in self.wires[network].sent
-            if isinstance(each, (m.CommandLong, m.CommandInt))
-            and each.target_system == int(number)
-            and each.command in ORDERS
+            (at, message)
+            for at, message in self.wires[network].sent
+            if isinstance(message, (m.CommandLong, m.CommandInt))
+            and message.target_system == int(number)
+            and message.command in ORDERS
         ]
 
     def modes_ordered(self, name: str) -> list[str]:
@@ -108,7 +108,7 @@ async def open_stage(
                 )
                 for number in range(count)
             ]
-            copters |= {f"{network}/{each.system_id}": each for each in own}
+            copters |= {f"{network}/{name.system_id}": name for name in own}
             wires[network] = Wire(await stack.enter_async_context(simulated_link(own)))
         options.setdefault("count", len(copters))
         async with fleet(dict(wires), **options) as opened:

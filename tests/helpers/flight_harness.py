@@ -85,7 +85,7 @@ class Wire(Link):
 
     def mode_orders(self) -> list[int]:
         """Custom modes requested by MAV_CMD_DO_SET_MODE, in ArduPilot's encoding."""
-        return [int(each.param2) for each in self.commands(MavCmd.DO_SET_MODE) if isinstance(each, m.CommandLong)]
+        return [int(command.param2) for command in self.commands(MavCmd.DO_SET_MODE) if isinstance(command, m.CommandLong)]
 
     def setpoints(self) -> list[tuple[float, Message]]:
         return [(at, message) for at, message in self.sent if isinstance(message, SETPOINTS)]

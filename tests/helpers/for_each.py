@@ -40,7 +40,7 @@ def for_each(names: str, rows: Iterable[Any]) -> Callable[[Check], Check]:
                 pytest.fail("\n".join((f"{len(failures)} of {count}:", *failures)), pytrace=False)
 
         signature = inspect.signature(check)
-        own = [each for name, each in signature.parameters.items() if name not in keys]
+        own = [parameter for name, parameter in signature.parameters.items() if name not in keys]
         test.__signature__ = signature.replace(parameters=own)  # type: ignore[attr-defined]
         return test
 

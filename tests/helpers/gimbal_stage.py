@@ -63,7 +63,7 @@ def takes_control(flight: Flight, component: int = 154, *, secondary: bool = Fal
 def configured(flight: Flight | Px4Flight) -> list[tuple[float, ...]]:
     """Params 1 to 4 and 7 of each gimbal control command sent."""
     sent: list[Any] = flight.wire.commands(CONFIGURE)
-    return [(each.param1, each.param2, each.param3, each.param4, each.param7) for each in sent]
+    return [(message.param1, message.param2, message.param3, message.param4, message.param7) for message in sent]
 
 
 def us(flight: Flight) -> tuple[int, int]:

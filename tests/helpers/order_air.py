@@ -110,7 +110,7 @@ class TrafficLog:
     @property
     def heartbeats(self) -> list[TrafficEntry]:
         """State messages of the vehicle that the program received."""
-        return [each for each in self.heard if _is_autopilots(each.message) and each.is_believed]
+        return [message for message in self.heard if _is_autopilots(message.message) and message.is_believed]
 
 
 @dataclass

@@ -46,7 +46,7 @@ class Airs:
         """Start the disturbances, as the order is given and the selected link fails."""
         assert self.connection is not None
         assert self.connection.links is not None
-        (used,) = [index for index, each in enumerate(self.connection.links.value) if each.used_for]
+        (used,) = [index for index, link in enumerate(self.connection.links.value) if link.used_for]
         self.airs[used].silence = self._two.silence
         for air in self.airs:
             air.begin()

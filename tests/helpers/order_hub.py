@@ -112,8 +112,8 @@ class HubSky:
         if self._through.side == "program":
             self.near.disturbances = disturbances
             return
-        for each in self.vehicles_ends:
-            each.disturbances = disturbances
+        for vehicle_end in self.vehicles_ends:
+            vehicle_end.disturbances = disturbances
 
     def begin(self) -> None:
         """Start the disturbances, as the order is given."""
@@ -126,9 +126,9 @@ class HubSky:
 
     def end(self) -> None:
         """Messages of the program that never reached the vehicle."""
-        arrived = {each.raw for each in self.at_vehicle.sent if not each.is_lost}
-        for each in self.sent:
-            each.is_lost |= each.raw not in arrived
+        arrived = {message.raw for message in self.at_vehicle.sent if not message.is_lost}
+        for message in self.sent:
+            message.is_lost |= message.raw not in arrived
 
     @property
     def sent(self) -> list[TrafficEntry]:
@@ -147,7 +147,7 @@ async def through_hub(
     async with AsyncExitStack() as stack:
         near, fars = await _programs_side(stack, through)
         sky = HubSky(near, through)
-        sky.programs_ends = [HubsEnd(each) for each in fars]
+        sky.programs_ends = [HubsEnd(far_end) for far_end in fars]
         sky.vehicles_ends = await _vehicles_side(stack, vehicle, through, sky.at_vehicle)
         ends = {"vehicle": sky.vehicles_ends, "program": sky.programs_ends}
         named = [

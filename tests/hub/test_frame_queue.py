@@ -79,9 +79,9 @@ def test_bounds_hold_and_every_frame_is_accounted_for(
         dropped += len(frames.expire(now))
         dropped += len(frames.put(held(bytes(size) * 40, kind, now), key))
         assert len(frames) <= MAX_QUEUED_FRAMES
-        assert sum(len(each.raw) for each in frames._frames.values()) == frames._bytes <= MAX_QUEUED_BYTES
+        assert sum(len(frame.raw) for frame in frames._frames.values()) == frames._bytes <= MAX_QUEUED_BYTES
         assert all(
-            now - each.since <= ORDER_MAX_AGE_S for each in frames._frames.values() if each.kind is MessageKind.ORDER
+            now - frame.since <= ORDER_MAX_AGE_S for frame in frames._frames.values() if frame.kind is MessageKind.ORDER
         )
     assert len(taken(frames)) + dropped == len(arrivals)
     assert frames._bytes == frames._orders == frames._telemetry == 0
@@ -125,9 +125,9 @@ def test_telemetry_is_never_an_order_and_has_no_target() -> None:
         assert kind_of(name, is_for_one=False) is MessageKind.TELEMETRY
         fields = {field.name for field in names[name].FIELDS}
         instances = {
-            each
-            for each in fields
-            if each.endswith("_id") or each == "id" or each in ("instance", "port", "text", "name")
+            field
+            for field in fields
+            if field.endswith("_id") or field == "id" or field in ("instance", "port", "text", "name")
         }
         assert not instances or name == "MISSION_CURRENT", (name, instances)
         assert "target_system" not in fields

@@ -57,12 +57,12 @@ async def joined(*programs: Program, **fields: dict[str, Any]) -> AsyncIterator[
         for program in programs:
             await stack.enter_async_context(program)
         names = "abcdefgh"[: len(programs)]
-        endpoints = [each.endpoint(name, **fields.get(name, {})) for name, each in zip(names, programs, strict=True)]
+        endpoints = [other_name.endpoint(name, **fields.get(name, {})) for name, other_name in zip(names, programs, strict=True)]
         yield await stack.enter_async_context(Hub(endpoints))
 
 
 def of(hub: Hub, name: str) -> EndpointStatistics:
-    return next(each for each in hub.endpoints if each.name == name)
+    return next(endpoint for endpoint in hub.endpoints if endpoint.name == name)
 
 
 @virtual
@@ -73,7 +73,7 @@ async def test_frames_are_forwarded_unchanged() -> None:
         await settle()
         assert station.heard == tablet.heard == ["HEARTBEAT", "ATTITUDE"]
         assert copter.frames == []
-        assert [(each.system_id, each.component_id, each.sequence) for each in station.frames] == [
+        assert [(frame.system_id, frame.component_id, frame.sequence) for frame in station.frames] == [
             (1, 1, 0),
             (1, 1, 1),
         ]
@@ -123,7 +123,7 @@ async def test_noise_and_unknown_messages() -> None:
         await settle()
         assert b"".join(station.pieces).count(b"mine") == 1
         assert b"booting" not in b"".join(station.pieces)
-        assert [each.message_id for each in station.frames] == [0, 51234, 0]
+        assert [frame.message_id for frame in station.frames] == [0, 51234, 0]
         assert of(hub, "a").bad_bytes == 13
         assert of(hub, "a").dropped == {"unknown": 1}
 
@@ -170,7 +170,7 @@ async def test_rates_apply_per_sender() -> None:
         for program in (copter, other, copter, other):
             program.say(ATTITUDE)
         await settle()
-        assert [each.system_id for each in station.frames] == [1, 2]
+        assert [frame.system_id for frame in station.frames] == [1, 2]
 
 
 @virtual
@@ -265,7 +265,7 @@ async def test_link_events_are_reported() -> None:
         station.say(ORDER)
         await settle()
         slow.receiver.link_lost(LinkLost("slow:1: unplugged"))
-        assert [each.kind for each in events] == ["stalled", "drained", "order_dropped", "lost"]
+        assert [event.kind for event in events] == ["stalled", "drained", "order_dropped", "lost"]
         assert "unplugged" in events[-1].text
         assert not of(hub, "slow").is_open
         station.say(ORDER)
@@ -285,10 +285,10 @@ async def test_signed_outside_and_unsigned_inside() -> None:
         copter.say(COPTER)
         station.say(STATION, ORDER)
         await settle()
-        assert [each.incompat_flags for each in station.frames] == [0]
+        assert [frame.incompat_flags for frame in station.frames] == [0]
         assert copter.heard == ["HEARTBEAT", "COMMAND_LONG"]
-        assert all(Signing(KEY).has_signed(each) for each in copter.frames)
-        assert [(each.system_id, each.sequence) for each in copter.frames] == [(255, 0), (255, 1)]
+        assert all(Signing(KEY).has_signed(frame) for frame in copter.frames)
+        assert [(frame.system_id, frame.sequence) for frame in copter.frames] == [(255, 0), (255, 1)]
         assert of(hub, "a").dropped == {}
 
 
@@ -303,7 +303,7 @@ async def test_unsigned_frames_are_refused_and_reported_once() -> None:
         assert station.frames == []
         assert of(hub, "a").dropped == {"refused": 3}
         assert of(hub, "a").systems == ()
-        assert [each.kind for each in events] == ["refused"]
+        assert [event.kind for event in events] == ["refused"]
         assert "1/1" in events[0].text
 
 
@@ -328,7 +328,7 @@ async def test_exhausted_key_stops_one_endpoint_only() -> None:
         await settle()
         assert tablet.heard == ["HEARTBEAT"] * 2
         assert station.heard == ["HEARTBEAT"]
-        assert [each.kind for each in events] == ["internal_error"]
+        assert [event.kind for event in events] == ["internal_error"]
         assert "exhausted" in events[0].text
 
 
@@ -347,13 +347,13 @@ async def test_endpoints_are_added_and_removed() -> None:
         await settle()
         assert late.heard == ["HEARTBEAT"]
         await hub.remove("late")
-        assert [each.name for each in hub.endpoints] == ["a", "b"]
+        assert [endpoint.name for endpoint in hub.endpoints] == ["a", "b"]
         copter.say(COPTER)
         await settle()
         assert late.is_lost
         assert late.heard == ["HEARTBEAT"]
         assert station.heard == ["HEARTBEAT"] * 2
-        assert [(each.endpoint, each.kind) for each in events] == [("late", "opened"), ("late", "removed")]
+        assert [(event.endpoint, event.kind) for event in events] == [("late", "opened"), ("late", "removed")]
         detach()
         detach()
         with pytest.raises(InvalidArgument, match=r"name = 'late' is not allowed: a, b"):
@@ -388,7 +388,7 @@ async def test_endpoint_exception_does_not_affect_others(monkeypatch: pytest.Mon
         monkeypatch.undo()
         copter.say(COPTER)
         await settle()
-        assert [each.kind for each in events] == ["internal_error"]
+        assert [event.kind for event in events] == ["internal_error"]
         assert station.heard == ["HEARTBEAT"]
 
 
@@ -437,7 +437,7 @@ async def test_lost_link_is_reopened(monkeypatch: pytest.MonkeyPatch) -> None:
             assert of(hub, "b").systems == ((255, 190),)
         links.can_be_opened = False
         await anyio.sleep(3)
-        assert [each.kind for each in events] == ["lost"]
+        assert [event.kind for event in events] == ["lost"]
         assert (of(hub, "b").is_open, of(hub, "b").peers, of(hub, "b").systems) == (False, 0, ())
         links.can_be_opened = True
         copter.say(COPTER)
@@ -446,7 +446,7 @@ async def test_lost_link_is_reopened(monkeypatch: pytest.MonkeyPatch) -> None:
             copter.say(COPTER)
             await settle()
             assert station.heard == ["HEARTBEAT"]
-            assert [each.kind for each in events] == ["lost", "restored"]
+            assert [event.kind for event in events] == ["lost", "restored"]
             assert of(hub, "b").is_open
             assert of(hub, "b").frames_in == 1, "it is still counted"
 
@@ -682,16 +682,16 @@ async def test_sixty_full_clients_cost_no_search_per_frame(monkeypatch: pytest.M
     monkeypatch.setattr(kinds, "fnmatchcase", match)
     kinds.kind_of.cache_clear()
     deaf, copter = [SlowLink(f"slow:{number}") for number in range(60)], Program(1, 1)
-    async with copter, Hub([copter.endpoint("copter"), *(Endpoint(each) for each in deaf)]) as hub:
-        for each in deaf:
-            each.unsent = 1 << 20
+    async with copter, Hub([copter.endpoint("copter"), *(Endpoint(link) for link in deaf)]) as hub:
+        for link in deaf:
+            link.unsent = 1 << 20
         for number in range(200):
             copter.say(Statustext(6, f"{number}"), ATTITUDE)
         await settle()
-        assert sum(each.waiting for each in hub.endpoints) == 60 * 201
+        assert sum(endpoint.waiting for endpoint in hub.endpoints) == 60 * 201
         for each in deaf:
             each.receiver.link_lost(LinkLost("gone"))
-        assert sum(each.dropped["link_lost"] for each in hub.endpoints[1:]) == 60 * 201
+        assert sum(endpoint.dropped["link_lost"] for endpoint in hub.endpoints[1:]) == 60 * 201
     assert len(matched) < 100
 
 

@@ -24,7 +24,7 @@ ORDER = CommandLong(1, 1, 400, 0, 1, 0, 0, 0, 0, 0, 0)
 
 
 def of(hub: Hub, name: str) -> EndpointStatistics:
-    return next(each for each in hub.endpoints if each.name == name)
+    return next(endpoint for endpoint in hub.endpoints if endpoint.name == name)
 
 
 def to(statistics: EndpointStatistics, scheme: str) -> Any:
@@ -66,7 +66,7 @@ async def test_connecting_and_disconnecting_clients_are_reported() -> None:
         async with Program(1, 1, to(hub.endpoints[1], "udpout")) as sender:
             sender.say(COPTER)
             await until(lambda: hub.endpoints[1].peers == 1)
-    assert [each.kind for each in told] == ["client_joined", "client_left"]
+    assert [event.kind for event in told] == ["client_joined", "client_left"]
 
 
 async def test_udp_senders_are_separate_and_noise_is_ignored() -> None:

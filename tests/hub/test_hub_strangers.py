@@ -72,7 +72,7 @@ async def test_udp_impostors_get_no_orders() -> None:
             station.say(ORDER)
             await until(lambda: copter.heard.count("COMMAND_LONG") == count + 1)  # noqa: B023
         assert not any("COMMAND_LONG" in stranger.heard for stranger in strangers)
-        assert [each.kind for each in told if each.kind == "duplicate_sender"] == ["duplicate_sender"], (
+        assert [event.kind for event in told if event.kind == "duplicate_sender"] == ["duplicate_sender"], (
             "told once, not 300 times"
         )
         assert of(hub, "radio").dropped["foreign"] == 600
@@ -86,7 +86,7 @@ async def test_silent_tcp_clients_evict_no_active_peer() -> None:
         port = int(of(hub, "stations").address.rpartition(":")[2])
         silent = [await asyncio.open_connection("127.0.0.1", port) for _ in range(MAX_CLIENTS + 5)]
         try:
-            await until(lambda: sum(each.kind == "client_joined" for each in told) >= MAX_CLIENTS + 5)
+            await until(lambda: sum(event.kind == "client_joined" for event in told) >= MAX_CLIENTS + 5)
             assert of(hub, "stations").peers == MAX_CLIENTS
             copter.say(ATTITUDE)
             station.say(ORDER)
@@ -106,7 +106,7 @@ async def test_disconnected_clients_leave_nothing() -> None:
             writer.write(FrameEncoder(1 + number % 250, 7).encode(STATION))
             await writer.drain()
             writer.close()
-        await until(lambda: sum(each.kind == "client_left" for each in told) == 200)
+        await until(lambda: sum(event.kind == "client_left" for event in told) == 200)
         assert (len(router._nodes), len(router._senders)) == (2, 2)
         assert len(list(hub._attachments["stations"]._peers)) == 1
         station.say(ORDER)
@@ -170,10 +170,10 @@ async def test_silent_vehicle_is_followed_to_its_new_port() -> None:
         await asyncio.sleep(ROUTE_TIMEOUT_S + 0.1)
         link.say("2@drone", second, COPTER)
         assert await ordered(link, station) == ["2@drone"]
-        assert [each.kind for each in told] == ["duplicate_sender", "route_changed"]
+        assert [event.kind for event in told] == ["duplicate_sender", "route_changed"]
         assert "1/1" in told[1].text
         link.say("1@drone", first, COPTER)
-        assert [each.kind for each in told] == ["duplicate_sender", "route_changed", "duplicate_sender"]
+        assert [event.kind for event in told] == ["duplicate_sender", "route_changed", "duplicate_sender"]
         assert await ordered(link, station) == ["2@drone"]
 
 
@@ -187,7 +187,7 @@ async def test_full_endpoint_rejects_new_peer() -> None:
         newcomer = FrameEncoder(1, 1)
         for _ in range(3):
             link.say("1@drone", newcomer, COPTER)
-        assert [each.kind for each in told] == ["peer_rejected"], "told once"
+        assert [event.kind for event in told] == ["peer_rejected"], "told once"
         assert of(hub, "udp").peers == MAX_PEERS
         assert (1, 1) not in of(hub, "udp").systems
         await asyncio.sleep(PEER_TTL_S + 1)

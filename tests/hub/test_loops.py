@@ -48,7 +48,7 @@ def test_dead_vehicle_behind_hub_loop_is_silent(latency_s: float) -> None:
                 await asyncio.sleep(200)
                 assert vehicle.heartbeat_age > 195
                 assert vehicle.position.age > 195
-        loops = [each for each in told if each.kind == "loop"]
+        loops = [event for event in told if event.kind == "loop"]
         assert bool(loops) == (latency_s > 1)
         assert len(loops) <= 4, "once for each end and sender"
         assert not loops or "1/1" in loops[0].text

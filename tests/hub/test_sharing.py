@@ -170,8 +170,8 @@ def test_station_receives_vehicle_and_program() -> None:
         on.connection.send(ORDER)
         on.connection.send(ParamRequestList(0, 0))
         await settle()
-        assert [(each.system_id, each.message_id) for each in on.station.frames if each.system_id == 1] == [(1, 0)]
-        assert [each.message_id for each in on.station.frames if each.system_id == 255] == [0, 21]
+        assert [(frame.system_id, frame.message_id) for frame in on.station.frames if frame.system_id == 1] == [(1, 0)]
+        assert [frame.message_id for frame in on.station.frames if frame.system_id == 255] == [0, 21]
         assert on.vehicle.heard == ["HEARTBEAT", "COMMAND_LONG", "PARAM_REQUEST_LIST"]
 
     on_stage(play)
@@ -185,7 +185,7 @@ def test_vehicle_receives_station_frames_once() -> None:
         on.station.say(SetupSigning(1, 1, bytes(range(32)), 5))
         await settle()
         assert on.vehicle.heard == ["HEARTBEAT", "COMMAND_LONG"]
-        assert {(each.system_id, each.component_id) for each in on.vehicle.frames} == {(250, 190)}
+        assert {(frame.system_id, frame.component_id) for frame in on.vehicle.frames} == {(250, 190)}
         assert on.station.frames == []
 
     on_stage(play)
@@ -208,14 +208,14 @@ def test_signing_program_signs_for_its_stations() -> None:
         on.station.say(STATION, ORDER)
         on.vehicle.say(Attitude(0, 0, 0, 0, 0, 0, 0))
         await settle()
-        assert all(Signing(KEY).has_signed(each) for each in on.vehicle.frames)
-        assert [(each.system_id, each.message_id) for each in on.vehicle.frames] == [
+        assert all(Signing(KEY).has_signed(frame) for frame in on.vehicle.frames)
+        assert [(frame.system_id, frame.message_id) for frame in on.vehicle.frames] == [
             (255, 0),
             (250, 0),
             (250, 76),
         ]
-        assert {each.incompat_flags for each in on.station.frames} == {0}
-        assert {each.system_id for each in on.station.frames} == {1, 255}
+        assert {frame.incompat_flags for frame in on.station.frames} == {0}
+        assert {frame.system_id for frame in on.station.frames} == {1, 255}
 
     on_stage(play, signing=Signing(KEY), vehicle=Program(1, 1, signing=Signing(KEY)))
 
@@ -237,7 +237,7 @@ def test_sharing_ends_with_connection_but_not_vice_versa() -> None:
                 hub.on_event(events.append)
                 connection.close()
                 await settle()
-                assert [(each.endpoint, each.kind) for each in events] == [("program", "lost")]
+                assert [(event.endpoint, event.kind) for event in events] == [("program", "lost")]
                 again.say(STATION)
                 await settle()
                 with pytest.raises(ConnectionClosed):

@@ -146,7 +146,7 @@ def _ardupilot(choice: Choice, port: int, folder: Path) -> tuple[list[str], dict
     binary, kind = Path(choice.vehicle).resolve(), choice.kind
     files = [folder / "patience.parm"]
     files[0].write_text("".join(f"{name} {value:g}\n" for name, value in _longer(choice).items()))
-    source = next((each for each in binary.parents if (each / "Tools/autotest").is_dir()), None)
+    source = next((folder for folder in binary.parents if (folder / "Tools/autotest").is_dir()), None)
     if source is not None:
         files.insert(0, source / "Tools/autotest" / kind.defaults)
     command = [str(binary), "--model", kind.model, "--speedup", f"{choice.speedup:g}", f"-I{INSTANCE}"]

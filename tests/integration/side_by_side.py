@@ -245,7 +245,7 @@ class _Runner:
         await wait(QUIET_S * self._scale)
 
     def _said(self) -> tuple[str, ...]:
-        texts = (re.sub(r"-?\d+(\.\d+)?", "#", each.strip()) for each in self._texts if not NOT_COMPARED.match(each))
+        texts = (re.sub(r"-?\d+(\.\d+)?", "#", text.strip()) for text in self._texts if not NOT_COMPARED.match(text))
         return tuple(sorted(set(texts)))
 
     # ------------------------------------------------------------------------------------- calls
@@ -370,7 +370,7 @@ def main() -> int:
             by_call[line[3:]].append(seed)
         if options.keep:
             options.keep.mkdir(exist_ok=True)
-            both = {"real": [asdict(each) for each in real], "ours": [asdict(each) for each in ours]}
+            both = {"real": [asdict(each) for each in real], "ours": [asdict(own) for own in ours]}
             (options.keep / f"{options.kind}-{seed}.json").write_text(json.dumps(both, indent=1))
     print("\nAll of them:")
     for line, seeds in sorted(by_call.items(), key=lambda each: -len(each[1])):

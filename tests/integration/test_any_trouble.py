@@ -75,7 +75,7 @@ def far(vehicle: Vehicle) -> Any:
 
 
 def sent(air: Air, command: int) -> int:
-    return sum(getattr(each.message, "command", None) == command for each in air.sent)
+    return sum(getattr(message.message, "command", None) == command for message in air.sent)
 
 
 class AnotherStation:
@@ -131,13 +131,13 @@ async def test_failsafe_during_real_outage_keeps_vehicle(choice: Choice) -> None
         with pytest.raises((HeartbeatTimeout, OperationRejected)):
             await vehicle.go_to(far(vehicle))
         await vehicle.armed.wait_until(lambda _: vehicle.heartbeat_age < 1.0, timeout=20)
-        back_at = next(each.at for each in air.heartbeats if each.at > air.began_at + 15.0)
+        back_at = next(heartbeat.at for heartbeat in air.heartbeats if heartbeat.at > air.began_at + 15.0)
         await anyio.sleep(5.0)
         assert sent(air, MavCmd.DO_SET_MODE) == 0
         if choice.kind.is_ardupilot:
             assert vehicle.mode_name == "RTL"
         else:  # It returns to its mode when it receives us again, and is then told to hold.
-            orders = [each.at for each in air.sent if getattr(each.message, "command", 0) == MavCmd.DO_REPOSITION]
+            orders = [message.at for message in air.sent if getattr(message.message, "command", 0) == MavCmd.DO_REPOSITION]
             assert not [at for at in orders[1:] if at < back_at]
 
 
@@ -152,7 +152,7 @@ async def test_blocked_program_leaves_the_failsafe_alone(choice: Choice) -> None
         with anyio.move_on_after(6.0), pytest.raises((HeartbeatTimeout, OperationRejected)):
             await vehicle.go_to(far(vehicle))
         await anyio.sleep(3.0)
-        assert [each for each in orders if each in STEER] == [MavCmd.DO_REPOSITION]
+        assert [order for order in orders if order in STEER] == [MavCmd.DO_REPOSITION]
         assert vehicle.mode_name in ("RTL", "LAND")
 
 

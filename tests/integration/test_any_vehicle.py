@@ -163,4 +163,4 @@ def around(vehicle: Vehicle, choice: Choice) -> Mission:
     """Two corners."""
     here, far, up = vehicle.position.value, choice.kind.travel_m, choice.kind.altitude_m
     corners = [here.offset(north_m=far), here.offset(north_m=far, east_m=far)]
-    return Mission([waypoint(each.latitude_deg, each.longitude_deg, altitude_relative_m=up) for each in corners])
+    return Mission([waypoint(corner.latitude_deg, corner.longitude_deg, altitude_relative_m=up) for corner in corners])

@@ -107,7 +107,7 @@ async def test_they_take_off_together_go_and_land_together() -> None:
 async def fly(address: str) -> None:
     async with aerokit.fleet({"field": address}, count=2, timeout=90) as fleet:
         assert sorted(fleet.vehicles) == ["field/1", f"field/{PX4_INSTANCE + 1}"]
-        firmwares = {each.autopilot.name for each in fleet.vehicles.values()}
+        firmwares = {vehicle.autopilot.name for vehicle in fleet.vehicles.values()}
         assert firmwares == {"ArduPilot", "PX4"}
         (await fleet.wait_ready(timeout=150)).raise_for_errors()
         for vehicle in fleet.vehicles.values():  # transfers pass, too

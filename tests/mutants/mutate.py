@@ -73,7 +73,7 @@ def _verdict(trials: Trials, mutation: Mutation, changed: str, tests: list[str],
     """
     while True:
         verdict, by = trials.run(mutation.path, changed, tests, reach.seconds)
-        test = next((each for each in tests if verdict == NOTICED and each in by), None)
+        test = next((test for test in tests if verdict == NOTICED and test in by), None)
         if test is None:
             return verdict, by
         if NO_SUCH_TEST in by:  # its name has the constant in it that was changed

@@ -111,7 +111,7 @@ def _for_type_checkers(source: str) -> set[int]:
         for each in ast.walk(ast.parse(source))
         if isinstance(each, ast.If) and isinstance(each.test, ast.Name) and each.test.id == "TYPE_CHECKING"
     ]
-    return {line for each in blocks for line in range(each.lineno, (each.body[-1].end_lineno or 0) + 1)}
+    return {line for block in blocks for line in range(block.lineno, (block.body[-1].end_lineno or 0) + 1)}
 
 
 def _is_marker(node: Any) -> bool:

@@ -44,7 +44,7 @@ class FakeVehicle:
     hash_first = False
 
     def __init__(self, parameters: Iterable[Parameter], *, bytewise: bool = False) -> None:
-        self.parameters = {each.name: each for each in parameters}
+        self.parameters = {parameter.name: parameter for parameter in parameters}
         self.bytewise = bytewise
         self.channel: Channel | None = None
 
@@ -144,10 +144,10 @@ class Channel:
         return exchange.result()
 
     def kinds(self) -> Counter[str]:
-        return Counter(type(each).NAME for _, each in self.sent)
+        return Counter(type(message).NAME for _, message in self.sent)
 
     def all(self, kind: type[M]) -> list[M]:
-        return [each for _, each in self.sent if isinstance(each, kind)]
+        return [message for _, message in self.sent if isinstance(message, kind)]
 
     def _arrive(self, message: Message) -> None:
         assert self._exchange is not None

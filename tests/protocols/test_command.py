@@ -33,7 +33,7 @@ def ack(result: int, command: int = ARM, *, progress: int = 0, system: int = 255
 
 
 def confirmations(machine: CommandExchange) -> list[int]:
-    return [each.confirmation for each in machine.take_outbox() if isinstance(each, CommandLong)]
+    return [message.confirmation for message in machine.take_outbox() if isinstance(message, CommandLong)]
 
 
 def test_command_ends_with_accepted_ack() -> None:

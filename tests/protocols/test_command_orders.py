@@ -44,7 +44,7 @@ def order(
 
 
 def confirmations(machine: CommandExchange) -> list[int]:
-    return [each.confirmation for each in machine.take_outbox() if isinstance(each, CommandLong)]
+    return [message.confirmation for message in machine.take_outbox() if isinstance(message, CommandLong)]
 
 
 def ack(result: int, progress: int = 0) -> CommandAck:

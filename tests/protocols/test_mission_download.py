@@ -43,7 +43,7 @@ def test_mission_download_restarts_eight_times() -> None:
     exchange.start(now)
     lists = 0
     while not exchange.done:
-        lists += sum(isinstance(each, m.MissionRequestList) for each in exchange.take_outbox())
+        lists += sum(isinstance(message, m.MissionRequestList) for message in exchange.take_outbox())
         now += 1.0
         exchange.receive(m.MissionCount(*GCS, 3), now)
         exchange.receive(m.MissionAck(*GCS, Result.ERROR), now)
@@ -64,7 +64,7 @@ def test_mission_download_restart_keeps_items(window: int, opaque_id: int, asked
     def answer(message: m.MissionCount | m.MissionItemInt | m.MissionAck, now: float) -> list[int]:
         exchange.take_outbox()
         exchange.receive(message, now)
-        return [each.seq for each in exchange.take_outbox() if isinstance(each, m.MissionRequestInt)]
+        return [message.seq for message in exchange.take_outbox() if isinstance(message, m.MissionRequestInt)]
 
     exchange.start(100.0)
     answer(m.MissionCount(*GCS, 3, 0, 7 if opaque_id else 0), 101.0)
@@ -72,7 +72,7 @@ def test_mission_download_restart_keeps_items(window: int, opaque_id: int, asked
     assert answer(m.MissionAck(*GCS, Result.ERROR), 103.0) == []
     kept = int(opaque_id == 7)
     assert answer(m.MissionCount(*GCS, 3, 0, opaque_id), 104.0) == asked
-    assert [each.done for each in told] == [0, 1, kept]
+    assert [event.done for event in told] == [0, 1, kept]
     for seq in range(3):
         answer(to_wire(held[seq], seq, target_system=GCS[0], target_component=GCS[1], mission_type=0), 105.0)
     assert list(exchange.result().items) == held

@@ -25,7 +25,7 @@ def upload(count: int = 4, **options: Any) -> MissionUpload:
 
 def sent_since(exchange: MissionUpload) -> list[int | str]:
     """Return what was sent since: numbers of items, names of other messages."""
-    return [each.seq if isinstance(each, m.MissionItemInt) else each.NAME for each in exchange.take_outbox()]
+    return [message.seq if isinstance(message, m.MissionItemInt) else message.NAME for message in exchange.take_outbox()]
 
 
 def request_item(exchange: MissionUpload, seq: int, now: float) -> list[int | str]:

@@ -44,7 +44,7 @@ def lose_once(channel: Channel, *indices: int) -> None:
 
 
 def repeated_requests(channel: Channel) -> list[int]:
-    return [each.param_index for each in channel.all(m.ParamRequestRead)]
+    return [request.param_index for request in channel.all(m.ParamRequestRead)]
 
 
 # ---------------------------------------------------------------------------------- a good link
@@ -99,7 +99,7 @@ def test_parameter_list_requests_gaps_at_once() -> None:
     lose_once(channel, 20, 21, 150)
     channel.run(listing())
     assert repeated_requests(channel) == [20, 21, 150]
-    times = [at for at, each in channel.sent if isinstance(each, m.ParamRequestRead)]
+    times = [at for at, message in channel.sent if isinstance(message, m.ParamRequestRead)]
     assert times[0] == pytest.approx(2 * channel.delay_s + FakeVehicle.tick_s * 4)  # with the value behind it
 
 
@@ -115,7 +115,7 @@ def test_parameter_list_waits_for_answer_before_retry() -> None:
 
     channel.is_lost = is_lost
     channel.run(listing())
-    times = [at for at, each in channel.sent if isinstance(each, m.ParamRequestRead)]
+    times = [at for at, message in channel.sent if isinstance(message, m.ParamRequestRead)]
     assert len(times) == 2
     assert times[1] - times[0] >= RTT_S
 
@@ -230,9 +230,9 @@ class Growing(FakeVehicle):
             rows = list(self.parameters.values())
             rows[self.place : self.place] = new
             count = len(rows)
-            self.parameters = {each.name: each for each in rows}
+            self.parameters = {row.name: row for row in rows}
             self.say(m.ParamValue("GROUP_0", 0.0, 2, count, 0xFFFF))
-            names = [each.name for each in rows]
+            names = [row.name for row in rows]
             shift = 3 if self.place < self.shown_at else 0
             for place, name in enumerate(names[self.shown_at + shift :]):
                 message = self.value(name, self.shown_at + place)
@@ -267,7 +267,7 @@ class Px4Growing(FakeVehicle):
         if name == "PARAM_0050" and "INSERTED" not in self.parameters:
             rows = list(self.parameters.values())
             rows.insert(10, Parameter("INSERTED", 1, ParameterType.INT32))
-            self.parameters = {each.name: each for each in rows}
+            self.parameters = {row.name: row for row in rows}
         self.say(self.value(name, list(self.parameters).index(name)))
 
 

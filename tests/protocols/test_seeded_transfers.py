@@ -128,16 +128,16 @@ def read_parameters(trouble: Trouble) -> bool:
 
 def set_parameters(trouble: Trouble) -> bool:
     table = table_of(30)
-    before = {each.name: each.value for each in table}
+    before = {name.name: name.value for name in table}
     wanted = [each.replace(value=each.value + 1, index=None) for each in trouble.dice.sample(table, 12)]
     exchange = ParameterWrites(
         1, 1, wanted, bytewise=trouble.is_bytewise, before=before, recent=[wanted[0].name], **trouble.options
     )
     channel = trouble.channel(table)
     answers = channel.run(exchange)
-    confirmed = [each for each in wanted if isinstance(answers[each.name], Parameter)]
-    return trouble.loss > 0.5 or [channel.vehicle.parameters[each.name].value for each in confirmed] == [
-        each.value for each in wanted
+    confirmed = [parameter for parameter in wanted if isinstance(answers[parameter.name], Parameter)]
+    return trouble.loss > 0.5 or [channel.vehicle.parameters[parameter.name].value for parameter in confirmed] == [
+        parameter.value for parameter in wanted
     ]
 
 

@@ -208,7 +208,7 @@ def test_missing_capabilities_are_unsupported() -> None:
 def test_video_streams_are_listed_and_switched() -> None:
     _, client = fitted(streams=["rtsp://10.0.0.1/main", "udp://10.0.0.1:5600"])
     streams = client.request(CAMERA, m.VideoStreamInformation, 0)
-    assert [(each.stream_id, each.count) for each in streams] == [(1, 2), (2, 2)]
+    assert [(stream.stream_id, stream.count) for stream in streams] == [(1, 2), (2, 2)]
     assert client.request(CAMERA, m.VideoStreamInformation, 2)[0].uri == "udp://10.0.0.1:5600"
     assert client.ask(CAMERA, MavCmd.VIDEO_STOP_STREAMING, 2) == DONE
     flags = [status.flags for status in client.request(CAMERA, m.VideoStreamStatus, 0)]

@@ -83,7 +83,7 @@ class Port:
 
     def texts(self) -> list[str]:
         decoded = map(STANDARD.decode, self.framer.receive(self.channel.take_outbox(), self.px4.now))
-        return [each.text.strip() for each in decoded if isinstance(each, m.Statustext)]
+        return [message.text.strip() for message in decoded if isinstance(message, m.Statustext)]
 
 
 def test_px4_texts_go_only_to_links_with_a_ground_station() -> None:
@@ -227,8 +227,8 @@ async def test_copter_reboot_closes_tcp_connections() -> None:
         reboot = m.CommandLong(1, 1, MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, 0, 1, *(0.0,) * 6)
         writer.write(FrameEncoder(255, 190).encode(reboot))
         heard = await asyncio.wait_for(reader.read(), 10.0)
-        answers = [STANDARD.decode(each) for each in Framer().receive(heard, 0.0)]
-        assert any(isinstance(each, m.CommandAck) and each.result == 0 for each in answers)
+        answers = [STANDARD.decode(message) for message in Framer().receive(heard, 0.0)]
+        assert any(isinstance(answer, m.CommandAck) and answer.result == 0 for answer in answers)
         writer.close()
         again, writer = await asyncio.open_connection(host, int(port))
         assert await asyncio.wait_for(again.read(1), 10.0)

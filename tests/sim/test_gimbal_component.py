@@ -180,7 +180,7 @@ def test_commands_select_one_of_two_gimbals() -> None:
     client.forget()
     client.ask(0, MavCmd.REQUEST_MESSAGE, m.GimbalManagerInformation.ID)
     client.run(0.1)
-    told = {source(each): each.gimbal_device_id for each in client.all(m.GimbalManagerInformation)}
+    told = {source(message): message.gimbal_device_id for message in client.all(m.GimbalManagerInformation)}
     assert told == {(1, 1): 1, (1, 154): 154, (1, 171): 171}
 
 

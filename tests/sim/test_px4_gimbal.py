@@ -42,7 +42,7 @@ def gimbal(client: Client) -> SimulatedPx4:
 def angles(client: Client) -> list[float]:
     client.run(0.3)
     told = client.last(m.GimbalDeviceAttitudeStatus)
-    return [round(math.degrees(each), 1) for each in euler_from_quaternion(*told.q)]
+    return [round(math.degrees(angle), 1) for angle in euler_from_quaternion(*told.q)]
 
 
 def test_commands_without_gimbal_are_not_answered() -> None:

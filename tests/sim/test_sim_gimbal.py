@@ -36,7 +36,7 @@ def status(client: Client) -> m.GimbalDeviceAttitudeStatus:
 
 def angles(client: Client) -> list[int]:
     """Return roll, pitch and yaw from the nose in whole degrees."""
-    return [round(math.degrees(each)) for each in euler_from_quaternion(*status(client).q)]
+    return [round(math.degrees(angle)) for angle in euler_from_quaternion(*status(client).q)]
 
 
 def mount(client: Client, mode: int, pitch: float = 0, roll: float = 0, yaw: float = 0) -> int | None:
@@ -170,7 +170,7 @@ def test_control_is_stored_and_reported(client: Client) -> None:
         assert client.command(MavCmd.DO_GIMBAL_MANAGER_CONFIGURE, system, component) == ACCEPTED
         client.run(0.1)
         told = client.all(m.GimbalManagerStatus)
-        return [(each.primary_control_sysid, each.primary_control_compid) for each in told]
+        return [(event.primary_control_sysid, event.primary_control_compid) for event in told]
 
     assert configure(-2, -2) == [(255, 190)]
     assert configure(255, 190) == []

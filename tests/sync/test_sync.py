@@ -110,8 +110,8 @@ def test_every_member_has_a_twin(original: type, twin: type, name: str) -> None:
     if kind_of(original, name) == "method":
         assert not inspect.iscoroutinefunction(getattr(twin, name))
         given, wanted = (inspect.signature(getattr(each, name)).parameters for each in (twin, original))
-        assert [(each.name, each.kind, each.default) for each in given.values()] == [
-            (each.name, each.kind, each.default) for each in wanted.values()
+        assert [(parameter.name, parameter.kind, parameter.default) for parameter in given.values()] == [
+            (parameter.name, parameter.kind, parameter.default) for parameter in wanted.values()
         ]
 
 
@@ -404,7 +404,7 @@ def test_links_cell_of_several_links() -> None:
             links = vehicle.connection.links
             assert isinstance(links, aerokit.sync.StateCell)
             states = links.wait_until(lambda each: each[0].state is LinkState.CONNECTED, timeout=100)
-            assert [each.link.split(":")[0] for each in states] == ["tcp", "udpin"]
+            assert [state.link.split(":")[0] for state in states] == ["tcp", "udpin"]
             assert links.value[0].used_for == (1,)
         with aerokit.sync.connect(address, rates={}) as vehicle:
             assert vehicle.connection.links is None
@@ -500,7 +500,7 @@ def test_gimbals_are_found_and_controlled() -> None:
         aerokit.sync.connect(address) as vehicle,
     ):
         assert vehicle.gimbals.discover() == (1, 171)
-        assert [each.device_id for each in vehicle.gimbals] == [1, 171]
+        assert [gimbal.device_id for gimbal in vehicle.gimbals] == [1, 171]
         assert len(vehicle.gimbals) == 2
         with vehicle.gimbals[171].control() as control:
             vehicle.gimbals[171].point(-20.0, 0.0, frame="vehicle")

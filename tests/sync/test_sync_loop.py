@@ -49,8 +49,8 @@ def test_call_soon_on_loop_during_calls_of_other_threads(loop: LoopThread) -> No
             loop.run(nothing)
 
     askers = [threading.Thread(target=ask, daemon=True) for _ in range(3)]
-    for each in askers:
-        each.start()
+    for asker in askers:
+        asker.start()
     asking = threading.Thread(target=loop.run, args=(ask_itself,), daemon=True)
     asking.start()
     for each in (*askers, asking):
@@ -70,8 +70,8 @@ def test_close_on_loop_during_calls_of_other_threads(loop: LoopThread) -> None:
             ends.append(type(error))
 
     askers = [threading.Thread(target=ask, daemon=True) for _ in range(3)]
-    for each in askers:
-        each.start()
+    for asker in askers:
+        asker.start()
     loop.call_soon(loop.close)
     for each in askers:
         each.join(LIMIT_S)

@@ -23,7 +23,7 @@ BLOCKING: dict[str, Any] = {
 
 def threads() -> list[str]:
     """Those that run: another test's that Ctrl-C had kept from starting are in ``threading``'s list for ever."""
-    return [each.name for each in threading.enumerate() if each.name.startswith("aerokit") and each.is_alive()]
+    return [thread.name for thread in threading.enumerate() if thread.name.startswith("aerokit") and thread.is_alive()]
 
 
 @pytest.mark.anyio

@@ -111,9 +111,9 @@ async def test_tcp_accepts_only_allowed_peers() -> None:
     await client.open(answered)
     assert "closed the connection" in str(await answered.until_lost()) or answered.losses
     assert link.peers == ()
-    for each in (client, link):
-        each.close()
-        await each.wait_closed()
+    for endpoint in (client, link):
+        endpoint.close()
+        await endpoint.wait_closed()
 
 
 # ------------------------------------------------------------- a receiver that says who is a peer
@@ -192,9 +192,9 @@ async def test_silent_client_makes_room_for_another(monkeypatch: pytest.MonkeyPa
     fourth = TcpConnect(*link.local_address)
     await fourth.open(Recorder())
     await vehicle_heard.until_lost()
-    for each in (mute, vehicle, third, fourth, link):
-        each.close()
-        await each.wait_closed()
+    for endpoint in (mute, vehicle, third, fourth, link):
+        endpoint.close()
+        await endpoint.wait_closed()
 
 
 # ------------------------------------------------------------------------------------ udpbcast

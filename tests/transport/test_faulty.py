@@ -41,7 +41,7 @@ def frames(count: int, version: int = 2) -> list[bytes]:
 
 
 def carried(path: FaultyPath, data: list[bytes], now: float = 0.0) -> list[tuple[float, bytes]]:
-    return [arrival for each in data for arrival in path.carry(each, now)]
+    return [arrival for datagram in data for arrival in path.carry(datagram, now)]
 
 
 # --------------------------------------------------------------------------------------- one direction
@@ -103,10 +103,10 @@ def test_changing_one_share_keeps_other_faults() -> None:
 def test_jitter_keeps_order_and_reordering_does_not() -> None:
     sent = frames(200)
     path = FaultyPath(FaultModel(delay_s=0.05, jitter_s=0.1))
-    due = [when for n, each in enumerate(sent) for when, _ in path.carry(each, n * 0.001)]
+    due = [when for n, message in enumerate(sent) for when, _ in path.carry(message, n * 0.001)]
     assert due == sorted(due)
     path = FaultyPath(FaultModel(reordering=0.1, overtaken_s=0.02))
-    due = [when for n, each in enumerate(sent) for when, _ in path.carry(each, n * 0.001)]
+    due = [when for n, message in enumerate(sent) for when, _ in path.carry(message, n * 0.001)]
     assert sum(before > after for before, after in pairwise(due)) == pytest.approx(path.reordered, abs=5)
 
 

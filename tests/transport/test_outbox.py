@@ -217,7 +217,7 @@ async def test_connection_reports_stall_and_drain(radio: FaultyLink, connection:
     connection.send(COMMAND)
     assert connection.unsent_bytes == radio.unsent_bytes > 0
     await anyio.sleep(4)
-    assert [type(each) for each in told] == [events.LinkStalled]
+    assert [type(event) for event in told] == [events.LinkStalled]
     radio.drain()
     await anyio.sleep(1)
     assert isinstance(told[-1], events.LinkDrained)
@@ -283,7 +283,7 @@ async def test_reconnecting_link_forwards_outbox_calls(radio: FaultyLink) -> Non
         assert connection.unsent_bytes == 0
         radio.drain()
         await anyio.sleep(0.5)
-        assert [type(each) for each in told] == [events.LinkStalled, events.LinkDrained]
+        assert [type(event) for event in told] == [events.LinkStalled, events.LinkDrained]
 
 
 async def test_links_without_outbox_have_nothing_unsent() -> None:

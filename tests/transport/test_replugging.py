@@ -101,9 +101,9 @@ async def test_server_closes_and_opens_again(reset: bool) -> None:
     await heard.until_data(b"one two")
     link.write(b"hello")
     await clients.until_data(b"hello")
-    for each in (link, again):
-        each.close()
-        await each.wait_closed()
+    for endpoint in (link, again):
+        endpoint.close()
+        await endpoint.wait_closed()
     assert (heard.away, heard.back, heard.losses) == (1, 1, [])
 
 

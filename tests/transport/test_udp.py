@@ -329,7 +329,7 @@ async def test_only_permanent_errors_end_a_udp_link(error: Exception, told: list
     await link.open(heard)
     udp._DatagramProtocol(link).error_received(error)
     await asyncio.sleep(0)
-    assert [str(each) for each in heard.losses] == [f"{link.address}: {each}" for each in told]
+    assert [str(loss) for loss in heard.losses] == [f"{link.address}: {event}" for event in told]
     link.close()
     await link.wait_closed()
 
@@ -360,7 +360,7 @@ async def test_end_of_burst_is_reported(wrap: Callable[[Any], Any]) -> None:
     assert link.reports_bursts
     assert gatherer.bursts[-1] == 3
     assert len(gatherer.bursts) <= 3
-    for each in (link, sender):
-        each.close()
-        await each.wait_closed()
+    for endpoint in (link, sender):
+        endpoint.close()
+        await endpoint.wait_closed()
     assert not inner.reports_bursts

@@ -46,12 +46,12 @@ async def test_zenoh_bytes_pass_both_ways() -> None:
     port = free_port()
     async with serving(port) as (vehicle, heard), client(port, "&client=ground") as (link, answered):
         frames = [frame(ParamRequestList(1, 1)) for _ in range(100)]
-        for each in frames:
-            link.write(each)
+        for received_frame in frames:
+            link.write(received_frame)
         await heard.until_data(b"".join(frames))
         assert heard.peers == ["ground"] == list(vehicle.peers)
-        for each in PIECES:
-            vehicle.write(each, "ground")
+        for piece in PIECES:
+            vehicle.write(piece, "ground")
         await answered.until_data(b"".join(PIECES))
         vehicle.write(b"to all")
         await answered.until_data(b"".join(PIECES) + b"to all")
@@ -125,9 +125,9 @@ async def test_name_in_use() -> None:
 async def test_zenoh_link_is_opened_once(tmp_path: Path) -> None:
     port = free_port()
     async with serving(port) as (vehicle, _), client(port) as (link, _told):
-        for each in (vehicle, link):
+        for endpoint in (vehicle, link):
             with pytest.raises(BusyError):
-                await each.open(Recorder())
+                await endpoint.open(Recorder())
     for each in (vehicle, link):
         with pytest.raises(ConnectionClosed):
             await each.open(Recorder())

@@ -307,7 +307,7 @@ def test_sent_command_records_heartbeats_within_its_block() -> None:
 
 
 def test_commands_are_classified_as_orders_or_questions() -> None:
-    assert {MavCmd(each).name for each in CHANGED_BY_COMMAND} == {
+    assert {MavCmd(number).name for number in CHANGED_BY_COMMAND} == {
         *("NAV_WAYPOINT", "NAV_LOITER_UNLIM", "NAV_LOITER_TURNS", "NAV_LOITER_TIME", "NAV_RETURN_TO_LAUNCH"),
         *("NAV_LAND", "NAV_TAKEOFF", "NAV_VTOL_TAKEOFF", "NAV_VTOL_LAND", "DO_SET_MODE", "DO_REPOSITION"),
         *("DO_FLIGHTTERMINATION", "DO_ORBIT", "DO_PAUSE_CONTINUE", "OVERRIDE_GOTO", "MISSION_START"),

@@ -30,7 +30,7 @@ async def _in_rtl() -> AsyncIterator[Px4Flight]:
 
 def _told_to_arm(flight: Px4Flight) -> bool:
     sent = flight.wire.commands(MavCmd.COMPONENT_ARM_DISARM)
-    return any(isinstance(each, CommandLong) and each.param1 == 1 for each in sent)
+    return any(isinstance(message, CommandLong) and message.param1 == 1 for message in sent)
 
 
 async def test_disarm_while_the_mode_changes_ends_arm() -> None:

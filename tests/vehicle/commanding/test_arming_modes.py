@@ -100,8 +100,8 @@ async def test_missing_for_flight_names_lost_link() -> None:
         flight.copter.faults.silent = True
         await anyio.sleep(20.0)
         reasons = await flight.vehicle.why_not_armable()
-        assert any("heartbeats (the last one 2" in each for each in reasons)
-        assert any("position (no GLOBAL_POSITION_INT" in each for each in reasons)
+        assert any("heartbeats (the last one 2" in reason for reason in reasons)
+        assert any("position (no GLOBAL_POSITION_INT" in reason for reason in reasons)
 
 
 async def test_missing_for_flight_without_link_lists_all() -> None:
@@ -114,7 +114,7 @@ async def test_missing_for_flight_without_link_lists_all() -> None:
         await anyio.sleep(0.5)
         with pytest.raises(OperationTimeout, match=r"heartbeats \(the last one .* s ago, the link is lost\)"):
             await vehicle.wait_ready(timeout=2.0)
-        assert any("the link is lost" in each for each in await vehicle.why_not_armable())
+        assert any("the link is lost" in reason for reason in await vehicle.why_not_armable())
         connection.link_restored(3.0)
         with pytest.raises(OperationTimeout, match="the link is lost"):
             await vehicle.wait_ready(timeout=0.2)
@@ -132,5 +132,5 @@ async def test_abandoned_arm_of_armed_vehicle_does_not_disarm() -> None:
         with anyio.move_on_after(0.001):
             await flight.vehicle.arm()
         await anyio.sleep(5.0)
-        assert [each.param1 for each in flight.wire.commands(ARM)] == [1.0]
+        assert [command.param1 for command in flight.wire.commands(ARM)] == [1.0]
         assert flight.vehicle.is_armed

@@ -27,7 +27,7 @@ async def test_block_left_after_cancelled_flight_warns_that_vehicle_holds(
             scope.deadline = anyio.current_time() + 2
             await flight.vehicle.go_to(flight.vehicle.position.value.offset(north_m=500))
     assert scope.cancelled_caught
-    (record,) = [each for each in caplog.records if "was left: " in each.message]
+    (record,) = [record for record in caplog.records if "was left: " in record.message]
     assert (record.name, record.levelname) == ("aerokit", "WARNING")
     assert record.message.startswith("the block of vehicle 1 was left: holding in BRAKE, still armed, ")
 
@@ -63,8 +63,8 @@ async def test_block_left_warns_only_with_active_order(
             caplog.clear()
             with pytest.raises(ZeroDivisionError):
                 async with aerokit.connect(connection) as vehicle:
-                    for each in orders:
-                        await each(vehicle)
+                    for order in orders:
+                        await order(vehicle)
                     raise ZeroDivisionError
             return caplog.text
 

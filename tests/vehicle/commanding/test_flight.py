@@ -390,8 +390,8 @@ async def test_go_to_without_do_reposition_sends_the_older_message() -> None:
         await flight.vehicle.go_to(target)
         assert flight.copter.motion.north == pytest.approx(40.0, abs=2.5)
         sent = flight.wire.all(m.SetPositionTargetGlobalInt)
-        assert {each.type_mask for each in sent} == {0x0DF8}  # velocity, acceleration, yaw and yaw rate ignored
-        assert {each.coordinate_frame for each in sent} == {6}
+        assert {message.type_mask for message in sent} == {0x0DF8}  # velocity, acceleration, yaw and yaw rate ignored
+        assert {message.coordinate_frame for message in sent} == {6}
         assert sent[0].lat_int == round(target.latitude_deg * 1e7)
         flight.wire.forget()
         await anyio.sleep(5.0)
@@ -590,7 +590,7 @@ async def test_set_heading_absolute_and_relative(flying: Flight) -> None:
     assert math.degrees(flying.copter.motion.yaw) == pytest.approx(60.0, abs=3.0)
     await vehicle.set_heading(40.0, relative=True, rate_deg_s=20.0, tolerance_deg=1.0)
     assert math.degrees(flying.copter.motion.yaw) == pytest.approx(100.0, abs=4.0)
-    absolute, left, right = (each for each in flying.wire.commands(MavCmd.CONDITION_YAW))
+    absolute, left, right = (command for command in flying.wire.commands(MavCmd.CONDITION_YAW))
     assert (absolute.param1, absolute.param3, absolute.param4) == (90.0, 0.0, 0.0)
     assert left.param1 == pytest.approx(60.0, abs=1.5)
     assert (left.param3, left.param4) == (-1.0, 0.0)

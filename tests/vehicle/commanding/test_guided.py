@@ -454,7 +454,7 @@ async def test_invalid_setpoint_keeps_previous(flying: Flight) -> None:
                 stream.set(VelocitySetpoint(wrong))
         flying.wire.forget()
         await anyio.sleep(1.0)
-        assert {each.vx for each in flying.wire.all(m.SetPositionTargetLocalNed)} == {3.0}
+        assert {message.vx for message in flying.wire.all(m.SetPositionTargetLocalNed)} == {3.0}
 
 
 async def test_unsupported_setpoint_kinds_raise() -> None:
@@ -483,8 +483,8 @@ async def test_px4_stream_starts_before_offboard_request() -> None:
             first = flight.wire.setpoints()[0][0]
             asked = next(
                 at
-                for at, each in flight.wire.sent
-                if isinstance(each, m.CommandLong) and each.command == MavCmd.DO_SET_MODE
+                for at, message in flight.wire.sent
+                if isinstance(message, m.CommandLong) and message.command == MavCmd.DO_SET_MODE
             )
             assert asked - first >= 0.9
             await stream.fly(NORTH, 6.0)

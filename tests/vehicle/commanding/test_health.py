@@ -150,7 +150,7 @@ async def test_disarm_in_the_air_is_refused_and_forced(flying: Flight) -> None:
     assert flying.vehicle.is_armed
     await flying.vehicle.disarm(force=True)
     assert not flying.copter.is_armed
-    assert [each.param2 for each in flying.wire.commands(ARM)] == [0.0, 21196.0]
+    assert [command.param2 for command in flying.wire.commands(ARM)] == [0.0, 21196.0]
 
 
 async def test_late_ack_of_cancelled_command_is_ignored() -> None:
@@ -291,4 +291,4 @@ async def test_state_older_than_five_seconds_is_missing_for_flight(grounded: Fli
     await anyio.sleep(4.5)
     assert grounded.vehicle.missing_for_flight() == []
     await anyio.sleep(1.5)
-    assert any("no SYS_STATUS for" in each for each in grounded.vehicle.missing_for_flight())
+    assert any("no SYS_STATUS for" in reason for reason in grounded.vehicle.missing_for_flight())

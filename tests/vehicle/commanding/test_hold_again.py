@@ -73,7 +73,7 @@ async def test_hold_ignored_is_repeated_three_times(
         flight.copter.faults.ignore(MavCmd.DO_SET_MODE)
         await give_up(flight)
         await anyio.sleep(60.0)
-        told = [each for each in caplog.messages if "is not confirmed yet" in each]
+        told = [message for message in caplog.messages if "is not confirmed yet" in message]
         assert len(told) == 3
         flight.wire.forget()
         await anyio.sleep(60.0)
@@ -85,7 +85,7 @@ async def test_refused_hold_warns_once(caplog: pytest.LogCaptureFixture) -> None
         flight.copter.faults.refuse(MavCmd.DO_SET_MODE, MavResult.DENIED)
         await give_up(flight)
         await anyio.sleep(10.0)
-        (record,) = [each for each in caplog.records if "does not hold" in each.message]
+        (record,) = [record for record in caplog.records if "does not hold" in record.message]
         assert record.message.startswith("the vehicle does not hold after an abandoned flight: ")
         assert flight.wire.mode_orders() == [BRAKE]
 

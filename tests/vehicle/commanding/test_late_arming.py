@@ -23,7 +23,7 @@ ARM = MavCmd.COMPONENT_ARM_DISARM
 
 def ordered(flight: Flight) -> list[float]:
     """1 for each order to arm that was sent, 0 for each to disarm."""
-    return [each.param1 for each in flight.wire.commands(ARM)]
+    return [command.param1 for command in flight.wire.commands(ARM)]
 
 
 async def test_arming_after_abandoned_order_is_undone(grounded: Flight) -> None:
@@ -95,7 +95,7 @@ async def test_failed_late_disarm_logs_error(grounded: Flight, caplog: pytest.Lo
     await grounded.vehicle.armed.wait_until(bool, timeout=5)
     grounded.copter.faults.refuse(ARM, MavResult.FAILED)
     await anyio.sleep(5.0)
-    (record,) = [each for each in caplog.records if each.levelname == "ERROR"]
+    (record,) = [record for record in caplog.records if record.levelname == "ERROR"]
     assert "an abandoned arm command has armed the vehicle, and it could not be disarmed" in record.message
     assert grounded.copter.is_armed
 
@@ -157,7 +157,7 @@ async def test_arm_is_not_repeated_after_pilot_disarmed(kind: str) -> None:
         with pytest.raises(AerokitError):
             await flight.vehicle.arm()
         await anyio.sleep(ARM_WATCH_S)
-        assert [each.param1 for each in flight.wire.commands(ARM)] == [1]
+        assert [command.param1 for command in flight.wire.commands(ARM)] == [1]
         assert not simulated.is_armed
 
 

@@ -57,11 +57,11 @@ def _commands(air: Air, command: int) -> list[tuple[float, float]]:
     """Return when the command was sent, and its param1 (176: param2)."""
     return [
         (
-            each.at - air.began_at,
-            each.message.param2 if command == MavCmd.DO_SET_MODE else each.message.param1,
+            message.at - air.began_at,
+            message.message.param2 if command == MavCmd.DO_SET_MODE else message.message.param1,
         )
-        for each in air.sent
-        if isinstance(each.message, (CommandLong, CommandInt)) and each.message.command == command
+        for message in air.sent
+        if isinstance(message.message, (CommandLong, CommandInt)) and message.message.command == command
     ]
 
 
@@ -147,10 +147,10 @@ async def test_legacy_set_mode_is_not_sent_for_ended_order(
             await vehicle.set_heading(90.0)
         await anyio.sleep(2.0)
         old = [
-            each
-            for each in air.sent
-            if isinstance(each.message, SetPositionTargetGlobalInt)
-            or (isinstance(each.message, SetMode) and each.message.custom_mode == CopterMode.LAND)
+            message
+            for message in air.sent
+            if isinstance(message.message, SetPositionTargetGlobalInt)
+            or (isinstance(message.message, SetMode) and message.message.custom_mode == CopterMode.LAND)
         ]
         assert not old
         assert true_point(copter).mode == "GUIDED"

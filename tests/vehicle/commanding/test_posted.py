@@ -228,8 +228,8 @@ def test_raw_messages_have_subjects(message: Any, subjects: set[str]) -> None:
 async def test_posted_mode_arm_take_off_without_waiting(grounded: Flight) -> None:
     """Each goes out at once, while the one before is not answered; lost answers are made good."""
     vehicle, wire = grounded.vehicle, grounded.wire
-    for each in (SET_MODE, ARM):
-        grounded.copter.faults.lose_ack(each, times=1)
+    for command in (SET_MODE, ARM):
+        grounded.copter.faults.lose_ack(command, times=1)
     guided = vehicle.autopilot.find_mode("GUIDED")
 
     async def mode() -> None:
@@ -250,7 +250,7 @@ async def test_posted_mode_arm_take_off_without_waiting(grounded: Flight) -> Non
     async with anyio.create_task_group() as tasks:
         for each_of in (mode, arm, take_off):
             tasks.start_soon(each_of)
-    sent = [at for each in (SET_MODE, ARM, TAKEOFF) for at, message in wire.sent if message in wire.commands(each)]
+    sent = [at for command in (SET_MODE, ARM, TAKEOFF) for at, message in wire.sent if message in wire.commands(command)]
     assert sent == [started] * 3  # Once each: HEARTBEAT reported the effects of the unacknowledged commands.
     await vehicle.position.wait_until(lambda here: (here.altitude_relative_m or 0) > 4.5, timeout=20)
 
@@ -281,9 +281,9 @@ async def test_message_to_other_system_is_no_order(flying: Flight) -> None:
         m.SetPositionTargetLocalNed(0, vehicle.system_id + 1, 1, 1, 0x0DC7, *(0,) * 11),
     )
     with vehicle.posted("motion") as order:
-        for each in others:
-            vehicle.send(each)
-            assert (each.NAME, order.end) == (each.NAME, "")
+        for other in others:
+            vehicle.send(other)
+            assert (other.NAME, order.end) == (other.NAME, "")
         vehicle.send(m.SetPositionTargetLocalNed(0, 0, 0, 1, 0x0DC7, *(0,) * 11))  # to everybody
         assert order.end == NEWER
 
@@ -450,7 +450,7 @@ async def test_disarm_before_armed_report_keeps_pilots_arming(is_posted: bool) -
             await armed.wait_until(lambda value: not value)
             flight.copter.arming.arm()
             await anyio.sleep(5)
-        assert [each.param1 for each in flight.wire.commands(ARM)] == [1, 0]
+        assert [command.param1 for command in flight.wire.commands(ARM)] == [1, 0]
         assert vehicle.is_armed
 
 

@@ -251,5 +251,5 @@ async def test_second_ack_of_cancelled_mode_is_not_taken_for_next(
         monkeypatch.undo()
         flight.px4.faults.ignore(MavCmd.DO_SET_MODE, times=1)
         await vehicle.land(timeout=60.0)
-        modes = [each for each in flight.wire.commands(MavCmd.DO_SET_MODE) if isinstance(each, m.CommandLong)]
-        assert [int(each.param3) for each in modes] == [5, 6, 6]
+        modes = [command for command in flight.wire.commands(MavCmd.DO_SET_MODE) if isinstance(command, m.CommandLong)]
+        assert [int(mode.param3) for mode in modes] == [5, 6, 6]

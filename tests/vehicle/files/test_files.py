@@ -57,7 +57,7 @@ class Bench:
         return bytes(file.read(0, 10_000_000))
 
     def sent(self) -> list[FtpMessage]:
-        return [FtpMessage.decode(each.payload) for each in self.wire.all(m.FileTransferProtocol)]
+        return [FtpMessage.decode(message.payload) for message in self.wire.all(m.FileTransferProtocol)]
 
     async def all_closed(self) -> None:
         """Check that within seconds the vehicle has no open session, and no task waits here."""
@@ -395,7 +395,7 @@ async def test_write_is_verified(ardupilot: Bench, monkeypatch: pytest.MonkeyPat
 
 
 def names_in(directory: Path) -> list[str]:
-    return sorted(each.name for each in directory.iterdir())
+    return sorted(path.name for path in directory.iterdir())
 
 
 def frame_of(message: m.FileTransferProtocol) -> bytes:

@@ -74,7 +74,7 @@ async def ardupilot() -> AsyncIterator[Bench]:
 
 async def test_list_returns_logs(bench: Bench) -> None:
     entries = await bench.logs.list()
-    assert [each.size for each in entries] == [each.size for each in bench.server.logs]
+    assert [entry.size for entry in entries] == [log.size for log in bench.server.logs]
     assert entries[0].id == bench.vehicle.autopilot.first_log_id
     assert entries[0].time_utc == datetime.fromtimestamp(bench.server.logs[0].time_utc, tz=timezone.utc)
 
@@ -168,7 +168,7 @@ async def test_growing_log_is_read_to_its_current_end(
             await bench.logs.download(entry, tmp_path / "flight.bin", method=method)
         assert bench.content(-1).startswith(content)
         assert bench.content(-1).startswith((tmp_path / "flight.bin").read_bytes())
-        texts = [each.getMessage() for each in caplog.records]
+        texts = [record.getMessage() for record in caplog.records]
         assert f"log {entry.id} was still being written: listed with {entry.size} byt" in texts[0]
         assert f"downloaded with {len(content)}" in texts[0]
         await bench.all_quiet()
@@ -179,7 +179,7 @@ async def test_complete_log_is_not_reported_as_growing(ardupilot: Bench, caplog:
     with caplog.at_level("INFO", "aerokit"):
         await ardupilot.logs.read(entry, method="log")
         await ardupilot.logs.read(entry, method="ftp")
-    assert not [each for each in caplog.records if "being written" in each.getMessage()]
+    assert not [record for record in caplog.records if "being written" in record.getMessage()]
 
 
 async def test_log_ended_since_listing_is_read_in_flight(ardupilot: Bench) -> None:
@@ -290,7 +290,7 @@ async def test_log_path_identifies_files() -> None:
 
 
 def names_in(directory: Path) -> list[str]:
-    return sorted(each.name for each in directory.iterdir())
+    return sorted(path.name for path in directory.iterdir())
 
 
 @pytest.mark.parametrize("make", [SimulatedCopter, SimulatedPx4])
@@ -307,7 +307,7 @@ def test_transfer_over_bad_radio(make: Any, loss: float, seed: int) -> None:
                 radio.outgoing.model = radio.incoming.model = model
                 logs = simulated.storage.logs
                 entries = await vehicle.logs.list()
-                assert [each.size for each in entries] == [each.size for each in logs.logs]
+                assert [entry.size for entry in entries] == [log.size for log in logs.logs]
                 assert await vehicle.logs.read(entries[-1], method="log") == logs.logs[-1].make()
                 radio.outgoing.model = radio.incoming.model = FaultModel(delay_s=0.05)
                 await anyio.sleep(5.0)

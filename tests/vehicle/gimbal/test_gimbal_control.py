@@ -348,8 +348,8 @@ async def test_control_is_released_after_silence() -> None:
 def pitchyaws(flight: Any) -> list[tuple[float, float]]:
     """Streamed rates in degrees per second."""
     return [
-        (round(math.degrees(each.pitch_rate), 2), round(math.degrees(each.yaw_rate), 2))
-        for each in flight.wire.all(m.GimbalManagerSetPitchyaw)
+        (round(math.degrees(message.pitch_rate), 2), round(math.degrees(message.yaw_rate), 2))
+        for message in flight.wire.all(m.GimbalManagerSetPitchyaw)
     ]
 
 
@@ -433,8 +433,8 @@ async def test_rates_stay_with_their_gimbal() -> None:
             one.faults.silent = True
             await stream.turn(0.0, 5.0, 15.0)
         commands: list[Any] = flight.wire.commands(PITCHYAW)
-        assert {each.target_component for each in commands} == {1}
-        assert {each.target_component for each in flight.wire.all(m.GimbalManagerSetPitchyaw)} == {1}
+        assert {command.target_component for command in commands} == {1}
+        assert {message.target_component for message in flight.wire.all(m.GimbalManagerSetPitchyaw)} == {1}
         assert flight.vehicle.gimbals.ids == (171, 154)
 
 

@@ -35,7 +35,7 @@ LEVEL, LOCKED = 12, 28
 
 
 def degrees(gimbal: SimulatedGimbal) -> list[float]:
-    return [math.degrees(each) for each in gimbal.angles()]
+    return [math.degrees(angle) for angle in gimbal.angles()]
 
 
 # ------------------------------------------------------------------------------------------- pointing
@@ -67,7 +67,7 @@ async def test_vehicle_frame_yaw_turns_with_the_vehicle() -> None:
         assert degrees(gimbal)[1:] == pytest.approx([-20, -30], abs=0.5)
         await flight.vehicle.gimbal.point(-20.0, 60.0)
         assert flight.vehicle.gimbal.attitude.value.yaw_from_nose_deg == pytest.approx(-30, abs=4)
-        flags = [int(each.param5) for each in flight.wire.commands(PITCHYAW)]  # type: ignore[union-attr]
+        flags = [int(command.param5) for command in flight.wire.commands(PITCHYAW)]  # type: ignore[union-attr]
         assert flags[0] == LEVEL
         assert flags[-1] == LOCKED
 
@@ -84,7 +84,7 @@ async def test_autopilot_attitude_is_requested_while_pointing() -> None:
         assert (command.target_component, command.param7) == (1, 0)  # type: ignore[union-attr]
         await anyio.sleep(1.0)
         asked = flight.wire.commands(MavCmd.SET_MESSAGE_INTERVAL)
-        of_it = [each.param2 for each in asked if each.param1 == m.GimbalDeviceAttitudeStatus.ID]
+        of_it = [request.param2 for request in asked if request.param1 == m.GimbalDeviceAttitudeStatus.ID]
         assert of_it == [250_000, 0]
 
 
@@ -214,7 +214,7 @@ async def test_old_mount_neutral_uses_mount_mode(name: str, mode: int) -> None:
     async with mounted() as flight:
         flight.copter.faults.refuse(PITCHYAW, MavResult.UNSUPPORTED)
         await getattr(flight.vehicle.gimbal, name)()
-        assert [each.param7 for each in flight.wire.commands(MOUNT)] == [mode]  # type: ignore[union-attr]
+        assert [command.param7 for command in flight.wire.commands(MOUNT)] == [mode]  # type: ignore[union-attr]
         await getattr(flight.vehicle.gimbal, name)(wait=False)
         assert len(flight.wire.commands(PITCHYAW)) == 1
 
@@ -369,15 +369,15 @@ async def test_several_gimbals_are_discovered() -> None:
         gimbals = flight.vehicle.gimbals
         assert await gimbals.discover() == (1, 154, 171)
         assert len(gimbals) == 3
-        assert [each.device_id for each in gimbals] == [1, 154, 171]
+        assert [gimbal.device_id for gimbal in gimbals] == [1, 154, 171]
         await gimbals[171].point(-30.0, 0.0, frame="vehicle")
         assert (degrees(one)[1], degrees(two)[1]) == pytest.approx((0, -30), abs=3)
         await gimbals[1].point(-10.0, 0.0, frame="vehicle")
         assert gimbals[1].attitude.value.pitch_deg == pytest.approx(-10, abs=3)
         assert flight.vehicle.gimbal.device_id == 1
-        to = [(each.target_component, each.param7) for each in flight.wire.commands(PITCHYAW)]  # type: ignore[union-attr]
+        to = [(command.target_component, command.param7) for command in flight.wire.commands(PITCHYAW)]  # type: ignore[union-attr]
         assert to == [(171, 171), (171, 171), (1, 1)]
-        claimed = [each.target_component for each in flight.wire.commands(CONFIGURE)]
+        claimed = [command.target_component for command in flight.wire.commands(CONFIGURE)]
         assert claimed == [171]
 
 
@@ -387,7 +387,7 @@ async def test_first_gimbal_is_the_autopilots() -> None:
         assert flight.vehicle.gimbal.attitude.source == Source(1, 154, "GIMBAL_DEVICE_ATTITUDE_STATUS")
         await flight.vehicle.gimbal.point(0.0, 0.0, frame="vehicle")
         assert flight.vehicle.gimbals[1].attitude.value.pitch_deg == pytest.approx(0, abs=3)
-        assert [each.target_component for each in flight.wire.commands(PITCHYAW)] == [1]
+        assert [command.target_component for command in flight.wire.commands(PITCHYAW)] == [1]
 
 
 async def test_undiscovered_gimbal_is_asked_for_its_manager() -> None:
@@ -417,7 +417,7 @@ async def test_number_of_gimbals_is_bounded() -> None:
         assert len(gimbals) == MAX_GIMBALS
         with pytest.raises(BusyError):
             gimbals.get(250)
-        assert len({id(each) for each in gimbals}) == MAX_GIMBALS
+        assert len({id(gimbal) for gimbal in gimbals}) == MAX_GIMBALS
         assert gimbals.get(1) is gimbals.get(1)
     with pytest.raises(InvalidArgument):
         gimbals.get(0)
@@ -468,7 +468,7 @@ async def test_gone_gimbal_is_no_longer_first() -> None:
         assert vehicle.gimbals.ids == (154, 171)
         await anyio.sleep(3.0)
         assert vehicle.gimbals.ids == (171, 154)
-        assert [each.device_id for each in vehicle.gimbals] == [171, 154]
+        assert [gimbal.device_id for gimbal in vehicle.gimbals] == [171, 154]
         await vehicle.gimbal.point(-20.0, 0.0, frame="vehicle")
         assert degrees(two)[1] == pytest.approx(-20, abs=3)
         source = vehicle.gimbal.attitude.source
@@ -509,7 +509,7 @@ async def test_foreign_status_does_not_redirect_orders() -> None:
         assert flight.vehicle.gimbal.controllers.value.primary != (9, 9)
         report(flight, 191, m.GimbalManagerInformation(0, 0, 154, 0, 0, 0, 0, 0, 0))
         await flight.vehicle.gimbal.point(-20.0, 0.0, frame="vehicle")
-        assert {each.target_component for each in flight.wire.commands(PITCHYAW)} == {154}
+        assert {command.target_component for command in flight.wire.commands(PITCHYAW)} == {154}
 
 
 @pytest.mark.parametrize("number", [0, 30])
@@ -521,7 +521,7 @@ async def test_gimbal_of_any_id_manages_itself(number: int) -> None:
         report(flight, 191, m.GimbalManagerInformation(0, 0, 30, 0, 0, 0, 0, 0, 0))
         with pytest.raises(CommandTimeout):
             await gimbals[30].point(0.0, 0.0, wait=False)
-        assert {each.target_component for each in flight.wire.commands(PITCHYAW)} == {30}
+        assert {command.target_component for command in flight.wire.commands(PITCHYAW)} == {30}
 
 
 async def test_gone_manager_is_replaced() -> None:

@@ -226,7 +226,7 @@ async def test_mission_file_is_compared_exactly(monkeypatch: pytest.MonkeyPatch)
         replace = items.replace
 
         def keep_something_else(type_: int, given: Any, **options: Any) -> Any:
-            return replace(type_, [each.replace(x=each.x + 3 * (each.frame == 3)) for each in given], **options)
+            return replace(type_, [order.replace(x=order.x + 3 * (order.frame == 3)) for order in given], **options)
 
         monkeypatch.setattr(items, "replace", keep_something_else)
         mission = long_mission(1)

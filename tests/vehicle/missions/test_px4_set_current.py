@@ -20,7 +20,7 @@ async def _start_mission(flight: Px4Flight) -> None:
     await flight.take_off()
     here = flight.vehicle.position.value
     places = [here.offset(north_m=50.0 * number) for number in (1, 2, 3)]
-    items = [missions.waypoint(each.latitude_deg, each.longitude_deg, altitude_relative_m=10) for each in places]
+    items = [missions.waypoint(place.latitude_deg, place.longitude_deg, altitude_relative_m=10) for place in places]
     await flight.vehicle.mission.upload(missions.Mission(items))
     await flight.vehicle.mission.start()
     await anyio.sleep(1.5)

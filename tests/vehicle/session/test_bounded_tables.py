@@ -56,8 +56,8 @@ def test_parameter_beyond_table_limit_is_not_requested_repeatedly() -> None:
         exchange.receive(ParamValue(f"P{number}", 1.0, 9, count, number), 0.0)
     for _ in range(3):
         exchange.receive(ParamValue(f"P{count - 1}", 1.0, 9, count, count - 1), 0.1)
-    asked = [each for each in exchange.take_outbox() if isinstance(each, ParamRequestRead)]
-    assert [each.param_index for each in asked] == [count - 1]
+    asked = [message for message in exchange.take_outbox() if isinstance(message, ParamRequestRead)]
+    assert [request.param_index for request in asked] == [count - 1]
 
 
 async def test_mode_names() -> None:

@@ -100,7 +100,7 @@ async def test_command_retries_increment_confirmation(grounded: Flight) -> None:
     grounded.copter.faults.ignore(BANNER, times=2)
     started = now()
     await grounded.vehicle.command(BANNER, retries=3)
-    assert [each.confirmation for each in grounded.wire.commands(BANNER)] == [0, 1, 2]  # type: ignore[union-attr]
+    assert [command.confirmation for command in grounded.wire.commands(BANNER)] == [0, 1, 2]  # type: ignore[union-attr]
     assert 1.5 <= now() - started <= 3.1  # each time right after a heartbeat
 
 
@@ -249,7 +249,7 @@ async def test_reboot_waits_for_return_and_resets_state(grounded: Flight) -> Non
     assert grounded.copter.uptime < 10.0
     await vehicle.wait_ready(timeout=30.0)
     assert vehicle.version.is_known
-    rates = [each for each in grounded.wire.commands(MavCmd.SET_MESSAGE_INTERVAL) if each.param1 == m.Attitude.ID]
+    rates = [command for command in grounded.wire.commands(MavCmd.SET_MESSAGE_INTERVAL) if command.param1 == m.Attitude.ID]
     assert len(rates) >= 1  # streams are asked for again
     assert vehicle.attitude.fresh(within=0.5)
 
@@ -264,8 +264,8 @@ async def test_reboot_time_is_requested_after_ack(
     await grounded.vehicle.reboot()
     detach()
     sent = grounded.wire.sent
-    ordered = next(i for i, (_, each) in enumerate(sent) if getattr(each, "command", 0) == REBOOT)
-    requested_at = [at for at, each in sent[ordered:] if isinstance(each, m.Timesync)]
+    ordered = next(i for i, (_, message) in enumerate(sent) if getattr(message, "command", 0) == REBOOT)
+    requested_at = [at for at, message in sent[ordered:] if isinstance(message, m.Timesync)]
     assert requested_at[:1] == answered_at
 
 

@@ -23,8 +23,8 @@ def interval(flight: Flight, kind: type[Message]) -> float:
 
 def requests(flight: Flight | Px4Flight) -> list[tuple[int, int, int, int]]:
     return [
-        (each.target_component, each.req_stream_id, each.req_message_rate, each.start_stop)
-        for each in flight.wire.all(m.RequestDataStream)
+        (message.target_component, message.req_stream_id, message.req_message_rate, message.start_stop)
+        for message in flight.wire.all(m.RequestDataStream)
     ]
 
 
@@ -65,10 +65,10 @@ async def test_streams_of_px4_requests_missing_states() -> None:
         with flight.vehicle.streams(2):
             await anyio.sleep(10.0)
             assert not requests(flight)
-            missing = [each.param1 for each in flight.wire.commands(MavCmd.SET_MESSAGE_INTERVAL)]
+            missing = [command.param1 for command in flight.wire.commands(MavCmd.SET_MESSAGE_INTERVAL)]
             assert all(flight.vehicle.telemetry.cells[name].is_known for name in ("attitude", "position", "gps"))
         await anyio.sleep(5.0)
-        given_back = [each.param1 for each in flight.wire.commands(MavCmd.SET_MESSAGE_INTERVAL) if each.param2 == 0]
+        given_back = [command.param1 for command in flight.wire.commands(MavCmd.SET_MESSAGE_INTERVAL) if command.param2 == 0]
         assert sorted(given_back) == sorted(set(missing))
 
 

@@ -23,7 +23,7 @@ SET_INTERVAL = MavCmd.SET_MESSAGE_INTERVAL
 
 def asked(flight: Flight, kind: type[Message]) -> list[float]:
     """The intervals in seconds that this message was asked for."""
-    return [each.param2 / 1e6 for each in flight.wire.commands(SET_INTERVAL) if each.param1 == kind.ID]
+    return [command.param2 / 1e6 for command in flight.wire.commands(SET_INTERVAL) if command.param1 == kind.ID]
 
 
 def interval(flight: Flight, kind: type[Message]) -> float:
@@ -33,9 +33,9 @@ def interval(flight: Flight, kind: type[Message]) -> float:
 
 def group_requests(flight: Flight) -> dict[int, list[tuple[int, int]]]:
     requests: dict[int, list[tuple[int, int]]] = {}
-    for each in flight.wire.all(m.RequestDataStream):
-        assert (each.target_system, each.target_component) == (1, 1)
-        requests.setdefault(each.req_stream_id, []).append((each.req_message_rate, each.start_stop))
+    for message in flight.wire.all(m.RequestDataStream):
+        assert (message.target_system, message.target_component) == (1, 1)
+        requests.setdefault(message.req_stream_id, []).append((message.req_message_rate, message.start_stop))
     return requests
 
 
@@ -158,7 +158,7 @@ async def test_answered_timesync_is_requested_immediately_again() -> None:
             flight.copter.faults.ignore(SET_INTERVAL, times=times)
             requests.enter_context(flight.vehicle.rate(m.RawImu, hz))
             await anyio.sleep(40.0)
-            at = [when for when, each in flight.wire.sent if isinstance(each, m.CommandLong)]
+            at = [when for when, message in flight.wire.sent if isinstance(message, m.CommandLong)]
             gaps = [later - earlier for earlier, later in itertools.pairwise(at)]
             assert gaps == pytest.approx([3.0, 5.0, 9.0][:times], abs=1.01)
 

@@ -49,7 +49,7 @@ async def test_px4_set_heading_turns_and_keeps_speed(heading_deg: float, yaw: fl
         (command,) = flight.wire.commands(MavCmd.DO_REPOSITION)
         params = params_of(command)
         assert params[:4] == pytest.approx([-1.0, 1.0, 0.0, yaw])
-        assert all(math.isnan(each) for each in params[4:])
+        assert all(math.isnan(param) for param in params[4:])
 
 
 async def test_speed_and_roi_are_raw_commands(flying: Flight) -> None:
@@ -152,8 +152,8 @@ async def test_px4_arms_when_ready_in_new_mode() -> None:
         await flight.vehicle.mode.wait_until(lambda mode: mode.name == "OFFBOARD")
         await anyio.sleep(1.0)
         await flight.vehicle.arm()
-        modes = [at for at, each in flight.wire.sent if getattr(each, "command", 0) == MavCmd.DO_SET_MODE]
-        arms = [at for at, each in flight.wire.sent if getattr(each, "command", 0) == MavCmd.COMPONENT_ARM_DISARM]
+        modes = [at for at, message in flight.wire.sent if getattr(message, "command", 0) == MavCmd.DO_SET_MODE]
+        arms = [at for at, message in flight.wire.sent if getattr(message, "command", 0) == MavCmd.COMPONENT_ARM_DISARM]
         assert arms[0] - modes[0] < 2.5
 
 

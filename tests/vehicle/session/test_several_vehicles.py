@@ -68,11 +68,11 @@ async def test_commands_reach_only_addressed_vehicle() -> None:
     async with two_vehicles() as both:
         await both.two.arm()
         assert not both.first.is_armed
-        assert {each.target_system for each in both.wire.commands(MavCmd.COMPONENT_ARM_DISARM)} == {2}
+        assert {command.target_system for command in both.wire.commands(MavCmd.COMPONENT_ARM_DISARM)} == {2}
         await both.one.set_mode("ALT_HOLD")
         assert both.second.mode.number == CopterMode.STABILIZE
-        sent = [each for _, each in both.wire.sent if not isinstance(each, m.Timesync)]
-        assert {getattr(each, "target_system", None) for each in sent} == {None, 1, 2}  # no broadcasts
+        sent = [message for _, message in both.wire.sent if not isinstance(message, m.Timesync)]
+        assert {getattr(message, "target_system", None) for message in sent} == {None, 1, 2}  # no broadcasts
 
 
 async def test_both_vehicles_fly_concurrently() -> None:
@@ -152,7 +152,7 @@ async def test_reboot_of_one_vehicle_keeps_other() -> None:
         assert both.one.position.fresh(within=0.5)
         assert both.first.uptime > 10.0
         requests = both.wire.commands(MavCmd.SET_MESSAGE_INTERVAL)
-        asked = {each.target_system for each in requests if each.param1 != m.DistanceSensor.ID}
+        asked = {request.target_system for request in requests if request.param1 != m.DistanceSensor.ID}
         assert asked == {2}
 
 
@@ -321,7 +321,7 @@ async def test_found_event_is_published_once_per_autopilot() -> None:
             async with aerokit.connect(connection, system_id=1):
                 await anyio.sleep(5.0)
             told = [await found.get(timeout=1.0), await found.get(timeout=1.0)]
-            assert [(each.system_id, each.component_id) for each in told] == [(1, 1), (2, 1)]
+            assert [(event.system_id, event.component_id) for event in told] == [(1, 1), (2, 1)]
             assert found.get_nowait() is None
 
 
@@ -332,7 +332,7 @@ async def test_connect_uses_recent_heartbeat_only(silent_s: float, is_found: boo
         await anyio.sleep(3.2)
         copter.faults.silent = True
         heard_at = max(
-            each.received_frame.received_at for each in connection.heartbeats.values() if each.received_frame
+            heartbeat.received_frame.received_at for heartbeat in connection.heartbeats.values() if heartbeat.received_frame
         )
         await anyio.sleep(heard_at + silent_s - now())
         try:

@@ -237,7 +237,7 @@ def test_silence_event_is_published_once_after_limit() -> None:
         stage.hear(HEARTBEAT, component_id=component_id)
         assert stage.watch.is_silent is silent
     assert (stage.told()[VehicleSilent], stage.told()[VehicleRecovered]) == (1, 1)
-    (back,) = [each for each in stage.bus.published if isinstance(each, VehicleRecovered)]
+    (back,) = [event for event in stage.bus.published if isinstance(event, VehicleRecovered)]
     assert back.silent_for_s == 9.0
 
 

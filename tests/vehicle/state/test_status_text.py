@@ -41,20 +41,20 @@ def test_status_text_trailing_tabs_are_removed() -> None:
 
 def test_status_text_chunks_are_joined() -> None:
     texts = StatusTextAssembler()
-    told = [text for each in chunks(LONG) for text in texts.receive(each, 1.0)]
+    told = [text for chunk in chunks(LONG) for text in texts.receive(chunk, 1.0)]
     assert told == [StatusText(4, LONG, 1.0)]
 
 
 def test_status_text_full_chunks_end_with_empty_chunk() -> None:
     texts = StatusTextAssembler()
-    told = [text.text for each in chunks("x" * 100) for text in texts.receive(each, 1.0)]
+    told = [text.text for chunk in chunks("x" * 100) for text in texts.receive(chunk, 1.0)]
     assert told == ["x" * 100]
 
 
 @given(st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=300))
 def test_status_text_round_trip_any_text(text: str) -> None:
     texts = StatusTextAssembler()
-    told = [each.text for chunk in chunks(text) for each in texts.receive(chunk, 0.0)]
+    told = [message.text for chunk in chunks(text) for message in texts.receive(chunk, 0.0)]
     assert told == [text.rstrip()]
 
 
@@ -102,13 +102,13 @@ def test_status_text_id_reused_ends_previous_text() -> None:
     texts = StatusTextAssembler()
     texts.receive(chunks(LONG)[0], 0.0)
     texts.receive(chunks(LONG)[1], 0.0)
-    told = [text.text for each in chunks("Another " + LONG) for text in texts.receive(each, 0.5)]
+    told = [text.text for chunk in chunks("Another " + LONG) for text in texts.receive(chunk, 0.5)]
     assert told == [LONG[:100].rstrip() + "…", "Another " + LONG]
 
 
 def test_status_text_repeated_chunk_is_used_once() -> None:
     texts = StatusTextAssembler()
-    told = [text.text for each in chunks(LONG) for _ in range(2) for text in texts.receive(each, 0.0)]
+    told = [text.text for chunk in chunks(LONG) for _ in range(2) for text in texts.receive(chunk, 0.0)]
     assert told[0] == LONG
 
 
@@ -168,7 +168,7 @@ def test_severity_names() -> None:
 
 @pytest.mark.parametrize("text", ["", "\t", "   "])
 def test_empty_texts(text: str) -> None:
-    assert [each.text for each in StatusTextAssembler().receive(Statustext(6, text), 0.0)] == [""]
+    assert [message.text for message in StatusTextAssembler().receive(Statustext(6, text), 0.0)] == [""]
 
 
 def test_every_state_message_is_in_standard_dialect() -> None:
@@ -179,10 +179,10 @@ def test_status_text_repetition_requires_same_text_and_sequence() -> None:
     """Only the last chunk once more is a frame that came by another way."""
     texts = StatusTextAssembler()
     first, second, other = chunks("a" * 50 + "b" * 50 + "c")[:2] + chunks("a" * 50 + "d" * 50)[1:2]
-    assert [text for each in (first, second, second) for text in texts.receive(each, 0.0)] == []
+    assert [text for message in (first, second, second) for text in texts.receive(message, 0.0)] == []
     cut = texts.receive(other, 1.0)
     assert [text.text.startswith("a" * 50 + "b" * 50) for text in cut] == [True]
     texts = StatusTextAssembler()
     same = chunks("a" * 50 + "a" * 50 + "c")
-    assert [text for each in same[:2] for text in texts.receive(each, 0.0)] == []
+    assert [text for message in same[:2] for text in texts.receive(message, 0.0)] == []
     assert len(texts.receive(same[0], 1.0)) == 1

@@ -91,7 +91,7 @@ def test_table_lists_every_cell_of_message(telemetry: Telemetry, name: str) -> N
 )
 def test_instance_field_is_read_from_payload(name: str, field: str) -> None:
     message = ANYTHING[name]
-    fields = {each.name: getattr(message, each.name) for each in message.FIELDS}
+    fields = {field.name: getattr(message, field.name) for field in message.FIELDS}
     body = frame_of(message_type(name)(**{**fields, field: 201})).body
     assert body[9 + offset_of(message_type(name), field)] == 201
 
@@ -134,7 +134,7 @@ def test_pending_frames_of_two_batteries_are_kept(telemetry: Telemetry) -> None:
         for number in (0, 1):
             battery = messages.BatteryStatus(number, 1, 1, 2500, (12000, *[65535] * 9), 100, 10, 10, percent - number)
             take(telemetry, battery, 100.0 + (90 - percent) / 100)
-    assert [each.remaining_percent for each in telemetry.batteries.value] == [80, 79]
+    assert [battery.remaining_percent for battery in telemetry.batteries.value] == [80, 79]
 
 
 def test_instance_field_truncated_is_zero(telemetry: Telemetry) -> None:
@@ -163,13 +163,13 @@ def test_value_age_is_of_last_frame(telemetry: Telemetry, clock: Clock, ends: in
     clock.now = 104.5
     assert telemetry.batteries.fresh(1.0) == telemetry.batteries.value
     assert telemetry.batteries.updated_at == 104.0
-    assert [each.id for each in telemetry.batteries.value] == [0, 1, 2]
+    assert [battery.id for battery in telemetry.batteries.value] == [0, 1, 2]
 
 
 def test_pending_frames_are_kept_per_instance(telemetry: Telemetry) -> None:
     for number in (0, *range(256)):
         take(telemetry, battery(number, number % 100), 100.0)
-    assert [each.remaining_percent for each in telemetry.batteries.value] == [n % 100 for n in range(256)]
+    assert [battery.remaining_percent for battery in telemetry.batteries.value] == [n % 100 for n in range(256)]
 
 
 def test_better_source_wins_in_any_read_order(telemetry: Telemetry) -> None:

@@ -186,7 +186,7 @@ def test_gimbal_yaw_from_nose_or_north_is_converted(
 @given(angles, st.floats(-89, 89), angles, st.floats(0.1, 10))
 def test_gimbal_angles_match_rotation(roll: float, pitch: float, yaw: float, length: float) -> None:
     """For any length of the quaternion."""
-    q = tuple(length * each for each in turned(roll, pitch, yaw))
+    q = tuple(length * component for component in turned(roll, pitch, yaw))
     told = gimbal.from_device(pointing(q, FROM_NORTH), None)
     assert told.pitch_deg == pytest.approx(pitch, abs=0.02)
     assert told.roll_deg == pytest.approx(roll, abs=0.02)

@@ -26,17 +26,17 @@ def hub_faults(flown: Flown) -> list[str]:
 def orders_in(crossings: list[TrafficEntry]) -> list[TrafficEntry]:
     """Those that change what a vehicle does or keeps."""
     return [
-        each
-        for each in crossings
-        if kind_of(each.message.NAME, is_for_one=True) is MessageKind.ORDER
-        and getattr(each.message, "command", None) not in QUESTIONS
+        crossing
+        for crossing in crossings
+        if kind_of(crossing.message.NAME, is_for_one=True) is MessageKind.ORDER
+        and getattr(crossing.message, "command", None) not in QUESTIONS
     ]
 
 
 def _passed_on(sky: HubSky) -> Iterator[str]:
     written: dict[bytes, list[TrafficEntry]] = {}
-    for each in orders_in(sky.sent):
-        written.setdefault(each.raw, []).append(each)
+    for order in orders_in(sky.sent):
+        written.setdefault(order.raw, []).append(order)
     newest = -1
     for each in orders_in(sky.at_vehicle.sent):
         what = f"{each.message.NAME} at {each.at:.2f}"

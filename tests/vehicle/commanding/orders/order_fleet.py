@@ -78,9 +78,9 @@ def random_fleet_case(action: str, policy: PolicyName, seed: int) -> FleetCase:
 
 def _row(action: str, autopilot: str) -> Row:
     """Return the row, with the modes of the policies."""
-    row = next(each for each in ROWS if each.name == action and autopilot in each.on)
+    row = next(entry for entry in ROWS if entry.name == action and autopilot in entry.on)
     copter, px4 = row.modes
-    return replace(row, modes=((*copter, *(each[0] for each in OWN)), (*px4, *(each[1] for each in OWN))))
+    return replace(row, modes=((*copter, *(modes[0] for modes in OWN)), (*px4, *(modes[1] for modes in OWN))))
 
 
 def faults_of(case: FleetCase) -> list[str]:
@@ -89,10 +89,10 @@ def faults_of(case: FleetCase) -> list[str]:
 
 
 async def _fly(case: FleetCase) -> list[str]:
-    cases = {name: replace(each, disturbances=replace(each.disturbances)) for name, each in case.members.items()}
-    vehicles = {name: set_up(each) for name, each in cases.items()}
+    cases = {name: replace(member, disturbances=replace(member.disturbances)) for name, member in case.members.items()}
+    vehicles = {name: set_up(case) for name, case in cases.items()}
     async with AsyncExitStack() as stack:
-        airs = {name: Air(await stack.enter_async_context(simulated_link(each))) for name, each in vehicles.items()}
+        airs = {name: Air(await stack.enter_async_context(simulated_link(vehicle))) for name, vehicle in vehicles.items()}
         fleet = await stack.enter_async_context(aerokit.fleet(dict(airs), count=len(airs), on_error=case.policy))
         with fleet.events(PolicyApplied) as news:
             flown = await _give(case, cases, vehicles, airs, fleet)
@@ -102,9 +102,9 @@ async def _fly(case: FleetCase) -> list[str]:
     found = list(_of_the_policy(case, ordered))
     for name, one in flown.items():
         if name == case.of_others:
-            found += [f"{name}: {each.message.NAME} was sent" for each in orders_in(one.air)]
+            found += [f"{name}: {order.message.NAME} was sent" for order in orders_in(one.air)]
             continue
-        one.fresh_at = tuple(each.at for each in ordered if f"{name}/1" in each.orders)
+        one.fresh_at = tuple(order_set.at for order_set in ordered if f"{name}/1" in order_set.orders)
         if one.fresh_at and case.policy != "hold_others":
             # It continues, also when cancelled.
             one.error = AerokitError("the policy had another order for it")
@@ -115,7 +115,7 @@ async def _fly(case: FleetCase) -> list[str]:
 def _of_the_policy(case: FleetCase, ordered: list[PolicyApplied]) -> Iterator[str]:
     """Return the orders of the policy, one for each member."""
     said = {"hold_others": "hold", "land_others": "land", "return_others": "return"}.get(case.policy)
-    told = [(member, order) for each in ordered for member, order in each.orders.items()]
+    told = [(member, order) for order_set in ordered for member, order in order_set.orders.items()]
     for member, order in told:
         if order != said:
             yield f"{member}: {case.policy} ordered {order}"
@@ -155,7 +155,7 @@ async def _give(
     if scope.cancelled_caught:
         errors.update(dict.fromkeys(fleet.members, asyncio.CancelledError()))
     ended_at = loop.time()
-    told = {name: (each.mode_name or "", each.is_armed) for name, each in programs.items()}
+    told = {name: (program.mode_name or "", program.is_armed) for name, program in programs.items()}
     await anyio.sleep(WATCH_S)
     return {
         name: Flown(

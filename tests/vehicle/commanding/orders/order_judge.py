@@ -55,11 +55,11 @@ def _orders(flown: Flown) -> Iterator[TrafficEntry]:
 
 def orders_in(air: Seen) -> Iterator[TrafficEntry]:
     """Return the sent messages that change something."""
-    for each in air.sent:
-        command = getattr(each.message, "command", None)
-        is_command = isinstance(each.message, (CommandLong, CommandInt)) and command not in QUESTIONS
-        if is_command or isinstance(each.message, SetMode):
-            yield each
+    for message in air.sent:
+        command = getattr(message.message, "command", None)
+        is_command = isinstance(message.message, (CommandLong, CommandInt)) and command not in QUESTIONS
+        if is_command or isinstance(message.message, SetMode):
+            yield message
 
 
 State = tuple[int, bool, bool]
@@ -68,7 +68,7 @@ State = tuple[int, bool, bool]
 
 def _told(flown: Flown, since: int, until: int) -> list[State]:
     """Return the states that HEARTBEAT reported between two recorded messages."""
-    told = [_state(each) for each in flown.air.heartbeats if since < each.number < until]
+    told = [_state(heartbeat) for heartbeat in flown.air.heartbeats if since < heartbeat.number < until]
     return [(mode, armed, False) for mode, armed, _ in told] if _ends_flight(flown) else told
 
 
@@ -96,17 +96,17 @@ def _sent_again(flown: Flown) -> Iterator[str]:
     """
     first: dict[object, int] = {}
     last: dict[object, int] = {}
-    for each in _orders(flown):
-        key = _key(each.message)
+    for order in _orders(flown):
+        key = _key(order.message)
         if key in first:
             before = _told(flown, -1, first[key])[-1:]
-            since = _told(flown, first[key], each.number)
-            if not _told(flown, last[key], each.number):
-                yield f"{_s(flown, each)} was sent again without a HEARTBEAT since"
-            elif any(told != before[0] and not _may_be_told(flown, each.message, told) for told in since):
-                yield f"{_s(flown, each)} was sent again although HEARTBEAT had told a change"
-        first.setdefault(key, each.number)
-        last[key] = each.number
+            since = _told(flown, first[key], order.number)
+            if not _told(flown, last[key], order.number):
+                yield f"{_s(flown, order)} was sent again without a HEARTBEAT since"
+            elif any(told != before[0] and not _may_be_told(flown, order.message, told) for told in since):
+                yield f"{_s(flown, order)} was sent again although HEARTBEAT had told a change"
+        first.setdefault(key, order.number)
+        last[key] = order.number
 
 
 def _may_be_told(flown: Flown, message: Message, told: State) -> bool:
@@ -131,11 +131,11 @@ def _may_be_told(flown: Flown, message: Message, told: State) -> bool:
 
 def _sent_blind(flown: Flown) -> Iterator[str]:
     """The rest of an order is not sent into a silence."""
-    for each in _orders(flown):
+    for order in _orders(flown):
         given = (flown.given_at, *flown.fresh_at)
-        is_late = not any(0 <= each.at - at <= INITIAL_SEND_S for at in given)
-        if is_late and not any(each.at - MODE_MAX_AGE_S <= told.at <= each.at for told in flown.air.heartbeats):
-            yield f"{_s(flown, each)} was sent blind"
+        is_late = not any(0 <= order.at - at <= INITIAL_SEND_S for at in given)
+        if is_late and not any(order.at - MODE_MAX_AGE_S <= told.at <= order.at for told in flown.air.heartbeats):
+            yield f"{_s(flown, order)} was sent blind"
 
 
 def _taken_back(flown: Flown) -> Iterator[str]:
@@ -143,11 +143,11 @@ def _taken_back(flown: Flown) -> Iterator[str]:
     taken = _taken(flown)
     if taken is None or not flown.case.row.steers:
         return
-    for each in flown.air.sent:
-        command = getattr(each.message, "command", None)
-        steers = command in CHANGED_BY_COMMAND.keys() - {ARM} or isinstance(each.message, (SetMode, *SETPOINTS))
-        if steers and each.number > taken.number:
-            yield f"{_s(flown, each)} was sent after somebody else's mode: {_s(flown, taken)}"
+    for message in flown.air.sent:
+        command = getattr(message.message, "command", None)
+        steers = command in CHANGED_BY_COMMAND.keys() - {ARM} or isinstance(message.message, (SetMode, *SETPOINTS))
+        if steers and message.number > taken.number:
+            yield f"{_s(flown, message)} was sent after somebody else's mode: {_s(flown, taken)}"
 
 
 def _taken(flown: Flown) -> TrafficEntry | None:
@@ -158,19 +158,19 @@ def _taken(flown: Flown) -> TrafficEntry | None:
     autopilot = autopilot_for(told[0].message)
     allowed: set[str] = set()
     had_failsafe = False
-    for each in told:
-        assert isinstance(each.message, Heartbeat)
-        name = autopilot.mode_of(each.message).name
-        has_failsafe = each.message.system_status in FAILSAFE_STATES
+    for event in told:
+        assert isinstance(event.message, Heartbeat)
+        name = autopilot.mode_of(event.message).name
+        has_failsafe = event.message.system_status in FAILSAFE_STATES
         is_new, had_failsafe = has_failsafe and not had_failsafe, has_failsafe
-        if each.at < flown.given_at:
+        if event.at < flown.given_at:
             allowed = {name}
         elif is_new and not _ends_flight(flown):
-            return each
+            return event
         elif name in own:
             allowed = set()
         elif name not in allowed:
-            return each
+            return event
     return None
 
 
@@ -196,7 +196,7 @@ def _armed_late(flown: Flown) -> Iterator[str]:
         return
     disturbances, until = flown.case.disturbances, flown.given_at + ARM_HEARTBEAT_DELAY_S
     is_answered = not disturbances.lost_acks and disturbances.outage is None and not (flown.case.two or flown.case.hub)
-    is_told = any(_state(each)[1] for each in flown.air.heartbeats if flown.given_at < each.at <= until)
+    is_told = any(_state(heartbeat)[1] for heartbeat in flown.air.heartbeats if flown.given_at < heartbeat.at <= until)
     if is_answered or (is_told and not flown.acted):
         yield f"arm ended with {flown.error!r} and the vehicle is armed"
 
@@ -216,15 +216,15 @@ def _sent_afterwards(flown: Flown) -> Iterator[str]:
     """An abandoned transfer or setting sends nothing more."""
     if flown.case.row.steers or flown.case.row.ends_later or flown.case.row.name == "arm":
         return
-    for each in flown.air.sent:
-        is_lasting = each.message.NAME in ("PARAM_SET", "MISSION_COUNT", "MISSION_ITEM_INT", "MISSION_ITEM")
-        if each.at > flown.ended_at and (is_lasting or each in list(_orders(flown))):
-            yield f"{_s(flown, each)} was sent after the call had ended"
+    for message in flown.air.sent:
+        is_lasting = message.message.NAME in ("PARAM_SET", "MISSION_COUNT", "MISSION_ITEM_INT", "MISSION_ITEM")
+        if message.at > flown.ended_at and (is_lasting or message in list(_orders(flown))):
+            yield f"{_s(flown, message)} was sent after the call had ended"
 
 
 def _is_reached(flown: Flown) -> bool:
     """Return True if the vehicle received any of it."""
-    return any(not each.is_lost for each in _orders(flown))
+    return any(not order.is_lost for order in _orders(flown))
 
 
 def _endless(flown: Flown) -> Iterator[str]:

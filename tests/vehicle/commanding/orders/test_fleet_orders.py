@@ -13,7 +13,7 @@ from test_orders import IS_SESSION, SEEDS
 from aerokit.fleets.policy import PolicyName
 
 EVERY = [(action, policy) for action in ACTIONS for policy in POLICIES]
-FLOWN, SEEDS_EACH = (EVERY, SEEDS) if IS_SESSION else (sampled([pytest.param(*each) for each in EVERY[::2]], 4), 1)
+FLOWN, SEEDS_EACH = (EVERY, SEEDS) if IS_SESSION else (sampled([pytest.param(*case) for case in EVERY[::2]], 4), 1)
 """Few of them in the tests, all of them in the session."""
 
 

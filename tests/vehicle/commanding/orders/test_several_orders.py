@@ -99,10 +99,10 @@ async def _fly(seed: int, is_px4: bool) -> None:
             await _give_some(dice, vehicle, air, given)
             await anyio.sleep(15.0)
     pilots = {2} if not is_px4 else {3 << 16}
-    told = next((each for each in air.heartbeats if getattr(each.message, "custom_mode", 0) in pilots), None)
-    story = f"seed {seed}: {[(round(each.at - air.began_at, 2), each.choice.name) for each in given]}"
+    told = next((heartbeat for heartbeat in air.heartbeats if getattr(heartbeat.message, "custom_mode", 0) in pilots), None)
+    story = f"seed {seed}: {[(round(order.at - air.began_at, 2), order.choice.name) for order in given]}"
     for place, crossing in enumerate(air.sent):
-        _judge(crossing, [each for each in given if each.sent <= place], told, is_px4, story)
+        _judge(crossing, [order for order in given if order.sent <= place], told, is_px4, story)
 
 
 async def _climb(simulated: Simulated, vehicle: aerokit.Vehicle) -> None:
@@ -153,17 +153,17 @@ def _judge(sent: TrafficEntry, given: list[Given], told: TrafficEntry | None, is
         return
     about = f"{kind} at {sent.at:.2f}; {story}"
     if kind in ((400, 0), (400, 1)):
-        newest = [each for each in given if each.choice.name in ("arm", "disarm")][-1]
+        newest = [order for order in given if order.choice.name in ("arm", "disarm")][-1]
         is_old = newest.choice.name == "disarm" and newest.at < sent.at
         assert kind == (400, 0) or not is_old, f"armed after disarm(): {about}"
         return
-    steering = [each for each in given if each.choice.sends[is_px4]]
+    steering = [order for order in given if order.choice.sends[is_px4]]
     newest = steering[-1]
-    eager = [each for each in steering if each.at == newest.at]
-    allowed = HOLD[is_px4].union(*(each.choice.sends[is_px4] for each in eager))
+    eager = [order for order in steering if order.at == newest.at]
+    allowed = HOLD[is_px4].union(*(order.choice.sends[is_px4] for order in eager))
     assert kind in allowed, f"an order that was overruled: {about}"
     is_against_the_pilot = told is not None and newest.at < told.at and sent.number > told.number
-    own = [each.at for each in given if each.choice.name == "command"]
+    own = [order.at for order in given if order.choice.name == "command"]
     if told is not None and own and told.at - own[-1] < MODE_GRACE_S:
         return  # Any mode counts as its effect, see docs/reliability.md.
     assert kind == "set-point" or not is_against_the_pilot, f"after the pilot was told: {about}"
