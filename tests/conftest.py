@@ -57,7 +57,7 @@ async def grounded(anyio_backend: object) -> AsyncIterator[Flight]:
     """A copter that is ready, disarmed and in STABILIZE."""
     async with open_flight() as flight:
         await flight.vehicle.wait_ready()
-        flight.wire.forget()
+        flight.wire.clear()
         yield flight
 
 

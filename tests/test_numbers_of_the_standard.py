@@ -27,7 +27,7 @@ PREFIXES = (
     "LANDED_",
     "STATE_",
 )
-NAMES = {f"{prefix}{each.name}": each.value for kind in ENUMS for each in kind for prefix in PREFIXES}
+NAMES = {f"{prefix}{member.name}": member.value for kind in ENUMS for member in kind for prefix in PREFIXES}
 
 
 def declared(path: Path) -> Iterator[tuple[str, int]]:

@@ -55,9 +55,9 @@ def assignable(thing: Any) -> list[str]:
     """Return the reported attributes (cells, properties, parts) that accept another value, and restore them."""
     found = []
     for name in dir(type(thing)):
-        told = inspect.getattr_static(type(thing), name)
-        is_told = not name.startswith("_") and hasattr(type(told), "__get__") and not callable(told)
-        if not is_told or (isinstance(told, property) and told.fset is not None):
+        attribute = inspect.getattr_static(type(thing), name)
+        is_told = not name.startswith("_") and hasattr(type(attribute), "__get__") and not callable(attribute)
+        if not is_told or (isinstance(attribute, property) and attribute.fset is not None):
             continue
         try:
             setattr(thing, name, None)

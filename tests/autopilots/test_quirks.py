@@ -64,8 +64,8 @@ def test_surface_vehicles_have_no_take_off(number: int, vehicle_type: int) -> No
 
 @pytest.mark.parametrize(("status", "landed"), [(3, 1), (4, 2), (5, None), (0, None)])
 def test_landed_state_from_system_status(status: int, landed: int | None) -> None:
-    for each in (copter, plane):
-        assert each.landed_state_of(Heartbeat(2, 3, 81, 4, status)) == landed
+    for kind in (copter, plane):
+        assert kind.landed_state_of(Heartbeat(2, 3, 81, 4, status)) == landed
     assert px4.landed_state_of(Heartbeat(2, 12, 81, 4, status)) is None
     assert autopilot(3, 10).landed_state_of(Heartbeat(10, 3, 81, 4, status)) is None
 

@@ -1,4 +1,4 @@
-"""Every transfer: how to begin, do and check it, what it ideally takes, and how many messages it may cost."""
+"""Every transfer: its preparation, call and check, its ideal duration, and its maximum number of messages."""
 
 from __future__ import annotations
 
@@ -182,7 +182,7 @@ PARAMETERS = [
         "param.pck upload",
         upload_parameters,
         check_writes,
-        # what has become of them is read back one by one
+        # their outcome is read back one by one
         lambda copter, sizes: ideals.file_write(16 * sizes.writes) + ideals.parameter_reads(sizes.writes),
         lambda copter, sizes: blocks(pack_size(copter)) + 2 * sizes.writes,
         before=know_parameters,
@@ -254,7 +254,7 @@ def read_plan(kind: str, copter: SimulatedCopter, sizes: Sizes) -> Ideal:
 
 
 def plan_cases(kind: str) -> Iterator[Case]:
-    """By items and as a file, up and down; an upload is read back."""
+    """Uploads and downloads, by items and as a file; an upload is read back."""
 
     def count(copter: SimulatedCopter, sizes: Sizes) -> int:
         return 2 * len(items_of(kind, sizes))

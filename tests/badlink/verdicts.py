@@ -35,7 +35,7 @@ class Verdict:
 def judge(case: Case, sizes: Sizes, radio: Radio, seed: int) -> Verdict:
     """Do a transfer once and look at all that is promised of it."""
     copter = make_copter(case, sizes, radio)
-    # what it ideally takes is asked before: reading files leaves traces
+    # The ideal is computed first, because reading files changes the server's state.
     ideal_s, most = (
         case.ideal(copter, sizes).seconds(radio),
         case.most_messages(copter, sizes, link_dies=radio.outage_s == math.inf),

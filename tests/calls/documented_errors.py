@@ -24,18 +24,18 @@ def documented() -> set[tuple[str, str]]:
     return pairs | {(cls.__name__, error) for cls in CLASSES for error in _of_class(cls)}
 
 
-def _of(member: Member, known: dict[str, Member], seen: set[str]) -> set[str]:
+def _of(member: Member, known: dict[str, Member], visited: set[str]) -> set[str]:
     """Those named in the docstring, those of the functions it refers to, and those of all methods of its class."""
-    seen.add(member.qualified)
+    visited.add(member.qualified)
     found = _named_in(member.docstring)
-    if member.owner is not None and member.is_awaited and len(seen) == 1:
+    if member.owner is not None and member.is_awaited and len(visited) == 1:
         takes = inspect.signature(member.function).parameters
         if "timeout" in takes or "initial" in takes:
             found |= _of_all_methods(member.owner)
     for name in AS_OTHERS.findall(member.docstring):
         other = known.get(name) or known[f"{member.qualified.partition('.')[0]}.{name}"]
-        if other.qualified not in seen:
-            found |= _of(other, known, seen)
+        if other.qualified not in visited:
+            found |= _of(other, known, visited)
     return found
 
 

@@ -15,7 +15,7 @@ from aerokit.sync.loop_thread import LoopThread
 __all__ = ["AT_ITS_END", "Interrupter"]
 
 AT_ITS_END = 1 << 30
-"""Interrupt when the work on the loop is done and the caller does not know yet."""
+"""Interrupt when the work on the loop is done but its result has not reached the caller."""
 PATIENCE_S = 200.0
 """For tests that hang."""
 

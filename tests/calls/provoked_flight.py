@@ -366,9 +366,9 @@ def _connections() -> Table:
         ("connect", "BusyError"): P(lambda s: _connect(s, s.vehicle.connection)),
         ("connect", "LinkOpenError"): P(lambda s: _connect(s, record=nowhere)),
         ("connect", "LinkLost"): P(
-            lambda s: _connect_and(s, lambda each: each.link_lost(errors.LinkLost("unplugged")))
+            lambda s: _connect_and(s, lambda connection: connection.link_lost(errors.LinkLost("unplugged")))
         ),
-        ("connect", "ConnectionClosed"): P(lambda s: _connect_and(s, lambda each: each.close())),
+        ("connect", "ConnectionClosed"): P(lambda s: _connect_and(s, lambda connection: connection.close())),
         ("connect", "ConnectFailed"): P(lambda s: _connect(s, system_id=77, timeout=3)),
         ("open_connection", "InvalidArgument"): P(lambda s: _open(s, "nonsense:")),
         ("open_connection", "LinkOpenError"): P(lambda s: _open(s, "tcp:127.0.0.1:9")),

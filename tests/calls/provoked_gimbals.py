@@ -142,8 +142,8 @@ def _many(stage: Stage) -> None:
     """Announce many gimbals."""
     for number in range(7, 200):
         stage.vehicle.gimbal  # noqa: B018 - it begins to listen
-        told = messages.GimbalDeviceAttitudeStatus(0, 0, 0, 32, (1, 0, 0, 0), 0, 0, 0, 0)
-        stage.wire.deliver(FrameEncoder(1, number).encode(told))
+        status = messages.GimbalDeviceAttitudeStatus(0, 0, 0, 32, (1, 0, 0, 0), 0, 0, 0, 0)
+        stage.wire.deliver(FrameEncoder(1, number).encode(status))
 
 
 async def _raise_if_taken(_: Stage, block: Any) -> None:
@@ -223,12 +223,12 @@ def _table() -> Table:
         ("look_at_system", lambda **o: _call("look_at_system", 9, **o), Cmd.DO_SET_ROI_SYSID),
     ):
         call = f"Gimbal.{name}"
-        told, stuck = _fitted(accepted(command)), airborne
+        status, stuck = _fitted(accepted(command)), airborne
         rows[call, "CommandRejected"] = P(do(), airborne, refused(command))
         rows[call, "CommandTimeout"] = P(do(), airborne, ignored(command))
-        rows[call, "OperationTimeout"] = P(do(timeout=1.0), stuck, told)
-        rows[call, "OperationRejected"] = later(do(timeout=9.0), _another_order, 0.5, stuck, before=told)
-        rows[call, "HeartbeatTimeout"] = later(do(timeout=60.0), falls_silent, 0.5, stuck, before=told)
+        rows[call, "OperationTimeout"] = P(do(timeout=1.0), stuck, status)
+        rows[call, "OperationRejected"] = later(do(timeout=9.0), _another_order, 0.5, stuck, before=status)
+        rows[call, "HeartbeatTimeout"] = later(do(timeout=60.0), falls_silent, 0.5, stuck, before=status)
         rows[call, "GimbalTaken"] = _taken(do())
     return rows
 

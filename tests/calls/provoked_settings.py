@@ -91,9 +91,9 @@ SETTINGS: Table = {
     ("Settings.download", "ParameterTimeout"): P(_call("download", **PATIENCE), _silent),
     ("Settings.download", "OperationTimeout"): P(_call("download", **HURRY), _silent),
     **{
-        (f"Settings.{name}", error): each
+        (f"Settings.{name}", error): provocation
         for name in ("get", "read")
-        for error, each in {
+        for error, provocation in {
             "InvalidArgument": P(_call(name, "CAM MODE")),
             "ParameterRejected": P(_call(name, "CAM_NOPE")),
             "ParameterTimeout": P(_call(name, "CAM_EV", **PATIENCE), _silent),

@@ -98,16 +98,16 @@ def _timers() -> Iterator[str]:
             yield f"timer {timer._callback.__qualname__}"
 
 
-def _locks(name: str, item: Any, seen: set[int]) -> Iterator[tuple[str, asyncio.Lock]]:
+def _locks(name: str, item: Any, visited: set[int]) -> Iterator[tuple[str, asyncio.Lock]]:
     """Every lock that a vehicle holds, wherever."""
-    if id(item) in seen:
+    if id(item) in visited:
         return
-    seen.add(id(item))
+    visited.add(id(item))
     if isinstance(item, asyncio.Lock):
         yield name, item
     elif isinstance(item, Mapping) and len(item) < 100:
         for key, value in item.items():
-            yield from _locks(f"{name}[{key}]", value, seen)
+            yield from _locks(f"{name}[{key}]", value, visited)
     elif type(item).__module__.startswith(("aerokit.vehicle", "aerokit.connection")):
         for key, value in getattr(item, "__dict__", {}).items():
-            yield from _locks(f"{name}.{key}", value, seen)
+            yield from _locks(f"{name}.{key}", value, visited)

@@ -77,7 +77,7 @@ def points_of(waits: list[float], most: int | None) -> list[Point]:
         suspension += stride
     if most is not None and len(found) > most:
         found = [found[round(index * (len(found) - 1) / (most - 1))] for index in range(most)]
-    return [Point(*each, how=("task", "scope")[number % 2]) for number, each in enumerate(found)]
+    return [Point(*place, how=("task", "scope")[number % 2]) for number, place in enumerate(found)]
 
 
 @dataclass

@@ -40,7 +40,7 @@ def groups() -> Iterator[tuple[str, list[tuple[str, str]]]]:
     for owner in sorted({name.partition(".")[0] for name, _ in PROMISED & PROVOCATIONS.keys()}):
         yield (
             owner,
-            sorted(each for each in PROMISED & PROVOCATIONS.keys() if each[0].partition(".")[0] == owner),
+            sorted(pair for pair in PROMISED & PROVOCATIONS.keys() if pair[0].partition(".")[0] == owner),
         )
 
 

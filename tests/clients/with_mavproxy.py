@@ -93,7 +93,7 @@ def write_mission(kind: str, path: Path) -> int:
     for number, item in enumerate(items):
         values = (number, int(number == 0), item.frame, item.command, item.hold_s, 0, 0, 0)
         place = (f"{item.latitude:.7f}", f"{item.longitude:.7f}", item.altitude_m, 1)
-        lines.append("\t".join(str(each) for each in (*values, *place)))
+        lines.append("\t".join(str(field) for field in (*values, *place)))
     path.write_text("\n".join(lines) + "\n")
     return len(items)
 

@@ -79,14 +79,14 @@ async def fly(kind: str, port: int) -> None:
     steps.done("download", len(back))
 
     await telemetry.set_rate_position(5.0)  # ArduPilot streams no position unasked, and MAVSDK does not ask
-    if kind == "px4":  # With ArduPilot, real or simulated, MAVSDK's health contains no more than a known home.
+    if kind == "px4":  # With ArduPilot, real or simulated, MAVSDK's health reports only the home position.
         await until(telemetry.subscribe_health_all_ok(), bool)
     await insist(lambda: action.set_takeoff_altitude(ALTITUDE_M))
     await insist(action.arm)
     await until(telemetry.subscribe_armed(), bool)
     steps.done("arm")
     await insist(action.takeoff)
-    there = await until(telemetry.subscribe_position(), lambda each: each.relative_altitude_m > ALTITUDE_M - 1)
+    there = await until(telemetry.subscribe_position(), lambda position: position.relative_altitude_m > ALTITUDE_M - 1)
     steps.done("take off", f"{there.relative_altitude_m:.1f} m")
     await insist(raw.start_mission)
     await until(telemetry.subscribe_position(), near_the_end(kind))

@@ -37,7 +37,7 @@ class Client:
     def command(self, command: int, *parameters: float) -> int:
         values = (*parameters, *[0.0] * (7 - len(parameters)))
         self.link.mav.command_long_send(self.link.target_system, 1, command, 0, *values)
-        ack = self.wait("COMMAND_ACK", until=lambda each: each.command == command, timeout=5)
+        ack = self.wait("COMMAND_ACK", until=lambda ack: ack.command == command, timeout=5)
         return int(ack.result)
 
     def insist(self, command: int, *parameters: float) -> None:
@@ -58,7 +58,7 @@ class Client:
 
     def wait_altitude(self, altitude_m: float) -> Any:
         return self.wait(
-            "GLOBAL_POSITION_INT", until=lambda each: each.relative_alt / 1000 > altitude_m - 1, timeout=60
+            "GLOBAL_POSITION_INT", until=lambda position: position.relative_alt / 1000 > altitude_m - 1, timeout=60
         )
 
 
@@ -98,7 +98,7 @@ def download(client: Client) -> int:
     assert count == len(items), count
     for number in range(count):
         link.mav.mission_request_int_send(link.target_system, 1, number, M.MAV_MISSION_TYPE_MISSION)
-        got = client.wait("MISSION_ITEM_INT", until=lambda each, number=number: each.seq == number, timeout=10)
+        got = client.wait("MISSION_ITEM_INT", until=lambda item, number=number: item.seq == number, timeout=10)
         assert got.command == items[number].command, got
         if number:
             assert abs(got.x - items[number].latitude * 1e7) <= 1, got
@@ -120,13 +120,13 @@ def fly(client: Client) -> None:
     """The mission, to the end."""
     last = len(mission(client.kind)) - 1
     client.set_mode("AUTO" if client.kind == "copter" else "MISSION")
-    client.wait("MISSION_ITEM_REACHED", until=lambda each: each.seq == last, timeout=90)
+    client.wait("MISSION_ITEM_REACHED", until=lambda report: report.seq == last, timeout=90)
 
 
 def main() -> None:
     steps = Steps()
     client = Client(sys.argv[1], int(sys.argv[2]))
-    client.wait("HEARTBEAT", until=lambda each: each.get_srcComponent() == 1)
+    client.wait("HEARTBEAT", until=lambda heartbeat: heartbeat.get_srcComponent() == 1)
     client.link.target_system = client.link.messages["HEARTBEAT"].get_srcSystem()
     steps.done("connect", f"system {client.link.target_system}")
     client.link.mav.request_data_stream_send(client.link.target_system, 1, M.MAV_DATA_STREAM_ALL, 4, 1)

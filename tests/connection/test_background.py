@@ -121,7 +121,7 @@ async def test_run_shielded_exception_becomes_cause_of_cancellation() -> None:
     if sys.version_info < (
         3,
         11,
-    ):  # there, who awaits the task gets another CancelledError, and this one behind it
+    ):  # there, the awaiting code gets a new CancelledError, with this one as its context
         raised = cancelled.value.__context__
     assert raised is not None
     assert isinstance(raised.__cause__, ValueError)

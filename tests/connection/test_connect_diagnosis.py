@@ -32,13 +32,13 @@ UNKNOWN_FRAME = bytes.fromhex("fd0100000001018888880011f0")
 
 
 class FarEnd:
-    """Whoever is at the other end of the link: sends the same bytes again and again."""
+    """The other end of the link, which sends the same bytes repeatedly."""
 
     def __init__(self) -> None:
-        self.heard = b""
+        self.received = b""
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
-        self.heard += data
+        self.received += data
 
     def link_lost(self, error: LinkLost) -> None:
         pass
@@ -67,9 +67,9 @@ def saying(system_id: int, component_id: int, *messages: Heartbeat | Attitude) -
 
 
 def heartbeat_of_system_0() -> bytes:
-    """Our own encoder refuses to be nobody."""
-    nobody = pymavlink.MAVLink(None, srcSystem=0, srcComponent=1)
-    return bytes(pymavlink.MAVLink_heartbeat_message(2, 3, 81, 0, 3, 3).pack(nobody))
+    """Return a HEARTBEAT of system 0, which our encoder refuses to make."""
+    unused = pymavlink.MAVLink(None, srcSystem=0, srcComponent=1)
+    return bytes(pymavlink.MAVLink_heartbeat_message(2, 3, 81, 0, 3, 3).pack(unused))
 
 
 def damaged(speak: Callable[[], bytes]) -> Callable[[], bytes]:
@@ -106,7 +106,7 @@ async def test_error_describes_what_was_received(speak: Callable[[], bytes], sys
 
 @pytest.mark.parametrize("seed", range(5))
 async def test_noise_is_not_diagnosed_as_dialect_or_damage(seed: int) -> None:
-    """As a serial port gives it at the wrong baud rate; places that look like a frame are in it."""
+    """Noise of a serial port at the wrong baud rate, which contains byte sequences that look like frames."""
     random = Random(seed)
     async with link_that_says(lambda: random.randbytes(random.randrange(1, 400))) as link:
         with pytest.raises(ConnectFailed, match="no MAVLink frame: wrong baud rate"):

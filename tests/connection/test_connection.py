@@ -37,8 +37,8 @@ pytestmark = pytest.mark.anyio
 COPTER = Heartbeat(2, 3, 81, 0, 3)
 
 
-class Ear:
-    """The far end of a link: keeps what it hears."""
+class ByteRecorder:
+    """The far end of a link, which records received bytes."""
 
     def __init__(self) -> None:
         self.data = b""
@@ -49,13 +49,13 @@ class Ear:
         self.times.append(anyio.current_time())
 
     def link_lost(self, error: LinkLost) -> None:
-        """Nothing to do."""
+        """Ignore it."""
 
 
 @asynccontextmanager
-async def far_end() -> AsyncIterator[tuple[MemoryLink, MemoryLink, Ear]]:
+async def far_end() -> AsyncIterator[tuple[MemoryLink, MemoryLink, ByteRecorder]]:
     near, far = memory_link_pair()
-    ear = Ear()
+    ear = ByteRecorder()
     await far.open(ear)
     yield near, far, ear
     far.close()
@@ -245,10 +245,10 @@ async def test_lost_link_ends_all_waiters() -> None:
 async def test_close_is_bounded_when_the_link_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
     async with simulated_link(SimulatedCopter(boot_time_s=0)) as link:
 
-        async def hang() -> None:
+        async def idle_for() -> None:
             await anyio.sleep_forever()
 
-        monkeypatch.setattr(link, "wait_closed", hang)
+        monkeypatch.setattr(link, "wait_closed", idle_for)
         async with open_connection(link):
             await anyio.sleep(1)
             started = anyio.current_time()
@@ -290,12 +290,12 @@ async def test_targeted_message_goes_only_to_its_peer() -> None:
             link.receive(FrameEncoder(system_id, 1).encode(COPTER), peer)
         connection.send(CommandLong(2, 1, 400, 0, *(0.0,) * 7))
         assert link.sent_to(76) == ["two"]
-        heard: list[DuplicateSender] = []
-        connection.bus.attach_event(DuplicateSender, heard.append)
+        received: list[DuplicateSender] = []
+        connection.bus.attach_event(DuplicateSender, received.append)
         link.receive(FrameEncoder(2, 1).encode(COPTER), "elsewhere")  # a second vehicle with the same ids?
         connection.send(CommandLong(2, 1, 400, 0, *(0.0,) * 7))
         assert link.sent_to(76) == ["two", "two"]
-        assert [(event.system_id, event.component_id) for event in heard] == [(2, 1)]
+        assert [(event.system_id, event.component_id) for event in received] == [(2, 1)]
         await anyio.sleep(4)
         link.receive(FrameEncoder(2, 1).encode(COPTER), "elsewhere")  # the vehicle's port has changed
         connection.send(CommandLong(2, 1, 400, 0, *(0.0,) * 7))

@@ -1,4 +1,4 @@
-"""``connect(reconnect=True)``: the link goes and comes back, and the program goes on where it was."""
+"""``connect(reconnect=True)``: the link fails and is restored, and the program continues."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ NEWS = (
 
 
 class CableEnd(BaseLink):
-    """The program's end of the cable, for as long as it is plugged in."""
+    """The program's end of the cable; open while the cable is plugged in."""
 
     def __init__(self, cable: Cable) -> None:
         super().__init__("cable")
@@ -63,7 +63,7 @@ class CableEnd(BaseLink):
     def write(self, data: bytes, peer: Peer = None) -> None:
         self._cable.write(data)
 
-    def hear(self, data: bytes) -> None:
+    def receive(self, data: bytes) -> None:
         self._deliver(data)
 
     def break_off(self) -> None:
@@ -82,7 +82,7 @@ class Cable:
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
         if self.end is not None:
-            self.end.hear(data)
+            self.end.receive(data)
 
     def link_lost(self, error: LinkLost) -> None:
         """The vehicle was switched off for good."""
@@ -109,7 +109,9 @@ class Cable:
 
     def asked_for(self, kind: type[m.Attitude]) -> int:
         """Number of requests to the vehicle for this message."""
-        return sum(message.command == MavCmd.SET_MESSAGE_INTERVAL and message.param1 == kind.ID for message in self.sent)
+        return sum(
+            message.command == MavCmd.SET_MESSAGE_INTERVAL and message.param1 == kind.ID for message in self.sent
+        )
 
 
 @asynccontextmanager
@@ -132,14 +134,14 @@ async def test_interruption_events() -> None:
         await vehicle.wait_ready()
         with vehicle.subscribe(*NEWS, capacity=9) as news:
             await cable.is_away(6)
-            heard = [await news.get(10) for _ in range(4)]
-        assert [type(event).__name__ for event in heard] == [
+            received = [await news.get(10) for _ in range(4)]
+        assert [type(event).__name__ for event in received] == [
             "LinkInterrupted",
             "VehicleSilent",
             "LinkRestored",
             "VehicleRecovered",
         ]
-        interrupted, _, restored, _ = heard
+        interrupted, _, restored, _ = received
         assert isinstance(interrupted, events.LinkInterrupted)
         assert str(interrupted.error) == "cable: unplugged"
         assert isinstance(restored, events.LinkRestored)
@@ -230,17 +232,17 @@ async def test_connect_finds_vehicle_on_restored_link() -> None:
 
 async def test_partial_frame_before_a_new_stream() -> None:
     link, encoder = OneEnd(), FrameEncoder(1, 1)
-    heard: list[int] = []
+    received: list[int] = []
     async with open_connection(link) as connection:
-        connection.attach([m.Attitude], lambda attitude: heard.append(attitude.time_boot_ms))
+        connection.attach([m.Attitude], lambda attitude: received.append(attitude.time_boot_ms))
         frames = [encoder.encode(m.Attitude(n, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6)) for n in range(3)]
-        link.hear(frames[0] + frames[1][:20])
+        link.receive(frames[0] + frames[1][:20])
         assert link.connection is not None
         link.connection.link_interrupted(LinkLost("unplugged"))
         link.connection.link_restored(1.0)
-        link.hear(frames[1][20:] + frames[2])
+        link.receive(frames[1][20:] + frames[2])
         (statistics,) = connection.statistics()
-        assert heard == [0, 2]
+        assert received == [0, 2]
         assert statistics.bad_crcs == 0
 
 
@@ -261,7 +263,7 @@ class OneEnd(BaseLink):
     def write(self, data: bytes, peer: Peer = None) -> None:
         pass
 
-    def hear(self, data: bytes) -> None:
+    def receive(self, data: bytes) -> None:
         self._deliver(data)
 
 
@@ -349,7 +351,7 @@ class TestServers:
             await exit_stack.__aexit__(None, None, None)
 
     async def test_client_from_other_port_is_accepted_at_once(self) -> None:
-        """With ``tcpin:`` the link is never lost; the vehicle's new connection is not a second vehicle."""
+        """A ``tcpin:`` link is never lost, and the vehicle's new connection is not a second vehicle."""
         doubles: list[events.DuplicateSender] = []
         encoder = FrameEncoder(1, 1)
         async with open_connection("tcpin:127.0.0.1:0") as connection:
@@ -376,13 +378,13 @@ async def eventually_gone(link: Link) -> None:
 
 
 class Deaf:
-    """A receiver that does not listen."""
+    """A receiver that ignores all data."""
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
-        """Nothing to do."""
+        """Ignore it."""
 
     def link_lost(self, error: LinkLost) -> None:
-        """Nothing to do."""
+        """Ignore it."""
 
 
 async def test_reopened_link_is_lost_and_then_connected() -> None:

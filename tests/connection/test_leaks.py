@@ -120,7 +120,7 @@ def test_cancelled_at_any_iteration(use: Use) -> None:
 
 @pytest.mark.parametrize("use", [nothing, exhaustive(fly)], ids=lambda use: use.__name__)
 def test_cancelled_by_scope_at_any_iteration(use: Use) -> None:
-    """As asyncio.timeout and anyio.fail_after do it: afterwards the program goes on, with nothing pending."""
+    """Cancelled as by asyncio.timeout and anyio.fail_after: the program continues, with nothing pending."""
     scopes: list[anyio.CancelScope] = []
 
     async def scoped() -> tuple[bool, bool]:

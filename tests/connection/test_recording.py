@@ -1,4 +1,4 @@
-"""Recording what is sent and received, and flying the same program on the recording."""
+"""Recording all traffic, and running the same program on the recording."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ async def test_program_runs_on_a_recorded_flight(tmp_path: Path, speed: str) -> 
 async def test_unknown_messages_are_recorded(tmp_path: Path) -> None:
     """In the order in which it came, and byte for byte."""
     path = tmp_path / "private.tlog"
-    known, private = FrameEncoder(9, 1), Private(9, 7)
+    known, private = FrameEncoder(9, 1), UnknownMessageSender(9, 7)
     near, far = memory_link_pair()
     await far.open(Deaf())
     frames = [
@@ -243,13 +243,13 @@ async def test_replay_ends_in_final_state_of_flight(tmp_path: Path, speed: str) 
 
 
 def state(vehicle: Vehicle) -> dict[str, Any]:
-    """All that is known; but for the last text's time, on the clock of the program that heard it."""
+    """Return all known values; the last text without its time, which is on the receiving program's clock."""
     known = {name: cell.value for name, cell in vehicle.telemetry.cells.items() if cell.is_known}
     return known | {"status_text": vehicle.status_text.value.text}
 
 
-class Private:
-    """Sends messages that no dialect of ours knows."""
+class UnknownMessageSender:
+    """Sends messages that are in no dialect."""
 
     def __init__(self, system_id: int, component_id: int) -> None:
         self._source, self._sequence = (system_id, component_id), 0
@@ -261,10 +261,10 @@ class Private:
 
 
 class Deaf:
-    """The far end of a link that does not listen."""
+    """The far end of a link that ignores all data."""
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
-        """Nothing to do."""
+        """Ignore it."""
 
     def link_lost(self, error: LinkLost) -> None:
-        """Nothing to do."""
+        """Ignore it."""

@@ -41,7 +41,7 @@ def anyio_backend() -> tuple[str, dict[str, object]]:
 
 
 class Deaf:
-    """Listens at the far end of a link, and does nothing."""
+    """A receiver that ignores all data."""
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
         pass
@@ -51,15 +51,15 @@ class Deaf:
 
 
 def of_system_0(message: m.Heartbeat) -> bytes:
-    """A frame that no encoder of ours makes."""
+    """Return a frame of system 0, which our encoder refuses to make."""
     frame = Frame.parse(FrameEncoder(1, 1).encode(message))
     body = frame.body[:4] + b"\0" + frame.body[5:]
     return b"\xfd" + body + x25(body + STANDARD.extras[frame.message_id]).to_bytes(2, "little")
 
 
-def orders(told: ReceivedMessages) -> list[int]:
-    """The radio that each order went over."""
-    return [index for index, _ in told.of(m.CommandLong)]
+def orders(received: ReceivedMessages) -> list[int]:
+    """Return the radio that carried each order."""
+    return [index for index, _ in received.of(m.CommandLong)]
 
 
 def an_order_to_all() -> m.CommandLong:
@@ -73,20 +73,20 @@ async def opened(radios: Radios) -> None:
 
 async def test_broadcast_commands_ignore_system_0() -> None:
     radios = Radios(2)
-    told = ReceivedMessages(radios)
+    received = ReceivedMessages(radios)
     await opened(radios)
     async with open_connection(radios.together()) as connection:
         radios.far[0].write(FrameEncoder(1, 1).encode(AUTOPILOT))
         radios.far[0].write(of_system_0(AUTOPILOT))
         await anyio.sleep(0.5)
         connection.send(an_order_to_all())
-        assert sorted(orders(told)) == [0, 1]
+        assert sorted(orders(received)) == [0, 1]
 
 
 async def test_broadcast_command_reaches_each_system_once() -> None:
     """A ground station was received over the other radio first, and then over the vehicle's as well."""
     radios = Radios(2)
-    told = ReceivedMessages(radios)
+    received = ReceivedMessages(radios)
     await opened(radios)
     async with open_connection(radios.together()) as connection:
         radios.far[1].write(FrameEncoder(250, 190).encode(STATION))
@@ -96,7 +96,7 @@ async def test_broadcast_command_reaches_each_system_once() -> None:
         radios.far[0].write(FrameEncoder(1, 1).encode(AUTOPILOT))
         await anyio.sleep(0.1)
         connection.send(an_order_to_all())
-        assert len(orders(told)) == 1
+        assert len(orders(received)) == 1
 
 
 def test_other_vehicle_is_refused_after_long_silence_of_ours() -> None:
@@ -160,7 +160,7 @@ async def test_late_copies_from_a_slow_link_are_dropped(late_s: float, dies: boo
                     far.write(data)
             await anyio.sleep(0.01)
         assert came == sorted(set(came))
-        assert sorted(states, reverse=True) == states, "armed was not told after disarmed"
+        assert sorted(states, reverse=True) == states, "armed was not reported after disarmed"
 
 
 async def test_signed_copies_are_accepted_in_any_order() -> None:
@@ -281,13 +281,13 @@ async def test_camera_received_first_does_not_hide_the_vehicle() -> None:
             await anyio.sleep(1)
         async with aerokit.connect(connection, timeout=20) as vehicle:
             assert vehicle.system_id == 1
-            told = connection.links
-            assert told is not None
-            assert told.value[0].used_for == (1,)
+            links = connection.links
+            assert links is not None
+            assert links.value[0].used_for == (1,)
 
 
 async def test_switch_to_better_link_delays_no_command() -> None:
-    """Over the radio in use an order takes a second and a half; a better one is taken while it is under way."""
+    """Over the radio in use an order takes 1.5 s; meanwhile the connection selects a better one."""
     copter = SimulatedCopter(boot_time_s=0.0)
     radios = Radios(2, models=[FaultModel(delay_s=1.5), GOOD])
     radios.cut(1)
@@ -332,7 +332,7 @@ class Ports:
         self._far = radios.far
         self._encoders = [FrameEncoder(1, 1) for _ in radios.far]
 
-    def say(self, message: Message, *ports: int) -> None:
+    def send(self, message: Message, *ports: int) -> None:
         for port in ports:
             self._far[port].write(self._encoders[port].encode(message))
 
@@ -342,7 +342,7 @@ async def changed_for_the_better(connection: Connection, ports: Ports, radios: R
     for step in range(200):
         both = (0,) if step < 20 else (0, 1)
         if step % 10 == 0:
-            ports.say(m.Heartbeat(2, 12, 81, 0, 4), *both)
+            ports.send(m.Heartbeat(2, 12, 81, 0, 4), *both)
         await anyio.sleep(0.1)
         assert connection._multilink is not None
         choice = connection._multilink._choices.get(1)
@@ -364,11 +364,11 @@ async def test_answer_over_former_link_is_accepted_once() -> None:
         await changed_for_the_better(connection, ports, radios)
         answers: list[tuple[int, int]] = []
         connection.bus.attach(m.CommandAck, lambda ack: answers.append((ack.command, ack.result)))
-        ports.say(m.CommandAck(176, 0), 0)
-        ports.say(m.CommandAck(400, 0), 0, 1)
+        ports.send(m.CommandAck(176, 0), 0)
+        ports.send(m.CommandAck(400, 0), 0, 1)
         await anyio.sleep(0.1)
-        ports.say(m.CommandAck(400, 4), 0, 1)
-        ports.say(m.CommandAck(400, 0), 0, 1)
+        ports.send(m.CommandAck(400, 4), 0, 1)
+        ports.send(m.CommandAck(400, 0), 0, 1)
         await anyio.sleep(1)
         assert answers == [(400, 0), (400, 4), (400, 0), (176, 0)]
 
@@ -408,7 +408,7 @@ async def test_peer_is_named_as_by_its_member_link() -> None:
 
 async def test_forged_ids_cost_few_probes() -> None:
     radios = Radios(2)
-    told = ReceivedMessages(radios)
+    received = ReceivedMessages(radios)
     await opened(radios)
     async with open_connection(radios.together()) as connection:
         for begin in (1, 101, 1, 101):
@@ -416,14 +416,14 @@ async def test_forged_ids_cost_few_probes() -> None:
                 for component in range(begin, begin + 4):
                     radios.far[0].write(FrameEncoder(system, component).encode(AUTOPILOT))
             await anyio.sleep(5)
-        asked = len(told.of(m.Timesync))
+        asked = len(received.of(m.Timesync))
         assert 200 < asked <= 25 * UNATTACHED_RATE_HZ
         await anyio.sleep(40)
-        told.messages.clear()
+        received.messages.clear()
         await anyio.sleep(10)
-        assert told.of(m.Timesync) == []
+        assert received.of(m.Timesync) == []
         assert connection._multilink is not None
         assert not any(connection._multilink._counters.values())
         radios.far[0].write(FrameEncoder(7, 1).encode(AUTOPILOT))
         await anyio.sleep(5)
-        assert len(told.of(m.Timesync)) >= 9
+        assert len(received.of(m.Timesync)) >= 9

@@ -1,4 +1,4 @@
-"""Two vehicles with one system id, switched on at the same instant: their hardware ids tell them apart."""
+"""Two vehicles with one system id, switched on at the same instant, are distinguished by their hardware ids."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Twins:
     def __init__(self, ours: bytes, theirs: bytes) -> None:
         self.ours, self.theirs = copter(ours), copter(theirs)
         self.radios = Radios(2)
-        self.told = ReceivedMessages(self.radios)
+        self.reported = ReceivedMessages(self.radios)
 
     def connected(self) -> AbstractAsyncContextManager[aerokit.Connection]:
         vehicles = [self.ours, self.theirs]
@@ -64,13 +64,13 @@ async def test_vehicle_with_other_hardware_id_is_reported_and_refused(
                 await flying.wait_ready()
                 await anyio.sleep(10)
                 assert [(event.system_id, type(event)) for event in doubts.all] == [(1, events.DuplicateSender)]
-                twins.told.messages.clear()
+                twins.reported.messages.clear()
                 twins.radios.cut(0)
                 await anyio.sleep(8)
                 with pytest.raises(AerokitError):
                     await flying.arm()
                 assert not twins.theirs.is_armed
-                assert [index for index, _ in twins.told.of(m.CommandLong) if index == 1] == []
+                assert [index for index, _ in twins.reported.of(m.CommandLong) if index == 1] == []
                 assert choice_of(connection).candidates[1].is_doubted
     warnings = [record.getMessage() for record in caplog.records if "hardware id" in record.getMessage()]
     assert len(warnings) == 1
@@ -95,18 +95,18 @@ async def test_both_links_are_probed_without_vehicle_object() -> None:
     twins = Twins(b"A" * 18, b"B" * 18)
     async with twins.connected() as connection:
         await anyio.sleep(5)
-        asked = [index for index, message in twins.told.of(m.CommandLong) if getattr(message, "command", 0) == 512]
+        asked = [index for index, message in twins.reported.of(m.CommandLong) if getattr(message, "command", 0) == 512]
         assert sorted(asked) == [0, 1]
         assert choice_of(connection).candidates[1].is_doubted
 
 
 async def test_second_radio_is_asked_once_for_hardware() -> None:
     radios = Radios(2)
-    told = ReceivedMessages(radios)
+    received = ReceivedMessages(radios)
     async with over(radios, copter(b"A" * 18)) as connection, aerokit.connect(connection) as flying:
         await flying.wait_ready()
         await anyio.sleep(5)
-        asked = [message for index, message in told.of(m.CommandLong) if index == 1]
+        asked = [message for index, message in received.of(m.CommandLong) if index == 1]
         assert [(getattr(request, "command", 0), getattr(request, "param1", 0)) for request in asked] == [(512, 148)]
         assert choice_of(connection).candidates[1].is_proven
 
@@ -135,7 +135,7 @@ async def test_lost_hardware_request_is_repeated() -> None:
 
 
 async def test_wrongly_used_vehicle_is_ignored_once_known() -> None:
-    """Theirs tells its hardware id only after ours has gone."""
+    """The other vehicle reports its hardware id only after ours has failed."""
     twins = Twins(b"A" * 18, NOBODY)
     async with twins.connected() as connection, aerokit.connect(connection) as flying:
         await flying.wait_ready()
@@ -146,12 +146,12 @@ async def test_wrongly_used_vehicle_is_ignored_once_known() -> None:
         twins.theirs.uid = b"B" * 18
         connection.send(m.CommandLong(1, 1, 512, 0, 148.0, 0, 0, 0, 0, 0, 0))
         await anyio.sleep(1)
-        twins.told.messages.clear()
+        twins.reported.messages.clear()
         taken: list[m.Heartbeat] = []
         connection.bus.attach(m.Heartbeat, taken.append)
         connection.send(m.CommandLong(1, 1, 400, 0, 1.0, 0, 0, 0, 0, 0, 0))
         await anyio.sleep(3)
-        assert twins.told.of(m.CommandLong) == []
+        assert twins.reported.of(m.CommandLong) == []
         assert taken == []
         assert not twins.theirs.is_armed
 
@@ -247,5 +247,5 @@ def test_hardware_ids_are_compared_by_common_field() -> None:
     assert of(one, 7).confirms(of(one, 8)), "uid2 decides"
     assert of(b"", 7).confirms(of(two, 7))
     assert not of(one, 7).confirms(of(two, 7))
-    assert not of(b"", 0).confirms(of(b"", 0)), "nothing told is no evidence"
+    assert not of(b"", 0).confirms(of(b"", 0)), "two missing ids are no evidence"
     assert [of(b"", 0).has_value, of(one, 0).has_value, of(b"", 1).has_value] == [False, True, True]

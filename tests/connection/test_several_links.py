@@ -1,4 +1,4 @@
-"""Several links to one vehicle: what is taken, over which of them orders go, and what happens when one dies."""
+"""Several links to one vehicle: accepted messages, the link that carries orders, and failures of a link."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ async def proven(connection: aerokit.Connection, link: int) -> None:
 
 async def test_flight_continues_when_the_used_link_fails(vehicle: SimulatedVehicle) -> None:
     radios = Radios(2)
-    told = ReceivedMessages(radios)
+    received = ReceivedMessages(radios)
     async with over(radios, vehicle) as connection, aerokit.connect(connection) as flying:
         news = EventLog(connection, events.LinkSelected, events.VehicleSilent, events.LinkStateChanged)
         await flying.wait_ready()
@@ -72,25 +72,25 @@ async def test_flight_continues_when_the_used_link_fails(vehicle: SimulatedVehic
         await flying.land()
         assert flying.heartbeat_age < 2
     assert [event for event in news.all if not isinstance(event, events.LinkSelected)] == []
-    orders = told.of(m.CommandLong, m.CommandInt, m.SetMode, m.SetPositionTargetGlobalInt)
+    orders = received.of(m.CommandLong, m.CommandInt, m.SetMode, m.SetPositionTargetGlobalInt)
     assert orders[0][0] == 0
     assert orders[-1][0] == 1
 
 
 async def test_command_is_sent_once_over_one_link() -> None:
     radios = Radios(3)
-    told = ReceivedMessages(radios)
+    received = ReceivedMessages(radios)
     async with over(radios, a_copter()) as connection, aerokit.connect(connection) as flying:
         await flying.wait_ready()
         await proven(connection, 1)
-        told.messages.clear()
+        received.messages.clear()
         await flying.arm()
         await flying.take_off(5)
-        orders = [entry for entry in told.of(m.CommandLong) if getattr(entry[1], "command", 0) in (400, 22)]
+        orders = [entry for entry in received.of(m.CommandLong) if getattr(entry[1], "command", 0) in (400, 22)]
         assert [getattr(order, "command", 0) for _, order in orders] == [400, 22]
         assert len({index for index, _ in orders}) == 1
         await anyio.sleep(3)
-        heartbeats = told.of(m.Heartbeat)
+        heartbeats = received.of(m.Heartbeat)
         assert {index for index, _ in heartbeats} == {0, 1, 2}, "every side hears that we are there"
 
 
@@ -134,7 +134,7 @@ async def test_second_stream_of_the_vehicle_is_not_mixed_in() -> None:
     radios = Radios(2, models=[GOOD, FaultModel(delay_s=1.0)])
     async with over(radios, a_copter()) as connection:
         times: list[int] = []
-        connection.bus.attach(m.Attitude, lambda each: times.append(each.time_boot_ms))
+        connection.bus.attach(m.Attitude, lambda attitude: times.append(attitude.time_boot_ms))
         async with aerokit.connect(connection, rates={m.Attitude: 10}):
             await proven(connection, 1)
             await anyio.sleep(5)
@@ -146,7 +146,7 @@ async def test_second_stream_of_the_vehicle_is_not_mixed_in() -> None:
 
 async def test_costly_link_is_used_only_while_other_fails() -> None:
     radios = Radios(2)
-    told = ReceivedMessages(radios)
+    received = ReceivedMessages(radios)
     async with over(radios, a_copter(), links={"costly": [0]}) as connection:
         news = EventLog(connection)
         async with aerokit.connect(connection):
@@ -160,9 +160,9 @@ async def test_costly_link_is_used_only_while_other_fails() -> None:
             radios.mend(1)
             await anyio.sleep(10)
             assert news.chosen[-1] == (cheap, "cheaper")
-            told.messages.clear()
+            received.messages.clear()
             await anyio.sleep(20)
-            asked = [len([1 for index, _ in told.of(m.Timesync) if index == link]) for link in (0, 1)]
+            asked = [len([1 for index, _ in received.of(m.Timesync) if index == link]) for link in (0, 1)]
             assert asked[0] < asked[1] / 5, "it is asked seldom"
 
 
@@ -184,10 +184,10 @@ async def test_better_link_is_preferred() -> None:
 
 
 async def test_other_vehicle_with_same_id_is_never_accepted() -> None:
-    """Its link is there, and ours dies: nothing is ordered of it."""
+    """Its link is open and ours fails: it gets no orders."""
     ours, another = SimulatedCopter(boot_time_s=0.0), SimulatedCopter(boot_time_s=0.0)
     radios = Radios(2)
-    told = ReceivedMessages(radios)
+    received = ReceivedMessages(radios)
     server = {"vehicles_on": [[ours], [another]]}
     async with over(radios, [ours, another], server=server) as connection:
         another.booted_at = -500.0
@@ -196,37 +196,37 @@ async def test_other_vehicle_with_same_id_is_never_accepted() -> None:
             await flying.wait_ready()
             await anyio.sleep(5)
             assert doubts.all
-            told.messages.clear()
+            received.messages.clear()
             radios.cut(0)
             await anyio.sleep(8)
             assert flying.link_state.value is LinkState.SILENT
             with pytest.raises(AerokitError):
                 await flying.arm()
             assert not another.is_armed
-            to_it = [message for index, message in told.of(m.CommandLong) if index == 1]
+            to_it = [message for index, message in received.of(m.CommandLong) if index == 1]
             assert to_it == []
 
 
 async def test_component_behind_other_link_is_reached_there() -> None:
-    """A camera on the second radio; the vehicle is spoken to over the first one."""
+    """A camera is on the second radio, while the vehicle is reached over the first one."""
     radios = Radios(2)
-    told, camera = ReceivedMessages(radios), FrameEncoder(1, 100)
+    events, camera = ReceivedMessages(radios), FrameEncoder(1, 100)
     async with over(radios, a_copter()) as connection, aerokit.connect(connection):
-        heard: list[m.Heartbeat] = []
-        connection.bus.attach(m.Heartbeat, heard.append)
+        received: list[m.Heartbeat] = []
+        connection.bus.attach(m.Heartbeat, received.append)
         await proven(connection, 1)
         for _ in range(3):
             radios.far[1].write(camera.encode(m.Heartbeat(30, 8, 0, 0, 4)))
             await anyio.sleep(1)
-        assert len([message for message in heard if message.autopilot == 8]) == 3
-        told.messages.clear()
+        assert len([message for message in received if message.autopilot == 8]) == 3
+        events.messages.clear()
         connection.send(m.CommandLong(1, 100, 512, 0, 259.0, 0, 0, 0, 0, 0, 0))
         connection.send(m.CommandLong(1, 1, 512, 0, 148.0, 0, 0, 0, 0, 0, 0))
-        assert [index for index, _ in told.of(m.CommandLong)] == [1, 0]
+        assert [index for index, _ in events.of(m.CommandLong)] == [1, 0]
 
 
 async def test_own_frames_forwarded_by_vehicle_are_ignored() -> None:
-    """As PX4 does with heartbeats of ground stations."""
+    """PX4 forwards heartbeats of ground stations."""
     radios = Radios(2)
     async with over(radios, a_copter()) as connection, aerokit.connect(connection):
         ours = FrameEncoder(connection.source_system, connection.source_component)
@@ -339,9 +339,9 @@ async def test_link_that_opens_late_is_used() -> None:
 
 
 async def test_ground_station_shares_all_links() -> None:
-    """Its transfer goes on, too, when one of them dies; each order of its own arrives once."""
+    """Its transfer continues when one of them fails, and each of its orders arrives once."""
     radios = Radios(2, models=[FaultModel(delay_s=0.02)] * 2)
-    told = ReceivedMessages(radios)
+    received = ReceivedMessages(radios)
     ours, theirs = memory_link_pair(latency_s=0.005)
     async with (
         over(radios, a_copter()) as connection,
@@ -352,9 +352,9 @@ async def test_ground_station_shares_all_links() -> None:
         await flying.wait_ready()
         await proven(connection, 1)
         used = 0 if connection.links.value[0].used_for else 1  # type: ignore[union-attr]
-        told.messages.clear()
+        received.messages.clear()
         await station.arm()
-        arming = [index for index, message in told.of(m.CommandLong) if getattr(message, "command", 0) == 400]
+        arming = [index for index, message in received.of(m.CommandLong) if getattr(message, "command", 0) == 400]
         assert arming == [used]
         found: list[int] = []
 
@@ -409,8 +409,8 @@ def used_of(connection: Connection) -> int:
 
 
 async def stand_still(copter: SimulatedCopter, radios: Radios, *, is_silent: bool) -> None:
-    for each in radios.links if is_silent else ():
-        each.incoming.model = DEAD
+    for link in radios.links if is_silent else ():
+        link.incoming.model = DEAD
     for _ in range(15):
         await anyio.sleep(0.1)
         copter.booted_at += 0.1

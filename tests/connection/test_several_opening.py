@@ -83,9 +83,9 @@ async def test_failed_member_link_is_reported_once(failures: int, caplog: pytest
         async with open_connection(together) as connection:
             news = EventLog(connection, events.MemberLinkOpenFailed, events.MemberLinkStateChanged)
             await anyio.sleep(30)
-            told = [event for event in news.all if isinstance(event, events.MemberLinkOpenFailed)]
-            assert [event.link for event in told] == ["memory:away"] * (failures > 1)
-            assert all(isinstance(event.error, LinkOpenError) for event in told)
+            reported = [event for event in news.all if isinstance(event, events.MemberLinkOpenFailed)]
+            assert [event.link for event in reported] == ["memory:away"] * (failures > 1)
+            assert all(isinstance(event.error, LinkOpenError) for event in reported)
             last = news.all[-1]
             assert isinstance(last, events.MemberLinkStateChanged)
             assert (last.link, last.after) == ("memory:away", LinkState.CONNECTED)

@@ -1,7 +1,7 @@
 """The API reference of DroneKit 2.9 as data: its names and signatures, and its examples in the spelling of Python 3.
 
-What cannot run in the reference itself is mended: a listener of two arguments, a latitude that a comma makes a tuple, a
-message that no dialect has any more.
+Errors of the reference are corrected: a listener with two arguments, a latitude that a comma makes a tuple, a message
+that was removed from all dialects.
 """
 
 from __future__ import annotations

@@ -157,7 +157,7 @@ def parameters_are_told_when_complete(stage: Stage) -> Any:
 
 def keep_three(fc: FlightController) -> None:
     fc.missions.items = [HOME, FIRST, SECOND, THIRD]
-    fc.missions.asks_int = False  # DroneKit knows no other items
+    fc.missions.asks_int = False  # DroneKit supports no other items
 
 
 def downloaded(stage: Stage) -> Any:
@@ -219,8 +219,8 @@ def row_37_upload(stage: Stage) -> Any:
         commands.add(waypoint(stage, item))
     stage.vehicle.commands.upload()
     first = kept(stage)
-    seen = [(item.seq, item.command) for item in downloaded(stage)]
-    return first, len(commands), seen, kept(stage)
+    observed = [(item.seq, item.command) for item in downloaded(stage)]
+    return first, len(commands), observed, kept(stage)
 
 
 @scenario((UPLOADED, []), prepare=keep_three)

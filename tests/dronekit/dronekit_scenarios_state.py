@@ -254,9 +254,9 @@ def row_28_channels(stage: Stage) -> Any:
     before = dict(channels)
     stage.report("RC_CHANNELS_RAW", port=0, **RAW)
     eight = dict(channels)
-    seen = len(channels), channels[1] == channels["1"], caught(lambda: channels["9"])
+    observed = len(channels), channels[1] == channels["1"], caught(lambda: channels["9"])
     stage.report("RC_CHANNELS_RAW", port=1, **RAW)
-    return before, eight, seen, (len(channels), channels[9], channels[9] == channels["9"], len(events))
+    return before, eight, observed, (len(channels), channels[9], channels[9] == channels["9"], len(events))
 
 
 @scenario(
@@ -300,12 +300,12 @@ def home_is_told_each_time(stage: Stage) -> Any:
 )
 def system_status(stage: Stage) -> Any:
     stage.fc.heartbeat_s = None
-    seen = []
+    observed = []
     for number in range(1, 9):
         stage.beat(system_status=number)
         status = stage.vehicle.system_status
-        seen.append((status and status.state, status and str(status)))
-    return seen
+        observed.append((status and status.state, status and str(status)))
+    return observed
 
 
 @scenario([("gimbal", "Gimbal: pitch=-45.0, roll=1.0, yaw=90.0")], controller={"version": 2}, is_kept=False)

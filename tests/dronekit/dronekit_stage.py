@@ -1,6 +1,6 @@
 """A DroneKit program connected to a scripted flight controller; scenarios return their observations as plain data.
 
-Nothing here knows which implementation of DroneKit it is given.
+The stage is independent of the DroneKit implementation that it runs.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ __all__ = [
 
 TEST_TIMEOUT_S = 100.0
 ALWAYS = ("PING", "HEARTBEAT", "REQUEST_DATA_STREAM", "PARAM_REQUEST_READ")
-"""Goes on by itself, whatever the program does."""
+"""Messages that are sent continuously, independent of the program."""
 QUIET = 3
 """Round trips without new messages after which an action counts as finished."""
 
@@ -56,12 +56,12 @@ class Stage:
                 self.fc.report("DEBUG", ind=7, time_boot_ms=number)
                 if self._saw.wait_for(lambda: number in self._seen, 0.1):
                     return
-        raise AssertionError("the vehicle's listeners heard nothing")
+        raise AssertionError("the vehicle's listeners received nothing")
 
     def reached(self) -> None:
-        """Wait until the flight controller has received all messages of the program, and their effects.
+        """Wait until the flight controller has received all messages of the program, and their effects have arrived.
 
-        Answers to what has come may have more sent: of two equal commands the second may wait for the first's answer.
+        An answer may release another message: the second of two equal commands waits for the first one's answer.
         """
         count, quiet = -1, 0
         while quiet < QUIET:
@@ -76,7 +76,7 @@ class Stage:
         self.fc.wait_for("PING", lambda frame: frame.seq == number)
 
     def report(self, name: str, **fields: Any) -> None:
-        """Have the flight controller say it, and wait until it is taken in."""
+        """Have the flight controller send a message, and wait until the program has processed it."""
         self.fc.report(name, **fields)
         self.settle()
 
@@ -161,10 +161,10 @@ SCENARIOS: list[Scenario] = []
 def scenario(expected: Any, **options: Any) -> Callable[[Callable[[Stage], Any]], Callable[[Stage], Any]]:
     """Decorator: make a scenario of a function that takes a stage and returns its observations.
 
-    Args:
-        expected: what it is to observe.
-        options: ``controller`` and ``connect``, arguments of both; ``is_slow``, it waits for timeouts; ``is_kept``,
-            DroneKit itself does so; ``prepare``, called with the flight controller before the program connects.
+        Args:
+    expected: the observations that the scenario must return.
+            options: ``controller`` and ``connect``, arguments of both; ``is_slow``: the scenario waits for timeouts;
+                ``is_kept``: DroneKit behaves the same; ``prepare``: called with the flight controller before connecting.
     """
 
     def register(function: Callable[[Stage], Any]) -> Callable[[Stage], Any]:
@@ -183,7 +183,7 @@ def on_stage(
 ) -> Iterator[Stage]:
     """Start a flight controller, connect to it, and close both in the end.
 
-    Streams are not asked for unless ``connect`` says so: what streams is waited for a moment, and here nothing does.
+    Streams are requested only if ``connect`` contains a rate: connecting waits for streams, and here there are none.
     """
     with FlightController(**(controller or {})) as fc:
         prepare(fc)
@@ -215,7 +215,7 @@ def plain(value: Any) -> str:
 
 
 def until(condition: Callable[[], object]) -> None:
-    """Wait until something holds that nothing tells of."""
+    """Poll until a condition holds that has no event."""
     deadline = time.monotonic() + 100
     while not condition():
         assert time.monotonic() < deadline

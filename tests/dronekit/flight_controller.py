@@ -1,7 +1,6 @@
 """A scripted flight controller on a real loopback socket: sends messages for a test, and records received ones.
 
-Built on pymavlink's encoder and parser, and knows nothing of the library under test: any program that speaks MAVLink
-can be its other side.
+Built on pymavlink's encoder and parser, and independent of the library under test: any MAVLink program can connect.
 """
 
 from __future__ import annotations
@@ -63,13 +62,13 @@ class Received:
 
 
 class FlightController:
-    """Beats its heart, answers commands, parameters and missions by tables, and sends anything on demand.
+    """Sends heartbeats, answers commands, parameters and missions from tables, and sends any message on demand.
 
-    Args:
-        link: ``"udp"`` (the other side listens at :attr:`address`) or ``"tcp"`` (this side does).
-        version: of MAVLink, 1 or 2, of what it sends.
-        vehicle_type: MAV_TYPE. autopilot: MAV_AUTOPILOT.
-        heartbeat_s: seconds between heartbeats; None sends none but those of :meth:`beat`.
+        Args:
+            link: ``"udp"`` (the other side listens at :attr:`address`) or ``"tcp"`` (this side does).
+    version: MAVLink version of sent messages, 1 or 2.
+            vehicle_type: MAV_TYPE. autopilot: MAV_AUTOPILOT.
+            heartbeat_s: seconds between heartbeats; None sends none but those of :meth:`beat`.
     """
 
     def __init__(
@@ -210,9 +209,9 @@ class FlightController:
         with contextlib.suppress(OSError):
             self._wake.send(b"!")
         self._thread.join(TEST_TIMEOUT_S)
-        for each in (self._socket, self._peer, self._wake, self._woken):
-            if each is not None:
-                each.close()
+        for used in (self._socket, self._peer, self._wake, self._woken):
+            if used is not None:
+                used.close()
 
     def __enter__(self) -> FlightController:
         return self
@@ -354,7 +353,7 @@ class FlightController:
 
 
 def message_of(name: str, **fields: Any) -> Message:
-    """A message of pymavlink; fields that are not given are 0, those it does not know are an error."""
+    """Return a pymavlink message; omitted fields are 0, unknown fields raise an error."""
     kind = mavlink.mavlink_map[getattr(mavlink, f"MAVLINK_MSG_ID_{name}")]
     unknown = set(fields) - set(kind.fieldnames)
     assert not unknown, f"{name} has no {unknown}"

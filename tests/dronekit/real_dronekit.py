@@ -1,6 +1,6 @@
-"""Play the scenarios that DroneKit itself is said to play so in the interpreter that runs this, which has DroneKit.
+"""Run the scenarios marked ``is_kept`` with the real DroneKit of this interpreter.
 
-Prints a JSON object: name of the scenario → what was observed, as JSON has it.
+Prints a JSON object: name of the scenario → observations.
 """
 
 from __future__ import annotations
@@ -21,7 +21,11 @@ def main(names: list[str]) -> None:
     import dronekit  # type: ignore[import-not-found, unused-ignore]
 
     logging.getLogger().addHandler(logging.NullHandler())
-    kept = [scenario for scenario in dronekit_scenarios.SCENARIOS if scenario.is_kept and (not names or scenario.name in names)]
+    kept = [
+        scenario
+        for scenario in dronekit_scenarios.SCENARIOS
+        if scenario.is_kept and (not names or scenario.name in names)
+    ]
     print(json.dumps({scenario.name: _observed(dronekit, scenario) for scenario in kept}))  # noqa: T201
 
 

@@ -1,7 +1,7 @@
 """Observed behaviour of DroneKit 2.9.2, row by row; unchanged rows are scenarios.
 
-With ``AEROKIT_DRONEKIT_PYTHON`` naming an interpreter that has DroneKit the scenarios are played with DroneKit itself,
-too, so that what is expected here is what it does.
+If ``AEROKIT_DRONEKIT_PYTHON`` names an interpreter with DroneKit, the scenarios run with DroneKit as well, which
+verifies the expected results.
 """
 
 from __future__ import annotations

@@ -28,14 +28,14 @@ REPORTED = {str(number): 1000 + number for number in range(1, 9)}
 
 @pytest.fixture
 def stage() -> Iterator[Stage]:
-    with on_stage(dronekit, connect={"rate": None}) as each:
-        yield each
+    with on_stage(dronekit, connect={"rate": None}) as stage:
+        yield stage
 
 
 @pytest.fixture
 def channels(stage: Stage) -> Channels:
-    each: Channels = stage.vehicle.channels
-    return each
+    value: Channels = stage.vehicle.channels
+    return value
 
 
 def sent(stage: Stage, action: Callable[[], object]) -> list[tuple[int, ...]]:
@@ -108,14 +108,14 @@ def test_channels_have_python_2_methods(channels: Channels) -> None:
 
 def test_channels_are_read_only(channels: Channels) -> None:
     changes: tuple[Callable[[Any], object], ...] = (
-        lambda each: each.__setitem__("1", 1),
-        lambda each: each.__delitem__("1"),
-        lambda each: each.__ior__({"1": 1}),
-        lambda each: each.update({"1": 1}),
-        lambda each: each.setdefault("1", 1),
-        lambda each: each.pop("1"),
-        lambda each: each.popitem(),
-        lambda each: each.clear(),
+        lambda channels: channels.__setitem__("1", 1),
+        lambda channels: channels.__delitem__("1"),
+        lambda channels: channels.__ior__({"1": 1}),
+        lambda channels: channels.update({"1": 1}),
+        lambda channels: channels.setdefault("1", 1),
+        lambda channels: channels.pop("1"),
+        lambda channels: channels.popitem(),
+        lambda channels: channels.clear(),
     )
     for change in changes:
         with pytest.raises(TypeError, match="is not supported on Channels object"):
@@ -192,7 +192,7 @@ def test_overrides_len_counts_overridden_channels(channels: Channels) -> None:
 
 @dataclass(frozen=True)
 class Int64:
-    """As numpy's: no int, but can be used as one."""
+    """An integer like numpy's: not an int, but usable as one."""
 
     value: int
 

@@ -160,7 +160,7 @@ def test_running_download_is_restarted(empty: Pair) -> None:
 
 def test_blocking_calls_work_in_listener(empty: Pair) -> None:
     controller, cmds = empty
-    seen: list[Any] = []
+    observed: list[Any] = []
     ended = threading.Event()
 
     def listener(vehicle: Any, _: str, commands: CommandSequence) -> None:
@@ -168,13 +168,13 @@ def test_blocking_calls_work_in_listener(empty: Pair) -> None:
         commands.add(waypoint())
         commands.upload(timeout=LIMIT_S)
         commands.download()
-        seen.extend([commands is cmds, commands.wait_ready(timeout=LIMIT_S), len(commands)])
+        observed.extend([commands is cmds, commands.wait_ready(timeout=LIMIT_S), len(commands)])
         ended.set()
 
     cmds._vehicle.add_attribute_listener("commands", listener)
     cmds.download()
     assert ended.wait(LIMIT_S)
-    assert seen == [True, True, 2]
+    assert observed == [True, True, 2]
     assert kept(controller)[1:] == [(16, -35.5, 20.0), (16, -35.5, 30.0)]
 
 

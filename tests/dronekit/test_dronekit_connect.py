@@ -23,8 +23,8 @@ MAX_LINES = 10
 
 @pytest.fixture
 def fc() -> Iterator[FlightController]:
-    with FlightController() as each:
-        yield each
+    with FlightController() as controller:
+        yield controller
 
 
 def test_simple_program_imports_neither_pymavlink_nor_sync(

@@ -30,8 +30,8 @@ CLOSED = "the program dropped it without close()"
 
 @pytest.fixture(scope="module")
 def address() -> Iterator[str]:
-    with served_copter() as each:
-        yield each
+    with served_copter() as served:
+        yield served
 
 
 @pytest.fixture(autouse=True)
@@ -85,7 +85,9 @@ def test_dropped_vehicle_is_closed_and_frees_its_link(
         dronekit.connect(address, wait_ready=["attitude"]) as vehicle,
     ):
         assert vehicle.attitude.pitch is not None
-    notified = [(record.name, record.levelname, record.getMessage()) for record in caplog.records if CLOSED in record.message]
+    notified = [
+        (record.name, record.levelname, record.getMessage()) for record in caplog.records if CLOSED in record.message
+    ]
     assert notified == [("dronekit", "WARNING", f"the connection to {address} was closed: {CLOSED}")]
 
 

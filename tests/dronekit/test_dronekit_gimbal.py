@@ -23,8 +23,8 @@ PLACE = (-35.1234567, 149.7654321, 10)
 
 @pytest.fixture
 def stage() -> Iterator[Stage]:
-    with on_stage(dronekit, connect={"rate": None}) as each:
-        yield each
+    with on_stage(dronekit, connect={"rate": None}) as opened:
+        yield opened
 
 
 def angles(stage: Stage) -> tuple[float | None, float | None, float | None]:
@@ -33,7 +33,7 @@ def angles(stage: Stage) -> tuple[float | None, float | None, float | None]:
 
 
 def quaternion(pitch: float, roll: float, yaw: float) -> list[float]:
-    p, r, y = (math.radians(each) / 2 for each in (pitch, roll, yaw))
+    p, r, y = (math.radians(angle) / 2 for angle in (pitch, roll, yaw))
     return [
         math.cos(r) * math.cos(p) * math.cos(y) + math.sin(r) * math.sin(p) * math.sin(y),
         math.sin(r) * math.cos(p) * math.cos(y) - math.cos(r) * math.sin(p) * math.sin(y),
@@ -111,7 +111,7 @@ def test_gimbal_device_yaw_is_from_north(stage: Stage) -> None:
     assert angles(stage) == (-45, 1, 280)
     tell_device(stage, -45, 1, 10, delta_yaw=math.radians(100))
     assert angles(stage) == (-45, 1, 110)
-    tell_device(stage, -45, 1, 10, delta_yaw=0.0)  # as PX4 does, whatever it is
+    tell_device(stage, -45, 1, 10, delta_yaw=0.0)  # as PX4 does for every gimbal
     assert angles(stage) == (-45, 1, 280)
     tell_device(stage, -45, 1, 10, IN_EARTH_FRAME | YAW_LOCK)
     assert angles(stage) == (-45, 1, 10)
@@ -209,16 +209,16 @@ def test_rotate_falls_back_to_mount_messages(stage: Stage) -> None:
     first, control, last = stage.fc.received("MOUNT_CONFIGURE", "MOUNT_CONTROL", since=since)
     assert (first.mount_mode, last.mount_mode) == (2, 3)
     assert (control.input_a, control.input_b, control.input_c) == (-4550, 0, 9000)
-    assert {each.target for each in (first, control, last)} == {(1, 1)}
+    assert {message.target for message in (first, control, last)} == {(1, 1)}
     assert not [line for line in lines if line.startswith("WARNING")]
 
 
 @pytest.mark.parametrize("wrong", [NAN, math.inf, None, "down"])
 def test_gimbal_angles_must_be_numbers(stage: Stage, wrong: Any) -> None:
     gimbal = stage.vehicle.gimbal
-    for each in ((wrong, 0, 0), (0, wrong, 0), (0, 0, wrong)):
+    for angles in ((wrong, 0, 0), (0, wrong, 0), (0, 0, wrong)):
         with pytest.raises(ValueError, match="a finite number of degrees"):
-            gimbal.rotate(*each)
+            gimbal.rotate(*angles)
     assert commands(stage, lambda: None) == []
 
 

@@ -150,7 +150,7 @@ def test_probably_vehicle_heartbeat(factory: MessageFactory) -> None:
 
 
 class Vehicle:
-    """A vehicle's side of a UDP link, spoken by pymavlink."""
+    """The vehicle's side of a UDP link, implemented with pymavlink."""
 
     def __init__(self, address: str, vehicle_type: int, autopilot: int) -> None:
         host, port = address.rsplit(":", 2)[-2:]
@@ -183,9 +183,9 @@ class Vehicle:
 
 @pytest.fixture
 def connection() -> Iterator[MAVConnection]:
-    each = MAVConnection("udpin:127.0.0.1:0")
-    yield each
-    each.close()
+    connection = MAVConnection("udpin:127.0.0.1:0")
+    yield connection
+    connection.close()
 
 
 @pytest.fixture
@@ -193,7 +193,7 @@ def connected(
     connection: MAVConnection, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[tuple[Master, Vehicle]]:
     """A master with a known vehicle: an ArduPilot copter by default."""
-    monkeypatch.setattr(mavutil, "mavlink", v20)  # whatever dialect other programs of this process have set
+    monkeypatch.setattr(mavutil, "mavlink", v20)  # independent of the dialect that other tests of this process have set
     kind = getattr(request, "param", (2, 3))
     assert connection.master.target_component == 0
     assert connection.master.mode_mapping() is None

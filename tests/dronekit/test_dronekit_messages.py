@@ -54,7 +54,7 @@ def raw_frame(message_id: int, payload: bytes, *, version: int = 2, sequence: in
 
 
 def decoded(raw: bytes) -> Any:
-    """As pymavlink does it."""
+    """Reference result from pymavlink."""
     message_id = raw[5] if raw[0] == 0xFE else int.from_bytes(raw[7:10], "little")
     module: Any = v20 if message_id in v20.mavlink_map else development
     return module.MAVLink(None).decode(bytearray(raw))
@@ -135,10 +135,10 @@ def test_messages_can_be_copied_and_pickled() -> None:
     raw = raw_frame(253, b"\6landing")
     message = message_of(Frame.parse(raw))
     message.extra = "kept"
-    for each in (copy.copy(message), copy.deepcopy(message), pickle.loads(pickle.dumps(message))):
-        assert type(each) is v20.MAVLink_statustext_message
-        assert said(each) == said(message) == said(decoded(raw))
-        assert each.extra == "kept"
+    for copied in (copy.copy(message), copy.deepcopy(message), pickle.loads(pickle.dumps(message))):
+        assert type(copied) is v20.MAVLink_statustext_message
+        assert said(copied) == said(message) == said(decoded(raw))
+        assert copied.extra == "kept"
     assert message == decoded(raw)
     assert decoded(raw) == message
 
@@ -194,7 +194,7 @@ def test_message_of_programs_dialect_only(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def packed(message: Any, module: Any = v20) -> bytes:
-    """As pymavlink does it."""
+    """Reference result from pymavlink."""
     data: bytes = message.pack(module.MAVLink(None, SYSTEM, COMPONENT))
     return data
 
@@ -302,7 +302,7 @@ def test_send_mavlink_accepts_objects_with_fields() -> None:
 
 
 class Number:
-    """As numpy's are: no subclass of float."""
+    """A number like numpy's: not a subclass of float."""
 
     def __float__(self) -> float:
         return 2.6

@@ -68,7 +68,9 @@ def test_mission_positions_have_full_precision(
         cmds.add(waypoint(-35.12345675, frame, y=149.7654321, z=30))
     cmds.upload()
     sent = controller.received("MISSION_ITEM_INT")[-6:]
-    assert [(message.x, message.y, message.frame) for message in sent] == [(-351234568, 1497654321, frame) for frame in frames]
+    assert [(message.x, message.y, message.frame) for message in sent] == [
+        (-351234568, 1497654321, frame) for frame in frames
+    ]
     cmds.download()
     cmds.wait_ready()
     assert {(command.x, command.y) for command in cmds} == {(-35.1234568, 149.7654321)}

@@ -35,7 +35,7 @@ def test_background_calls_send_in_call_order(loop: LoopThread) -> None:
         )
     orders.wait(LIMIT_S)
     loop.call(lambda: None)
-    replaced = {each for each in range(50) if each % 3 and f"order {each}" not in sent}
+    replaced = {number for number in range(50) if number % 3 and f"order {number}" not in sent}
     expected = [f"order {n}" if n % 3 else f"message {n}" for n in range(50) if n not in replaced]
     assert sent == expected
     assert not replaced or all(any(later % 7 == n % 7 for later in range(n + 1, 50)) for n in replaced)

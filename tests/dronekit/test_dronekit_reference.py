@@ -37,9 +37,9 @@ def notified() -> Iterator[Stage]:
 
 @pytest.fixture
 def stage() -> Iterator[Stage]:
-    with on_stage(dronekit, {"mode": 4}, READY, answer_streams) as each:
-        each.settle()
-        yield each
+    with on_stage(dronekit, {"mode": 4}, READY, answer_streams) as opened:
+        opened.settle()
+        yield opened
 
 
 # ---------------------------------------------------------------------------------------- names
@@ -101,7 +101,7 @@ def test_signature(path: str) -> None:
         if name != "self" and parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD)
     ]
     by_position = [name for name in own if name.kind is not name.KEYWORD_ONLY]
-    assert [each.name for each in by_position[: len(wanted)]] == list(wanted)
+    assert [parameter.name for parameter in by_position[: len(wanted)]] == list(wanted)
     assert all(name.default is not name.empty for name in own[len(wanted) :])
     for each in by_position[: len(wanted)]:
         default = ... if each.default is each.empty else getattr(each.default, "__name__", each.default)

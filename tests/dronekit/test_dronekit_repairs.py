@@ -57,8 +57,8 @@ def test_other_vehicles_do_not_change_attributes(copter: Stage) -> None:
     copter.beat(source=other)
     copter.report("GLOBAL_POSITION_INT", lat=471000000, lon=85000000, alt=30, relative_alt=40)
     copter.report("ATTITUDE", roll=0.5)
-    events, heard = copter.listen("*"), []
-    copter.vehicle.add_message_listener("VFR_HUD", lambda *_: heard.append(1))
+    events, received = copter.listen("*"), []
+    copter.vehicle.add_message_listener("VFR_HUD", lambda *_: received.append(1))
     copter.reached()
     for name, fields in (
         ("GLOBAL_POSITION_INT", {"lat": 7}),
@@ -75,7 +75,7 @@ def test_other_vehicles_do_not_change_attributes(copter: Stage) -> None:
         None,
     )
     assert not {name for _, name, _ in events} & {"attitude", "heading", "battery", "gps_0", "location"}
-    assert heard == []
+    assert received == []
 
 
 def test_parameters_of_other_systems_are_ignored(copter: Stage) -> None:
@@ -317,20 +317,20 @@ def test_blocking_listener_does_not_stop_reception_or_heartbeat(copter: Stage) -
 
 
 def test_listeners_may_call_blocking_methods(copter: Stage) -> None:
-    seen: list[Any] = []
+    observed: list[Any] = []
 
     def use(vehicle: Any, name: str, value: Any) -> None:
-        seen.append(vehicle.parameters["FOO"])
-        seen.append(vehicle.parameters.set("FOO", 5))
+        observed.append(vehicle.parameters["FOO"])
+        observed.append(vehicle.parameters.set("FOO", 5))
         vehicle.wait_for_mode("LOITER", timeout=100)
-        seen.append(vehicle.mode.name)
-        seen.append(vehicle.wait_ready("mode", timeout=100))
+        observed.append(vehicle.mode.name)
+        observed.append(vehicle.wait_ready("mode", timeout=100))
         vehicle.arm(timeout=100)
-        seen.append(vehicle.armed)
+        observed.append(vehicle.armed)
 
     copter.vehicle.add_attribute_listener("heading", use)
     copter.report("VFR_HUD", heading=271)
-    assert seen == [1.0, True, "LOITER", True, True]
+    assert observed == [1.0, True, "LOITER", True, True]
 
 
 def test_listener_removing_itself_hides_nothing_from_next(copter: Stage) -> None:

@@ -24,15 +24,15 @@ LIMIT_S = 100.0
 
 @pytest.fixture
 def copter() -> Iterator[FlightController]:
-    with FlightController() as each:
-        yield each
+    with FlightController() as controller:
+        yield controller
 
 
 @pytest.fixture
 def vehicle(copter: FlightController) -> Iterator[dronekit.Vehicle]:
-    each = dronekit.connect(copter.address, rate=None)
-    yield each
-    each.close()
+    connected = dronekit.connect(copter.address, rate=None)
+    yield connected
+    connected.close()
 
 
 def lose_answers(copter: FlightController, *commands: int, does: bool) -> None:

@@ -45,7 +45,7 @@ async def test_ten_members_land_by_policy_after_one_is_lost() -> None:
         assert len(result) == 10
         assert result.is_complete
         await fleet.wait_at_altitude(10)
-        stage.forget()
+        stage.clear()
         stage.copters["north/4"].faults.silent = True
         result = await fleet.go_to(north(300))
         assert list(result.failed) == ["north/4"]
@@ -221,7 +221,7 @@ async def test_member_taken_over_by_pilot_is_skipped_until_reclaimed() -> None:
         await anyio.sleep(2)
         member = stage.fleet.members["north/2"]
         assert (member.state, member.reason) == (MemberState.TAKEN_OVER, "the mode changed to LOITER")
-        stage.forget()
+        stage.clear()
         for order in (stage.fleet.go_to(north(10)), stage.fleet.hold(), stage.fleet.set_mode("GUIDED")):
             result = await order
             assert result.skipped == {"north/2": "taken over: the mode changed to LOITER"}
@@ -247,7 +247,7 @@ async def test_pilot_takeover_during_action_is_respected() -> None:
         await anyio.sleep(5)
         assert stage.modes == {"north/1": "BRAKE", "north/2": "LOITER", "north/3": "BRAKE"}
         assert "LOITER" in str(result.failed["north/2"])
-        assert [each.command for _, each in stage.orders_to("north/2")] == [MavCmd.DO_REPOSITION]
+        assert [command.command for _, command in stage.orders_to("north/2")] == [MavCmd.DO_REPOSITION]
         stage.pilot_takes("north/2", 9)
         (await stage.fleet.land()).raise_for_errors()
 
@@ -328,7 +328,7 @@ async def test_stagger_delays_consecutive_members() -> None:
         (await stage.fleet.wait_ready()).raise_for_errors()
         (await stage.fleet.arm()).raise_for_errors()
         await stage.fleet.set_mode("GUIDED")
-        stage.forget()
+        stage.clear()
         await stage.fleet.take_off(5, stagger_s=2)
         times = [stage.orders_to(name)[0][0] for name in stage.copters]
         assert [later - times[0] for later in times] == pytest.approx([0.0, 2.0, 4.0], abs=0.3)

@@ -88,13 +88,13 @@ async def test_too_close_members_hold_if_program_flies_them() -> None:
     async with open_stage(3, spacing_m=20, min_distance_m=6.0) as stage:
         await stage.take_off()
         stage.pilot_takes("north/2")
-        stage.forget()
+        stage.clear()
         one = stage.fleet.vehicles["north/1"]
         with pytest.raises(OperationRejected, match="another order"):
             await one.go_to(stage.fleet.vehicles["north/3"].position.value)  # the vehicle's own go_to compares no paths
         await anyio.sleep(3)
         first = stage.events(TooClose)
-        assert [(each.member, each.other, each.ordered) for each in first] == [("north/1", "north/2", ("north/1",))]
+        assert [(event.member, event.other, event.ordered) for event in first] == [("north/1", "north/2", ("north/1",))]
         assert first[0].distance_m < 6
         assert stage.modes == {"north/1": "BRAKE", "north/2": "LOITER", "north/3": "GUIDED"}
         assert stage.orders_to("north/2") == []
@@ -135,7 +135,10 @@ async def test_missions_upload_and_start_together() -> None:
         (await stage.fleet.arm()).raise_for_errors()
         (await stage.fleet.start_missions()).raise_for_errors()
         starts = [
-            at for name in stage.copters for at, each in stage.orders_to(name) if each.command == MavCmd.MISSION_START
+            at
+            for name in stage.copters
+            for at, command in stage.orders_to(name)
+            if command.command == MavCmd.MISSION_START
         ]
         assert len(starts) == 3
         assert max(starts) - min(starts) < 0.5
@@ -215,7 +218,7 @@ async def test_form_errors_name_action_and_member() -> None:
         assert done.action == "form"
         onto = Formation({"north/2": Offset(0.0, 20.0)})
         with pytest.raises(OperationRejected, match=r"^form: .*north/3.*nothing was sent"):
-            await stage.fleet.form(onto, leader="north/1")  # north/3 is there
+            await stage.fleet.form(onto, leader="north/1")  # north/3 occupies that place
         stage.copters["north/1"].faults.silent = True
         await anyio.sleep(2.5)
         with pytest.raises(ValueUnknownError, match=r"^north/1: position is"):
@@ -224,7 +227,7 @@ async def test_form_errors_name_action_and_member() -> None:
         with pytest.raises(ValueUnknownError, match=r"^north/1: position is"):
             await stage.fleet.go_to({"north/1": here.offset(up_m=20)})
         with pytest.raises(ValueUnknownError, match=r"^north/1: position is"):
-            await stage.fleet.go_to(lambda each: each.vehicle.position.fresh(1).offset(north_m=1))
+            await stage.fleet.go_to(lambda member: member.vehicle.position.fresh(1).offset(north_m=1))
 
 
 async def test_following_leader_lost_makes_followers_hold() -> None:
@@ -347,7 +350,7 @@ def test_formation_offset_rotates_with_heading() -> None:
 
 async def test_send_corrections_sends_once_per_link() -> None:
     async with open_stage(2, networks=("north", "south")) as stage:
-        stage.forget()
+        stage.clear()
         message = b"\xd3\x00\xc8" + bytes(range(200)) + b"crc"
         assert stage.fleet.send_corrections(message) == 2
         for wire in stage.wires.values():
@@ -387,7 +390,9 @@ def test_rtcm_messages_are_split() -> None:
 
 async def test_px4_after_mission_end_is_not_taken_over() -> None:
     async with (
-        simulated_link([SimulatedPx4(system_id=each, boot_time_s=1.0, seed=each) for each in (1, 2)]) as link,
+        simulated_link(
+            [SimulatedPx4(system_id=system_id, boot_time_s=1.0, seed=system_id) for system_id in (1, 2)]
+        ) as link,
         fleet({"south": link}, count=2) as both,
     ):
         (await both.wait_ready()).raise_for_errors()
@@ -409,19 +414,21 @@ async def test_px4_after_mission_end_is_not_taken_over() -> None:
         await anyio.sleep(5)
         assert [vehicle.state for vehicle in both] == [MemberState.ACTIVE] * 2
         assert both.vehicles["south/2"].mode_name == "LOITER"
-        (await both["south/2"].go_to(lambda each: each.vehicle.position.value.offset(north_m=10))).raise_for_errors()
+        (
+            await both["south/2"].go_to(lambda member: member.vehicle.position.value.offset(north_m=10))
+        ).raise_for_errors()
         (await both.land()).raise_for_errors()
 
 
 async def test_px4_fleet_flies_and_detects_pilot() -> None:
-    px4s = [SimulatedPx4(system_id=each, boot_time_s=1.0, seed=each) for each in (1, 2)]
+    px4s = [SimulatedPx4(system_id=system_id, boot_time_s=1.0, seed=system_id) for system_id in (1, 2)]
     async with (
         simulated_link(px4s) as link,
         fleet({"south": link}, count=2, on_error="continue_others") as both,
     ):
         for order in (both.wait_ready(), both.arm(), both.take_off(10)):
             (await order).raise_for_errors()
-        (await both.go_to(lambda each: each.vehicle.position.value.offset(north_m=20))).raise_for_errors()
+        (await both.go_to(lambda member: member.vehicle.position.value.offset(north_m=20))).raise_for_errors()
         line = Formation.line(["south/2"], 10.0, frame="north")
         async with both.following(line, leader="south/1") as following:
             await anyio.sleep(20)
@@ -434,7 +441,7 @@ async def test_px4_fleet_flies_and_detects_pilot() -> None:
 
 
 async def test_px4_mode_report_before_heartbeat_is_no_takeover() -> None:
-    px4s = [SimulatedPx4(system_id=each, boot_time_s=1.0, seed=each) for each in (1, 2)]
+    px4s = [SimulatedPx4(system_id=system_id, boot_time_s=1.0, seed=system_id) for system_id in (1, 2)]
     async with simulated_link(px4s) as link, fleet({"south": link}, count=2) as both:
         for order in (both.wait_ready(), both.arm(), both.take_off(6)):
             (await order).raise_for_errors()

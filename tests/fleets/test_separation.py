@@ -134,7 +134,9 @@ def test_layers_keep_min_distance_at_any_speed(routes: list[Route], rest: list[L
 def test_corridors_keep_min_distance_within_slack(routes: list[Route], least: float) -> None:
     plan = separate_by_time(routes, {}, least, 5.0, slack_s=2.0, max_delay_s=60.0)
     if plan.decision == "corridors":
-        timed = [Path.straight(route.name, route.start, route.target, 5.0, plan.delays_s[route.name]) for route in routes]
+        timed = [
+            Path.straight(route.name, route.start, route.target, 5.0, plan.delays_s[route.name]) for route in routes
+        ]
         assert not find_conflicts(timed, least - 1e-6, slack_s=2.0)
     assert plan.decision in ("clear", "corridors", "refused")
 

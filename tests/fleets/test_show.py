@@ -108,7 +108,7 @@ async def test_show_failure_applies_policy() -> None:
 async def test_invalid_show_is_rejected() -> None:
     async with open_stage(2, min_distance_m=5.0) as stage:
         await stage.take_off(8)
-        stage.forget()
+        stage.clear()
         near = Show.from_points({"north/1": circle(0, 0, 5), "north/2": circle(0, 3, 5)})
         with pytest.raises(OperationRejected, match=r"within 2\.\d m"):
             await stage.fleet.fly_show(near, ORIGIN)
@@ -232,7 +232,7 @@ def test_track_deviation_distinguishes_lag_from_offset(lag_s: float, offset: Loc
 
 def test_max_relative_error_compares_vectors_between_vehicles() -> None:
     other = track.replace(name="b")
-    times = [each / 2 for each in range(41)]
+    times = [tick / 2 for tick in range(41)]
 
     def shifted(by: float) -> list[tuple[float, LocalPoint]]:
         return [(at, (state_at(track, at)[0][0] + by, *state_at(track, at)[0][1:])) for at in times]

@@ -35,12 +35,12 @@ def fuzz_plan(data: bytes) -> None:
         plan = parse_plan(data.decode(errors="surrogateescape"))
     except FileFormatError:
         return
-    for each in (plan, plan.replace(mission=Mission(), source=plan.source), plan.replace(source="")):
+    for variant in (plan, plan.replace(mission=Mission(), source=plan.source), plan.replace(source="")):
         try:
-            text = format_plan(each)
+            text = format_plan(variant)
         except InvalidArgument:
             continue
-        assert parse_plan(text) == each
+        assert parse_plan(text) == variant
 
 
 def fuzz_waypoints(data: bytes) -> None:
@@ -107,7 +107,7 @@ def fuzz_camera_definition(data: bytes) -> None:
     except FileFormatError:
         return
     values = {name: setting.options[-1].value for name, setting in camera.settings.items() if setting.options}
-    for told in ({}, values):
+    for values_read in ({}, values):
         for name, setting in camera.localized("de").settings.items():
             assert name not in camera.dependencies(name)
             for value in (
@@ -117,10 +117,10 @@ def fuzz_camera_definition(data: bytes) -> None:
                 b"A",
                 math.nan,
                 1 << 70,
-                *(one.value for one in camera.options(name, told)),
+                *(one.value for one in camera.options(name, values_read)),
             ):
                 with suppress(InvalidArgument):
-                    sent = camera.checked(name, value, told)
+                    sent = camera.checked(name, value, values_read)
                     assert setting_value(setting_bytes(sent, setting.wire_type), setting.wire_type) == sent
 
 

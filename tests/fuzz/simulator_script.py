@@ -203,10 +203,10 @@ class _Player:
         return 5100 if kind == 2 else COMMANDS[choice % len(COMMANDS)]
 
 
-def play(vehicle: SimulatedVehicle, data: bytes, most_steps: int = 60) -> None:
+def play(vehicle: SimulatedVehicle, data: bytes, max_steps: int = 60) -> None:
     """Run the script, and check that the vehicle survives and sends only valid frames."""
     player = _Player(vehicle, Script(data))
-    for _ in range(most_steps):
+    for _ in range(max_steps):
         if not player.script.has_more:
             break
         player.step()

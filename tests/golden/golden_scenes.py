@@ -110,8 +110,8 @@ def north_of(vehicle: aerokit.Vehicle, *metres: float) -> list[aerokit.Position]
 def mission(vehicle: aerokit.Vehicle) -> Mission:
     return Mission(
         [
-            waypoint(each.latitude_deg, each.longitude_deg, altitude_relative_m=20)
-            for each in north_of(vehicle, 50, 100, 150)
+            waypoint(place.latitude_deg, place.longitude_deg, altitude_relative_m=20)
+            for place in north_of(vehicle, 50, 100, 150)
         ]
     )
 

@@ -132,7 +132,7 @@ class Stage:
     # -------------------------------------------------------------------------------- answers
 
     async def answers(self) -> None:
-        """Check that the vehicle still works, and reports what it does."""
+        """Check that the vehicle still executes commands and reports their effects."""
         await self.vehicle.command(MavCmd.REQUEST_MESSAGE, messages.AutopilotVersion.ID)
 
 

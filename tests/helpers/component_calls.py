@@ -1,4 +1,4 @@
-"""Calls about components beside the autopilot: successful, blocking, and failing ones."""
+"""Calls to components other than the autopilot: successful, blocking, and failing ones."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ async def mounted() -> AsyncIterator[Flight]:
     """A copter on the ground with a gimbal that its autopilot manages."""
     async with open_flight(copter_with_mount()) as flight:
         await flight.vehicle.wait_ready()
-        flight.wire.forget()
+        flight.wire.clear()
         yield flight
 
 
@@ -43,7 +43,7 @@ async def beside(*gimbals: SimulatedGimbal, copter: SimulatedCopter | None = Non
     async with open_flight(copter) as flight:
         await flight.vehicle.wait_ready()
         await flight.vehicle.gimbal.controllers.wait_until(lambda _: True, timeout=3)
-        flight.wire.forget()
+        flight.wire.clear()
         yield flight
 
 

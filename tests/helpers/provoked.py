@@ -1,4 +1,4 @@
-"""How to provoke an error: the state of the vehicle, the preparation, and the call that must raise it."""
+"""A provoked error: the state of the vehicle, the preparation, and the call that must raise it."""
 
 from __future__ import annotations
 

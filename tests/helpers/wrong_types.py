@@ -173,10 +173,12 @@ def misuses_of(function: Callable[..., Any], name: str) -> Iterator[Misuse]:
     """Yield one function with each parameter wrong in each way."""
     parameters = inspect.signature(function).parameters
     needed = [
-        parameter for parameter in parameters.values() if parameter.default is parameter.empty and parameter.kind is not parameter.VAR_POSITIONAL
+        parameter
+        for parameter in parameters.values()
+        if parameter.default is parameter.empty and parameter.kind is not parameter.VAR_POSITIONAL
     ]
     for parameter in parameters.values():
-        others = [each for each in needed if each is not parameter]
+        others = [needed_parameter for needed_parameter in needed if needed_parameter is not parameter]
         for value in (*WRONG[str(parameter.annotation)], *_impossible(name, parameter)):
             args, kwargs = _arguments(parameter, value, others)
             yield Misuse(name, parameter.name, value, partial(function, *args, **kwargs))
@@ -202,7 +204,7 @@ def _arguments(
 
 
 def refusal_of(misuse: Misuse, error: BaseException | None) -> str | None:
-    """Describe what is wrong with the error; None if nothing is."""
+    """Describe the fault of the error; None if it is as documented."""
     if not isinstance(error, InvalidArgument):
         return f"{misuse!r}: {error!r}"
     return None if misuse.parameter in str(error) else f"{misuse!r} is not named: {error}"

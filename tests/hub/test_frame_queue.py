@@ -43,7 +43,9 @@ def test_full_queue_drops_telemetry_first_then_new_frames() -> None:
     for number in range(MAX_QUEUED_FRAMES):
         assert frames.put(held(b"t", MessageKind.TELEMETRY), number) == []
     for _ in range(MAX_QUEUED_FRAMES):
-        assert [(why, each.kind) for why, each in frames.put(held(b"x"), 0)] == [("queue_full", MessageKind.TELEMETRY)]
+        assert [(why, dropped.kind) for why, dropped in frames.put(held(b"x"), 0)] == [
+            ("queue_full", MessageKind.TELEMETRY)
+        ]
     last = held(b"last")
     assert frames.put(last, 0) == [("queue_full", last)]
     assert taken(frames) == [b"x"] * MAX_QUEUED_FRAMES
@@ -56,7 +58,7 @@ def test_late_orders_are_dropped_and_returned() -> None:
     frames.put(held(b"second", MessageKind.ORDER, since=0.5), 0)
     assert ORDER_MAX_AGE_S == 1.0, "docs/hub.md and docs/reliability.md promise a second"
     assert frames.expire(1.0) == []
-    assert [(why, each.raw) for why, each in frames.expire(1.01)] == [("late", b"first")]
+    assert [(why, expired.raw) for why, expired in frames.expire(1.01)] == [("late", b"first")]
     assert taken(frames) == [b"part", b"second"]
     assert frames.expire(99.0) == []
 
@@ -120,7 +122,7 @@ def test_kind_of_message(name: str, is_for_one: bool, kind: MessageKind) -> None
 
 
 def test_telemetry_is_never_an_order_and_has_no_target() -> None:
-    names = {each.NAME: each for each in STANDARD}
+    names = {kind.NAME: kind for kind in STANDARD}
     for name in _PERIODIC.split():
         assert kind_of(name, is_for_one=False) is MessageKind.TELEMETRY
         fields = {field.name for field in names[name].FIELDS}

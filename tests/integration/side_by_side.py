@@ -92,7 +92,7 @@ PARAMETERS = {
 NEEDS_STICKS = frozenset(
     ("STABILIZE", "ACRO", "DRIFT", "SPORT", "FLIP", "THROW", "TURTLE", "ZIGZAG", "SYSTEMID", "AUTOTUNE", "GUIDED_NOGPS")
 )  # fmt: skip
-COPTER_MODES = tuple(each.name for each in CopterMode)
+COPTER_MODES = tuple(mode.name for mode in CopterMode)
 PX4_MODES = (
     "MANUAL",
     "ALTCTL",
@@ -189,7 +189,7 @@ class _Runner:
         here = vehicle.position.value
         self._here = here
         self._texts: list[str] = []
-        vehicle.status_text.observe(lambda _, told: self._texts.append(told.text), every_arrival=True)
+        vehicle.status_text.observe(lambda _, text: self._texts.append(text.text), every_arrival=True)
         self._doing: dict[str, Callable[..., Awaitable[object]]] = {
             "command": self._command, "command_int": self._command_int, "command_to": self._command_to,
             "set_mode": self._set_mode, "parameter": self._parameter, "mission": self._mission, "go_to": self._go_to,
@@ -370,10 +370,10 @@ def main() -> int:
             by_call[line[3:]].append(seed)
         if options.keep:
             options.keep.mkdir(exist_ok=True)
-            both = {"real": [asdict(each) for each in real], "ours": [asdict(own) for own in ours]}
+            both = {"real": [asdict(row) for row in real], "ours": [asdict(own) for own in ours]}
             (options.keep / f"{options.kind}-{seed}.json").write_text(json.dumps(both, indent=1))
     print("\nAll of them:")
-    for line, seeds in sorted(by_call.items(), key=lambda each: -len(each[1])):
+    for line, seeds in sorted(by_call.items(), key=lambda entry: -len(entry[1])):
         print(f"{len(seeds):3} × {line}  (seeds {', '.join(map(str, seeds[:5]))})")
     return 0
 

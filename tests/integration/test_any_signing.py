@@ -51,7 +51,7 @@ async def test_signing_key_is_installed(choice: Choice) -> None:
                 await vehicle.setup_signing(Signing(OTHER))
             vehicle.send(m.SetupSigning(vehicle.system_id, 1, OTHER.secret, signing.timestamp))
             await vehicle.status_text.wait_until(
-                lambda each: "signing" in each.text and "armed" in each.text, timeout=choice.seconds(5)
+                lambda status: "signing" in status.text and "armed" in status.text, timeout=choice.seconds(5)
             )
             await vehicle.disarm()
         finally:

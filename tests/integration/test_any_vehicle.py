@@ -120,7 +120,7 @@ async def test_messages_arrive_at_requested_rate(choice: Choice) -> None:
             while attitudes.get_nowait() is not None:
                 pass
             await anyio.sleep(2.0)
-            times = [each.time_boot_ms for each in iter(attitudes.get_nowait, None)]
+            times = [attitude.time_boot_ms for attitude in iter(attitudes.get_nowait, None)]
         seconds = (times[-1] - times[0]) / 1000
         assert 15 < (len(times) - 1) / seconds < 60
         await vehicle.command(REQUEST_MESSAGE, m.SystemTime.ID)

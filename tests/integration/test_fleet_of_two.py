@@ -26,7 +26,7 @@ pytest.importorskip("zenoh")
 pytestmark = pytest.mark.anyio
 
 ARDUCOPTER, PX4 = os.environ.get("AEROKIT_ARDUCOPTER"), os.environ.get("AEROKIT_PX4")
-BINARIES = [Path(each).resolve() for each in (ARDUCOPTER, PX4) if each]
+BINARIES = [Path(binary).resolve() for binary in (ARDUCOPTER, PX4) if binary]
 DEFAULTS = "Tools/autotest/default_params/copter.parm"
 SPEEDUP = 1.0 if ARDUCOPTER and PX4 else 8.0
 PX4_INSTANCE = 1  # its system id is one more

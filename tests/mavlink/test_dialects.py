@@ -410,5 +410,5 @@ def test_char_arrays_with_bytes_in_any_dialect(tmp_path: Path) -> None:
     path.write_text(own)
     ack: Any = Dialect.from_xml(path)[324]
     assert ack is not messages.ParamExtAck
-    told = ack.decode(ack(param_id="A", param_value=b"\0\1", param_type=3, param_result=0, own=7).encode())
-    assert told.to_dict()["param_value"] == b"\0\1".ljust(128, b"\0")
+    decoded = ack.decode(ack(param_id="A", param_value=b"\0\1", param_type=3, param_result=0, own=7).encode())
+    assert decoded.to_dict()["param_value"] == b"\0\1".ljust(128, b"\0")

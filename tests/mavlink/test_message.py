@@ -211,9 +211,9 @@ def test_char_arrays_with_bytes_keep_zeros(kind: type[Message]) -> None:
     assert (field.type, field.array_length, field.is_text) == ("char", 128, False)
     number = (1000).to_bytes(8, "little", signed=True)
     values = {field.name: "A" if field.is_text else 1 for field in kind.FIELDS} | {"param_value": number}
-    told = received(kind(**values))
-    assert told.to_dict()["param_value"] == number.ljust(128, b"\0")
-    assert told.to_dict()["param_id"] == "A"
+    decoded = received(kind(**values))
+    assert decoded.to_dict()["param_value"] == number.ljust(128, b"\0")
+    assert decoded.to_dict()["param_id"] == "A"
     for wrong in ("text", bytes(129), 5):
         with pytest.raises(InvalidArgument, match=r"\.param_value = .* cannot be sent"):
             kind(**values | {"param_value": wrong}).encode()

@@ -61,7 +61,7 @@ class _Sender:
         """Append frames: one or several, lost, doubled, reordered, after a reboot, or in a burst."""
         chance, begin = self._chance, self.number
         self.number += chance.choice((1, 1, 1, 2, 3, 8))
-        frames = [each & 0xFF for each in range(begin, self.number) if chance.random() >= self._loss]
+        frames = [number & 0xFF for number in range(begin, self.number) if chance.random() >= self._loss]
         if chance.random() < 0.05:
             chance.shuffle(frames)
         if chance.random() < 0.05:

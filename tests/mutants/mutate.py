@@ -77,13 +77,13 @@ def _verdict(trials: Trials, mutation: Mutation, changed: str, tests: list[str],
         if test is None:
             return verdict, by
         if NO_SUCH_TEST in by:  # its name has the constant in it that was changed
-            tests = [each for each in tests if each != test]
+            tests = [node_id for node_id in tests if node_id != test]
             continue
-        upto = [each for each in tests[: tests.index(test) + 1] if _file_of(each) == _file_of(test)]
+        upto = [node_id for node_id in tests[: tests.index(test) + 1] if _file_of(node_id) == _file_of(test)]
         same = (SOURCE / mutation.path).read_text()
         if trials.run(mutation.path, same, upto, reach.seconds)[0] == SURVIVED:
             return verdict, by
-        tests = [each for each in tests if _file_of(each) != _file_of(test)]
+        tests = [node_id for node_id in tests if _file_of(node_id) != _file_of(test)]
 
 
 def _file_of(test: str) -> str:

@@ -107,9 +107,9 @@ def mutations_of(path: str, source: str) -> list[Mutation]:
 def _for_type_checkers(source: str) -> set[int]:
     """The lines below ``if TYPE_CHECKING``."""
     blocks = [
-        each
-        for each in ast.walk(ast.parse(source))
-        if isinstance(each, ast.If) and isinstance(each.test, ast.Name) and each.test.id == "TYPE_CHECKING"
+        node
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
     ]
     return {line for block in blocks for line in range(block.lineno, (block.body[-1].end_lineno or 0) + 1)}
 

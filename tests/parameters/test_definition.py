@@ -144,7 +144,7 @@ def test_condition_evaluation(condition: str, values: dict[str, SettingValue], h
 
 def test_several_ranges_apply_together() -> None:
     def ruler(name: str, *allowed: int) -> str:
-        options = "".join(f'<roption name="{each}" value="{each}"/>' for each in allowed)
+        options = "".join(f'<roption name="{value}" value="{value}"/>' for value in allowed)
         return f"""<parameter name="{name}" type="uint8"><options><option name="on" value="1"><parameterranges>
             <parameterrange parameter="S">{options}</parameterrange></parameterranges></option></options></parameter>"""
 
@@ -244,9 +244,9 @@ def test_setting_value_round_trip(given_value: tuple[SettingValue, MavParamExtTy
     except InvalidArgument:
         assert isinstance(value, str)  # half of a surrogate pair
         return
-    told = setting_value(setting_bytes(wanted, kind).ljust(128, b"\0"), kind)
-    assert told == wanted
-    assert settings_equal(told, value)
+    decoded = setting_value(setting_bytes(wanted, kind).ljust(128, b"\0"), kind)
+    assert decoded == wanted
+    assert settings_equal(decoded, value)
 
 
 @given(st.binary(max_size=128), st.integers(0, 255))

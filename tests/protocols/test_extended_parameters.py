@@ -29,7 +29,7 @@ def table_of(count: int) -> list[Setting]:
 
 
 class FakeCamera(FakeVehicle):
-    """Answers as the standard says. Subclasses add faults."""
+    """A camera that answers according to the standard. Subclasses add faults."""
 
     tick_s = 0.02
 
@@ -115,7 +115,7 @@ def test_setting_list_requests_gap_by_index() -> None:
 
     channel.is_lost = is_lost
     found: dict[str, Setting] = channel.run(listing())
-    assert list(found) == [each.name for each in table_of(12)]
+    assert list(found) == [parameter.name for parameter in table_of(12)]
     assert [request.param_index for request in channel.all(m.ParamExtRequestRead)] == [5, 8, 11]
     assert channel.kinds()["PARAM_EXT_REQUEST_LIST"] == 1
     first = next(at for at, message in channel.sent if isinstance(message, m.ParamExtRequestRead))
@@ -157,7 +157,7 @@ def test_setting_list_ignores_unrelated_values() -> None:
     channel.at(0.0, lambda: channel.from_vehicle(stranger, component_id=2))
     channel.at(0.0, lambda: channel.from_vehicle(m.ParamExtValue("NONE", b"", T.UINT8, 3, 0xFFFF)))
     found: dict[str, Setting] = channel.run(listing())
-    assert list(found) == [each.name for each in table_of(3)]
+    assert list(found) == [parameter.name for parameter in table_of(3)]
     assert channel.kinds() == {"PARAM_EXT_REQUEST_LIST": 1}
 
 

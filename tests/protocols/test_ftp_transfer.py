@@ -131,7 +131,7 @@ def test_download_requests_gap_during_burst() -> None:
     sequences = {read.sequence for read in reads}
     assert not sequences & set(range(burst.sequence, burst.sequence + 500))  # may be replies of the burst
     exchange.receive(as_message(reply_to(reads[0], content(239), offset=239)), 0.2)
-    assert [each.offset for each in requests_in(exchange.take_outbox())] == [239 * 5]
+    assert [request.offset for request in requests_in(exchange.take_outbox())] == [239 * 5]
 
 
 def test_download_ignores_blocks_of_other_bursts() -> None:
@@ -264,11 +264,11 @@ def test_download_ends_on_read_error() -> None:
 
 
 def test_download_reports_progress() -> None:
-    told: list[TransferProgress] = []
-    download = Download(1000, on_progress=told.append)
+    reported: list[TransferProgress] = []
+    download = Download(1000, on_progress=reported.append)
     run(download.exchange, FileServer(bytearray(content(1000))))
-    assert [event.done for event in told] == [239, 478, 717, 956, 1000]
-    assert all(event.total == 1000 for event in told)
+    assert [event.done for event in reported] == [239, 478, 717, 956, 1000]
+    assert all(event.total == 1000 for event in reported)
 
 
 # ------------------------------------------------------------------------------------ uploads

@@ -58,7 +58,7 @@ def test_log_list_without_logs() -> None:
 def test_log_list_of_one_entry() -> None:
     exchange = make_list(start=2, end=2)
     run(exchange, LogVehicle([content(5), content(6), content(7)]))
-    assert [each.size for each in exchange.result()] == [6]
+    assert [log.size for log in exchange.result()] == [6]
 
 
 def test_log_list_without_answer_times_out() -> None:

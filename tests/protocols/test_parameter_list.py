@@ -79,11 +79,11 @@ def test_parameter_list_ignores_hash() -> None:
 
 
 def test_parameter_list_reports_progress() -> None:
-    seen: list[TransferProgress] = []
-    Channel(FakeVehicle(table_of(30))).run(listing(on_progress=seen.append))
-    assert [each.done for each in seen] == list(range(1, 31))
-    assert {each.total for each in seen} == {30}
-    assert seen[-1].fraction == 1.0
+    observed: list[TransferProgress] = []
+    Channel(FakeVehicle(table_of(30))).run(listing(on_progress=observed.append))
+    assert [progress.done for progress in observed] == list(range(1, 31))
+    assert {progress.total for progress in observed} == {30}
+    assert observed[-1].fraction == 1.0
 
 
 def test_idle_timeout_must_be_positive() -> None:
@@ -214,7 +214,7 @@ def test_parameter_list_index_beyond_count_sends_nothing() -> None:
 
 
 class Growing(FakeVehicle):
-    """As ArduPilot: a group appears after ``shown_at`` values. The stream continues behind it with the old count."""
+    """A vehicle like ArduPilot: a group appears after ``shown_at`` values, and the stream continues with the old count."""
 
     shown_at = 60
     place = 80
@@ -255,7 +255,7 @@ def test_parameter_list_includes_group_enabled_meanwhile(place: int) -> None:
 
 
 class Px4Growing(FakeVehicle):
-    """As PX4: count and indices are current; values inserted before the stream's position are skipped."""
+    """A vehicle like PX4: count and indices are current; values inserted before the stream's position are skipped."""
 
     def on_list(self) -> None:
         names = list(self.parameters)

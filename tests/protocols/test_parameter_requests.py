@@ -216,8 +216,8 @@ def test_value_before_write_does_not_confirm() -> None:
 def test_integer_reported_as_float_is_confirmed() -> None:
     class DefaultAsFloat(FakeVehicle):
         def value(self, name: str, index: int | None) -> m.ParamValue:
-            told = self.parameters[name]
-            return m.ParamValue(name, float(told.value), 9, 1, 0xFFFF)
+            reported = self.parameters[name]
+            return m.ParamValue(name, float(reported.value), 9, 1, 0xFFFF)
 
     channel = Channel(DefaultAsFloat([Parameter("A", 0, INT8)]))
     answer = channel.run(writes(Parameter("A", 3, INT8)))["A"]
@@ -254,9 +254,9 @@ def test_other_value_is_accepted_when_repeated_consecutively() -> None:
     exchange = writes(Parameter("A", 5, INT32), bytewise=True, before={"A": 0.0}, recent=["A"])
     exchange.start(0.0)
     done = []
-    for number, told in enumerate((4, 5, 4, 4)):
+    for number, reported in enumerate((4, 5, 4, 4)):
         exchange.take_outbox()
-        exchange.receive(m.ParamValue("A", to_wire(told, INT32, True), 6, 1, 0xFFFF), 1.0 + number)
+        exchange.receive(m.ParamValue("A", to_wire(reported, INT32, True), 6, 1, 0xFFFF), 1.0 + number)
         done.append(exchange.done)
     assert done == [False, False, False, True]
     assert value(exchange.result()["A"]) == 4

@@ -58,7 +58,7 @@ class Pair:
         vehicle.channels[0].streams = Streams()
 
     def run(self, exchange: Exchange[ResultT], *, limit_s: float = 900.0) -> ResultT:
-        """Return the result, or raise the error. Deadlines must neither be in the past nor repeat without progress."""
+        """Return the result or raise the error. Fails if a deadline is in the past or repeats without progress."""
         end = self.now + limit_s
         exchange.start(self.now)
         self._send(exchange)

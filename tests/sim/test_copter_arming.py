@@ -27,7 +27,7 @@ def test_arming_refusal_text_follows_acknowledgement() -> None:
     copter.faults.prearm_failures = ["Compass not healthy", "Hardware safety switch"]
     assert client.command(ARM, 1) == MavResult.FAILED
     assert client.texts == ["Arm: Compass not healthy", "Arm: Hardware safety switch"]
-    kinds = [type(message) for _, message in client.heard]
+    kinds = [type(message) for _, message in client.received]
     assert kinds[0] is m.CommandAck
 
 
@@ -45,12 +45,12 @@ def test_arming_needs_position_in_guided_only() -> None:
 def test_arming_reasons_change_during_boot() -> None:
     copter = SimulatedCopter(boot_time_s=41.5)
     client = Client(copter)
-    seen = []
+    observed = []
     while copter.uptime < 42.0:
         copter.mode = copter.guided
-        seen += copter.arming.reasons()[:1] or ["none"]
+        observed += copter.arming.reasons()[:1] or ["none"]
         client.run(0.05)
-    assert list(dict.fromkeys(seen)) == [
+    assert list(dict.fromkeys(observed)) == [
         "System not initialised",
         "GPS 1: not healthy",
         "GPS 1: Bad fix",

@@ -13,10 +13,10 @@ PING = m.Ping(1, 2, 0, 0)
 def test_reader_returns_wanted_messages_with_their_sender() -> None:
     encoder = FrameEncoder(255, 190)
     data = encoder.encode(HEARTBEAT) + encoder.encode(PING)
-    (heard,) = MessageReader({m.Ping.ID}).messages(data, 1.0, None)
-    assert heard == PING
-    assert heard.received_frame is not None
-    assert heard.received_frame.system_id == 255
+    (received,) = MessageReader({m.Ping.ID}).messages(data, 1.0, None)
+    assert received == PING
+    assert received.received_frame is not None
+    assert received.received_frame.system_id == 255
     assert MessageReader(None).messages(data, 1.0, None) == [HEARTBEAT, PING]
 
 
@@ -33,9 +33,9 @@ def test_shared_reader_decodes_once() -> None:
     hearing = SharedMessageReader()
     for _ in range(3):
         assert hearing.messages(frame[:9], 0.0, None) == []
-    hearing.forget()
+    hearing.clear()
     first = hearing.messages(frame[9:], 0.1, None)
     assert first == [PING]
     assert hearing.messages(frame[9:], 0.2, None) is first
-    hearing.forget()
+    hearing.clear()
     assert hearing.messages(b"", 0.3, None) == []

@@ -37,7 +37,7 @@ def flying(altitude_m: float = 20.0, **parameters: float) -> tuple[SimulatedPx4,
     assert station.command(MavCmd.COMPONENT_ARM_DISARM, 1) == MavResult.ACCEPTED
     station.run(30.0)
     assert px4.mode == HOLD
-    station.forget()
+    station.clear()
     return px4, station
 
 

@@ -23,7 +23,7 @@ def ready_plane(**parameters: float) -> tuple[SimulatedPx4Plane, Client]:
     plane = SimulatedPx4Plane(fast_rate_hz=1.0, boot_time_s=1.0, parameter_count=150, parameters=parameters)
     client = Client(plane)
     client.run(2.0)
-    client.forget()
+    client.clear()
     return plane, client
 
 

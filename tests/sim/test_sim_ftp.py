@@ -22,7 +22,7 @@ def copter_ftp(**options: object) -> tuple[SimulatedCopter, FtpClient]:
     copter = SimulatedCopter(boot_time_s=0.0, parameter_count=80, **options)  # type: ignore[arg-type]
     client = Client(copter)
     client.run(1.0)
-    client.forget()
+    client.clear()
     return copter, FtpClient(client)
 
 
@@ -30,7 +30,7 @@ def px4_ftp(**options: object) -> tuple[SimulatedPx4, FtpClient]:
     px4 = SimulatedPx4(boot_time_s=0.0, parameter_count=70, fast_rate_hz=1.0, **options)  # type: ignore[arg-type]
     client = Client(px4)
     client.run(1.0)
-    client.forget()
+    client.clear()
     return px4, FtpClient(client)
 
 
@@ -248,8 +248,8 @@ def test_ardupilot_serves_missions_as_files() -> None:
     ftp.data(Op.TERMINATESESSION)
     home = MissionItem(16, 0, x=-353632610, y=1491652299, z=584.0)
     item = MissionItem(16, 3, x=-353600000, y=1491600000, z=20.0)
-    numbers = [(0.0,) * 4 + (each.x, each.y, each.z, seq, 16, 0, 0, each.frame, 0, 1, 0)
-               for seq, each in enumerate((home, item))]  # fmt: skip
+    numbers = [(0.0,) * 4 + (mission_item.x, mission_item.y, mission_item.z, seq, 16, 0, 0, mission_item.frame, 0, 1, 0)
+               for seq, mission_item in enumerate((home, item))]  # fmt: skip
     content = struct.pack("<HHHHH", 0x763D, 0, 0, 0, 2) + b"".join(
         struct.pack("<4fiifHHBBBBBB", *row) for row in numbers
     )
@@ -315,7 +315,7 @@ def test_px4_keeps_reporting_eexist() -> None:
     _, ftp = px4_ftp()
     ftp.data(Op.CREATEDIRECTORY, "/a")
     assert ftp.refusal(Op.CREATEDIRECTORY, "/a") == (Err.FILEEXISTS,)
-    assert ftp.refusal(77) == (Err.FILEEXISTS,), "as seen: an errno is never forgotten"
+    assert ftp.refusal(77) == (Err.FILEEXISTS,), "as measured: the server keeps an errno"
     assert ftp.refusal(Op.OPENFILERO, "/none") == (Err.FILENOTFOUND,)
     assert ftp.refusal(77) == (Err.UNKNOWNCOMMAND,)
     assert ftp.refusal(Op.CALCFILECRC, "/none") == (Err.FILENOTFOUND,)

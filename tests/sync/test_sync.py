@@ -109,7 +109,7 @@ def test_every_member_has_a_twin(original: type, twin: type, name: str) -> None:
     assert kind_of(original, name) == kind_of(twin, name)
     if kind_of(original, name) == "method":
         assert not inspect.iscoroutinefunction(getattr(twin, name))
-        given, wanted = (inspect.signature(getattr(each, name)).parameters for each in (twin, original))
+        given, wanted = (inspect.signature(getattr(cls, name)).parameters for cls in (twin, original))
         assert [(parameter.name, parameter.kind, parameter.default) for parameter in given.values()] == [
             (parameter.name, parameter.kind, parameter.default) for parameter in wanted.values()
         ]
@@ -403,7 +403,7 @@ def test_links_cell_of_several_links() -> None:
         with aerokit.sync.connect([address, "udpin:127.0.0.1:0"], rates={}) as vehicle:
             links = vehicle.connection.links
             assert isinstance(links, aerokit.sync.StateCell)
-            states = links.wait_until(lambda each: each[0].state is LinkState.CONNECTED, timeout=100)
+            states = links.wait_until(lambda statuses: statuses[0].state is LinkState.CONNECTED, timeout=100)
             assert [state.link.split(":")[0] for state in states] == ["tcp", "udpin"]
             assert links.value[0].used_for == (1,)
         with aerokit.sync.connect(address, rates={}) as vehicle:
@@ -470,7 +470,7 @@ def test_exception_in_flight_logs_vehicle_state(caplog: pytest.LogCaptureFixture
 
 
 def test_part_can_be_first_read_in_predicate(vehicle: aerokit.sync.Vehicle) -> None:
-    """Which runs on the loop's thread, while another thread reads it first, too."""
+    """The predicate runs on the loop's thread while another thread reads the component for the first time."""
     entered = threading.Event()
 
     def looks(_: object) -> bool:

@@ -53,9 +53,9 @@ def test_call_soon_on_loop_during_calls_of_other_threads(loop: LoopThread) -> No
         asker.start()
     asking = threading.Thread(target=loop.run, args=(ask_itself,), daemon=True)
     asking.start()
-    for each in (*askers, asking):
-        each.join(LIMIT_S)
-        assert not each.is_alive()
+    for thread in (*askers, asking):
+        thread.join(LIMIT_S)
+        assert not thread.is_alive()
     assert asked
 
 
@@ -73,8 +73,8 @@ def test_close_on_loop_during_calls_of_other_threads(loop: LoopThread) -> None:
     for asker in askers:
         asker.start()
     loop.call_soon(loop.close)
-    for each in askers:
-        each.join(LIMIT_S)
+    for thread in askers:
+        thread.join(LIMIT_S)
     assert ends == [ConnectionClosed] * 3
 
 
@@ -204,13 +204,13 @@ Place = tuple[str, int]
 
 def interrupted_at(place: Place | None, use: Callable[[list[LoopThread]], object] = uses_of_the_loop) -> set[Place]:
     """Raise KeyboardInterrupt where the main thread first comes to this place; the places where it has been."""
-    seen: set[Place] = set()
+    observed: set[Place] = set()
 
     def trace(frame: FrameType, event: str, argument: object) -> Any:
         here = (frame.f_code.co_filename, frame.f_lineno)
-        if event != "line" or here in seen:
+        if event != "line" or here in observed:
             return trace
-        seen.add(here)
+        observed.add(here)
         if here == place:
             raise KeyboardInterrupt
         return trace
@@ -223,7 +223,7 @@ def interrupted_at(place: Place | None, use: Callable[[list[LoopThread]], object
         sys.settrace(before)
         for loop in loops:  # where closing was interrupted, it can be closed again
             loop.close()
-    return seen
+    return observed
 
 
 def test_run_shielded_completes_wherever_ctrl_c_arrives() -> None:

@@ -94,7 +94,7 @@ class Recorder:
 
 
 async def eventually(condition: Callable[[], bool]) -> None:
-    """Lets the loop turn until a condition holds that nobody signals; 100 s are for hung tests only."""
+    """Poll the loop until a condition holds that has no event; only hung tests take 100 s."""
     with anyio.fail_after(100):
         while not condition():  # noqa: ASYNC110
             await asyncio.sleep(0)

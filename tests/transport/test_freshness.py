@@ -23,7 +23,7 @@ from aerokit.transport.zenoh.keys import Beacon, Stamp
 Event = tuple[float, int, str, Any]
 Holds = tuple[Sequence[tuple[float, float]], Sequence[tuple[float, float]]]
 
-clocks = st.tuples(st.floats(-1e6, 1e6), st.sampled_from([1.0, 0.9999, 1.0001]))  # what it shows at 0, and its rate
+clocks = st.tuples(st.floats(-1e6, 1e6), st.sampled_from([1.0, 0.9999, 1.0001]))  # its offset and its rate
 delays = st.one_of(st.floats(0, 0.5), st.floats(0, 20))
 holds = st.lists(st.tuples(st.floats(0, 12), st.floats(0, 10)), max_size=3)  # begins, lasts
 
@@ -68,8 +68,8 @@ class World:
             (begun, rate), (begun_too, rate_too) = self.vehicle_clock, self.client_clock
             vehicle, client = begun + rate * now, begun_too + rate_too * now
             if kind == "beacon":
-                self.at(self.arrival(now, 0), "heard", self.checker.beacon(vehicle))
-            elif kind == "heard":
+                self.at(self.arrival(now, 0), "received", self.checker.beacon(vehicle))
+            elif kind == "received":
                 self.tracker.receive_beacon(what, client)
             elif kind == "send":
                 stamp = self.tracker.stamp(client)
@@ -183,7 +183,7 @@ def test_estimated_delay_never_exceeds_the_real_one(
     theirs: tuple[float, float], ours: tuple[float, float], sent: list[tuple[float, float]]
 ) -> None:
     estimator = DelayEstimator()
-    for delay, at in sorted(sent, key=lambda each: sum(each)):
+    for delay, at in sorted(sent, key=lambda times: sum(times)):
         now = at + delay
         late = estimator.delay(theirs[0] + theirs[1] * at, ours[0] + ours[1] * now)
         assert 0 <= late <= delay + 0.02

@@ -71,7 +71,7 @@ async def stage(count: int = 2) -> AsyncIterator[Stage]:
                 await anyio.sleep(6)
                 app.update_view()
                 await pilot.pause()
-                wire.forget()
+                wire.clear()
                 yield Stage(app, pilot, wire, copters)
             model.close()
             await commands.aclose()

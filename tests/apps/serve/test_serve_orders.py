@@ -39,7 +39,7 @@ async def test_commands_fly_vehicle() -> None:
 @pytest.mark.parametrize("is_open", [False, True])
 async def test_command_without_token_is_refused(is_open: bool) -> None:
     async with open_stage(open_reading=is_open) as stage:
-        stage.flight.wire.forget()
+        stage.flight.wire.clear()
         wrong = [None, "Bearer ", f"Bearer {TOKEN}x", f"Basic {TOKEN}", "Bearer ä"]
         for authorization in wrong:
             headers = {b"Idempotency-Key": b"12345678"}
@@ -73,7 +73,7 @@ async def test_command_without_token_is_refused(is_open: bool) -> None:
 )
 async def test_invalid_arguments_send_nothing(order: str, body: object, text: str) -> None:
     async with open_stage() as stage:
-        stage.flight.wire.forget()
+        stage.flight.wire.clear()
         answer = await stage.submit(order, body)
         assert (answer.status_code, answer.json()["status"]) == (400, 400)
         assert text in answer.json()["detail"]
@@ -94,8 +94,8 @@ async def test_invalid_arguments_send_nothing(order: str, body: object, text: st
         (b'{"altitude_m": 10}', {"Content-Type": "text/plain"}, 415),
         (b'{"altitude_m": 10}', {"Idempotency-Key": ""}, 400),
         (b'{"altitude_m": 10}', {"Idempotency-Key": "short"}, 400),
-        (b'{"altitude_m": 10}', {"Aerokit-Seen-At": "nan"}, 400),
-        (b'{"altitude_m": 10}', {"Aerokit-Seen-At": "-100"}, 409),
+        (b'{"altitude_m": 10}', {"Aerokit-RecordedTraffic-At": "nan"}, 400),
+        (b'{"altitude_m": 10}', {"Aerokit-RecordedTraffic-At": "-100"}, 409),
         (b'{"altitude_m": 10}', {"Host": "evil.example"}, 421),
         (b'{"altitude_m": 10}', {"Origin": "http://evil.example"}, 403),
         (b'{"altitude_m": 10}', {"Origin": "null"}, 403),
@@ -194,7 +194,7 @@ async def test_silent_vehicle_accepts_safe_commands_only() -> None:
     async with open_stage() as stage:
         stage.flight.copter.faults.silent = True
         await anyio.sleep(5)
-        stage.flight.wire.forget()
+        stage.flight.wire.clear()
         answer = await stage.submit("arm")
         assert (answer.status_code, answer.json()["error"]) == (503, "HeartbeatTimeout")
         assert stage.flight.wire.commands(MavCmd.COMPONENT_ARM_DISARM) == []

@@ -96,8 +96,8 @@ async def test_log_reset_with_first_capture_lost() -> None:
 async def test_repeated_capture_is_not_new() -> None:
     async with capture_flight() as (flight, reported):
         camera = flight.vehicle.camera_at(100)
-        for each in (image(0, boot_ms=1000), image(1, boot_ms=2000), image(0, boot_ms=1000)):
-            inject(flight, each, 100)
+        for report in (image(0, boot_ms=1000), image(1, boot_ms=2000), image(0, boot_ms=1000)):
+            inject(flight, report, 100)
         assert [event.index for event in reported] == [0, 1]
         assert camera.capture.value.index == 1
         inject(flight, status(2, boot_ms=3000), 100)
@@ -368,8 +368,8 @@ async def test_definition_does_not_overwrite_files(tmp_path: Path, capsys: pytes
         camera.files.put("/DCIM/101/IMG_0001.JPG", b"another")
         other = capture.replace(file_url="mftp:///DCIM/101/IMG_0001.JPG")
         options = Namespace(to=tmp_path, json=False)
-        for each in (capture, other, other.replace(index=1)):
-            assert await _show(options, vehicle.camera, each)
+        for photo in (capture, other, other.replace(index=1)):
+            assert await _show(options, vehicle.camera, photo)
         assert names(tmp_path) == [
             "00000-IMG_0001-2.JPG",
             "00000-IMG_0001.JPG",

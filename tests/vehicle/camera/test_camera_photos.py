@@ -373,8 +373,8 @@ async def test_captures_are_published_without_using_a_camera() -> None:
     camera, other = SimulatedCamera(), SimulatedCamera(101)
     async with on_board(camera, other) as vehicle:
         with vehicle.subscribe(ImageCaptured, capacity=20) as events:
-            for each in (camera, other, camera):
-                each.captures.take()
+            for source in (camera, other, camera):
+                source.captures.take()
                 await anyio.sleep(1.0)
             reported = []
             while (event := events.get_nowait()) is not None:

@@ -40,7 +40,7 @@ async def test_arm_with_mode_changes_mode_first() -> None:
 async def test_arm_in_unarmable_mode_raises_before_sending() -> None:
     async with open_flight() as flight:
         await flight.vehicle.wait_ready()
-        flight.wire.forget()
+        flight.wire.clear()
         with pytest.raises(InvalidArgument, match=r"mode = 'LAND' .*cannot arm in LAND, only in ACRO, .*GUIDED"):
             await flight.vehicle.arm(mode="LAND")
         with pytest.raises(InvalidArgument, match="NOWHERE"):
@@ -52,7 +52,7 @@ async def test_arm_in_unarmable_mode_raises_before_sending() -> None:
 async def test_arm_in_flight_keeps_mode() -> None:
     async with in_the_air() as flight:
         await flight.vehicle.set_mode("LAND")
-        flight.wire.forget()
+        flight.wire.clear()
         await flight.vehicle.arm()
         with pytest.raises(OperationRejected, match="arm: the vehicle is armed already, in LAND; nothing was sent"):
             await flight.vehicle.arm(mode="GUIDED")
@@ -94,7 +94,7 @@ async def test_plane_in_autoland_arms_in_passive_mode() -> None:
 
 
 async def test_missing_for_flight_names_lost_link() -> None:
-    """Results based on old values say so."""
+    """A result that is based on old values contains the lost link."""
     async with open_flight() as flight:
         await flight.vehicle.wait_ready()
         flight.copter.faults.silent = True
@@ -128,7 +128,7 @@ async def test_abandoned_arm_of_armed_vehicle_does_not_disarm() -> None:
     async with open_flight() as flight:
         await flight.vehicle.wait_ready()
         await flight.vehicle.arm()
-        flight.wire.forget()
+        flight.wire.clear()
         with anyio.move_on_after(0.001):
             await flight.vehicle.arm()
         await anyio.sleep(5.0)

@@ -131,7 +131,7 @@ async def test_vehicle_block_leaves_nothing_on_connection() -> None:
                 assert attached_sinks(connection) > before
                 assert connection.boot_clocks
             await anyio.sleep(2.0)
-            wire.forget()
+            wire.clear()
             assert attached_sinks(connection) == before
             assert not connection.boot_clocks
             await anyio.sleep(5.0)
@@ -156,7 +156,7 @@ async def test_block_left_with_stream_in_other_task_holds() -> None:
 
 
 async def test_block_left_with_flight_in_other_task_holds(caplog: pytest.LogCaptureFixture) -> None:
-    """The flight's task is gone: the vehicle is told to hold before the connection ends."""
+    """The flight's task has ended: aerokit commands a hold before it closes the connection."""
     ended: list[Exception] = []
     copter = SimulatedCopter(boot_time_s=0.0)
     async with simulated_link(copter) as link, anyio.create_task_group() as tasks:

@@ -101,7 +101,7 @@ async def test_take_off_while_landing_is_rejected(flying: Flight) -> None:
     vehicle = flying.vehicle
     await vehicle.set_mode("LAND")
     await vehicle.landed_state.wait_until(lambda state: state == MavLandedState.LANDING, timeout=10)
-    flying.wire.forget()
+    flying.wire.clear()
     with pytest.raises(OperationRejected, match=r"is already landing"):
         await vehicle.take_off(20.0)
     assert not flying.wire.mode_orders()
@@ -111,7 +111,7 @@ async def test_take_off_while_landing_is_rejected(flying: Flight) -> None:
 
 async def test_take_off_disarmed_sends_nothing(grounded: Flight) -> None:
     await grounded.vehicle.set_mode("GUIDED")
-    grounded.wire.forget()
+    grounded.wire.clear()
     with pytest.raises(OperationRejected, match="not armed"):
         await grounded.vehicle.take_off(10.0)
     assert not grounded.wire.mode_orders()
@@ -393,7 +393,7 @@ async def test_go_to_without_do_reposition_sends_the_older_message() -> None:
         assert {message.type_mask for message in sent} == {0x0DF8}  # velocity, acceleration, yaw and yaw rate ignored
         assert {message.coordinate_frame for message in sent} == {6}
         assert sent[0].lat_int == round(target.latitude_deg * 1e7)
-        flight.wire.forget()
+        flight.wire.clear()
         await anyio.sleep(5.0)
         assert not flight.wire.setpoints()  # nothing is resent once the call has ended
 
@@ -402,7 +402,7 @@ async def test_go_to_legacy_message_stops_after_cancellation() -> None:
     copter = SimulatedCopter(boot_time_s=0.0, unsupported_commands=[MavCmd.DO_REPOSITION])
     async with in_the_air(copter=copter) as flight:
         await cancelled_after(3.0, flight.vehicle.go_to(north_of_home(flight, 200.0)))
-        flight.wire.forget()
+        flight.wire.clear()
         await anyio.sleep(5.0)
         assert not flight.wire.setpoints()
         assert flight.copter.mode.number == BRAKE

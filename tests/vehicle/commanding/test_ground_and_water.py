@@ -138,7 +138,7 @@ async def test_sub_position_is_sent_three_times_then_every_five_seconds() -> Non
 
 
 async def test_go_to_vehicle_does_not_move_times_out() -> None:
-    """Its thrusters do nothing: neither an order nor a stream waits without limit."""
+    """Its thrusters have no effect: neither an order nor a stream waits without a limit."""
     sub = SimulatedSub(boot_time_s=1.0)
     async with guided(sub) as vehicle:
         there = vehicle.position.value.offset(north_m=30)

@@ -42,7 +42,7 @@ NORTH = VelocitySetpoint(north_m_s=3.0)
 
 async def stays_quiet(flight: Flight, seconds: float = 6.0) -> None:
     """Assert that nothing more is sent and the vehicle stands still in its hold mode."""
-    flight.wire.forget()
+    flight.wire.clear()
     await anyio.sleep(seconds)
     assert flight.wire.setpoints() == []
 
@@ -52,7 +52,7 @@ async def stays_quiet(flight: Flight, seconds: float = 6.0) -> None:
 
 async def first_sent(flight: Flight, stream: SetpointStream[Any], setpoint: object = None) -> Any:
     async with stream:
-        flight.wire.forget()
+        flight.wire.clear()
         if setpoint is not None:
             stream.set(setpoint)
         await anyio.sleep(0.25)
@@ -122,7 +122,7 @@ async def test_attitude(flying: Flight) -> None:
 @pytest.mark.parametrize("rate_hz", [2.0, 10.0, 40.0])
 async def test_setpoint_stream_rate_is_kept(flying: Flight, rate_hz: float) -> None:
     async with flying.vehicle.guided.velocity(rate_hz=rate_hz) as stream:
-        flying.wire.forget()
+        flying.wire.clear()
         await stream.fly(NORTH, 5.0)
         times = [at for at, _ in flying.wire.setpoints()]
     gaps = [later - earlier for earlier, later in itertools.pairwise(times)]
@@ -270,7 +270,7 @@ async def test_setpoint_stream_loop_blocked_stops(flying: Flight) -> None:
         async with flying.vehicle.guided.velocity(valid_for_s=60.0, max_lag_s=0.5) as stream:
             stream.set(NORTH)
             await anyio.sleep(2.0)
-            flying.wire.forget()
+            flying.wire.clear()
             block_loop(2.0)
             await anyio.sleep(1.0)
             assert not stream.is_running
@@ -283,7 +283,7 @@ async def test_setpoint_stream_loop_blocked_stops(flying: Flight) -> None:
 async def test_setpoint_stream_short_loop_delay_continues(flying: Flight) -> None:
     async with flying.vehicle.guided.velocity(max_lag_s=0.5) as stream:
         await stream.fly(NORTH, 1.0)
-        flying.wire.forget()
+        flying.wire.clear()
         block_loop(0.4)
         await stream.fly(NORTH, 1.0)
         assert stream.is_running
@@ -423,7 +423,7 @@ async def test_block_left_after_silence_warns_nothing_was_sent(flying: Flight) -
             flying.copter.faults.silent = True
             while flying.vehicle.heartbeat_age <= 2.6:
                 await stream.fly(NORTH, 0.1)
-            flying.wire.forget()
+            flying.wire.clear()
     assert not flying.wire.mode_orders()
 
 
@@ -452,7 +452,7 @@ async def test_invalid_setpoint_keeps_previous(flying: Flight) -> None:
         for wrong in (math.nan, 1e39):
             with pytest.raises(InvalidArgument):
                 stream.set(VelocitySetpoint(wrong))
-        flying.wire.forget()
+        flying.wire.clear()
         await anyio.sleep(1.0)
         assert {message.vx for message in flying.wire.all(m.SetPositionTargetLocalNed)} == {3.0}
 
@@ -490,7 +490,7 @@ async def test_px4_stream_starts_before_offboard_request() -> None:
             await stream.fly(NORTH, 6.0)
             assert flight.px4.motion.velocity_north == pytest.approx(3.0, abs=0.3)
         assert flight.vehicle.mode_name == "LOITER"
-        flight.wire.forget()
+        flight.wire.clear()
         await anyio.sleep(5.0)
         assert not flight.wire.setpoints()
 
@@ -502,7 +502,7 @@ async def test_px4_refuses_offboard() -> None:
         with pytest.raises(CommandRejected, match="Offboard denied"):
             async with flight.vehicle.guided.velocity():
                 raise AssertionError("entered")
-        flight.wire.forget()
+        flight.wire.clear()
         await anyio.sleep(5.0)
         assert not flight.wire.setpoints()
         assert flight.vehicle.mode_name == "LOITER"
@@ -526,7 +526,7 @@ async def test_px4_setpoint_stream_exit_by_exception_holds() -> None:
                 _ = 1 / 0
         await anyio.sleep(5.0)
         assert flight.vehicle.mode_name == "LOITER"
-        flight.wire.forget()
+        flight.wire.clear()
         await anyio.sleep(5.0)
         assert not flight.wire.setpoints()
         assert math.hypot(flight.px4.motion.velocity_north, flight.px4.motion.velocity_east) < 0.2
@@ -541,7 +541,7 @@ async def test_px4_setpoint_stream_cancelled_while_entering_holds() -> None:
                     await anyio.sleep(0.05)
             await anyio.sleep(6.0)
             assert flight.vehicle.mode_name == "LOITER"
-            flight.wire.forget()
+            flight.wire.clear()
             await anyio.sleep(3.0)
             assert not flight.wire.setpoints()
 

@@ -50,7 +50,7 @@ async def test_arm_command_lost_is_not_repeated(grounded: Flight) -> None:
 
 async def test_disarm_order_is_lost_is_repeated(grounded: Flight) -> None:
     await grounded.vehicle.arm()
-    grounded.wire.forget()
+    grounded.wire.clear()
     grounded.copter.faults.ignore(ARM, times=1)
     await grounded.vehicle.disarm()
     first, second = grounded.wire.commands(ARM)

@@ -68,8 +68,8 @@ async def test_late_disarm_continues_after_watch_time(grounded: Flight) -> None:
     """It armed in the last moment, and the first order to disarm is lost."""
     await grounded.vehicle.set_mode("GUIDED")
     grounded.copter.faults.ignore(ARM)
-    told_at = grounded.vehicle.armed.updated_at
-    await grounded.vehicle.armed.wait_until(lambda _: grounded.vehicle.armed.updated_at > told_at)
+    reported_at = grounded.vehicle.armed.updated_at
+    await grounded.vehicle.armed.wait_until(lambda _: grounded.vehicle.armed.updated_at > reported_at)
     await anyio.sleep(0.7)  # of the second from one heartbeat to the next
     with anyio.move_on_after(0.0):
         await grounded.vehicle.arm()
@@ -172,8 +172,8 @@ async def test_pilot_disarming_and_arming_later_stays_armed(grounded: Flight) ->
     """Our command was accepted and armed it; no HEARTBEAT reported that before the pilot disarmed."""
     await grounded.vehicle.set_mode("STABILIZE")
     grounded.copter.parameters["DISARM_DELAY"] = 0.0
-    told_at = grounded.vehicle.armed.updated_at
-    await grounded.vehicle.armed.wait_until(lambda _: grounded.vehicle.armed.updated_at > told_at)
+    reported_at = grounded.vehicle.armed.updated_at
+    await grounded.vehicle.armed.wait_until(lambda _: grounded.vehicle.armed.updated_at > reported_at)
     asyncio.get_running_loop().call_later(0.3, grounded.copter.arming.disarm)
     with anyio.move_on_after(0.2):
         await grounded.vehicle.arm()

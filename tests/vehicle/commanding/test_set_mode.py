@@ -138,7 +138,7 @@ async def test_px4_mode_has_main_and_sub_mode(mode: str | int, params: tuple[flo
     async with open_px4() as flight:
         await flight.vehicle.wait_ready()
         await flight.vehicle.set_mode("ALTCTL")
-        flight.wire.forget()
+        flight.wire.clear()
         await flight.vehicle.set_mode(mode)
         (command,) = flight.wire.commands(MavCmd.DO_SET_MODE)
         assert (command.param1, command.param2, command.param3) == params

@@ -139,7 +139,9 @@ async def test_lost_answer_is_requested_again() -> None:
 
 async def test_request_where_selects_the_message() -> None:
     async with on_board(SimulatedCamera(streams=["rtsp://127.0.0.1/a", "rtsp://127.0.0.1/b"])) as vehicle:
-        stream = await vehicle.component(100).request(m.VideoStreamInformation, where=lambda each: each.stream_id == 2)
+        stream = await vehicle.component(100).request(
+            m.VideoStreamInformation, where=lambda stream_information: stream_information.stream_id == 2
+        )
         assert stream.uri == "rtsp://127.0.0.1/b"
 
 
@@ -161,7 +163,7 @@ async def test_all_discovered_components_are_published() -> None:
             while (event := found.get_nowait()) is not None:
                 assert isinstance(event, VehicleFound | ComponentFound)
                 reported.append((type(event), event.system_id, event.component_id))
-        assert sorted(reported, key=lambda each: each[1:]) == [
+        assert sorted(reported, key=lambda report: report[1:]) == [
             (VehicleFound, 1, 1),
             (ComponentFound, 1, 100),
             (VehicleFound, 2, 1),

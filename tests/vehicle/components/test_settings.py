@@ -428,7 +428,7 @@ async def test_component_files() -> None:
     async with on_board(SimulatedCamera(101)) as shelf:
         shelf.camera.files.put("/DCIM/0001.jpg", bytes(range(256)) * 40)
         files = shelf.component.files
-        assert [each.name for each in await files.list("/DCIM")] == ["0001.jpg"]
+        assert [file.name for file in await files.list("/DCIM")] == ["0001.jpg"]
         assert await files.read("/DCIM/0001.jpg") == bytes(range(256)) * 40
         await files.write("/notes.txt", b"seen")
         assert shelf.camera.files.get("/notes.txt") == b"seen"

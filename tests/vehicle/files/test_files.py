@@ -423,7 +423,7 @@ def test_transfer_over_bad_radio(make: Any, loss: float, seed: int) -> None:
                 assert await vehicle.files.read(f"{root}/x") == DATA[:8000]
                 await vehicle.files.make_directory(f"{root}/d")
                 await vehicle.files.rename(f"{root}/x", f"{root}/d/x")
-                assert [each.name for each in await vehicle.files.list(f"{root}/d")] == ["x"]
+                assert [entry.name for entry in await vehicle.files.list(f"{root}/d")] == ["x"]
                 await vehicle.files.remove(f"{root}/d/x")
                 await vehicle.files.remove_directory(f"{root}/d")
                 radio.outgoing.model = radio.incoming.model = FaultModel(delay_s=0.05)

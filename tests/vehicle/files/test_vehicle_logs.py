@@ -89,7 +89,7 @@ async def test_read_by_messages_and_mavftp(bench: Bench) -> None:
 
 async def test_read_by_mavftp(ardupilot: Bench) -> None:
     entries = await ardupilot.logs.list()
-    ardupilot.wire.forget()
+    ardupilot.wire.clear()
     assert await ardupilot.logs.read(entries[0], method="ftp") == ardupilot.content(0)
     assert not ardupilot.wire.all(m.LogRequestData)
 
@@ -100,7 +100,7 @@ async def test_in_flight_only_mavftp_works(ardupilot: Bench) -> None:
     await ardupilot.vehicle.wait_ready()
     await ardupilot.vehicle.arm()
     assert await ardupilot.logs.read(entries[0]) == ardupilot.content(0)
-    ardupilot.wire.forget()
+    ardupilot.wire.clear()
     with pytest.raises(FileTimeout, match="does not answer"):
         await ardupilot.logs.read(entries[0], method="log", idle_timeout_s=2.0)
     assert not ardupilot.wire.all(m.FileTransferProtocol)
@@ -227,7 +227,7 @@ async def test_resumed_download_of_growing_log_is_complete(ardupilot: Bench, tmp
 
 
 async def test_invalid_log_arguments_are_refused(bench: Bench) -> None:
-    bench.wire.forget()
+    bench.wire.clear()
     logs: Any = bench.logs
     for log in (-1, 65536, "1"):
         with pytest.raises(InvalidArgument, match="log"):

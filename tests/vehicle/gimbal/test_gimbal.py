@@ -55,7 +55,9 @@ async def test_gimbal_points_and_reports_attitude() -> None:
     async with in_the_air(copter=with_gimbal()) as flight:
         gimbal = flight.vehicle.gimbal
         await gimbal.point(-45.0, 90.0, wait=False)
-        reported = await gimbal.attitude.wait_until(lambda each: abs((each.pitch_deg or 0.0) + 45) < 1, timeout=5)
+        reported = await gimbal.attitude.wait_until(
+            lambda attitude: abs((attitude.pitch_deg or 0.0) + 45) < 1, timeout=5
+        )
         assert reported.yaw_deg == pytest.approx(90, abs=2)
         assert gimbal.attitude.source == Source(1, 1, "GIMBAL_DEVICE_ATTITUDE_STATUS")
         (command,) = flight.wire.commands(PITCHYAW)
@@ -96,7 +98,7 @@ async def test_attitude_request_ends_with_the_last_watcher() -> None:
 async def test_point_with_roll_uses_mount_command() -> None:
     async with in_the_air(copter=with_gimbal()) as flight:
         await flight.vehicle.set_heading(90.0, tolerance_deg=1.0)
-        flight.wire.forget()
+        flight.wire.clear()
         await flight.vehicle.gimbal.point(-45.0, 80.0, roll_deg=5.0, wait=False)
         (command,) = flight.wire.commands(MOUNT)
         assert params(command) == pytest.approx((-45, 5, -10, 2), abs=2)

@@ -498,7 +498,7 @@ async def test_lost_control_stops_rates() -> None:
                 await anyio.sleep(0.3)
                 takes_control(flight)
                 await anyio.sleep(0.3)
-                flight.wire.forget()
+                flight.wire.clear()
                 await stream.turn(-5.0, 0.0, 1.0)
         assert not flight.wire.all(m.GimbalManagerSetPitchyaw)
         assert not flight.wire.commands(PITCHYAW)
@@ -564,7 +564,7 @@ async def test_rates_are_validated_and_entered_once() -> None:
 async def px4_with_gimbal() -> AsyncIterator[Px4Flight]:
     async with open_px4(SimulatedPx4(boot_time_s=1.0, parameters={"MNT_MODE_IN": 4.0})) as flight:
         await flight.vehicle.wait_ready()
-        flight.wire.forget()
+        flight.wire.clear()
         yield flight
 
 

@@ -483,8 +483,8 @@ async def test_first_gimbal_is_kept_after_link_outage() -> None:
     one, two = SimulatedGimbal(154), SimulatedGimbal(171)
     async with beside(one, two) as flight:
         await anyio.sleep(12.0)
-        for each in (flight.copter, one, two):
-            each.faults.silent = True
+        for simulated in (flight.copter, one, two):
+            simulated.faults.silent = True
         await anyio.sleep(15.0)
         report(flight, 171, attitude_of(0))
         assert flight.vehicle.gimbals.ids == (154, 171)
@@ -558,7 +558,7 @@ async def test_nan_attitude_is_unknown(wrong: float) -> None:
     async with open_flight() as flight:
         attitude = flight.vehicle.gimbal.attitude
         for place in range(4):
-            report(flight, 154, attitude_of(0, tuple(wrong if place == each else 0.5 for each in range(4))))
+            report(flight, 154, attitude_of(0, tuple(wrong if place == index else 0.5 for index in range(4))))
             reported = attitude.value
             assert (reported.pitch_deg, reported.roll_deg, reported.yaw_deg, reported.yaw_from_nose_deg) == (None,) * 4
 

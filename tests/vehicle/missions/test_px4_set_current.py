@@ -24,7 +24,7 @@ async def _start_mission(flight: Px4Flight) -> None:
     await flight.vehicle.mission.upload(missions.Mission(items))
     await flight.vehicle.mission.start()
     await anyio.sleep(1.5)
-    flight.wire.forget()
+    flight.wire.clear()
 
 
 @pytest.mark.parametrize("who", ["a pilot", "the program"])

@@ -177,12 +177,12 @@ async def test_concurrent_downloads_are_one() -> None:
 
 
 async def test_download_progress_ends_with_the_total() -> None:
-    seen: list[TransferProgress] = []
+    observed: list[TransferProgress] = []
     async with open_flight(copter()) as flight:
-        await flight.vehicle.parameters.download(method="list", on_progress=seen.append)
-        assert (seen[-1].done, seen[-1].total) == (120, 120)
-        await flight.vehicle.parameters.download(method="ftp", refresh=True, on_progress=seen.append)
-        assert seen[-1].done == seen[-1].total or seen[-1].total is None
+        await flight.vehicle.parameters.download(method="list", on_progress=observed.append)
+        assert (observed[-1].done, observed[-1].total) == (120, 120)
+        await flight.vehicle.parameters.download(method="ftp", refresh=True, on_progress=observed.append)
+        assert observed[-1].done == observed[-1].total or observed[-1].total is None
 
 
 async def test_incomplete_list_names_missing_indices() -> None:
@@ -496,7 +496,7 @@ async def test_upload_by_file_sets_the_rest() -> None:
 
 @pytest.mark.parametrize("method", ["ftp", "auto"])
 async def test_refused_upload_file_raises_or_falls_back(monkeypatch: pytest.MonkeyPatch, method: Any) -> None:
-    """With the requested method."""
+    """The requested method decides: a file transfer raises, an automatic choice falls back."""
 
     async def refused(*_: Any, **__: Any) -> None:
         raise FileError("write: not today", path="@PARAM/param.pck", code=MavFtpErr.FAIL)
@@ -525,7 +525,7 @@ async def test_upload_reads_back_singly_or_by_list(more: int) -> None:
         wanted = {name.name: name.value + 1 for name in table.values() if name.type == ParameterType.REAL32}
         wanted = dict(list(wanted.items())[: MAX_READ_BACK + more])
         assert len(wanted) == MAX_READ_BACK + more
-        flight.wire.forget()
+        flight.wire.clear()
         results = await parameters.upload(wanted, method="ftp")
         assert {result.outcome for result in results.values()} == {"set"}
         assert {name: result.value for name, result in results.items()} == pytest.approx(wanted, rel=1e-6)
@@ -587,7 +587,9 @@ async def test_doubtful_parameter_raises_the_parameter_rate() -> None:
             await flight.vehicle.parameters.get("NO_SUCH_ONE")
         await asyncio.sleep(1)
         asked = [
-            command for command in flight.wire.commands(MavCmd.SET_MESSAGE_INTERVAL) if command.param1 == messages.ParamValue.ID
+            command
+            for command in flight.wire.commands(MavCmd.SET_MESSAGE_INTERVAL)
+            if command.param1 == messages.ParamValue.ID
         ]
         assert {request.param2 for request in asked} == {20_000, 0}
 
@@ -602,7 +604,9 @@ async def test_renamed_parameters_in_files_and_blocks() -> None:
                 differences = await parameters.diff({"WP_SPD": 8.0, "SYSID_THISMAV": 1})
             assert [str(warning.message).split()[0] for warning in warned] == ["WP_SPD", "SYSID_THISMAV"]
             assert {warning.filename for warning in warned} == {__file__}
-            assert [(difference.name, difference.before, difference.after) for difference in differences] == [("WPNAV_SPEED", 1000, 800)]
+            assert [(difference.name, difference.before, difference.after) for difference in differences] == [
+                ("WPNAV_SPEED", 1000, 800)
+            ]
             assert (await parameters.upload({"WP_SPD": 8.0}))["WP_SPD"].outcome == "set"
             async with parameters.temporarily({"WP_SPD": 5.0}):
                 assert simulated.parameters["WPNAV_SPEED"] == 500
@@ -671,12 +675,12 @@ async def test_changed_hash_invalidates_the_cache(tmp_path: Path) -> None:
         await flight.vehicle.parameters.download(cache=tmp_path)
         simulated.parameters["COM_RC_IN_MODE"] = 4
         flight.vehicle.parameters._access.forget()
-        flight.wire.forget()
+        flight.wire.clear()
         table = await flight.vehicle.parameters.download(cache=tmp_path)
         assert table["COM_RC_IN_MODE"].value == 4
         assert len(flight.wire.all(messages.ParamRequestList)) == 1
         flight.vehicle.parameters._access.forget()
-        flight.wire.forget()
+        flight.wire.clear()
         await flight.vehicle.parameters.download(cache=tmp_path)
         assert hash_requests(flight) == ["_HASH_CHECK"]
         assert not flight.wire.all(messages.ParamRequestList)

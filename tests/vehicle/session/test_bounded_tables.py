@@ -26,7 +26,7 @@ from aerokit.vehicle.state.telemetry import MAX_MODE_NAMES
 pytestmark = pytest.mark.anyio
 
 
-def hear(flight: Flight, encoder: FrameEncoder, message: Message) -> None:
+def deliver(flight: Flight, encoder: FrameEncoder, message: Message) -> None:
     flight.wire.deliver(encoder.encode(message))
 
 
@@ -34,9 +34,9 @@ async def test_parameter_names() -> None:
     async with open_flight() as flight:
         encoder = FrameEncoder(1, 1)
         for number in range(MAX_PARAMETERS + 100):
-            hear(flight, encoder, ParamValue(f"P{number}", float(number), 9, 65535, 65535))
+            deliver(flight, encoder, ParamValue(f"P{number}", float(number), 9, 65535, 65535))
         assert len(flight.vehicle.parameters.table) == MAX_PARAMETERS
-        hear(flight, encoder, ParamValue("P7", 8.5, 9, 65535, 65535))
+        deliver(flight, encoder, ParamValue("P7", 8.5, 9, 65535, 65535))
         assert flight.vehicle.parameters.table["P7"].value == 8.5
 
 
@@ -64,7 +64,7 @@ async def test_mode_names() -> None:
     async with open_flight() as flight:
         encoder = FrameEncoder(1, 1)
         for number in range(MAX_MODE_NAMES + 50):
-            hear(flight, encoder, AvailableModes(255, number % 256, 0, 10_000 + number, 0, f"NEW {number}"))
+            deliver(flight, encoder, AvailableModes(255, number % 256, 0, 10_000 + number, 0, f"NEW {number}"))
         assert len(flight.vehicle.telemetry.mode_names) <= MAX_MODE_NAMES
 
 

@@ -45,7 +45,7 @@ async def test_reboot_requests_streams_again() -> None:
             await anyio.sleep(15.0)
             assert requests(flight)[0] == (0, 0, 1, 1)
             assert len(requests(flight)) > 1
-        flight.wire.forget()
+        flight.wire.clear()
         flight.copter.restart()
         await anyio.sleep(15.0)
         assert not requests(flight), "nobody wants them any more"
@@ -68,7 +68,9 @@ async def test_streams_of_px4_requests_missing_states() -> None:
             missing = [command.param1 for command in flight.wire.commands(MavCmd.SET_MESSAGE_INTERVAL)]
             assert all(flight.vehicle.telemetry.cells[name].is_known for name in ("attitude", "position", "gps"))
         await anyio.sleep(5.0)
-        given_back = [command.param1 for command in flight.wire.commands(MavCmd.SET_MESSAGE_INTERVAL) if command.param2 == 0]
+        given_back = [
+            command.param1 for command in flight.wire.commands(MavCmd.SET_MESSAGE_INTERVAL) if command.param2 == 0
+        ]
         assert sorted(given_back) == sorted(set(missing))
 
 

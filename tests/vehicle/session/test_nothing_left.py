@@ -172,7 +172,7 @@ async def nothing_is_left_of(steps: list[tuple[int, float | None]], airborne: bo
         await after_the_dust_has_settled(flight)
         assert (tasks(), waiting_on_cells(vehicle)) == before
         assert attached_sinks(connection) <= sinks + NEW_STREAMS
-        flight.wire.forget()
+        flight.wire.clear()
         await anyio.sleep(3.0)
         assert not flight.wire.setpoints()  # No set-point is supplied, so none is sent.
     assert attached_sinks(connection) <= 1  # the connection's own

@@ -128,7 +128,7 @@ async def test_rate_request_lost_is_sent_again() -> None:
 async def test_reboot_requests_all_rates_again(grounded: Flight) -> None:
     with grounded.vehicle.rate(m.RawImu, 20.0):
         await anyio.sleep(10.0)
-        grounded.wire.forget()
+        grounded.wire.clear()
         grounded.copter.restart()
         await anyio.sleep(10.0)
         assert asked(grounded, m.Attitude) == pytest.approx([0.1])
@@ -154,7 +154,7 @@ async def test_answered_timesync_is_requested_immediately_again() -> None:
     async with open_flight(rates={}) as flight, AsyncExitStack() as requests:
         await anyio.sleep(3.0)
         for times, hz in ((3, 20.0), (1, 50.0)):
-            flight.wire.forget()
+            flight.wire.clear()
             flight.copter.faults.ignore(SET_INTERVAL, times=times)
             requests.enter_context(flight.vehicle.rate(m.RawImu, hz))
             await anyio.sleep(40.0)
@@ -259,7 +259,7 @@ async def test_rates_old_firmware_gets_request_data_stream() -> None:
 async def test_rates_old_firmware_group_uses_highest_rate() -> None:
     async with open_flight(old_copter()) as flight:
         await anyio.sleep(2.0)
-        flight.wire.forget()
+        flight.wire.clear()
         with flight.vehicle.rate(m.Ahrs2, 30.0):
             await anyio.sleep(1.5)
             assert group_requests(flight) == {MavDataStream.EXTRA1: [(30, 1)]}
@@ -270,7 +270,7 @@ async def test_rates_old_firmware_group_uses_highest_rate() -> None:
 async def test_rates_old_firmware_requested_again_after_reboot() -> None:
     async with open_flight(old_copter()) as flight:
         await anyio.sleep(10.0)
-        flight.wire.forget()
+        flight.wire.clear()
         flight.copter.restart()
         await anyio.sleep(10.0)
         assert group_requests(flight)[MavDataStream.EXTRA1]

@@ -298,7 +298,7 @@ async def test_hold_in_silence_is_sent_after_heartbeat() -> None:
                     await anyio.sleep(2.0)
                     flight.copter.faults.silent = True
                     await events.get(timeout=10.0)
-                    flight.wire.forget()
+                    flight.wire.clear()
                     scope.cancel()
         await anyio.sleep(5.0)
         assert not flight.wire.mode_orders()
@@ -317,7 +317,7 @@ async def test_takeover_in_silence_keeps_vehicle() -> None:
                 flight.copter.faults.silent = True
                 await anyio.sleep(5.0)
                 scope.cancel()
-        flight.wire.forget()
+        flight.wire.clear()
         flight.pilot_takes_over()
         flight.copter.faults.silent = False
         await anyio.sleep(4.0)

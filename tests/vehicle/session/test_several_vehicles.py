@@ -45,7 +45,7 @@ async def two_vehicles() -> AsyncIterator[Two]:
         ):
             await one.wait_ready()
             await two.wait_ready()
-            wire.forget()
+            wire.clear()
             yield Two(first, second, one, two, wire)
 
 
@@ -146,7 +146,7 @@ async def test_subscription_separates_events_and_messages() -> None:
 async def test_reboot_of_one_vehicle_keeps_other() -> None:
     async with two_vehicles() as both:
         await anyio.sleep(8.0)
-        both.wire.forget()
+        both.wire.clear()
         await both.two.reboot()
         await anyio.sleep(5.0)
         assert both.one.position.fresh(within=0.5)
@@ -320,8 +320,8 @@ async def test_found_event_is_published_once_per_autopilot() -> None:
         with connection.subscribe(VehicleFound, capacity=10) as found:
             async with aerokit.connect(connection, system_id=1):
                 await anyio.sleep(5.0)
-            told = [await found.get(timeout=1.0), await found.get(timeout=1.0)]
-            assert [(event.system_id, event.component_id) for event in told] == [(1, 1), (2, 1)]
+            reported = [await found.get(timeout=1.0), await found.get(timeout=1.0)]
+            assert [(event.system_id, event.component_id) for event in reported] == [(1, 1), (2, 1)]
             assert found.get_nowait() is None
 
 
@@ -332,7 +332,9 @@ async def test_connect_uses_recent_heartbeat_only(silent_s: float, is_found: boo
         await anyio.sleep(3.2)
         copter.faults.silent = True
         heard_at = max(
-            heartbeat.received_frame.received_at for heartbeat in connection.heartbeats.values() if heartbeat.received_frame
+            heartbeat.received_frame.received_at
+            for heartbeat in connection.heartbeats.values()
+            if heartbeat.received_frame
         )
         await anyio.sleep(heard_at + silent_s - now())
         try:

@@ -233,7 +233,7 @@ def test_program_with_timed_out_calls_exits() -> None:
             timeout=30,  # It takes two seconds; a comparable library was reported never to end.
             check=False,
         )
-    told = ["connected", "timeout", "timeout", "timeout", "cancelled", "left", "done"]
-    assert finished.stdout.split() == told, finished.stderr
+    reported = ["connected", "timeout", "timeout", "timeout", "cancelled", "left", "done"]
+    assert finished.stdout.split() == reported, finished.stderr
     assert "an arm command may still be executed" in finished.stderr  # it never was answered
     assert finished.returncode == 0

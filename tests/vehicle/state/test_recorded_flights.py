@@ -1,7 +1,7 @@
 """Flights of real firmware: the cells' values are plausible, and agree with pymavlink at the end.
 
-Uses the recordings beside the project (``../shared/traces``) if present, else the project's own, which contain the
-essential parts of two of these flights; a flight in neither is skipped.
+Uses the recordings in ``../shared/traces`` if present, else the project's own, which contain the essential parts of two
+of these flights; a flight in neither is skipped.
 """
 
 from __future__ import annotations

@@ -41,28 +41,30 @@ def test_status_text_trailing_tabs_are_removed() -> None:
 
 def test_status_text_chunks_are_joined() -> None:
     texts = StatusTextAssembler()
-    told = [text for chunk in chunks(LONG) for text in texts.receive(chunk, 1.0)]
-    assert told == [StatusText(4, LONG, 1.0)]
+    texts_read = [text for chunk in chunks(LONG) for text in texts.receive(chunk, 1.0)]
+    assert texts_read == [StatusText(4, LONG, 1.0)]
 
 
 def test_status_text_full_chunks_end_with_empty_chunk() -> None:
     texts = StatusTextAssembler()
-    told = [text.text for chunk in chunks("x" * 100) for text in texts.receive(chunk, 1.0)]
-    assert told == ["x" * 100]
+    texts_read = [text.text for chunk in chunks("x" * 100) for text in texts.receive(chunk, 1.0)]
+    assert texts_read == ["x" * 100]
 
 
 @given(st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=300))
 def test_status_text_round_trip_any_text(text: str) -> None:
     texts = StatusTextAssembler()
-    told = [message.text for chunk in chunks(text) for message in texts.receive(chunk, 0.0)]
-    assert told == [text.rstrip()]
+    texts_read = [message.text for chunk in chunks(text) for message in texts.receive(chunk, 0.0)]
+    assert texts_read == [text.rstrip()]
 
 
 def test_status_texts_of_components_and_ids_are_separate() -> None:
     texts = StatusTextAssembler()
     first, second = chunks(LONG, 1), chunks(LONG.upper(), 2)
-    told = [text.text for pair in zip(first, second, strict=True) for each in pair for text in texts.receive(each, 0.0)]
-    assert told == [LONG, LONG.upper()]
+    texts_read = [
+        text.text for pair in zip(first, second, strict=True) for chunk in pair for text in texts.receive(chunk, 0.0)
+    ]
+    assert texts_read == [LONG, LONG.upper()]
 
 
 def test_status_text_chunk_missing_is_marked() -> None:
@@ -102,14 +104,14 @@ def test_status_text_id_reused_ends_previous_text() -> None:
     texts = StatusTextAssembler()
     texts.receive(chunks(LONG)[0], 0.0)
     texts.receive(chunks(LONG)[1], 0.0)
-    told = [text.text for chunk in chunks("Another " + LONG) for text in texts.receive(chunk, 0.5)]
-    assert told == [LONG[:100].rstrip() + "…", "Another " + LONG]
+    texts_read = [text.text for chunk in chunks("Another " + LONG) for text in texts.receive(chunk, 0.5)]
+    assert texts_read == [LONG[:100].rstrip() + "…", "Another " + LONG]
 
 
 def test_status_text_repeated_chunk_is_used_once() -> None:
     texts = StatusTextAssembler()
-    told = [text.text for chunk in chunks(LONG) for _ in range(2) for text in texts.receive(chunk, 0.0)]
-    assert told[0] == LONG
+    texts_read = [text.text for chunk in chunks(LONG) for _ in range(2) for text in texts.receive(chunk, 0.0)]
+    assert texts_read[0] == LONG
 
 
 def test_recent_texts_by_time() -> None:
@@ -136,15 +138,15 @@ def test_status_text_open_limit_drops_oldest() -> None:
     texts = StatusTextAssembler()
     for number in range(1, MAX_OPEN + 2):
         texts.receive(chunks("y" * 70, number)[0], 0.0)
-    told = [text.text for number in (2, 1) for text in texts.receive(chunks("y" * 70, number)[1], 0.1)]
-    assert told == ["y" * 70, "…" + "y" * 20]
+    texts_read = [text.text for number in (2, 1) for text in texts.receive(chunks("y" * 70, number)[1], 0.1)]
+    assert texts_read == ["y" * 70, "…" + "y" * 20]
 
 
 def test_status_text_is_limited_to_twenty_chunks() -> None:
     texts = StatusTextAssembler()
-    told = [texts.receive(_received(Statustext(6, "", 7, seq), b"z" * 50), 0.0) for seq in range(MAX_CHUNKS)]
-    assert told[:-1] == [[]] * (MAX_CHUNKS - 1)
-    assert told[-1] == [StatusText(6, "z" * 50 * MAX_CHUNKS, 0.0)]
+    texts_read = [texts.receive(_received(Statustext(6, "", 7, seq), b"z" * 50), 0.0) for seq in range(MAX_CHUNKS)]
+    assert texts_read[:-1] == [[]] * (MAX_CHUNKS - 1)
+    assert texts_read[-1] == [StatusText(6, "z" * 50 * MAX_CHUNKS, 0.0)]
 
 
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 5), st.binary(max_size=50), st.floats(0, 1)), max_size=40))

@@ -83,7 +83,7 @@ def take(telemetry: Telemetry, message: Message, at: float, component_id: int = 
 def test_table_lists_every_cell_of_message(telemetry: Telemetry, name: str) -> None:
     telemetry.receive(ANYTHING.get(name) or ones(message_type(name)))
     changed = {cell.name for cell in telemetry.cells.values() if cell.is_known}
-    assert changed == {told.name for told, _ in SOURCES[name]}
+    assert changed == {reported.name for reported, _ in SOURCES[name]}
 
 
 @pytest.mark.parametrize(
@@ -118,12 +118,12 @@ def test_status_texts_of_other_components_are_ignored(telemetry: Telemetry) -> N
 def test_observers_see_every_frame(telemetry: Telemetry) -> None:
     take(telemetry, messages.VfrHud(3.0, 4.0, 10, 50, 20.0, 0.5), 100.0)
     take(telemetry, messages.VfrHud(3.0, 5.0, 10, 50, 20.0, 0.5), 100.1)
-    seen: list[tuple[float | None, float]] = []
-    end = telemetry.ground_speed_m_s.observe(lambda before, after: seen.append((before, after)))
+    observed: list[tuple[float | None, float]] = []
+    end = telemetry.ground_speed_m_s.observe(lambda before, after: observed.append((before, after)))
     for number in range(3):
         take(telemetry, messages.VfrHud(3.0, 6.0 + number, 10, 50, 20.0, 0.5), 100.2 + number / 10)
     end()
-    assert seen == [(5.0, 6.0), (6.0, 7.0), (7.0, 8.0)]
+    assert observed == [(5.0, 6.0), (6.0, 7.0), (7.0, 8.0)]
     take(telemetry, messages.VfrHud(3.0, 9.0, 10, 50, 20.0, 0.5), 100.6)
     assert telemetry.streams[MESSAGE_IDS["VfrHud"]].pending
     assert telemetry.ground_speed_m_s.value == 9.0
@@ -238,12 +238,12 @@ def test_cells_can_be_read_by_other_threads(telemetry: Telemetry) -> None:
 
 
 def test_decoded_message_is_reused(telemetry: Telemetry) -> None:
-    bus, seen = Bus(), list[Message]()
+    bus, observed = Bus(), list[Message]()
     stream = telemetry.streams[MESSAGE_IDS["Attitude"]]
     bus.attach_lazily(messages.Attitude, stream.take)
-    bus.attach(messages.Attitude, seen.append)
+    bus.attach(messages.Attitude, observed.append)
     for at in (100.0, 100.5):
         bus.deliver(frame_of(ANYTHING["Attitude"], at))
     (pending,) = stream.pending.values()
-    assert pending is seen[1]
+    assert pending is observed[1]
     assert telemetry.attitude.value.yaw_deg == pytest.approx(17.19, abs=0.01)

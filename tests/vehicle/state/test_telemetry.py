@@ -387,11 +387,11 @@ def test_mission_time_vibration_version(telemetry: Telemetry) -> None:
 
 
 def test_status_texts_are_published_and_kept(telemetry: Telemetry, clock: Clock) -> None:
-    seen: list[str] = []
-    telemetry.status_text.observe(lambda _, text: seen.append(text.text))
+    observed: list[str] = []
+    telemetry.status_text.observe(lambda _, text: observed.append(text.text))
     for clock.now in (1.0, 2.0):
         telemetry.receive(messages.Statustext(4, "PreArm: RC not found"))
-    assert seen == ["PreArm: RC not found"] * 2
+    assert observed == ["PreArm: RC not found"] * 2
     assert [text.at for text in telemetry.texts_since(1.5)] == [2.0]
 
 

@@ -64,10 +64,10 @@ def fly(scheme: str, what: str) -> tuple[str, list[int], float, str, str]:
                 os.kill(program.pid, signal.SIGSTOP)
                 time.sleep(PAUSE_S)
                 os.kill(program.pid, signal.SIGCONT)
-                error, sent, oldest_s, told = json.loads(program.stdout.readline())
+                error, sent, oldest_s, reported = json.loads(program.stdout.readline())
             finally:
                 program.kill()
-        return error, sent, oldest_s, told, copter.mode.name
+        return error, sent, oldest_s, reported, copter.mode.name
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="processes are stopped by signals")
@@ -77,9 +77,9 @@ def test_blocked_program_keeps_failsafe(cases: list[tuple[str, str]]) -> None:
     """All of them at once, since they wait for the failsafe most of the time."""
     with ThreadPoolExecutor(len(cases)) as pool:
         flown = dict(zip(cases, pool.map(lambda case: fly(*case), cases), strict=True))
-    for (scheme, what), (error, sent, oldest_s, told, mode) in flown.items():
+    for (scheme, what), (error, sent, oldest_s, reported, mode) in flown.items():
         where = f"{what} over {scheme}: {flown[scheme, what]}"
         assert error is not None, where
         assert len(sent) == (what != "stream"), where  # Sent before the pause.
         assert oldest_s > PAUSE_S - 1.5, where  # HEARTBEATs that waited are called as old as they are
-        assert told == mode == RTL, where
+        assert reported == mode == RTL, where
