@@ -89,7 +89,7 @@ class Attempt:
     value: Any
     seconds: float
     sent: Counter[str] = field(default_factory=Counter)
-    heard: int = 0
+    received: int = 0
     left: list[str] = field(default_factory=list)
 
     @property
@@ -141,7 +141,7 @@ async def _attempt(
         except Exception as error:
             outcome.error = error
         outcome.seconds = loop.time() - begun
-        outcome.heard = program.radio.incoming.frames - received_before
+        outcome.received = program.radio.incoming.frames - received_before
         outcome.left = await _what_is_left(program, held, leftovers)
         outcome.sent = Counter(
             type(message).NAME for _, message in program.wire.sent if not isinstance(message, OWN_LIFE)

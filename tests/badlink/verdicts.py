@@ -45,7 +45,7 @@ def judge(case: Case, sizes: Sizes, radio: Radio, seed: int) -> Verdict:
         return await case.work(program, sizes)
 
     done = attempt(work, radio, seed, lambda: copter, before=case.before, leftovers=leftovers)
-    faults = [f"left: {task}" for task in done.left]
+    faults = [f"left: {name}" for name in done.left]
     if done.messages > most:
         faults.append(f"{done.messages} messages, at most {most} are allowed: {dict(done.sent)}")
     error = done.error

@@ -144,7 +144,7 @@ class TheirCamera:
         self.plugin = plugin
         self.count = 0
         self.is_recording = False
-        self.heard: list[tuple[str, Any]] = []
+        self.received: list[tuple[str, Any]] = []
         self._ok = of_server.CameraFeedback.OK
 
     def records(self) -> bool:
@@ -173,14 +173,14 @@ class TheirCamera:
 
     async def _obey(self, name: str) -> None:
         async for value in getattr(self.plugin, f"subscribe_{name}")():
-            self.heard.append((name, value))
+            self.received.append((name, value))
             if name in ("start_video", "stop_video"):
                 self.is_recording = name == "start_video"
             await getattr(self.plugin, f"respond_{name}")(self._ok)
 
     async def _tracking(self) -> None:
         async for value in self.plugin.subscribe_tracking_point_command():
-            self.heard.append(("track_point", value))
+            self.received.append(("track_point", value))
             await self.plugin.respond_tracking_point_command(self._ok)
 
     async def _photos(self) -> None:
@@ -267,9 +267,9 @@ async def our_client() -> list[bool]:
             try:
                 await camera.set_mode("video", timeout=2.0)
             except OperationTimeout as error:
-                assert ("set_mode", of_server.Mode.VIDEO) in theirs.heard, theirs.heard
+                assert ("set_mode", of_server.Mode.VIDEO) in theirs.received, theirs.received
                 return str(error)
-            raise AssertionError("it has learned to tell its mode: expect that here")
+            raise AssertionError("MAVSDK reports its mode now: expect it here")
 
         async def lens() -> None:
             await camera.zoom_to(40.0)
@@ -277,12 +277,12 @@ async def our_client() -> list[bool]:
                 await asyncio.sleep(0.3)
             await camera.focus_to(20.0)
             await camera.auto_focus()
-            names = [name for name, _ in theirs.heard]
+            names = [name for name, _ in theirs.received]
             assert {"zoom_range", "zoom_in_start", "zoom_stop", "focus_range", "focus_auto"} <= set(names), names
 
         async def tracking() -> None:
             await camera.track_point(0.25, 0.5, radius=0.1)
-            assert any(name == "track_point" for name, _ in theirs.heard)
+            assert any(name == "track_point" for name, _ in theirs.received)
 
         async def storage() -> str:
             (medium,) = await camera.load_storage()

@@ -82,7 +82,7 @@ def test_after_silence_numbers_may_be_ahead_by_lost_frames(ahead: int, takes: bo
 
 @pytest.mark.parametrize(("ahead", "reported"), [(9, []), (10, ["DuplicateSender"]), (-1, ["DuplicateSender"])])
 def test_without_silence_numbers_may_be_slightly_ahead(ahead: int, reported: list[str]) -> None:
-    """The limit is 8 + 1.5 · 10 Hz · 0.1 s. On the same host, no event is published while it may be the vehicle itself."""
+    """The limit is 8 + 1.5 · 10 Hz · 0.1 s. On the same host, no event is published while it may be the vehicle."""
     stage = Stage()
     assert not stage.claims(1.1, ahead, SAME_HOST)
     assert names(stage.reported) == reported

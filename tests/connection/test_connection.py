@@ -377,7 +377,7 @@ async def test_vehicle_search_leaves_no_subscriber_behind() -> None:
         assert (connection.bus.wanted, connection._end_signal._callbacks) == before
         with pytest.raises(ConnectFailed):
             async with connect(connection, system_id=9, timeout=2):
-                pytest.fail("nobody has this number")
+                pytest.fail("no system has this id")
         assert (connection.bus.wanted, connection._end_signal._callbacks) == before
 
 
@@ -386,6 +386,6 @@ async def test_failed_connect_leaves_nothing_behind() -> None:
     async with far_end() as (near, _, _ear):
         with pytest.raises(ConnectFailed):
             async with connect(near, timeout=2):
-                pytest.fail("nobody is there")
+                pytest.fail("there is no vehicle")
         assert asyncio.all_tasks() == tasks_before
         assert not scheduled_timers()

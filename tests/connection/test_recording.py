@@ -75,7 +75,7 @@ async def test_recording_without_reception_keeps_the_older_file(tmp_path: Path) 
     near, _ = memory_link_pair()
     with pytest.raises(ConnectFailed):
         async with connect(near, record=path, timeout=3):
-            pytest.fail("nobody is there")
+            pytest.fail("there is no vehicle")
     assert path.read_bytes() == before
     with pytest.raises(LinkOpenError):
         async with connect("/dev/no-such-device", record=path):

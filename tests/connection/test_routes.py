@@ -221,7 +221,7 @@ async def test_system_0_is_never_a_vehicle(link: PeersLink, connection: Connecti
     assert connection.heartbeats == {}
     with pytest.raises(ConnectFailed, match="system id 0"):
         async with connect(connection, timeout=2):
-            pytest.fail("nobody is nobody's vehicle")
+            pytest.fail("system 0 is no vehicle")
 
 
 def from_system_0(frame: bytes) -> bytes:

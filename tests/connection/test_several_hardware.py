@@ -240,7 +240,7 @@ def test_hardware_ids_are_compared_by_common_field() -> None:
     one, two = b"\1".ljust(18, b"\0"), b"\2".ljust(18, b"\0")
     assert of(one, 7).contradicts(of(two, 7))
     assert not of(one, 7).contradicts(of(one, 8))
-    assert of(b"", 7).contradicts(of(two, 8)), "as MAVLink 1 tells it"
+    assert of(b"", 7).contradicts(of(two, 8)), "as in a MAVLink 1 message"
     assert not of(b"", 7).contradicts(of(two, 7))
     assert not of(b"", 0).contradicts(of(two, 7))
     assert not of(one, 0).contradicts(of(b"", 7))

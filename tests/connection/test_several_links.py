@@ -91,7 +91,7 @@ async def test_command_is_sent_once_over_one_link() -> None:
         assert len({index for index, _ in orders}) == 1
         await anyio.sleep(3)
         heartbeats = received.of(m.Heartbeat)
-        assert {index for index, _ in heartbeats} == {0, 1, 2}, "every side hears that we are there"
+        assert {index for index, _ in heartbeats} == {0, 1, 2}, "our heartbeat is sent over every link"
 
 
 async def test_shared_stream_is_delivered_once() -> None:

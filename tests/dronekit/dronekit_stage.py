@@ -161,10 +161,10 @@ SCENARIOS: list[Scenario] = []
 def scenario(expected: Any, **options: Any) -> Callable[[Callable[[Stage], Any]], Callable[[Stage], Any]]:
     """Decorator: make a scenario of a function that takes a stage and returns its observations.
 
-        Args:
-    expected: the observations that the scenario must return.
-            options: ``controller`` and ``connect``, arguments of both; ``is_slow``: the scenario waits for timeouts;
-                ``is_kept``: DroneKit behaves the same; ``prepare``: called with the flight controller before connecting.
+    Args:
+        expected: the observations that the scenario must return.
+        options: ``controller`` and ``connect``, arguments of both; ``is_slow``: the scenario waits for timeouts;
+            ``is_kept``: DroneKit behaves the same; ``prepare``: called with the flight controller before connecting.
     """
 
     def register(function: Callable[[Stage], Any]) -> Callable[[Stage], Any]:
@@ -194,11 +194,11 @@ def on_stage(
             vehicle.close()
 
 
-def play(dronekit: Any, each: Scenario, **controller: Any) -> Any:
+def play(dronekit: Any, case: Scenario, **controller: Any) -> Any:
     """Return the observations of a scenario with this implementation."""
-    options = {**each.controller, **controller}
-    with on_stage(dronekit, options, each.connect, each.prepare) as stage:
-        return each.play(stage)
+    options = {**case.controller, **controller}
+    with on_stage(dronekit, options, case.connect, case.prepare) as stage:
+        return case.play(stage)
 
 
 def caught(action: Callable[[], object]) -> str:

@@ -64,11 +64,11 @@ class Received:
 class FlightController:
     """Sends heartbeats, answers commands, parameters and missions from tables, and sends any message on demand.
 
-        Args:
-            link: ``"udp"`` (the other side listens at :attr:`address`) or ``"tcp"`` (this side does).
-    version: MAVLink version of sent messages, 1 or 2.
-            vehicle_type: MAV_TYPE. autopilot: MAV_AUTOPILOT.
-            heartbeat_s: seconds between heartbeats; None sends none but those of :meth:`beat`.
+    Args:
+        link: ``"udp"`` (the other side listens at :attr:`address`) or ``"tcp"`` (this side does).
+        version: MAVLink version of sent messages, 1 or 2.
+        vehicle_type: MAV_TYPE. autopilot: MAV_AUTOPILOT.
+        heartbeat_s: seconds between heartbeats; None sends none but those of :meth:`beat`.
     """
 
     def __init__(

@@ -121,13 +121,13 @@ class Item(NamedTuple):
 class MissionService:
     """Mission downloads and uploads like ArduPilot's: item 0 is home, and an upload does not change it.
 
-        Attributes:
-    items: the stored items, home included.
-            has_home: whether item 0 is home (ArduPilot) or an item like others (PX4).
-    asks_int: whether items are requested with MISSION_REQUEST_INT.
-            lost: number of item → how many of its transmissions get lost (downloads).
-            result: MAV_MISSION_RESULT that an upload ends with; refused items are not kept.
-            is_mute: no upload is answered.
+    Attributes:
+        items: the stored items, home included.
+        has_home: whether item 0 is home (ArduPilot) or an item like others (PX4).
+        asks_int: whether items are requested with MISSION_REQUEST_INT.
+        lost: number of item → how many of its transmissions get lost (downloads).
+        result: MAV_MISSION_RESULT that an upload ends with; refused items are not kept.
+        is_mute: no upload is answered.
     """
 
     controller: FlightController

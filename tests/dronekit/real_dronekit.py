@@ -29,10 +29,10 @@ def main(names: list[str]) -> None:
     print(json.dumps({scenario.name: _observed(dronekit, scenario) for scenario in kept}))  # noqa: T201
 
 
-def _observed(dronekit: Any, each: Scenario) -> Any:
+def _observed(dronekit: Any, case: Scenario) -> Any:
     # of MAVLink 2 it makes broadcasts: its behaviour is that under MAVLink 1
     try:
-        return as_json(play(dronekit, each, version=1))
+        return as_json(play(dronekit, case, version=1))
     except BaseException as error:
         return f"{type(error).__name__}: {error}"
 

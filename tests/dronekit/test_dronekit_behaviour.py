@@ -54,11 +54,11 @@ def waiting(request: pytest.FixtureRequest) -> Iterator[dict[str, Future[Any]]]:
 
 
 @pytest.mark.parametrize("version", [1, 2])
-@pytest.mark.parametrize("each", QUICK, ids=lambda each: each.name)
-def test_scenario(each: Scenario, version: int) -> None:
-    if each.controller.get("version", version) != version:
+@pytest.mark.parametrize("case", QUICK, ids=lambda case: case.name)
+def test_scenario(case: Scenario, version: int) -> None:
+    if case.controller.get("version", version) != version:
         pytest.skip("the message is of the other version")
-    assert as_json(play(dronekit, each, version=version)) == as_json(each.expected)
+    assert as_json(play(dronekit, case, version=version)) == as_json(case.expected)
 
 
 @pytest.mark.skipif(not DRONEKIT_PYTHON, reason="AEROKIT_DRONEKIT_PYTHON names no interpreter with DroneKit")
@@ -262,6 +262,6 @@ def test_row_40_silence(waiting: dict[str, Future[Any]]) -> None:
     }
 
 
-@pytest.mark.parametrize("each", SLOW, ids=lambda each: each.name)
-def test_slow_scenario(each: Scenario, waiting: dict[str, Future[Any]]) -> None:
-    assert as_json(waiting[f"test_slow_scenario[{each.name}]"].result(timeout=60)) == as_json(each.expected)
+@pytest.mark.parametrize("case", SLOW, ids=lambda case: case.name)
+def test_slow_scenario(case: Scenario, waiting: dict[str, Future[Any]]) -> None:
+    assert as_json(waiting[f"test_slow_scenario[{case.name}]"].result(timeout=60)) == as_json(case.expected)

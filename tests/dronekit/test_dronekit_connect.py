@@ -37,7 +37,7 @@ vehicle = connect({fc.address!r}, wait_ready=['mode'])
 vehicle.mode = VehicleMode('GUIDED')
 vehicle.armed = True
 vehicle.close()
-print([each for each in ('pymavlink', 'aerokit.sync.twins', 'argparse') if each in sys.modules])
+print([module for module in ('pymavlink', 'aerokit.sync.twins', 'argparse') if module in sys.modules])
 """
     ran = subprocess.run(
         [sys.executable, "-c", program],

@@ -349,14 +349,14 @@ def test_connect_waits_for_first_values(address: str, monkeypatch: pytest.Monkey
 
 
 def test_connect_does_not_wait_for_missing_values(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(vehicle_module, "FIRST_VALUES", ("attitude", "heading", "what it never tells"))
+    monkeypatch.setattr(vehicle_module, "FIRST_VALUES", ("attitude", "heading", "a value never reported"))
     monkeypatch.setattr(vehicle_module, "FIRST_VALUES_TIMEOUT_S", 1e6)
     monkeypatch.setattr(vehicle_module, "NEXT_VALUE_TIMEOUT_S", 0.05)
     dronekit.connect(address).close()
 
 
 def test_connect_counts_earlier_values(vehicle: dronekit.Vehicle, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(vehicle_module, "FIRST_VALUES", ("mode", "what it never tells"))
+    monkeypatch.setattr(vehicle_module, "FIRST_VALUES", ("mode", "a value never reported"))
     monkeypatch.setattr(vehicle_module, "FIRST_VALUES_TIMEOUT_S", 1e6)
     monkeypatch.setattr(vehicle_module, "NEXT_VALUE_TIMEOUT_S", 0.05)
     vehicle._dk_wait_for_first_values()

@@ -263,7 +263,7 @@ def test_notify_does_not_deadlock() -> None:
 
     one, two = threads
     callers = [
-        threading.Thread(target=each.call, args=(meet_and_call, other)) for each, other in ((one, two), (two, one))
+        threading.Thread(target=first.call, args=(meet_and_call, second)) for first, second in ((one, two), (two, one))
     ]
     for caller in callers:
         caller.start()

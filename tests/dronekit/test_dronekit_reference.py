@@ -18,8 +18,8 @@ from for_each import for_each
 
 import aerokit.dronekit as dronekit
 
-for each in OTHER_NAMES:
-    importlib.import_module(f"aerokit.dronekit.{each}")
+for module in OTHER_NAMES:
+    importlib.import_module(f"aerokit.dronekit.{module}")
 
 
 def found(path: str) -> Any:
@@ -100,12 +100,13 @@ def test_signature(path: str) -> None:
         for name, parameter in inspect.signature(found(path)).parameters.items()
         if name != "self" and parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD)
     ]
-    by_position = [name for name in own if name.kind is not name.KEYWORD_ONLY]
+    by_position = [parameter for parameter in own if parameter.kind is not parameter.KEYWORD_ONLY]
     assert [parameter.name for parameter in by_position[: len(wanted)]] == list(wanted)
-    assert all(name.default is not name.empty for name in own[len(wanted) :])
-    for each in by_position[: len(wanted)]:
-        default = ... if each.default is each.empty else getattr(each.default, "__name__", each.default)
-        assert default == wanted[each.name], each.name
+    assert all(parameter.default is not parameter.empty for parameter in own[len(wanted) :])
+    for parameter in by_position[: len(wanted)]:
+        is_required = parameter.default is parameter.empty
+        default = ... if is_required else getattr(parameter.default, "__name__", parameter.default)
+        assert default == wanted[parameter.name], parameter.name
 
 
 @pytest.mark.parametrize("name", ["add_attribute_listener", "remove_attribute_listener"])

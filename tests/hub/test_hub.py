@@ -705,12 +705,12 @@ async def test_broadcast_order_reaches_each_vehicle_once() -> None:
     other, camera, station, program = Program(2, 1), Program(1, 100), Program(255, 190), Program(250, 190)
     everyone = first, second, other, camera, station, program
     async with joined(*everyone):
-        for each, heartbeat in zip(everyone, [COPTER] * 3 + [CAMERA] + [STATION] * 2, strict=True):
-            each.send(heartbeat)
+        for client, heartbeat in zip(everyone, [COPTER] * 3 + [CAMERA] + [STATION] * 2, strict=True):
+            client.send(heartbeat)
         await settle()
         for target in (0, 1), (0, 0):
             station.send(CommandLong(*target, 400, 0, 1, 0, 0, 0, 0, 0, 0))
             await settle()
-            assert [program.received.count("COMMAND_LONG") for program in everyone] == [1, 0, 1, 1, 0, 1]
-            for each in everyone:
-                each.frames.clear()
+            assert [client.received.count("COMMAND_LONG") for client in everyone] == [1, 0, 1, 1, 0, 1]
+            for client in everyone:
+                client.frames.clear()

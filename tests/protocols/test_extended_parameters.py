@@ -35,7 +35,7 @@ class FakeCamera(FakeVehicle):
 
     def __init__(self, table: Iterable[Setting]) -> None:
         super().__init__(())
-        self.table = {name.name: name for name in table}
+        self.table = {parameter.name: parameter for parameter in table}
         self.writes: list[SettingValue] = []
 
     def ext_value(self, name: str) -> m.ParamExtValue:
@@ -234,7 +234,7 @@ def test_setting_read_of_silent_component_times_out() -> None:
 def test_setting_reads_are_exact_despite_losses(seed: int, loss: float, count: int) -> None:
     table = table_of(30)
     channel = Channel(FakeCamera(table), loss=loss, jitter_s=0.05, seed=seed)
-    answers = channel.run(reads(*(name.name for name in table[:count]), idle_timeout_s=60.0))
+    answers = channel.run(reads(*(parameter.name for parameter in table[:count]), idle_timeout_s=60.0))
     assert list(answers.values()) == table[:count]
 
 

@@ -214,7 +214,7 @@ def test_parameter_list_index_beyond_count_sends_nothing() -> None:
 
 
 class Growing(FakeVehicle):
-    """A vehicle like ArduPilot: a group appears after ``shown_at`` values, and the stream continues with the old count."""
+    """A vehicle like ArduPilot: a group appears after ``shown_at`` values, while the stream keeps the old count."""
 
     shown_at = 60
     place = 80

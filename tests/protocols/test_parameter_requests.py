@@ -131,8 +131,8 @@ def test_possibly_stale_value_is_accepted_second_time() -> None:
 def test_parameter_reads_are_exact_despite_losses(seed: int, loss: float, count: int) -> None:
     table = table_of(60)
     channel = Channel(FakeVehicle(table), loss=loss, seed=seed)
-    answers = channel.run(reads(*(name.name for name in table[:count]), probe=True))
-    assert [value(answer) for answer in answers.values()] == [name.value for name in table[:count]]
+    answers = channel.run(reads(*(parameter.name for parameter in table[:count]), probe=True))
+    assert [value(answer) for answer in answers.values()] == [parameter.value for parameter in table[:count]]
     assert len(channel.sent) < 100 + 6 * count
 
 
@@ -297,7 +297,7 @@ def test_parameter_writes_arrive_despite_losses(seed: int, loss: float, count: i
     table = table_of(count)
     vehicle = FakeVehicle(table)
     channel = Channel(vehicle, loss=loss, seed=seed)
-    before = {name.name: name.value for name in table}
+    before = {parameter.name: parameter.value for parameter in table}
     answers = channel.run(writes(*(name.replace(value=101) for name in table), before=before))
     assert {value(answer) for answer in answers.values()} == {101}
     assert {parameter.value for parameter in vehicle.parameters.values()} == {101}

@@ -128,7 +128,7 @@ def read_parameters(trouble: Trouble) -> bool:
 
 def set_parameters(trouble: Trouble) -> bool:
     table = table_of(30)
-    before = {name.name: name.value for name in table}
+    before = {parameter.name: parameter.value for parameter in table}
     wanted = [parameter.replace(value=parameter.value + 1, index=None) for parameter in trouble.dice.sample(table, 12)]
     exchange = ParameterWrites(
         1, 1, wanted, bytewise=trouble.is_bytewise, before=before, recent=[wanted[0].name], **trouble.options

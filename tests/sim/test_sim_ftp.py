@@ -295,7 +295,7 @@ def test_px4_has_one_session_per_port() -> None:
     ftp.send(Op.OPENFILERO, "/t")
     assert [answer.opcode for answer in ftp.answers()] == [Op.NAK]
     assert px4.ftp.open_sessions == 1
-    assert other.take_outbox()[7:10] != b"\x6e\0\0", "nobody asked there"
+    assert other.take_outbox()[7:10] != b"\x6e\0\0", "no request came from there"
 
 
 def test_px4_burst_ignores_size_and_ends_at_35_kb() -> None:

@@ -47,7 +47,7 @@ def manage(client: Client, *params: float) -> int | None:
     return client.command(MavCmd.DO_GIMBAL_MANAGER_PITCHYAW, *params)
 
 
-# ------------------------------------------------------------------------------------ what it tells
+# ----------------------------------------------------------------------------------------- messages
 
 
 def test_commands_without_gimbal_fail() -> None:
@@ -180,7 +180,7 @@ def test_control_is_stored_and_reported(client: Client) -> None:
     assert configure(255, 190) == [(255, 190)]
     assert configure(-3, -3) == [(0, 0)]
     assert client.command(MavCmd.DO_GIMBAL_MANAGER_CONFIGURE, -4, 0) == FAILED
-    assert manage(client, -10, 0, NAN, NAN) == ACCEPTED, "nobody has to be in control"
+    assert manage(client, -10, 0, NAN, NAN) == ACCEPTED, "no controller is required"
 
 
 # -------------------------------------------------------------------------------------- places

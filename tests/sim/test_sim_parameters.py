@@ -328,7 +328,7 @@ def test_px4_serves_the_pack_if_enabled() -> None:
     size = int.from_bytes(ftp.data(Op.OPENFILERO, "@PARAM/param.pck?withdefaults=1"), "little")
     ftp.data(Op.TERMINATESESSION)
     content = ftp.download("@PARAM/param.pck?withdefaults=1")
-    assert len(content) == size, "an open tells the exact size"
+    assert len(content) == size, "opening reports the exact size"
     table = unpack_parameters(content)
     assert table.values_by_name() == {name: px4.parameters[name] for name in px4.parameters}
     assert table["CA_ROTOR_COUNT" if "CA_ROTOR_COUNT" in table else "BAT1_N_CELLS"].default == 0

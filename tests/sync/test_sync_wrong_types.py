@@ -60,7 +60,7 @@ def test_wrong_types_are_rejected_and_nothing_sent(owner: str, flight: tuple[aer
     left_out = LEFT_OUT.get(owner, frozenset())
     wrong = [refusal_of(misuse, misuse_it(misuse)) for misuse in misuses(OWNERS[owner](vehicle), leave_out=left_out)]
     assert not (found := list(filter(None, wrong))), "\n".join(found)
-    kinds = {type(heard.message) for heard in journal.messages}
+    kinds = {type(entry.message) for entry in journal.messages}
     assert kinds <= set(ASKED_BY_ITSELF)
 
 

@@ -23,7 +23,7 @@ from aerokit.transport.outbox import WRITE_TIMEOUT_S, Outbox
 pytestmark = pytest.mark.anyio
 
 COMMAND = messages.CommandLong(1, 1, 400, 0, *(0.0,) * 7)
-on_linux = pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells what the system has not sent")
+on_linux = pytest.mark.skipif(sys.platform != "linux", reason="only Linux reports unsent bytes")
 
 
 class Line:

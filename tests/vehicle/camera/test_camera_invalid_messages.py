@@ -278,8 +278,8 @@ async def test_temporary_refusal_is_polled_again() -> None:
         await vehicle.camera.status.wait_until(lambda _: True, timeout=20)
 
 
-@pytest.mark.parametrize("who", ["camera", "vehicle"])
-async def test_refusal_is_forgotten_after_reboot(who: str) -> None:
+@pytest.mark.parametrize("rebooted", ["camera", "vehicle"])
+async def test_refusal_is_forgotten_after_reboot(rebooted: str) -> None:
     camera = SimulatedCamera()
     async with on_board(camera) as vehicle:
         await vehicle.camera.wait_found()
@@ -287,7 +287,7 @@ async def test_refusal_is_forgotten_after_reboot(who: str) -> None:
         camera.faults.refuse(MavCmd.REQUEST_CAMERA_CAPTURE_STATUS, MavResult.UNSUPPORTED, times=1)
         with pytest.raises(OperationTimeout):
             await vehicle.camera.status.wait_until(lambda _: True, timeout=20)
-        if who == "camera":
+        if rebooted == "camera":
             camera.faults.silent = True
             await anyio.sleep(30)
             camera.faults.silent = False

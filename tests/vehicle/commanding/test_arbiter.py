@@ -86,7 +86,7 @@ def test_auxiliary_order_ignores_reports_after_block() -> None:
     assert aside.end == ""
 
 
-# ------------------------------------------------------------------------------ somebody else
+# ---------------------------------------------------------------------------------- takeovers
 
 
 @pytest.mark.parametrize("modes", [[LOITER], [GUIDED], [LOITER, LOITER, GUIDED, GUIDED]])
@@ -315,8 +315,8 @@ def test_commands_are_classified_as_orders_or_questions() -> None:
         *("DO_FLIGHTTERMINATION", "DO_ORBIT", "DO_PAUSE_CONTINUE", "OVERRIDE_GOTO", "MISSION_START"),
         "COMPONENT_ARM_DISARM",
     }
-    for each in QUESTIONS - {MavCmd.SET_MESSAGE_INTERVAL, MavCmd.RUN_PREARM_CHECKS}:
-        assert MavCmd(each).name.startswith(("REQUEST_", "GET_")), "what changes something is no question"
+    for number in QUESTIONS - {MavCmd.SET_MESSAGE_INTERVAL, MavCmd.RUN_PREARM_CHECKS}:
+        assert MavCmd(number).name.startswith(("REQUEST_", "GET_")), "what changes something is no question"
     assert len(QUESTIONS) == 11
 
 

@@ -158,7 +158,7 @@ async def test_lost_control_publishes_event_and_ends_waits() -> None:
             assert (event.gimbal_device_id, event.is_primary) == (154, True)
             assert (event.to_system_id, event.to_component_id) == OTHER
         await anyio.sleep(1.0)
-        assert gimbal.primary == OTHER, "nothing is given back that somebody else has"
+        assert gimbal.primary == OTHER, "control that another station has is not released"
 
 
 async def test_unnoticed_loss_raises_on_block_exit() -> None:

@@ -255,11 +255,11 @@ async def test_look_at_system_follows_reported_position() -> None:
             m.GlobalPositionInt(0, x, y, round(there.altitude_amsl_m * 1e3), 20000, 0, 0, 0, 0)
         )
 
-        def tell() -> None:
+        def report() -> None:
             flight.copter.receive(reported, flight.copter.now)
             flight.wire.deliver(reported)
 
-        flight.copter.every(0.5, tell)
+        flight.copter.every(0.5, report)
         await flight.vehicle.gimbal.look_at_system(7)
         attitude = flight.vehicle.gimbal.attitude.value
         assert attitude.yaw_deg == pytest.approx(270, abs=6)

@@ -27,8 +27,8 @@ async def _start_mission(flight: Px4Flight) -> None:
     flight.wire.clear()
 
 
-@pytest.mark.parametrize("who", ["a pilot", "the program"])
-async def test_set_current_is_not_resent_after_takeover(who: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("party", ["a pilot", "the program"])
+async def test_set_current_is_not_resent_after_takeover(party: str, monkeypatch: pytest.MonkeyPatch) -> None:
     async with open_px4() as flight:
         await _start_mission(flight)
         monkeypatch.setattr(SetCurrentItem, "receive", lambda *_: None)  # it is never confirmed
@@ -36,7 +36,7 @@ async def test_set_current_is_not_resent_after_takeover(who: str, monkeypatch: p
 
             async def interfere() -> None:
                 await anyio.sleep(0.3)
-                if who == "a pilot":
+                if party == "a pilot":
                     flight.px4.switch_to(POSITION)
                 else:
                     await flight.vehicle.command(MavCmd.NAV_RETURN_TO_LAUNCH)

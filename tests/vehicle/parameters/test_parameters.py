@@ -522,7 +522,11 @@ async def test_upload_reads_back_singly_or_by_list(more: int) -> None:
     async with open_flight(copter(400)) as flight:
         parameters = flight.vehicle.parameters
         table = await parameters.download()
-        wanted = {name.name: name.value + 1 for name in table.values() if name.type == ParameterType.REAL32}
+        wanted = {
+            parameter.name: parameter.value + 1
+            for parameter in table.values()
+            if parameter.type == ParameterType.REAL32
+        }
         wanted = dict(list(wanted.items())[: MAX_READ_BACK + more])
         assert len(wanted) == MAX_READ_BACK + more
         flight.wire.clear()

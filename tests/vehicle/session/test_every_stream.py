@@ -32,7 +32,7 @@ async def test_streams_arrive_at_requested_rate() -> None:
     async with open_flight(rates={}) as flight:
         with flight.vehicle.streams(8):
             await anyio.sleep(30.0)
-            assert requests(flight) == [(0, 0, 8, 1)], "asked once: it is heard"
+            assert requests(flight) == [(0, 0, 8, 1)], "requested once: it arrives"
             assert interval(flight, m.Attitude) == pytest.approx(1 / 8, rel=0.1)
             assert interval(flight, m.ServoOutputRaw) == pytest.approx(1 / 8, rel=0.1)
 
@@ -48,7 +48,7 @@ async def test_reboot_requests_streams_again() -> None:
         flight.wire.clear()
         flight.copter.restart()
         await anyio.sleep(15.0)
-        assert not requests(flight), "nobody wants them any more"
+        assert not requests(flight), "they have no subscriber left"
 
 
 async def test_missing_stream_request_interval_grows() -> None:

@@ -157,7 +157,7 @@ async def test_px4_arms_when_ready_in_new_mode() -> None:
         assert arms[0] - modes[0] < 2.5
 
 
-# ----------------------------------------------------------------- answers nobody waits for
+# ------------------------------------------------------------------------- unexpected answers
 
 
 @pytest.fixture

@@ -44,7 +44,7 @@ async def test_twenty_unanswered_commands_delay_nothing_else(grounded: Flight) -
         await anyio.sleep(0.5)
 
         started = now()
-        assert vehicle.attitude.value is not None  # a property never talks to anybody
+        assert vehicle.attitude.value is not None  # a property never sends a request
         assert vehicle.mode.fresh(within=1.5)
         assert now() == started
 

@@ -87,7 +87,7 @@ def random_case_over_two(row: Row, autopilot: str, seed: int) -> Case:
 
 
 def random_case_through_hub(row: Row, autopilot: str, seed: int) -> Case:
-    """The same through a hub, the disturbances on either side of it, where the hub's endpoint may be full, or go away and
+    """The same through a hub, with disturbances on either side, where the hub's endpoint may be full, or go away and
     come back; or there are two ways between the hub and one of them.
     """
     case = random_case(row, autopilot, seed)

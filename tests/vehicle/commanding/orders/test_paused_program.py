@@ -44,7 +44,7 @@ async def main(address, what):
         except (errors.AerokitError, asyncio.TimeoutError) as caught:
             error = type(caught).__name__
         await asyncio.sleep(2.5)
-        print(json.dumps([error, [each for each in sent if each in (176, 192)], max(ages), vehicle.mode_name]))
+        print(json.dumps([error, [command for command in sent if command in (176, 192)], max(ages), vehicle.mode_name]))
 
 asyncio.run(main(*sys.argv[1:]))
 """
