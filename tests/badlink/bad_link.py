@@ -71,7 +71,7 @@ class Program:
     known: Any = None
     """Result of the preparation, while the radio was good."""
 
-    def turn_bad(self, radio: Radio) -> None:
+    def degrade(self, radio: Radio) -> None:
         """Apply the faults of the bad radio from now on."""
         model = radio.model
         if radio.outage_after_s is not None:
@@ -131,7 +131,7 @@ async def _attempt(
         if before is not None:
             await before(program)
         held = _held(program)
-        program.turn_bad(radio)
+        program.degrade(radio)
         program.wire.clear()
         received_before, begun = program.radio.incoming.frames, loop.time()
         outcome = Attempt(seed, None, None, 0.0)
@@ -142,7 +142,7 @@ async def _attempt(
             outcome.error = error
         outcome.seconds = loop.time() - begun
         outcome.received = program.radio.incoming.frames - received_before
-        outcome.left = await _what_is_left(program, held, leftovers)
+        outcome.left = await _remaining_state(program, held, leftovers)
         outcome.sent = Counter(
             type(message).NAME for _, message in program.wire.sent if not isinstance(message, OWN_LIFE)
         )
@@ -175,7 +175,7 @@ def _held(program: Program) -> tuple[int, int, int, int]:
     )
 
 
-async def _what_is_left(
+async def _remaining_state(
     program: Program, held: tuple[int, ...], leftovers: Callable[[Any], Iterator[str]]
 ) -> list[str]:
     """At once if possible: the radio is still as bad, and closing needs it."""

@@ -33,7 +33,7 @@ def _camera(*troubles: Callable[[SimulatedCamera], object]) -> Callable[[Stage],
 
     def before(stage: Stage) -> None:
         camera = camera_of(stage)
-        settings_of(stage)._forget()
+        settings_of(stage)._clear_state()
         for trouble in troubles:
             trouble(camera)
 
@@ -51,7 +51,7 @@ def _names(uri: str) -> Callable[[SimulatedCamera], None]:
     return name
 
 
-def _refuses_to_tell(camera: SimulatedCamera) -> None:
+def _lacks_information(camera: SimulatedCamera) -> None:
     camera._builders.pop(m.CameraInformation.ID)
     camera.vehicle.call_later(5.0, lambda: camera._builders.update(camera.builders()))
 
@@ -80,7 +80,7 @@ HURRY: dict[str, Any] = {"timeout": 0.05}
 SETTINGS: Table = {
     ("Settings.load", "FileFormatError"): P(_load_damaged),
     ("Settings.fetch_definition", "NotSupported"): P(_call("fetch_definition"), _names("")),
-    ("Settings.fetch_definition", "CommandRejected"): P(_call("fetch_definition"), _refuses_to_tell),
+    ("Settings.fetch_definition", "CommandRejected"): P(_call("fetch_definition"), _lacks_information),
     ("Settings.fetch_definition", "OperationTimeout"): P(_call("fetch_definition", **HURRY), _silent),
     ("Settings.fetch_definition", "InvalidArgument"): P(_call("fetch_definition", "gopher://a")),
     ("Settings.fetch_definition", "FileFormatError"): P(_call("fetch_definition"), _damaged),

@@ -14,22 +14,22 @@ from flight_harness import make_parts
 from aerokit.connection import loop_watch
 from aerokit.vehicle.session.commands import PENDING_ACK_TIMEOUT_S
 
-__all__ = ["SETTLED_S", "look", "what_is_left"]
+__all__ = ["SETTLED_S", "check_remains", "snapshot"]
 
 SETTLED_S = 20.0
 """An abandoned arm command is monitored for 15 s, and acknowledged then."""
 POLL_INTERVAL_S = 0.25
 
 
-def look(stage: Stage) -> Counter[str]:
+def snapshot(stage: Stage) -> Counter[str]:
     """Return the present counts by name."""
     return Counter(_all(stage))
 
 
-async def what_is_left(stage: Stage, before: Counter[str]) -> Counter[str]:
+async def check_remains(stage: Stage, before: Counter[str]) -> Counter[str]:
     """Return what remains in addition to ``before``, after waiting for it to go or settle."""
     waited = 0.0
-    while (left := look(stage) - before) and waited < SETTLED_S:
+    while (left := snapshot(stage) - before) and waited < SETTLED_S:
         await anyio.sleep(POLL_INTERVAL_S)
         waited += POLL_INTERVAL_S
     return left

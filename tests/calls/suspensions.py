@@ -110,11 +110,11 @@ async def cancel_at(work: Awaitable[object], point: Point | None) -> Cancelled:
     def suspended(count: int) -> None:
         if point is not None and count == point.suspension:
             if point.after_s:
-                loop.call_later(point.after_s, still_there)
+                loop.call_later(point.after_s, cancel_at_point)
             else:
                 cancel()
 
-    def still_there() -> None:
+    def cancel_at_point() -> None:
         if point is not None and counted.count == point.suspension:
             cancel()
 

@@ -40,7 +40,7 @@ class Client:
         ack = self.wait("COMMAND_ACK", until=lambda ack: ack.command == command, timeout=5)
         return int(ack.result)
 
-    def insist(self, command: int, *parameters: float) -> None:
+    def command_until_accepted(self, command: int, *parameters: float) -> None:
         """A command is repeated until the vehicle is ready for it."""
         for _ in range(60):
             if self.command(command, *parameters) == M.MAV_RESULT_ACCEPTED:
@@ -51,9 +51,9 @@ class Client:
     def set_mode(self, name: str) -> None:
         mode = self.link.mode_mapping()[name]
         if isinstance(mode, tuple):
-            self.insist(M.MAV_CMD_DO_SET_MODE, mode[0], mode[1], mode[2])
+            self.command_until_accepted(M.MAV_CMD_DO_SET_MODE, mode[0], mode[1], mode[2])
         else:
-            self.insist(M.MAV_CMD_DO_SET_MODE, M.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, mode)
+            self.command_until_accepted(M.MAV_CMD_DO_SET_MODE, M.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, mode)
         self.wait("HEARTBEAT", until=lambda _: self.link.flightmode == name)
 
     def wait_altitude(self, altitude_m: float) -> Any:
@@ -109,11 +109,13 @@ def download(client: Client) -> int:
 def take_off(client: Client) -> None:
     """ArduPilot takes height above home; PX4 a place and height above the sea."""
     if client.kind == "copter":
-        client.insist(M.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, ALTITUDE_M)
+        client.command_until_accepted(M.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, ALTITUDE_M)
         return
     here = client.wait("GLOBAL_POSITION_INT")
     nan = float("nan")
-    client.insist(M.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, nan, here.lat / 1e7, here.lon / 1e7, here.alt / 1000 + ALTITUDE_M)
+    client.command_until_accepted(
+        M.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, nan, here.lat / 1e7, here.lon / 1e7, here.alt / 1000 + ALTITUDE_M
+    )
 
 
 def fly(client: Client) -> None:
@@ -139,7 +141,7 @@ def main() -> None:
     steps.done("download", download(client))
     if client.kind == "copter":
         client.set_mode("GUIDED")
-    client.insist(M.MAV_CMD_COMPONENT_ARM_DISARM, 1)
+    client.command_until_accepted(M.MAV_CMD_COMPONENT_ARM_DISARM, 1)
     client.wait("HEARTBEAT", until=lambda _: client.link.motors_armed())
     steps.done("arm")
     take_off(client)

@@ -19,7 +19,7 @@ from aerokit.mavlink.statistics import SourceStatistics
 PEER_TTL_S = 30.0
 ROUTE_TIMEOUT_S = 3.5
 
-HOME, SAME_HOST, ELSEWHERE = "1@copter", "2@copter", "1@stranger"
+HOME, SAME_HOST, OTHER_HOST = "1@copter", "2@copter", "1@stranger"
 
 
 class Sender:
@@ -58,7 +58,7 @@ class Stage:
     def next_number(self) -> int:
         return self.copter.encoder.sequence
 
-    def claims(self, at: float, ahead: int, peer: str = ELSEWHERE, **kind: Any) -> bool:
+    def claims(self, at: float, ahead: int, peer: str = OTHER_HOST, **kind: Any) -> bool:
         frame, counters = Sender(1, self.next_number + ahead).send(at, **kind)
         assert self.routes.arrived_on_other_peer(frame, peer)
         return self.routes.claims_route(frame, peer, counters, is_signed=False)
@@ -173,17 +173,17 @@ def test_peer_with_vehicle_object_is_never_evictable() -> None:
         (set[int](), 1.1 + PEER_TTL_S, [HOME]),
     ):
         assert Stage(attached).routes.evictable_peers([HOME], at) == forgotten
-    assert Stage().routes.evictable_peers([HOME, ELSEWHERE, SAME_HOST], 1.0) == [ELSEWHERE]
+    assert Stage().routes.evictable_peers([HOME, OTHER_HOST, SAME_HOST], 1.0) == [OTHER_HOST]
 
 
 def test_full_table_drops_expired_routes_and_keeps_vehicles(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(routes_module, "MAX_ROUTES", 3)
     stage = Stage(attached={9})
     routes = stage.routes
-    assert routes.record_heartbeat(Sender(9).send(1.0)[0], ELSEWHERE, None)
-    assert routes.record_heartbeat(Sender(3).send(30.0)[0], ELSEWHERE, None)
-    assert not routes.record_heartbeat(Sender(4).send(30.5)[0], ELSEWHERE, None)
-    assert routes.record_heartbeat(Sender(5).send(32.0)[0], ELSEWHERE, None)
+    assert routes.record_heartbeat(Sender(9).send(1.0)[0], OTHER_HOST, None)
+    assert routes.record_heartbeat(Sender(3).send(30.0)[0], OTHER_HOST, None)
+    assert not routes.record_heartbeat(Sender(4).send(30.5)[0], OTHER_HOST, None)
+    assert routes.record_heartbeat(Sender(5).send(32.0)[0], OTHER_HOST, None)
     known = [system for system in range(10) if routes.has_route((system, 1))]
     assert known == [3, 5, 9]
 
@@ -191,9 +191,9 @@ def test_full_table_drops_expired_routes_and_keeps_vehicles(monkeypatch: pytest.
 def test_full_table_is_swept_once_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(routes_module, "MAX_ROUTES", 1)
     routes = Stage(attached=set()).routes
-    assert not routes.record_heartbeat(Sender(2).send(30.5)[0], ELSEWHERE, None)
-    assert not routes.record_heartbeat(Sender(2).send(31.4)[0], ELSEWHERE, None)
-    assert routes.record_heartbeat(Sender(2).send(31.5)[0], ELSEWHERE, None)
+    assert not routes.record_heartbeat(Sender(2).send(30.5)[0], OTHER_HOST, None)
+    assert not routes.record_heartbeat(Sender(2).send(31.4)[0], OTHER_HOST, None)
+    assert routes.record_heartbeat(Sender(2).send(31.5)[0], OTHER_HOST, None)
 
 
 # ------------------------------------------------------------------------------------- claims

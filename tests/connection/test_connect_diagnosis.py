@@ -45,7 +45,7 @@ class FarEnd:
 
 
 @asynccontextmanager
-async def link_that_says(speak: Callable[[], bytes]) -> AsyncIterator[MemoryLink]:
+async def link_sending(speak: Callable[[], bytes]) -> AsyncIterator[MemoryLink]:
     near, far = memory_link_pair()
     await far.open(FarEnd())
 
@@ -61,7 +61,7 @@ async def link_that_says(speak: Callable[[], bytes]) -> AsyncIterator[MemoryLink
     far.close()
 
 
-def saying(system_id: int, component_id: int, *messages: Heartbeat | Attitude) -> Callable[[], bytes]:
+def frames_of(system_id: int, component_id: int, *messages: Heartbeat | Attitude) -> Callable[[], bytes]:
     encoder = FrameEncoder(system_id, component_id)
     return lambda: b"".join(encoder.encode(message) for message in messages)
 
@@ -82,12 +82,12 @@ def damaged(speak: Callable[[], bytes]) -> Callable[[], bytes]:
         (lambda: b"", None, "no bytes were received"),
         (lambda: b"Init ArduCopter V4.7\n", None, "no MAVLink frame: wrong baud rate, or another protocol"),
         (lambda: b"\x00\xff\x13" * 20, None, "no MAVLink frame"),
-        (damaged(saying(1, 1, ATTITUDE)), None, "damaged frames and no valid one"),
+        (damaged(frames_of(1, 1, ATTITUDE)), None, "damaged frames and no valid one"),
         (lambda: UNKNOWN_FRAME, None, r"unknown dialect \(messages 8947848\)"),
-        (saying(1, 1, ATTITUDE), None, "no HEARTBEAT among them"),
-        (saying(255, 190, GCS), None, r"only ground stations were received \(255/190\)"),
-        (saying(1, 154, GIMBAL), None, r"that are not autopilots were received \(1/154\)"),
-        (saying(7, 1, COPTER), 3, r"other system ids were received: 7 \(wanted: 3\)"),
+        (frames_of(1, 1, ATTITUDE), None, "no HEARTBEAT among them"),
+        (frames_of(255, 190, GCS), None, r"only ground stations were received \(255/190\)"),
+        (frames_of(1, 154, GIMBAL), None, r"that are not autopilots were received \(1/154\)"),
+        (frames_of(7, 1, COPTER), 3, r"other system ids were received: 7 \(wanted: 3\)"),
         (heartbeat_of_system_0, None, "all with the invalid system id 0"),
     ],
     ids=[
@@ -96,7 +96,7 @@ def damaged(speak: Callable[[], bytes]) -> Callable[[], bytes]:
     ],
 )
 async def test_error_describes_what_was_received(speak: Callable[[], bytes], system_id: int | None, text: str) -> None:
-    async with link_that_says(speak) as link:
+    async with link_sending(speak) as link:
         with pytest.raises(ConnectFailed, match=text) as caught:
             async with connect(link, system_id=system_id, timeout=5):
                 pytest.fail("there is no vehicle")
@@ -108,7 +108,7 @@ async def test_error_describes_what_was_received(speak: Callable[[], bytes], sys
 async def test_noise_is_not_diagnosed_as_dialect_or_damage(seed: int) -> None:
     """Noise of a serial port at the wrong baud rate, which contains byte sequences that look like frames."""
     random = Random(seed)
-    async with link_that_says(lambda: random.randbytes(random.randrange(1, 400))) as link:
+    async with link_sending(lambda: random.randbytes(random.randrange(1, 400))) as link:
         with pytest.raises(ConnectFailed, match="no MAVLink frame: wrong baud rate"):
             async with connect(link, timeout=50):
                 pytest.fail("there is no vehicle")
@@ -136,7 +136,7 @@ async def test_ground_station_and_gimbal_are_not_vehicles() -> None:
 
 async def test_connect_has_a_default_timeout() -> None:
     started = anyio.current_time()
-    async with link_that_says(lambda: b"") as link:
+    async with link_sending(lambda: b"") as link:
         with pytest.raises(ConnectFailed, match="within 30 s"):
             async with connect(link):
                 pytest.fail("there is no vehicle")

@@ -360,16 +360,16 @@ class TestServers:
             with connection.subscribe(m.Heartbeat, capacity=9) as heartbeats:
                 for _ in range(2):
                     link = TcpConnect("127.0.0.1", port)
-                    await link.open(Deaf())
+                    await link.open(IgnoringReceiver())
                     link.write(encoder.encode(m.Heartbeat(2, 3, 81, 0, 3)))
                     await heartbeats.get(20)
                     link.close()
                     await link.wait_closed()
-                    await eventually_gone(connection.link)
+                    await eventually_closed(connection.link)
         assert doubles == []
 
 
-async def eventually_gone(link: Link) -> None:
+async def eventually_closed(link: Link) -> None:
     """Waits until the server has noticed that its client has gone; 20 s are for hung tests only."""
     assert isinstance(link, TcpListen)
     with anyio.fail_after(20):
@@ -377,7 +377,7 @@ async def eventually_gone(link: Link) -> None:
             await asyncio.sleep(0)
 
 
-class Deaf:
+class IgnoringReceiver:
     """A receiver that ignores all data."""
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:

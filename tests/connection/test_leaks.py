@@ -167,11 +167,11 @@ def test_ended_connection_is_garbage() -> None:
 def test_block_exception_keeps_no_reference_cycle() -> None:
     """They are gone as soon as the exception is, not when the garbage collector comes by."""
 
-    class Precious:
+    class Resource:
         """Something that the program holds: a camera, a file."""
 
     async def body(connection: Connection, references: list[weakref.ref[object]]) -> None:
-        precious = Precious()
+        precious = Resource()
         references.append(weakref.ref(precious))
         connection.raise_if_ended()
         raise ValueError("mine")

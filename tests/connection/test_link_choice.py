@@ -14,7 +14,7 @@ from aerokit.connection.multilink.vehicle_clock import HardwareId, VehicleClock
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.frame import Frame
 
-WHAT = (
+STEP_KINDS = (
     "heartbeat",
     "counts",
     "answer",
@@ -29,7 +29,7 @@ WHAT = (
 )
 STEPS = st.lists(
     st.tuples(
-        st.sampled_from(WHAT),
+        st.sampled_from(STEP_KINDS),
         st.integers(0, 2),
         st.floats(0.01, 1.5),
         st.floats(0.0, 0.5),

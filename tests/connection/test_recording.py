@@ -147,7 +147,7 @@ async def test_unknown_messages_are_recorded(tmp_path: Path) -> None:
     path = tmp_path / "private.tlog"
     known, private = FrameEncoder(9, 1), UnknownMessageSender(9, 7)
     near, far = memory_link_pair()
-    await far.open(Deaf())
+    await far.open(IgnoringReceiver())
     frames = [
         known.encode(HEARTBEAT),
         private.frame(),
@@ -190,7 +190,7 @@ async def test_unwritable_file_is_refused_before_opening(tmp_path: Path) -> None
     with pytest.raises(LinkOpenError, match=r"cannot record to .*No such file or directory"):
         async with connect(near, record=tmp_path / "no such folder" / "flight.tlog"):
             pytest.fail("not open")
-    await far.open(Deaf())
+    await far.open(IgnoringReceiver())
     far.write(b"nobody is there")
     assert far.dropped_writes == 1
     far.close()
@@ -260,7 +260,7 @@ class UnknownMessageSender:
         return bytes([0xFD, 4, 0, 0, self._sequence, *self._source, *number]) + b"mine" + b"\x12\x34"
 
 
-class Deaf:
+class IgnoringReceiver:
     """The far end of a link that ignores all data."""
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:

@@ -40,7 +40,7 @@ def anyio_backend() -> tuple[str, dict[str, object]]:
     return VIRTUAL_BACKEND
 
 
-class Deaf:
+class IgnoringReceiver:
     """A receiver that ignores all data."""
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
@@ -68,7 +68,7 @@ def an_order_to_all() -> m.CommandLong:
 
 async def opened(radios: Radios) -> None:
     for far in radios.far:
-        await far.open(Deaf())
+        await far.open(IgnoringReceiver())
 
 
 async def test_broadcast_commands_ignore_system_0() -> None:
@@ -186,7 +186,7 @@ async def test_signed_copies_are_accepted_in_any_order() -> None:
 async def test_link_in_use_elsewhere_is_left_unchanged() -> None:
     near, far = memory_link_pair()
     other, _ = memory_link_pair()
-    await far.open(Deaf())
+    await far.open(IgnoringReceiver())
     async with open_connection(near) as connection:
         with pytest.raises(BusyError):
             async with open_connection([other, near]):
@@ -206,7 +206,7 @@ class SlowLink(MemoryLink):
 
 async def test_link_lost_while_another_opens_does_not_end_connection() -> None:
     near, far = memory_link_pair()
-    await far.open(Deaf())
+    await far.open(IgnoringReceiver())
     async with anyio.create_task_group() as tasks:
 
         async def close_soon() -> None:
@@ -223,7 +223,7 @@ async def test_link_lost_while_another_opens_does_not_end_connection() -> None:
 
 async def test_links_all_lost_while_opening_raise() -> None:
     near, far = memory_link_pair()
-    await far.open(Deaf())
+    await far.open(IgnoringReceiver())
 
     class Refused(SlowLink):
         async def _connect(self) -> None:
@@ -244,7 +244,7 @@ async def test_links_all_lost_while_opening_raise() -> None:
 
 async def test_link_opened_late_ends_the_interruption() -> None:
     near, far = memory_link_pair()
-    await far.open(Deaf())
+    await far.open(IgnoringReceiver())
     tries = 0
 
     class Third(MemoryLink):
@@ -337,7 +337,7 @@ class Ports:
             self._far[port].write(self._encoders[port].encode(message))
 
 
-async def changed_for_the_better(connection: Connection, ports: Ports, radios: Radios) -> LinkChoice:
+async def switched_to_better_link(connection: Connection, ports: Ports, radios: Radios) -> LinkChoice:
     """The second radio is the better one, and has just been taken."""
     for step in range(200):
         both = (0,) if step < 20 else (0, 1)
@@ -361,7 +361,7 @@ async def test_answer_over_former_link_is_accepted_once() -> None:
     await opened(radios)
     async with open_connection(radios.together()) as connection:
         ports = Ports(radios)
-        await changed_for_the_better(connection, ports, radios)
+        await switched_to_better_link(connection, ports, radios)
         answers: list[tuple[int, int]] = []
         connection.bus.attach(m.CommandAck, lambda ack: answers.append((ack.command, ack.result)))
         ports.send(m.CommandAck(176, 0), 0)
@@ -377,7 +377,7 @@ async def test_former_link_stays_proven() -> None:
     radios = Radios(2, models=[FaultModel(delay_s=0.5), GOOD])
     await opened(radios)
     async with open_connection(radios.together()) as connection:
-        choice = await changed_for_the_better(connection, Ports(radios), radios)
+        choice = await switched_to_better_link(connection, Ports(radios), radios)
         radios.far[1].close()
         await anyio.sleep(0.3)
         assert choice.used is choice.candidates[0]

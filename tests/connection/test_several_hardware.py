@@ -169,7 +169,7 @@ class Answers:
         self.choice.choose(0.0)
         self.second = self.choice.candidates[1]
 
-    def come(self, times: int, *links: int, ahead_s: float = 70.0) -> None:
+    def answer_probes(self, times: int, *links: int, ahead_s: float = 70.0) -> None:
         """Each is asked for its hardware, and answers with the time alone."""
         for _ in range(times):
             self.now += 0.5
@@ -185,7 +185,7 @@ def test_vehicle_without_hardware_id_is_proven_by_clock() -> None:
     answers.choice.record_hardware(0, OURS)
     steps = 0
     while not answers.second.is_proven:
-        answers.come(1)
+        answers.answer_probes(1)
         steps += 1
     assert MIN_CLOCK_MATCHES < steps <= 1 + MIN_CLOCK_MATCHES + MAX_TIMES_WITHOUT_HARDWARE
 
@@ -193,12 +193,12 @@ def test_vehicle_without_hardware_id_is_proven_by_clock() -> None:
 def test_late_other_hardware_id_disables_the_link() -> None:
     answers = Answers()
     answers.choice.record_hardware(0, OURS)
-    answers.come(10)
+    answers.answer_probes(10)
     assert answers.choice.may_be_used(answers.second)
     answers.choice.record_hardware(1, THEIRS)
     for _ in range(5):
         answers.second.record_copy(answers.now)
-    answers.come(10)
+    answers.answer_probes(10)
     assert not answers.choice.may_be_used(answers.second)
     assert answers.second.is_doubted
     assert not answers.second.is_proven
@@ -208,11 +208,11 @@ def test_used_link_with_other_hardware_gets_nothing() -> None:
     """Our vehicle has gone; the one behind the second link sends its hardware id only then."""
     answers = Answers()
     answers.choice.record_hardware(0, OURS)
-    answers.come(10)
-    answers.come(10, 1)
+    answers.answer_probes(10)
+    answers.answer_probes(10, 1)
     assert answers.choice.used is answers.second
     answers.choice.record_hardware(1, THEIRS)
-    answers.come(2, 1)
+    answers.answer_probes(2, 1)
     assert not answers.choice.may_be_used(answers.second)
     answers.choice.record_heartbeat(0, answers.now, is_costly=False)
     assert answers.choice.choose(answers.now) == "another vehicle"
@@ -224,11 +224,11 @@ def test_hardware_may_change_after_reboot() -> None:
     answers = Answers()
     for link in (0, 1):
         answers.choice.record_hardware(link, OURS)
-    answers.come(10)
-    answers.come(1, ahead_s=0.0)
+    answers.answer_probes(10)
+    answers.answer_probes(1, ahead_s=0.0)
     for link in (0, 1):
         answers.choice.record_hardware(link, THEIRS)
-    answers.come(10, ahead_s=0.0)
+    answers.answer_probes(10, ahead_s=0.0)
     assert answers.choice.may_be_used(answers.second)
     assert not answers.second.is_doubted
 

@@ -60,7 +60,7 @@ async def test_addresses_that_open_something_new_may_repeat() -> None:
         assert [connection.link.is_available(link) for link in range(3)] == [True, True, True]
 
 
-class NotYet(MemoryLink):
+class OpensLater(MemoryLink):
     """Cannot be opened for the first few times."""
 
     def __init__(self, failures: int) -> None:
@@ -77,7 +77,7 @@ class NotYet(MemoryLink):
 @pytest.mark.parametrize("failures", [1, 4])
 async def test_failed_member_link_is_reported_once(failures: int, caplog: pytest.LogCaptureFixture) -> None:
     near, _far = memory_link_pair()
-    both: list[Link] = [near, NotYet(failures)]
+    both: list[Link] = [near, OpensLater(failures)]
     together = MultiLink([partial(both.__getitem__, index) for index in range(2)])
     with caplog.at_level(logging.WARNING, "aerokit"):
         async with open_connection(together) as connection:

@@ -175,10 +175,10 @@ async def test_allow_unsigned_decides() -> None:
 async def test_allow_unsigned_exception_refuses_only_the_frame(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    def mistaken(frame: Frame) -> bool:
+    def raises_error(frame: Frame) -> bool:
         raise ValueError(frame.system_id)
 
-    async with connected(radio_copter(signing_key=KEY), signing=Signing(KEY, allow_unsigned=mistaken)) as one:
+    async with connected(radio_copter(signing_key=KEY), signing=Signing(KEY, allow_unsigned=raises_error)) as one:
         connection = one.connection
         connection.bytes_received(FrameEncoder(77, 1).encode(Heartbeat(2, 3, 0, 0, 3, 3)), None)
         await anyio.sleep(2)
@@ -264,7 +264,7 @@ async def test_next_run_starts_with_stored_time_stamp() -> None:
 # ------------------------------------------------------------------------------------ the connection
 
 
-class Far:
+class FarLink:
     """The far end of a memory link: sends on demand, and records received data."""
 
     def __init__(self) -> None:
@@ -289,8 +289,8 @@ class Far:
 
 
 @asynccontextmanager
-async def with_far(**options: Any) -> AsyncIterator[tuple[Connection, Far]]:
-    far = Far()
+async def with_far(**options: Any) -> AsyncIterator[tuple[Connection, FarLink]]:
+    far = FarLink()
     await far.open()
     async with open_connection(far.link, **options) as connection:
         yield connection, far

@@ -130,7 +130,7 @@ def row_35_parameter_listeners(stage: Stage) -> Any:
 
 
 @scenario([("MINE", 1.5), ("MINE", 1.5), ("MINE", 2.5)])
-def parameters_told_by_the_program(stage: Stage) -> Any:
+def parameters_notified_by_the_program(stage: Stage) -> Any:
     notified: list[tuple[str, float]] = []
     parameters = stage.vehicle.parameters
     parameters.on_attribute(attr_name="mine")(lambda _, name, value: notified.append((name, value)))
@@ -148,7 +148,7 @@ def parameters_lost_on_the_way(stage: Stage) -> Any:
 
 
 @scenario(True)
-def parameters_are_told_when_complete(stage: Stage) -> Any:
+def parameters_are_notified_when_complete(stage: Stage) -> Any:
     return stage.vehicle.wait_ready("parameters", timeout=100) and len(stage.vehicle.parameters) == 3
 
 

@@ -185,13 +185,13 @@ def row_25_gimbal(stage: Stage) -> Any:
 )
 def row_26_version(stage: Stage) -> Any:
     stage.fc.flight_sw_version = 0x030302FF
-    stage.fc.tell_version(flight_sw_version=0x030302FF)
+    stage.fc.send_version(flight_sw_version=0x030302FF)
     stage.settle()
     vehicle = stage.vehicle
     stable = vehicle.version
     stage.fc.flight_sw_version = 0x030300D7
     events = stage.listen("autopilot_version", "version", "capabilities")
-    stage.fc.tell_version(flight_sw_version=0x030300D7)
+    stage.fc.send_version(flight_sw_version=0x030300D7)
     stage.settle()
     version, can = vehicle.version, vehicle.capabilities
     notified = [(name, value) for _, name, value in events][-1:]
@@ -287,7 +287,7 @@ def rangefinder(stage: Stage) -> Any:
 
 
 @scenario(["home_location", "home_location"], prepare=lambda fc: setattr(fc, "home", None))
-def home_is_told_each_time(stage: Stage) -> Any:
+def home_is_notified_each_time(stage: Stage) -> Any:
     events = stage.listen("home_location")
     for _ in range(2):
         stage.report("HOME_POSITION", latitude=-353632610, longitude=1491652300, altitude=584000)
@@ -317,7 +317,7 @@ def mount_orientation(stage: Stage) -> Any:
 
 
 @scenario([])
-def messages_that_tell_nothing(stage: Stage) -> Any:
+def messages_without_values(stage: Stage) -> Any:
     stage.settle()
     events = stage.listen("*")
     stage.fc.report("STATUSTEXT", severity=6, text=b"hello")

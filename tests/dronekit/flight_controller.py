@@ -28,7 +28,7 @@ SET_HOME = 179
 HOUSEKEEPING = (511, REQUEST_MESSAGE, REQUEST_VERSION, GET_HOME)
 """Commands that only request information; scenarios ignore them by default."""
 TEST_TIMEOUT_S = 100.0
-UNHEARD_S = 0.005
+SILENCE_S = 0.005
 """Seconds between heartbeats until a client answers, so that tests connect quickly."""
 
 Message = Any
@@ -175,12 +175,12 @@ class FlightController:
         """
         found: list[Received] = []
 
-        def has_come() -> bool:
+        def has_arrived() -> bool:
             found.extend(frame for frame in self._log[since:] if frame.name == name and predicate(frame))
             return bool(found)
 
         with self._came:
-            if not self._came.wait_for(has_come, timeout):
+            if not self._came.wait_for(has_arrived, timeout):
                 raise AssertionError(f"no such {name} in {timeout} s; came: {_brief(self._log[since:])}")
         return found[0]
 
@@ -255,7 +255,7 @@ class FlightController:
             for ready_socket in ready:
                 self._read(ready_socket)
             if self.heartbeat_s and time.monotonic() >= next_beat:
-                next_beat = time.monotonic() + (self.heartbeat_s if self._log else UNHEARD_S)
+                next_beat = time.monotonic() + (self.heartbeat_s if self._log else SILENCE_S)
                 self.beat()
 
     def _read(self, ready: socket.socket) -> None:
@@ -320,9 +320,9 @@ class FlightController:
             main, sub = int(frame.param2), int(frame.param3)
             self._change_mode(main << 16 | sub << 24 if self.autopilot == PX4 else main)
         elif frame.command == REQUEST_VERSION or (frame.command == REQUEST_MESSAGE and number == 148):
-            self.tell_version()
+            self.send_version()
         elif frame.command == GET_HOME or (frame.command == REQUEST_MESSAGE and number == 242):
-            return self._tell_home()
+            return self._send_home()
         elif frame.command == SET_HOME:
             self._set_home(frame)
         elif frame.command == REQUEST_MESSAGE:
@@ -333,7 +333,7 @@ class FlightController:
         self.custom_mode = custom_mode
         self.beat()
 
-    def tell_version(self, **fields: Any) -> None:
+    def send_version(self, **fields: Any) -> None:
         """Send AUTOPILOT_VERSION."""
         usual = {"capabilities": self.capabilities, "flight_sw_version": self.flight_sw_version}
         self.report("AUTOPILOT_VERSION", **{**usual, **fields})
@@ -342,9 +342,9 @@ class FlightController:
         scale = 1 if frame.name == "COMMAND_INT" else 1e7
         x, y, z = frame.params[4:]
         self.home = round(x * scale), round(y * scale), round(z * 1000)
-        self._tell_home()
+        self._send_home()
 
-    def _tell_home(self) -> int:
+    def _send_home(self) -> int:
         if self.home is None:
             return 4
         latitude, longitude, altitude = self.home

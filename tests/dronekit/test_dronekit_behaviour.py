@@ -77,7 +77,7 @@ def test_dronekit_itself_matches_reference() -> None:
 @pytest.mark.parametrize("version", [1, 2])
 def test_row_03_messages_target_the_vehicle(version: int) -> None:
     """Messages are not broadcast to other vehicles on the link."""
-    with on_stage(dronekit, {"version": version, "mode": 4}, prepare=_be_system_7) as stage:
+    with on_stage(dronekit, {"version": version, "mode": 4}, prepare=_use_system_7) as stage:
         vehicle, factory = stage.vehicle, stage.vehicle.message_factory
         place = dronekit.LocationGlobalRelative(-35.1, 149.2, 20)
         vehicle.mode = "LOITER"
@@ -107,7 +107,7 @@ def test_row_03_messages_target_the_vehicle(version: int) -> None:
         assert {orders[number] for number in (176, 400, 22, 178, 241, 246, 31010)} == {0}
 
 
-def _be_system_7(fc: FlightController) -> None:
+def _use_system_7(fc: FlightController) -> None:
     fc.source = (7, 1)
     fc.missions.items = [HOME]
     fc.capabilities &= ~(8192 if fc.version == 1 else 0)

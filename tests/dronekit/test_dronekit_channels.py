@@ -299,7 +299,7 @@ def released(fc: FlightController, since: int) -> list[tuple[int, ...]]:
     ]
 
 
-GIVEN_BACK = (0, IGNORED, 0, *(IGNORED,) * 5, 0, RELEASED, *(0,) * 8)
+RELEASED_OVERRIDES = (0, IGNORED, 0, *(IGNORED,) * 5, 0, RELEASED, *(0,) * 8)
 
 
 def test_overrides_are_released_on_close(stage: Stage, channels: Channels) -> None:
@@ -308,7 +308,7 @@ def test_overrides_are_released_on_close(stage: Stage, channels: Channels) -> No
     stage.reached()
     since = stage.fc.mark()
     stage.vehicle.close()
-    assert set(released(stage.fc, since)) == {GIVEN_BACK}
+    assert set(released(stage.fc, since)) == {RELEASED_OVERRIDES}
 
 
 def test_overrides_sent_by_send_mavlink_are_released_on_close(stage: Stage) -> None:
@@ -317,7 +317,7 @@ def test_overrides_sent_by_send_mavlink_are_released_on_close(stage: Stage) -> N
     stage.reached()
     since = stage.fc.mark()
     stage.vehicle.close()
-    assert set(released(stage.fc, since)) == {GIVEN_BACK}
+    assert set(released(stage.fc, since)) == {RELEASED_OVERRIDES}
 
 
 @pytest.mark.parametrize("has_overridden", [False, True], ids=["never", "given back before"])

@@ -42,7 +42,7 @@ def quaternion(pitch: float, roll: float, yaw: float) -> list[float]:
     ]
 
 
-def tell_device(
+def send_device_attitude(
     stage: Stage, pitch: float, roll: float, yaw: float, flags: int = IN_VEHICLE_FRAME, **fields: Any
 ) -> None:
     fields.setdefault("delta_yaw", NAN)
@@ -103,29 +103,29 @@ def test_mount_orientation_yaw_is_from_north(stage: Stage) -> None:
 
 def test_gimbal_device_yaw_is_from_north(stage: Stage) -> None:
     events = stage.listen("mount", "gimbal")
-    tell_device(stage, -45, 1, 10)
+    send_device_attitude(stage, -45, 1, 10)
     assert angles(stage) == (-45, 1, 10)  # the vehicle's heading is not known yet
     assert [name for _, name, _ in events] == ["mount", "gimbal"]
     stage.report("ATTITUDE", yaw=math.radians(-90))
-    tell_device(stage, -45, 1, 10)
+    send_device_attitude(stage, -45, 1, 10)
     assert angles(stage) == (-45, 1, 280)
-    tell_device(stage, -45, 1, 10, delta_yaw=math.radians(100))
+    send_device_attitude(stage, -45, 1, 10, delta_yaw=math.radians(100))
     assert angles(stage) == (-45, 1, 110)
-    tell_device(stage, -45, 1, 10, delta_yaw=0.0)  # as PX4 does for every gimbal
+    send_device_attitude(stage, -45, 1, 10, delta_yaw=0.0)  # as PX4 does for every gimbal
     assert angles(stage) == (-45, 1, 280)
-    tell_device(stage, -45, 1, 10, IN_EARTH_FRAME | YAW_LOCK)
+    send_device_attitude(stage, -45, 1, 10, IN_EARTH_FRAME | YAW_LOCK)
     assert angles(stage) == (-45, 1, 10)
-    tell_device(stage, -45, 1, -10, YAW_LOCK)
+    send_device_attitude(stage, -45, 1, -10, YAW_LOCK)
     assert angles(stage) == (-45, 1, 350)
-    tell_device(stage, -45, 1, -10, 0, delta_yaw=1.0)
+    send_device_attitude(stage, -45, 1, -10, 0, delta_yaw=1.0)
     assert angles(stage) == (-45, 1, 260)
 
 
 @pytest.mark.parametrize("yaw", [0, 30, -170])
 def test_rotate_straight_down(stage: Stage, yaw: float) -> None:
-    tell_device(stage, -90, 0, yaw, IN_EARTH_FRAME)
+    send_device_attitude(stage, -90, 0, yaw, IN_EARTH_FRAME)
     assert angles(stage) == (-90, 0, yaw % 360)
-    tell_device(stage, 90, 0, yaw, IN_EARTH_FRAME)
+    send_device_attitude(stage, 90, 0, yaw, IN_EARTH_FRAME)
     assert angles(stage) == (90, 0, yaw % 360)
 
 
@@ -137,12 +137,12 @@ def test_gimbal_with_unknown_angles_is_none(stage: Stage) -> None:
 
 
 def test_gimbal_is_the_first_of_several(stage: Stage) -> None:
-    tell_device(stage, -20, 0, 0, IN_EARTH_FRAME, gimbal_device_id=2)
-    tell_device(stage, -10, 0, 0, IN_EARTH_FRAME, gimbal_device_id=1)
-    tell_device(stage, -20, 0, 0, IN_EARTH_FRAME, gimbal_device_id=2)
-    tell_device(stage, -30, 0, 0, IN_EARTH_FRAME, source=(1, 154))
+    send_device_attitude(stage, -20, 0, 0, IN_EARTH_FRAME, gimbal_device_id=2)
+    send_device_attitude(stage, -10, 0, 0, IN_EARTH_FRAME, gimbal_device_id=1)
+    send_device_attitude(stage, -20, 0, 0, IN_EARTH_FRAME, gimbal_device_id=2)
+    send_device_attitude(stage, -30, 0, 0, IN_EARTH_FRAME, source=(1, 154))
     stage.report("MOUNT_ORIENTATION", pitch=-40, yaw_absolute=90)
-    tell_device(stage, -50, 0, 0, IN_EARTH_FRAME, source=(2, 1))
+    send_device_attitude(stage, -50, 0, 0, IN_EARTH_FRAME, source=(2, 1))
     assert angles(stage) == (-10, 0, 0)
 
 

@@ -26,7 +26,7 @@ def thread() -> Iterator[ListenerThread]:
     listener_thread.join()
 
 
-def emptied(thread: ListenerThread) -> None:
+def wait_until_empty(thread: ListenerThread) -> None:
     """Everything posted so far has been called."""
     done = threading.Event()
     thread.post(done.set)
@@ -36,7 +36,7 @@ def emptied(thread: ListenerThread) -> None:
 def notified(observed: HasObservers, thread: ListenerThread, *values: Any, name: str = "x", **more: Any) -> None:
     for value in values:
         observed._dk_listeners.notify(name, value, **more)
-    emptied(thread)
+    wait_until_empty(thread)
 
 
 def test_listener_thread_starts_with_first_call_and_keeps_order() -> None:
@@ -45,7 +45,7 @@ def test_listener_thread_starts_with_first_call_and_keeps_order() -> None:
     observed: list[int] = []
     for number in range(100):
         thread.post(observed.append, number)
-    emptied(thread)
+    wait_until_empty(thread)
     assert observed == list(range(100))
     thread.stop()
     thread.join()
@@ -59,7 +59,7 @@ def test_listener_thread_logs_exception_and_continues(thread: ListenerThread, ca
         raise SystemExit(3)
 
     thread.post(fail)
-    emptied(thread)
+    wait_until_empty(thread)
     assert "Exception in a callback" in caplog.text
 
 
@@ -91,17 +91,17 @@ def test_queue_behind_blocked_listener_is_bounded(
     may_go_on, observed = threading.Event(), list[object]()
     is_stuck = threading.Event()
 
-    def be_stuck() -> None:
+    def block_thread() -> None:
         is_stuck.set()
         may_go_on.wait(LIMIT_S)
 
-    thread.post(be_stuck)
+    thread.post(block_thread)
     assert is_stuck.wait(LIMIT_S)
     for number in range(20):
         thread.offer(observed.append, number)
     thread.post(observed.append, "state")
     may_go_on.set()
-    emptied(thread)
+    wait_until_empty(thread)
     assert observed[-1] == "state"
     assert observed[:-1] == list(range(len(observed) - 1))
     assert len(observed) == 6
@@ -249,7 +249,7 @@ def test_blocked_listener_does_not_block_notify(thread: ListenerThread) -> None:
         observed._dk_listeners.notify("x", number)
     assert not results
     may_go_on.set()
-    emptied(thread)
+    wait_until_empty(thread)
     assert results == list(range(10))
 
 

@@ -157,7 +157,7 @@ def test_lost_orders_are_repeated(copter: Stage) -> None:
 # -------------------------------------------------------------------------------- connecting
 
 
-def tell_streams(fc: FlightController) -> None:
+def send_streams(fc: FlightController) -> None:
     for name in ("ATTITUDE", "GLOBAL_POSITION_INT", "VFR_HUD", "GPS_RAW_INT", "SYS_STATUS"):
         fc.report(name)
 
@@ -197,7 +197,7 @@ def test_connect_vehicle_without_parameters_returns() -> None:
 @pytest.mark.parametrize("names", ["mode", ["mode", "armed"], ("attitude",)])
 def test_connect_wait_ready_accepts_names(names: Any) -> None:
     def prepare(fc: FlightController) -> None:
-        fc.answers["REQUEST_DATA_STREAM"] = lambda _: tell_streams(fc)
+        fc.answers["REQUEST_DATA_STREAM"] = lambda _: send_streams(fc)
 
     with on_stage(dronekit, {}, {"rate": 4, "wait_ready": names, "timeout": 10}, prepare) as stage:
         assert stage.vehicle.wait_ready(*([names] if isinstance(names, str) else names), timeout=1)
@@ -246,7 +246,7 @@ def test_subclass_with_own_attributes() -> None:
 
 def test_initialize_later() -> None:
     with FlightController(mode=5) as fc:
-        fc.answers["REQUEST_DATA_STREAM"] = lambda _: tell_streams(fc)
+        fc.answers["REQUEST_DATA_STREAM"] = lambda _: send_streams(fc)
         vehicle = dronekit.connect(fc.address, _initialize=False)
         assert (vehicle.armed, vehicle.is_armable, vehicle.system_status) == (False, False, None)
         vehicle.initialize(rate=7, heartbeat_timeout=100)
@@ -260,7 +260,7 @@ def test_initialize_later() -> None:
 
 def test_lost_link_reconnects() -> None:
     def prepare(fc: FlightController) -> None:
-        fc.answers["REQUEST_DATA_STREAM"] = lambda _: tell_streams(fc)
+        fc.answers["REQUEST_DATA_STREAM"] = lambda _: send_streams(fc)
 
     with on_stage(dronekit, {"link": "tcp", "mode": 4}, {"rate": 4}, prepare) as stage:
         streams = len(stage.fc.received("REQUEST_DATA_STREAM"))

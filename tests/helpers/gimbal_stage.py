@@ -37,7 +37,7 @@ async def mounted() -> AsyncIterator[Flight]:
 
 
 @asynccontextmanager
-async def beside(*gimbals: SimulatedGimbal, copter: SimulatedCopter | None = None) -> AsyncIterator[Flight]:
+async def with_gimbals(*gimbals: SimulatedGimbal, copter: SimulatedCopter | None = None) -> AsyncIterator[Flight]:
     """A copter on the ground with gimbals that have their own ids and managers, which it has discovered."""
     copter = copter or SimulatedCopter(boot_time_s=0.0, components=gimbals)
     async with open_flight(copter) as flight:
@@ -66,6 +66,6 @@ def configured(flight: Flight | Px4Flight) -> list[tuple[float, ...]]:
     return [(message.param1, message.param2, message.param3, message.param4, message.param7) for message in sent]
 
 
-def us(flight: Flight) -> tuple[int, int]:
+def own_ids(flight: Flight) -> tuple[int, int]:
     connection = flight.vehicle.connection
     return connection.source_system, connection.source_component

@@ -190,7 +190,7 @@ async def test_keys_are_not_forwarded() -> None:
 
 
 @asynccontextmanager
-async def beside_a_slow_one() -> AsyncIterator[tuple[Hub, SlowLink, Program, Program, list[HubEvent]]]:
+async def with_slow_link() -> AsyncIterator[tuple[Hub, SlowLink, Program, Program, list[HubEvent]]]:
     """A hub with a slow link, a vehicle and a station."""
     slow, copter, station = SlowLink(), Program(2, 1), Program(255, 190)
     async with (
@@ -209,7 +209,7 @@ async def beside_a_slow_one() -> AsyncIterator[tuple[Hub, SlowLink, Program, Pro
 
 @virtual
 async def test_slow_link_gets_newest_telemetry_and_whole_transfer() -> None:
-    async with beside_a_slow_one() as (hub, slow, copter, station, _):
+    async with with_slow_link() as (hub, slow, copter, station, _):
         for number in range(50):
             copter.send(ATTITUDE, COPTER, ParamValue(f"P{number}", 1.0, 9, 50, number))
             await anyio.sleep(0.02)
@@ -230,7 +230,7 @@ async def test_slow_link_gets_newest_telemetry_and_whole_transfer() -> None:
 
 @virtual
 async def test_late_order_is_dropped_and_reported() -> None:
-    async with beside_a_slow_one() as (hub, slow, _, station, events):
+    async with with_slow_link() as (hub, slow, _, station, events):
         station.send(ORDER, ParamRequestList(1, 1))
         await anyio.sleep(0.9)
         station.send(ORDER)
@@ -246,7 +246,7 @@ async def test_late_order_is_dropped_and_reported() -> None:
 
 @virtual
 async def test_stalled_link_does_not_fill_the_memory() -> None:
-    async with beside_a_slow_one() as (hub, slow, copter, station, _):
+    async with with_slow_link() as (hub, slow, copter, station, _):
         for number in range(2000):
             copter.send(Statustext(6, f"{number:050}"))
             if number % 100 == 0:
@@ -261,7 +261,7 @@ async def test_stalled_link_does_not_fill_the_memory() -> None:
 
 @virtual
 async def test_link_events_are_reported() -> None:
-    async with beside_a_slow_one() as (hub, slow, copter, station, events):
+    async with with_slow_link() as (hub, slow, copter, station, events):
         slow.receiver.link_stalled(77)
         slow.receiver.link_drained(2.5)
         station.send(ORDER)
@@ -394,7 +394,7 @@ async def test_endpoint_exception_does_not_affect_others(monkeypatch: pytest.Mon
         assert station.received == ["HEARTBEAT"]
 
 
-class Phoenix:
+class ReopenableLinks:
     """Links of one address: the far end of the present one, and whether another can be opened."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -404,13 +404,13 @@ class Phoenix:
 
     def make(self, *_: object, **__: object) -> Link:
         near, far = memory_link_pair()
-        return Later(near, far, self)
+        return AttachedLater(near, far, self)
 
 
-class Later(SlowLink):
+class AttachedLater(SlowLink):
     """Stands for ``near`` where that can be opened."""
 
-    def __init__(self, near: MemoryLink, far: MemoryLink, phoenix: Phoenix) -> None:
+    def __init__(self, near: MemoryLink, far: MemoryLink, phoenix: ReopenableLinks) -> None:
         super().__init__()
         self._near, self._far, self._phoenix = near, far, phoenix
 
@@ -429,7 +429,7 @@ class Later(SlowLink):
 
 @virtual
 async def test_lost_link_is_reopened(monkeypatch: pytest.MonkeyPatch) -> None:
-    links, copter = Phoenix(monkeypatch), Program(1, 1)
+    links, copter = ReopenableLinks(monkeypatch), Program(1, 1)
     async with copter, Hub([copter.endpoint("a"), Endpoint("tcp:127.0.0.1:5760", name="b")]) as hub:
         events: list[HubEvent] = []
         hub.on_event(events.append)
@@ -455,7 +455,7 @@ async def test_lost_link_is_reopened(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @virtual
 async def test_endpoint_with_retry_open_may_open_later(monkeypatch: pytest.MonkeyPatch) -> None:
-    links, copter = Phoenix(monkeypatch), Program(1, 1)
+    links, copter = ReopenableLinks(monkeypatch), Program(1, 1)
     links.can_be_opened = False
     with pytest.raises(LinkOpenError, match="not there"):
         await Hub(["tcp:127.0.0.1:5760"]).__aenter__()
@@ -476,7 +476,7 @@ async def test_endpoint_with_retry_open_may_open_later(monkeypatch: pytest.Monke
 
 @virtual
 async def test_removed_endpoint_with_retry_open_is_not_opened(monkeypatch: pytest.MonkeyPatch) -> None:
-    links = Phoenix(monkeypatch)
+    links = ReopenableLinks(monkeypatch)
     links.can_be_opened = False
     async with Hub([Endpoint("tcp:127.0.0.1:5760", name="b", retry_open=True)]) as hub:
         await anyio.sleep(1)
@@ -510,7 +510,7 @@ async def test_link_with_one_named_peer() -> None:
         assert of(hub, "a").peers == 1
 
 
-class Crowded(SlowLink):
+class ManyPeersLink(SlowLink):
     """A link with any number of peers."""
 
     forgotten: int = 0
@@ -524,7 +524,7 @@ class Crowded(SlowLink):
 
 @virtual
 async def test_many_peers_are_bounded_and_silent_ones_evicted() -> None:
-    link, station = Crowded(), Program(255, 190)
+    link, station = ManyPeersLink(), Program(255, 190)
     async with station, Hub([Endpoint(link, name="a"), station.endpoint("b")]) as hub:
         receive, copter = link.receiver.bytes_received, Program(1, 1)
         for number in range(600):
@@ -543,7 +543,7 @@ async def test_many_peers_are_bounded_and_silent_ones_evicted() -> None:
 
 @virtual
 async def test_failed_open_closes_all_endpoints(monkeypatch: pytest.MonkeyPatch) -> None:
-    links, copter = Phoenix(monkeypatch), Program(1, 1)
+    links, copter = ReopenableLinks(monkeypatch), Program(1, 1)
     links.can_be_opened = False
     async with copter:
         hub = Hub([copter.endpoint("a"), "tcp:127.0.0.1:5760"])

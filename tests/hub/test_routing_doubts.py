@@ -11,7 +11,7 @@ from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.messages import Attitude, Heartbeat, ParamRequestList
 
 
-def a_camera_of_another_age() -> Stage:
+def vehicle_and_camera() -> Stage:
     """Vehicle and camera are received at ports a and b, in a different order."""
     stage = Stage()
     stage.receive("a", COPTER)
@@ -24,7 +24,7 @@ def a_camera_of_another_age() -> Stage:
 
 
 def test_system_message_goes_to_its_autopilot_once() -> None:
-    stage = a_camera_of_another_age()
+    stage = vehicle_and_camera()
     assert stage.receive("c", order(1, 0), 255, 190) == {"a"}
     assert stage.receive("c", order(1, 1), 255, 190) == {"a"}
     assert stage.receive("c", order(1, 100), 255, 190) == {"b"}
@@ -71,7 +71,7 @@ def test_returning_port_is_used_again() -> None:
 
 
 def test_broadcast_order_reaches_a_vehicle_once() -> None:
-    stage = a_camera_of_another_age()
+    stage = vehicle_and_camera()
     assert stage.receive("c", order(0, 0), 255, 190) == {"a", "d"}
     assert stage.receive("c", ParamRequestList(0, 0), 255, 190) == {"a", "b", "d"}, "it orders nothing"
     assert stage.receive("c", STATION, 255, 190) == {"a", "b", "d"}

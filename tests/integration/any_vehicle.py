@@ -82,7 +82,7 @@ def served(choice: Choice) -> AbstractAsyncContextManager[str | Link]:
     """The vehicle runs; gives what to connect to."""
     if choice.vehicle == "sim":
         return _simulated(choice)
-    return _binary(choice) if choice.is_binary else _given(choice.vehicle)
+    return _binary(choice) if choice.is_binary else _as_given(choice.vehicle)
 
 
 @asynccontextmanager
@@ -102,7 +102,7 @@ async def served_on_two(choice: Choice) -> AsyncIterator[list[Link]]:
 
 
 @asynccontextmanager
-async def _given(address: str) -> AsyncIterator[str]:
+async def _as_given(address: str) -> AsyncIterator[str]:
     yield address
 
 

@@ -214,7 +214,7 @@ class _Runner:
         await self._rest()
         vehicle = self.vehicle
         landed = vehicle.landed_state.latest == ON_GROUND
-        return Step(str(call), result, vehicle.mode.value.name, vehicle.is_armed, landed, self._said())
+        return Step(str(call), result, vehicle.mode.value.name, vehicle.is_armed, landed, self._texts_without_numbers())
 
     async def _result_of(self, call: Call) -> str:
         try:
@@ -244,7 +244,7 @@ class _Runner:
             await wait(self._scale)
         await wait(QUIET_S * self._scale)
 
-    def _said(self) -> tuple[str, ...]:
+    def _texts_without_numbers(self) -> tuple[str, ...]:
         texts = (re.sub(r"-?\d+(\.\d+)?", "#", text.strip()) for text in self._texts if not NOT_COMPARED.match(text))
         return tuple(sorted(set(texts)))
 

@@ -26,7 +26,7 @@ def anyio_backend(choice: Choice) -> Any:
 
 
 @pytest.fixture(autouse=True)
-def _not_on_somebodys_vehicle(choice: Choice) -> None:
+def _skip_on_real_vehicle(choice: Choice) -> None:
     if choice.vehicle != "sim" and not Path(choice.vehicle).is_file():
         pytest.skip("a test that ends too soon would leave its key there")
 

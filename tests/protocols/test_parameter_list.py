@@ -226,7 +226,7 @@ class Growing(FakeVehicle):
             self.say(self.value(name, index), self.tick_s * (index // self.burst))
         begin = self.tick_s * (self.shown_at // self.burst + 1)
 
-        def go_on() -> None:
+        def continue_stream() -> None:
             rows = list(self.parameters.values())
             rows[self.place : self.place] = new
             count = len(rows)
@@ -242,7 +242,7 @@ class Growing(FakeVehicle):
                 self.say(message, self.tick_s * (place // self.burst))
 
         assert self.channel is not None
-        self.channel.at(self.channel.now + begin, go_on)
+        self.channel.at(self.channel.now + begin, continue_stream)
 
 
 @pytest.mark.parametrize("place", [80, 20])
@@ -261,9 +261,9 @@ class Px4Growing(FakeVehicle):
         names = list(self.parameters)
         for place, name in enumerate(names):
             assert self.channel is not None
-            self.channel.at(self.channel.now + self.tick_s * (place // 5), partial(self.say_now, name))
+            self.channel.at(self.channel.now + self.tick_s * (place // 5), partial(self.report_value, name))
 
-    def say_now(self, name: str) -> None:
+    def report_value(self, name: str) -> None:
         if name == "PARAM_0050" and "INSERTED" not in self.parameters:
             rows = list(self.parameters.values())
             rows.insert(10, Parameter("INSERTED", 1, ParameterType.INT32))

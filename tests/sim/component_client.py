@@ -29,7 +29,7 @@ class ComponentClient(Client):
         self.ask(component, MavCmd.REQUEST_MESSAGE, kind.ID, *params)
         return [message for _, message in self.received[first:] if isinstance(message, kind)]
 
-    def said_by(self, component: int, kind: type[M], *, system: int | None = None) -> list[M]:
+    def messages_from(self, component: int, kind: type[M], *, system: int | None = None) -> list[M]:
         wanted = (self.vehicle.system_id if system is None else system, component)
         return [message for message in self.all(kind) if source(message) == wanted]
 

@@ -34,9 +34,9 @@ def fitted(**options: object) -> tuple[SimulatedCamera, ComponentClient]:
 def test_camera_sends_its_own_heartbeat() -> None:
     _, client = fitted()
     client.run(3.0)
-    heartbeats = client.said_by(CAMERA, m.Heartbeat)
+    heartbeats = client.messages_from(CAMERA, m.Heartbeat)
     assert [heartbeat.type for heartbeat in heartbeats] == [MavType.CAMERA] * 3
-    assert len(client.said_by(1, m.Heartbeat)) == 3
+    assert len(client.messages_from(1, m.Heartbeat)) == 3
 
 
 def test_camera_information_is_sent_on_request() -> None:
@@ -261,7 +261,7 @@ def test_camera_with_its_own_system_id() -> None:
     camera = SimulatedCamera(100, system_id=42)
     _, client = copter_with(camera)
     client.run(2.0)
-    assert client.said_by(100, m.Heartbeat, system=42)
+    assert client.messages_from(100, m.Heartbeat, system=42)
     assert client.ask(100, START, 0, 0, 1) == []
     assert client.ask(100, START, 0, 0, 1, system=42) == DONE
 
@@ -276,8 +276,8 @@ def test_faults_apply_to_the_component_only() -> None:
     client.clear()
     assert client.ask(CAMERA, START, 0, 0, 1) == []
     client.run(3.0)
-    assert not client.said_by(CAMERA, m.Heartbeat)
-    assert client.said_by(1, m.Heartbeat)
+    assert not client.messages_from(CAMERA, m.Heartbeat)
+    assert client.messages_from(1, m.Heartbeat)
     camera.faults.silent = False
     camera.faults.drop_incoming = 1
     assert client.ask(CAMERA, START, 0, 0, 1) == []
@@ -296,7 +296,7 @@ def test_reboot_ends_series_and_keeps_images() -> None:
     assert client.ask(CAMERA, START, 0, 0, 1) == DONE
     client.clear()
     client.run(2.05)
-    assert len(client.said_by(CAMERA, m.Heartbeat)) == 2
+    assert len(client.messages_from(CAMERA, m.Heartbeat)) == 2
 
 
 @pytest.mark.parametrize("make", [SimulatedPx4, SimulatedCopter])

@@ -40,7 +40,7 @@ def degrees(gimbal: SimulatedGimbal) -> list[float]:
 def test_information_is_sent_on_request() -> None:
     _, client = fitted(pitch_deg=(-80.0, 10.0))
     client.run(2.0)
-    assert client.said_by(GIMBAL, m.Heartbeat)[0].type == MavType.GIMBAL
+    assert client.messages_from(GIMBAL, m.Heartbeat)[0].type == MavType.GIMBAL
     (device,) = client.request(GIMBAL, m.GimbalDeviceInformation)
     (manager,) = client.request(GIMBAL, m.GimbalManagerInformation)
     assert manager.gimbal_device_id == GIMBAL

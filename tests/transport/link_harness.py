@@ -27,7 +27,7 @@ LOOPS: list[Any] = [
 ]
 
 
-def each_of(loops: list[Any]) -> Callable[[AsyncTest], AsyncTest]:
+def on_loops(loops: list[Any]) -> Callable[[AsyncTest], AsyncTest]:
     """A decorator that runs an async test on each of these loops."""
 
     def decorate(test: AsyncTest) -> AsyncTest:
@@ -36,7 +36,7 @@ def each_of(loops: list[Any]) -> Callable[[AsyncTest], AsyncTest]:
     return decorate
 
 
-each_loop = each_of(LOOPS)
+each_loop = on_loops(LOOPS)
 """Runs an async test on stock asyncio and on uvloop."""
 
 TRAFFIC: list[list[bytes]] = [

@@ -28,7 +28,7 @@ delays = st.one_of(st.floats(0, 0.5), st.floats(0, 20))
 holds = st.lists(st.tuples(st.floats(0, 12), st.floats(0, 10)), max_size=3)  # begins, lasts
 
 
-class World:
+class SimulatedNetwork:
     """A vehicle side that sends beacons, a client that sends continuously, and a network with arbitrary delays."""
 
     def __init__(
@@ -87,7 +87,7 @@ class World:
 def test_accepted_datagrams_are_at_most_two_seconds_old(
     vehicle: tuple[float, float], client: tuple[float, float], delays: list[float]
 ) -> None:
-    world = World(vehicle, client, iter(delays))
+    world = SimulatedNetwork(vehicle, client, iter(delays))
     world.run(15)
     for sent, accepted in world.accepted:
         assert accepted - sent <= MAX_DELAY_S * 1.001
@@ -99,7 +99,7 @@ def test_accepted_datagrams_are_at_most_two_seconds_old(
 def test_datagrams_delayed_by_partition_are_refused(
     vehicle: tuple[float, float], client: tuple[float, float], delay: float, holds: Holds
 ) -> None:
-    world = World(vehicle, client, repeat(delay), holds)
+    world = SimulatedNetwork(vehicle, client, repeat(delay), holds)
     world.run(25)
     for sent, accepted in world.accepted:
         assert accepted - sent <= MAX_DELAY_S * 1.001
@@ -114,7 +114,7 @@ def test_working_network_accepts_everything(
     vehicle: tuple[float, float], client: tuple[float, float], delays: list[float]
 ) -> None:
     steady = max(delays)  # in order
-    world = World(vehicle, client, iter([steady] * 200))
+    world = SimulatedNetwork(vehicle, client, iter([steady] * 200))
     world.run(15)
     assert world.refused == []
     assert all(sent <= steady for sent in world.unsent)  # before the first beacon

@@ -26,7 +26,7 @@ COMMAND = messages.CommandLong(1, 1, 400, 0, *(0.0,) * 7)
 on_linux = pytest.mark.skipif(sys.platform != "linux", reason="only Linux reports unsent bytes")
 
 
-class Line:
+class ManualTransport:
     """A transport that takes ``room`` bytes and sends none of them until ``flow`` is called."""
 
     def __init__(self, room: int, limit: int = 100) -> None:
@@ -52,7 +52,7 @@ class Line:
 
 
 async def test_accepted_data_passes_at_once_without_timer() -> None:
-    line = Line(room=1000)
+    line = ManualTransport(room=1000)
     line.outbox.write(b"one")
     line.outbox.write(b"two")
     assert line.sent == [b"one", b"two"]
@@ -65,7 +65,7 @@ async def test_accepted_data_passes_at_once_without_timer() -> None:
 
 
 async def test_kept_data_leaves_whole_in_order_and_joined() -> None:
-    line = Line(room=1)
+    line = ManualTransport(room=1)
     for word in (b"a", b"bb", b"ccc"):
         line.outbox.write(word)
     assert (line.sent, line.outbox.unsent_bytes) == ([b"a"], 6)
@@ -74,7 +74,7 @@ async def test_kept_data_leaves_whole_in_order_and_joined() -> None:
 
 
 async def test_kept_data_is_limited() -> None:
-    line = Line(room=1, limit=100)
+    line = ManualTransport(room=1, limit=100)
     for _ in range(1000):
         line.outbox.write(bytes(30))
     assert line.outbox.unsent_bytes == 30 + 90
@@ -82,7 +82,7 @@ async def test_kept_data_is_limited() -> None:
 
 
 async def test_data_older_than_a_second_is_not_written() -> None:
-    line = Line(room=1)
+    line = ManualTransport(room=1)
     line.outbox.write(b"taken")
     line.outbox.write(b"too late")
     await anyio.sleep(WRITE_TIMEOUT_S - 0.1)
@@ -93,7 +93,7 @@ async def test_data_older_than_a_second_is_not_written() -> None:
 
 
 async def test_limit_of_a_second_is_exact() -> None:
-    line = Line(room=1)
+    line = ManualTransport(room=1)
     line.outbox.write(b"taken")
     line.outbox.write(b"too late")
     until = asyncio.get_running_loop().time() + WRITE_TIMEOUT_S
@@ -104,7 +104,7 @@ async def test_limit_of_a_second_is_exact() -> None:
 
 
 async def test_late_writes_are_dropped_without_another_write() -> None:
-    line = Line(room=1)
+    line = ManualTransport(room=1)
     line.outbox.write(b"taken")
     line.outbox.write(b"too late")
     await anyio.sleep(2)
@@ -113,7 +113,7 @@ async def test_late_writes_are_dropped_without_another_write() -> None:
 
 async def test_stall_is_reported_once_and_stops_forwarding() -> None:
     """The operating system would accept more, but accepted data cannot be recalled, so the link sends no more."""
-    line = Line(room=1000)
+    line = ManualTransport(room=1000)
     for _ in range(5):
         line.outbox.write(b"heartbeat")
         await anyio.sleep(0.9)
@@ -128,7 +128,7 @@ async def test_stall_is_reported_once_and_stops_forwarding() -> None:
 
 
 async def test_data_written_during_stall_leaves_afterwards() -> None:
-    line = Line(room=1000)
+    line = ManualTransport(room=1000)
     line.outbox.write(b"taken")
     await anyio.sleep(1.4)
     line.outbox.write(b"in time")
@@ -139,7 +139,7 @@ async def test_data_written_during_stall_leaves_afterwards() -> None:
 
 
 async def test_slow_link_is_not_stalled() -> None:
-    line = Line(room=10_000)
+    line = ManualTransport(room=10_000)
     for _ in range(200):
         line.outbox.write(bytes(10))
         line.pending -= min(line.pending, 6)
@@ -148,7 +148,7 @@ async def test_slow_link_is_not_stalled() -> None:
 
 
 async def test_discarded_data_never_leaves() -> None:
-    line = Line(room=1)
+    line = ManualTransport(room=1)
     line.outbox.write(b"taken")
     line.outbox.write(b"order")
     line.outbox.discard()
@@ -158,7 +158,7 @@ async def test_discarded_data_never_leaves() -> None:
 
 
 async def test_discarding_is_no_progress() -> None:
-    line = Line(room=1000)
+    line = ManualTransport(room=1000)
     for _ in range(8):
         line.outbox.write(b"x" * 10)
         await anyio.sleep(0.2)
@@ -168,7 +168,7 @@ async def test_discarding_is_no_progress() -> None:
 
 
 async def test_closed_stalled_outbox_forwards_nothing() -> None:
-    line = Line(room=1)
+    line = ManualTransport(room=1)
     line.outbox.write(b"taken")
     await anyio.sleep(1.5)
     line.outbox.write(b"order")
@@ -178,7 +178,7 @@ async def test_closed_stalled_outbox_forwards_nothing() -> None:
 
 
 async def test_closed_outbox_forwards_data_in_time() -> None:
-    line = Line(room=1)
+    line = ManualTransport(room=1)
     line.outbox.write(b"taken")
     line.outbox.write(b"in time")
     line.outbox.close()

@@ -248,12 +248,12 @@ async def test_data_and_loss_before_open_returns() -> None:
 
 
 async def test_link_closed_in_interruption_callback_stays_closed() -> None:
-    class Leaving(InterruptionRecorder):
+    class ClosingRecorder(InterruptionRecorder):
         def link_interrupted(self, error: LinkLost) -> None:
             super().link_interrupted(error)
             link.close()
 
-    device, recorder = Device(), Leaving()
+    device, recorder = Device(), ClosingRecorder()
     link = ReconnectingLink(device.plug)
     await link.open(recorder)
     device.unplug(gone=False)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
-from link_harness import LOOPS, Recorder, each_loop, each_of, each_traffic, eventually
+from link_harness import LOOPS, Recorder, each_loop, each_traffic, eventually, on_loops
 
 from aerokit.errors import BusyError, ConnectionClosed, LinkOpenError
 from aerokit.transport import (
@@ -37,7 +37,7 @@ class LoopWithoutReaders(asyncio.SelectorEventLoop):
 WITHOUT_READERS = pytest.param(("asyncio", {"loop_factory": LoopWithoutReaders}), id="no add_reader")
 
 
-each_loop_and_the_fallback = each_of([*LOOPS, WITHOUT_READERS])
+each_loop_and_the_fallback = on_loops([*LOOPS, WITHOUT_READERS])
 
 
 @contextlib.contextmanager

@@ -314,7 +314,7 @@ async def test_router_restricts_reading_and_ordering(tmp_path: Path) -> None:
 # ------------------------------------------------------------------------------------ nothing is left
 
 
-def what_is_left() -> tuple[int, int]:
+def open_resources() -> tuple[int, int]:
     gc.collect()
     return threading.active_count(), len(os.listdir("/proc/self/fd"))
 
@@ -333,10 +333,10 @@ async def test_closed_links_leave_nothing() -> None:
         assert recorder.pieces == []  # no callback after close
 
     await once()
-    before = what_is_left()
+    before = open_resources()
     for _ in range(3):
         await once()
-    await eventually(lambda: what_is_left() <= (before[0] + 6, before[1]))  # threads of the loop's executor
+    await eventually(lambda: open_resources() <= (before[0] + 6, before[1]))  # threads of the loop's executor
 
 
 @pytest.mark.parametrize("after_s", [0, 0.001, 0.005, 0.02, 0.3])

@@ -58,17 +58,17 @@ async def test_corrupt_index_does_not_block_the_event_loop(when: int) -> None:
         camera = flight.vehicle.camera_at(1)
         given: list[int] = []
 
-        def lie() -> None:
+        def send_false_position() -> None:
             flight.wire.deliver(FrameEncoder(1, 1).encode(picture(FAR)))
 
         with anyio.fail_after(60):
             async with camera.photo_interval(1.0) as captures:
                 if when == 0:
-                    lie()
+                    send_false_position()
                 async for capture in captures:
                     given.append(capture.index)
                     if len(given) == when:
-                        lie()
+                        send_false_position()
                     if len(given) == 6:
                         break
         assert captures.missed == 0

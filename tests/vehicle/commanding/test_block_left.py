@@ -59,7 +59,7 @@ async def test_block_left_warns_only_with_active_order(
             await vehicle.arm()
             await vehicle.take_off(10.0)
 
-        async def left_after(*orders: Callable[[aerokit.Vehicle], Awaitable[object]]) -> str:
+        async def log_after(*orders: Callable[[aerokit.Vehicle], Awaitable[object]]) -> str:
             caplog.clear()
             with pytest.raises(ZeroDivisionError):
                 async with aerokit.connect(connection) as vehicle:
@@ -79,16 +79,16 @@ async def test_block_left_warns_only_with_active_order(
             assert vehicle.mode_name == "GUIDED"
             assert vehicle.taken_over == ""
 
-        assert "was left: " not in await left_after(lambda vehicle: vehicle.why_not_armable())
+        assert "was left: " not in await log_after(lambda vehicle: vehicle.why_not_armable())
         async with vehicles_on(connection) as vehicles:  # as `aerokit status` does it
             await anyio.sleep(2)
             assert list(vehicles) == [1]
         assert "was left: " not in caplog.text
-        assert "was left: in LOITER" in await left_after(lambda vehicle: vehicle.set_mode("LOITER"))
-        assert "was left: " not in await left_after(lambda vehicle: vehicle.set_mode("GUIDED"), pilot_takes)
-        assert "was left: in GUIDED" in await left_after(send_mode)
-        assert "was left: " not in await left_after(lambda vehicle: vehicle.set_speed(5.0))
-        assert "was left: " not in await left_after(send_mode, pilot_takes)
+        assert "was left: in LOITER" in await log_after(lambda vehicle: vehicle.set_mode("LOITER"))
+        assert "was left: " not in await log_after(lambda vehicle: vehicle.set_mode("GUIDED"), pilot_takes)
+        assert "was left: in GUIDED" in await log_after(send_mode)
+        assert "was left: " not in await log_after(lambda vehicle: vehicle.set_speed(5.0))
+        assert "was left: " not in await log_after(send_mode, pilot_takes)
 
 
 async def test_block_left_warns_program_that_armed(caplog: pytest.LogCaptureFixture) -> None:

@@ -40,7 +40,7 @@ BRAKE, GUIDED, LOITER = CopterMode.BRAKE, CopterMode.GUIDED, CopterMode.LOITER
 NORTH = VelocitySetpoint(north_m_s=3.0)
 
 
-async def stays_quiet(flight: Flight, seconds: float = 6.0) -> None:
+async def sends_nothing(flight: Flight, seconds: float = 6.0) -> None:
     """Assert that nothing more is sent and the vehicle stands still in its hold mode."""
     flight.wire.clear()
     await anyio.sleep(seconds)
@@ -175,7 +175,7 @@ async def test_block_left_normally_vehicle_holds(flying: Flight) -> None:
         await stream.fly(NORTH, 3.0)
     assert not stream.is_running
     assert flying.vehicle.mode_name == "BRAKE"
-    await stays_quiet(flying)
+    await sends_nothing(flying)
     assert speed_of(flying.copter) < 0.1
 
 
@@ -185,7 +185,7 @@ async def test_setpoint_stream_body_raises_holds(flying: Flight) -> None:
             await stream.fly(NORTH, 3.0)
             _ = 1 / 0
     assert flying.wire.mode_orders()[-1] == BRAKE  # It was sent before the exception left the block.
-    await stays_quiet(flying)
+    await sends_nothing(flying)
     assert flying.copter.mode.number == BRAKE
     assert speed_of(flying.copter) < 0.1
 
@@ -198,7 +198,7 @@ async def test_setpoint_stream_cancelled_holds(flying: Flight) -> None:
     with anyio.move_on_after(4.0):
         await fly_on()
     assert flying.wire.mode_orders()[-1] == BRAKE
-    await stays_quiet(flying)
+    await sends_nothing(flying)
     assert flying.copter.mode.number == BRAKE
 
 
@@ -212,7 +212,7 @@ async def test_setpoint_stream_cancelled_while_entering_holds() -> None:
         assert scope.cancelled_caught
         await anyio.sleep(3.0)
         assert flying.copter.mode.number == BRAKE
-        await stays_quiet(flying)
+        await sends_nothing(flying)
 
 
 async def test_program_cancelled_leaves_nothing() -> None:
@@ -235,7 +235,7 @@ async def test_setpoint_stream_not_fed_stops(flying: Flight) -> None:
             last = flying.wire.setpoints()[-1][0]
             assert fed_at + 0.8 <= last <= fed_at + 1.01
             assert flying.copter.mode.number == BRAKE
-    await stays_quiet(flying)
+    await sends_nothing(flying)
 
 
 async def test_setpoint_stream_stop_is_raised_once(flying: Flight) -> None:
@@ -243,7 +243,7 @@ async def test_setpoint_stream_stop_is_raised_once(flying: Flight) -> None:
         await anyio.sleep(2.0)
         with pytest.raises(SetpointStreamStopped, match="told to hold"):
             stream.set(NORTH)
-    await stays_quiet(flying)
+    await sends_nothing(flying)
 
 
 async def test_setpoint_stream_exit_by_exception_keeps_it(flying: Flight) -> None:
@@ -276,7 +276,7 @@ async def test_setpoint_stream_loop_blocked_stops(flying: Flight) -> None:
             assert not stream.is_running
             assert not flying.wire.setpoints()  # no stale one after the blockade
             assert flying.wire.mode_orders()[0] == BRAKE
-    await stays_quiet(flying)
+    await sends_nothing(flying)
     assert flying.copter.mode.number == BRAKE
 
 
@@ -298,7 +298,7 @@ async def test_setpoint_stream_pilot_takes_over_stops(flying: Flight) -> None:
             await anyio.sleep(1.0)
     assert "told to hold" not in str(caught.value)
     assert BRAKE not in flying.wire.mode_orders()
-    await stays_quiet(flying)
+    await sends_nothing(flying)
     assert flying.copter.mode.number == LOITER
 
 
@@ -322,7 +322,7 @@ async def test_land_ends_with_disarming(flying: Flight) -> None:
             await stream.fly(NORTH, 1.0)
             flying.copter.arming.disarm()
             await stream.fly(NORTH, 3.0)
-    await stays_quiet(flying)
+    await sends_nothing(flying)
 
 
 async def test_setpoint_stream_survives_disarm_and_arm(grounded: Flight) -> None:
@@ -333,7 +333,7 @@ async def test_setpoint_stream_survives_disarm_and_arm(grounded: Flight) -> None
             assert stream.is_running
             grounded.copter.arming.disarm()
             await stream.fly(VelocitySetpoint(), 3.0)
-    await stays_quiet(grounded)
+    await sends_nothing(grounded)
 
 
 async def test_setpoint_stream_connection_lost_raises(flying: Flight) -> None:
@@ -389,7 +389,7 @@ async def test_setpoint_stream_outside_block_or_reused_raises(flying: Flight) ->
     with pytest.raises(SetpointStreamStopped):
         async with stream:
             raise AssertionError("entered twice")
-    await stays_quiet(flying)
+    await sends_nothing(flying)
 
 
 BAD: list[Callable[[Any], object]] = [

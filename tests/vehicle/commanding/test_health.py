@@ -202,11 +202,11 @@ async def test_why_not_armable_unanswered_request_is_repeated(grounded: Flight) 
 async def test_why_not_armable_waits_for_status_texts(grounded: Flight) -> None:
     async with anyio.create_task_group() as tasks:
 
-        async def say_it_late() -> None:
+        async def report_late() -> None:
             await anyio.sleep(0.9)
             grounded.wire.deliver(FrameEncoder(1, 1).encode(Statustext(2, "PreArm: Gyros inconsistent")))
 
-        tasks.start_soon(say_it_late)
+        tasks.start_soon(report_late)
         assert await grounded.vehicle.why_not_armable() == ["PreArm: Gyros inconsistent"]
 
 

@@ -248,8 +248,8 @@ async def test_posted_mode_arm_take_off_without_waiting(grounded: Flight) -> Non
 
     started = now()
     async with anyio.create_task_group() as tasks:
-        for each_of in (mode, arm, take_off):
-            tasks.start_soon(each_of)
+        for action in (mode, arm, take_off):
+            tasks.start_soon(action)
     sent = [
         at for command in (SET_MODE, ARM, TAKEOFF) for at, message in wire.sent if message in wire.commands(command)
     ]

@@ -40,7 +40,7 @@ class Bench:
         kinds = (m.LogRequestList, m.LogRequestData, m.LogRequestEnd, m.LogErase, m.FileTransferProtocol)
         return sum(len(self.wire.all(kind)) for kind in kinds)
 
-    async def all_quiet(self) -> None:
+    async def wait_idle(self) -> None:
         for _ in range(100):
             if not self.server.is_busy and not self.simulated.ftp.open_sessions:
                 return
@@ -84,7 +84,7 @@ async def test_read_by_messages_and_mavftp(bench: Bench) -> None:
         for method in ("auto", "log"):
             assert await bench.logs.read(entry, method=method) == bench.content(number)
         assert await bench.logs.read(entry.id) == bench.content(number)
-    await bench.all_quiet()
+    await bench.wait_idle()
 
 
 async def test_read_by_mavftp(ardupilot: Bench) -> None:
@@ -118,7 +118,7 @@ async def test_download_resumes(bench: Bench, tmp_path: Path) -> None:
 
     with anyio.CancelScope() as scope:
         await bench.logs.download(entry, to, method="log", on_progress=stop)
-    await bench.all_quiet()
+    await bench.wait_idle()
     (part,) = names_in(tmp_path)
     assert part.startswith("flight.bin.log")
     reported: list[TransferProgress] = []
@@ -171,7 +171,7 @@ async def test_growing_log_is_read_to_its_current_end(
         texts = [record.getMessage() for record in caplog.records]
         assert f"log {entry.id} was still being written: listed with {entry.size} byt" in texts[0]
         assert f"downloaded with {len(content)}" in texts[0]
-        await bench.all_quiet()
+        await bench.wait_idle()
 
 
 async def test_complete_log_is_not_reported_as_growing(ardupilot: Bench, caplog: pytest.LogCaptureFixture) -> None:
@@ -256,7 +256,7 @@ async def test_cancellation_at_any_time_ends_the_transfer(bench: Bench) -> None:
     for milliseconds in range(0, 300, 37):
         with anyio.move_on_after(milliseconds / 1000):
             await bench.logs.read(entry, method="log")
-        await bench.all_quiet()
+        await bench.wait_idle()
     assert await bench.logs.read(entry, method="log") == bench.content(0)
 
 
@@ -265,7 +265,7 @@ async def test_timeout_limits_the_whole_call(bench: Bench) -> None:
     with pytest.raises(FileTimeout, match=r"not done within 0\.1 s") as raised:
         await bench.logs.read(entry, method="log", timeout=0.1)
     assert raised.value.missing
-    await bench.all_quiet()
+    await bench.wait_idle()
 
 
 async def test_log_path_identifies_files() -> None:

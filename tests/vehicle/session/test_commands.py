@@ -104,7 +104,7 @@ async def test_command_retries_increment_confirmation(grounded: Flight) -> None:
     assert 1.5 <= now() - started <= 3.1  # each time right after a heartbeat
 
 
-async def while_it_talks(flight: Flight, call: Awaitable[object]) -> None:
+async def with_text_during(flight: Flight, call: Awaitable[object]) -> None:
     """Await a call; half a second later the vehicle sends a status text."""
     loop = asyncio.get_running_loop()
     loop.call_later(0.5, flight.copter.send_text, 4, "Terrain data missing")
@@ -115,7 +115,7 @@ async def test_command_timeout_lists_link_state(grounded: Flight) -> None:
     grounded.copter.faults.ignore(BANNER)
     started = now()
     with pytest.raises(CommandTimeout) as caught:
-        await while_it_talks(grounded, grounded.vehicle.command(BANNER, retries=2, attempt_timeout=1.0))
+        await with_text_during(grounded, grounded.vehicle.command(BANNER, retries=2, attempt_timeout=1.0))
     assert now() - started == pytest.approx(3.0, abs=0.6)
     text = str(caught.value)
     assert "no COMMAND_ACK for MAV_CMD_DO_SEND_BANNER, sent 3 times within" in text

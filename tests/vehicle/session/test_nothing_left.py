@@ -158,7 +158,7 @@ def tasks() -> int:
     return len(asyncio.all_tasks())
 
 
-async def nothing_is_left_of(steps: list[tuple[int, float | None]], airborne: bool, latency_s: float) -> None:
+async def nothing_remains_of(steps: list[tuple[int, float | None]], airborne: bool, latency_s: float) -> None:
     alone = tasks()
     opened = in_the_air if airborne else open_flight
     async with opened(latency_s=latency_s) as flight:
@@ -185,7 +185,7 @@ async def nothing_is_left_of(steps: list[tuple[int, float | None]], airborne: bo
 def test_any_sequence_with_any_cancellation(
     steps: list[tuple[int, float | None]], airborne: bool, latency_s: float
 ) -> None:
-    run_virtual(nothing_is_left_of(steps, airborne, latency_s))
+    run_virtual(nothing_remains_of(steps, airborne, latency_s))
 
 
 @given(leave_after=st.floats(0.0, 12.0), how=st.sampled_from(["cancel", "raise", "return", "unplug"]))

@@ -96,11 +96,11 @@ async def test_equal_commands_to_two_vehicles_are_concurrent() -> None:
         both.first.faults.ignore(MavCmd.DO_SEND_BANNER)
         async with anyio.create_task_group() as tasks:
 
-            async def in_vain() -> None:
+            async def command_without_answer() -> None:
                 with pytest.raises(CommandTimeout):
                     await both.one.command(MavCmd.DO_SEND_BANNER)
 
-            tasks.start_soon(in_vain)
+            tasks.start_soon(command_without_answer)
             await anyio.sleep(0.01)
             started = now()
             ack = await both.two.command(MavCmd.DO_SEND_BANNER)

@@ -34,13 +34,13 @@ async def test_twenty_unanswered_commands_delay_nothing_else(grounded: Flight) -
     for command in silent:
         grounded.copter.faults.ignore(command)
 
-    async def in_vain(command: int) -> None:
+    async def command_without_answer(command: int) -> None:
         with pytest.raises(CommandTimeout):
             await vehicle.command(command)
 
     async with anyio.create_task_group() as tasks:
         for command in silent:
-            tasks.start_soon(in_vain, command)
+            tasks.start_soon(command_without_answer, command)
         await anyio.sleep(0.5)
 
         started = now()
@@ -76,11 +76,11 @@ async def test_silent_vehicle_delays_only_its_own_calls() -> None:
         flight.copter.faults.silent = True
         async with anyio.create_task_group() as tasks:
 
-            async def in_vain() -> None:
+            async def command_without_answer() -> None:
                 with pytest.raises(CommandTimeout):
                     await flight.vehicle.arm()
 
-            tasks.start_soon(in_vain)
+            tasks.start_soon(command_without_answer)
             await anyio.sleep(2.0)
             started = now()
             assert flight.vehicle.position.value.latitude_deg < 0
