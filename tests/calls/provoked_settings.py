@@ -33,7 +33,7 @@ def _camera(*troubles: Callable[[SimulatedCamera], object]) -> Callable[[Stage],
 
     def before(stage: Stage) -> None:
         camera = camera_of(stage)
-        settings_of(stage)._clear_state()
+        settings_of(stage)._forget()
         for trouble in troubles:
             trouble(camera)
 
