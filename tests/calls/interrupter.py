@@ -47,7 +47,7 @@ class Interrupter:
             assert self._has_interrupted
         finally:
             self._at = 0
-        assert self._ended == self._begun, "the call has come back, and its task goes on"
+        assert self._ended == self._begun, "the call has returned, but its task still runs"
         return self._has_interrupted
 
     def _watching(self, run: Callable[..., Any]) -> Callable[..., Any]:

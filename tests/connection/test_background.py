@@ -85,7 +85,7 @@ async def test_task_may_cancel_all_tasks() -> None:
     assert len(background) == 0
 
 
-# ------------------------------------------------------------------------- what must not be cut short
+# -------------------------------------------------------------------------------------- shielded work
 
 
 async def test_run_shielded_finishes_despite_repeated_cancellation() -> None:

@@ -1,4 +1,4 @@
-"""A failed connect explains what was received and what was missing."""
+"""A failed connect lists the received and the missing messages."""
 
 from __future__ import annotations
 

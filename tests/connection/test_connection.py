@@ -61,7 +61,7 @@ async def far_end() -> AsyncIterator[tuple[MemoryLink, MemoryLink, ByteRecorder]
     far.close()
 
 
-# ------------------------------------------------------------------------------------ what goes out
+# ------------------------------------------------------------------------------------------ sending
 
 
 async def test_own_heartbeat_is_sent_at_1_hz_from_start() -> None:
@@ -139,7 +139,7 @@ async def test_message_with_field_out_of_range_is_not_sent() -> None:
         assert ear.data == before
 
 
-# --------------------------------------------------------------------------- what comes out of the block
+# ------------------------------------------------------------------------------- exceptions of the block
 
 
 class Mine(BaseException):
@@ -189,7 +189,7 @@ async def test_internal_error_ends_connection_without_exception_group(
         assert not vehicle.connection.is_open
 
 
-# ----------------------------------------------------------------------------------- how it ends
+# ---------------------------------------------------------------------------------------- ending
 
 
 async def test_close_is_idempotent_and_ends_waiters() -> None:
@@ -327,7 +327,7 @@ class SeveralPeers(MemoryLink):
         return [peer for sent_id, peer in self.sent if sent_id == message_id]
 
 
-# -------------------------------------------------------------------------- nothing is left behind
+# ------------------------------------------------------------------------------------------- leaks
 
 
 def scheduled_timers() -> list[asyncio.TimerHandle]:

@@ -49,7 +49,7 @@ async def vehicle(link: MemoryLink) -> AsyncIterator[Vehicle]:
         yield vehicle
 
 
-# ------------------------------------------------------------------ what comes out of the block
+# ---------------------------------------------------------------------- exceptions of the block
 
 
 @pytest.mark.parametrize(

@@ -126,7 +126,7 @@ async def cabled(copter: SimulatedCopter | None = None, **options: Any) -> Async
             link.close()
 
 
-# ------------------------------------------------------------------------------ a program goes on
+# ---------------------------------------------------------------------------- a program continues
 
 
 async def test_interruption_events() -> None:
@@ -289,7 +289,7 @@ async def test_recording_ends_despite_reconnect(tmp_path: Any) -> None:
             await vehicle.mode.wait_until(lambda _: False)
 
 
-# ------------------------------------------------------------------------------- nothing is left
+# ----------------------------------------------------------------------------------------- leaks
 
 
 class Interrupted:

@@ -88,7 +88,7 @@ def test_unproven_link_is_never_used(
             others = [
                 candidate for candidate in choice.candidates.values() if candidate is not before and candidate.is_proven
             ]
-            assert not any(other.is_alive(now) for other in others), "a living link was not taken"
+            assert not any(other.is_alive(now) for other in others), "a live link was not selected"
 
 
 @given(st.floats(0.2, 20.0), st.floats(-1e5, 1e5), st.lists(st.floats(0.0, 0.4), min_size=3, max_size=30))
@@ -224,7 +224,7 @@ def test_equal_bytes_same_link_or_later_are_not_copies() -> None:
     assert not copies.is_copy(frame_of(7, 4.0), 1)
     for number in range(130):
         assert not copies.is_copy(frame_of((8 + number) % 256, 4.1, number + 1), 0)
-    assert not copies.is_copy(frame_of(7, 4.2), 0), "its numbers have come round"
+    assert not copies.is_copy(frame_of(7, 4.2), 0), "its sequence numbers have wrapped around"
 
 
 def test_copies_are_bounded() -> None:

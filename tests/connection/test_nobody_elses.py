@@ -222,7 +222,7 @@ async def test_claims_are_bounded(link: PeerKeepingLink) -> None:
         assert len(routes._claims) <= MAX_CLAIMS
 
 
-# ------------------------------------------------------------------------- taking a place
+# ------------------------------------------------------------------------- taking a route
 
 
 async def test_foreign_host_cannot_take_route_after_silence(
@@ -346,7 +346,7 @@ async def test_signature_is_sufficient_after_silence(link: PeerKeepingLink) -> N
             assert not is_armed(vehicle)
 
 
-# -------------------------------------------------------------------- one peer, and disorder
+# ---------------------------------------------------------------- one peer, reordered frames
 
 
 async def test_overtaken_heartbeat_is_dropped(link: PeerKeepingLink) -> None:

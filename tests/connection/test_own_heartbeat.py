@@ -166,7 +166,7 @@ with aerokit.sync.connect(sys.argv[1], heartbeat=aerokit.OwnHeartbeat(fed_within
 
 
 def test_heartbeat_of_program_in_endless_loop_stops() -> None:
-    """With real sockets: the vehicle no longer receives a ground station."""
+    """The vehicle no longer receives a ground station; with real sockets."""
     copter = SimulatedCopter(boot_time_s=0.0)
     received: list[float] = []
     copter.on(m.Heartbeat, lambda beat, _: received.append(time.monotonic()) if beat.type == MavType.GCS else None)
@@ -179,7 +179,7 @@ def test_heartbeat_of_program_in_endless_loop_stops() -> None:
             program.stdout.readline()
             give_up_at = time.monotonic() + 200.0
             while not received or time.monotonic() - received[-1] < 4.0:
-                assert time.monotonic() < give_up_at, "heartbeats go on"
+                assert time.monotonic() < give_up_at, "heartbeats continue"
                 time.sleep(0.1)
             assert program.poll() is None
         finally:

@@ -156,7 +156,7 @@ async def test_wrongly_used_vehicle_is_ignored_once_known() -> None:
         assert not twins.theirs.is_armed
 
 
-# ------------------------------------------------------------------------- the choice, by itself
+# ------------------------------------------------------------------------------ LinkChoice alone
 
 
 class Answers:

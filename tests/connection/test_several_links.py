@@ -68,7 +68,7 @@ async def test_flight_continues_when_the_used_link_fails(vehicle: SimulatedVehic
             assert news.chosen == [(radios.links[1].address, "silent")]
             assert flying.position.age < 1.0
         assert flying.distance_to(there) < 3
-        assert connection.now() - cut_at > 3, "it was cut on the way"
+        assert connection.now() - cut_at > 3, "it was lost in transit"
         await flying.land()
         assert flying.heartbeat_age < 2
     assert [event for event in news.all if not isinstance(event, events.LinkSelected)] == []
@@ -106,9 +106,9 @@ async def test_shared_stream_is_delivered_once() -> None:
             came.clear()
             await anyio.sleep(20)
         times = [message.time_boot_ms for message in came]
-        assert len(set(times)) == len(times), "nothing came twice"
-        assert times == sorted(times), "nothing older came after something newer"
-        assert 0.65 < len(times) / 400 < 0.85, "three of four arrive by one of the two"
+        assert len(set(times)) == len(times), "no duplicates"
+        assert times == sorted(times), "in order"
+        assert 0.65 < len(times) / 400 < 0.85, "three of four arrive over at least one link"
 
 
 async def test_copies_leave_no_gap_when_one_radio_fails() -> None:
@@ -141,7 +141,7 @@ async def test_second_stream_of_the_vehicle_is_not_mixed_in() -> None:
             radios.cut(0)
             await anyio.sleep(10)
         assert times == sorted(times)
-        assert len(times) - len(set(times)) <= 1, "the vehicle begins its stream anew on the other link"
+        assert len(times) - len(set(times)) <= 1, "the vehicle restarts its stream on the other link"
 
 
 async def test_costly_link_is_used_only_while_other_fails() -> None:
@@ -163,7 +163,7 @@ async def test_costly_link_is_used_only_while_other_fails() -> None:
             received.messages.clear()
             await anyio.sleep(20)
             asked = [len([1 for index, _ in received.of(m.Timesync) if index == link]) for link in (0, 1)]
-            assert asked[0] < asked[1] / 5, "it is asked seldom"
+            assert asked[0] < asked[1] / 5, "requests are rare"
 
 
 async def test_better_link_is_preferred() -> None:
@@ -180,7 +180,7 @@ async def test_better_link_is_preferred() -> None:
             assert slow.loss_percent == pytest.approx(20, abs=15)
             assert good.round_trip_s is not None
             assert good.round_trip_s < 0.2
-            assert len(news.chosen) <= 1, "it is not changed again and again"
+            assert len(news.chosen) <= 1, "the link does not alternate"
 
 
 async def test_other_vehicle_with_same_id_is_never_accepted() -> None:
@@ -250,7 +250,7 @@ async def test_transfers_continue_over_the_next_link(vehicle: SimulatedVehicle) 
             tasks.start_soon(flying.mission.upload, Mission(items))
             await anyio.sleep(1.0)
             radios.cut(used)
-        assert connection.links.value[1 - used].used_for, "the other one is used"  # type: ignore[union-attr]
+        assert connection.links.value[1 - used].used_for, "the other link is used"  # type: ignore[union-attr]
         radios.mend(used)
         await anyio.sleep(5)
         used = 1 - used
@@ -280,7 +280,7 @@ async def test_unsent_data_of_a_stalled_link_is_discarded() -> None:
         assert [reason for _, reason in news.chosen] in (["stalled"], ["silent"])
         radios.links[used].drain()
         await anyio.sleep(3)
-        assert not copter.is_armed, "the order was taken back, and did not arrive late"
+        assert not copter.is_armed, "the order was discarded and did not arrive late"
 
 
 async def test_closed_link_is_left_and_all_closed_end_connection() -> None:

@@ -71,7 +71,7 @@ def test_dronekit_itself_matches_reference() -> None:
     assert observed == expected
 
 
-# ------------------------------------------------------- rows in which the result is another one
+# ------------------------------------------------------------------ rows with a different result
 
 
 @pytest.mark.parametrize("version", [1, 2])

@@ -68,7 +68,7 @@ def commands(stage: Stage, order: Any) -> list[tuple[int, tuple[float | None, ..
     return [params(frame) for frame in frames]
 
 
-# ----------------------------------------------------------------------------- where it points
+# --------------------------------------------------------------------------------- orientation
 
 
 def test_gimbal_angles_without_gimbal_are_none(stage: Stage) -> None:

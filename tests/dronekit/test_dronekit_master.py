@@ -306,7 +306,7 @@ def test_master_set_mode_uses_vehicle(connected: Connected) -> None:
 
 def test_recv_match_returns_messages_in_order(connected: Connected) -> None:
     master, vehicle = connected
-    assert master.recv_match(type="ATTITUDE") is None, "nothing was kept before the first question"
+    assert master.recv_match(type="ATTITUDE") is None, "no messages are stored before the first access"
     for number in range(3):
         vehicle.mav.attitude_send(number, 0, 0, 0, 0, 0, 0)
         vehicle.mav.mission_current_send(number)
@@ -336,7 +336,7 @@ def test_master_messages_has_last_of_every_type(connected: Connected) -> None:
     master, vehicle = connected
     timer = threading.Timer(0.05, vehicle.mav.raw_imu_send, range(10))
     timer.start()
-    assert master.messages["RAW_IMU"].zmag == 9, "the first look-ups wait"
+    assert master.messages["RAW_IMU"].zmag == 9, "only the first accesses wait"
     timer.join()
     vehicle.mav.raw_imu_send(*range(10, 20))
     until(lambda: bool(master.messages["RAW_IMU"].zmag == 19))

@@ -217,7 +217,7 @@ def test_send_mavlink_every_message_matches_pymavlink() -> None:
             message = decoded(raw)
             expected = packed(message, module)
             assert encoded(message) == expected
-            assert encoded(message_of(Frame.parse(raw))) == expected, "what was received can be sent on"
+            assert encoded(message_of(Frame.parse(raw))) == expected, "received messages can be forwarded"
             assert isinstance(from_pymavlink(message), STANDARD[message_id])
 
 

@@ -62,7 +62,7 @@ class _ScriptedExchange:
             if self.exchange.done:
                 break
             self._expire()
-        assert self.exchange.done, "it does not end"
+        assert self.exchange.done, "the exchange does not end"
         text = ""
         try:
             self.exchange.result()
@@ -72,12 +72,12 @@ class _ScriptedExchange:
 
     def _expire(self) -> None:
         deadline = self.exchange.deadline
-        assert deadline is not None, "it waits for nothing, and has not ended"
+        assert deadline is not None, "the exchange has no deadline and has not ended"
         self.now = max(self.now, deadline)
         self.exchange.expire(self.now)
         self._take()
         later = self.exchange.deadline
-        assert self.exchange.done or later is None or later > deadline, "it spins"
+        assert self.exchange.done or later is None or later > deadline, "the exchange repeats without progress"
 
     def _answer(self) -> None:
         kind = self.script.byte()

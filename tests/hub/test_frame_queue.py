@@ -56,7 +56,7 @@ def test_late_orders_are_dropped_and_returned() -> None:
     frames.put(held(b"first", MessageKind.ORDER, since=0.0), 0)
     frames.put(held(b"part", since=0.0), 0)
     frames.put(held(b"second", MessageKind.ORDER, since=0.5), 0)
-    assert ORDER_MAX_AGE_S == 1.0, "docs/hub.md and docs/reliability.md promise a second"
+    assert ORDER_MAX_AGE_S == 1.0, "docs/hub.md and docs/reliability.md promise one second"
     assert frames.expire(1.0) == []
     assert [(why, expired.raw) for why, expired in frames.expire(1.01)] == [("late", b"first")]
     assert taken(frames) == [b"part", b"second"]

@@ -186,7 +186,7 @@ async def test_keys_are_not_forwarded() -> None:
         assert of(hub, "b").dropped == {"secret": 1}
 
 
-# --------------------------------------------------------------------------- a link that does not take more
+# ---------------------------------------------------------------------------------------------- a full link
 
 
 @asynccontextmanager
@@ -215,7 +215,7 @@ async def test_slow_link_gets_newest_telemetry_and_whole_transfer() -> None:
             await anyio.sleep(0.02)
         await settle()
         assert slow.written == []
-        assert station.received.count("ATTITUDE") == 50, "the others do not wait"
+        assert station.received.count("ATTITUDE") == 50, "other endpoints do not wait"
         assert of(hub, "slow").waiting == 52
         slow.unsent = 0
         await anyio.sleep(0.05)
@@ -334,7 +334,7 @@ async def test_exhausted_key_stops_one_endpoint_only() -> None:
         assert "exhausted" in events[0].text
 
 
-# ------------------------------------------------------------------------------- coming and going
+# ------------------------------------------------------------------ adding and removing endpoints
 
 
 @virtual
@@ -506,7 +506,7 @@ async def test_link_with_one_named_peer() -> None:
         assert link.kept[-1] == ("10.0.0.7", 14550)
         station.send(ORDER)
         await settle()
-        assert link.names() == ["COMMAND_LONG"], "once, not to everybody and to it"
+        assert link.names() == ["COMMAND_LONG"], "once, not as a broadcast as well"
         assert of(hub, "a").peers == 1
 
 
@@ -637,7 +637,7 @@ async def test_recording_has_every_frame_once(tmp_path: Path) -> None:
         copter.send(COPTER)  # the same frame by another way
         await settle()
         assert of(hub, "a").dropped == {"duplicate": 1}
-        assert path.stat().st_size > 0, "it is flushed now and then"
+        assert path.stat().st_size > 0, "the file is flushed periodically"
     assert [raw[7] for _, raw in read_tlog(path)] == [0, 30, 0, 76, 0]
 
 

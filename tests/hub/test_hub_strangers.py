@@ -35,7 +35,7 @@ def anyio_backend() -> str:
     return "asyncio"
 
 
-# ---------------------------------------------------------------------- who speaks as the vehicle
+# ----------------------------------------------------------------- senders with the vehicle's ids
 
 
 @asynccontextmanager
@@ -223,7 +223,7 @@ async def test_stations_with_shared_ids_both_pass() -> None:
         assert copter.received == ["HEARTBEAT", "COMMAND_LONG"] * 2
 
 
-# ---------------------------------------------------------------------------- made-up senders
+# ----------------------------------------------------------------------------- forged senders
 
 
 @pytest.mark.parametrize("message", [COPTER, STATION, ATTITUDE], ids=lambda message: type(message).__name__)
@@ -245,7 +245,7 @@ def test_silent_sender_makes_room_in_a_full_table() -> None:
     stage = Stage()
     for number in range(MAX_ROUTES):
         stage.receive("b", COPTER, 2 + number % 250, 1 + number // 250)
-    assert stage.receive("a", COPTER) == set("bcd"), "passed on, but not remembered"
+    assert stage.receive("a", COPTER) == set("bcd"), "forwarded, but not recorded"
     assert stage.receive("c", order(1), 255, 190) == set()
     stage.now += PEER_TTL_S + 1
     stage.receive("a", COPTER)

@@ -104,7 +104,7 @@ def test_frames_do_not_circulate_on_any_slow_network(network: Network) -> None:
     network.run()  # which fails after 20,000 hops
 
 
-# --------------------------------------------------------------------- two radios are no circle
+# -------------------------------------------------------------------- two radios are not a loop
 
 
 def two_radios(stage: Stage, seconds: int, first: FrameEncoder, second: FrameEncoder, ports: str) -> set[str]:

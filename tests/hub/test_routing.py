@@ -278,7 +278,7 @@ class Network:
         while self.heap:
             self.now, _, hub, port, raw = heapq.heappop(self.heap)
             self.hops += 1
-            assert self.hops < 20_000, "frames go round and round"
+            assert self.hops < 20_000, "frames loop"
             for out in self.routers[hub].route(self.nodes[hub][port], Frame.parse(raw), self.now).outs:
                 if out == (-1, 0):
                     self.got[hub][raw] += 1

@@ -28,7 +28,7 @@ def test_system_message_goes_to_its_autopilot_once() -> None:
     assert stage.receive("c", order(1, 0), 255, 190) == {"a"}
     assert stage.receive("c", order(1, 1), 255, 190) == {"a"}
     assert stage.receive("c", order(1, 100), 255, 190) == {"b"}
-    assert len(stage.receive("c", order(1, 77), 255, 190)) == 1, "of a component that is not known"
+    assert len(stage.receive("c", order(1, 77), 255, 190)) == 1, "for an unknown component"
 
 
 def test_system_message_follows_a_moved_autopilot() -> None:
@@ -73,7 +73,7 @@ def test_returning_port_is_used_again() -> None:
 def test_broadcast_order_reaches_a_vehicle_once() -> None:
     stage = vehicle_and_camera()
     assert stage.receive("c", order(0, 0), 255, 190) == {"a", "d"}
-    assert stage.receive("c", ParamRequestList(0, 0), 255, 190) == {"a", "b", "d"}, "it orders nothing"
+    assert stage.receive("c", ParamRequestList(0, 0), 255, 190) == {"a", "b", "d"}, "it is not a command"
     assert stage.receive("c", STATION, 255, 190) == {"a", "b", "d"}
     stage.now += ROUTE_TIMEOUT_S + 1
     stage.receive("b", COPTER)
@@ -109,7 +109,7 @@ def test_first_order_after_port_removal_is_no_copy() -> None:
     stage = Stage()
     stage.receive("a", COPTER)
     assert stage.pass_on("c", FIRST_ORDER) == {"a"}
-    assert stage.pass_on("d", FIRST_ORDER) == set(), "by another way that was there"
+    assert stage.pass_on("d", FIRST_ORDER) == set(), "over another route that existed"
     stage.router.remove(stage.nodes.pop("c"))
     stage.now += 0.1
     assert stage.pass_on("d", FIRST_ORDER) == {"a"}
@@ -120,7 +120,7 @@ def test_first_order_at_same_port_later_is_no_copy() -> None:
     stage.receive("a", COPTER)
     assert stage.pass_on("c", FIRST_ORDER) == {"a"}
     stage.now += REPEAT_WINDOW_S / 2
-    assert stage.pass_on("c", FIRST_ORDER, is_late=True) == set(), "doubled on its way"
+    assert stage.pass_on("c", FIRST_ORDER, is_late=True) == set(), "duplicated by the network"
     stage.now += REPEAT_WINDOW_S
     assert stage.pass_on("c", FIRST_ORDER, is_late=True) == {"a"}
 

@@ -132,7 +132,7 @@ def test_station_flies_and_the_program_sees_it() -> None:
     run_virtual(run())
 
 
-# ------------------------------------------------------------------------- what goes where
+# ------------------------------------------------------------------------------ forwarding
 
 
 class Stage:

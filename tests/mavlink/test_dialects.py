@@ -148,7 +148,7 @@ def test_private_message_round_trip(private: Dialect) -> None:
     decoded = private.decode(frame)
     assert decoded == message
     assert decoded.received_frame is frame
-    assert Framer().receive(raw) == [], "the standard does not know it"
+    assert Framer().receive(raw) == [], "it is not in the standard"
 
 
 @pytest.mark.parametrize(
@@ -331,7 +331,7 @@ def test_extended_dialect_merges_enums(private: Dialect) -> None:
     both = STANDARD.extended_by(private)
     commands = both.enum("MAV_CMD")
     assert (commands.WINCH_DROP, commands.NAV_TAKEOFF) == (60_000, 22)
-    assert commands.DO_SET_RESUME_REPEAT_DIST == 215, "ArduPilot's, which the private dialect has not"
+    assert commands.DO_SET_RESUME_REPEAT_DIST == 215, "ArduPilot's message, which is not in the private dialect"
     assert commands is both.enum("MAV_CMD")
     assert both.enum("MAV_RESULT") is enums.MavResult, "nothing was added"
     assert both.enum("WINCH_FLAGS") is private.enum("WINCH_FLAGS")

@@ -130,7 +130,7 @@ class Channel:
         self._send()
         while not exchange.done:
             due = exchange.deadline
-            assert due is not None, "it waits for nothing, and has not ended"
+            assert due is not None, "the exchange has no deadline and has not ended"
             if self._events and self._events[0][0] <= due:
                 self.now, _, action = heapq.heappop(self._events)
                 action()
@@ -138,9 +138,11 @@ class Channel:
                 assert due >= self.now - 1e-9, "a deadline in the past"
                 self.now = due
                 exchange.expire(self.now)
-                assert exchange.done or exchange.deadline is None or exchange.deadline > due, "it spins"
+                assert exchange.done or exchange.deadline is None or exchange.deadline > due, (
+                    "the exchange repeats without progress"
+                )
             self._send()
-            assert self.now < limit_s, "it does not end"
+            assert self.now < limit_s, "the exchange does not end"
         return exchange.result()
 
     def kinds(self) -> Counter[str]:

@@ -210,7 +210,7 @@ def test_parameter_list_index_beyond_count_sends_nothing() -> None:
     assert len(channel.sent) < 100
 
 
-# ------------------------------------------------------------------- the count changes meanwhile
+# --------------------------------------------------------- the count changes during the download
 
 
 class Growing(FakeVehicle):

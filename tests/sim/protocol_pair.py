@@ -63,9 +63,9 @@ class Pair:
         exchange.start(self.now)
         self._send(exchange)
         while not exchange.done:
-            assert exchange.deadline is not None, "it waits for nothing, and has not ended"
+            assert exchange.deadline is not None, "the exchange has no deadline and has not ended"
             assert exchange.deadline >= self.now - 1e-9, "a deadline in the past"
-            assert self.now < end, "it does not end"
+            assert self.now < end, "the exchange does not end"
             self._next(exchange)
             self._send(exchange)
         return exchange.result()
@@ -86,7 +86,9 @@ class Pair:
         else:
             self.now = deadline
             exchange.expire(self.now)
-            assert exchange.done or exchange.deadline is None or exchange.deadline > deadline, "it spins"
+            assert exchange.done or exchange.deadline is None or exchange.deadline > deadline, (
+                "the exchange repeats without progress"
+            )
 
     def _next_due(self) -> float:
         arrival = self._arrivals[0][0] if self._arrivals else float("inf")

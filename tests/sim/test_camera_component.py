@@ -231,7 +231,7 @@ def test_message_intervals_apply_to_the_component() -> None:
     assert client.ask(CAMERA, interval, m.Attitude.ID, 500_000) == DENIED
 
 
-# ----------------------------------------------------------------------------------- several of them
+# ----------------------------------------------------------------------------------- several cameras
 
 
 def test_commands_are_handled_by_their_target() -> None:
@@ -367,7 +367,7 @@ def test_tracking_status_is_reported() -> None:
     assert status.tracking_status == 2
     assert client.ask(CAMERA, MavCmd.CAMERA_STOP_TRACKING) == DONE
     assert client.request(CAMERA, m.CameraTrackingImageStatus)[0].tracking_mode == 0
-    assert client.request(CAMERA, m.CameraTrackingGeoStatus) == [], "it looks to the horizon"
+    assert client.request(CAMERA, m.CameraTrackingGeoStatus) == [], "it points at the horizon"
 
 
 def test_thermal_camera_reports_its_range() -> None:

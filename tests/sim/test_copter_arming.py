@@ -19,7 +19,7 @@ def test_arming_in_guided_sends_text() -> None:
     assert client.all(m.HomePosition), "home moves to where it is armed"
     client.run(1.0)
     assert client.last(m.Heartbeat).base_mode & MavModeFlag.SAFETY_ARMED
-    assert client.command(ARM, 1) == MavResult.ACCEPTED, "twice is no error"
+    assert client.command(ARM, 1) == MavResult.ACCEPTED, "arming twice is accepted"
 
 
 def test_arming_refusal_text_follows_acknowledgement() -> None:
@@ -70,7 +70,7 @@ def test_arming_in_returning_modes_is_refused() -> None:
     set_mode(client, CopterMode.AUTO)
     assert client.command(ARM, 1) == MavResult.FAILED
     assert client.texts[-1] == "Arm: Mode requires mission"
-    assert client.command(ARM, 1, FORCE) == MavResult.ACCEPTED, "force passes over it"
+    assert client.command(ARM, 1, FORCE) == MavResult.ACCEPTED, "force overrides it"
 
 
 def test_raised_throttle_prevents_arming_in_stick_modes() -> None:

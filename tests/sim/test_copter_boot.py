@@ -158,7 +158,7 @@ def test_reboot_is_silent_and_resets_vehicle() -> None:
     assert client.received == []
     client.run(4.0)
     assert "ArduPilot Ready" in client.texts
-    assert client.all(m.Attitude) == [], "stream rates are forgotten"
+    assert client.all(m.Attitude) == [], "stream rates are reset"
     client.send(m.RequestDataStream(1, 1, MavDataStream.ALL, 4, 1))
     client.run(1.0)
     assert client.last(m.Attitude).time_boot_ms < 6000

@@ -187,7 +187,7 @@ def test_timesync_is_answered_and_ping_is_not() -> None:
     assert answer.ts1 == 123_456_789
     assert answer.tc1 == pytest.approx(copter.uptime * 1e9)
     client.send(m.Timesync(5, 6))
-    assert len(client.all(m.Timesync)) == 1, "an answer is not answered"
+    assert len(client.all(m.Timesync)) == 1, "an answer gets no reply"
     client.send(m.Ping(99, 7, 0, 0))
     assert client.all(m.Ping) == []
 
@@ -218,7 +218,7 @@ def test_parameter_can_be_read_and_set() -> None:
     echo = client.last(m.ParamValue)
     assert (echo.param_id, echo.param_value, echo.param_index) == ("WPNAV_SPEED", 525.0, 0xFFFF)
     client.send(m.ParamSet(1, 1, "DISARM_DELAY", 300.7, 2))
-    assert client.last(m.ParamValue).param_value == 127.0, "an INT8 holds no more"
+    assert client.last(m.ParamValue).param_value == 127.0, "the limit of an INT8"
 
 
 def test_unknown_parameter_gets_no_answer() -> None:

@@ -204,7 +204,7 @@ def test_origin_is_sent_once_on_each_link() -> None:
     px4.step(client.now + 5.0)
     kinds = [frame.message_id for frame in client.framer.receive(other.take_outbox(), client.now)]
     assert kinds.count(m.GpsGlobalOrigin.ID) == 1
-    assert interval(client, m.GpsGlobalOrigin.ID) == 1_000_000, "what it says all the same"
+    assert interval(client, m.GpsGlobalOrigin.ID) == 1_000_000, "messages that are always sent"
 
 
 def test_further_links_use_the_last_mode() -> None:
@@ -238,7 +238,7 @@ def test_message_interval_reports_as_the_firmware() -> None:
     client.command(MavCmd.SET_MESSAGE_INTERVAL, m.Attitude.ID, 0)
     assert interval(client, m.Attitude.ID) == 66_666, "the link's own rate, not the simulator's"
     client.command(MavCmd.REQUEST_MESSAGE, m.StorageInformation.ID)
-    assert interval(client, m.StorageInformation.ID) == 0, "what was asked for once"
+    assert interval(client, m.StorageInformation.ID) == 0, "requested once"
 
 
 REQUESTED = (

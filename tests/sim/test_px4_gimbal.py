@@ -68,10 +68,10 @@ def test_messages_are_streamed_and_sent_on_request(client: Client) -> None:
 def test_commands_without_control_are_denied(client: Client) -> None:
     assert client.command(POINT, -30, 0, NAN, NAN, LEVEL) == DENIED
     assert client.command(CONFIGURE, -2, -2, -1, -1) == ACCEPTED
-    assert gimbal(client).gimbal.in_control == (1, 1), "whoever asks is PX4 itself"
+    assert gimbal(client).gimbal.in_control == (1, 1), "PX4 itself sends the request"
     assert client.command(POINT, -30, 0, NAN, NAN, LEVEL) == DENIED
     assert client.command(CONFIGURE, -3, -3, -1, -1) == ACCEPTED
-    assert gimbal(client).gimbal.in_control == (1, 1), "what is not ours is not let go"
+    assert gimbal(client).gimbal.in_control == (1, 1), "control of another station is not released"
     assert client.command(CONFIGURE, 255, 190, 7, 7) == ACCEPTED
     assert client.command(POINT, -30, 20, NAN, NAN, LEVEL) == ACCEPTED
     assert angles(client) == [0, -30, 20]
@@ -87,7 +87,7 @@ def test_frames_neutral_and_retracted(claimed: Client) -> None:
     assert angles(claimed) == [0, -30, 90]
     assert claimed.last(m.GimbalDeviceAttitudeStatus).flags == LOCKED
     assert claimed.command(POINT, NAN, NAN, NAN, NAN, RETRACT) == ACCEPTED
-    assert angles(claimed) == [0, -30, 90], "taken, and nothing done"
+    assert angles(claimed) == [0, -30, 90], "accepted without effect"
     assert claimed.command(POINT, NAN, NAN, NAN, NAN, NEUTRAL) == ACCEPTED
     assert angles(claimed) == [0, 0, 0]
     assert claimed.last(m.GimbalDeviceAttitudeStatus).flags == 32

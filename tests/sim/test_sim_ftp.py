@@ -174,7 +174,7 @@ def test_ardupilot_repeats_its_last_reply() -> None:
     ftp.upload("/t", b"123")
     first = ftp.ask(Op.REMOVEFILE, "/t")
     ftp.send(Op.REMOVEFILE, "/t", sequence=ftp.sequence)
-    assert ftp.answers() == [first], "and not that there is no such file"
+    assert ftp.answers() == [first], "the same reply, not FILENOTFOUND"
     assert "/t" not in vehicle.files
 
 
@@ -259,7 +259,7 @@ def test_ardupilot_serves_missions_as_files() -> None:
     assert (downloaded[:10], downloaded[48:]) == (content[:10], content[48:])
     for broken in (b"", b"short", content[:-1], content[:-38] + bytes(38), b"\0\0" + content[2:]):
         ftp.upload("@MISSION/mission.dat", broken)
-        assert len(vehicle.missions.items(0)) == 2, "acknowledged, and without effect"
+        assert len(vehicle.missions.items(0)) == 2, "acknowledged without effect"
 
 
 # ------------------------------------------------------------------------------------------ PX4

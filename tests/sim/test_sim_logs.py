@@ -146,6 +146,6 @@ def test_armed_ardupilot_sends_no_logs() -> None:
     assert client.command(MavCmd.COMPONENT_ARM_DISARM, 1) == 0
     assert entries(client) == []
     assert data(client, 1) == []
-    assert "Disarm for log download" not in client.texts, "it says so once"
+    assert "Disarm for log download" not in client.texts, "reported once"
     assert client.command(MavCmd.COMPONENT_ARM_DISARM, 0) == 0
     assert len(entries(client)) == 3

@@ -84,7 +84,7 @@ def test_each_ardupilot_firmware_has_a_table() -> None:
 
 def test_enabling_a_feature_changes_the_count() -> None:
     copter = parameters_of("copter")
-    assert copter["BATT2_CAPACITY"] == 3300, "there by name at any time"
+    assert copter["BATT2_CAPACITY"] == 3300, "always readable by name"
     assert "BATT2_CAPACITY" not in copter.names
     copter["BATT2_MONITOR"] = 4
     assert len(copter) == 1362
@@ -350,7 +350,7 @@ def test_px4_accepts_packs_in_order_only() -> None:
     ftp.data(Op.WRITEFILE, first)
     assert px4.parameters[names[0]] != 77, "before the end"
     assert ftp.refusal(Op.WRITEFILE, second, offset=478) == (Err.FAILERRNO, 22)
-    assert ftp.refusal(Op.WRITEFILE, second, offset=239) == (Err.FAILERRNO, 22), "a gap spoils it"
+    assert ftp.refusal(Op.WRITEFILE, second, offset=239) == (Err.FAILERRNO, 22), "a gap makes it invalid"
     assert ftp.refusal(Op.TERMINATESESSION) == (Err.FAILERRNO, 22)
     assert px4.ftp.open_sessions == 0
 

@@ -71,7 +71,7 @@ def test_messages_to_others_are_ignored() -> None:
     assert client.all(m.CommandAck) == []
     for target in ((1, 1), (1, 0), (0, 0), (1, 99)):
         client.send(m.CommandLong(*target, MavCmd.DO_SEND_BANNER, 0, 0, 0, 0, 0, 0, 0, 0))
-    assert len(client.all(m.CommandAck)) == 4, "ArduPilot takes what is for a component that is not there, too"
+    assert len(client.all(m.CommandAck)) == 4, "ArduPilot also executes messages for a missing component"
 
 
 def test_answers_are_addressed_to_the_sender() -> None:
@@ -191,7 +191,7 @@ def test_command_faults() -> None:
     client.clear()
     copter.faults.lose_ack(banner)
     assert client.command(banner) is None
-    assert len(client.texts) == 3, "it was done all the same"
+    assert len(client.texts) == 3, "it was executed nevertheless"
     copter.faults.repeat_ack(banner, 2, times=1)
     client.clear()
     client.command(banner)

@@ -125,7 +125,7 @@ def test_other_kinds_reset_requested_rates_at_reboot(kind: str) -> None:
     assert len(client.all(m.Attitude)) == pytest.approx(2 * before, abs=1)
 
 
-# --------------------------------------------------------------------------------------- by its id
+# -------------------------------------------------------------------------- requests by message id
 
 
 @every_kind

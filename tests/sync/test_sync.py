@@ -239,7 +239,7 @@ def test_rate_lasts_for_its_block(vehicle: aerokit.sync.Vehicle) -> None:
         assert vibrations.get(timeout=100)
 
 
-# ------------------------------------------------------------------------- ends of all kinds
+# -------------------------------------------------------------------- ends of the connection
 
 
 def test_close_is_idempotent_and_ends_thread() -> None:
@@ -466,7 +466,7 @@ def test_exception_in_flight_logs_vehicle_state(caplog: pytest.LogCaptureFixture
     assert "vehicle 1 was left: in GUIDED, still armed, " in caplog.text
 
 
-# --------------------------------------------------------------------------- parts that are read first
+# -------------------------------------------------------------------------- first access to components
 
 
 def test_part_can_be_first_read_in_predicate(vehicle: aerokit.sync.Vehicle) -> None:

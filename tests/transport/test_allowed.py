@@ -116,7 +116,7 @@ async def test_tcp_accepts_only_allowed_peers() -> None:
         await endpoint.wait_closed()
 
 
-# ------------------------------------------------------------- a receiver that says who is a peer
+# ------------------------------------------------------------ a receiver that decides about peers
 
 
 class PeerKeeper(Recorder):

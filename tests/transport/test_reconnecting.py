@@ -108,7 +108,7 @@ def lines(caplog: pytest.LogCaptureFixture) -> list[tuple[str, str]]:
     return [(record.levelname, record.getMessage()) for record in caplog.records if record.name == "aerokit"]
 
 
-# ------------------------------------------------------------------------------ opening it the first time
+# ------------------------------------------------------------------------------------------ first opening
 
 
 async def test_first_opening_behaves_as_the_link() -> None:
@@ -304,7 +304,7 @@ async def test_peers_are_of_the_current_link() -> None:
     await link.wait_closed()
 
 
-# ----------------------------------------------------------------------------- what cannot be mended
+# ---------------------------------------------------------------------------------- permanent errors
 
 
 async def test_end_of_recording_ends_the_link(tmp_path: Path) -> None:
@@ -335,7 +335,7 @@ async def test_failing_factory_ends_the_link() -> None:
     await link.wait_closed()
 
 
-# ------------------------------------------------------------------------------- nothing is left
+# ----------------------------------------------------------------------------------------- leaks
 
 
 async def lose_it_twice(recorder: InterruptionRecorder) -> None:

@@ -362,7 +362,7 @@ async def test_track_point_reports_until_lost() -> None:
         await anyio.sleep(1.0)
         updated_at = one.tracking.updated_at
         await anyio.sleep(3.0)
-        assert one.tracking.updated_at == updated_at, "nothing is asked for any more"
+        assert one.tracking.updated_at == updated_at, "no more requests"
 
 
 async def test_tracked_position_on_earth_is_reported() -> None:
@@ -482,7 +482,7 @@ async def test_legacy_camera_gets_legacy_requests() -> None:
         assert (await vehicle.camera.status.wait_until(lambda _: True, timeout=5)).image_count == 2
         commands = commands_to(camera, REQUEST)
         await vehicle.camera.load_storage()
-        assert commands == [], "what it does not know is not tried again"
+        assert commands == [], "unknown messages are not requested again"
 
 
 async def test_set_mode_without_settings_message_trusts_the_ack() -> None:

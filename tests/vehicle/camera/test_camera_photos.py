@@ -106,7 +106,7 @@ async def test_lost_photo_order_is_resent_on_evidence(lost: int) -> None:
         capture = await vehicle.camera.take_photo()
         assert (capture.index, camera.image_count) == (0, 1)
         assert len(commands) == lost + 1
-        assert len({command[4] for command in commands}) == 1, "the number of the order stays"
+        assert len({command[4] for command in commands}) == 1, "the sequence number of the order is kept"
 
 
 async def test_photo_order_with_lost_ack_is_not_resent() -> None:

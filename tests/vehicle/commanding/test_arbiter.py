@@ -316,7 +316,7 @@ def test_commands_are_classified_as_orders_or_questions() -> None:
         "COMPONENT_ARM_DISARM",
     }
     for number in QUESTIONS - {MavCmd.SET_MESSAGE_INTERVAL, MavCmd.RUN_PREARM_CHECKS}:
-        assert MavCmd(number).name.startswith(("REQUEST_", "GET_")), "what changes something is no question"
+        assert MavCmd(number).name.startswith(("REQUEST_", "GET_")), "a command that changes something is not a query"
     assert len(QUESTIONS) == 11
 
 
@@ -374,7 +374,7 @@ def test_land_and_return_orders_survive_failsafe(mode: Mode) -> None:
         assert "failsafe" in order.failsafe
 
 
-# --------------------------------------------------------------------------------- who flies it
+# ----------------------------------------------------------------------- control of the vehicle
 
 
 def arm(stage: Stage, *, is_refused: bool = False) -> None:

@@ -248,7 +248,7 @@ async def test_take_off_ends_when_it_is_disarmed(grounded: Flight) -> None:
 
 
 async def test_take_off_after_cancelled_one_continues(grounded: Flight) -> None:
-    """The hold of the first one must not be sent after the second one's order."""
+    """The hold of the first call must not be sent after the order of the second call."""
     vehicle = grounded.vehicle
     await vehicle.set_mode("GUIDED")
     await vehicle.arm()
@@ -558,7 +558,7 @@ async def test_hold_stops(flying: Flight) -> None:
     assert speed_of(flying.copter) < 0.1
 
 
-# ----------------------------------------------------------------------------------- on the way
+# ---------------------------------------------------------------------------- during the flight
 
 
 async def test_set_speed(flying: Flight) -> None:

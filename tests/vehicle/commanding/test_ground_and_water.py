@@ -47,7 +47,7 @@ async def guided(simulated: SimulatedVehicle) -> AsyncIterator[Vehicle]:
 
 
 async def test_rover_go_to_with_home_at_sea_level_arrives() -> None:
-    """As with real rovers, home was set before the altitude was known."""
+    """Home was set before the altitude was known, as with real rovers."""
     async with guided(SimulatedRover(boot_time_s=1.0)) as vehicle:
         here = vehicle.position.value
         x, y = round(here.latitude_deg * 1e7), round(here.longitude_deg * 1e7)

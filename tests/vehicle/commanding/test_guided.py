@@ -130,7 +130,7 @@ async def test_setpoint_stream_rate_is_kept(flying: Flight, rate_hz: float) -> N
     assert len(times) == pytest.approx(5.0 * rate_hz, abs=1)
 
 
-# ------------------------------------------------------------------------------- what it does
+# ---------------------------------------------------------------------------------- behaviour
 
 
 async def test_setpoint_stream_is_flown(flying: Flight) -> None:
@@ -167,7 +167,7 @@ async def test_setpoint_stream_entry_changes_to_guided(flying: Flight) -> None:
         assert flying.copter.motion.north == pytest.approx(10.0, abs=0.5)
 
 
-# ------------------------------------------------------------------------------ how it ends
+# ------------------------------------------------------------------------ end of the stream
 
 
 async def test_block_left_normally_vehicle_holds(flying: Flight) -> None:

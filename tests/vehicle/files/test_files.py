@@ -272,7 +272,7 @@ async def test_local_disk_errors_propagate(ardupilot: Bench, tmp_path: Path) -> 
     assert names_in(tmp_path) == []
 
 
-# ----------------------------------------------------------------------------- kinds of end
+# ------------------------------------------------------------------ errors and cancellation
 
 
 async def test_cancellation_at_any_time_closes_the_session(bench: Bench) -> None:

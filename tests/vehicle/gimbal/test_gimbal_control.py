@@ -408,7 +408,7 @@ async def test_unanswered_first_rates_end_with_zero() -> None:
         here = gimbal.angles()
         await anyio.sleep(2.0)
         assert gimbal.angles() == here
-        assert math.degrees(here[2]) > 5, "it had obeyed"
+        assert math.degrees(here[2]) > 5, "it had executed the command"
         commands: list[Any] = flight.wire.commands(PITCHYAW)
         assert (commands[-1].param3, commands[-1].param4) == (0, 0)
 

@@ -58,7 +58,7 @@ async def reaches(flight: AnyFlight, item: int) -> None:
     await flight.vehicle.mission.current.wait_until(lambda current: (current or 0) >= item, timeout=60)
 
 
-# ------------------------------------------------------------------------------------ to its end
+# ------------------------------------------------------------------------------------ completion
 
 
 @pytest.mark.parametrize(
@@ -186,7 +186,7 @@ async def test_count_and_current_without_mission() -> None:
         assert other.vehicle.mission.current.value is None
 
 
-# ---------------------------------------------------------------------------------- take-over
+# ---------------------------------------------------------------------------------- takeovers
 
 
 async def test_pilot_mode_change_ends_wait_finished() -> None:

@@ -265,7 +265,7 @@ async def test_px4_setpoint_stream_not_fed_after_entry_holds() -> None:
                 await anyio.sleep(5.0)
 
 
-# ---------------------------------------------------------------------- left in a silence
+# ---------------------------------------------------------------- block left in a silence
 
 
 async def test_block_left_with_unconfirmed_hold_warns(caplog: pytest.LogCaptureFixture) -> None:

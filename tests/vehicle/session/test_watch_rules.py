@@ -292,7 +292,7 @@ def test_loss_and_rates_of_a_second() -> None:
     assert (report.loss_percent, report.frames_per_s) == (100.0, 0.0)
 
 
-# ------------------------------------------------------------------------------- order_status still
+# ------------------------------------------------------------------------------------------- stalls
 
 
 class StallStage:

@@ -95,7 +95,7 @@ def note(items: list[Any], item: Any) -> None:
 Flights = Callable[[str], Flight]
 
 
-# ------------------------------------------------------------------------- what happened on the way
+# ------------------------------------------------------------------------- events during the flight
 
 
 def test_copter(flights: Flights) -> None:
@@ -147,7 +147,7 @@ def test_px4(flights: Flights) -> None:
     assert [reason for reason in reasons if reason] == ["heading estimate not stable"]
 
 
-# ----------------------------------------------------------------------- what pymavlink says at the end
+# ---------------------------------------------------------------------------- comparison with pymavlink
 
 
 def theirs(flight: Flight) -> dict[str, Any]:

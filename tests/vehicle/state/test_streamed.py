@@ -99,7 +99,7 @@ def test_instance_field_is_read_from_payload(name: str, field: str) -> None:
 def test_unread_value_is_not_decoded(telemetry: Telemetry, clock: Clock) -> None:
     stream = telemetry.streams[MESSAGE_IDS["Attitude"]]
     take(telemetry, messages.Attitude(0, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0), 100.0)
-    assert not stream.pending, "the first is worked out at once: everybody can see that it is known"
+    assert not stream.pending, "the first message is decoded at once, so that is_known is true"
     take(telemetry, messages.Attitude(0, 0.2, 0.0, 0.0, 0.0, 0.0, 0.0), 100.5)
     take(telemetry, messages.Attitude(0, 0.3, 0.0, 0.0, 0.0, 0.0, 0.0), 101.0)
     clock.now = 103.0

@@ -220,7 +220,7 @@ def test_wind_of_both_autopilots(telemetry: Telemetry) -> None:
     assert telemetry.wind.value.speed_m_s == 5.0
 
 
-# ------------------------------------------------------------------------------ several of a kind
+# -------------------------------------------------------------------- several devices of one kind
 
 
 def gps(fix_type: int = 3, satellites: int = 9) -> messages.GpsRawInt:
@@ -403,7 +403,7 @@ def test_status_text_end_lost_is_delivered_in_time(telemetry: Telemetry, clock: 
     assert telemetry.status_text.value.text == "x" * 50 + "…"
 
 
-# ------------------------------------------------------------------------------------ as a whole
+# ------------------------------------------------------------------------------- whole telemetry
 
 
 def test_forget_keeps_status_texts(telemetry: Telemetry) -> None:

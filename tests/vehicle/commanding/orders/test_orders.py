@@ -64,7 +64,7 @@ def test_orders_are_all_documented() -> None:
         assert re.search(rf"^\| [^|]*`{re.escape(row.name.split()[0])}", text, re.MULTILINE), row.name
 
 
-# --------------------------------------------------------- the faults that were found, one by one
+# ------------------------------------------------------------------------------------ regressions
 
 
 @pytest.mark.parametrize("autopilot", BOTH)

@@ -167,7 +167,7 @@ def _judge(
     newest = steering[-1]
     eager = [order for order in steering if order.at == newest.at]
     allowed = HOLD[is_px4].union(*(order.choice.sends[is_px4] for order in eager))
-    assert kind in allowed, f"an order that was overruled: {about}"
+    assert kind in allowed, f"a superseded order: {about}"
     is_against_the_pilot = takeover is not None and newest.at < takeover.at and sent.number > takeover.number
     own = [order.at for order in given if order.choice.name == "command"]
     if takeover is not None and own and takeover.at - own[-1] < MODE_GRACE_S:
