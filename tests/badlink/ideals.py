@@ -80,7 +80,7 @@ def file_write(size: int) -> Ideal:
 
 
 def checksum() -> Ideal:
-    """Asked for and answered."""
+    """One request and one answer."""
     return Ideal(1, FTP_REQUEST, FTP_REQUEST)
 
 

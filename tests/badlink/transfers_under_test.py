@@ -76,7 +76,7 @@ def make_copter(case: Case, sizes: Sizes, radio: Radio) -> SimulatedCopter:
 
 
 def leftovers(copter: SimulatedCopter) -> Iterator[str]:
-    """State that the vehicle still holds for a client that has gone."""
+    """State that the vehicle still keeps for a disconnected client."""
     if copter.ftp.open_sessions:
         yield f"{copter.ftp.open_sessions} FTP sessions"
     if copter.missions.transfer_is_open:

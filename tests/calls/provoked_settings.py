@@ -29,7 +29,7 @@ async def _load_damaged(stage: Stage) -> None:
 
 
 def _camera(*troubles: Callable[[SimulatedCamera], object]) -> Callable[[Stage], None]:
-    """There is a camera, and then something happens to it."""
+    """Add a camera to the vehicle, then apply the troubles to it."""
 
     def before(stage: Stage) -> None:
         camera = camera_of(stage)

@@ -147,7 +147,7 @@ def _unknown_and_silent(stage: Stage) -> None:
 
 
 def _answering(kind: type[Any], result: int, mission_type: int) -> Callable[[Stage], None]:
-    """This message is answered with a MISSION_ACK, and nothing is done."""
+    """Answer this message with a MISSION_ACK and do not execute it."""
 
     def trouble(stage: Stage) -> None:
         def handle(_: Any, channel: Any) -> None:

@@ -98,7 +98,7 @@ async def settle(stage: Stage) -> None:
 
 
 def is_it(raised: Exception, name: str, error: str) -> bool:
-    """This error, or a special case of it that is not promised by itself."""
+    """Return True if this is the documented error, or a subclass of it that is not documented separately."""
     known = {cls.__name__ for cls in type(raised).__mro__} & NAMES
     return error in known and not any(
         (name, member) in PROMISED and member != error and issubclass(getattr(errors, member, OSError), _class(error))

@@ -138,7 +138,7 @@ async def their_client() -> list[bool]:
 
 
 class TheirCamera:
-    """MAVSDK's server with answers to everything."""
+    """MAVSDK's camera server, which answers all requests."""
 
     def __init__(self, plugin: CameraServerAsync) -> None:
         self.plugin = plugin

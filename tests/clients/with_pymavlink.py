@@ -119,7 +119,7 @@ def take_off(client: Client) -> None:
 
 
 def fly(client: Client) -> None:
-    """The mission, to the end."""
+    """Fly the mission to its end."""
     last = len(mission(client.kind)) - 1
     client.set_mode("AUTO" if client.kind == "copter" else "MISSION")
     client.wait("MISSION_ITEM_REACHED", until=lambda report: report.seq == last, timeout=90)

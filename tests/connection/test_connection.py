@@ -1,4 +1,4 @@
-"""The connection as an async context manager: what comes out of it, how it ends, and that nothing is left behind."""
+"""The connection as an async context manager: its exceptions, its end, and leaks."""
 
 from __future__ import annotations
 
@@ -337,7 +337,7 @@ def scheduled_timers() -> list[asyncio.TimerHandle]:
 
 
 async def use(vehicle: Vehicle) -> None:
-    """A program that does a little of everything and never ends by itself."""
+    """A program that uses most features and never ends by itself."""
     await vehicle.wait_ready()
     await vehicle.set_mode("GUIDED")
     await vehicle.arm()

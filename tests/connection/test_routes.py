@@ -62,7 +62,7 @@ class PeersLink(MemoryLink):
         return encoder.encode(message)
 
     def receive(self, peer: Peer, source: tuple[int, int], *messages: Message, lost: int = 0) -> None:
-        """Messages come from there; before them, some were lost."""
+        """Receive messages from this peer, after ``lost`` lost ones."""
         assert self.connection is not None
         for _ in range(lost):
             self.frame(peer, source, ATTITUDE)

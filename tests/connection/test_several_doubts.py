@@ -137,7 +137,7 @@ def test_late_link_is_proven_by_its_clock() -> None:
 @pytest.mark.parametrize("late_s", [2.0, 4.0, 6.0])
 @pytest.mark.parametrize("dies", [False, True])
 async def test_late_copies_from_a_slow_link_are_dropped(late_s: float, dies: bool) -> None:
-    """Both radios carry 100 frames a second; one of them begins to be late, and the other dies perhaps."""
+    """Both radios carry 100 frames a second; one becomes late, and the other one may fail."""
     radios = Radios(2)
     await opened(radios)
     async with open_connection(radios.together()) as connection:

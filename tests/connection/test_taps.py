@@ -1,4 +1,4 @@
-"""Frames for programs that forward, log or show everything: taps, raw frames, the version of what we send."""
+"""Frames for programs that forward, log or show all traffic: observers, raw frames, the version of sent frames."""
 
 from __future__ import annotations
 

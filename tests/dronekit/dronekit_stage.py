@@ -93,7 +93,7 @@ class Stage:
         return self.fc.received(*names, since=since) if names else self.fc.commands(since=since)
 
     def commands_of(self, action: Callable[[], object]) -> list[tuple[float, ...]]:
-        """The commands that an action had the program send: number, then param1 to param7."""
+        """Return the commands that the program sent during an action: number, then param1 to param7."""
         return [(frame.command, *(round(p, 5) for p in frame.params)) for frame in self.sent_by(action)]
 
     def assign(self, name: str, value: Any) -> Callable[[], None]:

@@ -121,7 +121,7 @@ async def settle() -> None:
 
 
 async def until(condition: Callable[[], object]) -> None:
-    """Let the loop turn, on real sockets, until it holds."""
+    """Poll until the condition holds, with real sockets."""
     with anyio.fail_after(100):
         while not condition():  # noqa: ASYNC110
             await anyio.sleep(0.005)

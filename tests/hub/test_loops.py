@@ -179,7 +179,7 @@ def test_frame_received_once_elsewhere_is_no_loop() -> None:
 
 
 def test_restarted_program_with_equal_frames_is_no_loop() -> None:
-    """A client of TCP each time, whose numbers begin at 0: its orders are new ones."""
+    """Each time a new TCP client with sequence numbers from 0: its orders are new."""
     stage = Stage()
     stage.receive("a", COPTER)
     encoder = FrameEncoder(255, 190)

@@ -65,7 +65,7 @@ class Choice:
 
 @asynccontextmanager
 async def connected(choice: Choice) -> AsyncIterator[Vehicle]:
-    """It was switched on just now, unless it is at an address."""
+    """Connect to the vehicle, which was just started unless it is at an address."""
     async with served(choice) as address, connect(address, timeout=30) as vehicle:
         yield vehicle
 

@@ -331,7 +331,7 @@ async def run_choice(choice: Choice, seed: int, calls: int = CALLS) -> list[Step
 
 
 def differences(real: list[Step], ours: list[Step]) -> list[str]:
-    """Line by line; from the first step on that left them in other states only that one counts."""
+    """Compare line by line, up to the first step that ends in different states."""
     found = []
     for number, (one, other) in enumerate(zip(real, ours, strict=True)):
         for what in ("result", "texts", "mode", "armed", "landed"):

@@ -80,7 +80,7 @@ async def test_flight_by_velocities(choice: Choice) -> None:
 
 
 async def fly_north(vehicle: Vehicle, choice: Choice) -> None:
-    """For ten seconds of its clock, which may go slower than it was asked to."""
+    """Ten seconds of the vehicle's clock, which may be slower than requested."""
     speed, milliseconds = choice.kind.speed_m_s, 10_000
     here = vehicle.position.fresh(within=5)
     stream = vehicle.guided.velocity(rate_hz=min(100, 10 * choice.speedup), valid_for_s=10, max_lag_s=10)

@@ -1,4 +1,4 @@
-"""A key for signing, on every vehicle: taken, used, not changed while armed, taken away. See `test_any_vehicle`."""
+"""A key for signing, on every vehicle: set, used, not changeable while armed, removed. See `test_any_vehicle`."""
 
 from __future__ import annotations
 

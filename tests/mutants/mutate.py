@@ -137,7 +137,7 @@ def _sample(sources: Iterator[Path], size: int, chance: random.Random) -> Iterat
 
 
 def _tests_of(mutation: Mutation, reach: Reach, seconds: float) -> list[str]:
-    """The tests that run the line, as many as there is time for: those named after its file, then the quickest."""
+    """Return the tests that run the line, within the time limit: first those named after its file, then the fastest."""
     words = (Path(mutation.path).stem, *Path(mutation.path).stem.split("_"))
     near = reach.by_file.get(mutation.path, set())
     chosen, left = [], seconds

@@ -1,4 +1,4 @@
-"""One round of a day's work: connect, fly, lose the radio, reboot, unplug, plug in again; and the remaining objects."""
+"""One soak round: connect, fly, lose the radio, reboot, unplug, plug in again; and the remaining objects."""
 
 from __future__ import annotations
 

@@ -264,7 +264,7 @@ async def test_link_closed_in_interruption_callback_stays_closed() -> None:
 
 
 async def test_lost_link_is_released_before_the_next_opens() -> None:
-    """A serial port is not shared; not even with the link that had it before."""
+    """A serial port is exclusive, even against the previous link of the same program."""
     device = Device()
     device.releasing_takes_s = 0.7
     link = ReconnectingLink(device.plug)

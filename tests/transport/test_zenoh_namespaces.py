@@ -85,7 +85,7 @@ def machines() -> Iterator[tuple[str, str]]:
 
 
 class Program:
-    """One in a namespace, which answers lines with lines."""
+    """A process in a network namespace, which answers each line with a line."""
 
     def __init__(self, namespace: str, program: str) -> None:
         self.running = subprocess.Popen(

@@ -1,4 +1,4 @@
-"""Both sides of a name on a zenoh network, with receivers that keep all."""
+"""Both sides of a name on a zenoh network, with receivers that record all data."""
 
 from __future__ import annotations
 

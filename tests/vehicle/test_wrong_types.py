@@ -1,4 +1,4 @@
-"""Arguments of wrong types: our error with the argument's name, and not a byte goes out; for every public method."""
+"""Arguments of wrong types, for every public method: InvalidArgument names the argument, and nothing is sent."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ COPTER = autopilot_for(Heartbeat(2, 3, 81, 0, 4, 3))
 
 
 class Stage:
-    """An arbiter, and heartbeats at the test's word."""
+    """An arbiter, and heartbeats on demand."""
 
     def __init__(self, mode: Mode | None = LOITER, armed: bool | None = True) -> None:
         self.now, self.open = 0.0, ExitStack()
@@ -100,7 +100,7 @@ def test_mode_before_and_own_modes_are_no_takeover(modes: list[Mode]) -> None:
 
 @pytest.mark.parametrize("modes", [[RTL], [GUIDED, LOITER], [GUIDED, RTL, GUIDED], [LOITER, RTL, LOITER]])
 def test_other_mode_ends_order_permanently(modes: list[Mode]) -> None:
-    """The mode before, too, once the vehicle was in the one that was ordered."""
+    """The previous mode also ends the order, once the ordered mode was reported."""
     stage = Stage()
     order = stage.arbiter.order(GUIDED)
     for mode in modes:

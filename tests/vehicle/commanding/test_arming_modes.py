@@ -18,7 +18,7 @@ ARM = MavCmd.COMPONENT_ARM_DISARM
 
 
 async def test_program_runs_twice_in_one_process() -> None:
-    """After the first flight a copter stands there in RTL."""
+    """After the first flight a copter is on the ground in RTL."""
     async with open_flight() as flight:
         for _ in range(2):
             await flight.vehicle.wait_ready()

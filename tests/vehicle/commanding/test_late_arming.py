@@ -52,7 +52,7 @@ async def test_late_arming_counts_only_later_reports(grounded: Flight) -> None:
 
 @pytest.mark.parametrize("ends", ["cancelled", "unanswered"])
 async def test_vehicle_armed_before_order_stays_armed(flying: Flight, ends: str) -> None:
-    """It flies: that it is armed is nothing that this order has done."""
+    """It is flying, so this order has not armed it."""
     if ends == "cancelled":
         with anyio.move_on_after(0.0):
             await flying.vehicle.arm()
@@ -217,7 +217,7 @@ async def test_arming_after_watch_time_is_left_alone(grounded: Flight) -> None:
 async def test_late_arming_is_undone_only_with_timely_ack(
     grounded: Flight, ack_delay_s: float, is_undone: bool
 ) -> None:
-    """Without its ack, an arming seconds after the order may be a pilot's."""
+    """Without an ack, arming seconds after the order may be the pilot's."""
     await grounded.vehicle.set_mode("GUIDED")
     grounded.copter.faults.ignore(ARM)
     with anyio.move_on_after(0.0):

@@ -220,13 +220,13 @@ async def test_wrong_readback_is_verification_failed() -> None:
 
 
 async def test_mission_file_is_compared_exactly(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Items that go through 32-bit floats are not, and a file does not."""
+    """A file is compared exactly; items are not, because they are converted to 32-bit floats."""
     async with open_flight() as flight:
         items = flight.copter.missions
         replace = items.replace
 
         def keep_something_else(type_: int, given: Any, **options: Any) -> Any:
-            return replace(type_, [order.replace(x=order.x + 3 * (order.frame == 3)) for order in given], **options)
+            return replace(type_, [item.replace(x=item.x + 3 * (item.frame == 3)) for item in given], **options)
 
         monkeypatch.setattr(items, "replace", keep_something_else)
         mission = long_mission(1)

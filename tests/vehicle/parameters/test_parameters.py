@@ -741,7 +741,7 @@ async def test_ardupilot_is_not_cached(tmp_path: Path) -> None:
 
 
 def test_signalling_nan_bits_are_kept() -> None:
-    """Explains the tests with -5,000,000."""
+    """Shows the reason for the tests with -5,000,000."""
     bits = struct.unpack("<I", struct.pack("<i", -5_000_000))[0]
     assert bits & 0x7F800000 == 0x7F800000
     assert bits & 0x007FFFFF

@@ -1,4 +1,4 @@
-"""One flight of the order table: a vehicle, an order, bad disturbances, and another party that acts."""
+"""One flight of the order table: a vehicle, an order, disturbances, and another party that acts."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def run_the_battery_down(vehicle: Simulated) -> None:
 
 
 def _act(case: Case, vehicle: Simulated) -> None:
-    """Another station disarms what stands on the ground, or changes its mode; a pilot takes what flies."""
+    """Another station disarms a landed vehicle or changes its mode; a pilot takes over a flying one."""
     if case.row.place == "ground":
         if case.by_switch:
             turn_switch(vehicle)

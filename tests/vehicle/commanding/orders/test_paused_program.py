@@ -1,4 +1,4 @@
-"""A program that is stopped in flight, while the failsafe for a lost ground station acts: it keeps the vehicle."""
+"""A program that is stopped in flight, while the failsafe for a lost ground station acts: the failsafe stays in control."""
 
 from __future__ import annotations
 
