@@ -178,7 +178,7 @@ def _held(program: Program) -> tuple[int, int, int, int]:
 async def _remaining_state(
     program: Program, held: tuple[int, ...], leftovers: Callable[[Any], Iterator[str]]
 ) -> list[str]:
-    """At once if possible: the radio is still as bad, and closing needs it."""
+    """Close at once if possible; the radio is still bad, and closing needs it."""
     names = ("sinks", "waiters", "deadlines", "tasks")
     until = asyncio.get_running_loop().time() + GRACE_S
     while True:

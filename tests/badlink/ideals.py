@@ -37,12 +37,12 @@ class Ideal:
     """Time that the vehicle itself takes to send its part."""
 
     def seconds(self, radio: Radio) -> float:
-        """Over this kind of radio, were it without faults."""
+        """Ideal duration over this kind of radio without faults."""
         moved = self.up + self.down if radio.half_duplex else max(self.up, self.down)
         return self.round_trips * 2 * radio.model.delay_s + max(moved / radio.model.bandwidth, self.vehicle_s)
 
     def __add__(self, other: Ideal) -> Ideal:
-        """One after the other."""
+        """Sum of consecutive exchanges."""
         return Ideal(
             self.round_trips + other.round_trips,
             self.up + other.up,

@@ -57,7 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def say(text: str) -> None:
-    """A line of the table, at once."""
+    """Print a line of the table immediately."""
     sys.stdout.write(text + "\n")
     sys.stdout.flush()
 

@@ -28,7 +28,7 @@ class Verdict:
 
     @property
     def is_exact(self) -> bool:
-        """All there, and nothing to complain of."""
+        """Return True if the content is complete and there are no complaints."""
         return self.error is None and not self.faults
 
 

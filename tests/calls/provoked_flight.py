@@ -230,7 +230,7 @@ async def _sign_twice(stage: Stage) -> None:
 
 
 def _ended(function: Callable[[Stage], object], how: Callable[[Stage], None] | None = None) -> Provocation:
-    """After the end of the connection."""
+    """Call it after the connection has ended."""
     end = how or (lambda stage: stage.vehicle.connection.close())
     return P(_now(function), before=end, alone=True)
 
@@ -239,7 +239,7 @@ def _ended(function: Callable[[Stage], object], how: Callable[[Stage], None] | N
 
 
 async def _stop(stage: Stage, feed: Callable[[Any], Any]) -> None:
-    """A stream that has stopped by itself."""
+    """A stream that stopped because no set-points were supplied."""
     async with stage.vehicle.guided.velocity(valid_for_s=0.3) as stream:
         await anyio.sleep(1)
         await feed(stream)

@@ -27,7 +27,7 @@ def _call(name: str, *args: Any, **options: Any) -> Do:
 
 
 def _fitted(*troubles: Trouble) -> Trouble:
-    """There is a gimbal, and then something happens."""
+    """Add a gimbal to the vehicle, then apply the troubles to it."""
 
     def before(stage: Stage) -> None:
         stage.simulated.parameters["MNT1_TYPE"] = 1.0

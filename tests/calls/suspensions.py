@@ -93,7 +93,7 @@ class Cancelled:
 
 
 async def cancel_at(work: Awaitable[object], point: Point | None) -> Cancelled:
-    """Run a call in a task of its own and cancel it there; None: nowhere."""
+    """Run a call in a separate task and cancel it at ``point``; None: never."""
     loop, outcome = asyncio.get_running_loop(), Cancelled()
     scope = anyio.CancelScope()
 

@@ -1,4 +1,4 @@
-"""Every public coroutine, cancelled at every await: it ends at once, and nothing is left of it.
+"""Every public coroutine, cancelled at every await: it ends at once, without leaks.
 
 Here a few of the awaits of each; `nox -s cancel` does all of them.
 """
@@ -51,7 +51,7 @@ def groups() -> Iterator[tuple[str, list[str]]]:
 
 
 def rows() -> Iterator[Any]:
-    """Each group on each autopilot; a few of them by default."""
+    """Return each group on each autopilot; by default only some of them."""
     for owner, names in groups():
         for autopilot in AUTOPILOTS:
             row = pytest.param(names, autopilot, id=f"{owner}-{autopilot}")

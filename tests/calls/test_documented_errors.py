@@ -36,7 +36,7 @@ def test_each_documented_error_is_provoked() -> None:
 
 
 def groups() -> Iterator[tuple[str, list[tuple[str, str]]]]:
-    """One vehicle serves all calls of one class, but for those after which it is of no use."""
+    """One vehicle serves all calls of one class, except those that leave it unusable."""
     for owner in sorted({name.partition(".")[0] for name, _ in PROMISED & PROVOCATIONS.keys()}):
         yield (
             owner,

@@ -75,7 +75,7 @@ def all_parameters(client: Client) -> int:
 
 
 def upload(client: Client) -> bool:
-    """Send it as the vehicle asks for it; whether it was accepted."""
+    """Upload the mission; return True if it was accepted."""
     items = mission(client.kind)
     link = client.link
     link.mav.mission_count_send(link.target_system, 1, len(items), M.MAV_MISSION_TYPE_MISSION)
@@ -107,7 +107,7 @@ def download(client: Client) -> int:
 
 
 def take_off(client: Client) -> None:
-    """ArduPilot takes height above home; PX4 a place and height above the sea."""
+    """Take off. ArduPilot expects an altitude above home, PX4 a position and an altitude above sea level."""
     if client.kind == "copter":
         client.command_until_accepted(M.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, ALTITUDE_M)
         return

@@ -87,7 +87,7 @@ async def test_arrival_stays_old_until_waiting_data_is_read() -> None:
 
 @pytest.mark.parametrize("scheme", ["udpin", "tcpin"])
 async def test_arrival_stays_old_while_reading_takes_long(scheme: str) -> None:
-    """On virtual time; the sockets are real, and hold more than is read in one turn."""
+    """Virtual time with real sockets, which hold more data than one iteration reads."""
     encoder, ages = FrameEncoder(1, 1), list[float]()
     kind = socket.SOCK_DGRAM if scheme == "udpin" else socket.SOCK_STREAM
     async with open_connection(f"{scheme}:127.0.0.1:0") as connection:
@@ -165,7 +165,7 @@ OURS = ("link_state", "link_quality", "links")
 
 
 def every_cell(vehicle: aerokit.Vehicle) -> list[StateCell[Any]]:
-    """All cells of a vehicle, its parts and its devices; `make_parts` has made them."""
+    """Return all cells of a vehicle, its parts and its devices, as created by `make_parts`."""
     gc.collect()
     cells = [thing for thing in gc.get_objects() if isinstance(thing, StateCell)]
     return [cell for cell in cells if cell.name not in OURS and cell._closed_by is None]

@@ -48,7 +48,7 @@ async def test_exception_is_reported_and_other_tasks_continue() -> None:
 
 
 async def test_aclose_survives_cancellation_of_its_caller() -> None:
-    """They are gone all the same, and the cancellation is not swallowed."""
+    """The tasks end nevertheless, and the cancellation is not suppressed."""
     background, cleaned_up = BackgroundTasks(lambda error: pytest.fail(repr(error))), list[str]()
 
     async def slow_to_end() -> None:

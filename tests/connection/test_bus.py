@@ -1,4 +1,4 @@
-"""The bus decodes on interest, keeps systems apart, and survives a subscriber that raises."""
+"""The bus decodes on demand, separates systems, and survives a subscriber that raises."""
 
 from __future__ import annotations
 

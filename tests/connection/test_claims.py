@@ -94,7 +94,7 @@ def test_route_times_out_after_three_and_a_half_seconds(after_s: float, takes: b
 
 
 def test_clock_decides_where_numbers_are_ambiguous() -> None:
-    """After 8 s at 10 Hz the counter may have come round."""
+    """After 8 s at 10 Hz the counter may have wrapped around."""
     assert not Stage().claims(9.1, 0)  # and there is no clock
     clocks = {(1, 1): lambda at: 1000 * at}
     for boot_ms, takes in (

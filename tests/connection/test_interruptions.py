@@ -370,7 +370,7 @@ class TestServers:
 
 
 async def eventually_closed(link: Link) -> None:
-    """Waits until the server has noticed that its client has gone; 20 s are for hung tests only."""
+    """Wait until the server has noticed that its client disconnected; only hung tests take 20 s."""
     assert isinstance(link, TcpListen)
     with anyio.fail_after(20):
         while link.peers:  # noqa: ASYNC110

@@ -192,7 +192,7 @@ async def test_split_frame_makes_a_peer(link: PeerKeepingLink) -> None:
 
 
 async def test_heartbeats_of_many_senders_fill_no_table(link: PeerKeepingLink) -> None:
-    """65,000 senders behind one peer: the vehicle that is flown keeps its place, its counters and its route."""
+    """65,000 senders behind one peer: the connected vehicle keeps its entry, its counters and its route."""
     async with flown(link) as (vehicle, copter):
         connection, encoder = vehicle.connection, FrameEncoder(1, 1)
         for system_id in range(2, 256):

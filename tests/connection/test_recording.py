@@ -143,7 +143,7 @@ async def test_program_runs_on_a_recorded_flight(tmp_path: Path, speed: str) -> 
 
 
 async def test_unknown_messages_are_recorded(tmp_path: Path) -> None:
-    """In the order in which it came, and byte for byte."""
+    """Frames are recorded in order of arrival, byte for byte."""
     path = tmp_path / "private.tlog"
     known, private = FrameEncoder(9, 1), UnknownMessageSender(9, 7)
     near, far = memory_link_pair()

@@ -150,7 +150,7 @@ async def test_vehicle_returns_from_another_port(link: PeersLink, connection: Co
 
 
 async def test_returning_client_is_not_a_second_vehicle(link: PeersLink, connection: Connection) -> None:
-    """A TCP client's new connection is a new peer; the old one is known to have gone."""
+    """A TCP client's new connection is a new peer; the old one is reported as closed."""
     doubles: list[events.DuplicateSender] = []
     connection.bus.attach_event(events.DuplicateSender, doubles.append)
     attitudes: list[Message] = []
@@ -163,7 +163,7 @@ async def test_returning_client_is_not_a_second_vehicle(link: PeersLink, connect
 
 
 async def test_many_peers_do_not_evict_the_vehicle(link: PeersLink, connection: Connection) -> None:
-    """A scanner, or a program that takes a new port for each datagram."""
+    """A scanner, or a program that sends each datagram from a new port."""
     link.receive("vehicle", (1, 1), *[COPTER] * 5)
     for port in range(2 * MAX_PEERS):
         link.receive(port, (250, 1), ATTITUDE)
@@ -187,7 +187,7 @@ async def test_loss_is_counted_per_component(link: PeersLink, connection: Connec
 
 
 async def test_loss_is_counted_per_peer_of_one_vehicle(link: PeersLink, connection: Connection) -> None:
-    """Each has a sequence of its own; what comes twice is delivered once."""
+    """Each has its own sequence; duplicates are delivered once."""
     attitudes: list[Message] = []
     connection.bus.attach(Attitude, attitudes.append)
     link.receive("radio", (1, 1), COPTER)

@@ -100,7 +100,7 @@ async def test_broadcast_command_reaches_each_system_once() -> None:
 
 
 def test_other_vehicle_is_refused_after_long_silence_of_ours() -> None:
-    """Two that were switched on ten seconds apart; ours is switched off."""
+    """Two vehicles were switched on ten seconds apart; ours is switched off."""
     choice, now = LinkChoice(needs_proof=True), 0.0
     while now < 30.0:
         for link in (0, 1):
@@ -164,7 +164,7 @@ async def test_late_copies_from_a_slow_link_are_dropped(late_s: float, dies: boo
 
 
 async def test_signed_copies_are_accepted_in_any_order() -> None:
-    """The quicker radio is not in use yet; nothing but heartbeats comes, which prove nothing."""
+    """The faster radio is not in use yet; only heartbeats arrive, which are no proof."""
     radios = Radios(2, models=[FaultModel(delay_s=0.05), GOOD])
     await opened(radios)
     key = SigningKey(bytes(range(32)))
@@ -326,7 +326,7 @@ def test_continuous_commands_delay_switch_for_limited_time() -> None:
 
 
 class Ports:
-    """An autopilot with a port for each radio, each with numbers of its own."""
+    """An autopilot with a port and a sequence counter for each radio."""
 
     def __init__(self, radios: Radios) -> None:
         self._far = radios.far
@@ -338,7 +338,7 @@ class Ports:
 
 
 async def switched_to_better_link(connection: Connection, ports: Ports, radios: Radios) -> LinkChoice:
-    """The second radio is the better one, and has just been taken."""
+    """Make the second radio the better one; returns when it has just been selected."""
     for step in range(200):
         both = (0,) if step < 20 else (0, 1)
         if step % 10 == 0:
@@ -356,7 +356,7 @@ async def switched_to_better_link(connection: Connection, ports: Ports, radios: 
 
 
 async def test_answer_over_former_link_is_accepted_once() -> None:
-    """ArduPilot answers over the port that was asked, PX4 over all ports where it has seen us."""
+    """ArduPilot answers over the port of the request, PX4 over all ports where it has received us."""
     radios = Radios(2, models=[FaultModel(delay_s=0.5), GOOD])
     await opened(radios)
     async with open_connection(radios.together()) as connection:

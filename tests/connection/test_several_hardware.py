@@ -36,7 +36,7 @@ def copter(uid2: bytes) -> SimulatedCopter:
 
 
 class Twins:
-    """Two copters that were switched on together; each has a radio of its own."""
+    """Two copters that were switched on together, each with its own radio."""
 
     def __init__(self, ours: bytes, theirs: bytes) -> None:
         self.ours, self.theirs = copter(ours), copter(theirs)
@@ -170,7 +170,7 @@ class Answers:
         self.second = self.choice.candidates[1]
 
     def answer_probes(self, times: int, *links: int, ahead_s: float = 70.0) -> None:
-        """Each is asked for its hardware, and answers with the time alone."""
+        """Request the hardware id over each link; the answers contain only the time."""
         for _ in range(times):
             self.now += 0.5
             for link in links or (0, 1):
@@ -205,7 +205,7 @@ def test_late_other_hardware_id_disables_the_link() -> None:
 
 
 def test_used_link_with_other_hardware_gets_nothing() -> None:
-    """Our vehicle has gone; the one behind the second link sends its hardware id only then."""
+    """Our vehicle has failed; only then the one behind the second link sends its hardware id."""
     answers = Answers()
     answers.choice.record_hardware(0, OURS)
     answers.answer_probes(10)

@@ -81,7 +81,7 @@ class Stage:
         self.settle()
 
     def beat(self, **fields: Any) -> None:
-        """Have it send a heartbeat, and wait until it is taken in."""
+        """Have the flight controller send a heartbeat, and wait until the program has processed it."""
         self.fc.beat(**fields)
         self.settle()
 

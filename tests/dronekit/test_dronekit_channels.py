@@ -290,7 +290,7 @@ OURS = {"1": 1500, "3": 1900, "10": 1700}
 
 
 def released(fc: FlightController, since: int) -> list[tuple[int, ...]]:
-    """The last RC_CHANNELS_OVERRIDE of a connection, and how often it came."""
+    """Return the channels of each RC_CHANNELS_OVERRIDE that releases channel 3."""
     fc.wait_for("RC_CHANNELS_OVERRIDE", lambda frame: frame.chan3_raw == 0, since=since)
     return [
         tuple(getattr(frame, f"chan{number}_raw") for number in range(1, 19))

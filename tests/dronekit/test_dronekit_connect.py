@@ -106,7 +106,7 @@ def test_unknown_autopilot_has_ardupilot_modes() -> None:
 
 
 def test_accept_input_discards_received_bytes(fc: FlightController) -> None:
-    """Programs play a link that has gone by it."""
+    """Programs set it to simulate a lost link."""
     with dronekit.connect(fc.address, rate=None) as vehicle:
         handler = vehicle._handler
         assert handler._accept_input

@@ -55,7 +55,7 @@ def eventually(is_true: Callable[[], object]) -> None:
 
 
 def is_gone(vehicle: weakref.ref[Any]) -> bool:
-    """At this moment the loop may be in one of its methods."""
+    """The loop may be executing one of its methods at this moment."""
     gc.collect()
     return vehicle() is None
 

@@ -27,7 +27,7 @@ def thread() -> Iterator[ListenerThread]:
 
 
 def wait_until_empty(thread: ListenerThread) -> None:
-    """Everything posted so far has been called."""
+    """Wait until all calls posted so far have run."""
     done = threading.Event()
     thread.post(done.set)
     assert done.wait(LIMIT_S)

@@ -61,7 +61,7 @@ def decoded(raw: bytes) -> Any:
 
 
 def contents_of(message: Any) -> dict[str, Any]:
-    """Everything that can be asked of a message, NaN comparable."""
+    """Return all public attributes of a message, with comparable NaN."""
     fields = message.get_fieldnames()
     return {
         "fields": repr([(name, getattr(message, name)) for name in fields]),

@@ -71,7 +71,7 @@ def fuzz_parameter_file(data: bytes) -> None:
 
 
 def fuzz_parameter_pack(data: bytes) -> None:
-    """Each reader of packed files returns a table, or raises our error."""
+    """Each reader of packed files returns a table or raises FileFormatError."""
     with suppress(RemoteProtocolError):
         unpack_items(data)
     try:

@@ -271,7 +271,7 @@ async def guided_velocity(trace: Trace) -> None:
 
 @scene()
 async def guided_velocity_px4(trace: Trace) -> None:
-    """A stream of velocities to PX4: it needs set-points before it takes OFFBOARD."""
+    """A stream of velocities to PX4: it needs set-points before it accepts OFFBOARD."""
     async with connected(trace, px4(), airborne=True) as vehicle:
         await _velocity(trace, vehicle)
 
@@ -335,7 +335,7 @@ async def fence_and_rally(trace: Trace) -> None:
 
 @scene(show=[RATES])
 async def parameter_read_all(trace: Trace) -> None:
-    """Reading all parameters of PX4 message by message; two values are lost and asked for by index."""
+    """Reading all parameters of PX4 message by message; two values are lost and requested by index."""
     simulated = px4()
     simulated.faults.no_ftp = True
     async with connected(trace, simulated) as vehicle:
@@ -346,7 +346,7 @@ async def parameter_read_all(trace: Trace) -> None:
 
 @scene(show=[RATES])
 async def parameter_set(trace: Trace) -> None:
-    """Setting a parameter of ArduPilot: the value that comes back counts; then one whose answer is lost."""
+    """Setting a parameter of ArduPilot: the returned value counts; then another one whose answer is lost."""
     simulated = copter()
     async with connected(trace, simulated) as vehicle:
         await vehicle.parameters.set("WP_YAW_BEHAVIOR", 1)
@@ -357,7 +357,7 @@ async def parameter_set(trace: Trace) -> None:
 
 @scene(show=[RATES])
 async def parameter_renamed(trace: Trace) -> None:
-    """Setting a parameter by its newer name: the vehicle is asked which of the two it has."""
+    """Setting a parameter by its newer name: aerokit requests which of the two the vehicle has."""
     async with connected(trace, copter()) as vehicle:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ParameterRenamedWarning)

@@ -176,7 +176,7 @@ def _texts_of_fields(message: Message) -> Iterator[str]:
 
 
 def _text_of_command(message: CommandLong | CommandInt) -> str:
-    """Its name with its parameters, up to the last one that is no zero; one that is about a message names it."""
+    """Return the command's name and its parameters up to the last non-zero one; message ids are shown as names."""
     if message.command in (MavCmd.SET_MESSAGE_INTERVAL, MavCmd.REQUEST_MESSAGE):
         assert isinstance(message, CommandLong)
         name = STANDARD[int(message.param1)].NAME

@@ -181,10 +181,10 @@ class DisturbedLink(Link):
             self._receiver.link_lost(error)  # type: ignore[arg-type]
 
     def link_stalled(self, unsent_bytes: int) -> None:
-        """It never does."""
+        """Ignore it: the inner link never stalls."""
 
     def link_drained(self) -> None:
-        """It always does."""
+        """Ignore it: the inner link never stalls."""
 
     def _note_sent(self, frame: Frame, crossing: TrafficEntry) -> None:
         crossing.raw, crossing.arrives_at = frame.raw, crossing.at + self._delay()

@@ -36,7 +36,7 @@ class _Counting:
 
 
 class CountingLoop(_Counting, VirtualClockLoop):
-    """On virtual time."""
+    """Counting loop on virtual time."""
 
 
 class RealCountingLoop(_Counting, asyncio.SelectorEventLoop):

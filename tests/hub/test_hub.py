@@ -488,7 +488,7 @@ async def test_removed_endpoint_with_retry_open_is_not_opened(monkeypatch: pytes
 
 
 class Broadcast(SlowLink):
-    """One other side, which has an address all the same, as `UdpBroadcast` has."""
+    """A link with a single peer that has an address, like `UdpBroadcast`."""
 
     kept: list[Peer]
 

@@ -59,7 +59,7 @@ async def udp_hub() -> AsyncIterator[tuple[Hub, list[HubEvent], Program, Program
 
 @pytest.mark.anyio
 async def test_udp_impostors_get_no_orders() -> None:
-    """Three hundred ports, as many as the hub has places and more; the vehicle keeps its own."""
+    """Three hundred ports, more than the hub's peer limit; the vehicle keeps its entry."""
     async with udp_hub() as (hub, events, copter, station), AsyncExitStack() as stack:
         strangers = [await stack.enter_async_context(Program(1, 1, to(of(hub, "radio"), "udpout"))) for _ in range(300)]
         for count in range(2):

@@ -1,4 +1,4 @@
-"""Hubs in a circle: what goes round ends, however long it takes, and a vehicle on two radios is no circle."""
+"""Hubs in a loop: looping frames are dropped at any delay, and a vehicle on two radios is not taken for a loop."""
 
 from __future__ import annotations
 

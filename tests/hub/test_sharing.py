@@ -42,7 +42,7 @@ def make(kind: str) -> tuple[SimulatedVehicle, str]:
 
 
 async def transfer_at_once(one: Vehicle, other: Vehicle, path: str, new: str) -> None:
-    """Each does all three kinds of transfers while the other does another one."""
+    """Each program runs all three kinds of transfers while the other one runs a different kind."""
     for this, that in ((one, other), (other, one)):
         parameters, _, data = await asyncio.gather(
             this.parameters.download(method="list", refresh=True),

@@ -87,7 +87,7 @@ def served(choice: Choice) -> AbstractAsyncContextManager[str | Link]:
 
 @asynccontextmanager
 async def served_on_two(choice: Choice) -> AsyncIterator[list[Link]]:
-    """The vehicle runs, with two ports of its own; a vehicle at an address is skipped."""
+    """Run the vehicle with two ports; skips the test for a vehicle at an address."""
     if choice.vehicle == "sim":
         ours, theirs = zip(*(memory_link_pair() for _ in range(2)), strict=True)
         async with SimulatorServer(_patient(choice), theirs, speedup=choice.speedup):
@@ -126,7 +126,7 @@ def _patient(choice: Choice) -> SimulatedVehicle:
 
 @asynccontextmanager
 async def _binary(choice: Choice, more: Sequence[str] = ()) -> AsyncIterator[str]:
-    """It is started in an empty directory, and ended afterwards."""
+    """Start the binary in an empty directory, and terminate it afterwards."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         is_px4 = not choice.kind.is_ardupilot
         port = 14540 + min(INSTANCE, 9) if is_px4 else _free_port()
@@ -142,7 +142,7 @@ async def _binary(choice: Choice, more: Sequence[str] = ()) -> AsyncIterator[str
 
 
 def _ardupilot(choice: Choice, port: int, folder: Path) -> tuple[list[str], dict[str, str]]:
-    """It waits for us as long as a simulated one does that is as fast."""
+    """Return command and environment; its time-outs are those of a simulated vehicle at the same speed."""
     binary, kind = Path(choice.vehicle).resolve(), choice.kind
     files = [folder / "patience.parm"]
     files[0].write_text("".join(f"{name} {value:g}\n" for name, value in _longer(choice).items()))

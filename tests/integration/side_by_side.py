@@ -310,7 +310,7 @@ async def _beat(vehicle: Vehicle, interval_s: float) -> None:
 
 
 def run_simulated(kind: str, seed: int, speedup: float = 1.0, calls: int = CALLS) -> list[Step]:
-    """On virtual time."""
+    """Run the calls on a simulated vehicle, on virtual time."""
 
     async def main() -> list[Step]:
         latitude, longitude, altitude, heading = KINDS[kind].home

@@ -34,7 +34,7 @@ async def up(vehicle: Vehicle, choice: Choice) -> None:
 
 
 async def down(vehicle: Vehicle, choice: Choice) -> None:
-    """On the ground, in the water or where it stands, the motors off."""
+    """Land the vehicle, or disarm it, and wait until its motors are off."""
     if choice.kind.lands and vehicle.is_armed:
         await vehicle.land(timeout=choice.seconds(400))
     if not choice.kind.takes_off:
@@ -43,7 +43,7 @@ async def down(vehicle: Vehicle, choice: Choice) -> None:
 
 
 async def test_flight_by_orders(choice: Choice) -> None:
-    """It goes there at that speed, does not disarm in the air, turns, holds, returns, comes down."""
+    """It flies to a place at a speed, refuses to disarm in the air, turns, holds, returns and lands."""
     kind = choice.kind
     async with ready(choice) as vehicle:
         here = vehicle.position.value
@@ -68,7 +68,7 @@ async def test_flight_by_orders(choice: Choice) -> None:
 
 
 async def test_flight_by_velocities(choice: Choice) -> None:
-    """It moves as far as speed and time give, and stops afterwards; planes do not take velocities."""
+    """The distance is speed times time, then it stops; planes do not accept velocities."""
     async with ready(choice) as vehicle:
         if choice.kind.takes_velocities:
             await up(vehicle, choice)

@@ -32,7 +32,7 @@ def _skip_on_real_vehicle(choice: Choice) -> None:
 
 
 async def test_signing_key_is_installed(choice: Choice) -> None:
-    """PX4 on a computer has no USB port, where alone it takes one."""
+    """PX4 accepts a key over USB only, and its simulation has no USB port."""
     async with ready(choice) as vehicle:
         signing = Signing(KEY)
         if choice.vehicle != "sim" and not choice.kind.is_ardupilot:

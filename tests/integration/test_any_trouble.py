@@ -50,7 +50,7 @@ def _is_a_copter(choice: Choice) -> None:
 
 @asynccontextmanager
 async def flying(choice: Choice, *, through_disturbance: bool = True) -> AsyncIterator[tuple[Vehicle, DisturbedLink]]:
-    """Some metres up, where it takes orders; the disturbances is good so far, if there is any."""
+    """A vehicle some metres up that accepts orders, over a link without disturbances so far."""
     async with served(choice) as served_at:
         link = served_at if isinstance(served_at, Link) else create_link(served_at)
         path = DisturbedLink(link)
@@ -79,7 +79,7 @@ def sent(path: DisturbedLink, command: int) -> int:
 
 
 class AnotherStation:
-    """Sends commands on the same link, by a name of its own."""
+    """Sends commands on the same link, with its own ids."""
 
     def __init__(self, vehicle: Vehicle, path: DisturbedLink) -> None:
         self._vehicle, self._path = vehicle, path
@@ -165,7 +165,7 @@ def command_in(raw: bytes) -> int:
 
 
 async def test_fleet_member_taken_by_other_station_is_left_alone(choice: Choice) -> None:
-    """It is flown from before the fleet was opened; another member does not do its part."""
+    """It was flying before the fleet was opened; another member does not respond."""
     silent = SimulatedCopter(system_id=77, boot_time_s=0.0)
     async with flying(choice) as (vehicle, path), simulated_link(silent) as link:
         connection = vehicle.connection

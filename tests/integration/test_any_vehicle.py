@@ -37,7 +37,7 @@ def anyio_backend(choice: Choice) -> Any:
 
 
 async def test_boot_until_ready(choice: Choice) -> None:
-    """It is not armed while it boots; then it reports its position and home, and does not move."""
+    """It is disarmed while booting; then it reports position and home, and does not move."""
     async with connected(choice) as vehicle:
         if choice.kind.is_ardupilot and choice.vehicle == "sim":
             with pytest.raises(CommandRejected):
@@ -148,7 +148,7 @@ async def test_armed_and_disarmed(choice: Choice) -> None:
 
 
 async def test_reboot(choice: Choice) -> None:
-    """It is back, and its streams are requested again; PX4's own simulation refuses."""
+    """After the reboot its streams are requested again; PX4's simulation refuses to reboot."""
     async with ready(choice) as vehicle:
         if choice.vehicle != "sim" and not choice.kind.is_ardupilot:
             with pytest.raises(CommandRejected):

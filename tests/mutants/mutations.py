@@ -1,4 +1,4 @@
-"""Single changes of a source file: cosmic-ray's operators, and one of ours that takes a statement away."""
+"""Single changes of a source file: cosmic-ray's operators, and an operator that removes a statement."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SWAPS = {
 
 
 class RemoveStatement(Operator):  # type: ignore[misc]
-    """A call, a change of an object, a raise, a return or a continue that is gone: resends, checks, tables."""
+    """Removes a call, an assignment to an object, a raise, a return or a continue."""
 
     def mutation_positions(self, node: Any) -> Any:
         if node.type == "simple_stmt" and _does_something(node.children[0]):

@@ -286,7 +286,7 @@ def test_parameter_list_finds_inserted_parameter() -> None:
     ],
 )
 def test_parameter_list_accepts_unstable_list_after_retries(count: int, names: list[str], asked: list[int]) -> None:
-    """Two of its parameters have the same name, and each answer reports another count."""
+    """Two of its parameters have the same name, and each answer reports a different count."""
 
     class ChangesCount(FakeVehicle):
         answers = 0

@@ -203,7 +203,7 @@ Place = tuple[str, int]
 
 
 def interrupted_at(place: Place | None, use: Callable[[list[LoopThread]], object] = uses_of_the_loop) -> set[Place]:
-    """Raise KeyboardInterrupt where the main thread first comes to this place; the places where it has been."""
+    """Raise KeyboardInterrupt when the main thread first reaches this place; return the places it has visited."""
     observed: set[Place] = set()
 
     def trace(frame: FrameType, event: str, argument: object) -> Any:
@@ -227,7 +227,7 @@ def interrupted_at(place: Place | None, use: Callable[[list[LoopThread]], object
 
 
 def test_run_shielded_completes_wherever_ctrl_c_arrives() -> None:
-    """At every line of ours but those before it can be noticed: the calls themselves."""
+    """Interrupt at every line of aerokit except the calls themselves, where it cannot be noticed yet."""
     done: list[int] = []
 
     async def work() -> None:
@@ -265,7 +265,7 @@ def test_run_shielded_completes_wherever_ctrl_c_arrives() -> None:
 
 
 def test_ctrl_c_is_never_lost_and_leaves_no_threads() -> None:
-    """At every line that the main thread runs, ours and those of threading; contextlib and pytest are not meant."""
+    """Interrupt at every line that the main thread runs in aerokit and threading, but not in contextlib and pytest."""
     ours = ("loop_thread.py", "thread_future.py", "threading.py")
     places = sorted(place for place in interrupted_at(None) if place[0].endswith(ours))
     assert len(places) > 80

@@ -76,7 +76,7 @@ def test_asynchronous_connect_used_before_entering_raises(name: str) -> None:
 
 
 def misuse(word: str, opened: Any) -> Any:
-    """A coroutine that does so."""
+    """Return a coroutine that misuses the block in the way named by ``word``."""
 
     async def wait() -> None:
         await opened

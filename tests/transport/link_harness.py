@@ -51,7 +51,7 @@ each_traffic = pytest.mark.parametrize("pieces", TRAFFIC, ids=["frame", "words",
 
 
 class Recorder:
-    """A receiver that keeps everything, and lets a test wait for it."""
+    """A receiver that records all callbacks and can wait for them."""
 
     def __init__(self) -> None:
         self.pieces: list[tuple[bytes, Peer]] = []

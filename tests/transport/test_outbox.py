@@ -327,7 +327,7 @@ async def read_until(connection: socket.socket, mark: bytes) -> bytes:
 
 
 async def fill(link: TcpConnect | SerialLink, frame: bytes) -> int:
-    """Write until something waits with us; the number of frames that were taken before."""
+    """Write until data waits in the outbox; return the number of frames accepted before."""
     for count in range(1000):
         link.write(frame)
         stream = next(iter(link._streams)) if isinstance(link, TcpConnect) else link

@@ -83,7 +83,7 @@ def test_unread_data_is_dropped_and_files_are_kept(tmp_path: Path) -> None:
 
 @posix_only
 def test_closed_pty_is_not_polled() -> None:
-    """Another file may have the number soon."""
+    """Another file may reuse the file descriptor."""
 
     async def close() -> None:
         link = PtyLink()

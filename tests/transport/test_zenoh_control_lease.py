@@ -1,4 +1,4 @@
-"""One client orders; the others only read, and get notices."""
+"""One client sends commands; the others only read, and receive notices."""
 
 from __future__ import annotations
 

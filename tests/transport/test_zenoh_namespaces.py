@@ -1,4 +1,4 @@
-"""Two machines, as network namespaces with a cable between them, which is pulled out; where the system allows it."""
+"""Two machines, as network namespaces with a cable between them that is pulled out; needs privileges."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Modes in which a vehicle does not arm: left before arming, named when asked, and no reason to wait."""
+"""Modes in which a vehicle does not arm: left before arming, named in the reasons, and not waited for."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ async def test_missing_for_flight_names_lost_link() -> None:
 
 
 async def test_missing_for_flight_without_link_lists_all() -> None:
-    """At once, with values that are still young; and only a heartbeat of after it brings it back."""
+    """The link is lost at once although values are recent, and only a later heartbeat restores it."""
     async with open_flight() as flight:
         vehicle, connection = flight.vehicle, flight.vehicle.connection
         await vehicle.wait_ready()
@@ -124,7 +124,7 @@ async def test_missing_for_flight_without_link_lists_all() -> None:
 
 
 async def test_abandoned_arm_of_armed_vehicle_does_not_disarm() -> None:
-    """On the ground, armed by its pilot; the program asks again and is cancelled at once."""
+    """The vehicle is armed on the ground; a second arm() is cancelled at once."""
     async with open_flight() as flight:
         await flight.vehicle.wait_ready()
         await flight.vehicle.arm()

@@ -150,7 +150,7 @@ async def test_body_velocity_is_in_body_frame(flying: Flight) -> None:
 
 
 async def test_body_velocity_with_heading_keeps_heading(flying: Flight) -> None:
-    """In MAV_FRAME_BODY_NED ArduPilot counts yaw from where the nose points; users give degrees from north."""
+    """In MAV_FRAME_BODY_NED ArduPilot measures yaw from the nose; users give degrees from north."""
     await flying.vehicle.set_heading(40.0)
     async with flying.vehicle.guided.body_velocity() as stream:
         await stream.fly(BodyVelocitySetpoint(forward_m_s=2.0, yaw_deg=180.0), 10.0)
@@ -216,7 +216,7 @@ async def test_setpoint_stream_cancelled_while_entering_holds() -> None:
 
 
 async def test_program_cancelled_leaves_nothing() -> None:
-    """The order to hold goes out although connection and loop are about to end."""
+    """The hold command is sent although the connection and the loop are about to end."""
     flight: Flight | None = None
     with anyio.move_on_after(30.0):
         async with in_the_air() as flight, flight.vehicle.guided.velocity() as stream:
@@ -303,7 +303,7 @@ async def test_setpoint_stream_pilot_takes_over_stops(flying: Flight) -> None:
 
 
 async def test_setpoint_stream_takeover_before_exit_sends_no_hold() -> None:
-    """The stream has not noticed yet; the vehicle is the pilot's all the same."""
+    """The stream has not noticed the takeover yet; the pilot keeps control."""
     async with in_the_air() as flying:
         with pytest.raises(SetpointStreamStopped, match="left GUIDED for LOITER"):
             async with flying.vehicle.guided.velocity(rate_hz=2.0) as stream:
@@ -562,7 +562,7 @@ async def test_px4_entry_cancelled_before_offboard_request_keeps_pilot() -> None
 async def test_setpoint_stream_stops_after_silence(
     phase: float,
 ) -> None:
-    """Whenever the second begins in which silence is looked for."""
+    """The result does not depend on the phase of the one-second silence check."""
     async with in_the_air() as flight:
         await anyio.sleep(phase)
         silent_since = math.inf

@@ -1,4 +1,4 @@
-"""Hold after an abandoned flight: sent at once, and repeated until it is obeyed."""
+"""Hold after an abandoned flight: sent at once, and repeated until it is executed."""
 
 from __future__ import annotations
 

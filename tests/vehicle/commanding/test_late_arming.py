@@ -65,7 +65,7 @@ async def test_vehicle_armed_before_order_stays_armed(flying: Flight, ends: str)
 
 
 async def test_late_disarm_continues_after_watch_time(grounded: Flight) -> None:
-    """It armed in the last moment, and the first order to disarm is lost."""
+    """It armed at the last moment, and the first disarm command is lost."""
     await grounded.vehicle.set_mode("GUIDED")
     grounded.copter.faults.ignore(ARM)
     reported_at = grounded.vehicle.armed.updated_at

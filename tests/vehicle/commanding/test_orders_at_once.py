@@ -1,4 +1,4 @@
-"""Two orders at once, where the second needs the command that the first waits for: the newest is the one that holds."""
+"""Two orders at once, where the second needs the command that the first waits for: the newest one counts."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ async def test_arm_and_disarm_commands_supersede_each_other() -> None:
 async def test_legacy_set_mode_is_not_sent_for_ended_order(
     legacy: MavCmd,
 ) -> None:
-    """It would be sent 0.3 s after the refusal, whose reasons are waited for."""
+    """It would be sent 0.3 s after the refusal, because the refusal waits for its reasons."""
     async with _copter(flies=True) as (copter, vehicle, path):
         copter.faults.refuse(legacy, MavResult.UNSUPPORTED)
         there = vehicle.position.value.offset(north_m=8)

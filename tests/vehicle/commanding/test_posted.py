@@ -226,7 +226,7 @@ def test_raw_messages_have_subjects(message: Any, subjects: set[str]) -> None:
 
 @pytest.mark.anyio
 async def test_posted_mode_arm_take_off_without_waiting(grounded: Flight) -> None:
-    """Each goes out at once, while the one before is not answered; lost answers are made good."""
+    """Each is sent at once, before the previous one is acknowledged; lost acks are compensated."""
     vehicle, wire = grounded.vehicle, grounded.wire
     for command in (SET_MODE, ARM):
         grounded.copter.faults.lose_ack(command, times=1)

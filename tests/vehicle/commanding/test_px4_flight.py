@@ -56,7 +56,7 @@ async def test_px4_take_off_uses_amsl_altitude_and_ends_in_loiter() -> None:
 async def test_take_off_is_not_repeated_after_mode_report(
     monkeypatch: pytest.MonkeyPatch, tells_landed_state: bool
 ) -> None:
-    """It starts in LOITER, where it also ends, and stands for a second while the motors spin up."""
+    """It starts and ends in LOITER, and stays on the ground for a second while the motors spin up."""
     async with open_px4() as flight:
         await flight.vehicle.wait_ready()
         await flight.vehicle.set_mode("LOITER")

@@ -108,7 +108,7 @@ async def test_available_modes_name_is_accepted() -> None:
 
 
 async def test_available_modes_are_requested_until_received() -> None:
-    """The link is bad when the vehicle connects: its own modes are asked for again."""
+    """The link is bad when the vehicle connects: its list of modes is requested again."""
     copter = CopterWithAScript(boot_time_s=0.0)
     copter.faults.ignore(MavCmd.REQUEST_MESSAGE)
     async with open_flight(copter) as flight:

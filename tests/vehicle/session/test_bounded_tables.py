@@ -92,7 +92,7 @@ def test_peers_of_a_simulated_vehicle() -> None:
 
 
 def test_bus_plans_are_bounded() -> None:
-    """One for each subscribed system and message, and none for others."""
+    """There is one entry for each subscribed system and message, and no other."""
     bus = Bus()
     bus.attach(Heartbeat, lambda _: None)
     for system_id in range(1, 256):

@@ -1,4 +1,4 @@
-"""Any command by number, rebooting, and what two commands at once have to do with each other."""
+"""Any command by number, rebooting, and concurrent commands."""
 
 from __future__ import annotations
 

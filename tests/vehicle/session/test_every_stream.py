@@ -1,4 +1,4 @@
-"""``vehicle.streams``: all that a vehicle streams, asked for again when it does not come."""
+"""``vehicle.streams``: all streams of a vehicle, requested again when missing."""
 
 from __future__ import annotations
 

@@ -191,7 +191,7 @@ def test_any_sequence_with_any_cancellation(
 @given(leave_after=st.floats(0.0, 12.0), how=st.sampled_from(["cancel", "raise", "return", "unplug"]))
 @settings(max_examples=16)
 def test_setpoint_stream_exit_in_flight_holds(leave_after: float, how: str) -> None:
-    """Also while connecting: the block ends at once and takes all operations with it."""
+    """Also while connecting: the block and all its operations end at once."""
 
     async def flying(flight: Flight) -> None:
         vehicle = flight.vehicle

@@ -22,7 +22,7 @@ SET_INTERVAL = MavCmd.SET_MESSAGE_INTERVAL
 
 
 def asked(flight: Flight, kind: type[Message]) -> list[float]:
-    """The intervals in seconds that this message was asked for."""
+    """Return the requested intervals of this message in seconds."""
     return [command.param2 / 1e6 for command in flight.wire.commands(SET_INTERVAL) if command.param1 == kind.ID]
 
 
@@ -150,7 +150,7 @@ async def test_missing_sensor_is_not_requested_continuously() -> None:
 
 
 async def test_answered_timesync_is_requested_immediately_again() -> None:
-    """Each question in vain doubles the pause, until one is answered."""
+    """Each unanswered request doubles the pause."""
     async with open_flight(rates={}) as flight, AsyncExitStack() as requests:
         await anyio.sleep(3.0)
         for times, hz in ((3, 20.0), (1, 50.0)):

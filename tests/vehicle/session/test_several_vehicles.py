@@ -252,7 +252,7 @@ async def test_autopilot_with_other_component_id_is_accepted() -> None:
 
 
 async def test_gimbal_works_while_autopilot_is_silent() -> None:
-    """Its heartbeats come from the same system; the vehicle is silent all the same."""
+    """Its heartbeats come from the same system, but the vehicle counts as silent."""
     copter = SimulatedCopter(boot_time_s=0.0)
     async with simulated_link(copter) as link:
         wire = Wire(link)

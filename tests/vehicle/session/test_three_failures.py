@@ -224,7 +224,7 @@ class SilentVehicle:
 
 
 def test_program_with_timed_out_calls_exits() -> None:
-    """In a process of its own, on a real socket: the interpreter itself has to come to its end."""
+    """A separate process with a real socket: the interpreter must exit."""
     with SilentVehicle() as silent:
         finished = subprocess.run(
             [sys.executable, "-W", "error", "-c", textwrap.dedent(PROGRAM), f"udpin:127.0.0.1:{silent.port}"],

@@ -178,7 +178,7 @@ def test_every_state_message_is_in_standard_dialect() -> None:
 
 
 def test_status_text_repetition_requires_same_text_and_sequence() -> None:
-    """Only the last chunk once more is a frame that came by another way."""
+    """A repeated last chunk alone is a frame that arrived over another route."""
     texts = StatusTextAssembler()
     first, second, other = chunks("a" * 50 + "b" * 50 + "c")[:2] + chunks("a" * 50 + "d" * 50)[1:2]
     assert [text for message in (first, second, second) for text in texts.receive(message, 0.0)] == []

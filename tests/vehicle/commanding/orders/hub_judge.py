@@ -17,7 +17,7 @@ ROUNDING_S = 1e-6
 
 
 def hub_faults(flown: Flown) -> list[str]:
-    """Every order that the hub has made up, doubled, kept too long or sent in another order; in words."""
+    """Return a description of each order that the hub invented, duplicated, kept too long or reordered."""
     path = flown.traffic
     assert isinstance(path, DisturbedHubPath)
     return list(_passed_on(path))

@@ -1,4 +1,4 @@
-"""A program that is stopped in flight, while the failsafe for a lost ground station acts: the failsafe stays in control."""
+"""A program that is stopped in flight while the ground station failsafe acts: the failsafe stays in control."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def fly(scheme: str, what: str) -> tuple[str, list[int], float, str, str]:
 @pytest.mark.exhaustive  # twenty seconds of real time
 @pytest.mark.parametrize("cases", [CASES[:1], CASES[1:]], ids=["one", "others"])
 def test_blocked_program_keeps_failsafe(cases: list[tuple[str, str]]) -> None:
-    """All of them at once, since they wait for the failsafe most of the time."""
+    """Run all of them concurrently, because they mostly wait for the failsafe."""
     with ThreadPoolExecutor(len(cases)) as pool:
         flown = dict(zip(cases, pool.map(lambda case: fly(*case), cases), strict=True))
     for (scheme, what), (error, sent, oldest_s, reported, mode) in flown.items():
