@@ -108,7 +108,7 @@ def test_frames_do_not_circulate_on_any_slow_network(network: Network) -> None:
 
 
 def two_radios(stage: Stage, seconds: int, first: FrameEncoder, second: FrameEncoder, ports: str) -> set[str]:
-    """A disarmed vehicle with a sequence counter for each port; yields the drop reasons of port b."""
+    """A disarmed vehicle with a sequence counter for each port; returns the drop reasons of port b."""
     reasons = set()
     for _ in range(seconds):
         for step in range(4):
