@@ -244,7 +244,7 @@ async def test_two_programs_order_the_same_vehicle() -> None:
             two.write(frame(SET_POINT))
             two.write(read := frame(ParamRequestList(1, 1)))
             await eventually(lambda: len(client_recorder.refused) == 2)
-            assert client_recorder.refused[0] == ("COMMAND_LONG", "client one has control", "one")
+            assert client_recorder.refused[0] == ("COMMAND_LONG", "one has control", "one")
             assert len(client_recorder.answers[0]) == 2
             assert recorder.data == read
             assert vehicle.refused_frames == 2 == two.dropped_writes

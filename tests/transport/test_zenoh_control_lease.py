@@ -112,7 +112,7 @@ def test_first_order_acquires_lease_and_others_are_notified() -> None:
     assert lease.holder(0.1) == "one"
     passed, (notice,) = second.receive(send(REQUEST) + send(ARM) + send(HEARTBEAT), "free", 0.2)
     assert passed == send(REQUEST) + send(HEARTBEAT)
-    assert (notice.message, notice.lease_holder, notice.reason) == ("COMMAND_LONG", "one", "client one has control")
+    assert (notice.message, notice.lease_holder, notice.reason) == ("COMMAND_LONG", "one", "one has control")
     answer = answer_of(notice.answer)
     assert isinstance(answer, CommandAck)
     assert (answer.command, answer.result, answer.target_system) == (400, 1, 255)
@@ -172,7 +172,7 @@ def test_setpoint_notices_are_limited_and_counted() -> None:
 def test_late_orders_are_refused_without_answer() -> None:
     client = ClientFilter("one", ControlLease())
     (notice,) = client.refuse_late(send(ARM) + send(HEARTBEAT), 0.0)
-    assert (notice.message, notice.reason, notice.answer) == ("COMMAND_LONG", "it arrived too late", b"")
+    assert (notice.message, notice.reason, notice.answer) == ("COMMAND_LONG", "it came too late", b"")
     assert client.refused == 2
 
 
