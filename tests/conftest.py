@@ -57,12 +57,12 @@ async def grounded(anyio_backend: object) -> AsyncIterator[Flight]:
     """A copter that is ready, disarmed and in STABILIZE."""
     async with open_flight() as flight:
         await flight.vehicle.wait_ready()
-        flight.wire.forget()
+        flight.wire.clear()
         yield flight
 
 
 @pytest.fixture
 async def flying(anyio_backend: object) -> AsyncIterator[Flight]:
-    """A copter hovering 10 m above home in GUIDED; ``wire.sent`` has only what the test sends."""
+    """A copter hovering 10 m above home in GUIDED; ``wire.sent`` has only the messages sent during the test."""
     async with in_the_air() as flight:
         yield flight

@@ -14,9 +14,9 @@ def branch(cls: type[BaseException], depth: int = 0) -> list[str]:
     """Return lines for a class, its built-in bases, and its subclasses below."""
     builtin = [base.__name__ for base in cls.__bases__ if base.__module__ == builtins.__name__]
     also = f" ({', '.join(builtin)})" if builtin and cls is not errors.AerokitError else ""
-    below = [each for each in (getattr(errors, name) for name in errors.__all__) if each.__bases__[0] is cls]
+    below = [error for error in (getattr(errors, name) for name in errors.__all__) if error.__bases__[0] is cls]
     lines = [f"{'  ' * depth}{cls.__name__}{also}"]
-    return lines + [line for each in below for line in branch(each, depth + 1)]
+    return lines + [line for subclass in below for line in branch(subclass, depth + 1)]
 
 
 def test_error_tree_in_reference_matches_classes() -> None:

@@ -174,7 +174,7 @@ def test_enum_values_must_fit_64_bits(tmp_path: Path) -> None:
     path = tmp_path / "own.xml"
     path.write_text(entries(*values))
     loaded = Dialect.from_xml(path).enum("E")
-    assert {each.value for each in loaded.__members__.values()} == {0, 1 << 63, highest, -(1 << 63), 1}
+    assert {member.value for member in loaded.__members__.values()} == {0, 1 << 63, highest, -(1 << 63), 1}
 
 
 @pytest.mark.parametrize(

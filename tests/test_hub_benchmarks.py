@@ -1,4 +1,4 @@
-"""The benchmark of the hub runs and writes what it promises; the figures are no matter for a test."""
+"""The hub benchmark runs and writes its report; its figures are not tested."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def run(*arguments: str, peer: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.exhaustive
 def test_aerokit_alone_forwards_everything(tmp_path: Path) -> None:
-    """It has nobody to be compared with, so there are no rows; that no frame was lost is what counts."""
+    """Without a competitor the report has no rows; the test checks that no frame was lost."""
     path = tmp_path / "bench.json"
     done = run("--quick", "out_4", "latency_p99", "--output", str(path), peer="/nowhere/python")
     assert done.returncode == 0, done.stderr

@@ -134,7 +134,7 @@ def test_subpackages_import_only_lower_ones(path: Path) -> None:
 
 
 def test_imports_have_no_cycles() -> None:
-    """Includes type-checking imports and imports inside functions."""
+    """Type-checking imports and imports inside functions count as well."""
     trees = {
         ".".join(("aerokit", *path.relative_to(SOURCE).with_suffix("").parts)).removesuffix(".__init__"): path
         for path in SOURCE.rglob("*.py")

@@ -27,7 +27,7 @@ PREFIXES = (
     "LANDED_",
     "STATE_",
 )
-NAMES = {f"{prefix}{each.name}": each.value for kind in ENUMS for each in kind for prefix in PREFIXES}
+NAMES = {f"{prefix}{member.name}": member.value for kind in ENUMS for member in kind for prefix in PREFIXES}
 
 
 def declared(path: Path) -> Iterator[tuple[str, int]]:
@@ -44,15 +44,15 @@ def declared(path: Path) -> Iterator[tuple[str, int]]:
                 yield name.id, number.value
 
 
-@pytest.mark.parametrize("package", sorted(each.name for each in SOURCE.iterdir() if each.is_dir()))
+@pytest.mark.parametrize("package", sorted(path.name for path in SOURCE.iterdir() if path.is_dir()))
 def test_standard_numbers_are_not_redeclared(package: str) -> None:
     files = [
-        each for each in (SOURCE / package).rglob("*.py") if not str(each.relative_to(SOURCE)).startswith(GENERATED)
+        path for path in (SOURCE / package).rglob("*.py") if not str(path.relative_to(SOURCE)).startswith(GENERATED)
     ]
     again = [
-        f"{each.relative_to(SOURCE)}: {name} = {number}"
-        for each in files
-        for name, number in declared(each)
+        f"{file.relative_to(SOURCE)}: {name} = {number}"
+        for file in files
+        for name, number in declared(file)
         if NAMES.get(name.lstrip("_")) == number and len(name) > 8
     ]
     assert not again

@@ -36,9 +36,9 @@ def mixed(folder: Path, init: str | None) -> Path:
     """Remains of the unrelated project named aerokit, installed before ours (None) or after it."""
     package = folder / "aerokit"
     package.mkdir()
-    for each in SOURCE.iterdir():
-        if each.name not in ("__pycache__", "__init__.py"):
-            (package / each.name).symlink_to(each)
+    for path in SOURCE.iterdir():
+        if path.name not in ("__pycache__", "__init__.py"):
+            (package / path.name).symlink_to(path)
     (package / "__init__.py").write_text((SOURCE / "__init__.py").read_text() if init is None else init)
     (package / "aero").mkdir()
     (package / "aero" / "__init__.py").touch()

@@ -89,16 +89,16 @@ async def test_live_video_frames_have_vehicle_state() -> None:
                     frames.append(frame)
                     if len(frames) == 5:
                         break
-        times = [each.received_at for each in frames]
+        times = [frame.received_at for frame in frames]
         assert times == sorted(times)
-        assert all(each.position is not None and each.attitude is not None for each in frames)
+        assert all(frame.position is not None and frame.attitude is not None for frame in frames)
         assert frames[0].picture.to_ndarray(format="rgb24").shape == (48, 64, 3)
-        stamps = [each.stream_s or 0.0 for each in frames]
+        stamps = [frame.stream_s or 0.0 for frame in frames]
         assert all(later > earlier for earlier, later in pairwise(stamps))
-    for each in threading.enumerate():
-        if "video" in each.name:
-            each.join(100)
-            assert not each.is_alive()
+    for thread in threading.enumerate():
+        if "video" in thread.name:
+            thread.join(100)
+            assert not thread.is_alive()
 
 
 async def test_video_file_is_read_to_end(tmp_path: Path) -> None:
@@ -151,7 +151,7 @@ async def test_video_opening_can_be_cancelled(monkeypatch: pytest.MonkeyPatch) -
         async with open_video(f"udp://127.0.0.1:{free_port()}", timeout=3.0):
             pass
     assert scope.cancelled_caught
-    left = [each for each in threading.enumerate() if "video" in each.name]
+    left = [thread for thread in threading.enumerate() if "video" in thread.name]
     assert len(left) == 1  # until the timeout
     left[0].join(100)
     assert not left[0].is_alive()

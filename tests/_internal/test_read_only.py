@@ -36,7 +36,7 @@ async def test_assignment_error_names_method(grounded: Flight, name: str, value:
 @pytest.mark.anyio
 async def test_vehicle_attributes_are_read_only(grounded: Flight) -> None:
     objects = [grounded.vehicle, *(getattr(grounded.vehicle, part) for part in PARTS[:-1])]
-    assert [assigned for each in objects for assigned in assignable(each)] == []
+    assert [assigned for thing in objects for assigned in assignable(thing)] == []
 
 
 def test_blocking_vehicle_attributes_are_read_only() -> None:
@@ -48,16 +48,16 @@ def test_blocking_vehicle_attributes_are_read_only() -> None:
             vehicle.position.latitude_deg  # type: ignore[attr-defined]  # noqa: B018
         assert copy.copy(vehicle.position).latest is not None
         objects = [vehicle, *(getattr(vehicle, part) for part in PARTS)]
-        assert [assigned for each in objects for assigned in assignable(each)] == []
+        assert [assigned for thing in objects for assigned in assignable(thing)] == []
 
 
 def assignable(thing: Any) -> list[str]:
     """Return the reported attributes (cells, properties, parts) that accept another value, and restore them."""
     found = []
     for name in dir(type(thing)):
-        told = inspect.getattr_static(type(thing), name)
-        is_told = not name.startswith("_") and hasattr(type(told), "__get__") and not callable(told)
-        if not is_told or (isinstance(told, property) and told.fset is not None):
+        attribute = inspect.getattr_static(type(thing), name)
+        is_told = not name.startswith("_") and hasattr(type(attribute), "__get__") and not callable(attribute)
+        if not is_told or (isinstance(attribute, property) and attribute.fset is not None):
             continue
         try:
             setattr(thing, name, None)

@@ -101,10 +101,10 @@ def test_snapshot_repr_and_matching() -> None:
 
 
 def test_snapshot_base_fields_come_first() -> None:
-    heard = TimedText(1.5, "ping")
-    assert heard.to_dict() == {"at": 1.5, "text": "ping", "loudness": 1.0}
-    assert (Timed(1.5) == heard, heard == TimedText(1.5, "ping", 1.0)) == (False, True)
-    assert not hasattr(heard, "__dict__")
+    text = TimedText(1.5, "ping")
+    assert text.to_dict() == {"at": 1.5, "text": "ping", "loudness": 1.0}
+    assert (Timed(1.5) == text, text == TimedText(1.5, "ping", 1.0)) == (False, True)
+    assert not hasattr(text, "__dict__")
 
 
 def test_snapshot_subclass_without_own_fields() -> None:

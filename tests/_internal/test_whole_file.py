@@ -18,4 +18,4 @@ def test_atomic_write_does_not_follow_link(tmp_path: Path) -> None:
     write_atomically(tmp_path / "report.html", "text")
     assert victim.read_text() == "precious"
     assert not (tmp_path / "report.html").is_symlink()
-    assert sorted(each.name for each in tmp_path.iterdir()) == ["report.html", "victim"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["report.html", "victim"]

@@ -190,8 +190,8 @@ def test_unknown_ardupilot_type_is_ardupilot() -> None:
 @pytest.mark.parametrize("others", [0, 1, 2, 32, 128, 1 | 2 | 32 | 128])
 def test_base_mode_name_is_most_automatic_flag(others: int) -> None:
     """AUTO is 4, GUIDED 8, STABILIZE 16, MANUAL 64; the other flags do not depend on the mode."""
-    told = {flags: base_mode_name(flags | others) for flags in (0, 4, 8, 16, 64)}
-    assert told == {0: "PREFLIGHT", 4: "AUTO", 8: "GUIDED", 16: "STABILIZE", 64: "MANUAL"}
+    names = {flags: base_mode_name(flags | others) for flags in (0, 4, 8, 16, 64)}
+    assert names == {0: "PREFLIGHT", 4: "AUTO", 8: "GUIDED", 16: "STABILIZE", 64: "MANUAL"}
     assert [base_mode_name(flags | others) for flags in (92, 88, 80)] == ["AUTO", "GUIDED", "STABILIZE"]
 
 

@@ -64,8 +64,8 @@ def test_surface_vehicles_have_no_take_off(number: int, vehicle_type: int) -> No
 
 @pytest.mark.parametrize(("status", "landed"), [(3, 1), (4, 2), (5, None), (0, None)])
 def test_landed_state_from_system_status(status: int, landed: int | None) -> None:
-    for each in (copter, plane):
-        assert each.landed_state_of(Heartbeat(2, 3, 81, 4, status)) == landed
+    for kind in (copter, plane):
+        assert kind.landed_state_of(Heartbeat(2, 3, 81, 4, status)) == landed
     assert px4.landed_state_of(Heartbeat(2, 12, 81, 4, status)) is None
     assert autopilot(3, 10).landed_state_of(Heartbeat(10, 3, 81, 4, status)) is None
 
@@ -84,7 +84,7 @@ def test_px4_missing_sensors_are_enabled_but_absent() -> None:
 
 
 @pytest.mark.parametrize(
-    ("each", "present", "enabled", "healthy", "passes"),
+    ("kind", "present", "enabled", "healthy", "passes"),
     [
         (copter, True, True, True, True),
         (copter, True, True, False, False),
@@ -93,8 +93,8 @@ def test_px4_missing_sensors_are_enabled_but_absent() -> None:
         (px4, False, False, False, False),
     ],
 )
-def test_prearm_bit(each: Autopilot, present: bool, enabled: bool, healthy: bool, passes: bool | None) -> None:
-    assert each.prearm_checks_pass(*(PREARM_CHECK * bit for bit in (present, enabled, healthy))) is passes
+def test_prearm_bit(kind: Autopilot, present: bool, enabled: bool, healthy: bool, passes: bool | None) -> None:
+    assert kind.prearm_checks_pass(*(PREARM_CHECK * bit for bit in (present, enabled, healthy))) is passes
 
 
 def test_ardupilot_missing_estimates() -> None:
@@ -117,7 +117,7 @@ def test_px4_missing_estimates() -> None:
 
 
 @pytest.mark.parametrize(
-    ("each", "text", "reason"),
+    ("kind", "text", "reason"),
     [
         (copter, "PreArm: RC not found", "RC not found"),
         (copter, "Arm: Compass not calibrated", "Compass not calibrated"),
@@ -128,8 +128,8 @@ def test_px4_missing_estimates() -> None:
         (px4, "PreArm: of another autopilot", None),
     ],
 )
-def test_arming_reason_texts(each: Autopilot, text: str, reason: str | None) -> None:
-    assert each.arming_reason(text) == reason
+def test_arming_reason_texts(kind: Autopilot, text: str, reason: str | None) -> None:
+    assert kind.arming_reason(text) == reason
 
 
 def test_refusal_texts() -> None:

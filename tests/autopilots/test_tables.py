@@ -45,7 +45,7 @@ NOT_OF_THE_STANDARD = {
     ],
 )
 def test_ardupilot_modes_match_standard(name: str, table: ModeTable) -> None:
-    theirs = {each.value: SPELT_OTHERWISE.get(each.name, each.name) for each in getattr(enums, name)} | {
+    theirs = {member.value: SPELT_OTHERWISE.get(member.name, member.name) for member in getattr(enums, name)} | {
         number: text for (kind, number), text in NOT_OF_THE_STANDARD.items() if kind == name
     }
     assert dict(table.numbers) == theirs
@@ -117,10 +117,10 @@ def test_missing_estimate_is_named(autopilot: int, needed: dict[int, str]) -> No
 
 def test_prearm_check_is_single_bit() -> None:
     for autopilot in (3, 12):
-        each = of(autopilot, 2)
-        assert each.failing_sensors(0x7FFF_FFFF, 0x7FFF_FFFF, 0x7FFF_FFFF & ~(1 << 28 | 1)) == ("gyroscope",)
-        assert each.prearm_checks_pass(0x7FFF_FFFF, 0x7FFF_FFFF, 0x7FFF_FFFF & ~(1 << 28)) is False
-        assert each.prearm_checks_pass(1 << 28, 1 << 28, 1 << 28) is True
+        table = of(autopilot, 2)
+        assert table.failing_sensors(0x7FFF_FFFF, 0x7FFF_FFFF, 0x7FFF_FFFF & ~(1 << 28 | 1)) == ("gyroscope",)
+        assert table.prearm_checks_pass(0x7FFF_FFFF, 0x7FFF_FFFF, 0x7FFF_FFFF & ~(1 << 28)) is False
+        assert table.prearm_checks_pass(1 << 28, 1 << 28, 1 << 28) is True
 
 
 # ---------------------------------------------------------------------------------- take-off
@@ -257,6 +257,6 @@ PX4_DOWN = PX4 | {"lands_after_return": False}
     ],
 )
 def test_autopilot_attributes(autopilot: int, vehicle_type: int, firmware: str, habits: dict[str, Any]) -> None:
-    each = of(autopilot, vehicle_type)
-    assert each.firmware == firmware
-    assert {name: getattr(each, name) for name in habits} == habits
+    table = of(autopilot, vehicle_type)
+    assert table.firmware == firmware
+    assert {name: getattr(table, name) for name in habits} == habits

@@ -1,7 +1,7 @@
 """A simulated vehicle behind a bad radio, and the cost of one transfer over it, on virtual time.
 
-`attempt` does one transfer and gives an `Attempt`: how it ended, how long it took, what was sent for it, and what was
-left on either side.
+`attempt` runs one transfer and returns an `Attempt`: its outcome, its duration, the messages sent, and the state left
+on either side.
 """
 
 from __future__ import annotations
@@ -71,8 +71,8 @@ class Program:
     known: Any = None
     """Result of the preparation, while the radio was good."""
 
-    def turn_bad(self, radio: Radio) -> None:
-        """From now on."""
+    def degrade(self, radio: Radio) -> None:
+        """Apply the faults of the bad radio from now on."""
         model = radio.model
         if radio.outage_after_s is not None:
             begin = asyncio.get_running_loop().time() - self.opened_at + radio.outage_after_s
@@ -89,7 +89,7 @@ class Attempt:
     value: Any
     seconds: float
     sent: Counter[str] = field(default_factory=Counter)
-    heard: int = 0
+    received: int = 0
     left: list[str] = field(default_factory=list)
 
     @property
@@ -110,9 +110,9 @@ def attempt(
     timeout_s: float = 900.0,
     leftovers: Callable[[Any], Iterator[str]] = lambda simulated: iter(()),
 ) -> Attempt:
-    """One transfer. The radio turns bad when the vehicle is connected and ``before`` was done.
+    """Run one transfer. The radio turns bad when the vehicle is connected and ``before`` has run.
 
-    ``leftovers`` names what the vehicle kept.
+    ``leftovers`` returns names of the state that the vehicle kept.
     """
     return run_virtual(_attempt(work, radio, seed, make_vehicle(), before, timeout_s, leftovers))
 
@@ -131,9 +131,9 @@ async def _attempt(
         if before is not None:
             await before(program)
         held = _held(program)
-        program.turn_bad(radio)
-        program.wire.forget()
-        heard, begun = program.radio.incoming.frames, loop.time()
+        program.degrade(radio)
+        program.wire.clear()
+        received_before, begun = program.radio.incoming.frames, loop.time()
         outcome = Attempt(seed, None, None, 0.0)
         try:
             with anyio.fail_after(timeout_s):
@@ -141,9 +141,11 @@ async def _attempt(
         except Exception as error:
             outcome.error = error
         outcome.seconds = loop.time() - begun
-        outcome.heard = program.radio.incoming.frames - heard
-        outcome.left = await _what_is_left(program, held, leftovers)
-        outcome.sent = Counter(type(each).NAME for _, each in program.wire.sent if not isinstance(each, OWN_LIFE))
+        outcome.received = program.radio.incoming.frames - received_before
+        outcome.left = await _remaining_state(program, held, leftovers)
+        outcome.sent = Counter(
+            type(message).NAME for _, message in program.wire.sent if not isinstance(message, OWN_LIFE)
+        )
     return outcome
 
 
@@ -151,7 +153,7 @@ async def _attempt(
 async def open_program(
     simulated: SimulatedVehicle, seed: int = 0, *, half_duplex: bool = False
 ) -> AsyncIterator[Program]:
-    """Connected, what it is known to be able to do, no streams but the vehicle's own; the radio is still good."""
+    """Open a connected program: capabilities known, no streams but the vehicle's own, the radio still good."""
     async with simulated_link(simulated) as link:
         radio = FaultyLink(link, PERFECT, seed=seed, half_duplex=half_duplex)
         opened_at = asyncio.get_running_loop().time()
@@ -173,10 +175,10 @@ def _held(program: Program) -> tuple[int, int, int, int]:
     )
 
 
-async def _what_is_left(
+async def _remaining_state(
     program: Program, held: tuple[int, ...], leftovers: Callable[[Any], Iterator[str]]
 ) -> list[str]:
-    """At once if possible: the radio is still as bad, and closing needs it."""
+    """Close at once if possible; the radio is still bad, and closing needs it."""
     names = ("sinks", "waiters", "deadlines", "tasks")
     until = asyncio.get_running_loop().time() + GRACE_S
     while True:

@@ -1,11 +1,10 @@
-"""The time that a transfer cannot do without: computed from what has to be moved, never measured.
+"""The minimum duration of each transfer, computed from its data, never measured.
 
 ``ideal = round trips that depend on each other × round-trip time + the longer of (bytes / bandwidth, vehicle's pace)``
 
-It is what a client takes that makes no mistake over a radio that loses nothing: requests that do not depend on each
-other's answers are all sent at once, nothing is sent twice, no time is taken to think. With a radio of two frequencies
-the busier direction counts, with one frequency both. (A little less is possible where bytes move while others wait for
-their round trip.)
+It is the duration of a perfect client over a lossless radio: independent requests are sent at once, nothing is sent
+twice, and processing takes no time. With a radio of two frequencies the busier direction counts, with one frequency the
+sum of both. (A little less is possible where bytes move while others wait for their round trip.)
 """
 
 from __future__ import annotations
@@ -38,12 +37,12 @@ class Ideal:
     """Time that the vehicle itself takes to send its part."""
 
     def seconds(self, radio: Radio) -> float:
-        """Over this kind of radio, were it without faults."""
+        """Ideal duration over this kind of radio without faults."""
         moved = self.up + self.down if radio.half_duplex else max(self.up, self.down)
         return self.round_trips * 2 * radio.model.delay_s + max(moved / radio.model.bandwidth, self.vehicle_s)
 
     def __add__(self, other: Ideal) -> Ideal:
-        """One after the other."""
+        """Sum of consecutive exchanges."""
         return Ideal(
             self.round_trips + other.round_trips,
             self.up + other.up,
@@ -58,7 +57,7 @@ def parameter_list(count: int, *, per_second: float) -> Ideal:
 
 
 def parameter_writes(count: int) -> Ideal:
-    """Each is sent and confirmed, none depends on another; but a vehicle keeps no more than `QUEUE` waiting."""
+    """Each write is sent and confirmed independently, but a vehicle queues at most `QUEUE` writes."""
     return Ideal(math.ceil(count / QUEUE), count * PARAM_SET, count * PARAM_VALUE)
 
 
@@ -81,7 +80,7 @@ def file_write(size: int) -> Ideal:
 
 
 def checksum() -> Ideal:
-    """Asked for and answered."""
+    """One request and one answer."""
     return Ideal(1, FTP_REQUEST, FTP_REQUEST)
 
 

@@ -2,10 +2,9 @@
 
     PYTHONPATH=tests/helpers python tests/badlink/survey.py --seeds 200 --sizes real "parameter list" file
 
-prints a table for each kind of radio. In it: how many of the transfers were exact, how many ended in an error that says
-what is missing, the median of time / ideal (see `ideals.py`) and the most messages that were sent. The exit code is 1
-when anything was wrong, left behind or too much, or when a median is above 2 at 5 % loss or 4 at 20 % where that is
-promised.
+prints a table for each kind of radio: the numbers of exact transfers and of errors that name the missing parts, the
+median of time / ideal (see `ideals.py`), and the maximum number of messages sent. The exit code is 1 if a transfer was
+wrong, left state behind or sent too much, or if a promised median (2 at 5 % loss, 4 at 20 %) is exceeded.
 """
 
 from __future__ import annotations
@@ -58,7 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def say(text: str) -> None:
-    """A line of the table, at once."""
+    """Print a line of the table immediately."""
     sys.stdout.write(text + "\n")
     sys.stdout.flush()
 

@@ -1,4 +1,4 @@
-"""Every transfer: how to begin, do and check it, what it ideally takes, and how many messages it may cost."""
+"""Every transfer: its preparation, call and check, its ideal duration, and its maximum number of messages."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def make_copter(case: Case, sizes: Sizes, radio: Radio) -> SimulatedCopter:
 
 
 def leftovers(copter: SimulatedCopter) -> Iterator[str]:
-    """State that the vehicle still holds for a client that has gone."""
+    """State that the vehicle still keeps for a disconnected client."""
     if copter.ftp.open_sessions:
         yield f"{copter.ftp.open_sessions} FTP sessions"
     if copter.missions.transfer_is_open:
@@ -182,7 +182,7 @@ PARAMETERS = [
         "param.pck upload",
         upload_parameters,
         check_writes,
-        # what has become of them is read back one by one
+        # their outcome is read back one by one
         lambda copter, sizes: ideals.file_write(16 * sizes.writes) + ideals.parameter_reads(sizes.writes),
         lambda copter, sizes: blocks(pack_size(copter)) + 2 * sizes.writes,
         before=know_parameters,
@@ -254,7 +254,7 @@ def read_plan(kind: str, copter: SimulatedCopter, sizes: Sizes) -> Ideal:
 
 
 def plan_cases(kind: str) -> Iterator[Case]:
-    """By items and as a file, up and down; an upload is read back."""
+    """Uploads and downloads, by items and as a file; an upload is read back."""
 
     def count(copter: SimulatedCopter, sizes: Sizes) -> int:
         return 2 * len(items_of(kind, sizes))
@@ -320,7 +320,7 @@ def check_upload(_: Any, copter: SimulatedCopter, sizes: Sizes) -> None:
 
 
 def check_folder(entries: Any, copter: SimulatedCopter, sizes: Sizes) -> None:
-    assert [(each.name, each.size) for each in entries] == copter.files.entries(FOLDER)
+    assert [(entry.name, entry.size) for entry in entries] == copter.files.entries(FOLDER)
 
 
 def pages(copter: SimulatedCopter, sizes: Sizes) -> int:
@@ -333,7 +333,7 @@ async def know_logs(program: Program) -> None:
 
 
 def check_logs(entries: Any, copter: SimulatedCopter, sizes: Sizes) -> None:
-    assert [(each.id, each.size, each.time_utc.timestamp()) for each in entries] == [
+    assert [(entry.id, entry.size, entry.time_utc.timestamp()) for entry in entries] == [
         (number, log.size, log.time_utc) for number, log in enumerate(copter.storage.logs.logs, start=1)
     ]
 

@@ -28,14 +28,14 @@ class Verdict:
 
     @property
     def is_exact(self) -> bool:
-        """All there, and nothing to complain of."""
+        """Return True if the content is complete and there are no complaints."""
         return self.error is None and not self.faults
 
 
 def judge(case: Case, sizes: Sizes, radio: Radio, seed: int) -> Verdict:
     """Do a transfer once and look at all that is promised of it."""
     copter = make_copter(case, sizes, radio)
-    # what it ideally takes is asked before: reading files leaves traces
+    # The ideal is computed first, because reading files changes the server's state.
     ideal_s, most = (
         case.ideal(copter, sizes).seconds(radio),
         case.most_messages(copter, sizes, link_dies=radio.outage_s == math.inf),
@@ -45,7 +45,7 @@ def judge(case: Case, sizes: Sizes, radio: Radio, seed: int) -> Verdict:
         return await case.work(program, sizes)
 
     done = attempt(work, radio, seed, lambda: copter, before=case.before, leftovers=leftovers)
-    faults = [f"left: {each}" for each in done.left]
+    faults = [f"left: {name}" for name in done.left]
     if done.messages > most:
         faults.append(f"{done.messages} messages, at most {most} are allowed: {dict(done.sent)}")
     error = done.error

@@ -14,9 +14,9 @@ current_async_library_cvar: ContextVar[str | None] = ContextVar("current_async_l
 
 
 def current_async_library() -> str:
-    told = current_async_library_cvar.get()
-    if told is not None:
-        return told
+    library = current_async_library_cvar.get()
+    if library is not None:
+        return library
     try:
         if asyncio.current_task() is not None:
             return "asyncio"

@@ -19,23 +19,23 @@ FOR_ALL = re.compile(r"(Every method raises:|All methods take|NotSupported is\s+
 
 def documented() -> set[tuple[str, str]]:
     """(call, error) for everything that is promised."""
-    known = {each.qualified: each for each in members()}
-    pairs = {(name, error) for name, each in known.items() for error in _of(each, known, set())}
-    return pairs | {(each.__name__, error) for each in CLASSES for error in _of_class(each)}
+    known = {member.qualified: member for member in members()}
+    pairs = {(name, error) for name, member in known.items() for error in _of(member, known, set())}
+    return pairs | {(cls.__name__, error) for cls in CLASSES for error in _of_class(cls)}
 
 
-def _of(member: Member, known: dict[str, Member], seen: set[str]) -> set[str]:
+def _of(member: Member, known: dict[str, Member], visited: set[str]) -> set[str]:
     """Those named in the docstring, those of the functions it refers to, and those of all methods of its class."""
-    seen.add(member.qualified)
+    visited.add(member.qualified)
     found = _named_in(member.docstring)
-    if member.owner is not None and member.is_awaited and len(seen) == 1:
+    if member.owner is not None and member.is_awaited and len(visited) == 1:
         takes = inspect.signature(member.function).parameters
         if "timeout" in takes or "initial" in takes:
             found |= _of_all_methods(member.owner)
     for name in AS_OTHERS.findall(member.docstring):
         other = known.get(name) or known[f"{member.qualified.partition('.')[0]}.{name}"]
-        if other.qualified not in seen:
-            found |= _of(other, known, seen)
+        if other.qualified not in visited:
+            found |= _of(other, known, visited)
     return found
 
 

@@ -15,7 +15,7 @@ from aerokit.sync.loop_thread import LoopThread
 __all__ = ["AT_ITS_END", "Interrupter"]
 
 AT_ITS_END = 1 << 30
-"""Interrupt when the work on the loop is done and the caller does not know yet."""
+"""Interrupt when the work on the loop is done but its result has not reached the caller."""
 PATIENCE_S = 200.0
 """For tests that hang."""
 
@@ -47,7 +47,7 @@ class Interrupter:
             assert self._has_interrupted
         finally:
             self._at = 0
-        assert self._ended == self._begun, "the call has come back, and its task goes on"
+        assert self._ended == self._begun, "the call has returned, but its task still runs"
         return self._has_interrupted
 
     def _watching(self, run: Callable[..., Any]) -> Callable[..., Any]:

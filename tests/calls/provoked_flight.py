@@ -15,13 +15,13 @@ from provoked import (
     Provocation,
     Table,
     accepted,
-    falls_silent,
     ignored,
     later,
     lost,
     no_modes,
     pilot,
     refused,
+    stops_sending,
 )
 
 import aerokit
@@ -106,7 +106,7 @@ def _old(stage: Stage) -> None:
     connection._encoder.version = 1
 
 
-def _forget(name: str) -> Callable[[Stage], None]:
+def _clear_state(name: str) -> Callable[[Stage], None]:
     return lambda stage: getattr(stage.vehicle.telemetry, name).forget()
 
 
@@ -124,17 +124,17 @@ def _actions() -> Table:
         ("Vehicle.arm", "OperationRejected"): later(_method("arm"), pilot, 0.1, grounded, before=ignored(arm)),
         ("Vehicle.arm", "OperationTimeout"): P(_method("arm", timeout=1.5), grounded, accepted(arm)),
         ("Vehicle.arm", "HeartbeatTimeout"): later(
-            _method("arm", timeout=30), falls_silent, 1.0, grounded, before=accepted(arm)
+            _method("arm", timeout=30), stops_sending, 1.0, grounded, before=accepted(arm)
         ),
         ("Vehicle.disarm", "HeartbeatTimeout"): later(
-            _method("disarm", timeout=30), falls_silent, 1.0, armed, before=accepted(arm)
+            _method("disarm", timeout=30), stops_sending, 1.0, armed, before=accepted(arm)
         ),
         ("Vehicle.disarm", "CommandRejected"): P(_method("disarm"), airborne),
         ("Vehicle.disarm", "OperationTimeout"): P(_method("disarm", timeout=1.5), armed, accepted(arm)),
         ("Vehicle.reboot", "OperationRejected"): P(_method("reboot"), armed),
         ("Vehicle.reboot", "OperationTimeout"): P(_method("reboot", timeout=2), grounded, accepted(reboot)),
         ("Vehicle.reboot", "LinkLost"): later(_method("reboot"), lost, 0.05, grounded, alone=True),
-        ("Vehicle.wait_ready", "OperationTimeout"): P(_method("wait_ready", timeout=1), before=_forget("home")),
+        ("Vehicle.wait_ready", "OperationTimeout"): P(_method("wait_ready", timeout=1), before=_clear_state("home")),
         ("Vehicle.send", "InvalidArgument"): P(_now(lambda s: s.vehicle.send(messages.Ping(0, 0, 999, 0)))),
         ("Vehicle.send", "ConnectionClosed"): _ended(lambda s: s.vehicle.send(messages.Ping(0, 0, 0, 0))),
         ("Vehicle.send", "LinkLost"): _ended(lambda s: s.vehicle.send(messages.Ping(0, 0, 0, 0)), lost),
@@ -143,15 +143,15 @@ def _actions() -> Table:
         ("Vehicle.message", "InvalidArgument"): P(_now(lambda s: s.vehicle.message(messages.Attitude, rate_hz=5000))),
         ("Vehicle.setup_signing", "NotSupported"): P(_sign, grounded, _old, alone=True),
         ("Vehicle.setup_signing", "OperationRejected"): P(_sign, armed),
-        ("Vehicle.setup_signing", "OperationTimeout"): P(_sign, grounded, falls_silent),
-        ("Vehicle.setup_signing", "BusyError"): P(_sign_twice, grounded, falls_silent),
+        ("Vehicle.setup_signing", "OperationTimeout"): P(_sign, grounded, stops_sending),
+        ("Vehicle.setup_signing", "BusyError"): P(_sign_twice, grounded, stops_sending),
         ("Vehicle.set_mode", "InvalidArgument"): P(_method("set_mode", "NONE")),
         ("Vehicle.set_heading", "InvalidArgument"): P(_method("set_heading", 999), airborne),
         ("Vehicle.set_home", "OperationTimeout"): P(
             _method("set_home", timeout=1),
-            before=lambda s: [accepted(each)(s) for each in (Cmd.DO_SET_HOME, Cmd.REQUEST_MESSAGE)],
+            before=lambda s: [accepted(command)(s) for command in (Cmd.DO_SET_HOME, Cmd.REQUEST_MESSAGE)],
         ),
-        ("Vehicle.look_at", "ValueUnknownError"): P(_look_north, airborne, _forget("home"), on="px4"),
+        ("Vehicle.look_at", "ValueUnknownError"): P(_look_north, airborne, _clear_state("home"), on="px4"),
         ("Vehicle.look_at", "OperationRejected"): later(
             _look_north, pilot, 0.3, before=ignored(Cmd.DO_SET_ROI_LOCATION)
         ),
@@ -178,18 +178,18 @@ def _actions() -> Table:
             lambda s: _post(s, ["arm"], armed=True), _deny_arming, 0.5, grounded, before=accepted(arm)
         ),
         ("Vehicle.set_heading", "HeartbeatTimeout"): later(
-            _method("set_heading", 179, relative=True, rate_deg_s=1), falls_silent, 3.0
+            _method("set_heading", 179, relative=True, rate_deg_s=1), stops_sending, 3.0
         ),
         ("Vehicle.go_to", "InvalidArgument"): P(_method("go_to", Position(0, 0, altitude_relative_m=9e9)), airborne),
-        ("Vehicle.go_to", "ValueUnknownError"): P(_method("go_to", Position(0, 0)), airborne, _forget("position")),
+        ("Vehicle.go_to", "ValueUnknownError"): P(_method("go_to", Position(0, 0)), airborne, _clear_state("position")),
         ("Vehicle.take_off", "InvalidArgument"): P(_method("take_off", -1)),
         ("Vehicle.take_off", "NotSupported"): P(_method("take_off", 5), armed, no_modes, alone=True),
         ("Vehicle.take_off", "OperationRejected"): P(_method("take_off", 5), grounded),
         ("Vehicle.take_off", "CommandRejected"): P(_method("take_off", 5), armed, refused(Cmd.NAV_TAKEOFF)),
         ("Vehicle.take_off", "CommandTimeout"): P(_method("take_off", 5), armed, ignored(Cmd.NAV_TAKEOFF)),
-        ("Vehicle.take_off", "HeartbeatTimeout"): later(_method("take_off", 50), falls_silent, 1.0, armed),
+        ("Vehicle.take_off", "HeartbeatTimeout"): later(_method("take_off", 50), stops_sending, 1.0, armed),
         ("Vehicle.take_off", "OperationTimeout"): P(_method("take_off", 50, timeout=2), armed),
-        ("Vehicle.take_off", "ValueUnknownError"): P(_method("take_off", 5), armed, _forget("home"), on="px4"),
+        ("Vehicle.take_off", "ValueUnknownError"): P(_method("take_off", 5), armed, _clear_state("home"), on="px4"),
     }
     for name, do, repeated in (
         ("Vehicle.set_mode", _method("set_mode", "LOITER"), mode),
@@ -209,9 +209,9 @@ def _actions() -> Table:
         _method("set_heading", 90, relative=True, timeout=0.2), airborne
     )
     for name in ("land", "return_to_launch"):
-        rows[f"Vehicle.{name}", "HeartbeatTimeout"] = later(_method(name), falls_silent)
+        rows[f"Vehicle.{name}", "HeartbeatTimeout"] = later(_method(name), stops_sending)
         rows[f"Vehicle.{name}", "OperationTimeout"] = P(_method(name, timeout=1), airborne)
-    rows["Vehicle.go_to", "HeartbeatTimeout"] = later(_go, falls_silent)
+    rows["Vehicle.go_to", "HeartbeatTimeout"] = later(_go, stops_sending)
     rows["Vehicle.go_to", "OperationTimeout"] = P(lambda s: _go(s, timeout=1), airborne)
     return rows
 
@@ -230,7 +230,7 @@ async def _sign_twice(stage: Stage) -> None:
 
 
 def _ended(function: Callable[[Stage], object], how: Callable[[Stage], None] | None = None) -> Provocation:
-    """After the end of the connection."""
+    """Call it after the connection has ended."""
     end = how or (lambda stage: stage.vehicle.connection.close())
     return P(_now(function), before=end, alone=True)
 
@@ -239,7 +239,7 @@ def _ended(function: Callable[[Stage], object], how: Callable[[Stage], None] | N
 
 
 async def _stop(stage: Stage, feed: Callable[[Any], Any]) -> None:
-    """A stream that has stopped by itself."""
+    """A stream that stopped because no set-points were supplied."""
     async with stage.vehicle.guided.velocity(valid_for_s=0.3) as stream:
         await anyio.sleep(1)
         await feed(stream)
@@ -303,7 +303,9 @@ def _parts() -> Table:
         ("SetpointStream.set", "InvalidArgument"): P(_set_too_much, airborne),
         ("SetpointStream.fly", stopped): later(lambda s: _fly(s), pilot, 1.0),
         ("StateCell.fresh", "StaleValueError"): P(_old_value, grounded),
-        ("StateCell.fresh", "ValueUnknownError"): P(_now(lambda s: s.vehicle.home.fresh(1)), before=_forget("home")),
+        ("StateCell.fresh", "ValueUnknownError"): P(
+            _now(lambda s: s.vehicle.home.fresh(1)), before=_clear_state("home")
+        ),
         ("StateCell.wait_until", "OperationTimeout"): P(
             lambda s: s.vehicle.mode.wait_until(lambda _: False, timeout=1)
         ),
@@ -366,9 +368,9 @@ def _connections() -> Table:
         ("connect", "BusyError"): P(lambda s: _connect(s, s.vehicle.connection)),
         ("connect", "LinkOpenError"): P(lambda s: _connect(s, record=nowhere)),
         ("connect", "LinkLost"): P(
-            lambda s: _connect_and(s, lambda each: each.link_lost(errors.LinkLost("unplugged")))
+            lambda s: _connect_and(s, lambda connection: connection.link_lost(errors.LinkLost("unplugged")))
         ),
-        ("connect", "ConnectionClosed"): P(lambda s: _connect_and(s, lambda each: each.close())),
+        ("connect", "ConnectionClosed"): P(lambda s: _connect_and(s, lambda connection: connection.close())),
         ("connect", "ConnectFailed"): P(lambda s: _connect(s, system_id=77, timeout=3)),
         ("open_connection", "InvalidArgument"): P(lambda s: _open(s, "nonsense:")),
         ("open_connection", "LinkOpenError"): P(lambda s: _open(s, "tcp:127.0.0.1:9")),

@@ -9,7 +9,7 @@ from typing import Any
 
 import anyio
 from call_stage import Stage, airborne, grounded
-from provoked import Do, Provocation, Table, accepted, falls_silent, ignored, later, lost, refused
+from provoked import Do, Provocation, Table, accepted, ignored, later, lost, refused, stops_sending
 
 from aerokit import Position, messages
 from aerokit.mavlink.encoder import FrameEncoder
@@ -27,12 +27,12 @@ def _call(name: str, *args: Any, **options: Any) -> Do:
 
 
 def _fitted(*troubles: Trouble) -> Trouble:
-    """There is a gimbal, and then something happens."""
+    """Add a gimbal to the vehicle, then apply the troubles to it."""
 
     def before(stage: Stage) -> None:
         stage.simulated.parameters["MNT1_TYPE"] = 1.0
-        for each in troubles:
-            each(stage)
+        for trouble in troubles:
+            trouble(stage)
 
     return before
 
@@ -98,14 +98,14 @@ def _turning(*args: float, after_s: float = 0.0) -> Callable[[Any], Any]:
     return feed
 
 
-async def _fed_after_it_was_taken(stage: Stage, feed: Callable[[Any], Any]) -> None:
+async def _feed_after_takeover(stage: Stage, feed: Callable[[Any], Any]) -> None:
     async with stage.vehicle.gimbal.control(), stage.vehicle.gimbal.rates(valid_for_s=9.0) as stream:
         _takes(stage)
         await anyio.sleep(1.0)
         await feed(stream)
 
 
-async def _rates_after_it_was_taken(stage: Stage) -> None:
+async def _rates_after_takeover(stage: Stage) -> None:
     async with stage.vehicle.gimbal.control():
         _takes(stage)
         await anyio.sleep(1.0)
@@ -142,11 +142,11 @@ def _many(stage: Stage) -> None:
     """Announce many gimbals."""
     for number in range(7, 200):
         stage.vehicle.gimbal  # noqa: B018 - it begins to listen
-        told = messages.GimbalDeviceAttitudeStatus(0, 0, 0, 32, (1, 0, 0, 0), 0, 0, 0, 0)
-        stage.wire.deliver(FrameEncoder(1, number).encode(told))
+        status = messages.GimbalDeviceAttitudeStatus(0, 0, 0, 32, (1, 0, 0, 0), 0, 0, 0, 0)
+        stage.wire.deliver(FrameEncoder(1, number).encode(status))
 
 
-async def _raise_if_taken(_: Stage, block: Any) -> None:
+async def _raise_after_takeover(_: Stage, block: Any) -> None:
     block.raise_if_taken()
 
 
@@ -187,14 +187,14 @@ def _table() -> Table:
         ("GimbalRates", "NotSupported"): P(_rates(), before=refused(PITCHYAW, MavResult.UNSUPPORTED), alone=True),
         ("GimbalRates", "CommandRejected"): P(_rates(), before=refused(PITCHYAW)),
         ("GimbalRates", "CommandTimeout"): P(_rates(), grounded, ignored(PITCHYAW)),
-        ("GimbalRates", "GimbalTaken"): P(_rates_after_it_was_taken, grounded, _fitted()),
+        ("GimbalRates", "GimbalTaken"): P(_rates_after_takeover, grounded, _fitted()),
         ("GimbalRates.set", "InvalidArgument"): P(_rates(_setting(9e9)), before=_fitted()),
         ("GimbalRates.set", "SetpointStreamStopped"): P(_rates(_setting(0.0, after_s=2.0)), before=_fitted()),
-        ("GimbalRates.set", "GimbalTaken"): P(lambda s: _fed_after_it_was_taken(s, _setting(1.0)), grounded, _fitted()),
+        ("GimbalRates.set", "GimbalTaken"): P(lambda s: _feed_after_takeover(s, _setting(1.0)), grounded, _fitted()),
         ("GimbalRates.turn", "InvalidArgument"): P(_rates(_turning(9e9, 0, 1)), before=_fitted()),
         ("GimbalRates.turn", "SetpointStreamStopped"): P(_rates(_turning(0, 0, 1, after_s=2.0)), before=_fitted()),
         ("GimbalRates.turn", "GimbalTaken"): P(
-            lambda s: _fed_after_it_was_taken(s, _turning(0, 0, 1)), grounded, _fitted()
+            lambda s: _feed_after_takeover(s, _turning(0, 0, 1)), grounded, _fitted()
         ),
         ("GimbalControl", "NotSupported"): P(_control(secondary=True)),
         ("GimbalControl", "BusyError"): P(_in_control(lambda s, _: _control()(s)), grounded, _fitted()),
@@ -203,7 +203,7 @@ def _table() -> Table:
         ("GimbalControl", "OperationTimeout"): P(_control(), grounded, accepted(CONFIGURE)),
         ("GimbalControl", "GimbalTaken"): _taken(_nothing),
         ("GimbalControl.raise_if_taken", "GimbalTaken"): P(
-            _in_control(_raise_if_taken, taken=True), grounded, _fitted()
+            _in_control(_raise_after_takeover, taken=True), grounded, _fitted()
         ),
         ("GimbalControl.until_lost", "OperationRejected"): P(_left, grounded, _fitted()),
         ("GimbalControl.until_lost", "ConnectionClosed"): P(
@@ -223,12 +223,12 @@ def _table() -> Table:
         ("look_at_system", lambda **o: _call("look_at_system", 9, **o), Cmd.DO_SET_ROI_SYSID),
     ):
         call = f"Gimbal.{name}"
-        told, stuck = _fitted(accepted(command)), airborne
+        status, stuck = _fitted(accepted(command)), airborne
         rows[call, "CommandRejected"] = P(do(), airborne, refused(command))
         rows[call, "CommandTimeout"] = P(do(), airborne, ignored(command))
-        rows[call, "OperationTimeout"] = P(do(timeout=1.0), stuck, told)
-        rows[call, "OperationRejected"] = later(do(timeout=9.0), _another_order, 0.5, stuck, before=told)
-        rows[call, "HeartbeatTimeout"] = later(do(timeout=60.0), falls_silent, 0.5, stuck, before=told)
+        rows[call, "OperationTimeout"] = P(do(timeout=1.0), stuck, status)
+        rows[call, "OperationRejected"] = later(do(timeout=9.0), _another_order, 0.5, stuck, before=status)
+        rows[call, "HeartbeatTimeout"] = later(do(timeout=60.0), stops_sending, 0.5, stuck, before=status)
         rows[call, "GimbalTaken"] = _taken(do())
     return rows
 

@@ -29,13 +29,13 @@ async def _load_damaged(stage: Stage) -> None:
 
 
 def _camera(*troubles: Callable[[SimulatedCamera], object]) -> Callable[[Stage], None]:
-    """There is a camera, and then something happens to it."""
+    """Add a camera to the vehicle, then apply the troubles to it."""
 
     def before(stage: Stage) -> None:
         camera = camera_of(stage)
         settings_of(stage)._forget()
-        for each in troubles:
-            each(camera)
+        for trouble in troubles:
+            trouble(camera)
 
     return before
 
@@ -51,7 +51,7 @@ def _names(uri: str) -> Callable[[SimulatedCamera], None]:
     return name
 
 
-def _refuses_to_tell(camera: SimulatedCamera) -> None:
+def _lacks_information(camera: SimulatedCamera) -> None:
     camera._builders.pop(m.CameraInformation.ID)
     camera.vehicle.call_later(5.0, lambda: camera._builders.update(camera.builders()))
 
@@ -80,7 +80,7 @@ HURRY: dict[str, Any] = {"timeout": 0.05}
 SETTINGS: Table = {
     ("Settings.load", "FileFormatError"): P(_load_damaged),
     ("Settings.fetch_definition", "NotSupported"): P(_call("fetch_definition"), _names("")),
-    ("Settings.fetch_definition", "CommandRejected"): P(_call("fetch_definition"), _refuses_to_tell),
+    ("Settings.fetch_definition", "CommandRejected"): P(_call("fetch_definition"), _lacks_information),
     ("Settings.fetch_definition", "OperationTimeout"): P(_call("fetch_definition", **HURRY), _silent),
     ("Settings.fetch_definition", "InvalidArgument"): P(_call("fetch_definition", "gopher://a")),
     ("Settings.fetch_definition", "FileFormatError"): P(_call("fetch_definition"), _damaged),
@@ -91,9 +91,9 @@ SETTINGS: Table = {
     ("Settings.download", "ParameterTimeout"): P(_call("download", **PATIENCE), _silent),
     ("Settings.download", "OperationTimeout"): P(_call("download", **HURRY), _silent),
     **{
-        (f"Settings.{name}", error): each
+        (f"Settings.{name}", error): provocation
         for name in ("get", "read")
-        for error, each in {
+        for error, provocation in {
             "InvalidArgument": P(_call(name, "CAM MODE")),
             "ParameterRejected": P(_call(name, "CAM_NOPE")),
             "ParameterTimeout": P(_call(name, "CAM_EV", **PATIENCE), _silent),

@@ -8,18 +8,18 @@ from typing import Any
 
 from call_stage import Stage, airborne, grounded, on_mission
 from provoked import (
-    FORGETTING,
+    LOSING_STATE,
     NONSENSE,
     REFUSING,
     Do,
     Provocation,
     Table,
-    falls_silent,
     ignored,
     later,
     no_modes,
     pilot,
     refused,
+    stops_sending,
 )
 
 from aerokit import messages as m
@@ -37,7 +37,7 @@ def _of(part: str, name: str, *args: Any, **options: Any) -> Do:
     """A method of a part of the vehicle; arguments that are functions are given the stage."""
 
     def do(stage: Stage) -> Any:
-        given = [each(stage) if callable(each) else each for each in args]
+        given = [arg(stage) if callable(arg) else arg for arg in args]
         return getattr(getattr(stage.vehicle, part), name)(*given, **options)
 
     return do
@@ -77,7 +77,7 @@ async def _silent_in(stage: Stage, block: Any) -> None:
         if hasattr(block, "set"):
             await block.set(stage.parameter, stage.other_value())
             await block.set(stage.parameter, stage.other_value())
-        falls_silent(stage)
+        stops_sending(stage)
         raise ZeroDivisionError
 
 
@@ -89,13 +89,13 @@ def _clamp(stage: Stage) -> None:
 def _parameters() -> Table:
     rows: Table = {
         ("Parameters.download", "ParameterTimeout"): P(
-            _of("parameters", "download", method="list", refresh=True, **PATIENCE), before=falls_silent
+            _of("parameters", "download", method="list", refresh=True, **PATIENCE), before=stops_sending
         ),
         ("Parameters.download", "FileError"): P(
             _of("parameters", "download", method="ftp", refresh=True), before=REFUSING
         ),
         ("Parameters.download", "FileTimeout"): P(
-            _of("parameters", "download", method="ftp", refresh=True, **PATIENCE), before=falls_silent
+            _of("parameters", "download", method="ftp", refresh=True, **PATIENCE), before=stops_sending
         ),
         ("Parameters.download", "RemoteProtocolError"): P(
             _of("parameters", "download", method="ftp", refresh=True), before=NONSENSE
@@ -110,7 +110,7 @@ def _parameters() -> Table:
         ("Transaction", "RollbackFailed"): P(lambda s: _silent_in(s, s.vehicle.parameters.transaction(**PATIENCE))),
         ("Transaction.set", "InvalidArgument"): P(lambda s: _in_transaction(s, s.parameter, math.nan)),
         ("Transaction.set", "ParameterRejected"): P(lambda s: _in_transaction(s, "NOSUCH_PARAM", 1)),
-        ("Transaction.set", "ParameterTimeout"): P(lambda s: _in_transaction(s, s.parameter, 1), before=falls_silent),
+        ("Transaction.set", "ParameterTimeout"): P(lambda s: _in_transaction(s, s.parameter, 1), before=stops_sending),
         ("Transaction.set", "VerificationFailed"): P(lambda s: _in_transaction(s, s.parameter, 3), before=_clamp),
     }
     for name, args, wrong, unknown in (
@@ -140,14 +140,14 @@ def _parameters() -> Table:
 
 def _unknown_and_silent(stage: Stage) -> None:
     stage.vehicle.parameters._access.forget()
-    falls_silent(stage)
+    stops_sending(stage)
 
 
 # --------------------------------------------------------------------------------------- missions
 
 
 def _answering(kind: type[Any], result: int, mission_type: int) -> Callable[[Stage], None]:
-    """This message is answered with a MISSION_ACK, and nothing is done."""
+    """Answer this message with a MISSION_ACK and do not execute it."""
 
     def trouble(stage: Stage) -> None:
         def handle(_: Any, channel: Any) -> None:
@@ -203,15 +203,15 @@ def _plans(part: str) -> Table:
         rows |= {
             (key, "InvalidArgument"): P(_of(part, name, *args, idle_timeout_s=-1)),
             (key, "MissionRejected"): P(_of(part, name, *args, **options), grounded, _answering(asked, 1, kind)),
-            (key, "MissionTimeout"): P(_of(part, name, *args, **options, **PATIENCE), grounded, falls_silent),
-            (key, "OperationTimeout"): P(_of(part, name, *args, **options, **HURRY), grounded, falls_silent),
+            (key, "MissionTimeout"): P(_of(part, name, *args, **options, **PATIENCE), grounded, stops_sending),
+            (key, "OperationTimeout"): P(_of(part, name, *args, **options, **HURRY), grounded, stops_sending),
         }
         if options:
             ftp = {"method": "ftp"}
             rows |= {
                 (key, "NotSupported"): P(_of(part, name, *args, **ftp), grounded, _no_files, alone=True),
                 (key, "FileError"): P(_of(part, name, *args, **ftp), grounded, REFUSING),
-                (key, "FileTimeout"): P(_of(part, name, *args, **ftp, **PATIENCE), grounded, falls_silent),
+                (key, "FileTimeout"): P(_of(part, name, *args, **ftp, **PATIENCE), grounded, stops_sending),
             }
     rows[f"{owner}.download", "RemoteProtocolError"] = P(_of(part, "download", method="ftp"), grounded, NONSENSE)
     return rows
@@ -247,7 +247,7 @@ def _flown() -> Table:
         ),
         ("MissionControl.wait_finished", "OperationTimeout"): P(_of(mission, "wait_finished", timeout=1), on_mission),
         ("MissionControl.wait_finished", "HeartbeatTimeout"): later(
-            _of(mission, "wait_finished"), falls_silent, 1.0, on_mission
+            _of(mission, "wait_finished"), stops_sending, 1.0, on_mission
         ),
         ("FenceControl.enable", "CommandRejected"): P(_of("fence", "enable"), grounded, refused(Cmd.DO_FENCE_ENABLE)),
         ("FenceControl.enable", "CommandTimeout"): P(_of("fence", "enable"), grounded, ignored(Cmd.DO_FENCE_ENABLE)),
@@ -267,7 +267,7 @@ def _flown() -> Table:
 
 
 def _both(*troubles: Callable[[Stage], object]) -> Callable[[Stage], object]:
-    return lambda stage: [each(stage) for each in troubles]
+    return lambda stage: [trouble(stage) for trouble in troubles]
 
 
 # ---------------------------------------------------------------------------------- files and logs
@@ -275,8 +275,8 @@ def _both(*troubles: Callable[[Stage], object]) -> Callable[[Stage], object]:
 
 def _files() -> Table:
     rows: Table = {
-        ("Files.write", "VerificationFailed"): P(_of("files", "write", "/x", b"abc"), before=FORGETTING),
-        ("Files.upload", "VerificationFailed"): P(_of("files", "upload", Stage.local_file, "/x"), before=FORGETTING),
+        ("Files.write", "VerificationFailed"): P(_of("files", "write", "/x", b"abc"), before=LOSING_STATE),
+        ("Files.upload", "VerificationFailed"): P(_of("files", "upload", Stage.local_file, "/x"), before=LOSING_STATE),
         ("Files.download", "OSError"): P(_of("files", "download", lambda s: s.file, NOWHERE)),
         ("Files.upload", "OSError"): P(_of("files", "upload", NOWHERE, "/x")),
     }
@@ -299,28 +299,28 @@ def _files() -> Table:
         rows |= {
             (key, "InvalidArgument"): P(_of("files", name, *before, "", *after)),
             (key, "FileError"): P(_of("files", name, *right), before=REFUSING),
-            (key, "FileTimeout"): P(_of("files", name, *right, **PATIENCE), before=falls_silent),
+            (key, "FileTimeout"): P(_of("files", name, *right, **PATIENCE), before=stops_sending),
         }
         if name in ("read", "download", "list", "crc32", "write", "upload"):
             rows[key, "RemoteProtocolError"] = P(_of("files", name, *right), before=NONSENSE)
     return rows
 
 
-def _deaf_to_erase(stage: Stage) -> None:
+def _ignores_erase(stage: Stage) -> None:
     stage.simulated.handlers[m.LogErase.ID] = lambda *_: None
 
 
 def _logs() -> Table:
     rows: Table = {
-        ("Logs.list", "FileTimeout"): P(_of("logs", "list", **PATIENCE), grounded, falls_silent),
-        ("Logs.erase", "FileTimeout"): P(_of("logs", "erase", idle_timeout_s=2), grounded, _deaf_to_erase),
+        ("Logs.list", "FileTimeout"): P(_of("logs", "list", **PATIENCE), grounded, stops_sending),
+        ("Logs.erase", "FileTimeout"): P(_of("logs", "erase", idle_timeout_s=2), grounded, _ignores_erase),
         ("Logs.download", "OSError"): P(_of("logs", "download", 1, NOWHERE), grounded),
     }
     for name, after in (("download", (Stage.local,)), ("read", ())):
         rows |= {
             (f"Logs.{name}", "InvalidArgument"): P(_of("logs", name, -1, *after)),
             (f"Logs.{name}", "FileError"): P(_of("logs", name, 77, *after), grounded),
-            (f"Logs.{name}", "FileTimeout"): P(_of("logs", name, 1, *after, **PATIENCE), grounded, falls_silent),
+            (f"Logs.{name}", "FileTimeout"): P(_of("logs", name, 1, *after, **PATIENCE), grounded, stops_sending),
         }
     return rows
 

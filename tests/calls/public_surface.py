@@ -87,7 +87,7 @@ class Member(NamedTuple):
         if inspect.iscoroutinefunction(plain) or inspect.isasyncgenfunction(plain):
             return True
         given = str(inspect.signature(plain).return_annotation).partition("[")[0]
-        return any(each.__name__ == given and _is_entered(each) for each in CLASSES)
+        return any(cls.__name__ == given and _is_entered(cls) for cls in CLASSES)
 
 
 def _is_entered(cls: type) -> bool:
@@ -108,7 +108,7 @@ def members() -> Iterator[Member]:
 
 def awaited() -> dict[str, Member]:
     """Return everything that a program awaits, enters or iterates, by qualified name."""
-    return {each.qualified: each for each in members() if each.is_awaited}
+    return {member.qualified: member for member in members() if member.is_awaited}
 
 
 def own_classes_in(vehicle: aerokit.Vehicle) -> Iterator[type]:
@@ -116,6 +116,6 @@ def own_classes_in(vehicle: aerokit.Vehicle) -> Iterator[type]:
     for name in dir(vehicle):
         if not name.startswith("_"):
             cls = type(getattr(vehicle, name))
-            coroutines = [each for each in vars(cls).values() if inspect.iscoroutinefunction(each)]
+            coroutines = [attribute for attribute in vars(cls).values() if inspect.iscoroutinefunction(attribute)]
             if cls.__module__.startswith("aerokit") and coroutines:
                 yield cls

@@ -14,22 +14,22 @@ from flight_harness import make_parts
 from aerokit.connection import loop_watch
 from aerokit.vehicle.session.commands import PENDING_ACK_TIMEOUT_S
 
-__all__ = ["SETTLED_S", "look", "what_is_left"]
+__all__ = ["SETTLED_S", "check_remains", "snapshot"]
 
 SETTLED_S = 20.0
 """An abandoned arm command is monitored for 15 s, and acknowledged then."""
 POLL_INTERVAL_S = 0.25
 
 
-def look(stage: Stage) -> Counter[str]:
+def snapshot(stage: Stage) -> Counter[str]:
     """Return the present counts by name."""
     return Counter(_all(stage))
 
 
-async def what_is_left(stage: Stage, before: Counter[str]) -> Counter[str]:
+async def check_remains(stage: Stage, before: Counter[str]) -> Counter[str]:
     """Return what remains in addition to ``before``, after waiting for it to go or settle."""
     waited = 0.0
-    while (left := look(stage) - before) and waited < SETTLED_S:
+    while (left := snapshot(stage) - before) and waited < SETTLED_S:
         await anyio.sleep(POLL_INTERVAL_S)
         waited += POLL_INTERVAL_S
     return left
@@ -41,7 +41,7 @@ def _all(stage: Stage) -> Iterator[str]:
     make_parts(vehicle)
     yield from _tasks()
     yield from _timers()
-    talks = [vehicle._session, *(each._session for each in vehicle._components._by_id.values())]
+    talks = [vehicle._session, *(component._session for component in vehicle._components._by_id.values())]
     streams = [stream for session in talks for stream in session.rates._streams.values()]
     counters = [stream.on_frame for stream in streams]  # they stay, one for each stream
     for key, sinks in connection.bus._sinks.items():
@@ -61,7 +61,7 @@ def _all(stage: Stage) -> Iterator[str]:
     yield from _times("sending", vehicle._arbiter._sent)
     yield from _times("held parameter", vehicle.parameters._registry._blocks)
     closing = vehicle.files._channel._closing.values()
-    yield from _times("file that is being closed", [each for each in closing if not each.ended.is_set()])
+    yield from _times("file that is being closed", [file for file in closing if not file.ended.is_set()])
     yield from _times("open session", range(stage.simulated.ftp.open_sessions))
     yield from _times("log on its way", range(stage.simulated.storage.logs.is_busy))
     yield from _times("set-point stream", range(vehicle._flight_cleanup.stop_stream is not None))
@@ -98,16 +98,16 @@ def _timers() -> Iterator[str]:
             yield f"timer {timer._callback.__qualname__}"
 
 
-def _locks(name: str, item: Any, seen: set[int]) -> Iterator[tuple[str, asyncio.Lock]]:
+def _locks(name: str, item: Any, visited: set[int]) -> Iterator[tuple[str, asyncio.Lock]]:
     """Every lock that a vehicle holds, wherever."""
-    if id(item) in seen:
+    if id(item) in visited:
         return
-    seen.add(id(item))
+    visited.add(id(item))
     if isinstance(item, asyncio.Lock):
         yield name, item
     elif isinstance(item, Mapping) and len(item) < 100:
         for key, value in item.items():
-            yield from _locks(f"{name}[{key}]", value, seen)
+            yield from _locks(f"{name}[{key}]", value, visited)
     elif type(item).__module__.startswith(("aerokit.vehicle", "aerokit.connection")):
         for key, value in getattr(item, "__dict__", {}).items():
-            yield from _locks(f"{name}.{key}", value, seen)
+            yield from _locks(f"{name}.{key}", value, visited)

@@ -77,7 +77,7 @@ def points_of(waits: list[float], most: int | None) -> list[Point]:
         suspension += stride
     if most is not None and len(found) > most:
         found = [found[round(index * (len(found) - 1) / (most - 1))] for index in range(most)]
-    return [Point(*each, how=("task", "scope")[number % 2]) for number, each in enumerate(found)]
+    return [Point(*place, how=("task", "scope")[number % 2]) for number, place in enumerate(found)]
 
 
 @dataclass
@@ -93,7 +93,7 @@ class Cancelled:
 
 
 async def cancel_at(work: Awaitable[object], point: Point | None) -> Cancelled:
-    """Run a call in a task of its own and cancel it there; None: nowhere."""
+    """Run a call in a separate task and cancel it at ``point``; None: never."""
     loop, outcome = asyncio.get_running_loop(), Cancelled()
     scope = anyio.CancelScope()
 
@@ -110,11 +110,11 @@ async def cancel_at(work: Awaitable[object], point: Point | None) -> Cancelled:
     def suspended(count: int) -> None:
         if point is not None and count == point.suspension:
             if point.after_s:
-                loop.call_later(point.after_s, still_there)
+                loop.call_later(point.after_s, cancel_at_point)
             else:
                 cancel()
 
-    def still_there() -> None:
+    def cancel_at_point() -> None:
         if point is not None and counted.count == point.suspension:
             cancel()
 

@@ -1,4 +1,4 @@
-"""Every public coroutine, cancelled at every await: it ends at once, and nothing is left of it.
+"""Every public coroutine, cancelled at every await: it ends at once, without leaks.
 
 Here a few of the awaits of each; `nox -s cancel` does all of them.
 """
@@ -17,7 +17,7 @@ from call_stage import AUTOPILOTS, Stage, open_stage
 from call_table import CALLS
 from exhaustive import exhaustive
 from public_surface import CLASSES, awaited, own_classes_in
-from remains import look, what_is_left
+from remains import check_remains, snapshot
 from suspensions import Cancelled, Point, cancel_at, points_of
 
 from aerokit.testing import run_virtual
@@ -37,11 +37,11 @@ def test_public_coroutines_are_all_in_table() -> None:
 
 
 def test_public_classes_are_all_covered(tmp_path: Path) -> None:
-    async def look_for_them() -> None:
+    async def find_classes() -> None:
         async with open_stage("ardupilot", tmp_path) as stage:
-            assert [each for each in own_classes_in(stage.vehicle) if each not in CLASSES] == []
+            assert [cls for cls in own_classes_in(stage.vehicle) if cls not in CLASSES] == []
 
-    run_virtual(look_for_them())
+    run_virtual(find_classes())
 
 
 def groups() -> Iterator[tuple[str, list[str]]]:
@@ -51,7 +51,7 @@ def groups() -> Iterator[tuple[str, list[str]]]:
 
 
 def rows() -> Iterator[Any]:
-    """Each group on each autopilot; a few of them by default."""
+    """Return each group on each autopilot; by default only some of them."""
     for owner, names in groups():
         for autopilot in AUTOPILOTS:
             row = pytest.param(names, autopilot, id=f"{owner}-{autopilot}")
@@ -76,7 +76,7 @@ async def faults_of(stage: Stage, name: str, autopilot: str, points: int) -> Asy
     if rehearsed.error is not None or rehearsed.counted is None:
         yield f"{name} does not work: {rehearsed.error!r}"
         return
-    await what_is_left(stage, look(stage))
+    await check_remains(stage, snapshot(stage))
     await anyio.sleep(2.0)
     for point in points_of(rehearsed.counted.waits, points or None):
         fault = await fault_at(stage, name, point)
@@ -97,13 +97,13 @@ async def run(stage: Stage, name: str, point: Point | None) -> Cancelled:
 async def fault_at(stage: Stage, name: str, point: Point) -> str:
     call = CALLS[name]
     await call.place(stage)
-    before = look(stage)
+    before = snapshot(stage)
     call.before(stage)
     outcome = await cancel_at(call.do(stage), point)
     call.after(stage)
     if fault := fault_of(outcome, point):
         return fault
-    left = await what_is_left(stage, before)
+    left = await check_remains(stage, before)
     if left:
         return f"left are {dict(left)}"
     try:

@@ -36,11 +36,11 @@ def test_each_documented_error_is_provoked() -> None:
 
 
 def groups() -> Iterator[tuple[str, list[tuple[str, str]]]]:
-    """One vehicle serves all calls of one class, but for those after which it is of no use."""
+    """One vehicle serves all calls of one class, except those that leave it unusable."""
     for owner in sorted({name.partition(".")[0] for name, _ in PROMISED & PROVOCATIONS.keys()}):
         yield (
             owner,
-            sorted(each for each in PROMISED & PROVOCATIONS.keys() if each[0].partition(".")[0] == owner),
+            sorted(pair for pair in PROMISED & PROVOCATIONS.keys() if pair[0].partition(".")[0] == owner),
         )
 
 
@@ -60,13 +60,13 @@ async def faults_of(pairs: list[tuple[str, str]], folder: Path) -> list[str]:
     """Return the errors that were not provoked; calls on one autopilot share a flight."""
     found = []
     for on in ("ardupilot", "px4"):
-        together = [each for each in pairs if PROVOCATIONS[each].on == on and not PROVOCATIONS[each].alone]
-        alone = [[each] for each in pairs if PROVOCATIONS[each].on == on and PROVOCATIONS[each].alone]
+        together = [pair for pair in pairs if PROVOCATIONS[pair].on == on and not PROVOCATIONS[pair].alone]
+        alone = [[pair] for pair in pairs if PROVOCATIONS[pair].on == on and PROVOCATIONS[pair].alone]
         for group in filter(None, [together, *alone]):
             async with AsyncExitStack() as stack:
                 stage = await stack.enter_async_context(open_stage(on, folder))
                 for pair in group:
-                    found += [f"{pair}: {each}" for each in await fault_of(stage, *pair)]
+                    found += [f"{pair}: {fault}" for fault in await fault_of(stage, *pair)]
     return found
 
 
@@ -98,11 +98,11 @@ async def settle(stage: Stage) -> None:
 
 
 def is_it(raised: Exception, name: str, error: str) -> bool:
-    """This error, or a special case of it that is not promised by itself."""
+    """Return True if this is the documented error, or a subclass of it that is not documented separately."""
     known = {cls.__name__ for cls in type(raised).__mro__} & NAMES
     return error in known and not any(
-        (name, each) in PROMISED and each != error and issubclass(getattr(errors, each, OSError), _class(error))
-        for each in known
+        (name, member) in PROMISED and member != error and issubclass(getattr(errors, member, OSError), _class(error))
+        for member in known
     )
 
 

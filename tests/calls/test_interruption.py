@@ -20,7 +20,7 @@ from call_stage import LOGS, Stage, stage_cameras
 from call_table import CALLS, Call
 from exhaustive import sampled
 from interrupter import AT_ITS_END, Interrupter
-from remains import look
+from remains import snapshot
 from served_copter import served
 
 import aerokit.sync
@@ -92,7 +92,7 @@ def test_interrupted(name: str, stages: tuple[BlockingStage, Stage], monkeypatch
     threads = threading.active_count()
     for at in (1, LATER, AT_ITS_END):
         loop.run(call.place, stage)
-        before = loop.call(look, stage)
+        before = loop.call(snapshot, stage)
         call.before(stage)
         was_interrupted = interrupter.interrupted(attempt, at)
         assert was_interrupted or at != AT_ITS_END
@@ -106,6 +106,6 @@ def test_interrupted(name: str, stages: tuple[BlockingStage, Stage], monkeypatch
 
 def _left(loop: Any, stage: Stage, before: Counter[str]) -> Counter[str]:
     patience = time.monotonic() + PATIENCE_S
-    while (left := loop.call(look, stage) - before) and time.monotonic() < patience:
+    while (left := loop.call(snapshot, stage) - before) and time.monotonic() < patience:
         time.sleep(0.01)
     return Counter(left)

@@ -62,7 +62,7 @@ class Steps:
 
 
 def wait_for(condition: Callable[[], bool], what: str, timeout: float = 60.0, every: float = 0.05) -> None:
-    """Ask again and again; ends the program when it takes too long."""
+    """Poll until the condition holds; exits the program when it takes too long."""
     deadline = time.monotonic() + timeout
     while not condition():
         if time.monotonic() > deadline:

@@ -68,7 +68,9 @@ class Console:
             time.sleep(0.05)
         return None
 
-    def insist(self, line: str, pattern: str, attempts: int = 30, patience_s: float = 2.0) -> re.Match[str]:
+    def command_until_accepted(
+        self, line: str, pattern: str, attempts: int = 30, patience_s: float = 2.0
+    ) -> re.Match[str]:
         """Type it until the vehicle is ready for it."""
         for _ in range(attempts):
             self.type(line)
@@ -93,7 +95,7 @@ def write_mission(kind: str, path: Path) -> int:
     for number, item in enumerate(items):
         values = (number, int(number == 0), item.frame, item.command, item.hold_s, 0, 0, 0)
         place = (f"{item.latitude:.7f}", f"{item.longitude:.7f}", item.altitude_m, 1)
-        lines.append("\t".join(str(each) for each in (*values, *place)))
+        lines.append("\t".join(str(field) for field in (*values, *place)))
     path.write_text("\n".join(lines) + "\n")
     return len(items)
 
@@ -103,32 +105,32 @@ def fly(kind: str, console: Console) -> None:
     console.wait(r"Detected vehicle|online system 1|Received \d+ parameters")
     steps.done("connect")
     got_all = r"Received (\d+) parameters"  # it does not ask again when one of its requests timed out
-    received = console.look(got_all, 30.0) or console.insist("param fetch", got_all, 4, 30.0)
+    received = console.look(got_all, 30.0) or console.command_until_accepted("param fetch", got_all, 4, 30.0)
     assert int(received[1]) >= PARAMETERS[kind], received[0]
     steps.done("parameters", received[1])
     count = write_mission(kind, Path("flight.txt"))
-    console.insist("wp load flight.txt", rf"Loaded {count} waypoints in ")
+    console.command_until_accepted("wp load flight.txt", rf"Loaded {count} waypoints in ")
     steps.done("upload", count)
-    console.insist("wp list", r"Saved waypoints to ")
+    console.command_until_accepted("wp list", r"Saved waypoints to ")
     assert len(WAYPOINT.findall(console.answer)) == count, console.answer
     steps.done("download", count)
     if kind == "copter":
-        console.insist("mode GUIDED", r"Mode GUIDED|GUIDED>")
-    console.insist("arm throttle", r"\bARMED")
+        console.command_until_accepted("mode GUIDED", r"Mode GUIDED|GUIDED>")
+    console.command_until_accepted("arm throttle", r"\bARMED")
     steps.done("arm")
     if kind == "copter":
-        console.insist(f"takeoff {ALTITUDE_M}", r"TAKEOFF: ACCEPTED")
+        console.command_until_accepted(f"takeoff {ALTITUDE_M}", r"TAKEOFF: ACCEPTED")
     else:  # MAVProxy's take-off has no position, which PX4 requires.
-        console.insist(PX4_MISSION, r"Mode MISSION|MISSION>")
+        console.command_until_accepted(PX4_MISSION, r"Mode MISSION|MISSION>")
     console.type("watch GLOBAL_POSITION_INT")
     wait_for(lambda: console.altitude_m() > ALTITUDE_M - 1, f"altitude: {console.text[-1000:]}")
     steps.done("take off", f"{console.altitude_m()} m")
     console.type("unwatch")
     if kind == "copter":
-        console.insist("mode AUTO", r"Mode AUTO|AUTO>")
+        console.command_until_accepted("mode AUTO", r"Mode AUTO|AUTO>")
     console.wait(rf"[Ww]aypoint {count - 1}|Reached waypoint #{count - 1}", timeout=90)
     steps.done("fly")
-    console.insist("mode LAND" if kind == "copter" else PX4_LAND, r"Mode LAND|LAND>")
+    console.command_until_accepted("mode LAND" if kind == "copter" else PX4_LAND, r"Mode LAND|LAND>")
     console.wait(r"DISARMED")
     steps.done("land")
 

@@ -20,7 +20,7 @@ from steps import ALTITUDE_M, PARAMETERS, Steps, mission
 T = TypeVar("T")
 
 
-async def insist(action: Callable[[], Awaitable[T]]) -> T:
+async def command_until_accepted(action: Callable[[], Awaitable[T]]) -> T:
     """Repeat until the vehicle is ready for it."""
     refusal: MavsdkError | None = None
     for _ in range(60):
@@ -71,24 +71,24 @@ async def fly(kind: str, port: int) -> None:
     steps.done("parameters", count)
 
     items = raw_items(kind)
-    await insist(lambda: raw.upload_mission(items))
+    await command_until_accepted(lambda: raw.upload_mission(items))
     steps.done("upload", len(items))
     back = await raw.download_mission()
-    assert [each.command for each in back] == [each.command for each in items], back
-    assert [each.x for each in back[1:]] == [each.x for each in items[1:]], back
+    assert [item.command for item in back] == [item.command for item in items], back
+    assert [item.x for item in back[1:]] == [item.x for item in items[1:]], back
     steps.done("download", len(back))
 
     await telemetry.set_rate_position(5.0)  # ArduPilot streams no position unasked, and MAVSDK does not ask
-    if kind == "px4":  # With ArduPilot, real or simulated, MAVSDK's health contains no more than a known home.
+    if kind == "px4":  # With ArduPilot, real or simulated, MAVSDK's health reports only the home position.
         await until(telemetry.subscribe_health_all_ok(), bool)
-    await insist(lambda: action.set_takeoff_altitude(ALTITUDE_M))
-    await insist(action.arm)
+    await command_until_accepted(lambda: action.set_takeoff_altitude(ALTITUDE_M))
+    await command_until_accepted(action.arm)
     await until(telemetry.subscribe_armed(), bool)
     steps.done("arm")
-    await insist(action.takeoff)
-    there = await until(telemetry.subscribe_position(), lambda each: each.relative_altitude_m > ALTITUDE_M - 1)
+    await command_until_accepted(action.takeoff)
+    there = await until(telemetry.subscribe_position(), lambda position: position.relative_altitude_m > ALTITUDE_M - 1)
     steps.done("take off", f"{there.relative_altitude_m:.1f} m")
-    await insist(raw.start_mission)
+    await command_until_accepted(raw.start_mission)
     await until(telemetry.subscribe_position(), near_the_end(kind))
     steps.done("fly")
     await action.land()

@@ -72,10 +72,10 @@ async def their_client() -> list[bool]:
 
         async def photo() -> str:
             captures = plugin.subscribe_capture_info()
-            heard = asyncio.ensure_future(first(captures))
+            received = asyncio.ensure_future(first(captures))
             await asyncio.sleep(0.2)
             await plugin.take_photo(CAMERA)
-            capture = await heard
+            capture = await received
             assert capture.is_success
             assert capture.file_url == "mftp:///DCIM/IMG_0001.JPG", capture.file_url
             return f"index {capture.index}"
@@ -116,9 +116,9 @@ async def their_client() -> list[bool]:
             """Without format_storage: MAVSDK 4.1 takes IN_PROGRESS for a refusal, and aborts the program at the
             result.
             """
-            told = await plugin.get_storage(CAMERA)
+            reported = await plugin.get_storage(CAMERA)
             await plugin.reset_settings(CAMERA)
-            return f"{told.total_storage_mib:.0f} MiB"
+            return f"{reported.total_storage_mib:.0f} MiB"
 
         async def streaming() -> str:
             await plugin.stop_video_streaming(CAMERA, 1)
@@ -126,7 +126,10 @@ async def their_client() -> list[bool]:
             return str((await plugin.get_video_stream_info(CAMERA)).settings.uri)
 
         steps = (photo, interval, video, lens, tracking, storage, streaming)
-        done = [await step(f"their client: {each.__name__}", each()) for each in steps]
+        done = [
+            await step(f"their client: {coroutine_function.__name__}", coroutine_function())
+            for coroutine_function in steps
+        ]
         sdk.destroy()
         return done
 
@@ -135,13 +138,13 @@ async def their_client() -> list[bool]:
 
 
 class TheirCamera:
-    """MAVSDK's server with answers to everything."""
+    """MAVSDK's camera server, which answers all requests."""
 
     def __init__(self, plugin: CameraServerAsync) -> None:
         self.plugin = plugin
         self.count = 0
         self.is_recording = False
-        self.heard: list[tuple[str, Any]] = []
+        self.received: list[tuple[str, Any]] = []
         self._ok = of_server.CameraFeedback.OK
 
     def records(self) -> bool:
@@ -170,14 +173,14 @@ class TheirCamera:
 
     async def _obey(self, name: str) -> None:
         async for value in getattr(self.plugin, f"subscribe_{name}")():
-            self.heard.append((name, value))
+            self.received.append((name, value))
             if name in ("start_video", "stop_video"):
                 self.is_recording = name == "start_video"
             await getattr(self.plugin, f"respond_{name}")(self._ok)
 
     async def _tracking(self) -> None:
         async for value in self.plugin.subscribe_tracking_point_command():
-            self.heard.append(("track_point", value))
+            self.received.append(("track_point", value))
             await self.plugin.respond_tracking_point_command(self._ok)
 
     async def _photos(self) -> None:
@@ -194,14 +197,14 @@ class TheirCamera:
         status = of_server.CaptureStatus
         async for _ in self.plugin.subscribe_capture_status():
             video = status.VideoStatus.CAPTURE_IN_PROGRESS if self.is_recording else status.VideoStatus.IDLE
-            told = status(0.0, 1.0, 900.0, status.ImageStatus.IDLE, video, self.count)
-            await self.plugin.respond_capture_status(self._ok, told)
+            reported = status(0.0, 1.0, 900.0, status.ImageStatus.IDLE, video, self.count)
+            await self.plugin.respond_capture_status(self._ok, reported)
 
     async def _storage(self) -> None:
         kind = of_server.StorageInformation
         async for _ in self.plugin.subscribe_storage_information():
-            told = kind(100.0, 900.0, 1000.0, kind.StorageStatus.FORMATTED, 1, kind.StorageType.SD, 10.0, 5.0)
-            await self.plugin.respond_storage_information(self._ok, told)
+            reported = kind(100.0, 900.0, 1000.0, kind.StorageStatus.FORMATTED, 1, kind.StorageType.SD, 10.0, 5.0)
+            await self.plugin.respond_storage_information(self._ok, reported)
 
 
 @asynccontextmanager
@@ -234,9 +237,9 @@ async def our_client() -> list[bool]:
         camera = vehicle.camera
 
         async def information() -> str:
-            told = await camera.wait_found()
-            assert (told.vendor, told.model, camera.number) == ("MAVSDK", "Server", CAMERA), told
-            return " ".join(sorted(told.capabilities))
+            reported = await camera.wait_found()
+            assert (reported.vendor, reported.model, camera.number) == ("MAVSDK", "Server", CAMERA), reported
+            return " ".join(sorted(reported.capabilities))
 
         async def photo() -> str:
             for index in (0, 1):
@@ -249,7 +252,7 @@ async def our_client() -> list[bool]:
 
         async def interval() -> str:
             async with camera.photo_interval(0.5, count=3) as captures:
-                return f"{[each.index async for each in captures]}"
+                return f"{[capture.index async for capture in captures]}"
 
         async def video() -> str:
             async with camera.video():
@@ -264,9 +267,9 @@ async def our_client() -> list[bool]:
             try:
                 await camera.set_mode("video", timeout=2.0)
             except OperationTimeout as error:
-                assert ("set_mode", of_server.Mode.VIDEO) in theirs.heard, theirs.heard
+                assert ("set_mode", of_server.Mode.VIDEO) in theirs.received, theirs.received
                 return str(error)
-            raise AssertionError("it has learned to tell its mode: expect that here")
+            raise AssertionError("MAVSDK reports its mode now: expect it here")
 
         async def lens() -> None:
             await camera.zoom_to(40.0)
@@ -274,12 +277,12 @@ async def our_client() -> list[bool]:
                 await asyncio.sleep(0.3)
             await camera.focus_to(20.0)
             await camera.auto_focus()
-            names = [name for name, _ in theirs.heard]
+            names = [name for name, _ in theirs.received]
             assert {"zoom_range", "zoom_in_start", "zoom_stop", "focus_range", "focus_auto"} <= set(names), names
 
         async def tracking() -> None:
             await camera.track_point(0.25, 0.5, radius=0.1)
-            assert any(name == "track_point" for name, _ in theirs.heard)
+            assert any(name == "track_point" for name, _ in theirs.received)
 
         async def storage() -> str:
             (medium,) = await camera.load_storage()
@@ -294,7 +297,10 @@ async def our_client() -> list[bool]:
             return stream.uri
 
         steps = (information, photo, interval, video, mode, lens, tracking, storage, streaming)
-        return [await step(f"our client: {each.__name__}", each()) for each in steps]
+        return [
+            await step(f"our client: {coroutine_function.__name__}", coroutine_function())
+            for coroutine_function in steps
+        ]
 
 
 async def main() -> int:

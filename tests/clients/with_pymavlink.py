@@ -37,10 +37,10 @@ class Client:
     def command(self, command: int, *parameters: float) -> int:
         values = (*parameters, *[0.0] * (7 - len(parameters)))
         self.link.mav.command_long_send(self.link.target_system, 1, command, 0, *values)
-        ack = self.wait("COMMAND_ACK", until=lambda each: each.command == command, timeout=5)
+        ack = self.wait("COMMAND_ACK", until=lambda ack: ack.command == command, timeout=5)
         return int(ack.result)
 
-    def insist(self, command: int, *parameters: float) -> None:
+    def command_until_accepted(self, command: int, *parameters: float) -> None:
         """A command is repeated until the vehicle is ready for it."""
         for _ in range(60):
             if self.command(command, *parameters) == M.MAV_RESULT_ACCEPTED:
@@ -51,14 +51,14 @@ class Client:
     def set_mode(self, name: str) -> None:
         mode = self.link.mode_mapping()[name]
         if isinstance(mode, tuple):
-            self.insist(M.MAV_CMD_DO_SET_MODE, mode[0], mode[1], mode[2])
+            self.command_until_accepted(M.MAV_CMD_DO_SET_MODE, mode[0], mode[1], mode[2])
         else:
-            self.insist(M.MAV_CMD_DO_SET_MODE, M.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, mode)
+            self.command_until_accepted(M.MAV_CMD_DO_SET_MODE, M.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, mode)
         self.wait("HEARTBEAT", until=lambda _: self.link.flightmode == name)
 
     def wait_altitude(self, altitude_m: float) -> Any:
         return self.wait(
-            "GLOBAL_POSITION_INT", until=lambda each: each.relative_alt / 1000 > altitude_m - 1, timeout=60
+            "GLOBAL_POSITION_INT", until=lambda position: position.relative_alt / 1000 > altitude_m - 1, timeout=60
         )
 
 
@@ -75,7 +75,7 @@ def all_parameters(client: Client) -> int:
 
 
 def upload(client: Client) -> bool:
-    """Send it as the vehicle asks for it; whether it was accepted."""
+    """Upload the mission; return True if it was accepted."""
     items = mission(client.kind)
     link = client.link
     link.mav.mission_count_send(link.target_system, 1, len(items), M.MAV_MISSION_TYPE_MISSION)
@@ -98,7 +98,7 @@ def download(client: Client) -> int:
     assert count == len(items), count
     for number in range(count):
         link.mav.mission_request_int_send(link.target_system, 1, number, M.MAV_MISSION_TYPE_MISSION)
-        got = client.wait("MISSION_ITEM_INT", until=lambda each, number=number: each.seq == number, timeout=10)
+        got = client.wait("MISSION_ITEM_INT", until=lambda item, number=number: item.seq == number, timeout=10)
         assert got.command == items[number].command, got
         if number:
             assert abs(got.x - items[number].latitude * 1e7) <= 1, got
@@ -107,26 +107,28 @@ def download(client: Client) -> int:
 
 
 def take_off(client: Client) -> None:
-    """ArduPilot takes height above home; PX4 a place and height above the sea."""
+    """Take off. ArduPilot expects an altitude above home, PX4 a position and an altitude above sea level."""
     if client.kind == "copter":
-        client.insist(M.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, ALTITUDE_M)
+        client.command_until_accepted(M.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, ALTITUDE_M)
         return
     here = client.wait("GLOBAL_POSITION_INT")
     nan = float("nan")
-    client.insist(M.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, nan, here.lat / 1e7, here.lon / 1e7, here.alt / 1000 + ALTITUDE_M)
+    client.command_until_accepted(
+        M.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, nan, here.lat / 1e7, here.lon / 1e7, here.alt / 1000 + ALTITUDE_M
+    )
 
 
 def fly(client: Client) -> None:
-    """The mission, to the end."""
+    """Fly the mission to its end."""
     last = len(mission(client.kind)) - 1
     client.set_mode("AUTO" if client.kind == "copter" else "MISSION")
-    client.wait("MISSION_ITEM_REACHED", until=lambda each: each.seq == last, timeout=90)
+    client.wait("MISSION_ITEM_REACHED", until=lambda report: report.seq == last, timeout=90)
 
 
 def main() -> None:
     steps = Steps()
     client = Client(sys.argv[1], int(sys.argv[2]))
-    client.wait("HEARTBEAT", until=lambda each: each.get_srcComponent() == 1)
+    client.wait("HEARTBEAT", until=lambda heartbeat: heartbeat.get_srcComponent() == 1)
     client.link.target_system = client.link.messages["HEARTBEAT"].get_srcSystem()
     steps.done("connect", f"system {client.link.target_system}")
     client.link.mav.request_data_stream_send(client.link.target_system, 1, M.MAV_DATA_STREAM_ALL, 4, 1)
@@ -139,7 +141,7 @@ def main() -> None:
     steps.done("download", download(client))
     if client.kind == "copter":
         client.set_mode("GUIDED")
-    client.insist(M.MAV_CMD_COMPONENT_ARM_DISARM, 1)
+    client.command_until_accepted(M.MAV_CMD_COMPONENT_ARM_DISARM, 1)
     client.wait("HEARTBEAT", until=lambda _: client.link.motors_armed())
     steps.done("arm")
     take_off(client)

@@ -1,4 +1,4 @@
-"""Ages after a pause of ours: what is read then may have come long before, and is not called younger."""
+"""Ages after the program was paused: values that arrived during the pause are not reported as younger."""
 
 from __future__ import annotations
 
@@ -42,11 +42,11 @@ class Wire(BaseLink):
 
     def write(self, data: bytes, peer: Peer = None) -> None: ...
 
-    def hear(self, number: int = 0) -> None:
+    def receive(self, number: int = 0) -> None:
         self._deliver(self._encoder.encode(m.Attitude(number, 0, 0, 0, 0, 0, 0)))
 
 
-async def ages_of(connection: Connection, wire: Wire, hear: int = 1) -> list[float]:
+async def ages_of(connection: Connection, wire: Wire, receive: int = 1) -> list[float]:
     ages: list[float] = []
 
     def take(attitude: m.Attitude) -> None:
@@ -54,8 +54,8 @@ async def ages_of(connection: Connection, wire: Wire, hear: int = 1) -> list[flo
         ages.append(connection.now() - attitude.received_frame.received_at)
 
     (detach,) = connection.attach([m.Attitude], take)
-    for _ in range(hear):
-        wire.hear()
+    for _ in range(receive):
+        wire.receive()
         await anyio.lowlevel.checkpoint()  # as a socket that is read in bursts, one in each turn
     detach()
     return ages
@@ -67,7 +67,7 @@ async def test_arrival_after_pause_is_start_of_pause() -> None:
         await anyio.sleep(5.03)
         assert await ages_of(connection, wire) == [0.0]
         block_loop(3.7)
-        assert await ages_of(connection, wire, hear=50) == pytest.approx([3.73] * 50, abs=0.11)
+        assert await ages_of(connection, wire, receive=50) == pytest.approx([3.73] * 50, abs=0.11)
 
 
 async def test_arrival_stays_old_until_waiting_data_is_read() -> None:
@@ -77,7 +77,7 @@ async def test_arrival_stays_old_until_waiting_data_is_read() -> None:
         await anyio.sleep(1)
         block_loop(3.7)
         await anyio.lowlevel.checkpoint()
-        assert all(age > 3.5 for age in await ages_of(connection, wire, hear=50))
+        assert all(age > 3.5 for age in await ages_of(connection, wire, receive=50))
         for _ in range(IDLE_ITERATIONS + 2):
             await anyio.lowlevel.checkpoint()
         for later_s in (0, 0.05, 1):
@@ -87,7 +87,7 @@ async def test_arrival_stays_old_until_waiting_data_is_read() -> None:
 
 @pytest.mark.parametrize("scheme", ["udpin", "tcpin"])
 async def test_arrival_stays_old_while_reading_takes_long(scheme: str) -> None:
-    """On virtual time; the sockets are real, and hold more than is read in one turn."""
+    """Virtual time with real sockets, which hold more data than one iteration reads."""
     encoder, ages = FrameEncoder(1, 1), list[float]()
     kind = socket.SOCK_DGRAM if scheme == "udpin" else socket.SOCK_STREAM
     async with open_connection(f"{scheme}:127.0.0.1:0") as connection:
@@ -126,9 +126,9 @@ async def test_value_from_before_pause_is_not_fresh(grounded: Flight) -> None:
     block_loop(3.7)
     await anyio.lowlevel.checkpoint()
     await anyio.lowlevel.checkpoint()
-    for each in (vehicle.attitude, cell):
+    for state in (vehicle.attitude, cell):
         with pytest.raises(StaleValueError):
-            each.fresh(within=0.5)
+            state.fresh(within=0.5)
     assert vehicle.heartbeat_age > 3.5
     await anyio.sleep(1.2)
     assert vehicle.attitude.fresh(within=0.5)
@@ -161,14 +161,14 @@ async def test_closed_watch_reports_nothing() -> None:
 
 
 OURS = ("link_state", "link_quality", "links")
-"""Cells about what was read and when; their values come in no message."""
+"""Cells about the reception itself; no message contains their values."""
 
 
 def every_cell(vehicle: aerokit.Vehicle) -> list[StateCell[Any]]:
-    """All cells of a vehicle, its parts and its devices; `make_parts` has made them."""
+    """Return all cells of a vehicle, its parts and its devices, as created by `make_parts`."""
     gc.collect()
-    cells = [each for each in gc.get_objects() if isinstance(each, StateCell)]
-    return [each for each in cells if each.name not in OURS and each._closed_by is None]
+    cells = [thing for thing in gc.get_objects() if isinstance(thing, StateCell)]
+    return [cell for cell in cells if cell.name not in OURS and cell._closed_by is None]
 
 
 async def test_cells_after_pause_are_as_old_as_their_message(grounded: Flight) -> None:
@@ -206,12 +206,12 @@ async def test_values_are_older_after_the_computer_slept(grounded: Flight, caplo
     await anyio.sleep(1.0)
     assert vehicle.armed.age < 1.1
     ages: list[float] = []
-    with vehicle.connection.subscribe(ComputerSlept) as told:
+    with vehicle.connection.subscribe(ComputerSlept) as events:
         asleep[0] = 600.0
         grounded.copter.faults.silent = True
         await anyio.sleep(0.2)
         ages += [vehicle.armed.age, vehicle.position.age, vehicle.heartbeat_age]
-        assert told.get_nowait() is not None
+        assert events.get_nowait() is not None
     assert min(ages) > 600.0
     assert not vehicle._arbiter.is_known
     assert "the computer slept for 600 s" in caplog.text

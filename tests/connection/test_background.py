@@ -48,7 +48,7 @@ async def test_exception_is_reported_and_other_tasks_continue() -> None:
 
 
 async def test_aclose_survives_cancellation_of_its_caller() -> None:
-    """They are gone all the same, and the cancellation is not swallowed."""
+    """The tasks end nevertheless, and the cancellation is not suppressed."""
     background, cleaned_up = BackgroundTasks(lambda error: pytest.fail(repr(error))), list[str]()
 
     async def slow_to_end() -> None:
@@ -85,7 +85,7 @@ async def test_task_may_cancel_all_tasks() -> None:
     assert len(background) == 0
 
 
-# ------------------------------------------------------------------------- what must not be cut short
+# -------------------------------------------------------------------------------------- shielded work
 
 
 async def test_run_shielded_finishes_despite_repeated_cancellation() -> None:
@@ -121,7 +121,7 @@ async def test_run_shielded_exception_becomes_cause_of_cancellation() -> None:
     if sys.version_info < (
         3,
         11,
-    ):  # there, who awaits the task gets another CancelledError, and this one behind it
+    ):  # there, the awaiting code gets a new CancelledError, with this one as its context
         raised = cancelled.value.__context__
     assert raised is not None
     assert isinstance(raised.__cause__, ValueError)

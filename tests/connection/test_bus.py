@@ -1,4 +1,4 @@
-"""The bus decodes on interest, keeps systems apart, and survives a subscriber that raises."""
+"""The bus decodes on demand, separates systems, and survives a subscriber that raises."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ def test_frame_without_subscribers_is_not_decoded(monkeypatch: pytest.MonkeyPatc
 
 
 def test_subscribed_frame_is_decoded_once() -> None:
-    bus, seen = Bus(), list[Heartbeat]()
-    bus.attach(Heartbeat, seen.append)
-    bus.attach(Heartbeat, seen.append, system_id=1)
+    bus, observed = Bus(), list[Heartbeat]()
+    bus.attach(Heartbeat, observed.append)
+    bus.attach(Heartbeat, observed.append, system_id=1)
     bus.deliver(frame(HEARTBEAT))
-    assert seen == [HEARTBEAT, HEARTBEAT]
-    assert seen[0] is seen[1]
+    assert observed == [HEARTBEAT, HEARTBEAT]
+    assert observed[0] is observed[1]
 
 
 def test_subscribers_get_only_their_system() -> None:
@@ -45,47 +45,47 @@ def test_subscribers_get_only_their_system() -> None:
 
 
 def test_create_on_first_delivers_the_first_message_once() -> None:
-    bus, heard, made = Bus(), list[Message](), list[object]()
+    bus, received, made = Bus(), list[Message](), list[object]()
 
     def make() -> None:
         if not made:
-            made.append(bus.attach(Heartbeat, heard.append))
+            made.append(bus.attach(Heartbeat, received.append))
 
     bus.create_on_first([Attitude.ID, Heartbeat.ID], make, system_id=1)
     bus.deliver(frame(HEARTBEAT, 2))
     assert not made
     for _ in range(2):
         bus.deliver(frame(HEARTBEAT))
-    assert heard == [HEARTBEAT, HEARTBEAT]
+    assert received == [HEARTBEAT, HEARTBEAT]
     assert set(bus.wanted) == {Heartbeat.ID}
 
 
 def test_sink_attached_by_another_sink_gets_first_message() -> None:
-    bus, heard, made = Bus(), list[Message](), list[object]()
+    bus, received, made = Bus(), list[Message](), list[object]()
 
     def make(*_: object) -> None:
         if not made:
-            made.append(bus.attach(Heartbeat, heard.append))
+            made.append(bus.attach(Heartbeat, received.append))
 
     bus.attach(Heartbeat, make, system_id=1)
     bus.create_on_first([Heartbeat.ID], make, system_id=1)
     bus.deliver(frame(HEARTBEAT))
     bus.deliver(frame(HEARTBEAT))
-    assert heard == [HEARTBEAT, HEARTBEAT]
+    assert received == [HEARTBEAT, HEARTBEAT]
 
 
 def test_failed_creation_is_retried_with_next_message(caplog: pytest.LogCaptureFixture) -> None:
-    bus, heard, failures = Bus(), list[Message](), [MemoryError()]
+    bus, received, failures = Bus(), list[Message](), [MemoryError()]
 
     def make() -> None:
         if failures:
             raise failures.pop()
-        bus.attach(Heartbeat, heard.append)
+        bus.attach(Heartbeat, received.append)
 
     bus.create_on_first([Heartbeat.ID], make)
     for _ in range(3):
         bus.deliver(frame(HEARTBEAT))
-    assert heard == [HEARTBEAT, HEARTBEAT]
+    assert received == [HEARTBEAT, HEARTBEAT]
     assert len(caplog.records) == 1
 
 
@@ -105,31 +105,31 @@ def test_wanted_ids_are_live() -> None:
 
 
 def test_subscriber_exception_is_logged_and_others_continue(caplog: pytest.LogCaptureFixture) -> None:
-    bus, seen = Bus(), list[Heartbeat]()
+    bus, observed = Bus(), list[Heartbeat]()
 
     def raising(message: Heartbeat) -> None:
         raise ValueError("mine")
 
     bus.attach(Heartbeat, raising)
-    bus.attach(Heartbeat, seen.append)
+    bus.attach(Heartbeat, observed.append)
     with caplog.at_level(logging.ERROR, "aerokit"):
         bus.deliver(frame(HEARTBEAT))
-    assert len(seen) == 1
+    assert len(observed) == 1
     assert "subscriber" in caplog.text
 
 
 def test_detach_during_delivery() -> None:
-    bus, seen = Bus(), list[str]()
+    bus, observed = Bus(), list[str]()
 
     def first(message: Heartbeat) -> None:
-        seen.append("first")
+        observed.append("first")
         detach()
 
     detach = bus.attach(Heartbeat, first)
-    bus.attach(Heartbeat, lambda message: seen.append("second"))
+    bus.attach(Heartbeat, lambda message: observed.append("second"))
     bus.deliver(frame(HEARTBEAT))
     bus.deliver(frame(HEARTBEAT))
-    assert seen == ["first", "second", "second"]
+    assert observed == ["first", "second", "second"]
 
 
 def test_events_reach_subscribers_of_base_classes() -> None:
@@ -145,7 +145,7 @@ def test_events_reach_subscribers_of_base_classes() -> None:
 
 
 def test_messages_of_other_ids_are_not_delivered() -> None:
-    bus, seen = Bus(), list[Attitude]()
-    bus.attach(Attitude, seen.append)
+    bus, observed = Bus(), list[Attitude]()
+    bus.attach(Attitude, observed.append)
     bus.deliver(frame(HEARTBEAT))
-    assert seen == []
+    assert observed == []

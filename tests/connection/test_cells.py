@@ -263,28 +263,28 @@ async def test_same_value_after_forget_is_a_change() -> None:
 
 async def test_observers_get_previous_and_new_value() -> None:
     cell = make_cell()
-    seen: list[tuple[int | None, int]] = []
-    stop = cell.observe(lambda before, after: seen.append((before, after)))
+    observed: list[tuple[int | None, int]] = []
+    stop = cell.observe(lambda before, after: observed.append((before, after)))
     for value in (1, 1, 2):
         cell.set(value, HEARTBEAT)
     stop()
     stop()
     cell.set(3, HEARTBEAT)
-    assert seen == [(None, 1), (1, 2)]
+    assert observed == [(None, 1), (1, 2)]
 
 
 async def test_observer_exception_is_logged_and_others_are_called(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    cell, seen = make_cell(), list[int]()
+    cell, observed = make_cell(), list[int]()
 
     def fail(_: int | None, value: int) -> None:
         raise ZeroDivisionError
 
     cell.observe(fail)
-    cell.observe(lambda _, value: seen.append(value))
+    cell.observe(lambda _, value: observed.append(value))
     cell.set(1, HEARTBEAT)
-    assert seen == [1]
+    assert observed == [1]
     assert "an observer of altitude raised" in caplog.text
     assert "ZeroDivisionError" in caplog.text
 
@@ -295,7 +295,7 @@ class LazyFeed:
     pending: object = None
 
     def __init__(self) -> None:
-        self.told: list[bool] = []
+        self.reported: list[bool] = []
         self.cell = make_cell()
         self.cell._feed_from(self)
 
@@ -304,14 +304,14 @@ class LazyFeed:
         self.cell.set(value, HEARTBEAT)  # type: ignore[arg-type]
 
     def watchers_changed(self) -> None:
-        self.told.append(self.cell._is_watched)
+        self.reported.append(self.cell._is_watched)
 
 
 async def test_feed_is_notified_of_watchers_and_asked_by_readers() -> None:
     feed = LazyFeed()
     stop = feed.cell.observe(lambda _, __: None)
     stop()
-    assert feed.told == [True, False]
+    assert feed.reported == [True, False]
     feed.pending = 5
     assert feed.cell.value == 5
     feed.pending = 6
@@ -319,7 +319,7 @@ async def test_feed_is_notified_of_watchers_and_asked_by_readers() -> None:
     assert not feed.pending
     assert feed.cell._latest == 6
     feed.cell.changes()
-    assert feed.told == [True, False] * 3  # each was dropped at once
+    assert feed.reported == [True, False] * 3  # each was dropped at once
 
 
 async def test_repr_is_readable() -> None:

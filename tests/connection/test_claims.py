@@ -19,18 +19,18 @@ from aerokit.mavlink.statistics import SourceStatistics
 PEER_TTL_S = 30.0
 ROUTE_TIMEOUT_S = 3.5
 
-HOME, SAME_HOST, ELSEWHERE = "1@copter", "2@copter", "1@stranger"
+HOME, SAME_HOST, OTHER_HOST = "1@copter", "2@copter", "1@stranger"
 
 
 class Sender:
-    """Somebody with a counter of frames and the framer that hears him."""
+    """A sender with a frame counter, and the framer that receives its frames."""
 
     def __init__(self, system_id: int = 1, sequence: int = 0) -> None:
         self.encoder = FrameEncoder(system_id, 1)
         self.encoder.sequence = sequence & 0xFF
         self.framer = Framer()
 
-    def say(self, at: float, message: Message = COPTER) -> tuple[Frame, SourceStatistics]:
+    def send(self, at: float, message: Message = COPTER) -> tuple[Frame, SourceStatistics]:
         (frame,) = self.framer.receive(self.encoder.encode(message), at)
         (counters,) = self.framer.statistics.sources.values()
         return frame, counters
@@ -44,32 +44,32 @@ class Stage:
     """Routes with a vehicle that sent ten frames a second from HOME until 1 s."""
 
     def __init__(self, attached: set[int] | None = None, **options: Any) -> None:
-        self.told: list[events.Event] = []
+        self.reported: list[events.Event] = []
         self.link = PeersLink()
         attached = {1} if attached is None else attached
-        self.routes = Routes(self.link, self.told.append, attached, **options)
+        self.routes = Routes(self.link, self.reported.append, attached, **options)
         self.copter = Sender()
         assert self.routes.record_heartbeat(*self._at_home(0.0))
         for number in range(9):
-            self.copter.say(number / 10)
+            self.copter.send(number / 10)
         assert self.routes.record_heartbeat(*self._at_home(1.0))
 
     @property
     def next_number(self) -> int:
         return self.copter.encoder.sequence
 
-    def claims(self, at: float, ahead: int, peer: str = ELSEWHERE, **kind: Any) -> bool:
-        frame, counters = Sender(1, self.next_number + ahead).say(at, **kind)
+    def claims(self, at: float, ahead: int, peer: str = OTHER_HOST, **kind: Any) -> bool:
+        frame, counters = Sender(1, self.next_number + ahead).send(at, **kind)
         assert self.routes.arrived_on_other_peer(frame, peer)
         return self.routes.claims_route(frame, peer, counters, is_signed=False)
 
     def _at_home(self, at: float) -> tuple[Frame, str, SourceStatistics]:
-        frame, counters = self.copter.say(at)
+        frame, counters = self.copter.send(at)
         return frame, HOME, counters
 
 
-def names(told: list[events.Event]) -> list[str]:
-    return [type(event).__name__ for event in told]
+def names(reported: list[events.Event]) -> list[str]:
+    return [type(event).__name__ for event in reported]
 
 
 @pytest.mark.parametrize(("ahead", "takes"), [(0, True), (68, True), (69, False), (-1, False)])
@@ -77,15 +77,15 @@ def test_after_silence_numbers_may_be_ahead_by_lost_frames(ahead: int, takes: bo
     """8 + 1.5 · 10 Hz · 4 s."""
     stage = Stage()
     assert stage.claims(5.0, ahead) is takes
-    assert names(stage.told) == (["RouteChanged"] if takes else ["DuplicateSender", "RouteChangeRefused"])
+    assert names(stage.reported) == (["RouteChanged"] if takes else ["DuplicateSender", "RouteChangeRefused"])
 
 
-@pytest.mark.parametrize(("ahead", "told"), [(9, []), (10, ["DuplicateSender"]), (-1, ["DuplicateSender"])])
-def test_without_silence_numbers_may_be_slightly_ahead(ahead: int, told: list[str]) -> None:
-    """8 + 1.5 · 10 Hz · 0.1 s; of the same host nothing is told while it may be the vehicle itself."""
+@pytest.mark.parametrize(("ahead", "reported"), [(9, []), (10, ["DuplicateSender"]), (-1, ["DuplicateSender"])])
+def test_without_silence_numbers_may_be_slightly_ahead(ahead: int, reported: list[str]) -> None:
+    """The limit is 8 + 1.5 · 10 Hz · 0.1 s. On the same host, no event is published while it may be the vehicle."""
     stage = Stage()
     assert not stage.claims(1.1, ahead, SAME_HOST)
-    assert names(stage.told) == told
+    assert names(stage.reported) == reported
 
 
 @pytest.mark.parametrize(("after_s", "takes"), [(ROUTE_TIMEOUT_S, False), (ROUTE_TIMEOUT_S + 0.01, True)])
@@ -94,7 +94,7 @@ def test_route_times_out_after_three_and_a_half_seconds(after_s: float, takes: b
 
 
 def test_clock_decides_where_numbers_are_ambiguous() -> None:
-    """After 8 s at 10 Hz the counter may have come round."""
+    """After 8 s at 10 Hz the counter may have wrapped around."""
     assert not Stage().claims(9.1, 0)  # and there is no clock
     clocks = {(1, 1): lambda at: 1000 * at}
     for boot_ms, takes in (
@@ -125,12 +125,12 @@ def test_other_port_takes_route_with_three_frames_in_time() -> None:
     other.encoder.sequence = stage.next_number
     takes = []
     for at in (1.1, 1.2, 1.3, 1.41):
-        frame, counters = other.say(at)
+        frame, counters = other.send(at)
         takes.append(stage.routes.claims_route(frame, SAME_HOST, counters, is_signed=False))
     assert takes == [False, False, False, True]
-    assert names(stage.told) == ["RouteChanged"]
+    assert names(stage.reported) == ["RouteChanged"]
     assert stage.routes.peers_of(1, 1) == (SAME_HOST,)
-    (moved,) = stage.told
+    (moved,) = stage.reported
     assert isinstance(moved, events.RouteChanged)
     assert moved.at == pytest.approx(1.41)
 
@@ -139,17 +139,17 @@ def test_claims_are_reported_again_after_owner_returns() -> None:
     stage = Stage()
     for at in (5.0, 5.1):
         assert not stage.claims(at, 100)
-    assert names(stage.told) == ["DuplicateSender", "RouteChangeRefused"]
+    assert names(stage.reported) == ["DuplicateSender", "RouteChangeRefused"]
     stage.routes.record_heartbeat(*stage._at_home(5.2))
     assert not stage.claims(10.0, 100)
-    assert names(stage.told) == ["DuplicateSender", "RouteChangeRefused", "RouteChangeRefused"]
+    assert names(stage.reported) == ["DuplicateSender", "RouteChangeRefused", "RouteChangeRefused"]
 
 
 def test_duplicate_behind_same_peer_is_reported_once() -> None:
     stage = Stage()
     for at in (1.1, 1.2):
-        stage.routes.record_duplicate_sender(Sender().say(at)[0])
-    assert names(stage.told) == ["DuplicateSender"]
+        stage.routes.record_duplicate_sender(Sender().send(at)[0])
+    assert names(stage.reported) == ["DuplicateSender"]
 
 
 @pytest.mark.parametrize(
@@ -158,9 +158,9 @@ def test_duplicate_behind_same_peer_is_reported_once() -> None:
 )
 def test_heartbeat_is_outdated_by_up_to_127_frames(behind: int, after_s: float, is_outdated: bool) -> None:
     stage = Stage()
-    frame, _ = Sender(1, stage.next_number - 1 - behind).say(1.0 + after_s)
+    frame, _ = Sender(1, stage.next_number - 1 - behind).send(1.0 + after_s)
     assert stage.routes.is_outdated(frame) is is_outdated
-    assert not stage.routes.is_outdated(Sender(9).say(1.0)[0])
+    assert not stage.routes.is_outdated(Sender(9).send(1.0)[0])
 
 
 # -------------------------------------------------------------------------------------- room
@@ -173,17 +173,17 @@ def test_peer_with_vehicle_object_is_never_evictable() -> None:
         (set[int](), 1.1 + PEER_TTL_S, [HOME]),
     ):
         assert Stage(attached).routes.evictable_peers([HOME], at) == forgotten
-    assert Stage().routes.evictable_peers([HOME, ELSEWHERE, SAME_HOST], 1.0) == [ELSEWHERE]
+    assert Stage().routes.evictable_peers([HOME, OTHER_HOST, SAME_HOST], 1.0) == [OTHER_HOST]
 
 
 def test_full_table_drops_expired_routes_and_keeps_vehicles(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(routes_module, "MAX_ROUTES", 3)
     stage = Stage(attached={9})
     routes = stage.routes
-    assert routes.record_heartbeat(Sender(9).say(1.0)[0], ELSEWHERE, None)
-    assert routes.record_heartbeat(Sender(3).say(30.0)[0], ELSEWHERE, None)
-    assert not routes.record_heartbeat(Sender(4).say(30.5)[0], ELSEWHERE, None)
-    assert routes.record_heartbeat(Sender(5).say(32.0)[0], ELSEWHERE, None)
+    assert routes.record_heartbeat(Sender(9).send(1.0)[0], OTHER_HOST, None)
+    assert routes.record_heartbeat(Sender(3).send(30.0)[0], OTHER_HOST, None)
+    assert not routes.record_heartbeat(Sender(4).send(30.5)[0], OTHER_HOST, None)
+    assert routes.record_heartbeat(Sender(5).send(32.0)[0], OTHER_HOST, None)
     known = [system for system in range(10) if routes.has_route((system, 1))]
     assert known == [3, 5, 9]
 
@@ -191,16 +191,16 @@ def test_full_table_drops_expired_routes_and_keeps_vehicles(monkeypatch: pytest.
 def test_full_table_is_swept_once_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(routes_module, "MAX_ROUTES", 1)
     routes = Stage(attached=set()).routes
-    assert not routes.record_heartbeat(Sender(2).say(30.5)[0], ELSEWHERE, None)
-    assert not routes.record_heartbeat(Sender(2).say(31.4)[0], ELSEWHERE, None)
-    assert routes.record_heartbeat(Sender(2).say(31.5)[0], ELSEWHERE, None)
+    assert not routes.record_heartbeat(Sender(2).send(30.5)[0], OTHER_HOST, None)
+    assert not routes.record_heartbeat(Sender(2).send(31.4)[0], OTHER_HOST, None)
+    assert routes.record_heartbeat(Sender(2).send(31.5)[0], OTHER_HOST, None)
 
 
 # ------------------------------------------------------------------------------------- claims
 
 
 def test_claim_is_judged_by_first_frame_after_owner() -> None:
-    claim, (frame, _) = RouteClaim(), Sender().say(1.0)
+    claim, (frame, _) = RouteClaim(), Sender().send(1.0)
     assert (claim.continues_owner, claim.may_continue_owner) == (False, True)
     claim.add(frame, (10, False, True))
     claim.add(frame, (10, True, True))
@@ -220,7 +220,7 @@ def test_claim_is_judged_by_first_frame_after_owner() -> None:
 
 
 def test_claim_needs_three_frames_in_the_time_of_three() -> None:
-    claim, (frame, _) = RouteClaim(), Sender().say(1.0)
+    claim, (frame, _) = RouteClaim(), Sender().send(1.0)
     for frames in (1, 2, 3):
         claim.add(frame, (10, True, True))
         assert claim.has_replaced(9.0, 10.0) is (frames == 3)
@@ -230,5 +230,5 @@ def test_claim_needs_three_frames_in_the_time_of_three() -> None:
 
 
 def test_boot_time_of_a_frame() -> None:
-    assert boot_time_ms(Sender().say(0.0, attitude(123_456_789))[0]) == 123_456_789
-    assert boot_time_ms(Sender().say(0.0, Heartbeat(2, 3, 81, 0, 3))[0]) is None
+    assert boot_time_ms(Sender().send(0.0, attitude(123_456_789))[0]) == 123_456_789
+    assert boot_time_ms(Sender().send(0.0, Heartbeat(2, 3, 81, 0, 3))[0]) is None

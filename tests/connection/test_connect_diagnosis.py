@@ -1,4 +1,4 @@
-"""A failed connect explains what was received and what was missing."""
+"""A failed connect lists the received and the missing messages."""
 
 from __future__ import annotations
 
@@ -32,20 +32,20 @@ UNKNOWN_FRAME = bytes.fromhex("fd0100000001018888880011f0")
 
 
 class FarEnd:
-    """Whoever is at the other end of the link: sends the same bytes again and again."""
+    """The other end of the link, which sends the same bytes repeatedly."""
 
     def __init__(self) -> None:
-        self.heard = b""
+        self.received = b""
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
-        self.heard += data
+        self.received += data
 
     def link_lost(self, error: LinkLost) -> None:
         pass
 
 
 @asynccontextmanager
-async def link_that_says(speak: Callable[[], bytes]) -> AsyncIterator[MemoryLink]:
+async def link_sending(speak: Callable[[], bytes]) -> AsyncIterator[MemoryLink]:
     near, far = memory_link_pair()
     await far.open(FarEnd())
 
@@ -61,15 +61,15 @@ async def link_that_says(speak: Callable[[], bytes]) -> AsyncIterator[MemoryLink
     far.close()
 
 
-def saying(system_id: int, component_id: int, *messages: Heartbeat | Attitude) -> Callable[[], bytes]:
+def frames_of(system_id: int, component_id: int, *messages: Heartbeat | Attitude) -> Callable[[], bytes]:
     encoder = FrameEncoder(system_id, component_id)
     return lambda: b"".join(encoder.encode(message) for message in messages)
 
 
 def heartbeat_of_system_0() -> bytes:
-    """Our own encoder refuses to be nobody."""
-    nobody = pymavlink.MAVLink(None, srcSystem=0, srcComponent=1)
-    return bytes(pymavlink.MAVLink_heartbeat_message(2, 3, 81, 0, 3, 3).pack(nobody))
+    """Return a HEARTBEAT of system 0, which our encoder refuses to make."""
+    unused = pymavlink.MAVLink(None, srcSystem=0, srcComponent=1)
+    return bytes(pymavlink.MAVLink_heartbeat_message(2, 3, 81, 0, 3, 3).pack(unused))
 
 
 def damaged(speak: Callable[[], bytes]) -> Callable[[], bytes]:
@@ -82,12 +82,12 @@ def damaged(speak: Callable[[], bytes]) -> Callable[[], bytes]:
         (lambda: b"", None, "no bytes were received"),
         (lambda: b"Init ArduCopter V4.7\n", None, "no MAVLink frame: wrong baud rate, or another protocol"),
         (lambda: b"\x00\xff\x13" * 20, None, "no MAVLink frame"),
-        (damaged(saying(1, 1, ATTITUDE)), None, "damaged frames and no valid one"),
+        (damaged(frames_of(1, 1, ATTITUDE)), None, "damaged frames and no valid one"),
         (lambda: UNKNOWN_FRAME, None, r"unknown dialect \(messages 8947848\)"),
-        (saying(1, 1, ATTITUDE), None, "no HEARTBEAT among them"),
-        (saying(255, 190, GCS), None, r"only ground stations were received \(255/190\)"),
-        (saying(1, 154, GIMBAL), None, r"that are not autopilots were received \(1/154\)"),
-        (saying(7, 1, COPTER), 3, r"other system ids were received: 7 \(wanted: 3\)"),
+        (frames_of(1, 1, ATTITUDE), None, "no HEARTBEAT among them"),
+        (frames_of(255, 190, GCS), None, r"only ground stations were received \(255/190\)"),
+        (frames_of(1, 154, GIMBAL), None, r"that are not autopilots were received \(1/154\)"),
+        (frames_of(7, 1, COPTER), 3, r"other system ids were received: 7 \(wanted: 3\)"),
         (heartbeat_of_system_0, None, "all with the invalid system id 0"),
     ],
     ids=[
@@ -96,7 +96,7 @@ def damaged(speak: Callable[[], bytes]) -> Callable[[], bytes]:
     ],
 )
 async def test_error_describes_what_was_received(speak: Callable[[], bytes], system_id: int | None, text: str) -> None:
-    async with link_that_says(speak) as link:
+    async with link_sending(speak) as link:
         with pytest.raises(ConnectFailed, match=text) as caught:
             async with connect(link, system_id=system_id, timeout=5):
                 pytest.fail("there is no vehicle")
@@ -106,9 +106,9 @@ async def test_error_describes_what_was_received(speak: Callable[[], bytes], sys
 
 @pytest.mark.parametrize("seed", range(5))
 async def test_noise_is_not_diagnosed_as_dialect_or_damage(seed: int) -> None:
-    """As a serial port gives it at the wrong baud rate; places that look like a frame are in it."""
+    """Noise of a serial port at the wrong baud rate, which contains byte sequences that look like frames."""
     random = Random(seed)
-    async with link_that_says(lambda: random.randbytes(random.randrange(1, 400))) as link:
+    async with link_sending(lambda: random.randbytes(random.randrange(1, 400))) as link:
         with pytest.raises(ConnectFailed, match="no MAVLink frame: wrong baud rate"):
             async with connect(link, timeout=50):
                 pytest.fail("there is no vehicle")
@@ -136,7 +136,7 @@ async def test_ground_station_and_gimbal_are_not_vehicles() -> None:
 
 async def test_connect_has_a_default_timeout() -> None:
     started = anyio.current_time()
-    async with link_that_says(lambda: b"") as link:
+    async with link_sending(lambda: b"") as link:
         with pytest.raises(ConnectFailed, match="within 30 s"):
             async with connect(link):
                 pytest.fail("there is no vehicle")

@@ -1,4 +1,4 @@
-"""The connection as an async context manager: what comes out of it, how it ends, and that nothing is left behind."""
+"""The connection as an async context manager: its exceptions, its end, and leaks."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ pytestmark = pytest.mark.anyio
 COPTER = Heartbeat(2, 3, 81, 0, 3)
 
 
-class Ear:
-    """The far end of a link: keeps what it hears."""
+class ByteRecorder:
+    """The far end of a link, which records received bytes."""
 
     def __init__(self) -> None:
         self.data = b""
@@ -49,19 +49,19 @@ class Ear:
         self.times.append(anyio.current_time())
 
     def link_lost(self, error: LinkLost) -> None:
-        """Nothing to do."""
+        """Ignore it."""
 
 
 @asynccontextmanager
-async def far_end() -> AsyncIterator[tuple[MemoryLink, MemoryLink, Ear]]:
+async def far_end() -> AsyncIterator[tuple[MemoryLink, MemoryLink, ByteRecorder]]:
     near, far = memory_link_pair()
-    ear = Ear()
+    ear = ByteRecorder()
     await far.open(ear)
     yield near, far, ear
     far.close()
 
 
-# ------------------------------------------------------------------------------------ what goes out
+# ------------------------------------------------------------------------------------------ sending
 
 
 async def test_own_heartbeat_is_sent_at_1_hz_from_start() -> None:
@@ -139,7 +139,7 @@ async def test_message_with_field_out_of_range_is_not_sent() -> None:
         assert ear.data == before
 
 
-# --------------------------------------------------------------------------- what comes out of the block
+# ------------------------------------------------------------------------------- exceptions of the block
 
 
 class Mine(BaseException):
@@ -189,7 +189,7 @@ async def test_internal_error_ends_connection_without_exception_group(
         assert not vehicle.connection.is_open
 
 
-# ----------------------------------------------------------------------------------- how it ends
+# ---------------------------------------------------------------------------------------- ending
 
 
 async def test_close_is_idempotent_and_ends_waiters() -> None:
@@ -245,10 +245,10 @@ async def test_lost_link_ends_all_waiters() -> None:
 async def test_close_is_bounded_when_the_link_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
     async with simulated_link(SimulatedCopter(boot_time_s=0)) as link:
 
-        async def hang() -> None:
+        async def idle_for() -> None:
             await anyio.sleep_forever()
 
-        monkeypatch.setattr(link, "wait_closed", hang)
+        monkeypatch.setattr(link, "wait_closed", idle_for)
         async with open_connection(link):
             await anyio.sleep(1)
             started = anyio.current_time()
@@ -290,12 +290,12 @@ async def test_targeted_message_goes_only_to_its_peer() -> None:
             link.receive(FrameEncoder(system_id, 1).encode(COPTER), peer)
         connection.send(CommandLong(2, 1, 400, 0, *(0.0,) * 7))
         assert link.sent_to(76) == ["two"]
-        heard: list[DuplicateSender] = []
-        connection.bus.attach_event(DuplicateSender, heard.append)
+        received: list[DuplicateSender] = []
+        connection.bus.attach_event(DuplicateSender, received.append)
         link.receive(FrameEncoder(2, 1).encode(COPTER), "elsewhere")  # a second vehicle with the same ids?
         connection.send(CommandLong(2, 1, 400, 0, *(0.0,) * 7))
         assert link.sent_to(76) == ["two", "two"]
-        assert [(event.system_id, event.component_id) for event in heard] == [(2, 1)]
+        assert [(event.system_id, event.component_id) for event in received] == [(2, 1)]
         await anyio.sleep(4)
         link.receive(FrameEncoder(2, 1).encode(COPTER), "elsewhere")  # the vehicle's port has changed
         connection.send(CommandLong(2, 1, 400, 0, *(0.0,) * 7))
@@ -327,7 +327,7 @@ class SeveralPeers(MemoryLink):
         return [peer for sent_id, peer in self.sent if sent_id == message_id]
 
 
-# -------------------------------------------------------------------------- nothing is left behind
+# ------------------------------------------------------------------------------------------- leaks
 
 
 def scheduled_timers() -> list[asyncio.TimerHandle]:
@@ -337,7 +337,7 @@ def scheduled_timers() -> list[asyncio.TimerHandle]:
 
 
 async def use(vehicle: Vehicle) -> None:
-    """A program that does a little of everything and never ends by itself."""
+    """A program that uses most features and never ends by itself."""
     await vehicle.wait_ready()
     await vehicle.set_mode("GUIDED")
     await vehicle.arm()
@@ -377,7 +377,7 @@ async def test_vehicle_search_leaves_no_subscriber_behind() -> None:
         assert (connection.bus.wanted, connection._end_signal._callbacks) == before
         with pytest.raises(ConnectFailed):
             async with connect(connection, system_id=9, timeout=2):
-                pytest.fail("nobody has this number")
+                pytest.fail("no system has this id")
         assert (connection.bus.wanted, connection._end_signal._callbacks) == before
 
 
@@ -386,6 +386,6 @@ async def test_failed_connect_leaves_nothing_behind() -> None:
     async with far_end() as (near, _, _ear):
         with pytest.raises(ConnectFailed):
             async with connect(near, timeout=2):
-                pytest.fail("nobody is there")
+                pytest.fail("there is no vehicle")
         assert asyncio.all_tasks() == tasks_before
         assert not scheduled_timers()

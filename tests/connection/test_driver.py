@@ -34,15 +34,15 @@ class Counting(Exchange[int]):
     def __init__(self, answers: int = 1, question: Message | None = None) -> None:
         super().__init__()
         self.question = question or Ping(0, 0, SYSTEM, 1)
-        self.answers, self.heard, self.asked = answers, 0, 0
+        self.answers, self.received, self.asked = answers, 0, 0
 
     def start(self, now: float) -> None:
         self._ask(now)
 
     def receive(self, message: Message, now: float) -> None:
-        self.heard += 1
-        if self.heard >= self.answers:
-            self._finish(self.heard)
+        self.received += 1
+        if self.received >= self.answers:
+            self._finish(self.received)
 
     def expire(self, now: float) -> None:
         if self.asked == 5:
@@ -70,7 +70,7 @@ class FarEnd:
                 self.questions.append(anyio.current_time())
 
     def link_lost(self, error: LinkLost) -> None:
-        """Nothing to do."""
+        """Ignore it."""
 
     def answer(self, system_id: int = SYSTEM) -> None:
         encoder = self._encoder if system_id == SYSTEM else FrameEncoder(system_id, 1)
@@ -145,7 +145,7 @@ async def test_messages_of_other_systems_are_ignored(pair: Pair) -> None:
     exchange = Counting()
     with pytest.raises(CommandTimeout):
         await pair.run(exchange)
-    assert exchange.heard == 0
+    assert exchange.received == 0
 
 
 async def test_concurrent_exchanges_end_separately(pair: Pair) -> None:
@@ -173,7 +173,7 @@ async def test_cancelled_exchange_sends_nothing_more(pair: Pair, seconds: float)
     assert anyio.current_time() == pytest.approx(started + seconds)
     asked = len(pair.far.questions)
     await anyio.sleep(3)
-    assert len(pair.far.questions) <= asked + 1  # one may have been under way
+    assert len(pair.far.questions) <= asked + 1  # one may already have been sent
     assert pair.attached() == pair.before
 
 
@@ -193,7 +193,7 @@ async def test_lost_link_ends_exchange(pair: Pair) -> None:
 
 
 async def test_unsendable_message_is_raised_at_once(pair: Pair) -> None:
-    """Also when it is a later one: nobody else would tell."""
+    """The error is raised for a later message as well; there is no other way to report it."""
     nonsense = CommandLong(300, 1, 400, 0, *(0.0,) * 7)
     with pytest.raises(InvalidArgument, match="target_system"):
         await pair.run(Counting(question=nonsense))

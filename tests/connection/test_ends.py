@@ -49,7 +49,7 @@ async def vehicle(link: MemoryLink) -> AsyncIterator[Vehicle]:
         yield vehicle
 
 
-# ------------------------------------------------------------------ what comes out of the block
+# ---------------------------------------------------------------------- exceptions of the block
 
 
 @pytest.mark.parametrize(
@@ -239,22 +239,22 @@ async def test_block_continues_after_close(vehicle: Vehicle) -> None:
     for use in (vehicle.arm, vehicle.wait_ready, lambda: vehicle.command(511), vehicle.hold, vehicle.land):
         with pytest.raises(ConnectionClosed, match="was closed"):
             await use()
-    assert vehicle.mode_name == "STABILIZE"  # what was known can still be read
+    assert vehicle.mode_name == "STABILIZE"  # the last values can still be read
 
 
 async def test_sink_may_close_during_delivery(link: MemoryLink) -> None:
     async with open_connection(link) as connection:
-        heard: list[Heartbeat] = []
+        received: list[Heartbeat] = []
 
         def close(heartbeat: Heartbeat) -> None:
-            heard.append(heartbeat)
+            received.append(heartbeat)
             connection.close()
 
         connection.bus.attach(Heartbeat, close)
         connection.bytes_received(FrameEncoder(9, 1).encode(COPTER) * 3, None)
-        assert len(heard) == 1
+        assert len(received) == 1
         await anyio.sleep(3)
-        assert len(heard) == 1
+        assert len(received) == 1
 
 
 @pytest.mark.parametrize("how", ["close", "lose"])
@@ -289,7 +289,7 @@ async def test_all_waiters_end_at_the_same_time(
     errors = [error for _, error in ended]
     expected = ConnectionClosed if how == "close" else LinkLost
     assert [type(error) for error in errors] == [expected] * len(waits)
-    assert len(set(map(id, errors))) == len(waits)  # nobody gets another one's traceback
+    assert len(set(map(id, errors))) == len(waits)  # each waiting call gets an error and a traceback of its own
     assert {at for at, _ in ended} == {anyio.current_time()}
 
 
@@ -320,27 +320,27 @@ async def test_queued_items_are_read_before_the_loss(link: MemoryLink) -> None:
         with vehicle.subscribe(Attitude, events.LinkClosed, capacity=100) as items:
             await anyio.sleep(1)
             link._lose("unplugged")
-            seen = []
+            observed = []
             with pytest.raises(LinkLost, match="unplugged"):
                 async for item in items:
-                    seen.append(type(item))
-    assert len(seen) > 5
-    assert seen[-1] is events.LinkClosed
-    assert set(seen[:-1]) == {Attitude}
+                    observed.append(type(item))
+    assert len(observed) > 5
+    assert observed[-1] is events.LinkClosed
+    assert set(observed[:-1]) == {Attitude}
 
 
 async def test_end_callback_exception_does_not_affect_others(
     link: MemoryLink, caplog: pytest.LogCaptureFixture
 ) -> None:
     async with open_connection(link) as connection:
-        told: list[Exception] = []
+        failures: list[Exception] = []
         connection.on_end(broken)
-        connection.on_end(told.append)
+        connection.on_end(failures.append)
         with caplog.at_level(logging.CRITICAL, "aerokit"):
             connection.close()
-        assert [type(error) for error in told] == [ConnectionClosed]
-        connection.on_end(told.append)
-        assert len(told) == 2  # a late callback is called at once
+        assert [type(error) for error in failures] == [ConnectionClosed]
+        connection.on_end(failures.append)
+        assert len(failures) == 2  # a late callback is called at once
 
 
 async def test_link_is_used_once() -> None:
@@ -373,19 +373,19 @@ async def test_vehicle_after_its_block_on_open_connection(link: MemoryLink) -> N
 
 async def test_sink_may_subscribe_send_and_detach(link: MemoryLink) -> None:
     async with open_connection(link) as connection:
-        heard: list[str] = []
+        received: list[str] = []
 
         def first(heartbeat: Heartbeat) -> None:
-            heard.append("first")
+            received.append("first")
             detach()
-            connection.bus.attach(Heartbeat, lambda _: heard.append("new"))
+            connection.bus.attach(Heartbeat, lambda _: received.append("new"))
             connection.send(COPTER)
 
         detach = connection.bus.attach(Heartbeat, first)
         connection.bytes_received(FrameEncoder(9, 1).encode(COPTER), None)
-        assert heard == ["first"]
+        assert received == ["first"]
         connection.bytes_received(FrameEncoder(9, 1).encode(COPTER), None)
-        assert heard == ["first", "new"]
+        assert received == ["first", "new"]
 
 
 async def test_subscription_can_be_entered_once(link: MemoryLink) -> None:

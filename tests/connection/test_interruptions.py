@@ -1,4 +1,4 @@
-"""``connect(reconnect=True)``: the link goes and comes back, and the program goes on where it was."""
+"""``connect(reconnect=True)``: the link fails and is restored, and the program continues."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ NEWS = (
 
 
 class CableEnd(BaseLink):
-    """The program's end of the cable, for as long as it is plugged in."""
+    """The program's end of the cable; open while the cable is plugged in."""
 
     def __init__(self, cable: Cable) -> None:
         super().__init__("cable")
@@ -63,7 +63,7 @@ class CableEnd(BaseLink):
     def write(self, data: bytes, peer: Peer = None) -> None:
         self._cable.write(data)
 
-    def hear(self, data: bytes) -> None:
+    def receive(self, data: bytes) -> None:
         self._deliver(data)
 
     def break_off(self) -> None:
@@ -82,7 +82,7 @@ class Cable:
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
         if self.end is not None:
-            self.end.hear(data)
+            self.end.receive(data)
 
     def link_lost(self, error: LinkLost) -> None:
         """The vehicle was switched off for good."""
@@ -109,7 +109,9 @@ class Cable:
 
     def asked_for(self, kind: type[m.Attitude]) -> int:
         """Number of requests to the vehicle for this message."""
-        return sum(each.command == MavCmd.SET_MESSAGE_INTERVAL and each.param1 == kind.ID for each in self.sent)
+        return sum(
+            message.command == MavCmd.SET_MESSAGE_INTERVAL and message.param1 == kind.ID for message in self.sent
+        )
 
 
 @asynccontextmanager
@@ -124,7 +126,7 @@ async def cabled(copter: SimulatedCopter | None = None, **options: Any) -> Async
             link.close()
 
 
-# ------------------------------------------------------------------------------ a program goes on
+# ---------------------------------------------------------------------------- a program continues
 
 
 async def test_interruption_events() -> None:
@@ -132,14 +134,14 @@ async def test_interruption_events() -> None:
         await vehicle.wait_ready()
         with vehicle.subscribe(*NEWS, capacity=9) as news:
             await cable.is_away(6)
-            heard = [await news.get(10) for _ in range(4)]
-        assert [type(event).__name__ for event in heard] == [
+            received = [await news.get(10) for _ in range(4)]
+        assert [type(event).__name__ for event in received] == [
             "LinkInterrupted",
             "VehicleSilent",
             "LinkRestored",
             "VehicleRecovered",
         ]
-        interrupted, _, restored, _ = heard
+        interrupted, _, restored, _ = received
         assert isinstance(interrupted, events.LinkInterrupted)
         assert str(interrupted.error) == "cable: unplugged"
         assert isinstance(restored, events.LinkRestored)
@@ -230,17 +232,17 @@ async def test_connect_finds_vehicle_on_restored_link() -> None:
 
 async def test_partial_frame_before_a_new_stream() -> None:
     link, encoder = OneEnd(), FrameEncoder(1, 1)
-    heard: list[int] = []
+    received: list[int] = []
     async with open_connection(link) as connection:
-        connection.attach([m.Attitude], lambda attitude: heard.append(attitude.time_boot_ms))
+        connection.attach([m.Attitude], lambda attitude: received.append(attitude.time_boot_ms))
         frames = [encoder.encode(m.Attitude(n, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6)) for n in range(3)]
-        link.hear(frames[0] + frames[1][:20])
+        link.receive(frames[0] + frames[1][:20])
         assert link.connection is not None
         link.connection.link_interrupted(LinkLost("unplugged"))
         link.connection.link_restored(1.0)
-        link.hear(frames[1][20:] + frames[2])
+        link.receive(frames[1][20:] + frames[2])
         (statistics,) = connection.statistics()
-        assert heard == [0, 2]
+        assert received == [0, 2]
         assert statistics.bad_crcs == 0
 
 
@@ -261,7 +263,7 @@ class OneEnd(BaseLink):
     def write(self, data: bytes, peer: Peer = None) -> None:
         pass
 
-    def hear(self, data: bytes) -> None:
+    def receive(self, data: bytes) -> None:
         self._deliver(data)
 
 
@@ -287,7 +289,7 @@ async def test_recording_ends_despite_reconnect(tmp_path: Any) -> None:
             await vehicle.mode.wait_until(lambda _: False)
 
 
-# ------------------------------------------------------------------------------- nothing is left
+# ----------------------------------------------------------------------------------------- leaks
 
 
 class Interrupted:
@@ -349,7 +351,7 @@ class TestServers:
             await exit_stack.__aexit__(None, None, None)
 
     async def test_client_from_other_port_is_accepted_at_once(self) -> None:
-        """With ``tcpin:`` the link is never lost; the vehicle's new connection is not a second vehicle."""
+        """A ``tcpin:`` link is never lost, and the vehicle's new connection is not a second vehicle."""
         doubles: list[events.DuplicateSender] = []
         encoder = FrameEncoder(1, 1)
         async with open_connection("tcpin:127.0.0.1:0") as connection:
@@ -358,31 +360,31 @@ class TestServers:
             with connection.subscribe(m.Heartbeat, capacity=9) as heartbeats:
                 for _ in range(2):
                     link = TcpConnect("127.0.0.1", port)
-                    await link.open(Deaf())
+                    await link.open(IgnoringReceiver())
                     link.write(encoder.encode(m.Heartbeat(2, 3, 81, 0, 3)))
                     await heartbeats.get(20)
                     link.close()
                     await link.wait_closed()
-                    await eventually_gone(connection.link)
+                    await eventually_closed(connection.link)
         assert doubles == []
 
 
-async def eventually_gone(link: Link) -> None:
-    """Waits until the server has noticed that its client has gone; 20 s are for hung tests only."""
+async def eventually_closed(link: Link) -> None:
+    """Wait until the server has noticed that its client disconnected; only hung tests take 20 s."""
     assert isinstance(link, TcpListen)
     with anyio.fail_after(20):
         while link.peers:  # noqa: ASYNC110
             await asyncio.sleep(0)
 
 
-class Deaf:
-    """A receiver that does not listen."""
+class IgnoringReceiver:
+    """A receiver that ignores all data."""
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
-        """Nothing to do."""
+        """Ignore it."""
 
     def link_lost(self, error: LinkLost) -> None:
-        """Nothing to do."""
+        """Ignore it."""
 
 
 async def test_reopened_link_is_lost_and_then_connected() -> None:

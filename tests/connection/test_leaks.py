@@ -100,7 +100,7 @@ def turns_of(use: Use) -> int:
 
 
 def some_of(turns: int, most: int) -> list[int]:
-    """All of the first ones, then some."""
+    """Return all of the first iterations, then a sample."""
     first = min(turns, most // 2)
     rest = range(first, turns, max(1, (turns - first) // (most - first) + 1))
     return [*range(first), *rest]
@@ -120,7 +120,7 @@ def test_cancelled_at_any_iteration(use: Use) -> None:
 
 @pytest.mark.parametrize("use", [nothing, exhaustive(fly)], ids=lambda use: use.__name__)
 def test_cancelled_by_scope_at_any_iteration(use: Use) -> None:
-    """As asyncio.timeout and anyio.fail_after do it: afterwards the program goes on, with nothing pending."""
+    """Cancelled as by asyncio.timeout and anyio.fail_after: the program continues, with nothing pending."""
     scopes: list[anyio.CancelScope] = []
 
     async def scoped() -> tuple[bool, bool]:
@@ -165,13 +165,13 @@ def test_ended_connection_is_garbage() -> None:
 
 
 def test_block_exception_keeps_no_reference_cycle() -> None:
-    """They are gone as soon as the exception is, not when the garbage collector comes by."""
+    """They are freed with the exception, without the garbage collector."""
 
-    class Precious:
+    class Resource:
         """Something that the program holds: a camera, a file."""
 
     async def body(connection: Connection, references: list[weakref.ref[object]]) -> None:
-        precious = Precious()
+        precious = Resource()
         references.append(weakref.ref(precious))
         connection.raise_if_ended()
         raise ValueError("mine")
@@ -249,7 +249,7 @@ asyncio.run(main())
     ids=["return", "exit", "interrupt"],
 )
 def test_program_with_unanswered_call_exits(tmp_path: Path, ending: str, code: int) -> None:
-    """In a separate process, which would hang with a thread or shield left over."""
+    """Run in a separate process, which would hang if a thread or shield remained."""
     file = tmp_path / "program.py"
     file.write_text(PROGRAM.format(ending=ending))
     source = Path(__file__).parents[2] / "src"

@@ -14,8 +14,8 @@ from aerokit.connection.multilink.vehicle_clock import HardwareId, VehicleClock
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.frame import Frame
 
-WHAT = (
-    "heard",
+STEP_KINDS = (
+    "heartbeat",
     "counts",
     "answer",
     "there",
@@ -29,7 +29,7 @@ WHAT = (
 )
 STEPS = st.lists(
     st.tuples(
-        st.sampled_from(WHAT),
+        st.sampled_from(STEP_KINDS),
         st.integers(0, 2),
         st.floats(0.01, 1.5),
         st.floats(0.0, 0.5),
@@ -44,7 +44,7 @@ def test_unproven_link_is_never_used(
 ) -> None:
     """Link 2 leads to another vehicle: its clock is 300 s ahead, or more when ours has paused or rebooted.
 
-    Both are simulated on one machine, so that they tell the same hardware id.
+    Both are simulated on one machine, so they report the same hardware id.
     """
     choice, now, begin = LinkChoice(needs_proof=True), 1.0, -50.0
     choice.record_heartbeat(0, now, is_costly=False)
@@ -53,7 +53,9 @@ def test_unproven_link_is_never_used(
     for what, link, later, round_trip in steps:
         now += later
         candidate = (
-            choice.record_heartbeat(link, now, is_costly=link == 1) if what == "heard" else choice.candidates.get(link)
+            choice.record_heartbeat(link, now, is_costly=link == 1)
+            if what == "heartbeat"
+            else choice.candidates.get(link)
         )
         if candidate is None:
             continue
@@ -61,8 +63,8 @@ def test_unproven_link_is_never_used(
             received += 5
             candidate.record_counts(received, 1, now)
         elif what == "answer":
-            told = now + 350.0 if link == 2 else max(0.0, now - begin)
-            choice.record_answer(link, now - round_trip / 2, told, round_trip, now)
+            boot_s = now + 350.0 if link == 2 else max(0.0, now - begin)
+            choice.record_answer(link, now - round_trip / 2, boot_s, round_trip, now)
         elif what == "hardware":
             choice.record_hardware(link, HardwareId(b"A" * 18, 0))
         elif what == "pause":
@@ -83,8 +85,10 @@ def test_unproven_link_is_never_used(
             if before is not None and before.is_alive(now):
                 assert reason in ("better", "cheaper")
         elif choice.used is before and before is not None and not before.is_alive(now):
-            others = [each for each in choice.candidates.values() if each is not before and each.is_proven]
-            assert not any(each.is_alive(now) for each in others), "a living link was not taken"
+            others = [
+                candidate for candidate in choice.candidates.values() if candidate is not before and candidate.is_proven
+            ]
+            assert not any(other.is_alive(now) for other in others), "a live link was not selected"
 
 
 @given(st.floats(0.2, 20.0), st.floats(-1e5, 1e5), st.lists(st.floats(0.0, 0.4), min_size=3, max_size=30))
@@ -93,11 +97,11 @@ def test_clock_continues_at_any_speed(speed: float, begin: float, round_trips: l
     clock, now = VehicleClock(), 100.0
     for index, round_trip in enumerate(round_trips):
         now += 0.5
-        told = begin + speed * (now - round_trip / 2 + (round_trip / 2) * 0.2 * (-1) ** index)
+        boot_s = begin + speed * (now - round_trip / 2 + (round_trip / 2) * 0.2 * (-1) ** index)
         at = now - round_trip / 2
-        assert clock.matches(at, told, round_trip) is not False
-        assert not clock.matches(at, told + 60.0 * max(1.0, speed), round_trip)
-        assert clock.add(at, told, round_trip)
+        assert clock.matches(at, boot_s, round_trip) is not False
+        assert not clock.matches(at, boot_s + 60.0 * max(1.0, speed), round_trip)
+        assert clock.add(at, boot_s, round_trip)
 
 
 def test_reboot_resets_proof_until_clock_matches_again() -> None:
@@ -131,15 +135,15 @@ def test_paused_clock_continues_at_the_same_speed() -> None:
 
 @given(st.floats(0.2, 20.0), st.floats(0.2, 20.0))
 def test_changed_clock_speed_is_measured_again(before: float, after: float) -> None:
-    clock, told = VehicleClock(), 0.0
+    clock, boot_s = VehicleClock(), 0.0
     for step in range(40):
-        told += 0.5 * (before if step < 10 else after)
-        clock.add(step / 2, told, 0.01)
-    assert clock.matches(21.0, told + 1.5 * after, 0.01)
+        boot_s += 0.5 * (before if step < 10 else after)
+        clock.add(step / 2, boot_s, 0.01)
+    assert clock.matches(21.0, boot_s + 1.5 * after, 0.01)
 
 
 def test_hardware_alone_proves_only_previously_proven_link() -> None:
-    """The link in use dies with the reboot, and a pause makes the other one's clock useless."""
+    """The link in use fails during the reboot, and a pause makes the clock of the other link useless."""
     for was_proven in (True, False):
         choice = LinkChoice(needs_proof=True)
         for link in (0, 1):
@@ -161,7 +165,7 @@ def test_hardware_alone_proves_only_previously_proven_link() -> None:
 
 
 def test_other_hardware_after_reboot_outweighs_the_clock() -> None:
-    """Two vehicles that are switched off and on together; the link in use dies before ours has told its id again."""
+    """Two vehicles are switched off and on together; the link in use fails before ours has reported its id again."""
     choice = LinkChoice(needs_proof=True)
     for link in (0, 1):
         choice.record_heartbeat(link, 0.0, is_costly=False)
@@ -198,18 +202,18 @@ def frame_of(sequence: int, at: float, value: int = 0) -> Frame:
 
 @given(st.lists(st.tuples(st.integers(0, 2), st.floats(0.0, 2.0)), max_size=6), st.integers(0, 255))
 def test_one_copy_of_each_frame_is_accepted(rest: list[tuple[int, float]], sequence: int) -> None:
-    copies, seen = Copies(), set[int]()
+    copies, observed = Copies(), set[int]()
     taken = 0
-    for link, delay in sorted(rest, key=lambda each: each[1]):
-        if link in seen:
+    for link, delay in sorted(rest, key=lambda copy: copy[1]):
+        if link in observed:
             continue  # the same link again: another frame
-        seen.add(link)
+        observed.add(link)
         if not copies.is_copy(frame_of(sequence, 10.0 + delay), link):
             taken += 1
             copies.accept()
         else:
             assert copies.was_accepted
-    assert taken == (1 if seen else 0)
+    assert taken == (1 if observed else 0)
 
 
 def test_equal_bytes_same_link_or_later_are_not_copies() -> None:
@@ -220,7 +224,7 @@ def test_equal_bytes_same_link_or_later_are_not_copies() -> None:
     assert not copies.is_copy(frame_of(7, 4.0), 1)
     for number in range(130):
         assert not copies.is_copy(frame_of((8 + number) % 256, 4.1, number + 1), 0)
-    assert not copies.is_copy(frame_of(7, 4.2), 0), "its numbers have come round"
+    assert not copies.is_copy(frame_of(7, 4.2), 0), "its sequence numbers have wrapped around"
 
 
 def test_copies_are_bounded() -> None:

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.anyio
 CONNECTED, SILENT, LOST = LinkState.CONNECTED, LinkState.SILENT, LinkState.LOST
 
 
-def told(changes: Subscription[events.LinkStateChanged]) -> list[tuple[int, LinkState, LinkState]]:
+def transitions(changes: Subscription[events.LinkStateChanged]) -> list[tuple[int, LinkState, LinkState]]:
     found = []
     while (change := changes.get_nowait()) is not None:
         found.append((change.system_id, change.before, change.after))
@@ -39,7 +39,7 @@ async def test_states_from_connected_to_lost_with_events(grounded: Flight) -> No
         await connection.link_state.wait_until(lambda state: state is CONNECTED, timeout=2)
         connection.link_lost(LinkLost("unplugged"))
         one = vehicle.system_id
-        assert sorted(told(changes), key=lambda change: change[0]) == [
+        assert sorted(transitions(changes), key=lambda change: change[0]) == [
             (0, CONNECTED, SILENT),
             (0, SILENT, CONNECTED),
             (0, CONNECTED, LOST),
@@ -51,15 +51,15 @@ async def test_states_from_connected_to_lost_with_events(grounded: Flight) -> No
 
 def test_silence_starts_after_three_and_a_half_seconds() -> None:
     bus, now = Bus(), 0.0
-    seen: list[events.LinkStateChanged] = []
-    bus.attach_event(events.LinkStateChanged, seen.append)
+    observed: list[events.LinkStateChanged] = []
+    bus.attach_event(events.LinkStateChanged, observed.append)
     watch = LinkStateTracker(StateCell("link_state", lambda: now, "frame"), bus, system_id=7)
     states = []
     for now, frames in ((0.0, 0), (1.0, 0), (9.0, 1), (12.5, 1), (12.6, 1), (99.0, 1), (99.1, 2), (102.6, 2)):
         watch.update(now, frames)
         states.append(watch.state)
     assert states == [None, None, CONNECTED, CONNECTED, SILENT, SILENT, CONNECTED, CONNECTED]
-    assert seen == [
+    assert observed == [
         events.LinkStateChanged(12.6, 7, CONNECTED, SILENT),
         events.LinkStateChanged(99.1, 7, SILENT, CONNECTED),
     ]
@@ -84,7 +84,7 @@ async def test_closed_connection_is_lost_without_event() -> None:
             assert (vehicle.link_state.value, connection.link_state.value) == (LOST, CONNECTED)
             with pytest.raises(ConnectionClosed):
                 await vehicle.link_state.wait_until(lambda state: state is CONNECTED)
-        assert told(changes) == []
+        assert transitions(changes) == []
 
 
 async def test_no_sender_means_silent() -> None:

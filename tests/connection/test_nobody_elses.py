@@ -29,7 +29,7 @@ DISARMED = Heartbeat(2, 3, 81, 9, 3)
 ARMED = Heartbeat(2, 3, 81 | 128, 4, 4)
 
 
-class KeptPeers(PeersLink):
+class PeerKeepingLink(PeersLink):
     """Remembers the peers that the connection keeps, like UdpListen."""
 
     def __init__(self) -> None:
@@ -44,43 +44,43 @@ class KeptPeers(PeersLink):
 
 
 class Copter:
-    """A vehicle with one counter and one clock, wherever it speaks from."""
+    """A vehicle with one frame counter and one clock for all its addresses."""
 
-    def __init__(self, link: KeptPeers, first: int = 0, booted_at: float = -100.0) -> None:
+    def __init__(self, link: PeerKeepingLink, first: int = 0, booted_at: float = -100.0) -> None:
         self._link, self._booted_at = link, booted_at
         self.encoder = FrameEncoder(1, 1)
         self.encoder.sequence = first
 
-    def say(self, peer: str, *messages: Message) -> None:
+    def send(self, peer: str, *messages: Message) -> None:
         assert self._link.connection is not None
         for message in messages:
             self._link.connection.bytes_received(self.encoder.encode(message), peer)
 
-    def tell_time(self, peer: str) -> None:
+    def send_attitude(self, peer: str) -> None:
         assert self._link.connection is not None
         boot_ms = int((self._link.connection.now() - self._booted_at) * 1000)
-        self.say(peer, Attitude(boot_ms, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+        self.send(peer, Attitude(boot_ms, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
 
     async def live(self, peer: str, seconds: float, heartbeat: Message = ARMED) -> None:
         """Four attitudes and a heartbeat a second."""
         for count in range(round(seconds * 4)):
             if count % 4 == 0:
-                self.say(peer, heartbeat)
-            self.tell_time(peer)
+                self.send(peer, heartbeat)
+            self.send_attitude(peer)
             await anyio.sleep(0.25)
 
 
 @pytest.fixture
-async def link() -> KeptPeers:
-    return KeptPeers()
+async def link() -> PeerKeepingLink:
+    return PeerKeepingLink()
 
 
 @asynccontextmanager
-async def flown(link: KeptPeers, **options: object) -> AsyncIterator[tuple[aerokit.Vehicle, Copter]]:
+async def flown(link: PeerKeepingLink, **options: object) -> AsyncIterator[tuple[aerokit.Vehicle, Copter]]:
     """An armed vehicle that was received from "14550@copter" for some seconds."""
     async with open_connection(link, **options) as connection:  # type: ignore[arg-type]
         copter = Copter(link)
-        copter.say("14550@copter", ARMED)
+        copter.send("14550@copter", ARMED)
         async with aerokit.connect(connection, rates={}) as vehicle:
             await copter.live("14550@copter", 6)
             yield vehicle, copter
@@ -96,14 +96,14 @@ def signed_by(key: SigningKey) -> FrameEncoder:
     return encoder
 
 
-def told(connection: Connection) -> list[events.Event]:
-    heard: list[events.Event] = []
+def route_events(connection: Connection) -> list[events.Event]:
+    received: list[events.Event] = []
     for kind in (events.DuplicateSender, events.RouteChanged, events.RouteChangeRefused, events.ArmedChanged):
-        connection.bus.attach_event(kind, heard.append)
-    return heard
+        connection.bus.attach_event(kind, received.append)
+    return received
 
 
-def peer_of(vehicle: aerokit.Vehicle, link: KeptPeers) -> object:
+def peer_of(vehicle: aerokit.Vehicle, link: PeerKeepingLink) -> object:
     link.sent.clear()
     vehicle.send(command(1, 1))
     (peer,) = link.peers_of(CommandLong)
@@ -113,7 +113,7 @@ def peer_of(vehicle: aerokit.Vehicle, link: KeptPeers) -> object:
 # -------------------------------------------------------------------------------------- room
 
 
-async def test_noise_evicts_no_peer(link: KeptPeers) -> None:
+async def test_noise_evicts_no_peer(link: PeerKeepingLink) -> None:
     async with flown(link) as (vehicle, copter):
         connection = vehicle.connection
         for port in range(300):
@@ -121,14 +121,14 @@ async def test_noise_evicts_no_peer(link: KeptPeers) -> None:
         assert link.kept == ["14550@copter"]
         assert len(list(connection.statistics())) == 1 + MAX_UNVERIFIED_PEERS
         intruder = Copter(link, 77)
-        intruder.say("666@stranger", DISARMED, DISARMED)
+        intruder.send("666@stranger", DISARMED, DISARMED)
         assert is_armed(vehicle)
-        copter.say("14550@copter", DISARMED)
+        copter.send("14550@copter", DISARMED)
         assert not is_armed(vehicle)
         assert peer_of(vehicle, link) == "14550@copter"
 
 
-async def test_peer_with_live_route_is_never_evicted(link: KeptPeers) -> None:
+async def test_peer_with_live_route_is_never_evicted(link: PeerKeepingLink) -> None:
     async with flown(link) as (vehicle, _):
         connection = vehicle.connection
         await anyio.sleep(100)
@@ -138,50 +138,50 @@ async def test_peer_with_live_route_is_never_evicted(link: KeptPeers) -> None:
         assert len(link.kept) == MAX_PEERS
 
 
-async def test_new_sender_is_ignored_while_table_is_full(link: KeptPeers) -> None:
+async def test_new_sender_is_ignored_while_table_is_full(link: PeerKeepingLink) -> None:
     async with open_connection(link) as connection:
         for port in range(MAX_PEERS):
-            link.hear(f"{port}@swarm", (1 + port % 250, 1 + port // 250), COPTER)
-        heard: list[Message] = []
-        connection.bus.attach(Attitude, heard.append)
-        link.hear("late@comer", (251, 1), ATTITUDE)
-        assert heard == []
+            link.receive(f"{port}@swarm", (1 + port % 250, 1 + port // 250), COPTER)
+        received: list[Message] = []
+        connection.bus.attach(Attitude, received.append)
+        link.receive("late@comer", (251, 1), ATTITUDE)
+        assert received == []
         await anyio.sleep(31)
-        link.hear("late@comer", (251, 1), ATTITUDE)
-        assert (len(heard), len(link.kept)) == (1, MAX_PEERS)
+        link.receive("late@comer", (251, 1), ATTITUDE)
+        assert (len(received), len(link.kept)) == (1, MAX_PEERS)
 
 
-async def test_ignored_sender_gets_no_counters(link: KeptPeers) -> None:
+async def test_ignored_sender_gets_no_counters(link: PeerKeepingLink) -> None:
     async with open_connection(link) as connection:
         for port in range(MAX_PEERS):
-            link.hear(f"{port}@swarm", (1 + port % 250, 1 + port // 250), COPTER)
+            link.receive(f"{port}@swarm", (1 + port % 250, 1 + port // 250), COPTER)
         for port in range(MAX_SENDERS):
-            link.hear(f"{port}@late", (251, 1), ATTITUDE)
+            link.receive(f"{port}@late", (251, 1), ATTITUDE)
         for component_id in range(100, 200):
-            link.hear("0@swarm", (1, component_id), COPTER)
-        counted = [source for each in connection.statistics() for source in each.sources]
+            link.receive("0@swarm", (1, component_id), COPTER)
+        counted = [source for link in connection.statistics() for source in link.sources]
         assert len(counted) == MAX_PEERS + 100
 
 
-async def test_evicted_peer_frees_its_counters(link: KeptPeers) -> None:
+async def test_evicted_peer_frees_its_counters(link: PeerKeepingLink) -> None:
     async with open_connection(link) as connection:
         for port in range(MAX_SENDERS // 8):
             for component_id in range(1, 9):
-                link.hear(f"{port}@swarm", (1 + port % 250, component_id + 8 * (port // 250)), ATTITUDE)
+                link.receive(f"{port}@swarm", (1 + port % 250, component_id + 8 * (port // 250)), ATTITUDE)
         for port in range(100):
-            link.hear(f"{port}@new", (251, 1), ATTITUDE)
-        counted = sum(len(each.sources) for each in connection.statistics())
+            link.receive(f"{port}@new", (251, 1), ATTITUDE)
+        counted = sum(len(link.sources) for link in connection.statistics())
         assert counted == MAX_SENDERS - 100 * 8 + 99  # the first new one came when all places were taken
 
 
-async def test_evicted_peer_leaves_nothing_behind(link: KeptPeers) -> None:
+async def test_evicted_peer_leaves_nothing_behind(link: PeerKeepingLink) -> None:
     async with open_connection(link) as connection:
         for port in range(2 * MAX_UNVERIFIED_PEERS):
             connection.bytes_received(b"\xfd", f"{port}@stranger")
         assert len(connection._receiver._peers._limit._statistics) == MAX_UNVERIFIED_PEERS
 
 
-async def test_split_frame_makes_a_peer(link: KeptPeers) -> None:
+async def test_split_frame_makes_a_peer(link: PeerKeepingLink) -> None:
     """A bridge between a serial line and UDP cuts frames anywhere."""
     async with open_connection(link) as connection:
         for place in range(0, 60, 7):
@@ -191,8 +191,8 @@ async def test_split_frame_makes_a_peer(link: KeptPeers) -> None:
         assert (1, 1) in connection.heartbeats
 
 
-async def test_heartbeats_of_many_senders_fill_no_table(link: KeptPeers) -> None:
-    """65,000 senders behind one peer: the vehicle that is flown keeps its place, its counters and its route."""
+async def test_heartbeats_of_many_senders_fill_no_table(link: PeerKeepingLink) -> None:
+    """65,000 senders behind one peer: the connected vehicle keeps its entry, its counters and its route."""
     async with flown(link) as (vehicle, copter):
         connection, encoder = vehicle.connection, FrameEncoder(1, 1)
         for system_id in range(2, 256):
@@ -201,81 +201,83 @@ async def test_heartbeats_of_many_senders_fill_no_table(link: KeptPeers) -> None
                 connection.bytes_received(encoder.encode(COPTER), f"{component_id}@stranger")
         assert len(connection.heartbeats) <= MAX_ROUTES
         assert len(connection._routes._routes) <= MAX_ROUTES
-        assert sum(len(each.sources) for each in connection.statistics()) <= MAX_SENDERS
+        assert sum(len(link.sources) for link in connection.statistics()) <= MAX_SENDERS
         await copter.live("14550@copter", 2)
         assert connection.counts(1)[1] == 0
         assert peer_of(vehicle, link) == "14550@copter"
         await anyio.sleep(40)
-        link.hear("new@comer", (2, 3), COPTER)
-        link.hear("new@comer", (2, 3), COPTER)
+        link.receive("new@comer", (2, 3), COPTER)
+        link.receive("new@comer", (2, 3), COPTER)
         assert (2, 3) in connection.heartbeats
         assert len(connection.heartbeats) < 50
 
 
-async def test_claims_are_bounded(link: KeptPeers) -> None:
+async def test_claims_are_bounded(link: PeerKeepingLink) -> None:
     async with flown(link) as (vehicle, _):
         for port in range(MAX_CLAIMS + 100):
             for component_id in (1, 2, 3):
-                link.hear(f"{port % 200}@stranger", (1, component_id), COPTER)
+                link.receive(f"{port % 200}@stranger", (1, component_id), COPTER)
         routes = vehicle.connection._routes
         assert isinstance(routes, Routes)
         assert len(routes._claims) <= MAX_CLAIMS
 
 
-# ------------------------------------------------------------------------- taking a place
+# ------------------------------------------------------------------------- taking a route
 
 
-async def test_foreign_host_cannot_take_route_after_silence(link: KeptPeers, caplog: pytest.LogCaptureFixture) -> None:
+async def test_foreign_host_cannot_take_route_after_silence(
+    link: PeerKeepingLink, caplog: pytest.LogCaptureFixture
+) -> None:
     async with flown(link) as (vehicle, copter):
-        heard = told(vehicle.connection)
+        duplicates = route_events(vehicle.connection)
         await anyio.sleep(20)
         intruder = Copter(link, 5, booted_at=3)
         with caplog.at_level(logging.WARNING, "aerokit"):
             await intruder.live("666@stranger", 10, DISARMED)
         assert is_armed(vehicle)
         assert vehicle.is_silent
-        kinds = [type(each) for each in heard]
+        kinds = [type(message) for message in duplicates]
         assert kinds == [events.DuplicateSender, events.RouteChangeRefused]
-        assert heard[1] == events.RouteChangeRefused(heard[1].at, 1, 1, "666@stranger")
+        assert duplicates[1] == events.RouteChangeRefused(duplicates[1].at, 1, 1, "666@stranger")
         assert "frames from 666@stranger under the same ids are refused" in caplog.text
-        copter.say("14550@copter", ARMED)
+        copter.send("14550@copter", ARMED)
         await copter.live("14550@copter", 1)
         assert not vehicle.is_silent
 
 
-async def test_foreign_host_cannot_try_sequence_numbers(link: KeptPeers) -> None:
+async def test_foreign_host_cannot_try_sequence_numbers(link: PeerKeepingLink) -> None:
     async with flown(link) as (vehicle, _):
         await anyio.sleep(5)
         for first in range(256):
             intruder = Copter(link, first, booted_at=3)
-            intruder.say("666@stranger", DISARMED)
-            intruder.tell_time("666@stranger")
+            intruder.send("666@stranger", DISARMED)
+            intruder.send_attitude("666@stranger")
         assert is_armed(vehicle)
 
 
-async def test_may_move_accepts_any_host_after_silence_only(link: KeptPeers) -> None:
+async def test_may_move_accepts_any_host_after_silence_only(link: PeerKeepingLink) -> None:
     async with flown(link, may_move=True) as (vehicle, _):
-        heard = told(vehicle.connection)
+        duplicates = route_events(vehicle.connection)
         other = Copter(link, 5, booted_at=3)
-        other.say("666@stranger", DISARMED)
+        other.send("666@stranger", DISARMED)
         assert is_armed(vehicle)
         await anyio.sleep(5)
-        other.say("666@stranger", DISARMED)
+        other.send("666@stranger", DISARMED)
         assert not is_armed(vehicle)
-        assert events.RouteChanged(vehicle.connection.now(), 1, 1, "14550@copter", "666@stranger") in heard
+        assert events.RouteChanged(vehicle.connection.now(), 1, 1, "14550@copter", "666@stranger") in duplicates
 
 
-async def test_other_host_that_continues_stream_takes_route_after_silence(link: KeptPeers) -> None:
-    """From the wireless network to the mobile one: the same counter, the same clock."""
+async def test_other_host_that_continues_stream_takes_route_after_silence(link: PeerKeepingLink) -> None:
+    """The vehicle moves from Wi-Fi to the mobile network: same counter, same clock."""
     async with flown(link) as (vehicle, copter):
-        heard = told(vehicle.connection)
+        duplicates = route_events(vehicle.connection)
         await copter.live("14550@mobile", 8)
         assert peer_of(vehicle, link) == "14550@mobile"
         assert not vehicle.is_silent
-        assert [type(each) for each in heard] == [events.DuplicateSender, events.RouteChanged]
+        assert [type(message) for message in duplicates] == [events.DuplicateSender, events.RouteChanged]
 
 
-async def test_known_clock_must_continue(link: KeptPeers) -> None:
+async def test_known_clock_must_continue(link: PeerKeepingLink) -> None:
     async with flown(link) as (vehicle, copter):
         impostor = Copter(link, copter.encoder.sequence, booted_at=-90)
         await anyio.sleep(4)
@@ -283,7 +285,7 @@ async def test_known_clock_must_continue(link: KeptPeers) -> None:
         assert is_armed(vehicle)
 
 
-async def test_known_sequence_numbers_must_continue(link: KeptPeers) -> None:
+async def test_known_sequence_numbers_must_continue(link: PeerKeepingLink) -> None:
     async with flown(link) as (vehicle, copter):
         impostor = Copter(link, copter.encoder.sequence + 100 & 0xFF)
         await anyio.sleep(4)
@@ -291,29 +293,29 @@ async def test_known_sequence_numbers_must_continue(link: KeptPeers) -> None:
         assert is_armed(vehicle)
 
 
-async def test_other_port_that_continues_stream_takes_route_at_once(link: KeptPeers) -> None:
+async def test_other_port_that_continues_stream_takes_route_at_once(link: PeerKeepingLink) -> None:
     async with flown(link) as (vehicle, copter):
-        heard, begun = told(vehicle.connection), vehicle.connection.now()
+        duplicates, begun = route_events(vehicle.connection), vehicle.connection.now()
         await copter.live("14999@copter", 1)
         assert peer_of(vehicle, link) == "14999@copter"
-        assert [type(each) for each in heard] == [events.RouteChanged]
-        assert heard[0].at - begun < 1
+        assert [type(message) for message in duplicates] == [events.RouteChanged]
+        assert duplicates[0].at - begun < 1
 
 
-async def test_two_programs_on_one_host_do_not_alternate(link: KeptPeers) -> None:
-    """The numbers of the second may fit by chance; the first one is heard all the same."""
+async def test_two_programs_on_one_host_do_not_alternate(link: PeerKeepingLink) -> None:
+    """The sequence numbers of the second may fit by chance; the first one keeps the route all the same."""
     async with flown(link) as (vehicle, copter):
-        heard = told(vehicle.connection)
+        duplicates = route_events(vehicle.connection)
         second = Copter(link, copter.encoder.sequence)
         for _ in range(40):
-            copter.say("14550@copter", ARMED)
-            second.say("14999@copter", DISARMED)
+            copter.send("14550@copter", ARMED)
+            second.send("14999@copter", DISARMED)
             await anyio.sleep(0.25)
         assert is_armed(vehicle)
-        assert [type(each) for each in heard] == [events.DuplicateSender]
+        assert [type(message) for message in duplicates] == [events.DuplicateSender]
 
 
-async def test_reboot_on_same_host_takes_route_after_silence(link: KeptPeers) -> None:
+async def test_reboot_on_same_host_takes_route_after_silence(link: PeerKeepingLink) -> None:
     async with flown(link) as (vehicle, _):
         await anyio.sleep(1)
         rebooted = Copter(link, 0, booted_at=vehicle.connection.now())
@@ -322,14 +324,14 @@ async def test_reboot_on_same_host_takes_route_after_silence(link: KeptPeers) ->
         assert not is_armed(vehicle)
 
 
-async def test_reboot_on_same_port_is_accepted_at_once(link: KeptPeers) -> None:
+async def test_reboot_on_same_port_is_accepted_at_once(link: PeerKeepingLink) -> None:
     async with flown(link) as (vehicle, _):
         rebooted = Copter(link, 0, booted_at=vehicle.connection.now())
         await rebooted.live("14550@copter", 1.5, DISARMED)
         assert not is_armed(vehicle)
 
 
-async def test_signature_is_sufficient_after_silence(link: KeptPeers) -> None:
+async def test_signature_is_sufficient_after_silence(link: PeerKeepingLink) -> None:
     key = SigningKey.from_passphrase("ours")
     async with open_connection(link, signing=Signing(key)) as connection:
         unix_time = connection.unix_time
@@ -344,45 +346,45 @@ async def test_signature_is_sufficient_after_silence(link: KeptPeers) -> None:
             assert not is_armed(vehicle)
 
 
-# -------------------------------------------------------------------- one peer, and disorder
+# ---------------------------------------------------------------- one peer, reordered frames
 
 
-async def test_overtaken_heartbeat_is_dropped(link: KeptPeers) -> None:
+async def test_overtaken_heartbeat_is_dropped(link: PeerKeepingLink) -> None:
     async with flown(link) as (vehicle, copter):
         late = [copter.encoder.encode(message) for message in (ARMED, ATTITUDE)]
-        copter.say("14550@copter", ATTITUDE, DISARMED)
+        copter.send("14550@copter", ATTITUDE, DISARMED)
         assert not is_armed(vehicle)
         for frame in late:
             vehicle.connection.bytes_received(frame, "14550@copter")
         assert not is_armed(vehicle)
 
 
-async def test_heartbeat_overtaken_by_other_messages_is_accepted(link: KeptPeers) -> None:
+async def test_heartbeat_overtaken_by_other_messages_is_accepted(link: PeerKeepingLink) -> None:
     async with flown(link) as (vehicle, copter):
         late = copter.encoder.encode(DISARMED)
-        copter.say("14550@copter", ATTITUDE, ATTITUDE)
+        copter.send("14550@copter", ATTITUDE, ATTITUDE)
         vehicle.connection.bytes_received(late, "14550@copter")
         assert not is_armed(vehicle)
 
 
-async def test_two_vehicles_behind_one_peer_do_not_flap(link: KeptPeers) -> None:
+async def test_two_vehicles_behind_one_peer_do_not_flap(link: PeerKeepingLink) -> None:
     """Behind a router: the same ids, the same address."""
     async with flown(link) as (vehicle, copter):
-        heard, begun = told(vehicle.connection), vehicle.connection.now()
+        duplicates, begun = route_events(vehicle.connection), vehicle.connection.now()
         changes: list[float] = []
         vehicle.armed.observe(lambda *_: changes.append(vehicle.connection.now() - begun))
         other = Copter(link, copter.encoder.sequence + 100, booted_at=-900)
         async with anyio.create_task_group() as group:
             group.start_soon(copter.live, "14550@copter", 20, ARMED)
             group.start_soon(other.live, "14550@copter", 20, DISARMED)
-        assert events.DuplicateSender in [type(each) for each in heard]
-        assert len([each for each in heard if isinstance(each, events.DuplicateSender)]) == 1
+        assert events.DuplicateSender in [type(message) for message in duplicates]
+        assert len([message for message in duplicates if isinstance(message, events.DuplicateSender)]) == 1
         assert max(changes) <= 3
         assert len(changes) <= 3
         assert is_armed(vehicle)
 
 
-async def test_second_vehicle_behind_one_peer_is_dropped(link: KeptPeers) -> None:
+async def test_second_vehicle_behind_one_peer_is_dropped(link: PeerKeepingLink) -> None:
     async with flown(link) as (vehicle, copter):
         other = Copter(link, copter.encoder.sequence + 100, booted_at=-900)
         times: list[SystemTime] = []
@@ -390,13 +392,13 @@ async def test_second_vehicle_behind_one_peer_is_dropped(link: KeptPeers) -> Non
         async with anyio.create_task_group() as group:
             group.start_soon(copter.live, "14550@copter", 10, ARMED)
             group.start_soon(other.live, "14550@copter", 10, DISARMED)
-        other.say("14550@copter", SystemTime(1, 2))
+        other.send("14550@copter", SystemTime(1, 2))
         assert times == []
-        copter.say("14550@copter", SystemTime(3, 4))
+        copter.send("14550@copter", SystemTime(3, 4))
         assert len(times) == 1
 
 
-async def test_one_forged_frame_does_not_disable_signing(link: KeptPeers) -> None:
+async def test_one_forged_frame_does_not_disable_signing(link: PeerKeepingLink) -> None:
     key = SigningKey.from_passphrase("ours")
     signing = Signing(key)
     async with open_connection(link, signing=signing) as connection:
@@ -424,7 +426,7 @@ async def test_one_forged_frame_does_not_disable_signing(link: KeptPeers) -> Non
             assert connection.signing is signing
 
 
-async def test_frames_of_other_peers_never_disable_signing(link: KeptPeers) -> None:
+async def test_frames_of_other_peers_never_disable_signing(link: PeerKeepingLink) -> None:
     key = SigningKey.from_passphrase("ours")
     signing = Signing(key)
     async with open_connection(link, signing=signing) as connection:
@@ -447,23 +449,23 @@ async def test_frames_of_other_peers_never_disable_signing(link: KeptPeers) -> N
 
 
 async def test_slow_sender_keeps_route_from_program_on_host(
-    link: KeptPeers,
+    link: PeerKeepingLink,
 ) -> None:
-    """Heartbeats only, and no clock: the numbers of another one that speaks more often fit now and then."""
+    """It sends heartbeats only, without a clock: sequence numbers of a faster sender fit now and then."""
     async with open_connection(link) as connection:
         copter = Copter(link)
-        copter.say("14550@copter", ARMED)
+        copter.send("14550@copter", ARMED)
         async with aerokit.connect(connection, rates={}) as vehicle:
             for _ in range(60):
-                copter.say("14550@copter", ARMED)
+                copter.send("14550@copter", ARMED)
                 second = Copter(link, copter.encoder.sequence)
                 for _ in range(9):
-                    second.say("14999@copter", DISARMED)
+                    second.send("14999@copter", DISARMED)
                     await anyio.sleep(0.1)
             assert is_armed(vehicle)
 
 
-async def test_reopened_link_gets_its_peers(link: KeptPeers) -> None:
+async def test_reopened_link_gets_its_peers(link: PeerKeepingLink) -> None:
     async with flown(link) as (vehicle, _):
         link.kept.clear()
         vehicle.connection.link_restored(1.0)
@@ -471,16 +473,16 @@ async def test_reopened_link_gets_its_peers(link: KeptPeers) -> None:
 
 
 async def test_system_broadcast_skips_duplicate_vehicle(
-    link: KeptPeers,
+    link: PeerKeepingLink,
 ) -> None:
-    """Its autopilot is not listened to, its camera has ids that nobody else has; both would obey what is for all."""
+    """Its autopilot is ignored, its camera has unique ids; both would execute a broadcast."""
     camera = Heartbeat(30, 8, 0, 0, 4)
     async with flown(link) as (vehicle, copter):
         other = Copter(link, first=99, booted_at=-9000.0)
         others_camera = FrameEncoder(1, 100)
         for _ in range(3):
-            copter.say("14550@copter", ARMED)
-            other.say("14550@other", DISARMED)
+            copter.send("14550@copter", ARMED)
+            other.send("14550@other", DISARMED)
             vehicle.connection.bytes_received(others_camera.encode(camera), "14550@other")
             await anyio.sleep(1.0)
         link.sent.clear()

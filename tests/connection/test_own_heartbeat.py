@@ -1,4 +1,4 @@
-"""Our own heartbeat: what it says, and that it pauses when the program shows no sign of life."""
+"""Our own heartbeat: its fields, and its pause when the program makes no calls."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ BLOCKING_MAX_IDLE_S = 60.0
 @pytest.mark.parametrize("limit_s", [None, exhaustive(float("inf"))])
 async def test_heartbeat_in_asyncio_needs_no_feeding(limit_s: float | None) -> None:
     async with open_flight(heartbeat=OwnHeartbeat(fed_within_s=limit_s)) as flight:
-        flight.wire.forget()
+        flight.wire.clear()
         await anyio.sleep(600.0)
         assert len(flight.wire.all(m.Heartbeat)) >= 600
 
@@ -38,30 +38,30 @@ async def test_heartbeat_in_asyncio_needs_no_feeding(limit_s: float | None) -> N
 async def test_unfed_heartbeat_pauses_and_resumes(caplog: pytest.LogCaptureFixture) -> None:
     async with open_flight(heartbeat=OwnHeartbeat(fed_within_s=5.0)) as flight:
         connection = flight.vehicle.connection
-        with connection.subscribe(HeartbeatPaused, HeartbeatResumed, capacity=5) as told:
+        with connection.subscribe(HeartbeatPaused, HeartbeatResumed, capacity=5) as events:
             for _ in range(4):
                 connection.feed()
                 await anyio.sleep(4.0)
-            assert told.get_nowait() is None
+            assert events.get_nowait() is None
             await anyio.sleep(3.0)
-            flight.wire.forget()
+            flight.wire.clear()
             await anyio.sleep(10.0)
             assert flight.wire.all(m.Heartbeat) == []
-            paused = told.get_nowait()
+            paused = events.get_nowait()
             assert isinstance(paused, HeartbeatPaused)
             assert 5.0 < paused.idle_s <= 6.0
             assert "has made no call for" in caplog.text
             connection.feed()
             await anyio.sleep(1.5)
             assert flight.wire.all(m.Heartbeat)
-            assert isinstance(told.get_nowait(), HeartbeatResumed)
+            assert isinstance(events.get_nowait(), HeartbeatResumed)
 
 
 @pytest.mark.anyio
 async def test_heartbeat_has_the_configured_type() -> None:
     async with open_flight(heartbeat=OwnHeartbeat(type=MavType.ONBOARD_CONTROLLER)) as flight:
         await anyio.sleep(2.0)
-        assert {each.type for each in flight.wire.all(m.Heartbeat)} == {MavType.ONBOARD_CONTROLLER}
+        assert {heartbeat.type for heartbeat in flight.wire.all(m.Heartbeat)} == {MavType.ONBOARD_CONTROLLER}
 
 
 @pytest.mark.anyio
@@ -89,8 +89,8 @@ async def test_connect_does_not_change_heartbeat_of_open_connection() -> None:
 # ------------------------------------------------------------------------- blocking programs
 
 
-class Hang:
-    """The program's clock, which a test lets go on as if the program had made no call."""
+class IdleClock:
+    """The program's clock, which a test advances as if the program had made no call."""
 
     def __init__(self, connection: Connection) -> None:
         assert connection._heartbeat is not None
@@ -104,54 +104,54 @@ class Hang:
 
 def test_heartbeat_of_blocking_program_pauses_until_next_call() -> None:
     with served_copter() as address, aerokit.sync.connect(address) as vehicle:
-        hang = Hang(vehicle.aio.connection)
-        assert hang(BLOCKING_MAX_IDLE_S - 5.0)
-        assert not hang(10.0)
+        idle_for = IdleClock(vehicle.aio.connection)
+        assert idle_for(BLOCKING_MAX_IDLE_S - 5.0)
+        assert not idle_for(10.0)
         _ = vehicle.position.latest  # a reading is a sign of life
-        assert hang(0.0)
-        assert not hang(BLOCKING_MAX_IDLE_S + 1.0)
+        assert idle_for(0.0)
+        assert not idle_for(BLOCKING_MAX_IDLE_S + 1.0)
         vehicle.wait_ready()
-        assert hang(0.0)
+        assert idle_for(0.0)
         position = vehicle.position
-        assert not hang(BLOCKING_MAX_IDLE_S + 1.0)
+        assert not idle_for(BLOCKING_MAX_IDLE_S + 1.0)
         _ = position.age  # and so is one of a cell that the program has kept
-        assert hang(0.0)
+        assert idle_for(0.0)
 
 
 def test_heartbeat_continues_during_a_blocking_call() -> None:
     with served_copter() as address, aerokit.sync.connect(address) as vehicle:
-        hang = Hang(vehicle.aio.connection)
-        seen: list[bool] = []
+        idle_for = IdleClock(vehicle.aio.connection)
+        observed: list[bool] = []
 
         def look(_: object) -> bool:
-            seen.append(hang(BLOCKING_MAX_IDLE_S + 10.0))
+            observed.append(idle_for(BLOCKING_MAX_IDLE_S + 10.0))
             return True
 
         vehicle.armed.wait_until(look)
-        assert seen == [True]
+        assert observed == [True]
 
 
 def test_calls_feed_heartbeat_of_blocking_fleet_and_connection() -> None:
     with served_copter() as address, aerokit.sync.open_connection(address) as connection:
-        hang = Hang(connection.aio)
-        assert not hang(BLOCKING_MAX_IDLE_S + 1.0)
+        idle_for = IdleClock(connection.aio)
+        assert not idle_for(BLOCKING_MAX_IDLE_S + 1.0)
         with aerokit.sync.fleet(connection, count=1) as fleet:
-            assert hang(0.0)
-            assert not hang(BLOCKING_MAX_IDLE_S + 1.0)
+            assert idle_for(0.0)
+            assert not idle_for(BLOCKING_MAX_IDLE_S + 1.0)
             assert len(fleet) == 1
-            assert hang(0.0)
+            assert idle_for(0.0)
 
 
 def test_attribute_reads_feed_heartbeat_of_classic_program() -> None:
     with served_copter() as address:
         vehicle = dronekit.connect(address)
         try:
-            hang = Hang(vehicle.aio.connection)
+            idle_for = IdleClock(vehicle.aio.connection)
             for name in ("mode", "armed", "location", "battery", "parameters", "is_armable", "channels"):
-                assert not hang(BLOCKING_MAX_IDLE_S + 1.0)
+                assert not idle_for(BLOCKING_MAX_IDLE_S + 1.0)
                 getattr(vehicle, name)
-                assert hang(0.0), name
-            assert hang(BLOCKING_MAX_IDLE_S - 5.0)
+                assert idle_for(0.0), name
+            assert idle_for(BLOCKING_MAX_IDLE_S - 5.0)
         finally:
             vehicle.close()
 
@@ -166,10 +166,10 @@ with aerokit.sync.connect(sys.argv[1], heartbeat=aerokit.OwnHeartbeat(fed_within
 
 
 def test_heartbeat_of_program_in_endless_loop_stops() -> None:
-    """With real sockets: the vehicle hears no ground station any more."""
+    """The vehicle no longer receives a ground station; with real sockets."""
     copter = SimulatedCopter(boot_time_s=0.0)
-    heard: list[float] = []
-    copter.on(m.Heartbeat, lambda beat, _: heard.append(time.monotonic()) if beat.type == MavType.GCS else None)
+    received: list[float] = []
+    copter.on(m.Heartbeat, lambda beat, _: received.append(time.monotonic()) if beat.type == MavType.GCS else None)
     with (
         served([copter]) as address,
         subprocess.Popen([sys.executable, "-c", HANGING, address], stdout=subprocess.PIPE) as program,
@@ -178,8 +178,8 @@ def test_heartbeat_of_program_in_endless_loop_stops() -> None:
             assert program.stdout is not None
             program.stdout.readline()
             give_up_at = time.monotonic() + 200.0
-            while not heard or time.monotonic() - heard[-1] < 4.0:
-                assert time.monotonic() < give_up_at, "heartbeats go on"
+            while not received or time.monotonic() - received[-1] < 4.0:
+                assert time.monotonic() < give_up_at, "heartbeats continue"
                 time.sleep(0.1)
             assert program.poll() is None
         finally:

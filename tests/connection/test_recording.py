@@ -1,4 +1,4 @@
-"""Recording what is sent and received, and flying the same program on the recording."""
+"""Recording all traffic, and running the same program on the recording."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ async def test_recording_without_reception_keeps_the_older_file(tmp_path: Path) 
     near, _ = memory_link_pair()
     with pytest.raises(ConnectFailed):
         async with connect(near, record=path, timeout=3):
-            pytest.fail("nobody is there")
+            pytest.fail("there is no vehicle")
     assert path.read_bytes() == before
     with pytest.raises(LinkOpenError):
         async with connect("/dev/no-such-device", record=path):
@@ -143,11 +143,11 @@ async def test_program_runs_on_a_recorded_flight(tmp_path: Path, speed: str) -> 
 
 
 async def test_unknown_messages_are_recorded(tmp_path: Path) -> None:
-    """In the order in which it came, and byte for byte."""
+    """Frames are recorded in order of arrival, byte for byte."""
     path = tmp_path / "private.tlog"
-    known, private = FrameEncoder(9, 1), Private(9, 7)
+    known, private = FrameEncoder(9, 1), UnknownMessageSender(9, 7)
     near, far = memory_link_pair()
-    await far.open(Deaf())
+    await far.open(IgnoringReceiver())
     frames = [
         known.encode(HEARTBEAT),
         private.frame(),
@@ -190,7 +190,7 @@ async def test_unwritable_file_is_refused_before_opening(tmp_path: Path) -> None
     with pytest.raises(LinkOpenError, match=r"cannot record to .*No such file or directory"):
         async with connect(near, record=tmp_path / "no such folder" / "flight.tlog"):
             pytest.fail("not open")
-    await far.open(Deaf())
+    await far.open(IgnoringReceiver())
     far.write(b"nobody is there")
     assert far.dropped_writes == 1
     far.close()
@@ -214,7 +214,7 @@ def test_full_disk_is_reported_once(caplog: pytest.LogCaptureFixture, end: str) 
     recording.write(frame, 2.0)
     recording.flush()
     recording.close()
-    errors = [each.getMessage() for each in caplog.records if each.levelno == logging.ERROR]
+    errors = [record.getMessage() for record in caplog.records if record.levelno == logging.ERROR]
     assert errors == ["recording to /dev/full has ended: No space left on device"]
 
 
@@ -243,13 +243,13 @@ async def test_replay_ends_in_final_state_of_flight(tmp_path: Path, speed: str) 
 
 
 def state(vehicle: Vehicle) -> dict[str, Any]:
-    """All that is known; but for the last text's time, on the clock of the program that heard it."""
+    """Return all known values; the last text without its time, which is on the receiving program's clock."""
     known = {name: cell.value for name, cell in vehicle.telemetry.cells.items() if cell.is_known}
     return known | {"status_text": vehicle.status_text.value.text}
 
 
-class Private:
-    """Sends messages that no dialect of ours knows."""
+class UnknownMessageSender:
+    """Sends messages that are in no dialect."""
 
     def __init__(self, system_id: int, component_id: int) -> None:
         self._source, self._sequence = (system_id, component_id), 0
@@ -260,11 +260,11 @@ class Private:
         return bytes([0xFD, 4, 0, 0, self._sequence, *self._source, *number]) + b"mine" + b"\x12\x34"
 
 
-class Deaf:
-    """The far end of a link that does not listen."""
+class IgnoringReceiver:
+    """The far end of a link that ignores all data."""
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
-        """Nothing to do."""
+        """Ignore it."""
 
     def link_lost(self, error: LinkLost) -> None:
-        """Nothing to do."""
+        """Ignore it."""

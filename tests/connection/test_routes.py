@@ -61,8 +61,8 @@ class PeersLink(MemoryLink):
         encoder = self._encoders.setdefault((*source, peer), FrameEncoder(*source))
         return encoder.encode(message)
 
-    def hear(self, peer: Peer, source: tuple[int, int], *messages: Message, lost: int = 0) -> None:
-        """Messages come from there; before them, some were lost."""
+    def receive(self, peer: Peer, source: tuple[int, int], *messages: Message, lost: int = 0) -> None:
+        """Receive messages from this peer, after ``lost`` lost ones."""
         assert self.connection is not None
         for _ in range(lost):
             self.frame(peer, source, ATTITUDE)
@@ -93,9 +93,9 @@ def command(system_id: int, component_id: int) -> CommandLong:
 
 async def test_command_goes_to_the_peer_of_its_component(link: PeersLink, connection: Connection) -> None:
     """An autopilot on one port, its companion on another, a second vehicle on a third."""
-    link.hear("autopilot", (1, 1), COPTER)
-    link.hear("companion", (1, 191), Heartbeat(18, 8, 0, 0, 4))
-    link.hear("other", (2, 1), COPTER)
+    link.receive("autopilot", (1, 1), COPTER)
+    link.receive("companion", (1, 191), Heartbeat(18, 8, 0, 0, 4))
+    link.receive("other", (2, 1), COPTER)
     for _ in range(2):
         connection.send(command(1, 1))
         assert link.peers_of(CommandLong) == ["autopilot"]
@@ -103,14 +103,14 @@ async def test_command_goes_to_the_peer_of_its_component(link: PeersLink, connec
         assert link.peers_of(CommandLong) == ["companion"]
         connection.send(command(2, 1))
         assert link.peers_of(CommandLong) == ["other"]
-        link.hear("companion", (1, 191), Heartbeat(18, 8, 0, 0, 4))
+        link.receive("companion", (1, 191), Heartbeat(18, 8, 0, 0, 4))
 
 
 async def test_system_broadcast_goes_to_all_peers_of_system(link: PeersLink, connection: Connection) -> None:
-    link.hear("autopilot", (1, 1), COPTER)
-    link.hear("companion", (1, 191), Heartbeat(18, 8, 0, 0, 4))
-    link.hear("companion", (1, 192), Heartbeat(18, 8, 0, 0, 4))
-    link.hear("other", (2, 1), COPTER)
+    link.receive("autopilot", (1, 1), COPTER)
+    link.receive("companion", (1, 191), Heartbeat(18, 8, 0, 0, 4))
+    link.receive("companion", (1, 192), Heartbeat(18, 8, 0, 0, 4))
+    link.receive("other", (2, 1), COPTER)
     connection.send(ParamRequestList(1, 0))
     assert sorted(map(str, link.peers_of(ParamRequestList))) == ["autopilot", "companion"]
     connection.send(command(1, 154))  # an unknown component
@@ -120,7 +120,7 @@ async def test_system_broadcast_goes_to_all_peers_of_system(link: PeersLink, con
 
 
 async def test_broadcast_and_unknown_targets_go_to_all_peers(link: PeersLink, connection: Connection) -> None:
-    link.hear("one", (1, 1), COPTER)
+    link.receive("one", (1, 1), COPTER)
     connection.send(RequestDataStream(9, 1, 0, 4, 1))
     assert link.peers_of(RequestDataStream) == [None]
     connection.send(RequestDataStream(0, 0, 0, 4, 1))
@@ -130,43 +130,43 @@ async def test_broadcast_and_unknown_targets_go_to_all_peers(link: PeersLink, co
 
 
 async def test_only_heartbeats_make_routes(link: PeersLink, connection: Connection) -> None:
-    link.hear("forwarder", (1, 1), ATTITUDE)
+    link.receive("forwarder", (1, 1), ATTITUDE)
     connection.send(command(1, 1))
     assert link.peers_of(CommandLong) == [None]
 
 
 async def test_vehicle_returns_from_another_port(link: PeersLink, connection: Connection) -> None:
-    link.hear("old@host", (1, 1), COPTER)
+    link.receive("old@host", (1, 1), COPTER)
     async with connect(connection, rates={}) as vehicle:
-        with vehicle.subscribe(events.VehicleSilent, events.VehicleRecovered, capacity=9) as heard:
+        with vehicle.subscribe(events.VehicleSilent, events.VehicleRecovered, capacity=9) as received:
             await anyio.sleep(5)
             link.sent.clear()
-            link.hear("new@host", (1, 1), COPTER)
+            link.receive("new@host", (1, 1), COPTER)
             connection.send(command(1, 1))
             assert link.peers_of(CommandLong) == ["new@host"]
-            assert type(await heard.get(1)) is events.VehicleSilent
-            assert type(await heard.get(1)) is events.VehicleRecovered
+            assert type(await received.get(1)) is events.VehicleSilent
+            assert type(await received.get(1)) is events.VehicleRecovered
         assert vehicle.heartbeat_age < 1
 
 
 async def test_returning_client_is_not_a_second_vehicle(link: PeersLink, connection: Connection) -> None:
-    """A TCP client's new connection is a new peer; the old one is known to have gone."""
+    """A TCP client's new connection is a new peer; the old one is reported as closed."""
     doubles: list[events.DuplicateSender] = []
     connection.bus.attach_event(events.DuplicateSender, doubles.append)
     attitudes: list[Message] = []
     connection.bus.attach(Attitude, attitudes.append)
-    link.hear("old", (1, 1), COPTER)
+    link.receive("old", (1, 1), COPTER)
     link.gone.add("old")
-    link.hear("new", (1, 1), ATTITUDE, COPTER)
+    link.receive("new", (1, 1), ATTITUDE, COPTER)
     connection.send(command(1, 1))
     assert (link.peers_of(CommandLong), len(attitudes), doubles) == (["new"], 1, [])
 
 
 async def test_many_peers_do_not_evict_the_vehicle(link: PeersLink, connection: Connection) -> None:
-    """A scanner, or a program that takes a new port for each datagram."""
-    link.hear("vehicle", (1, 1), *[COPTER] * 5)
+    """A scanner, or a program that sends each datagram from a new port."""
+    link.receive("vehicle", (1, 1), *[COPTER] * 5)
     for port in range(2 * MAX_PEERS):
-        link.hear(port, (250, 1), ATTITUDE)
+        link.receive(port, (250, 1), ATTITUDE)
     assert len(list(connection.statistics())) == MAX_PEERS
     assert connection.counts(1) == (5, 0)
 
@@ -175,39 +175,39 @@ async def test_many_peers_do_not_evict_the_vehicle(link: PeersLink, connection: 
 
 
 async def test_loss_is_counted_per_component(link: PeersLink, connection: Connection) -> None:
-    link.hear("one", (1, 1), *[ATTITUDE] * 10)
-    link.hear("one", (1, 154), GIMBAL)  # its own sequence: no gap in that of the autopilot
-    link.hear("one", (1, 1), *[ATTITUDE] * 10, lost=5)
-    link.hear("one", (1, 154), GIMBAL, lost=2)
-    link.hear("two", (2, 1), *[ATTITUDE] * 3)
-    link.hear("two", (2, 1), ATTITUDE, lost=40)
+    link.receive("one", (1, 1), *[ATTITUDE] * 10)
+    link.receive("one", (1, 154), GIMBAL)  # its own sequence: no gap in that of the autopilot
+    link.receive("one", (1, 1), *[ATTITUDE] * 10, lost=5)
+    link.receive("one", (1, 154), GIMBAL, lost=2)
+    link.receive("two", (2, 1), *[ATTITUDE] * 3)
+    link.receive("two", (2, 1), ATTITUDE, lost=40)
     assert connection.counts(1) == (22, 7)
     assert connection.counts(2) == (4, 40)
     assert connection.counts(3) == (0, 0)
 
 
 async def test_loss_is_counted_per_peer_of_one_vehicle(link: PeersLink, connection: Connection) -> None:
-    """Each has a sequence of its own; what comes twice is delivered once."""
+    """Each has its own sequence; duplicates are delivered once."""
     attitudes: list[Message] = []
     connection.bus.attach(Attitude, attitudes.append)
-    link.hear("radio", (1, 1), COPTER)
-    link.hear("modem", (1, 1), COPTER)
+    link.receive("radio", (1, 1), COPTER)
+    link.receive("modem", (1, 1), COPTER)
     for _ in range(10):
-        link.hear("radio", (1, 1), ATTITUDE)
-        link.hear("modem", (1, 1), ATTITUDE, lost=1)
+        link.receive("radio", (1, 1), ATTITUDE)
+        link.receive("modem", (1, 1), ATTITUDE, lost=1)
     assert len(attitudes) == 10
     assert connection.counts(1) == (22, 10)
 
 
 async def test_loss_is_reported_every_second(link: PeersLink, connection: Connection) -> None:
-    link.hear("one", (1, 1), COPTER)
+    link.receive("one", (1, 1), COPTER)
     async with connect(connection, rates={}) as vehicle:
         reports: list[events.LinkReport] = []
         connection.bus.attach_event(events.LinkReport, reports.append)
         for lost in (0, 5, 0):
             await anyio.sleep(0.5)
-            link.hear("one", (1, 1), *[ATTITUDE] * 14)
-            link.hear("one", (1, 1), ATTITUDE, lost=lost)
+            link.receive("one", (1, 1), *[ATTITUDE] * 14)
+            link.receive("one", (1, 1), ATTITUDE, lost=lost)
             await anyio.sleep(0.5)
         await anyio.sleep(1.1)
         assert [report.loss_percent for report in reports[:4]] == pytest.approx([0, 25, 0, None])
@@ -215,16 +215,16 @@ async def test_loss_is_reported_every_second(link: PeersLink, connection: Connec
 
 
 async def test_system_0_is_never_a_vehicle(link: PeersLink, connection: Connection) -> None:
-    nobody = from_system_0(FrameEncoder(1, 1).encode(COPTER))
-    assert Framer().receive(nobody)[0].system_id == 0
-    connection.bytes_received(nobody, "zero")
+    unused = from_system_0(FrameEncoder(1, 1).encode(COPTER))
+    assert Framer().receive(unused)[0].system_id == 0
+    connection.bytes_received(unused, "zero")
     assert connection.heartbeats == {}
     with pytest.raises(ConnectFailed, match="system id 0"):
         async with connect(connection, timeout=2):
-            pytest.fail("nobody is nobody's vehicle")
+            pytest.fail("system 0 is no vehicle")
 
 
 def from_system_0(frame: bytes) -> bytes:
-    """Our own encoder refuses to be nobody."""
+    """Return a frame of system 0, which our encoder refuses to make."""
     body = frame[1:5] + b"\0" + frame[6:-2]
     return frame[:1] + body + x25(body + bytes((Heartbeat.CRC_EXTRA,))).to_bytes(2, "little")

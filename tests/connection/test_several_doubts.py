@@ -40,8 +40,8 @@ def anyio_backend() -> tuple[str, dict[str, object]]:
     return VIRTUAL_BACKEND
 
 
-class Deaf:
-    """Listens at the far end of a link, and does nothing."""
+class IgnoringReceiver:
+    """A receiver that ignores all data."""
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
         pass
@@ -51,15 +51,15 @@ class Deaf:
 
 
 def of_system_0(message: m.Heartbeat) -> bytes:
-    """A frame that no encoder of ours makes."""
+    """Return a frame of system 0, which our encoder refuses to make."""
     frame = Frame.parse(FrameEncoder(1, 1).encode(message))
     body = frame.body[:4] + b"\0" + frame.body[5:]
     return b"\xfd" + body + x25(body + STANDARD.extras[frame.message_id]).to_bytes(2, "little")
 
 
-def orders(told: ReceivedMessages) -> list[int]:
-    """The radio that each order went over."""
-    return [index for index, _ in told.of(m.CommandLong)]
+def orders(received: ReceivedMessages) -> list[int]:
+    """Return the radio that carried each order."""
+    return [index for index, _ in received.of(m.CommandLong)]
 
 
 def an_order_to_all() -> m.CommandLong:
@@ -68,25 +68,25 @@ def an_order_to_all() -> m.CommandLong:
 
 async def opened(radios: Radios) -> None:
     for far in radios.far:
-        await far.open(Deaf())
+        await far.open(IgnoringReceiver())
 
 
 async def test_broadcast_commands_ignore_system_0() -> None:
     radios = Radios(2)
-    told = ReceivedMessages(radios)
+    received = ReceivedMessages(radios)
     await opened(radios)
     async with open_connection(radios.together()) as connection:
         radios.far[0].write(FrameEncoder(1, 1).encode(AUTOPILOT))
         radios.far[0].write(of_system_0(AUTOPILOT))
         await anyio.sleep(0.5)
         connection.send(an_order_to_all())
-        assert sorted(orders(told)) == [0, 1]
+        assert sorted(orders(received)) == [0, 1]
 
 
 async def test_broadcast_command_reaches_each_system_once() -> None:
     """A ground station was received over the other radio first, and then over the vehicle's as well."""
     radios = Radios(2)
-    told = ReceivedMessages(radios)
+    received = ReceivedMessages(radios)
     await opened(radios)
     async with open_connection(radios.together()) as connection:
         radios.far[1].write(FrameEncoder(250, 190).encode(STATION))
@@ -96,11 +96,11 @@ async def test_broadcast_command_reaches_each_system_once() -> None:
         radios.far[0].write(FrameEncoder(1, 1).encode(AUTOPILOT))
         await anyio.sleep(0.1)
         connection.send(an_order_to_all())
-        assert len(orders(told)) == 1
+        assert len(orders(received)) == 1
 
 
 def test_other_vehicle_is_refused_after_long_silence_of_ours() -> None:
-    """Two that were switched on ten seconds apart; ours is switched off."""
+    """Two vehicles were switched on ten seconds apart; ours is switched off."""
     choice, now = LinkChoice(needs_proof=True), 0.0
     while now < 30.0:
         for link in (0, 1):
@@ -137,7 +137,7 @@ def test_late_link_is_proven_by_its_clock() -> None:
 @pytest.mark.parametrize("late_s", [2.0, 4.0, 6.0])
 @pytest.mark.parametrize("dies", [False, True])
 async def test_late_copies_from_a_slow_link_are_dropped(late_s: float, dies: bool) -> None:
-    """Both radios carry 100 frames a second; one of them begins to be late, and the other dies perhaps."""
+    """Both radios carry 100 frames a second; one becomes late, and the other one may fail."""
     radios = Radios(2)
     await opened(radios)
     async with open_connection(radios.together()) as connection:
@@ -160,11 +160,11 @@ async def test_late_copies_from_a_slow_link_are_dropped(late_s: float, dies: boo
                     far.write(data)
             await anyio.sleep(0.01)
         assert came == sorted(set(came))
-        assert sorted(states, reverse=True) == states, "armed was not told after disarmed"
+        assert sorted(states, reverse=True) == states, "armed was not reported after disarmed"
 
 
 async def test_signed_copies_are_accepted_in_any_order() -> None:
-    """The quicker radio is not in use yet; nothing but heartbeats comes, which prove nothing."""
+    """The faster radio is not in use yet; only heartbeats arrive, which are no proof."""
     radios = Radios(2, models=[FaultModel(delay_s=0.05), GOOD])
     await opened(radios)
     key = SigningKey(bytes(range(32)))
@@ -186,7 +186,7 @@ async def test_signed_copies_are_accepted_in_any_order() -> None:
 async def test_link_in_use_elsewhere_is_left_unchanged() -> None:
     near, far = memory_link_pair()
     other, _ = memory_link_pair()
-    await far.open(Deaf())
+    await far.open(IgnoringReceiver())
     async with open_connection(near) as connection:
         with pytest.raises(BusyError):
             async with open_connection([other, near]):
@@ -206,7 +206,7 @@ class SlowLink(MemoryLink):
 
 async def test_link_lost_while_another_opens_does_not_end_connection() -> None:
     near, far = memory_link_pair()
-    await far.open(Deaf())
+    await far.open(IgnoringReceiver())
     async with anyio.create_task_group() as tasks:
 
         async def close_soon() -> None:
@@ -218,12 +218,12 @@ async def test_link_lost_while_another_opens_does_not_end_connection() -> None:
             await anyio.sleep(1)
             assert connection.is_open
             assert connection.links is not None
-            assert [each.state for each in connection.links.value] == [LinkState.LOST, LinkState.CONNECTED]
+            assert [link.state for link in connection.links.value] == [LinkState.LOST, LinkState.CONNECTED]
 
 
 async def test_links_all_lost_while_opening_raise() -> None:
     near, far = memory_link_pair()
-    await far.open(Deaf())
+    await far.open(IgnoringReceiver())
 
     class Refused(SlowLink):
         async def _connect(self) -> None:
@@ -244,7 +244,7 @@ async def test_links_all_lost_while_opening_raise() -> None:
 
 async def test_link_opened_late_ends_the_interruption() -> None:
     near, far = memory_link_pair()
-    await far.open(Deaf())
+    await far.open(IgnoringReceiver())
     tries = 0
 
     class Third(MemoryLink):
@@ -264,9 +264,9 @@ async def test_link_opened_late_ends_the_interruption() -> None:
         news = EventLog(connection, events.LinkInterrupted, events.LinkRestored)
         far.close()
         await anyio.sleep(0.1)
-        assert [type(each) for each in news.all] == [events.LinkInterrupted]
+        assert [type(event) for event in news.all] == [events.LinkInterrupted]
         await anyio.sleep(20)
-        assert [type(each) for each in news.all] == [events.LinkInterrupted, events.LinkRestored]
+        assert [type(event) for event in news.all] == [events.LinkInterrupted, events.LinkRestored]
         late._lose("gone")
         assert not connection.is_open
 
@@ -281,13 +281,13 @@ async def test_camera_received_first_does_not_hide_the_vehicle() -> None:
             await anyio.sleep(1)
         async with aerokit.connect(connection, timeout=20) as vehicle:
             assert vehicle.system_id == 1
-            told = connection.links
-            assert told is not None
-            assert told.value[0].used_for == (1,)
+            links = connection.links
+            assert links is not None
+            assert links.value[0].used_for == (1,)
 
 
 async def test_switch_to_better_link_delays_no_command() -> None:
-    """Over the radio in use an order takes a second and a half; a better one is taken while it is under way."""
+    """Over the radio in use an order takes 1.5 s; meanwhile the connection selects a better one."""
     copter = SimulatedCopter(boot_time_s=0.0)
     radios = Radios(2, models=[FaultModel(delay_s=1.5), GOOD])
     radios.cut(1)
@@ -326,23 +326,23 @@ def test_continuous_commands_delay_switch_for_limited_time() -> None:
 
 
 class Ports:
-    """An autopilot with a port for each radio, each with numbers of its own."""
+    """An autopilot with a port and a sequence counter for each radio."""
 
     def __init__(self, radios: Radios) -> None:
         self._far = radios.far
         self._encoders = [FrameEncoder(1, 1) for _ in radios.far]
 
-    def say(self, message: Message, *ports: int) -> None:
+    def send(self, message: Message, *ports: int) -> None:
         for port in ports:
             self._far[port].write(self._encoders[port].encode(message))
 
 
-async def changed_for_the_better(connection: Connection, ports: Ports, radios: Radios) -> LinkChoice:
-    """The second radio is the better one, and has just been taken."""
+async def switched_to_better_link(connection: Connection, ports: Ports, radios: Radios) -> LinkChoice:
+    """Make the second radio the better one; returns when it has just been selected."""
     for step in range(200):
         both = (0,) if step < 20 else (0, 1)
         if step % 10 == 0:
-            ports.say(m.Heartbeat(2, 12, 81, 0, 4), *both)
+            ports.send(m.Heartbeat(2, 12, 81, 0, 4), *both)
         await anyio.sleep(0.1)
         assert connection._multilink is not None
         choice = connection._multilink._choices.get(1)
@@ -356,19 +356,19 @@ async def changed_for_the_better(connection: Connection, ports: Ports, radios: R
 
 
 async def test_answer_over_former_link_is_accepted_once() -> None:
-    """ArduPilot answers over the port that was asked, PX4 over all ports where it has seen us."""
+    """ArduPilot answers over the port of the request, PX4 over all ports where it has received us."""
     radios = Radios(2, models=[FaultModel(delay_s=0.5), GOOD])
     await opened(radios)
     async with open_connection(radios.together()) as connection:
         ports = Ports(radios)
-        await changed_for_the_better(connection, ports, radios)
+        await switched_to_better_link(connection, ports, radios)
         answers: list[tuple[int, int]] = []
         connection.bus.attach(m.CommandAck, lambda ack: answers.append((ack.command, ack.result)))
-        ports.say(m.CommandAck(176, 0), 0)
-        ports.say(m.CommandAck(400, 0), 0, 1)
+        ports.send(m.CommandAck(176, 0), 0)
+        ports.send(m.CommandAck(400, 0), 0, 1)
         await anyio.sleep(0.1)
-        ports.say(m.CommandAck(400, 4), 0, 1)
-        ports.say(m.CommandAck(400, 0), 0, 1)
+        ports.send(m.CommandAck(400, 4), 0, 1)
+        ports.send(m.CommandAck(400, 0), 0, 1)
         await anyio.sleep(1)
         assert answers == [(400, 0), (400, 4), (400, 0), (176, 0)]
 
@@ -377,7 +377,7 @@ async def test_former_link_stays_proven() -> None:
     radios = Radios(2, models=[FaultModel(delay_s=0.5), GOOD])
     await opened(radios)
     async with open_connection(radios.together()) as connection:
-        choice = await changed_for_the_better(connection, Ports(radios), radios)
+        choice = await switched_to_better_link(connection, Ports(radios), radios)
         radios.far[1].close()
         await anyio.sleep(0.3)
         assert choice.used is choice.candidates[0]
@@ -408,7 +408,7 @@ async def test_peer_is_named_as_by_its_member_link() -> None:
 
 async def test_forged_ids_cost_few_probes() -> None:
     radios = Radios(2)
-    told = ReceivedMessages(radios)
+    received = ReceivedMessages(radios)
     await opened(radios)
     async with open_connection(radios.together()) as connection:
         for begin in (1, 101, 1, 101):
@@ -416,14 +416,14 @@ async def test_forged_ids_cost_few_probes() -> None:
                 for component in range(begin, begin + 4):
                     radios.far[0].write(FrameEncoder(system, component).encode(AUTOPILOT))
             await anyio.sleep(5)
-        asked = len(told.of(m.Timesync))
+        asked = len(received.of(m.Timesync))
         assert 200 < asked <= 25 * UNATTACHED_RATE_HZ
         await anyio.sleep(40)
-        told.messages.clear()
+        received.messages.clear()
         await anyio.sleep(10)
-        assert told.of(m.Timesync) == []
+        assert received.of(m.Timesync) == []
         assert connection._multilink is not None
         assert not any(connection._multilink._counters.values())
         radios.far[0].write(FrameEncoder(7, 1).encode(AUTOPILOT))
         await anyio.sleep(5)
-        assert len(told.of(m.Timesync)) >= 9
+        assert len(received.of(m.Timesync)) >= 9

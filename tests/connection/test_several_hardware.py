@@ -1,4 +1,4 @@
-"""Two vehicles with one system id, switched on at the same instant: their hardware ids tell them apart."""
+"""Two vehicles with one system id, switched on at the same instant, are distinguished by their hardware ids."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ def copter(uid2: bytes) -> SimulatedCopter:
 
 
 class Twins:
-    """Two copters that were switched on together; each has a radio of its own."""
+    """Two copters that were switched on together, each with its own radio."""
 
     def __init__(self, ours: bytes, theirs: bytes) -> None:
         self.ours, self.theirs = copter(ours), copter(theirs)
         self.radios = Radios(2)
-        self.told = ReceivedMessages(self.radios)
+        self.reported = ReceivedMessages(self.radios)
 
     def connected(self) -> AbstractAsyncContextManager[aerokit.Connection]:
         vehicles = [self.ours, self.theirs]
@@ -63,16 +63,16 @@ async def test_vehicle_with_other_hardware_id_is_reported_and_refused(
             async with aerokit.connect(connection) as flying:
                 await flying.wait_ready()
                 await anyio.sleep(10)
-                assert [(each.system_id, type(each)) for each in doubts.all] == [(1, events.DuplicateSender)]
-                twins.told.messages.clear()
+                assert [(event.system_id, type(event)) for event in doubts.all] == [(1, events.DuplicateSender)]
+                twins.reported.messages.clear()
                 twins.radios.cut(0)
                 await anyio.sleep(8)
                 with pytest.raises(AerokitError):
                     await flying.arm()
                 assert not twins.theirs.is_armed
-                assert [index for index, _ in twins.told.of(m.CommandLong) if index == 1] == []
+                assert [index for index, _ in twins.reported.of(m.CommandLong) if index == 1] == []
                 assert choice_of(connection).candidates[1].is_doubted
-    warnings = [each.getMessage() for each in caplog.records if "hardware id" in each.getMessage()]
+    warnings = [record.getMessage() for record in caplog.records if "hardware id" in record.getMessage()]
     assert len(warnings) == 1
     assert "another vehicle with system id 1 was received over" in warnings[0]
 
@@ -95,19 +95,19 @@ async def test_both_links_are_probed_without_vehicle_object() -> None:
     twins = Twins(b"A" * 18, b"B" * 18)
     async with twins.connected() as connection:
         await anyio.sleep(5)
-        asked = [index for index, each in twins.told.of(m.CommandLong) if getattr(each, "command", 0) == 512]
+        asked = [index for index, message in twins.reported.of(m.CommandLong) if getattr(message, "command", 0) == 512]
         assert sorted(asked) == [0, 1]
         assert choice_of(connection).candidates[1].is_doubted
 
 
 async def test_second_radio_is_asked_once_for_hardware() -> None:
     radios = Radios(2)
-    told = ReceivedMessages(radios)
+    received = ReceivedMessages(radios)
     async with over(radios, copter(b"A" * 18)) as connection, aerokit.connect(connection) as flying:
         await flying.wait_ready()
         await anyio.sleep(5)
-        asked = [each for index, each in told.of(m.CommandLong) if index == 1]
-        assert [(getattr(each, "command", 0), getattr(each, "param1", 0)) for each in asked] == [(512, 148)]
+        asked = [message for index, message in received.of(m.CommandLong) if index == 1]
+        assert [(getattr(request, "command", 0), getattr(request, "param1", 0)) for request in asked] == [(512, 148)]
         assert choice_of(connection).candidates[1].is_proven
 
 
@@ -135,7 +135,7 @@ async def test_lost_hardware_request_is_repeated() -> None:
 
 
 async def test_wrongly_used_vehicle_is_ignored_once_known() -> None:
-    """Theirs tells its hardware id only after ours has gone."""
+    """The other vehicle reports its hardware id only after ours has failed."""
     twins = Twins(b"A" * 18, NOBODY)
     async with twins.connected() as connection, aerokit.connect(connection) as flying:
         await flying.wait_ready()
@@ -146,17 +146,17 @@ async def test_wrongly_used_vehicle_is_ignored_once_known() -> None:
         twins.theirs.uid = b"B" * 18
         connection.send(m.CommandLong(1, 1, 512, 0, 148.0, 0, 0, 0, 0, 0, 0))
         await anyio.sleep(1)
-        twins.told.messages.clear()
+        twins.reported.messages.clear()
         taken: list[m.Heartbeat] = []
         connection.bus.attach(m.Heartbeat, taken.append)
         connection.send(m.CommandLong(1, 1, 400, 0, 1.0, 0, 0, 0, 0, 0, 0))
         await anyio.sleep(3)
-        assert twins.told.of(m.CommandLong) == []
+        assert twins.reported.of(m.CommandLong) == []
         assert taken == []
         assert not twins.theirs.is_armed
 
 
-# ------------------------------------------------------------------------- the choice, by itself
+# ------------------------------------------------------------------------------ LinkChoice alone
 
 
 class Answers:
@@ -169,8 +169,8 @@ class Answers:
         self.choice.choose(0.0)
         self.second = self.choice.candidates[1]
 
-    def come(self, times: int, *links: int, ahead_s: float = 70.0) -> None:
-        """Each is asked for its hardware, and answers with the time alone."""
+    def answer_probes(self, times: int, *links: int, ahead_s: float = 70.0) -> None:
+        """Request the hardware id over each link; the answers contain only the time."""
         for _ in range(times):
             self.now += 0.5
             for link in links or (0, 1):
@@ -185,7 +185,7 @@ def test_vehicle_without_hardware_id_is_proven_by_clock() -> None:
     answers.choice.record_hardware(0, OURS)
     steps = 0
     while not answers.second.is_proven:
-        answers.come(1)
+        answers.answer_probes(1)
         steps += 1
     assert MIN_CLOCK_MATCHES < steps <= 1 + MIN_CLOCK_MATCHES + MAX_TIMES_WITHOUT_HARDWARE
 
@@ -193,26 +193,26 @@ def test_vehicle_without_hardware_id_is_proven_by_clock() -> None:
 def test_late_other_hardware_id_disables_the_link() -> None:
     answers = Answers()
     answers.choice.record_hardware(0, OURS)
-    answers.come(10)
+    answers.answer_probes(10)
     assert answers.choice.may_be_used(answers.second)
     answers.choice.record_hardware(1, THEIRS)
     for _ in range(5):
         answers.second.record_copy(answers.now)
-    answers.come(10)
+    answers.answer_probes(10)
     assert not answers.choice.may_be_used(answers.second)
     assert answers.second.is_doubted
     assert not answers.second.is_proven
 
 
 def test_used_link_with_other_hardware_gets_nothing() -> None:
-    """Our vehicle has gone; the one behind the second link sends its hardware id only then."""
+    """Our vehicle has failed; only then the one behind the second link sends its hardware id."""
     answers = Answers()
     answers.choice.record_hardware(0, OURS)
-    answers.come(10)
-    answers.come(10, 1)
+    answers.answer_probes(10)
+    answers.answer_probes(10, 1)
     assert answers.choice.used is answers.second
     answers.choice.record_hardware(1, THEIRS)
-    answers.come(2, 1)
+    answers.answer_probes(2, 1)
     assert not answers.choice.may_be_used(answers.second)
     answers.choice.record_heartbeat(0, answers.now, is_costly=False)
     assert answers.choice.choose(answers.now) == "another vehicle"
@@ -224,11 +224,11 @@ def test_hardware_may_change_after_reboot() -> None:
     answers = Answers()
     for link in (0, 1):
         answers.choice.record_hardware(link, OURS)
-    answers.come(10)
-    answers.come(1, ahead_s=0.0)
+    answers.answer_probes(10)
+    answers.answer_probes(1, ahead_s=0.0)
     for link in (0, 1):
         answers.choice.record_hardware(link, THEIRS)
-    answers.come(10, ahead_s=0.0)
+    answers.answer_probes(10, ahead_s=0.0)
     assert answers.choice.may_be_used(answers.second)
     assert not answers.second.is_doubted
 
@@ -240,12 +240,12 @@ def test_hardware_ids_are_compared_by_common_field() -> None:
     one, two = b"\1".ljust(18, b"\0"), b"\2".ljust(18, b"\0")
     assert of(one, 7).contradicts(of(two, 7))
     assert not of(one, 7).contradicts(of(one, 8))
-    assert of(b"", 7).contradicts(of(two, 8)), "as MAVLink 1 tells it"
+    assert of(b"", 7).contradicts(of(two, 8)), "as in a MAVLink 1 message"
     assert not of(b"", 7).contradicts(of(two, 7))
     assert not of(b"", 0).contradicts(of(two, 7))
     assert not of(one, 0).contradicts(of(b"", 7))
     assert of(one, 7).confirms(of(one, 8)), "uid2 decides"
     assert of(b"", 7).confirms(of(two, 7))
     assert not of(one, 7).confirms(of(two, 7))
-    assert not of(b"", 0).confirms(of(b"", 0)), "nothing told is no evidence"
+    assert not of(b"", 0).confirms(of(b"", 0)), "two missing ids are no evidence"
     assert [of(b"", 0).has_value, of(one, 0).has_value, of(b"", 1).has_value] == [False, True, True]

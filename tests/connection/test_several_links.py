@@ -1,4 +1,4 @@
-"""Several links to one vehicle: what is taken, over which of them orders go, and what happens when one dies."""
+"""Several links to one vehicle: accepted messages, the link that carries orders, and failures of a link."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ async def proven(connection: aerokit.Connection, link: int) -> None:
 
 async def test_flight_continues_when_the_used_link_fails(vehicle: SimulatedVehicle) -> None:
     radios = Radios(2)
-    told = ReceivedMessages(radios)
+    received = ReceivedMessages(radios)
     async with over(radios, vehicle) as connection, aerokit.connect(connection) as flying:
         news = EventLog(connection, events.LinkSelected, events.VehicleSilent, events.LinkStateChanged)
         await flying.wait_ready()
@@ -68,30 +68,30 @@ async def test_flight_continues_when_the_used_link_fails(vehicle: SimulatedVehic
             assert news.chosen == [(radios.links[1].address, "silent")]
             assert flying.position.age < 1.0
         assert flying.distance_to(there) < 3
-        assert connection.now() - cut_at > 3, "it was cut on the way"
+        assert connection.now() - cut_at > 3, "it was lost in transit"
         await flying.land()
         assert flying.heartbeat_age < 2
-    assert [each for each in news.all if not isinstance(each, events.LinkSelected)] == []
-    orders = told.of(m.CommandLong, m.CommandInt, m.SetMode, m.SetPositionTargetGlobalInt)
+    assert [event for event in news.all if not isinstance(event, events.LinkSelected)] == []
+    orders = received.of(m.CommandLong, m.CommandInt, m.SetMode, m.SetPositionTargetGlobalInt)
     assert orders[0][0] == 0
     assert orders[-1][0] == 1
 
 
 async def test_command_is_sent_once_over_one_link() -> None:
     radios = Radios(3)
-    told = ReceivedMessages(radios)
+    received = ReceivedMessages(radios)
     async with over(radios, a_copter()) as connection, aerokit.connect(connection) as flying:
         await flying.wait_ready()
         await proven(connection, 1)
-        told.messages.clear()
+        received.messages.clear()
         await flying.arm()
         await flying.take_off(5)
-        orders = [each for each in told.of(m.CommandLong) if getattr(each[1], "command", 0) in (400, 22)]
-        assert [getattr(each, "command", 0) for _, each in orders] == [400, 22]
+        orders = [entry for entry in received.of(m.CommandLong) if getattr(entry[1], "command", 0) in (400, 22)]
+        assert [getattr(order, "command", 0) for _, order in orders] == [400, 22]
         assert len({index for index, _ in orders}) == 1
         await anyio.sleep(3)
-        heartbeats = told.of(m.Heartbeat)
-        assert {index for index, _ in heartbeats} == {0, 1, 2}, "every side hears that we are there"
+        heartbeats = received.of(m.Heartbeat)
+        assert {index for index, _ in heartbeats} == {0, 1, 2}, "our heartbeat is sent over every link"
 
 
 async def test_shared_stream_is_delivered_once() -> None:
@@ -105,10 +105,10 @@ async def test_shared_stream_is_delivered_once() -> None:
             await anyio.sleep(10)
             came.clear()
             await anyio.sleep(20)
-        times = [each.time_boot_ms for each in came]
-        assert len(set(times)) == len(times), "nothing came twice"
-        assert times == sorted(times), "nothing older came after something newer"
-        assert 0.65 < len(times) / 400 < 0.85, "three of four arrive by one of the two"
+        times = [message.time_boot_ms for message in came]
+        assert len(set(times)) == len(times), "no duplicates"
+        assert times == sorted(times), "in order"
+        assert 0.65 < len(times) / 400 < 0.85, "three of four arrive over at least one link"
 
 
 async def test_copies_leave_no_gap_when_one_radio_fails() -> None:
@@ -123,7 +123,7 @@ async def test_copies_leave_no_gap_when_one_radio_fails() -> None:
             came.clear()
             radios.cut(0 if used else 1)
             await anyio.sleep(5)
-        times = [each.time_boot_ms for each in came]
+        times = [message.time_boot_ms for message in came]
         gaps = [after - before for before, after in pairwise(times)]
         assert max(gaps) <= 60
         assert [reason for _, reason in news.chosen] == ["silent"]
@@ -134,25 +134,25 @@ async def test_second_stream_of_the_vehicle_is_not_mixed_in() -> None:
     radios = Radios(2, models=[GOOD, FaultModel(delay_s=1.0)])
     async with over(radios, a_copter()) as connection:
         times: list[int] = []
-        connection.bus.attach(m.Attitude, lambda each: times.append(each.time_boot_ms))
+        connection.bus.attach(m.Attitude, lambda attitude: times.append(attitude.time_boot_ms))
         async with aerokit.connect(connection, rates={m.Attitude: 10}):
             await proven(connection, 1)
             await anyio.sleep(5)
             radios.cut(0)
             await anyio.sleep(10)
         assert times == sorted(times)
-        assert len(times) - len(set(times)) <= 1, "the vehicle begins its stream anew on the other link"
+        assert len(times) - len(set(times)) <= 1, "the vehicle restarts its stream on the other link"
 
 
 async def test_costly_link_is_used_only_while_other_fails() -> None:
     radios = Radios(2)
-    told = ReceivedMessages(radios)
+    received = ReceivedMessages(radios)
     async with over(radios, a_copter(), links={"costly": [0]}) as connection:
         news = EventLog(connection)
         async with aerokit.connect(connection):
             await anyio.sleep(10)
             cheap, costly = radios.links[1].address, radios.links[0].address
-            used = [each.link for each in news.all if isinstance(each, events.LinkSelected)][-1]
+            used = [event.link for event in news.all if isinstance(event, events.LinkSelected)][-1]
             assert used == cheap
             radios.cut(1)
             await anyio.sleep(3)
@@ -160,10 +160,10 @@ async def test_costly_link_is_used_only_while_other_fails() -> None:
             radios.mend(1)
             await anyio.sleep(10)
             assert news.chosen[-1] == (cheap, "cheaper")
-            told.messages.clear()
+            received.messages.clear()
             await anyio.sleep(20)
-            asked = [len([1 for index, _ in told.of(m.Timesync) if index == link]) for link in (0, 1)]
-            assert asked[0] < asked[1] / 5, "it is asked seldom"
+            asked = [len([1 for index, _ in received.of(m.Timesync) if index == link]) for link in (0, 1)]
+            assert asked[0] < asked[1] / 5, "requests are rare"
 
 
 async def test_better_link_is_preferred() -> None:
@@ -180,14 +180,14 @@ async def test_better_link_is_preferred() -> None:
             assert slow.loss_percent == pytest.approx(20, abs=15)
             assert good.round_trip_s is not None
             assert good.round_trip_s < 0.2
-            assert len(news.chosen) <= 1, "it is not changed again and again"
+            assert len(news.chosen) <= 1, "the link does not alternate"
 
 
 async def test_other_vehicle_with_same_id_is_never_accepted() -> None:
-    """Its link is there, and ours dies: nothing is ordered of it."""
+    """Its link is open and ours fails: it gets no orders."""
     ours, another = SimulatedCopter(boot_time_s=0.0), SimulatedCopter(boot_time_s=0.0)
     radios = Radios(2)
-    told = ReceivedMessages(radios)
+    received = ReceivedMessages(radios)
     server = {"vehicles_on": [[ours], [another]]}
     async with over(radios, [ours, another], server=server) as connection:
         another.booted_at = -500.0
@@ -196,37 +196,37 @@ async def test_other_vehicle_with_same_id_is_never_accepted() -> None:
             await flying.wait_ready()
             await anyio.sleep(5)
             assert doubts.all
-            told.messages.clear()
+            received.messages.clear()
             radios.cut(0)
             await anyio.sleep(8)
             assert flying.link_state.value is LinkState.SILENT
             with pytest.raises(AerokitError):
                 await flying.arm()
             assert not another.is_armed
-            to_it = [each for index, each in told.of(m.CommandLong) if index == 1]
+            to_it = [message for index, message in received.of(m.CommandLong) if index == 1]
             assert to_it == []
 
 
 async def test_component_behind_other_link_is_reached_there() -> None:
-    """A camera on the second radio; the vehicle is spoken to over the first one."""
+    """A camera is on the second radio, while the vehicle is reached over the first one."""
     radios = Radios(2)
-    told, camera = ReceivedMessages(radios), FrameEncoder(1, 100)
+    events, camera = ReceivedMessages(radios), FrameEncoder(1, 100)
     async with over(radios, a_copter()) as connection, aerokit.connect(connection):
-        heard: list[m.Heartbeat] = []
-        connection.bus.attach(m.Heartbeat, heard.append)
+        received: list[m.Heartbeat] = []
+        connection.bus.attach(m.Heartbeat, received.append)
         await proven(connection, 1)
         for _ in range(3):
             radios.far[1].write(camera.encode(m.Heartbeat(30, 8, 0, 0, 4)))
             await anyio.sleep(1)
-        assert len([each for each in heard if each.autopilot == 8]) == 3
-        told.messages.clear()
+        assert len([message for message in received if message.autopilot == 8]) == 3
+        events.messages.clear()
         connection.send(m.CommandLong(1, 100, 512, 0, 259.0, 0, 0, 0, 0, 0, 0))
         connection.send(m.CommandLong(1, 1, 512, 0, 148.0, 0, 0, 0, 0, 0, 0))
-        assert [index for index, _ in told.of(m.CommandLong)] == [1, 0]
+        assert [index for index, _ in events.of(m.CommandLong)] == [1, 0]
 
 
 async def test_own_frames_forwarded_by_vehicle_are_ignored() -> None:
-    """As PX4 does with heartbeats of ground stations."""
+    """PX4 forwards heartbeats of ground stations."""
     radios = Radios(2)
     async with over(radios, a_copter()) as connection, aerokit.connect(connection):
         ours = FrameEncoder(connection.source_system, connection.source_component)
@@ -234,7 +234,7 @@ async def test_own_frames_forwarded_by_vehicle_are_ignored() -> None:
             radios.far[1].write(ours.encode(m.Heartbeat(6, 8, 0, 0, 4)))
             await anyio.sleep(1)
         assert connection.links is not None
-        assert all(each.systems == (1,) for each in connection.links.value)
+        assert all(link.systems == (1,) for link in connection.links.value)
         assert (connection.source_system, connection.source_component) not in connection.heartbeats
 
 
@@ -250,7 +250,7 @@ async def test_transfers_continue_over_the_next_link(vehicle: SimulatedVehicle) 
             tasks.start_soon(flying.mission.upload, Mission(items))
             await anyio.sleep(1.0)
             radios.cut(used)
-        assert connection.links.value[1 - used].used_for, "the other one is used"  # type: ignore[union-attr]
+        assert connection.links.value[1 - used].used_for, "the other link is used"  # type: ignore[union-attr]
         radios.mend(used)
         await anyio.sleep(5)
         used = 1 - used
@@ -280,7 +280,7 @@ async def test_unsent_data_of_a_stalled_link_is_discarded() -> None:
         assert [reason for _, reason in news.chosen] in (["stalled"], ["silent"])
         radios.links[used].drain()
         await anyio.sleep(3)
-        assert not copter.is_armed, "the order was taken back, and did not arrive late"
+        assert not copter.is_armed, "the order was discarded and did not arrive late"
 
 
 async def test_closed_link_is_left_and_all_closed_end_connection() -> None:
@@ -292,7 +292,7 @@ async def test_closed_link_is_left_and_all_closed_end_connection() -> None:
         radios.far[used].close()
         await anyio.sleep(0.2)
         assert [reason for _, reason in news.chosen] == ["lost"]
-        changed = [each for each in news.all if isinstance(each, events.MemberLinkStateChanged)]
+        changed = [event for event in news.all if isinstance(event, events.MemberLinkStateChanged)]
         assert (changed[0].link, changed[0].after) == (radios.links[used].address, LinkState.LOST)
         radios.far[1 - used].close()
         await anyio.sleep(0.2)
@@ -339,9 +339,9 @@ async def test_link_that_opens_late_is_used() -> None:
 
 
 async def test_ground_station_shares_all_links() -> None:
-    """Its transfer goes on, too, when one of them dies; each order of its own arrives once."""
+    """Its transfer continues when one of them fails, and each of its orders arrives once."""
     radios = Radios(2, models=[FaultModel(delay_s=0.02)] * 2)
-    told = ReceivedMessages(radios)
+    received = ReceivedMessages(radios)
     ours, theirs = memory_link_pair(latency_s=0.005)
     async with (
         over(radios, a_copter()) as connection,
@@ -352,9 +352,9 @@ async def test_ground_station_shares_all_links() -> None:
         await flying.wait_ready()
         await proven(connection, 1)
         used = 0 if connection.links.value[0].used_for else 1  # type: ignore[union-attr]
-        told.messages.clear()
+        received.messages.clear()
         await station.arm()
-        arming = [index for index, each in told.of(m.CommandLong) if getattr(each, "command", 0) == 400]
+        arming = [index for index, message in received.of(m.CommandLong) if getattr(message, "command", 0) == 400]
         assert arming == [used]
         found: list[int] = []
 
@@ -405,12 +405,12 @@ async def test_link_that_fails_after_reboot_is_left(seconds: float, hiccups: int
 
 def used_of(connection: Connection) -> int:
     assert connection.links is not None
-    return next(index for index, each in enumerate(connection.links.value) if each.used_for)
+    return next(index for index, link in enumerate(connection.links.value) if link.used_for)
 
 
 async def stand_still(copter: SimulatedCopter, radios: Radios, *, is_silent: bool) -> None:
-    for each in radios.links if is_silent else ():
-        each.incoming.model = DEAD
+    for link in radios.links if is_silent else ():
+        link.incoming.model = DEAD
     for _ in range(15):
         await anyio.sleep(0.1)
         copter.booted_at += 0.1

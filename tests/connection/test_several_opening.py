@@ -60,7 +60,7 @@ async def test_addresses_that_open_something_new_may_repeat() -> None:
         assert [connection.link.is_available(link) for link in range(3)] == [True, True, True]
 
 
-class NotYet(MemoryLink):
+class OpensLater(MemoryLink):
     """Cannot be opened for the first few times."""
 
     def __init__(self, failures: int) -> None:
@@ -77,18 +77,18 @@ class NotYet(MemoryLink):
 @pytest.mark.parametrize("failures", [1, 4])
 async def test_failed_member_link_is_reported_once(failures: int, caplog: pytest.LogCaptureFixture) -> None:
     near, _far = memory_link_pair()
-    both: list[Link] = [near, NotYet(failures)]
+    both: list[Link] = [near, OpensLater(failures)]
     together = MultiLink([partial(both.__getitem__, index) for index in range(2)])
     with caplog.at_level(logging.WARNING, "aerokit"):
         async with open_connection(together) as connection:
             news = EventLog(connection, events.MemberLinkOpenFailed, events.MemberLinkStateChanged)
             await anyio.sleep(30)
-            told = [each for each in news.all if isinstance(each, events.MemberLinkOpenFailed)]
-            assert [each.link for each in told] == ["memory:away"] * (failures > 1)
-            assert all(isinstance(each.error, LinkOpenError) for each in told)
+            reported = [event for event in news.all if isinstance(event, events.MemberLinkOpenFailed)]
+            assert [event.link for event in reported] == ["memory:away"] * (failures > 1)
+            assert all(isinstance(event.error, LinkOpenError) for event in reported)
             last = news.all[-1]
             assert isinstance(last, events.MemberLinkStateChanged)
             assert (last.link, last.after) == ("memory:away", LinkState.CONNECTED)
-    warnings = [each.getMessage() for each in caplog.records if "memory:away" in each.getMessage()]
+    warnings = [record.getMessage() for record in caplog.records if "memory:away" in record.getMessage()]
     assert len(warnings) == 1
     assert "refused" in warnings[0]

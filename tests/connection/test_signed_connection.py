@@ -175,10 +175,10 @@ async def test_allow_unsigned_decides() -> None:
 async def test_allow_unsigned_exception_refuses_only_the_frame(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    def mistaken(frame: Frame) -> bool:
+    def raises_error(frame: Frame) -> bool:
         raise ValueError(frame.system_id)
 
-    async with connected(radio_copter(signing_key=KEY), signing=Signing(KEY, allow_unsigned=mistaken)) as one:
+    async with connected(radio_copter(signing_key=KEY), signing=Signing(KEY, allow_unsigned=raises_error)) as one:
         connection = one.connection
         connection.bytes_received(FrameEncoder(77, 1).encode(Heartbeat(2, 3, 0, 0, 3, 3)), None)
         await anyio.sleep(2)
@@ -235,7 +235,7 @@ async def test_setup_over_a_lossy_link() -> None:
         await vehicle.wait_ready()
         copter.faults.drop_incoming = 2
         await vehicle.setup_signing(Signing(KEY), timeout=20)
-        await vehicle.setup_signing(Signing(WRONG), timeout=20)  # signed with the old one on its way there
+        await vehicle.setup_signing(Signing(WRONG), timeout=20)  # SETUP_SIGNING itself is signed with the old key
         assert copter.signing.key == WRONG
 
 
@@ -264,7 +264,7 @@ async def test_next_run_starts_with_stored_time_stamp() -> None:
 # ------------------------------------------------------------------------------------ the connection
 
 
-class Far:
+class FarLink:
     """The far end of a memory link: sends on demand, and records received data."""
 
     def __init__(self) -> None:
@@ -280,17 +280,17 @@ class Far:
         self.frames += self.framer.receive(data)
 
     def link_lost(self, error: Exception) -> None:
-        """Not looked at."""
+        """Ignore it."""
 
-    async def say(self, *raws: bytes) -> None:
+    async def send(self, *raws: bytes) -> None:
         for raw in raws:
             self._own.write(raw)
         await anyio.sleep(0.01)
 
 
 @asynccontextmanager
-async def with_far(**options: Any) -> AsyncIterator[tuple[Connection, Far]]:
-    far = Far()
+async def with_far(**options: Any) -> AsyncIterator[tuple[Connection, FarLink]]:
+    far = FarLink()
     await far.open()
     async with open_connection(far.link, **options) as connection:
         yield connection, far
@@ -313,15 +313,15 @@ async def test_refused_frames_are_reported_once_per_reason(tmp_path: Path) -> No
     async with with_far(signing=signing, record=path) as (connection, far):
         with (
             connection.subscribe(events.FrameRefused, capacity=9) as refused,
-            connection.subscribe(Heartbeat, Attitude, capacity=9) as heard,
+            connection.subscribe(Heartbeat, Attitude, capacity=9) as attitudes,
         ):
             connection.observe_frames(lambda frame, _: tapped.append(frame.system_id))
             bad = raw(ATTITUDE, system_id=7), raw(ATTITUDE, Signing(WRONG), 8), good
-            await far.say(good, *bad, *bad, raw(RadioStatus(0, 0, 0, 0, 0, 0, 0), system_id=51))
-            told = [await refused.get() for _ in range(3)]
-            assert (await heard.get()) == HEARTBEAT
-            assert refused.missed == heard.missed == 0
-        assert [(each.system_id, each.reason) for each in told] == [
+            await far.send(good, *bad, *bad, raw(RadioStatus(0, 0, 0, 0, 0, 0, 0), system_id=51))
+            reported = [await refused.get() for _ in range(3)]
+            assert (await attitudes.get()) == HEARTBEAT
+            assert refused.missed == attitudes.missed == 0
+        assert [(event.system_id, event.reason) for event in reported] == [
             (7, Refusal.UNSIGNED.value),
             (8, Refusal.WRONG_SIGNATURE.value),
             (1, Refusal.REPLAYED.value),
@@ -329,7 +329,7 @@ async def test_refused_frames_are_reported_once_per_reason(tmp_path: Path) -> No
         assert tapped == [1, 51]
         assert list(connection.heartbeats) == [(1, 1)]
     assert signing.refused == {**dict.fromkeys(Refusal, 2), Refusal.TOO_OLD: 0}
-    received = [each for _, each in read_tlog(path) if each[5] != 255]
+    received = [frame for _, frame in read_tlog(path) if frame[5] != 255]
     assert received[0] == good
     assert len(received) == 2
 
@@ -346,20 +346,20 @@ async def test_forwarded_frames_keep_signature_and_keys_are_not_recorded(
         await anyio.sleep(0.01)
         assert [frame.message_id for frame in far.frames].count(SetupSigning.ID) == 2
         assert theirs in [frame.raw for frame in far.frames]
-    recorded = [each for _, each in read_tlog(path)]
+    recorded = [frame for _, frame in read_tlog(path)]
     assert theirs in recorded
     assert KEY.secret not in path.read_bytes()
-    assert all(Signing(KEY).has_signed(Frame.parse(each)) for each in recorded if each[5] == 255)
+    assert all(Signing(KEY).has_signed(Frame.parse(frame)) for frame in recorded if frame[5] == 255)
 
 
 async def test_unknown_message_is_verified() -> None:
-    signing, seen = Signing(KEY), []
+    signing, observed = Signing(KEY), []
     header = bytes((0xFD, 3, 1, 0, 0, 1, 1)) + (16_000_000).to_bytes(3, "little")
     frame = header + b"abc\x11\x22"
     async with with_far(signing=signing) as (connection, far):
-        connection.observe_frames(lambda frame, _: seen.append(frame.message_id))
-        await far.say(frame + Signing(KEY).sign(frame, 1.9e9), frame + Signing(WRONG).sign(frame, 2e9))
-    assert seen == [16_000_000]
+        connection.observe_frames(lambda frame, _: observed.append(frame.message_id))
+        await far.send(frame + Signing(KEY).sign(frame, 1.9e9), frame + Signing(WRONG).sign(frame, 2e9))
+    assert observed == [16_000_000]
     assert signing.refused[Refusal.WRONG_SIGNATURE] == 1
 
 
@@ -387,7 +387,7 @@ async def test_time_stamps_follow_the_clock_of_the_connection() -> None:
 async def test_storage_error_of_time_stamp_is_logged_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """From the first heartbeat on; we fly on all the same."""
+    """Storing fails from the first heartbeat on, and the flight continues."""
 
     def full(target: Path, text: str) -> None:
         raise OSError(28, "No space left on device")
@@ -401,8 +401,8 @@ async def test_storage_error_of_time_stamp_is_logged_once(
                 if far is None:
                     _, far = await stack.enter_async_context(with_far(signing=signing))
                 await anyio.sleep(100)
-                told = [text for text in caplog.messages if "cannot be stored: [Errno 28]" in text]
-                assert len(told) == times
+                events = [text for text in caplog.messages if "cannot be stored: [Errno 28]" in text]
+                assert len(events) == times
             await anyio.sleep(100)
             assert signing.keep_error is None
         assert far is not None

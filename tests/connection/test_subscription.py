@@ -69,12 +69,12 @@ async def test_subscription_is_active_inside_its_block() -> None:
 
 
 async def test_waiting_reader_is_woken() -> None:
-    source, seen = Source(), list[int]()
+    source, observed = Source(), list[int]()
     with source.subscribe(10) as numbers:
 
         async def read() -> None:
             async for number in numbers:
-                seen.append(number)
+                observed.append(number)
 
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(read)
@@ -82,7 +82,7 @@ async def test_waiting_reader_is_woken() -> None:
             source.give(1, 2)
             await anyio.sleep(1)
             numbers.close()
-    assert seen == [1, 2]
+    assert observed == [1, 2]
 
 
 async def test_get_timeout_keeps_the_subscription_usable() -> None:

@@ -1,4 +1,4 @@
-"""Frames for programs that forward, log or show everything: taps, raw frames, the version of what we send."""
+"""Frames for programs that forward, log or show all traffic: observers, raw frames, the version of sent frames."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class TwoPeers(MemoryLink):
     def write(self, data: bytes, peer: Peer = None) -> None:
         self.sent.append((data, peer))
 
-    def hear(self, data: bytes, peer: Peer) -> None:
+    def receive(self, data: bytes, peer: Peer) -> None:
         assert self.connection is not None
         self.connection.bytes_received(data, peer)
 
@@ -62,16 +62,16 @@ async def connection(link: TwoPeers) -> AsyncIterator[Connection]:
 
 
 async def test_frame_observer_gets_all_frames_in_order(link: TwoPeers, connection: Connection) -> None:
-    encoder, heard = FrameEncoder(1, 1), list[tuple[int, Peer]]()
-    link.hear(encoder.encode(COPTER), "one")
-    detach = connection.observe_frames(lambda frame, peer: heard.append((frame.message_id, peer)))
-    link.hear(encoder.encode(ATTITUDE) + UNKNOWN + encoder.encode(COPTER), "one")
-    link.hear(FrameEncoder(2, 1).encode(ATTITUDE), "another, new one")
-    assert heard == [(30, "one"), (51234, "one"), (0, "one"), (30, "another, new one")]
+    encoder, received = FrameEncoder(1, 1), list[tuple[int, Peer]]()
+    link.receive(encoder.encode(COPTER), "one")
+    detach = connection.observe_frames(lambda frame, peer: received.append((frame.message_id, peer)))
+    link.receive(encoder.encode(ATTITUDE) + UNKNOWN + encoder.encode(COPTER), "one")
+    link.receive(FrameEncoder(2, 1).encode(ATTITUDE), "another, new one")
+    assert received == [(30, "one"), (51234, "one"), (0, "one"), (30, "another, new one")]
     detach()
     detach()
-    link.hear(encoder.encode(ATTITUDE), "one")
-    assert len(heard) == 4
+    link.receive(encoder.encode(ATTITUDE), "one")
+    assert len(received) == 4
     assert all(framer.wanted is connection.bus.wanted for framer in connection._receiver.framers.values())
     assert not any(framer.keep_unknown for framer in connection._receiver.framers.values())
 
@@ -80,44 +80,44 @@ async def test_subscribers_are_called_before_observers(link: TwoPeers, connectio
     order: list[str] = []
     connection.observe_frames(lambda frame, peer: order.append(f"tap, {len(connection.heartbeats)} known"))
     connection.attach([Heartbeat], lambda heartbeat: order.append("subscriber"))
-    link.hear(FrameEncoder(1, 1).encode(COPTER), "one")
+    link.receive(FrameEncoder(1, 1).encode(COPTER), "one")
     assert order == ["subscriber", "tap, 1 known"]
 
 
 async def test_observer_exception_is_logged_and_others_continue(
     link: TwoPeers, connection: Connection, caplog: pytest.LogCaptureFixture
 ) -> None:
-    heard: list[Frame] = []
+    received: list[Frame] = []
     connection.observe_frames(lambda frame, peer: 1 / 0)
-    connection.observe_frames(lambda frame, peer: heard.append(frame))
+    connection.observe_frames(lambda frame, peer: received.append(frame))
     with caplog.at_level(logging.CRITICAL, "aerokit"):
-        link.hear(FrameEncoder(1, 1).encode(COPTER), "one")
-    assert len(heard) == 1
+        link.receive(FrameEncoder(1, 1).encode(COPTER), "one")
+    assert len(received) == 1
     assert connection.is_open
 
 
 async def test_duplicate_vehicle_is_observed_once(link: TwoPeers, connection: Connection) -> None:
-    heard: list[Peer] = []
-    link.hear(FrameEncoder(1, 1).encode(COPTER), "one")
-    connection.observe_frames(lambda frame, peer: heard.append(peer))
+    received: list[Peer] = []
+    link.receive(FrameEncoder(1, 1).encode(COPTER), "one")
+    connection.observe_frames(lambda frame, peer: received.append(peer))
     for peer in ("one", "two"):
-        link.hear(FrameEncoder(1, 1).encode(ATTITUDE), peer)
-    assert heard == ["one"]
+        link.receive(FrameEncoder(1, 1).encode(ATTITUDE), peer)
+    assert received == ["one"]
 
 
 # --------------------------------------------------------------------------------- raw frames
 
 
 async def test_raw_frame_goes_unchanged_to_its_target(link: TwoPeers, connection: Connection) -> None:
-    link.hear(FrameEncoder(1, 1).encode(COPTER), "one")
-    link.hear(FrameEncoder(2, 1).encode(COPTER), "two")
-    asked, told = (
+    link.receive(FrameEncoder(1, 1).encode(COPTER), "one")
+    link.receive(FrameEncoder(2, 1).encode(COPTER), "two")
+    asked, answers = (
         FrameEncoder(77, 7).encode(ParamRequestList(2, 1)),
         FrameEncoder(77, 7, version=1).encode(COPTER),
     )
-    for raw in (asked, told, UNKNOWN):
+    for raw in (asked, answers, UNKNOWN):
         connection.write_raw(raw)
-    assert link.sent == [(asked, "two"), (told, None), (UNKNOWN, None)]
+    assert link.sent == [(asked, "two"), (answers, None), (UNKNOWN, None)]
 
 
 @pytest.mark.parametrize(
@@ -163,8 +163,8 @@ async def test_ground_station_behind_a_forwarding_program() -> None:
 # ------------------------------------------------------------------------------ version and source
 
 
-class Ear:
-    """The far end of a link: keeps what it hears."""
+class FrameRecorder:
+    """The far end of a link, which records received frames."""
 
     def __init__(self) -> None:
         self.frames: list[Frame] = []
@@ -174,12 +174,12 @@ class Ear:
         self.frames += self._framer.receive(data)
 
     def link_lost(self, error: LinkLost) -> None:
-        """Nothing to do."""
+        """Ignore it."""
 
 
 async def test_version_can_be_changed_while_open() -> None:
     near, far = memory_link_pair()
-    ear = Ear()
+    ear = FrameRecorder()
     await far.open(ear)
     async with open_connection(near) as connection:
         await anyio.sleep(0.5)

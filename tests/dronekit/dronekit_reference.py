@@ -1,7 +1,7 @@
 """The API reference of DroneKit 2.9 as data: its names and signatures, and its examples in the spelling of Python 3.
 
-What cannot run in the reference itself is mended: a listener of two arguments, a latitude that a comma makes a tuple, a
-message that no dialect has any more.
+Errors of the reference are corrected: a listener with two arguments, a latitude that a comma makes a tuple, a message
+that was removed from all dialects.
 """
 
 from __future__ import annotations
@@ -136,7 +136,7 @@ SIGNATURES: dict[str, dict[str, Any]] = {
     "mavlink.MAVConnection.reset": {},
     "mavlink.MAVConnection.start": {},
     "mavlink.MAVConnection.stop_threads": {},
-    **{f"{owner}.{name}": each for owner in ("Vehicle", "Locations") for name, each in OBSERVERS.items()},
+    **{f"{owner}.{name}": observer for owner in ("Vehicle", "Locations") for name, observer in OBSERVERS.items()},
 }
 """Arguments in their order, with their defaults; ``...`` where there is none."""
 

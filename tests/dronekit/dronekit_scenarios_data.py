@@ -130,7 +130,7 @@ def row_35_parameter_listeners(stage: Stage) -> Any:
 
 
 @scenario([("MINE", 1.5), ("MINE", 1.5), ("MINE", 2.5)])
-def parameters_told_by_the_program(stage: Stage) -> Any:
+def parameters_notified_by_the_program(stage: Stage) -> Any:
     notified: list[tuple[str, float]] = []
     parameters = stage.vehicle.parameters
     parameters.on_attribute(attr_name="mine")(lambda _, name, value: notified.append((name, value)))
@@ -148,7 +148,7 @@ def parameters_lost_on_the_way(stage: Stage) -> Any:
 
 
 @scenario(True)
-def parameters_are_told_when_complete(stage: Stage) -> Any:
+def parameters_are_notified_when_complete(stage: Stage) -> Any:
     return stage.vehicle.wait_ready("parameters", timeout=100) and len(stage.vehicle.parameters) == 3
 
 
@@ -157,7 +157,7 @@ def parameters_are_told_when_complete(stage: Stage) -> Any:
 
 def keep_three(fc: FlightController) -> None:
     fc.missions.items = [HOME, FIRST, SECOND, THIRD]
-    fc.missions.asks_int = False  # DroneKit knows no other items
+    fc.missions.asks_int = False  # DroneKit supports no other items
 
 
 def downloaded(stage: Stage) -> Any:
@@ -190,8 +190,8 @@ def row_36_download(stage: Stage) -> Any:
         (len(commands), commands.count),
         (first.seq, first.command, first.x, first.y, first.z, first.frame),
         [caught(lambda: commands[3]), caught(lambda: commands["a"])],
-        [each.seq for each in commands[0:2]],
-        [each.seq for each in commands],
+        [command.seq for command in commands[0:2]],
+        [command.seq for command in commands],
         str(home),
         [name for _, name, _ in events],
     )
@@ -204,7 +204,7 @@ def waypoint(stage: Stage, item: Item) -> Any:
 def kept(stage: Stage) -> list[tuple[int, float, float, float]]:
     """The mission on the vehicle; home as its command only."""
     home, *rest = stage.fc.missions.items
-    return [(home.command, 0, 0, 0), *((each.command, each.x, each.y, each.z) for each in rest)]
+    return [(home.command, 0, 0, 0), *((item.command, item.x, item.y, item.z) for item in rest)]
 
 
 UPLOADED = [(16, 0, 0, 0), (22, 0.0, 0.0, 10.0), (16, -35.75, 149.25, 21.0)]
@@ -219,8 +219,8 @@ def row_37_upload(stage: Stage) -> Any:
         commands.add(waypoint(stage, item))
     stage.vehicle.commands.upload()
     first = kept(stage)
-    seen = [(each.seq, each.command) for each in downloaded(stage)]
-    return first, len(commands), seen, kept(stage)
+    observed = [(item.seq, item.command) for item in downloaded(stage)]
+    return first, len(commands), observed, kept(stage)
 
 
 @scenario((UPLOADED, []), prepare=keep_three)

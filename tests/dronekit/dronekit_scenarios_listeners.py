@@ -165,7 +165,7 @@ def message_listener_that_raises(stage: Stage) -> Any:
 
 
 @scenario(["one X 1", "every X 1"])
-def message_listeners_told_by_the_program(stage: Stage) -> Any:
+def message_listeners_notified_by_the_program(stage: Stage) -> Any:
     calls: list[str] = []
     stage.vehicle.add_message_listener("*", lambda _, name, value: calls.append(f"every {name} {value}"))
     stage.vehicle.add_message_listener("X", lambda _, name, value: calls.append(f"one {name} {value}"))

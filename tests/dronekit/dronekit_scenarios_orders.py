@@ -10,7 +10,7 @@ from flight_controller_services import Item
 
 HOME = Item(16, -35.363261, 149.16523, 584.0, 0)
 GOTO = ("MISSION_ITEM", "COMMAND_INT", "SET_POSITION_TARGET_GLOBAL_INT")
-"""How DroneKit sends a vehicle to a place, and how it can be done better."""
+"""Commands for a destination: DroneKit's, and the better one."""
 REPOSITION = 192
 
 # ---------------------------------------------------------------------------------------- modes
@@ -18,12 +18,12 @@ REPOSITION = 192
 
 @scenario([[(176, 1, 5, 0, 0, 0, 0, 0)]] * 3)
 def row_04_mode(stage: Stage) -> Any:
-    seen = []
+    observed = []
     for value in ("LOITER", stage.dronekit.VehicleMode("LOITER"), 5):
         stage.fc.custom_mode = 0
         stage.beat()
-        seen.append(stage.commands_of(stage.assign("mode", value)))
-    return seen
+        observed.append(stage.commands_of(stage.assign("mode", value)))
+    return observed
 
 
 @scenario(
@@ -70,10 +70,10 @@ def row_09_wait_for_mode(stage: Stage) -> Any:
 
 @scenario(([], [(400, 1)], [], [(400, 0)]))
 def row_07_armed(stage: Stage) -> Any:
-    seen = [stage.commands_of(stage.assign("armed", False)), stage.commands_of(stage.assign("armed", True))]
+    observed = [stage.commands_of(stage.assign("armed", False)), stage.commands_of(stage.assign("armed", True))]
     stage.settle()
-    seen += [stage.commands_of(stage.assign("armed", True)), stage.commands_of(stage.assign("armed", False))]
-    return tuple([frame[:2] for frame in frames] for frames in seen)
+    observed += [stage.commands_of(stage.assign("armed", True)), stage.commands_of(stage.assign("armed", False))]
+    return tuple([frame[:2] for frame in frames] for frames in observed)
 
 
 @scenario(("TimeoutError: failed to arm vehicle", [(400, 1)]), is_slow=True)
@@ -127,20 +127,20 @@ def row_10_takeoff(stage: Stage) -> Any:
 
 def places(stage: Stage, location: Any, **speeds: float) -> list[tuple[Any, ...]]:
     """Return what ``simple_goto`` sent: positions as ``("goto", lat, lon, alt above home)``, commands unchanged."""
-    seen: list[tuple[Any, ...]] = []
+    observed: list[tuple[Any, ...]] = []
     names = (*GOTO, "COMMAND_LONG")
     for frame in stage.sent_by(lambda: stage.vehicle.simple_goto(location, **speeds), *names):
         if frame.name == "MISSION_ITEM":
             assert (frame.frame, frame.command, frame.current) == (3, 16, 2)
-            seen.append(("goto", round(frame.x, 4), round(frame.y, 4), round(frame.z, 3)))
+            observed.append(("goto", round(frame.x, 4), round(frame.y, 4), round(frame.z, 3)))
         elif frame.name == "COMMAND_INT":
             assert (frame.frame in (3, 6), frame.command) == (True, REPOSITION)
-            seen.append(("goto", round(frame.x / 1e7, 4), round(frame.y / 1e7, 4), round(frame.z, 3)))
+            observed.append(("goto", round(frame.x / 1e7, 4), round(frame.y / 1e7, 4), round(frame.z, 3)))
         elif frame.name == "SET_POSITION_TARGET_GLOBAL_INT":
-            seen.append(("goto", round(frame.lat_int / 1e7, 4), round(frame.lon_int / 1e7, 4), round(frame.alt, 3)))
+            observed.append(("goto", round(frame.lat_int / 1e7, 4), round(frame.lon_int / 1e7, 4), round(frame.alt, 3)))
         elif frame.command == 178:
-            seen.append((frame.command, *frame.params[:3]))
-    return seen
+            observed.append((frame.command, *frame.params[:3]))
+    return observed
 
 
 @scenario([("goto", -35.1, 149.2, 20.0), (178, 0, 5, -1), (178, 1, 3, -1)], controller={"mode": 4})
@@ -171,7 +171,7 @@ def row_13_speeds(stage: Stage) -> Any:
     ground = stage.commands_of(stage.assign("groundspeed", 7))
     air = stage.commands_of(stage.assign("airspeed", 8.5))
     vehicle = stage.vehicle
-    return [each[:4] for each in ground], [each[:4] for each in air], vehicle.groundspeed, vehicle.airspeed
+    return [frame[:4] for frame in ground], [frame[:4] for frame in air], vehicle.groundspeed, vehicle.airspeed
 
 
 @scenario(
@@ -281,8 +281,8 @@ def send_mavlink(stage: Stage) -> Any:
     stage.fc.results[31000] = None
     message = stage.vehicle.message_factory.command_long_encode(0, 9, 31000, 0, 1.5, 0, 0, 0, 0, 0, 7)
     sent = stage.sent_by(lambda: stage.vehicle.send_mavlink(message))
-    seen = [(frame.name, frame.target, frame.params) for frame in sent]
-    return message.target_system, message.target_component, seen
+    observed = [(frame.name, frame.target, frame.params) for frame in sent]
+    return message.target_system, message.target_component, observed
 
 
 @scenario((1, 2))
@@ -314,7 +314,7 @@ def override(*values: int) -> list[tuple[int, ...]]:
 )
 def row_29_overrides(stage: Stage) -> Any:
     channels = stage.vehicle.channels
-    seen: list[Any] = [
+    observed: list[Any] = [
         channels_of(stage, lambda: channels.overrides.__setitem__("2", 200)),
         channels_of(stage, lambda: channels.overrides.__setitem__(3, 1500)),
         channels_of(stage, lambda: channels.overrides.__delitem__("3")),
@@ -324,7 +324,7 @@ def row_29_overrides(stage: Stage) -> Any:
         dict(channels.overrides),
     ]
     channels.overrides["1"] = 1100
-    return [*seen, dict(channels.overrides)]
+    return [*observed, dict(channels.overrides)]
 
 
 @scenario(("KeyError: 'Invalid channel index 9'", "KeyError: 'Invalid channel index 9'", []))

@@ -56,7 +56,7 @@ def row_02_no_rate_asks_for_no_streams(stage: Stage) -> Any:
 def row_02_rate_and_source(stage: Stage) -> Any:
     stream = stage.fc.wait_for("REQUEST_DATA_STREAM")
     stage.fc.wait_for("HEARTBEAT")
-    return stream.req_message_rate, sorted({(each.system, each.component) for each in stage.fc.received()})
+    return stream.req_message_rate, sorted({(frame.system, frame.component) for frame in stage.fc.received()})
 
 
 # --------------------------------------------------------------------------------------- values
@@ -185,13 +185,13 @@ def row_25_gimbal(stage: Stage) -> Any:
 )
 def row_26_version(stage: Stage) -> Any:
     stage.fc.flight_sw_version = 0x030302FF
-    stage.fc.tell_version(flight_sw_version=0x030302FF)
+    stage.fc.send_version(flight_sw_version=0x030302FF)
     stage.settle()
     vehicle = stage.vehicle
     stable = vehicle.version
     stage.fc.flight_sw_version = 0x030300D7
     events = stage.listen("autopilot_version", "version", "capabilities")
-    stage.fc.tell_version(flight_sw_version=0x030300D7)
+    stage.fc.send_version(flight_sw_version=0x030300D7)
     stage.settle()
     version, can = vehicle.version, vehicle.capabilities
     notified = [(name, value) for _, name, value in events][-1:]
@@ -254,9 +254,9 @@ def row_28_channels(stage: Stage) -> Any:
     before = dict(channels)
     stage.report("RC_CHANNELS_RAW", port=0, **RAW)
     eight = dict(channels)
-    seen = len(channels), channels[1] == channels["1"], caught(lambda: channels["9"])
+    observed = len(channels), channels[1] == channels["1"], caught(lambda: channels["9"])
     stage.report("RC_CHANNELS_RAW", port=1, **RAW)
-    return before, eight, seen, (len(channels), channels[9], channels[9] == channels["9"], len(events))
+    return before, eight, observed, (len(channels), channels[9], channels[9] == channels["9"], len(events))
 
 
 @scenario(
@@ -287,7 +287,7 @@ def rangefinder(stage: Stage) -> Any:
 
 
 @scenario(["home_location", "home_location"], prepare=lambda fc: setattr(fc, "home", None))
-def home_is_told_each_time(stage: Stage) -> Any:
+def home_is_notified_each_time(stage: Stage) -> Any:
     events = stage.listen("home_location")
     for _ in range(2):
         stage.report("HOME_POSITION", latitude=-353632610, longitude=1491652300, altitude=584000)
@@ -300,12 +300,12 @@ def home_is_told_each_time(stage: Stage) -> Any:
 )
 def system_status(stage: Stage) -> Any:
     stage.fc.heartbeat_s = None
-    seen = []
+    observed = []
     for number in range(1, 9):
         stage.beat(system_status=number)
         status = stage.vehicle.system_status
-        seen.append((status and status.state, status and str(status)))
-    return seen
+        observed.append((status and status.state, status and str(status)))
+    return observed
 
 
 @scenario([("gimbal", "Gimbal: pitch=-45.0, roll=1.0, yaw=90.0")], controller={"version": 2}, is_kept=False)
@@ -317,7 +317,7 @@ def mount_orientation(stage: Stage) -> Any:
 
 
 @scenario([])
-def messages_that_tell_nothing(stage: Stage) -> Any:
+def messages_without_values(stage: Stage) -> Any:
     stage.settle()
     events = stage.listen("*")
     stage.fc.report("STATUSTEXT", severity=6, text=b"hello")

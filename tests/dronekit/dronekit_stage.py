@@ -1,6 +1,6 @@
 """A DroneKit program connected to a scripted flight controller; scenarios return their observations as plain data.
 
-Nothing here knows which implementation of DroneKit it is given.
+The stage is independent of the DroneKit implementation that it runs.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ __all__ = [
 
 TEST_TIMEOUT_S = 100.0
 ALWAYS = ("PING", "HEARTBEAT", "REQUEST_DATA_STREAM", "PARAM_REQUEST_READ")
-"""Goes on by itself, whatever the program does."""
+"""Messages that are sent continuously, independent of the program."""
 QUIET = 3
 """Round trips without new messages after which an action counts as finished."""
 
@@ -56,17 +56,17 @@ class Stage:
                 self.fc.report("DEBUG", ind=7, time_boot_ms=number)
                 if self._saw.wait_for(lambda: number in self._seen, 0.1):
                     return
-        raise AssertionError("the vehicle's listeners heard nothing")
+        raise AssertionError("the vehicle's listeners received nothing")
 
     def reached(self) -> None:
-        """Wait until the flight controller has received all messages of the program, and their effects.
+        """Wait until the flight controller has received all messages of the program, and their effects have arrived.
 
-        Answers to what has come may have more sent: of two equal commands the second may wait for the first's answer.
+        An answer may release another message: the second of two equal commands waits for the first one's answer.
         """
         count, quiet = -1, 0
         while quiet < QUIET:
             self._round_trip()
-            before, count = count, len([each for each in self.fc.received() if each.name not in ALWAYS])
+            before, count = count, len([frame for frame in self.fc.received() if frame.name not in ALWAYS])
             quiet = quiet + 1 if count == before else 0
 
     def _round_trip(self) -> None:
@@ -76,12 +76,12 @@ class Stage:
         self.fc.wait_for("PING", lambda frame: frame.seq == number)
 
     def report(self, name: str, **fields: Any) -> None:
-        """Have the flight controller say it, and wait until it is taken in."""
+        """Have the flight controller send a message, and wait until the program has processed it."""
         self.fc.report(name, **fields)
         self.settle()
 
     def beat(self, **fields: Any) -> None:
-        """Have it send a heartbeat, and wait until it is taken in."""
+        """Have the flight controller send a heartbeat, and wait until the program has processed it."""
         self.fc.beat(**fields)
         self.settle()
 
@@ -93,7 +93,7 @@ class Stage:
         return self.fc.received(*names, since=since) if names else self.fc.commands(since=since)
 
     def commands_of(self, action: Callable[[], object]) -> list[tuple[float, ...]]:
-        """The commands that an action had the program send: number, then param1 to param7."""
+        """Return the commands that the program sent during an action: number, then param1 to param7."""
         return [(frame.command, *(round(p, 5) for p in frame.params)) for frame in self.sent_by(action)]
 
     def assign(self, name: str, value: Any) -> Callable[[], None]:
@@ -162,9 +162,9 @@ def scenario(expected: Any, **options: Any) -> Callable[[Callable[[Stage], Any]]
     """Decorator: make a scenario of a function that takes a stage and returns its observations.
 
     Args:
-        expected: what it is to observe.
-        options: ``controller`` and ``connect``, arguments of both; ``is_slow``, it waits for timeouts; ``is_kept``,
-            DroneKit itself does so; ``prepare``, called with the flight controller before the program connects.
+        expected: the observations that the scenario must return.
+        options: ``controller`` and ``connect``, arguments of both; ``is_slow``: the scenario waits for timeouts;
+            ``is_kept``: DroneKit behaves the same; ``prepare``: called with the flight controller before connecting.
     """
 
     def register(function: Callable[[Stage], Any]) -> Callable[[Stage], Any]:
@@ -183,7 +183,7 @@ def on_stage(
 ) -> Iterator[Stage]:
     """Start a flight controller, connect to it, and close both in the end.
 
-    Streams are not asked for unless ``connect`` says so: what streams is waited for a moment, and here nothing does.
+    Streams are requested only if ``connect`` contains a rate: connecting waits for streams, and here there are none.
     """
     with FlightController(**(controller or {})) as fc:
         prepare(fc)
@@ -194,11 +194,11 @@ def on_stage(
             vehicle.close()
 
 
-def play(dronekit: Any, each: Scenario, **controller: Any) -> Any:
+def play(dronekit: Any, case: Scenario, **controller: Any) -> Any:
     """Return the observations of a scenario with this implementation."""
-    options = {**each.controller, **controller}
-    with on_stage(dronekit, options, each.connect, each.prepare) as stage:
-        return each.play(stage)
+    options = {**case.controller, **controller}
+    with on_stage(dronekit, options, case.connect, case.prepare) as stage:
+        return case.play(stage)
 
 
 def caught(action: Callable[[], object]) -> str:
@@ -215,7 +215,7 @@ def plain(value: Any) -> str:
 
 
 def until(condition: Callable[[], object]) -> None:
-    """Wait until something holds that nothing tells of."""
+    """Poll until a condition holds that has no event."""
     deadline = time.monotonic() + 100
     while not condition():
         assert time.monotonic() < deadline

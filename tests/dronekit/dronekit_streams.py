@@ -1,4 +1,4 @@
-"""A flight controller that streams one of everything as soon as it is asked for streams."""
+"""A flight controller that sends one message of each kind as soon as streams are requested."""
 
 from __future__ import annotations
 

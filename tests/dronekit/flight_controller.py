@@ -1,7 +1,6 @@
 """A scripted flight controller on a real loopback socket: sends messages for a test, and records received ones.
 
-Built on pymavlink's encoder and parser, and knows nothing of the library under test: any program that speaks MAVLink
-can be its other side.
+Built on pymavlink's encoder and parser, and independent of the library under test: any MAVLink program can connect.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ SET_HOME = 179
 HOUSEKEEPING = (511, REQUEST_MESSAGE, REQUEST_VERSION, GET_HOME)
 """Commands that only request information; scenarios ignore them by default."""
 TEST_TIMEOUT_S = 100.0
-UNHEARD_S = 0.005
+SILENCE_S = 0.005
 """Seconds between heartbeats until a client answers, so that tests connect quickly."""
 
 Message = Any
@@ -63,11 +62,11 @@ class Received:
 
 
 class FlightController:
-    """Beats its heart, answers commands, parameters and missions by tables, and sends anything on demand.
+    """Sends heartbeats, answers commands, parameters and missions from tables, and sends any message on demand.
 
     Args:
         link: ``"udp"`` (the other side listens at :attr:`address`) or ``"tcp"`` (this side does).
-        version: of MAVLink, 1 or 2, of what it sends.
+        version: MAVLink version of sent messages, 1 or 2.
         vehicle_type: MAV_TYPE. autopilot: MAV_AUTOPILOT.
         heartbeat_s: seconds between heartbeats; None sends none but those of :meth:`beat`.
     """
@@ -176,12 +175,12 @@ class FlightController:
         """
         found: list[Received] = []
 
-        def has_come() -> bool:
+        def has_arrived() -> bool:
             found.extend(frame for frame in self._log[since:] if frame.name == name and predicate(frame))
             return bool(found)
 
         with self._came:
-            if not self._came.wait_for(has_come, timeout):
+            if not self._came.wait_for(has_arrived, timeout):
                 raise AssertionError(f"no such {name} in {timeout} s; came: {_brief(self._log[since:])}")
         return found[0]
 
@@ -210,9 +209,9 @@ class FlightController:
         with contextlib.suppress(OSError):
             self._wake.send(b"!")
         self._thread.join(TEST_TIMEOUT_S)
-        for each in (self._socket, self._peer, self._wake, self._woken):
-            if each is not None:
-                each.close()
+        for used in (self._socket, self._peer, self._wake, self._woken):
+            if used is not None:
+                used.close()
 
     def __enter__(self) -> FlightController:
         return self
@@ -253,10 +252,10 @@ class FlightController:
                 ready = select.select(listened, [], [], beats_in)[0]
             except (OSError, ValueError):  # dropped meanwhile
                 continue
-            for each in ready:
-                self._read(each)
+            for ready_socket in ready:
+                self._read(ready_socket)
             if self.heartbeat_s and time.monotonic() >= next_beat:
-                next_beat = time.monotonic() + (self.heartbeat_s if self._log else UNHEARD_S)
+                next_beat = time.monotonic() + (self.heartbeat_s if self._log else SILENCE_S)
                 self.beat()
 
     def _read(self, ready: socket.socket) -> None:
@@ -321,9 +320,9 @@ class FlightController:
             main, sub = int(frame.param2), int(frame.param3)
             self._change_mode(main << 16 | sub << 24 if self.autopilot == PX4 else main)
         elif frame.command == REQUEST_VERSION or (frame.command == REQUEST_MESSAGE and number == 148):
-            self.tell_version()
+            self.send_version()
         elif frame.command == GET_HOME or (frame.command == REQUEST_MESSAGE and number == 242):
-            return self._tell_home()
+            return self._send_home()
         elif frame.command == SET_HOME:
             self._set_home(frame)
         elif frame.command == REQUEST_MESSAGE:
@@ -334,7 +333,7 @@ class FlightController:
         self.custom_mode = custom_mode
         self.beat()
 
-    def tell_version(self, **fields: Any) -> None:
+    def send_version(self, **fields: Any) -> None:
         """Send AUTOPILOT_VERSION."""
         usual = {"capabilities": self.capabilities, "flight_sw_version": self.flight_sw_version}
         self.report("AUTOPILOT_VERSION", **{**usual, **fields})
@@ -343,9 +342,9 @@ class FlightController:
         scale = 1 if frame.name == "COMMAND_INT" else 1e7
         x, y, z = frame.params[4:]
         self.home = round(x * scale), round(y * scale), round(z * 1000)
-        self._tell_home()
+        self._send_home()
 
-    def _tell_home(self) -> int:
+    def _send_home(self) -> int:
         if self.home is None:
             return 4
         latitude, longitude, altitude = self.home
@@ -354,13 +353,13 @@ class FlightController:
 
 
 def message_of(name: str, **fields: Any) -> Message:
-    """A message of pymavlink; fields that are not given are 0, those it does not know are an error."""
+    """Return a pymavlink message; omitted fields are 0, unknown fields raise an error."""
     kind = mavlink.mavlink_map[getattr(mavlink, f"MAVLINK_MSG_ID_{name}")]
     unknown = set(fields) - set(kind.fieldnames)
     assert not unknown, f"{name} has no {unknown}"
     lengths = dict(zip(kind.ordered_fieldnames, kind.array_lengths, strict=True))
     kinds = dict(zip(kind.fieldnames, kind.fieldtypes, strict=True))
-    return kind(*(fields.get(each, _zero(kinds[each], lengths[each])) for each in kind.fieldnames))
+    return kind(*(fields.get(name, _zero(kinds[name], lengths[name])) for name in kind.fieldnames))
 
 
 def _zero(kind: str, length: int) -> Any:

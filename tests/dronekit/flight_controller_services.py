@@ -96,7 +96,7 @@ class ParameterService:
         kind = self.types.get(name, REAL32)
         if self.is_silent or name not in self.values:
             return
-        if self.is_bytewise and frame.param_type != kind:  # PX4 refuses it: it tells the old value
+        if self.is_bytewise and frame.param_type != kind:  # PX4 refuses it and reports the old value
             self.report(name)
             return
         self.values[name] = self.adjust(name, self._decoded(frame.param_value, kind))
@@ -119,12 +119,12 @@ class Item(NamedTuple):
 
 @dataclass
 class MissionService:
-    """Downloads and uploads, as ArduPilot has them: item 0 is home, and stays home whatever is sent for it.
+    """Mission downloads and uploads like ArduPilot's: item 0 is home, and an upload does not change it.
 
     Attributes:
-        items: what is kept, home included.
+        items: the stored items, home included.
         has_home: whether item 0 is home (ArduPilot) or an item like others (PX4).
-        asks_int: whether items are asked for by MISSION_REQUEST_INT.
+        asks_int: whether items are requested with MISSION_REQUEST_INT.
         lost: number of item → how many of its transmissions get lost (downloads).
         result: MAV_MISSION_RESULT that an upload ends with; refused items are not kept.
         is_mute: no upload is answered.

@@ -56,7 +56,7 @@ def connected(
 
 def kept(controller: FlightController) -> list[tuple[int, float, float]]:
     """Return the stored mission: command, latitude, altitude."""
-    return [(each.command, each.x, each.z) for each in controller.missions.items]
+    return [(item.command, item.x, item.z) for item in controller.missions.items]
 
 
 def transfers(controller: FlightController, since: int) -> list[str]:

@@ -1,6 +1,6 @@
-"""Play the scenarios that DroneKit itself is said to play so in the interpreter that runs this, which has DroneKit.
+"""Run the scenarios marked ``is_kept`` with the real DroneKit of this interpreter.
 
-Prints a JSON object: name of the scenario → what was observed, as JSON has it.
+Prints a JSON object: name of the scenario → observations.
 """
 
 from __future__ import annotations
@@ -21,14 +21,18 @@ def main(names: list[str]) -> None:
     import dronekit  # type: ignore[import-not-found, unused-ignore]
 
     logging.getLogger().addHandler(logging.NullHandler())
-    kept = [each for each in dronekit_scenarios.SCENARIOS if each.is_kept and (not names or each.name in names)]
-    print(json.dumps({each.name: _observed(dronekit, each) for each in kept}))  # noqa: T201
+    kept = [
+        scenario
+        for scenario in dronekit_scenarios.SCENARIOS
+        if scenario.is_kept and (not names or scenario.name in names)
+    ]
+    print(json.dumps({scenario.name: _observed(dronekit, scenario) for scenario in kept}))  # noqa: T201
 
 
-def _observed(dronekit: Any, each: Scenario) -> Any:
+def _observed(dronekit: Any, case: Scenario) -> Any:
     # of MAVLink 2 it makes broadcasts: its behaviour is that under MAVLink 1
     try:
-        return as_json(play(dronekit, each, version=1))
+        return as_json(play(dronekit, case, version=1))
     except BaseException as error:
         return f"{type(error).__name__}: {error}"
 

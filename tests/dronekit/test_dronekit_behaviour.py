@@ -1,7 +1,7 @@
 """Observed behaviour of DroneKit 2.9.2, row by row; unchanged rows are scenarios.
 
-With ``AEROKIT_DRONEKIT_PYTHON`` naming an interpreter that has DroneKit the scenarios are played with DroneKit itself,
-too, so that what is expected here is what it does.
+If ``AEROKIT_DRONEKIT_PYTHON`` names an interpreter with DroneKit, the scenarios run with DroneKit as well, which
+verifies the expected results.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from flight_controller import FlightController
 import aerokit.dronekit as dronekit
 
 DRONEKIT_PYTHON = os.environ.get("AEROKIT_DRONEKIT_PYTHON", "")
-QUICK = [each for each in SCENARIOS if not each.is_slow]
-SLOW = [each for each in SCENARIOS if each.is_slow]
+QUICK = [scenario for scenario in SCENARIOS if not scenario.is_slow]
+SLOW = [scenario for scenario in SCENARIOS if scenario.is_slow]
 
 
 @pytest.fixture
@@ -40,7 +40,7 @@ def copter() -> Iterator[Stage]:
 def waiting(request: pytest.FixtureRequest) -> Iterator[dict[str, Future[Any]]]:
     """Run slow scenarios in the background while other tests run; each collects its own log records."""
     slow: dict[str, Callable[[], Any]] = {
-        f"test_slow_scenario[{each.name}]": partial(play, dronekit, each) for each in SLOW
+        f"test_slow_scenario[{scenario.name}]": partial(play, dronekit, scenario) for scenario in SLOW
     }
     slow["test_row_40_silence"] = silence
     with contextlib.ExitStack() as stack:
@@ -54,11 +54,11 @@ def waiting(request: pytest.FixtureRequest) -> Iterator[dict[str, Future[Any]]]:
 
 
 @pytest.mark.parametrize("version", [1, 2])
-@pytest.mark.parametrize("each", QUICK, ids=lambda each: each.name)
-def test_scenario(each: Scenario, version: int) -> None:
-    if each.controller.get("version", version) != version:
+@pytest.mark.parametrize("case", QUICK, ids=lambda case: case.name)
+def test_scenario(case: Scenario, version: int) -> None:
+    if case.controller.get("version", version) != version:
         pytest.skip("the message is of the other version")
-    assert as_json(play(dronekit, each, version=version)) == as_json(each.expected)
+    assert as_json(play(dronekit, case, version=version)) == as_json(case.expected)
 
 
 @pytest.mark.skipif(not DRONEKIT_PYTHON, reason="AEROKIT_DRONEKIT_PYTHON names no interpreter with DroneKit")
@@ -67,17 +67,17 @@ def test_dronekit_itself_matches_reference() -> None:
     program = [DRONEKIT_PYTHON, str(here / "real_dronekit.py")]
     output = subprocess.run(program, capture_output=True, text=True, timeout=300, check=True).stdout
     observed = json.loads(output.splitlines()[-1])
-    expected = {each.name: as_json(each.expected) for each in SCENARIOS if each.is_kept}
+    expected = {scenario.name: as_json(scenario.expected) for scenario in SCENARIOS if scenario.is_kept}
     assert observed == expected
 
 
-# ------------------------------------------------------- rows in which the result is another one
+# ------------------------------------------------------------------ rows with a different result
 
 
 @pytest.mark.parametrize("version", [1, 2])
 def test_row_03_messages_target_the_vehicle(version: int) -> None:
     """Messages are not broadcast to other vehicles on the link."""
-    with on_stage(dronekit, {"version": version, "mode": 4}, prepare=_be_system_7) as stage:
+    with on_stage(dronekit, {"version": version, "mode": 4}, prepare=_use_system_7) as stage:
         vehicle, factory = stage.vehicle, stage.vehicle.message_factory
         place = dronekit.LocationGlobalRelative(-35.1, 149.2, 20)
         vehicle.mode = "LOITER"
@@ -107,7 +107,7 @@ def test_row_03_messages_target_the_vehicle(version: int) -> None:
         assert {orders[number] for number in (176, 400, 22, 178, 241, 246, 31010)} == {0}
 
 
-def _be_system_7(fc: FlightController) -> None:
+def _use_system_7(fc: FlightController) -> None:
     fc.source = (7, 1)
     fc.missions.items = [HOME]
     fc.capabilities &= ~(8192 if fc.version == 1 else 0)
@@ -262,6 +262,6 @@ def test_row_40_silence(waiting: dict[str, Future[Any]]) -> None:
     }
 
 
-@pytest.mark.parametrize("each", SLOW, ids=lambda each: each.name)
-def test_slow_scenario(each: Scenario, waiting: dict[str, Future[Any]]) -> None:
-    assert as_json(waiting[f"test_slow_scenario[{each.name}]"].result(timeout=60)) == as_json(each.expected)
+@pytest.mark.parametrize("case", SLOW, ids=lambda case: case.name)
+def test_slow_scenario(case: Scenario, waiting: dict[str, Future[Any]]) -> None:
+    assert as_json(waiting[f"test_slow_scenario[{case.name}]"].result(timeout=60)) == as_json(case.expected)

@@ -28,14 +28,14 @@ REPORTED = {str(number): 1000 + number for number in range(1, 9)}
 
 @pytest.fixture
 def stage() -> Iterator[Stage]:
-    with on_stage(dronekit, connect={"rate": None}) as each:
-        yield each
+    with on_stage(dronekit, connect={"rate": None}) as stage:
+        yield stage
 
 
 @pytest.fixture
 def channels(stage: Stage) -> Channels:
-    each: Channels = stage.vehicle.channels
-    return each
+    value: Channels = stage.vehicle.channels
+    return value
 
 
 def sent(stage: Stage, action: Callable[[], object]) -> list[tuple[int, ...]]:
@@ -108,14 +108,14 @@ def test_channels_have_python_2_methods(channels: Channels) -> None:
 
 def test_channels_are_read_only(channels: Channels) -> None:
     changes: tuple[Callable[[Any], object], ...] = (
-        lambda each: each.__setitem__("1", 1),
-        lambda each: each.__delitem__("1"),
-        lambda each: each.__ior__({"1": 1}),
-        lambda each: each.update({"1": 1}),
-        lambda each: each.setdefault("1", 1),
-        lambda each: each.pop("1"),
-        lambda each: each.popitem(),
-        lambda each: each.clear(),
+        lambda channels: channels.__setitem__("1", 1),
+        lambda channels: channels.__delitem__("1"),
+        lambda channels: channels.__ior__({"1": 1}),
+        lambda channels: channels.update({"1": 1}),
+        lambda channels: channels.setdefault("1", 1),
+        lambda channels: channels.pop("1"),
+        lambda channels: channels.popitem(),
+        lambda channels: channels.clear(),
     )
     for change in changes:
         with pytest.raises(TypeError, match="is not supported on Channels object"):
@@ -192,7 +192,7 @@ def test_overrides_len_counts_overridden_channels(channels: Channels) -> None:
 
 @dataclass(frozen=True)
 class Int64:
-    """As numpy's: no int, but can be used as one."""
+    """An integer like numpy's: not an int, but usable as one."""
 
     value: int
 
@@ -290,7 +290,7 @@ OURS = {"1": 1500, "3": 1900, "10": 1700}
 
 
 def released(fc: FlightController, since: int) -> list[tuple[int, ...]]:
-    """The last RC_CHANNELS_OVERRIDE of a connection, and how often it came."""
+    """Return the channels of each RC_CHANNELS_OVERRIDE that releases channel 3."""
     fc.wait_for("RC_CHANNELS_OVERRIDE", lambda frame: frame.chan3_raw == 0, since=since)
     return [
         tuple(getattr(frame, f"chan{number}_raw") for number in range(1, 19))
@@ -299,7 +299,7 @@ def released(fc: FlightController, since: int) -> list[tuple[int, ...]]:
     ]
 
 
-GIVEN_BACK = (0, IGNORED, 0, *(IGNORED,) * 5, 0, RELEASED, *(0,) * 8)
+RELEASED_OVERRIDES = (0, IGNORED, 0, *(IGNORED,) * 5, 0, RELEASED, *(0,) * 8)
 
 
 def test_overrides_are_released_on_close(stage: Stage, channels: Channels) -> None:
@@ -308,7 +308,7 @@ def test_overrides_are_released_on_close(stage: Stage, channels: Channels) -> No
     stage.reached()
     since = stage.fc.mark()
     stage.vehicle.close()
-    assert set(released(stage.fc, since)) == {GIVEN_BACK}
+    assert set(released(stage.fc, since)) == {RELEASED_OVERRIDES}
 
 
 def test_overrides_sent_by_send_mavlink_are_released_on_close(stage: Stage) -> None:
@@ -317,7 +317,7 @@ def test_overrides_sent_by_send_mavlink_are_released_on_close(stage: Stage) -> N
     stage.reached()
     since = stage.fc.mark()
     stage.vehicle.close()
-    assert set(released(stage.fc, since)) == {GIVEN_BACK}
+    assert set(released(stage.fc, since)) == {RELEASED_OVERRIDES}
 
 
 @pytest.mark.parametrize("has_overridden", [False, True], ids=["never", "given back before"])

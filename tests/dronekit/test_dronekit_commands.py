@@ -60,7 +60,7 @@ def test_downloaded_commands_are_counted_without_home(
     _, cmds = three
     first = cmds[0]
     assert isinstance(first, Command)
-    assert (len(cmds), cmds.count, [each.seq for each in cmds]) == (3, 3, [1, 2, 3])
+    assert (len(cmds), cmds.count, [command.seq for command in cmds]) == (3, 3, [1, 2, 3])
     assert (first.x, first.y, first.z, first.frame, first.autocontinue) == (-35.5, 149.25, 20.0, 3, 1)
     assert (first.target_system, first.target_component) == (255, 0)
     vehicle: Any = cmds._vehicle
@@ -69,8 +69,8 @@ def test_downloaded_commands_are_counted_without_home(
 
 def test_commands_work_like_a_list(three: Pair) -> None:
     _, cmds = three
-    assert [each.seq for each in cmds[0:2]] == [1, 2]
-    assert [each.seq for each in cmds[-2:]] == [2, 3]
+    assert [command.seq for command in cmds[0:2]] == [1, 2]
+    assert [command.seq for command in cmds[-2:]] == [2, 3]
     assert type(cmds[:]) is list
     assert cmds[-1].seq == 3
     assert cmds[2] in cmds
@@ -123,14 +123,14 @@ def test_failed_download_raises_reason_and_can_be_repeated(empty: Pair, caplog: 
     assert not cmds.wait_ready(timeout=LIMIT_S, raise_exception=False)
     with pytest.raises(APIException, match=r"download\(\) again, or clear\(\)"):
         cmds.add(waypoint())
-    assert [each.name for each in caplog.records if each.levelno >= logging.WARNING] == ["dronekit"]
+    assert [record.name for record in caplog.records if record.levelno >= logging.WARNING] == ["dronekit"]
     cmds.clear()
     assert cmds.wait_ready(timeout=0)
     cmds.add(waypoint())
     controller.answers["MISSION_REQUEST_LIST"] = answer
     cmds.download()
     assert cmds.wait_ready(timeout=LIMIT_S)
-    assert [each.z for each in cmds] == [20.0]
+    assert [command.z for command in cmds] == [20.0]
 
 
 def test_changes_after_download_wait_for_it(
@@ -139,7 +139,7 @@ def test_changes_after_download_wait_for_it(
     _, cmds = empty
     cmds.download()
     cmds.add(waypoint())
-    assert [each.z for each in cmds] == [20.0, 30]
+    assert [command.z for command in cmds] == [20.0, 30]
     cmds.download()
     cmds.clear()
     assert cmds.wait_ready(timeout=LIMIT_S)
@@ -160,7 +160,7 @@ def test_running_download_is_restarted(empty: Pair) -> None:
 
 def test_blocking_calls_work_in_listener(empty: Pair) -> None:
     controller, cmds = empty
-    seen: list[Any] = []
+    observed: list[Any] = []
     ended = threading.Event()
 
     def listener(vehicle: Any, _: str, commands: CommandSequence) -> None:
@@ -168,13 +168,13 @@ def test_blocking_calls_work_in_listener(empty: Pair) -> None:
         commands.add(waypoint())
         commands.upload(timeout=LIMIT_S)
         commands.download()
-        seen.extend([commands is cmds, commands.wait_ready(timeout=LIMIT_S), len(commands)])
+        observed.extend([commands is cmds, commands.wait_ready(timeout=LIMIT_S), len(commands)])
         ended.set()
 
     cmds._vehicle.add_attribute_listener("commands", listener)
     cmds.download()
     assert ended.wait(LIMIT_S)
-    assert seen == [True, True, 2]
+    assert observed == [True, True, 2]
     assert kept(controller)[1:] == [(16, -35.5, 20.0), (16, -35.5, 30.0)]
 
 
@@ -190,7 +190,7 @@ def test_upload_without_download_sends_added_commands(
         cmds.add(cmd)
     cmds.upload()
     assert kept(controller)[1:] == [(22, -35.5, 30.0), (16, -35.6, 30.0), (16, -35.7, 30.0)]
-    assert [each.command for each in cmds] == [22, 16, 16]
+    assert [command.command for command in cmds] == [22, 16, 16]
     assert {frame.name for frame in controller.received("MISSION_ITEM", "MISSION_ITEM_INT")} == {"MISSION_ITEM_INT"}
 
 
@@ -211,7 +211,7 @@ def test_add_accepts_pymavlink_messages(empty: Pair) -> None:
     content = (0, 0, 0, 3, 16, 0, 1, 0, 0, 0, 0)
     cmds.add(mavlink_1.MAVLink_mission_item_message(*content, -35.5, 149.25, 30))
     cmds.add(mavlink.MAVLink_mission_item_int_message(*content, -355000000, 1492500000, 30))
-    assert [(type(each), each.x, each.y) for each in cmds] == [(Command, -35.5, 149.25)] * 2
+    assert [(type(command), command.x, command.y) for command in cmds] == [(Command, -35.5, 149.25)] * 2
 
 
 def test_edited_and_assigned_commands_are_uploaded(
@@ -223,12 +223,12 @@ def test_edited_and_assigned_commands_are_uploaded(
     assert transfers(controller, before) == []
     cmds[0].z = 77
     cmds.upload()
-    assert [each.z for each in controller.missions.items[1:]] == [77, 21, 22]
+    assert [item.z for item in controller.missions.items[1:]] == [77, 21, 22]
     cmds[1] = replaced = waypoint()
     cmds[3] = waypoint(-35.9)  # appended, as DroneKit does
     cmds.upload()
     assert (cmds[1] is replaced, replaced.seq, cmds[3].seq) == (True, 2, 4)
-    assert [each.z for each in controller.missions.items[1:]] == [77, 30, 22, 30]
+    assert [item.z for item in controller.missions.items[1:]] == [77, 30, 22, 30]
     with pytest.raises(IndexError, match=r"^Index 9 out of range.$"):
         cmds[9] = waypoint()
     with pytest.raises(TypeError):
@@ -292,7 +292,7 @@ def test_add_from_several_threads_keeps_all_commands(empty: Pair) -> None:
         thread.start()
     for thread in threads:
         thread.join()
-    assert [each.seq for each in cmds] == list(range(1, 201))
+    assert [command.seq for command in cmds] == list(range(1, 201))
 
 
 def test_commands_of_closed_vehicle_raise() -> None:

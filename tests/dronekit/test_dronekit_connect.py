@@ -23,8 +23,8 @@ MAX_LINES = 10
 
 @pytest.fixture
 def fc() -> Iterator[FlightController]:
-    with FlightController() as each:
-        yield each
+    with FlightController() as controller:
+        yield controller
 
 
 def test_simple_program_imports_neither_pymavlink_nor_sync(
@@ -37,7 +37,7 @@ vehicle = connect({fc.address!r}, wait_ready=['mode'])
 vehicle.mode = VehicleMode('GUIDED')
 vehicle.armed = True
 vehicle.close()
-print([each for each in ('pymavlink', 'aerokit.sync.twins', 'argparse') if each in sys.modules])
+print([module for module in ('pymavlink', 'aerokit.sync.twins', 'argparse') if module in sys.modules])
 """
     ran = subprocess.run(
         [sys.executable, "-c", program],
@@ -106,7 +106,7 @@ def test_unknown_autopilot_has_ardupilot_modes() -> None:
 
 
 def test_accept_input_discards_received_bytes(fc: FlightController) -> None:
-    """Programs play a link that has gone by it."""
+    """Programs set it to simulate a lost link."""
     with dronekit.connect(fc.address, rate=None) as vehicle:
         handler = vehicle._handler
         assert handler._accept_input

@@ -30,8 +30,8 @@ CLOSED = "the program dropped it without close()"
 
 @pytest.fixture(scope="module")
 def address() -> Iterator[str]:
-    with served_copter() as each:
-        yield each
+    with served_copter() as served:
+        yield served
 
 
 @pytest.fixture(autouse=True)
@@ -39,12 +39,12 @@ def nothing_else_is_open() -> Iterator[None]:
     """Close connections that a failed test left open."""
     with mavlink.created_connections() as connections:
         yield
-        for each in tuple(connections):
-            each.close()
+        for connection in tuple(connections):
+            connection.close()
 
 
 def own_threads() -> list[str]:
-    return [each.name for each in threading.enumerate() if each.name.startswith(("aerokit", "dronekit"))]
+    return [thread.name for thread in threading.enumerate() if thread.name.startswith(("aerokit", "dronekit"))]
 
 
 def eventually(is_true: Callable[[], object]) -> None:
@@ -55,7 +55,7 @@ def eventually(is_true: Callable[[], object]) -> None:
 
 
 def is_gone(vehicle: weakref.ref[Any]) -> bool:
-    """At this moment the loop may be in one of its methods."""
+    """The loop may be executing one of its methods at this moment."""
     gc.collect()
     return vehicle() is None
 
@@ -85,7 +85,9 @@ def test_dropped_vehicle_is_closed_and_frees_its_link(
         dronekit.connect(address, wait_ready=["attitude"]) as vehicle,
     ):
         assert vehicle.attitude.pitch is not None
-    notified = [(each.name, each.levelname, each.getMessage()) for each in caplog.records if CLOSED in each.message]
+    notified = [
+        (record.name, record.levelname, record.getMessage()) for record in caplog.records if CLOSED in record.message
+    ]
     assert notified == [("dronekit", "WARNING", f"the connection to {address} was closed: {CLOSED}")]
 
 

@@ -69,7 +69,7 @@ EXPECTED: dict[str, tuple[float, list[str], list[str]]] = {
 """Example: speed-up, additional arguments, expected output."""
 
 PARAMETERS = {"gimbal": {"MNT1_TYPE": 1.0}}
-"""Of the vehicle, where they are not the usual ones."""
+"""Parameters of the vehicle that differ from the defaults."""
 
 
 @pytest.fixture(autouse=True)

@@ -23,8 +23,8 @@ PLACE = (-35.1234567, 149.7654321, 10)
 
 @pytest.fixture
 def stage() -> Iterator[Stage]:
-    with on_stage(dronekit, connect={"rate": None}) as each:
-        yield each
+    with on_stage(dronekit, connect={"rate": None}) as opened:
+        yield opened
 
 
 def angles(stage: Stage) -> tuple[float | None, float | None, float | None]:
@@ -33,7 +33,7 @@ def angles(stage: Stage) -> tuple[float | None, float | None, float | None]:
 
 
 def quaternion(pitch: float, roll: float, yaw: float) -> list[float]:
-    p, r, y = (math.radians(each) / 2 for each in (pitch, roll, yaw))
+    p, r, y = (math.radians(angle) / 2 for angle in (pitch, roll, yaw))
     return [
         math.cos(r) * math.cos(p) * math.cos(y) + math.sin(r) * math.sin(p) * math.sin(y),
         math.sin(r) * math.cos(p) * math.cos(y) - math.cos(r) * math.sin(p) * math.sin(y),
@@ -42,7 +42,7 @@ def quaternion(pitch: float, roll: float, yaw: float) -> list[float]:
     ]
 
 
-def tell_device(
+def send_device_attitude(
     stage: Stage, pitch: float, roll: float, yaw: float, flags: int = IN_VEHICLE_FRAME, **fields: Any
 ) -> None:
     fields.setdefault("delta_yaw", NAN)
@@ -51,7 +51,7 @@ def tell_device(
 
 def params(frame: Received) -> tuple[int, tuple[float | None, ...]]:
     """Number and parameters without the zeros at their end; None for NaN."""
-    values = [None if math.isnan(each) else round(each, 4) for each in frame.params]
+    values = [None if math.isnan(param) else round(param, 4) for param in frame.params]
     while values and values[-1] == 0:
         values.pop()
     return frame.command, tuple(values)
@@ -68,7 +68,7 @@ def commands(stage: Stage, order: Any) -> list[tuple[int, tuple[float | None, ..
     return [params(frame) for frame in frames]
 
 
-# ----------------------------------------------------------------------------- where it points
+# --------------------------------------------------------------------------------- orientation
 
 
 def test_gimbal_angles_without_gimbal_are_none(stage: Stage) -> None:
@@ -103,29 +103,29 @@ def test_mount_orientation_yaw_is_from_north(stage: Stage) -> None:
 
 def test_gimbal_device_yaw_is_from_north(stage: Stage) -> None:
     events = stage.listen("mount", "gimbal")
-    tell_device(stage, -45, 1, 10)
+    send_device_attitude(stage, -45, 1, 10)
     assert angles(stage) == (-45, 1, 10)  # the vehicle's heading is not known yet
     assert [name for _, name, _ in events] == ["mount", "gimbal"]
     stage.report("ATTITUDE", yaw=math.radians(-90))
-    tell_device(stage, -45, 1, 10)
+    send_device_attitude(stage, -45, 1, 10)
     assert angles(stage) == (-45, 1, 280)
-    tell_device(stage, -45, 1, 10, delta_yaw=math.radians(100))
+    send_device_attitude(stage, -45, 1, 10, delta_yaw=math.radians(100))
     assert angles(stage) == (-45, 1, 110)
-    tell_device(stage, -45, 1, 10, delta_yaw=0.0)  # as PX4 does, whatever it is
+    send_device_attitude(stage, -45, 1, 10, delta_yaw=0.0)  # as PX4 does for every gimbal
     assert angles(stage) == (-45, 1, 280)
-    tell_device(stage, -45, 1, 10, IN_EARTH_FRAME | YAW_LOCK)
+    send_device_attitude(stage, -45, 1, 10, IN_EARTH_FRAME | YAW_LOCK)
     assert angles(stage) == (-45, 1, 10)
-    tell_device(stage, -45, 1, -10, YAW_LOCK)
+    send_device_attitude(stage, -45, 1, -10, YAW_LOCK)
     assert angles(stage) == (-45, 1, 350)
-    tell_device(stage, -45, 1, -10, 0, delta_yaw=1.0)
+    send_device_attitude(stage, -45, 1, -10, 0, delta_yaw=1.0)
     assert angles(stage) == (-45, 1, 260)
 
 
 @pytest.mark.parametrize("yaw", [0, 30, -170])
 def test_rotate_straight_down(stage: Stage, yaw: float) -> None:
-    tell_device(stage, -90, 0, yaw, IN_EARTH_FRAME)
+    send_device_attitude(stage, -90, 0, yaw, IN_EARTH_FRAME)
     assert angles(stage) == (-90, 0, yaw % 360)
-    tell_device(stage, 90, 0, yaw, IN_EARTH_FRAME)
+    send_device_attitude(stage, 90, 0, yaw, IN_EARTH_FRAME)
     assert angles(stage) == (90, 0, yaw % 360)
 
 
@@ -137,12 +137,12 @@ def test_gimbal_with_unknown_angles_is_none(stage: Stage) -> None:
 
 
 def test_gimbal_is_the_first_of_several(stage: Stage) -> None:
-    tell_device(stage, -20, 0, 0, IN_EARTH_FRAME, gimbal_device_id=2)
-    tell_device(stage, -10, 0, 0, IN_EARTH_FRAME, gimbal_device_id=1)
-    tell_device(stage, -20, 0, 0, IN_EARTH_FRAME, gimbal_device_id=2)
-    tell_device(stage, -30, 0, 0, IN_EARTH_FRAME, source=(1, 154))
+    send_device_attitude(stage, -20, 0, 0, IN_EARTH_FRAME, gimbal_device_id=2)
+    send_device_attitude(stage, -10, 0, 0, IN_EARTH_FRAME, gimbal_device_id=1)
+    send_device_attitude(stage, -20, 0, 0, IN_EARTH_FRAME, gimbal_device_id=2)
+    send_device_attitude(stage, -30, 0, 0, IN_EARTH_FRAME, source=(1, 154))
     stage.report("MOUNT_ORIENTATION", pitch=-40, yaw_absolute=90)
-    tell_device(stage, -50, 0, 0, IN_EARTH_FRAME, source=(2, 1))
+    send_device_attitude(stage, -50, 0, 0, IN_EARTH_FRAME, source=(2, 1))
     assert angles(stage) == (-10, 0, 0)
 
 
@@ -209,16 +209,16 @@ def test_rotate_falls_back_to_mount_messages(stage: Stage) -> None:
     first, control, last = stage.fc.received("MOUNT_CONFIGURE", "MOUNT_CONTROL", since=since)
     assert (first.mount_mode, last.mount_mode) == (2, 3)
     assert (control.input_a, control.input_b, control.input_c) == (-4550, 0, 9000)
-    assert {each.target for each in (first, control, last)} == {(1, 1)}
+    assert {message.target for message in (first, control, last)} == {(1, 1)}
     assert not [line for line in lines if line.startswith("WARNING")]
 
 
 @pytest.mark.parametrize("wrong", [NAN, math.inf, None, "down"])
 def test_gimbal_angles_must_be_numbers(stage: Stage, wrong: Any) -> None:
     gimbal = stage.vehicle.gimbal
-    for each in ((wrong, 0, 0), (0, wrong, 0), (0, 0, wrong)):
+    for angles in ((wrong, 0, 0), (0, wrong, 0), (0, 0, wrong)):
         with pytest.raises(ValueError, match="a finite number of degrees"):
-            gimbal.rotate(*each)
+            gimbal.rotate(*angles)
     assert commands(stage, lambda: None) == []
 
 

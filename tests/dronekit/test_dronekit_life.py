@@ -28,19 +28,19 @@ SOURCES = Path(__file__).parent.parent.parent / "src"
 
 @pytest.fixture(scope="module")
 def address() -> Iterator[str]:
-    with served_copter() as each:
-        yield each
+    with served_copter() as served:
+        yield served
 
 
 @pytest.fixture
 def vehicle(address: str) -> Iterator[dronekit.Vehicle]:
-    each = dronekit.connect(address, wait_ready=["mode", "armed"])
-    yield each
-    each.close()
+    connected = dronekit.connect(address, wait_ready=["mode", "armed"])
+    yield connected
+    connected.close()
 
 
 def own_threads() -> list[str]:
-    return sorted(each.name for each in threading.enumerate() if each.name.startswith(("aerokit", "dronekit")))
+    return sorted(thread.name for thread in threading.enumerate() if thread.name.startswith(("aerokit", "dronekit")))
 
 
 def open_sockets() -> int:
@@ -125,29 +125,29 @@ def test_close_ends_waiting_calls_of_other_threads(vehicle: dronekit.Vehicle) ->
         lambda: vehicle.wait_for_alt(1000),
     ]
     threads = [threading.Thread(target=wait, args=(call,)) for call in calls]
-    for each in threads:
-        each.start()
+    for thread in threads:
+        thread.start()
     vehicle.close()
-    for each in threads:
-        each.join(LIMIT_S)
+    for running in threads:
+        running.join(LIMIT_S)
     assert len(errors) == len(calls)
 
 
 def test_callback_may_block_during_reception(vehicle: dronekit.Vehicle) -> None:
-    seen: list[str] = []
+    observed: list[str] = []
     done = threading.Event()
 
     def change_mode(self: dronekit.Vehicle, name: str, value: Any) -> None:
         self.remove_attribute_listener(name, change_mode)
         self.wait_for_mode("ALT_HOLD", timeout=LIMIT_S)
         self.parameters["RTL_ALT"] = 2000
-        seen.append(self.mode.name)
+        observed.append(self.mode.name)
         self.wait_for_mode("STABILIZE", timeout=LIMIT_S)
         done.set()
 
     vehicle.add_attribute_listener("attitude", change_mode)
     assert done.wait(LIMIT_S)
-    assert seen == ["ALT_HOLD"]
+    assert observed == ["ALT_HOLD"]
 
 
 def test_attributes_are_read_without_loop(vehicle: dronekit.Vehicle) -> None:
@@ -349,14 +349,14 @@ def test_connect_waits_for_first_values(address: str, monkeypatch: pytest.Monkey
 
 
 def test_connect_does_not_wait_for_missing_values(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(vehicle_module, "FIRST_VALUES", ("attitude", "heading", "what it never tells"))
+    monkeypatch.setattr(vehicle_module, "FIRST_VALUES", ("attitude", "heading", "a value never reported"))
     monkeypatch.setattr(vehicle_module, "FIRST_VALUES_TIMEOUT_S", 1e6)
     monkeypatch.setattr(vehicle_module, "NEXT_VALUE_TIMEOUT_S", 0.05)
     dronekit.connect(address).close()
 
 
 def test_connect_counts_earlier_values(vehicle: dronekit.Vehicle, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(vehicle_module, "FIRST_VALUES", ("mode", "what it never tells"))
+    monkeypatch.setattr(vehicle_module, "FIRST_VALUES", ("mode", "a value never reported"))
     monkeypatch.setattr(vehicle_module, "FIRST_VALUES_TIMEOUT_S", 1e6)
     monkeypatch.setattr(vehicle_module, "NEXT_VALUE_TIMEOUT_S", 0.05)
     vehicle._dk_wait_for_first_values()

@@ -20,14 +20,14 @@ LIMIT_S = 100.0
 
 @pytest.fixture
 def thread() -> Iterator[ListenerThread]:
-    each = ListenerThread("test listeners")
-    yield each
-    each.stop()
-    each.join()
+    listener_thread = ListenerThread("test listeners")
+    yield listener_thread
+    listener_thread.stop()
+    listener_thread.join()
 
 
-def emptied(thread: ListenerThread) -> None:
-    """Everything posted so far has been called."""
+def wait_until_empty(thread: ListenerThread) -> None:
+    """Wait until all calls posted so far have run."""
     done = threading.Event()
     thread.post(done.set)
     assert done.wait(LIMIT_S)
@@ -36,22 +36,22 @@ def emptied(thread: ListenerThread) -> None:
 def notified(observed: HasObservers, thread: ListenerThread, *values: Any, name: str = "x", **more: Any) -> None:
     for value in values:
         observed._dk_listeners.notify(name, value, **more)
-    emptied(thread)
+    wait_until_empty(thread)
 
 
 def test_listener_thread_starts_with_first_call_and_keeps_order() -> None:
     thread = ListenerThread("late")
-    assert all(each.name != "late" for each in threading.enumerate())
-    seen: list[int] = []
+    assert all(thread.name != "late" for thread in threading.enumerate())
+    observed: list[int] = []
     for number in range(100):
-        thread.post(seen.append, number)
-    emptied(thread)
-    assert seen == list(range(100))
+        thread.post(observed.append, number)
+    wait_until_empty(thread)
+    assert observed == list(range(100))
     thread.stop()
     thread.join()
-    assert all(each.name != "late" for each in threading.enumerate())
-    thread.post(seen.append, -1)
-    assert -1 not in seen
+    assert all(thread.name != "late" for thread in threading.enumerate())
+    thread.post(observed.append, -1)
+    assert -1 not in observed
 
 
 def test_listener_thread_logs_exception_and_continues(thread: ListenerThread, caplog: pytest.LogCaptureFixture) -> None:
@@ -59,7 +59,7 @@ def test_listener_thread_logs_exception_and_continues(thread: ListenerThread, ca
         raise SystemExit(3)
 
     thread.post(fail)
-    emptied(thread)
+    wait_until_empty(thread)
     assert "Exception in a callback" in caplog.text
 
 
@@ -76,50 +76,50 @@ def test_listener_thread_stop_in_call_does_not_deadlock(thread: ListenerThread) 
 
 
 def test_listener_thread_call_waits_or_is_direct(thread: ListenerThread) -> None:
-    seen: list[object] = []
-    thread.call(lambda: thread.call(lambda: seen.append(threading.current_thread().name)))
-    assert seen == ["test listeners"]
+    observed: list[object] = []
+    thread.call(lambda: thread.call(lambda: observed.append(threading.current_thread().name)))
+    assert observed == ["test listeners"]
     thread.stop()
-    thread.call(lambda: seen.append("after"))
-    assert seen[-1] == "after"
+    thread.call(lambda: observed.append("after"))
+    assert observed[-1] == "after"
 
 
 def test_queue_behind_blocked_listener_is_bounded(
     thread: ListenerThread, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(listener_thread, "MAX_QUEUED_CALLS", 5)
-    may_go_on, seen = threading.Event(), list[object]()
+    may_go_on, observed = threading.Event(), list[object]()
     is_stuck = threading.Event()
 
-    def be_stuck() -> None:
+    def block_thread() -> None:
         is_stuck.set()
         may_go_on.wait(LIMIT_S)
 
-    thread.post(be_stuck)
+    thread.post(block_thread)
     assert is_stuck.wait(LIMIT_S)
     for number in range(20):
-        thread.offer(seen.append, number)
-    thread.post(seen.append, "state")
+        thread.offer(observed.append, number)
+    thread.post(observed.append, "state")
     may_go_on.set()
-    emptied(thread)
-    assert seen[-1] == "state"
-    assert seen[:-1] == list(range(len(seen) - 1))
-    assert len(seen) == 6
-    assert thread.dropped == 20 - (len(seen) - 1)
+    wait_until_empty(thread)
+    assert observed[-1] == "state"
+    assert observed[:-1] == list(range(len(observed) - 1))
+    assert len(observed) == 6
+    assert thread.dropped == 20 - (len(observed) - 1)
     assert caplog.text.count("blocks the callback thread") == 1
 
 
 def test_listeners_of_name_run_before_wildcard(thread: ListenerThread) -> None:
-    observed, seen = HasObservers(thread), list[Any]()
+    observed, results = HasObservers(thread), list[Any]()
 
     def every(*call: Any) -> None:
-        seen.append(("*", *call))
+        results.append(("*", *call))
 
     def first(*call: Any) -> None:
-        seen.append(("first", *call))
+        results.append(("first", *call))
 
     def second(*call: Any) -> None:
-        seen.append(("second", *call))
+        results.append(("second", *call))
 
     observed.add_attribute_listener("*", every)
     observed.add_attribute_listener("x", first)
@@ -127,7 +127,7 @@ def test_listeners_of_name_run_before_wildcard(thread: ListenerThread) -> None:
     observed.add_attribute_listener("x", first)
     notified(observed, thread, 7)
     notified(observed, thread, 8, name="y")
-    assert seen == [
+    assert results == [
         ("first", observed, "x", 7),
         ("second", observed, "x", 7),
         ("*", observed, "x", 7),
@@ -136,45 +136,45 @@ def test_listeners_of_name_run_before_wildcard(thread: ListenerThread) -> None:
 
 
 def test_listener_that_removes_itself_does_not_affect_next(thread: ListenerThread) -> None:
-    observed, seen = HasObservers(thread), list[Any]()
+    observed, results = HasObservers(thread), list[Any]()
 
     def once(_: Any, name: str, value: Any) -> None:
-        seen.append(("once", value))
+        results.append(("once", value))
         observed.remove_attribute_listener(name, once)
 
     observed.add_attribute_listener("x", once)
-    observed.add_attribute_listener("x", lambda _, name, value: seen.append(("always", value)))
+    observed.add_attribute_listener("x", lambda _, name, value: results.append(("always", value)))
     notified(observed, thread, 1, 2)
-    assert seen == [("once", 1), ("always", 1), ("always", 2)]
+    assert results == [("once", 1), ("always", 1), ("always", 2)]
 
 
 @pytest.mark.parametrize("error", [ValueError("no"), SystemExit(1), KeyboardInterrupt()])
 def test_raising_listener_is_logged_and_others_run(
     thread: ListenerThread, caplog: pytest.LogCaptureFixture, error: BaseException
 ) -> None:
-    observed, seen = HasObservers(thread), list[Any]()
+    observed, results = HasObservers(thread), list[Any]()
 
     def fail(*_: Any) -> None:
         raise error
 
     observed.add_attribute_listener("heading", fail)
-    observed.add_attribute_listener("heading", lambda _, name, value: seen.append(value))
+    observed.add_attribute_listener("heading", lambda _, name, value: results.append(value))
     notified(observed, thread, 1, 2, name="heading")
-    assert seen == [1, 2]
-    records = [each for each in caplog.records if each.levelno == logging.ERROR]
-    assert [(each.name, each.message) for each in records] == [
+    assert results == [1, 2]
+    records = [record for record in caplog.records if record.levelno == logging.ERROR]
+    assert [(record.name, record.message) for record in records] == [
         ("dronekit", "Exception in attribute handler for heading")
     ] * 2
     assert records[0].exc_info is not None
 
 
 def test_cached_attributes_notify_on_change(thread: ListenerThread) -> None:
-    observed, seen = HasObservers(thread), list[Any]()
-    observed.add_attribute_listener("x", lambda _, name, value: seen.append(value))
+    observed, results = HasObservers(thread), list[Any]()
+    observed.add_attribute_listener("x", lambda _, name, value: results.append(value))
     notified(observed, thread, False, False, True, True, False, cache=True)
-    assert seen == [False, True, False]
+    assert results == [False, True, False]
     notified(observed, thread, False, False)
-    assert seen == [False, True, False, False, False]
+    assert results == [False, True, False, False, False]
 
 
 def test_listeners_can_be_removed(thread: ListenerThread) -> None:
@@ -195,62 +195,62 @@ def test_listeners_can_be_removed(thread: ListenerThread) -> None:
 
 
 def test_listener_decorators_accept_name_or_list(thread: ListenerThread) -> None:
-    observed, seen = HasObservers(thread), list[Any]()
+    observed, results = HasObservers(thread), list[Any]()
 
     @observed.on_attribute(["x", "y"])
     def listener(_: Any, name: str, value: Any) -> None:
-        seen.append((name, value))
+        results.append((name, value))
 
     assert callable(listener)
     notified(observed, thread, 1)
     notified(observed, thread, 2, name="y")
-    assert seen == [("x", 1), ("y", 2)]
+    assert results == [("x", 1), ("y", 2)]
 
 
 def test_notify_waits_for_listeners_and_works_inside_one(thread: ListenerThread) -> None:
-    observed, seen = HasObservers(thread), list[Any]()
+    observed, results = HasObservers(thread), list[Any]()
 
     def outer(_: Any, name: str, value: Any) -> None:
         observed.notify_attribute_listeners("inner", value + 1)
-        seen.append((name, value, threading.current_thread().name))
+        results.append((name, value, threading.current_thread().name))
 
     observed.add_attribute_listener("outer", outer)
-    observed.add_attribute_listener("inner", lambda _, name, value: seen.append((name, value)))
+    observed.add_attribute_listener("inner", lambda _, name, value: results.append((name, value)))
     observed.notify_attribute_listeners("outer", 1)
-    assert seen == [("inner", 2), ("outer", 1, "test listeners")]
+    assert results == [("inner", 2), ("outer", 1, "test listeners")]
     observed.notify_attribute_listeners("inner", 5, cache=True)
     observed.notify_attribute_listeners("inner", 5, True)
-    assert seen[2:] == [("inner", 5)]
+    assert results[2:] == [("inner", 5)]
 
 
 def test_listeners_without_thread_run_on_notifying_thread() -> None:
-    observed, seen = HasObservers(), list[Any]()
-    observed.add_attribute_listener("x", lambda *_: seen.append(threading.current_thread()))
+    observed, results = HasObservers(), list[Any]()
+    observed.add_attribute_listener("x", lambda *_: results.append(threading.current_thread()))
     observed.notify_attribute_listeners("x", 1)
     observed._dk_listeners.notify("x", 1)
-    assert seen == [threading.current_thread()] * 2
+    assert results == [threading.current_thread()] * 2
 
 
 def test_notify_without_listeners_starts_no_thread() -> None:
     thread = ListenerThread("unused")
     HasObservers(thread)._dk_listeners.notify("x", 1)
-    assert all(each.name != "unused" for each in threading.enumerate())
+    assert all(thread.name != "unused" for thread in threading.enumerate())
 
 
 def test_blocked_listener_does_not_block_notify(thread: ListenerThread) -> None:
-    observed, may_go_on, seen = HasObservers(thread), threading.Event(), list[Any]()
+    observed, may_go_on, results = HasObservers(thread), threading.Event(), list[Any]()
 
     def block(_: Any, name: str, value: Any) -> None:
         may_go_on.wait(LIMIT_S)
-        seen.append(value)
+        results.append(value)
 
     observed.add_attribute_listener("x", block)
     for number in range(10):
         observed._dk_listeners.notify("x", number)
-    assert not seen
+    assert not results
     may_go_on.set()
-    emptied(thread)
-    assert seen == list(range(10))
+    wait_until_empty(thread)
+    assert results == list(range(10))
 
 
 def test_notify_does_not_deadlock() -> None:
@@ -263,7 +263,7 @@ def test_notify_does_not_deadlock() -> None:
 
     one, two = threads
     callers = [
-        threading.Thread(target=each.call, args=(meet_and_call, other)) for each, other in ((one, two), (two, one))
+        threading.Thread(target=first.call, args=(meet_and_call, second)) for first, second in ((one, two), (two, one))
     ]
     for caller in callers:
         caller.start()
@@ -276,10 +276,10 @@ def test_notify_does_not_deadlock() -> None:
 
     one.post(time.sleep, 0.05)
     asyncio.run(notify())
-    for each in threads:
-        each.call(lambda: None)
-        each.stop()
-        each.join()
+    for thread in threads:
+        thread.call(lambda: None)
+        thread.stop()
+        thread.join()
     assert ended == ["called", "called", "from a coroutine"]
 
 
@@ -293,8 +293,8 @@ def test_listeners_added_from_many_threads_are_all_kept() -> None:
             observed.add_attribute_listener("x", lambda *_: None)
 
     adders = [threading.Thread(target=add) for _ in range(4)]
-    for each in adders:
-        each.start()
-    for each in adders:
-        each.join(LIMIT_S)
+    for adder in adders:
+        adder.start()
+    for started in adders:
+        started.join(LIMIT_S)
     assert len(observed._attribute_listeners["x"]) == 800

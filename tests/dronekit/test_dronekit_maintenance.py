@@ -18,8 +18,8 @@ FAILED, IN_PROGRESS = 4, 5
 
 @pytest.fixture
 def stage() -> Iterator[Stage]:
-    with on_stage(dronekit, connect={"rate": None}) as each:
-        yield each
+    with on_stage(dronekit, connect={"rate": None}) as opened:
+        yield opened
 
 
 def test_calibrations_send_commands(stage: Stage) -> None:

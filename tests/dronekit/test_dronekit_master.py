@@ -150,7 +150,7 @@ def test_probably_vehicle_heartbeat(factory: MessageFactory) -> None:
 
 
 class Vehicle:
-    """A vehicle's side of a UDP link, spoken by pymavlink."""
+    """The vehicle's side of a UDP link, implemented with pymavlink."""
 
     def __init__(self, address: str, vehicle_type: int, autopilot: int) -> None:
         host, port = address.rsplit(":", 2)[-2:]
@@ -183,9 +183,9 @@ class Vehicle:
 
 @pytest.fixture
 def connection() -> Iterator[MAVConnection]:
-    each = MAVConnection("udpin:127.0.0.1:0")
-    yield each
-    each.close()
+    connection = MAVConnection("udpin:127.0.0.1:0")
+    yield connection
+    connection.close()
 
 
 @pytest.fixture
@@ -193,7 +193,7 @@ def connected(
     connection: MAVConnection, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[tuple[Master, Vehicle]]:
     """A master with a known vehicle: an ArduPilot copter by default."""
-    monkeypatch.setattr(mavutil, "mavlink", v20)  # whatever dialect other programs of this process have set
+    monkeypatch.setattr(mavutil, "mavlink", v20)  # independent of the dialect that other tests of this process have set
     kind = getattr(request, "param", (2, 3))
     assert connection.master.target_component == 0
     assert connection.master.mode_mapping() is None
@@ -306,7 +306,7 @@ def test_master_set_mode_uses_vehicle(connected: Connected) -> None:
 
 def test_recv_match_returns_messages_in_order(connected: Connected) -> None:
     master, vehicle = connected
-    assert master.recv_match(type="ATTITUDE") is None, "nothing was kept before the first question"
+    assert master.recv_match(type="ATTITUDE") is None, "no messages are stored before the first access"
     for number in range(3):
         vehicle.mav.attitude_send(number, 0, 0, 0, 0, 0, 0)
         vehicle.mav.mission_current_send(number)
@@ -336,7 +336,7 @@ def test_master_messages_has_last_of_every_type(connected: Connected) -> None:
     master, vehicle = connected
     timer = threading.Timer(0.05, vehicle.mav.raw_imu_send, range(10))
     timer.start()
-    assert master.messages["RAW_IMU"].zmag == 9, "the first look-ups wait"
+    assert master.messages["RAW_IMU"].zmag == 9, "only the first accesses wait"
     timer.join()
     vehicle.mav.raw_imu_send(*range(10, 20))
     until(lambda: bool(master.messages["RAW_IMU"].zmag == 19))

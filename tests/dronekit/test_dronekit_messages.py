@@ -54,14 +54,14 @@ def raw_frame(message_id: int, payload: bytes, *, version: int = 2, sequence: in
 
 
 def decoded(raw: bytes) -> Any:
-    """As pymavlink does it."""
+    """Reference result from pymavlink."""
     message_id = raw[5] if raw[0] == 0xFE else int.from_bytes(raw[7:10], "little")
     module: Any = v20 if message_id in v20.mavlink_map else development
     return module.MAVLink(None).decode(bytearray(raw))
 
 
-def said(message: Any) -> dict[str, Any]:
-    """Everything that can be asked of a message, NaN comparable."""
+def contents_of(message: Any) -> dict[str, Any]:
+    """Return all public attributes of a message, with comparable NaN."""
     fields = message.get_fieldnames()
     return {
         "fields": repr([(name, getattr(message, name)) for name in fields]),
@@ -101,21 +101,21 @@ def test_message_of_every_message_matches_pymavlink(version: int) -> None:
             raw = raw_frame(message_id, payload, version=version)
             expected = decoded(raw)
             message = message_of(Frame.parse(raw))
-            assert said(message) == said(expected)
+            assert contents_of(message) == contents_of(expected)
             assert isinstance(message, type(expected))
 
 
 @given(st.sampled_from(IDS), st.binary(min_size=1, max_size=255), st.binary(min_size=13, max_size=13))
 def test_message_of_any_payload_matches_pymavlink(message_id: int, payload: bytes, signature: bytes) -> None:
     for raw in (raw_frame(message_id, payload), raw_frame(message_id, payload, signature=signature)):
-        assert said(message_of(Frame.parse(raw))) == said(decoded(raw))
+        assert contents_of(message_of(Frame.parse(raw))) == contents_of(decoded(raw))
 
 
 def test_message_of_frame_from_framer() -> None:
     raw = raw_frame(30, random.Random(3).randbytes(27))
     (frame,) = Framer().receive(raw)
     message = message_of(frame)
-    assert said(message) == said(decoded(raw))
+    assert contents_of(message) == contents_of(decoded(raw))
     assert message.get_type() == "ATTITUDE"
     assert type(message).__name__ == "MAVLink_attitude_message"
     assert message._timestamp > 1e9
@@ -135,10 +135,10 @@ def test_messages_can_be_copied_and_pickled() -> None:
     raw = raw_frame(253, b"\6landing")
     message = message_of(Frame.parse(raw))
     message.extra = "kept"
-    for each in (copy.copy(message), copy.deepcopy(message), pickle.loads(pickle.dumps(message))):
-        assert type(each) is v20.MAVLink_statustext_message
-        assert said(each) == said(message) == said(decoded(raw))
-        assert each.extra == "kept"
+    for copied in (copy.copy(message), copy.deepcopy(message), pickle.loads(pickle.dumps(message))):
+        assert type(copied) is v20.MAVLink_statustext_message
+        assert contents_of(copied) == contents_of(message) == contents_of(decoded(raw))
+        assert copied.extra == "kept"
     assert message == decoded(raw)
     assert decoded(raw) == message
 
@@ -194,7 +194,7 @@ def test_message_of_programs_dialect_only(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def packed(message: Any, module: Any = v20) -> bytes:
-    """As pymavlink does it."""
+    """Reference result from pymavlink."""
     data: bytes = message.pack(module.MAVLink(None, SYSTEM, COMPONENT))
     return data
 
@@ -217,7 +217,7 @@ def test_send_mavlink_every_message_matches_pymavlink() -> None:
             message = decoded(raw)
             expected = packed(message, module)
             assert encoded(message) == expected
-            assert encoded(message_of(Frame.parse(raw))) == expected, "what was received can be sent on"
+            assert encoded(message_of(Frame.parse(raw))) == expected, "received messages can be forwarded"
             assert isinstance(from_pymavlink(message), STANDARD[message_id])
 
 
@@ -302,7 +302,7 @@ def test_send_mavlink_accepts_objects_with_fields() -> None:
 
 
 class Number:
-    """As numpy's are: no subclass of float."""
+    """A number like numpy's: not a subclass of float."""
 
     def __float__(self) -> float:
         return 2.6
@@ -364,7 +364,7 @@ def tune(text: Any) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("message", "said"),
+    ("message", "pattern"),
     [
         (command(command=None), "COMMAND_LONG.command = None .*0..65535"),
         (command(command=math.nan), "COMMAND_LONG.command = nan .*0..65535"),
@@ -393,8 +393,8 @@ def tune(text: Any) -> Any:
         (None, "not a MAVLink message"),
     ],
 )
-def test_send_mavlink_rejects_invalid_values(message: Any, said: str) -> None:
-    with pytest.raises(InvalidArgument, match=said) as caught:
+def test_send_mavlink_rejects_invalid_values(message: Any, pattern: str) -> None:
+    with pytest.raises(InvalidArgument, match=pattern) as caught:
         from_pymavlink(message, 1)
     assert isinstance(caught.value, ValueError)
 

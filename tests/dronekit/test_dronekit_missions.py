@@ -68,11 +68,13 @@ def test_mission_positions_have_full_precision(
         cmds.add(waypoint(-35.12345675, frame, y=149.7654321, z=30))
     cmds.upload()
     sent = controller.received("MISSION_ITEM_INT")[-6:]
-    assert [(each.x, each.y, each.frame) for each in sent] == [(-351234568, 1497654321, frame) for frame in frames]
+    assert [(message.x, message.y, message.frame) for message in sent] == [
+        (-351234568, 1497654321, frame) for frame in frames
+    ]
     cmds.download()
     cmds.wait_ready()
-    assert {(each.x, each.y) for each in cmds} == {(-35.1234568, 149.7654321)}
-    assert [each.frame for each in cmds] == [0, 3, 10, 0, 3, 10]
+    assert {(command.x, command.y) for command in cmds} == {(-35.1234568, 149.7654321)}
+    assert [command.frame for command in cmds] == [0, 3, 10, 0, 3, 10]
 
 
 def test_mission_params_5_and_6_that_are_no_positions(empty: Pair) -> None:
@@ -111,7 +113,7 @@ def test_home_row_of_waypoint_file_is_not_flown(
         cmds.clear()
         for cmd in (row, waypoint(), waypoint(-35.7)):
             cmds.add(cmd)
-        assert ([each.x for each in cmds], [each.seq for each in cmds]) == ([-35.5, -35.7], [1, 2])
+        assert ([command.x for command in cmds], [command.seq for command in cmds]) == ([-35.5, -35.7], [1, 2])
     cmds.upload()
     assert kept(controller)[1:] == [(16, -35.5, 30.0), (16, -35.7, 30.0)]
 
@@ -192,7 +194,7 @@ def test_mission_px4_indices_match_ardupilot(px4: tuple[FlightController, Vehicl
     cmds = vehicle.commands
     cmds.download()
     cmds.wait_ready()
-    assert [(each.seq, each.z) for each in cmds] == [(1, 20.0), (2, 21.0)]
+    assert [(command.seq, command.z) for command in cmds] == [(1, 20.0), (2, 21.0)]
     assert (vehicle._wploader.count(), vehicle._wploader.wp(1).z) == (3, 20.0)
     cmds.next = 2
     assert controller.wait_for("MISSION_SET_CURRENT").seq == 1
@@ -233,7 +235,7 @@ def test_mission_px4_gets_explicit_positions(px4: tuple[FlightController, Vehicl
         cmd.autocontinue = 1
         vehicle.commands.add(cmd)
     vehicle.commands.upload()
-    assert [(each.command, each.frame, each.x, each.y) for each in controller.missions.items] == [
+    assert [(item.command, item.frame, item.x, item.y) for item in controller.missions.items] == [
         (TAKE_OFF, 3, 47.0, 8.5),
         (SPEED, 2, 0, 0),
         (16, 3, 47.1, 8.6),
@@ -267,16 +269,16 @@ def test_long_mission_round_trip() -> None:
             cmds.add(waypoint(round(-35.3 + number * 1e-7, 7), (0, 3, 10)[number % 3]))
         cmds.add(waypoint(command=SPEED, param1=1, param2=5, x=0, y=0, z=0))
         cmds.add(waypoint(command=JUMP, param1=2, param2=3, x=0, y=0, z=0))
-        written = [(each.command, each.x, each.param1, each.seq) for each in cmds]
+        written = [(command.command, command.x, command.param1, command.seq) for command in cmds]
         cmds.upload(timeout=LIMIT_S)
         cmds.download()
         assert cmds.wait_ready(timeout=LIMIT_S)
-        assert [(each.command, each.x, each.param1, each.seq) for each in cmds] == written
+        assert [(command.command, command.x, command.param1, command.seq) for command in cmds] == written
         cmds[50].z = 77
         cmds.upload(timeout=LIMIT_S)
         cmds.download()
         assert cmds.wait_ready(timeout=LIMIT_S)
-        assert [each.seq for each in cmds if each.z == 77] == [51]
+        assert [command.seq for command in cmds if command.z == 77] == [51]
         assert str(vehicle.home_location).startswith("LocationGlobal:lat=-35.36326")
 
 

@@ -35,7 +35,7 @@ def test_background_calls_send_in_call_order(loop: LoopThread) -> None:
         )
     orders.wait(LIMIT_S)
     loop.call(lambda: None)
-    replaced = {each for each in range(50) if each % 3 and f"order {each}" not in sent}
+    replaced = {number for number in range(50) if number % 3 and f"order {number}" not in sent}
     expected = [f"order {n}" if n % 3 else f"message {n}" for n in range(50) if n not in replaced]
     assert sent == expected
     assert not replaced or all(any(later % 7 == n % 7 for later in range(n + 1, 50)) for n in replaced)
@@ -70,7 +70,7 @@ def test_background_call_failure_is_logged_and_in_future(loop: LoopThread, caplo
     future = BackgroundCalls(loop).start("arm", fail)
     with pytest.raises(ValueError, match="said no"):
         future.result(LIMIT_S)
-    assert [(each.name, each.levelname, each.message) for each in caplog.records] == [
+    assert [(record.name, record.levelname, record.message) for record in caplog.records] == [
         ("dronekit", "WARNING", "arm: the vehicle said no")
     ]
 

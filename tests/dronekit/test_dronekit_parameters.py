@@ -40,8 +40,8 @@ def connected(fc: FlightController, **options: Any) -> Iterator[dronekit.Vehicle
 @pytest.fixture
 def vehicle(fc: FlightController) -> Iterator[dronekit.Vehicle]:
     fc.parameters.types = {"THR_MIN": INT16}
-    with connected(fc, wait_ready=["parameters"]) as each:
-        yield each
+    with connected(fc, wait_ready=["parameters"]) as connected_vehicle:
+        yield connected_vehicle
 
 
 def wait_for_listeners(vehicle: dronekit.Vehicle) -> None:
@@ -54,17 +54,17 @@ def wait_for_listeners(vehicle: dronekit.Vehicle) -> None:
 
 def notified(vehicle: dronekit.Vehicle, fc: FlightController, name: str, value: float, **more: Any) -> None:
     """Send a value from the flight controller and wait until it is stored."""
-    seen = threading.Event()
+    observed = threading.Event()
 
     def listener(*_: Any) -> None:
-        seen.set()
+        observed.set()
 
     vehicle.add_message_listener("DEBUG", listener)
     wait_for_listeners(vehicle)
     fc.parameters.values[name] = value
     fc.parameters.report(name, **more)
     fc.report("DEBUG", ind=1)
-    assert seen.wait(LIMIT_S)
+    assert observed.wait(LIMIT_S)
     vehicle.remove_message_listener("DEBUG", listener)
     wait_for_listeners(vehicle)
 
@@ -131,7 +131,7 @@ def test_integer_parameters_cut_off_fractions(vehicle: dronekit.Vehicle, fc: Fli
     assert parameters.set("THR_MIN", True)
     assert parameters["THR_MIN"] == 1.0
     parameters.update({"FOO": 7}, bar=8)
-    sent = [(each.param_id, each.param_value, each.param_type) for each in fc.received("PARAM_SET")]
+    sent = [(frame.param_id, frame.param_value, frame.param_type) for frame in fc.received("PARAM_SET")]
     assert sent[0] == ("THR_MIN", 99.0, INT16)
     assert ("THR_MIN", -2.0, INT16) in sent
     assert ("BAR", 8.0, 9) in sent
@@ -168,7 +168,7 @@ def test_rejected_parameter_returns_false_and_logs_error(
     fc.parameters.adjust = lambda _, wanted: min(wanted, 10.0)
     assert not vehicle.parameters.set(name, value)
     vehicle.parameters[name] = value
-    records = [each for each in caplog.records if each.levelno == logging.ERROR]
+    records = [record for record in caplog.records if record.levelno == logging.ERROR]
     assert len(records) == 2
     assert f"could not set parameter {name} to " in records[0].getMessage()
     assert reason in records[0].getMessage()
@@ -224,51 +224,51 @@ def test_parameter_set_in_listener(vehicle: dronekit.Vehicle, fc: FlightControll
 
 def test_parameter_listeners_are_called_once_per_parameter(fc: FlightController) -> None:
     with connected(fc, _initialize=False) as vehicle:
-        seen: list[tuple[object, str, object]] = []
-        vehicle.parameters.add_attribute_listener("*", lambda *event: seen.append(event))
-        vehicle.add_attribute_listener("parameters", lambda *event: seen.append(event))
+        observed: list[tuple[object, str, object]] = []
+        vehicle.parameters.add_attribute_listener("*", lambda *event: observed.append(event))
+        vehicle.add_attribute_listener("parameters", lambda *event: observed.append(event))
         vehicle.initialize(rate=None)
         vehicle.parameters.wait_ready()
         wait_for_listeners(vehicle)
         parameters = vehicle.parameters
-        assert seen[:-1] == [
+        assert observed[:-1] == [
             (parameters, "FOO", 1.0),
             (parameters, "BAR", 2.5),
             (parameters, "THR_MIN", 130.0),
         ]
-        assert seen[-1] == (vehicle, "parameters", parameters)
+        assert observed[-1] == (vehicle, "parameters", parameters)
         notified(vehicle, fc, "FOO", 1.0)
-        assert len(seen) == 4
+        assert len(observed) == 4
         notified(vehicle, fc, "FOO", 2.0)
-        assert seen[4:] == [(parameters, "FOO", 2.0)]
+        assert observed[4:] == [(parameters, "FOO", 2.0)]
 
 
 def test_parameter_listener_names_are_upper_cased(vehicle: dronekit.Vehicle, fc: FlightController) -> None:
-    seen: list[str] = []
+    observed: list[str] = []
     parameters = vehicle.parameters
 
     @parameters.on_attribute(["foo", "Bar"])
     def listener(_: object, name: str, value: float) -> None:
-        seen.append(name)
+        observed.append(name)
 
     notified(vehicle, fc, "FOO", 2.0)
     notified(vehicle, fc, "BAR", 2.0)
     parameters.remove_attribute_listener("bar", listener)
     notified(vehicle, fc, "BAR", 3.0)
-    assert seen == ["FOO", "BAR"]
+    assert observed == ["FOO", "BAR"]
     parameters.notify_attribute_listeners("foo", 17.0)
     parameters.notify_attribute_listeners("foo", 17.0)
-    assert seen == ["FOO", "BAR", "FOO", "FOO"]
+    assert observed == ["FOO", "BAR", "FOO", "FOO"]
     parameters.notify_attribute_listeners("foo", 18.0, cache=True)
     parameters.notify_attribute_listeners("foo", 18.0, True)
-    assert seen == ["FOO", "BAR", *["FOO"] * 3]
+    assert observed == ["FOO", "BAR", *["FOO"] * 3]
 
 
 def test_parameter_decorator_argument_name(vehicle: dronekit.Vehicle, fc: FlightController) -> None:
-    seen: list[str] = []
-    vehicle.parameters.on_attribute(attr_name="foo")(lambda _, name, value: seen.append(name))
+    observed: list[str] = []
+    vehicle.parameters.on_attribute(attr_name="foo")(lambda _, name, value: observed.append(name))
     notified(vehicle, fc, "FOO", 2.0)
-    assert seen == ["FOO"]
+    assert observed == ["FOO"]
 
 
 def test_old_parameter_names_work_on_new_firmware(fc: FlightController) -> None:
@@ -352,7 +352,7 @@ def test_failed_parameter_download_is_repeated_while_waiting(
     with connected(fc, wait_ready=["parameters"]) as vehicle:
         assert len(attempts) == 3
         assert dict(vehicle.parameters) == {"FOO": 1.0, "BAR": 2.5, "THR_MIN": 130.0}
-    lines = [each.getMessage() for each in caplog.records if each.levelno == logging.WARNING]
+    lines = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
     assert lines == ["the parameters could not be downloaded: 2 of 3 parameters are missing"]
 
 
@@ -431,13 +431,13 @@ def test_renamed_parameters_are_converted(copter: SimulatedCopter) -> None:
 
 def test_parameters_include_download_by_aio(copter: SimulatedCopter) -> None:
     with served([copter]) as address, dronekit.connect(address, wait_ready=["parameters"]) as vehicle:
-        seen: list[object] = []
-        vehicle.parameters.add_attribute_listener("RTL_ALT", lambda *event: seen.append(event))
+        observed: list[object] = []
+        vehicle.parameters.add_attribute_listener("RTL_ALT", lambda *event: observed.append(event))
         copter.parameters["RTL_ALT"] = 4321.0
         vehicle.run(vehicle.aio.parameters.download, refresh=True)
         wait_for_listeners(vehicle)
         assert vehicle.parameters["RTL_ALT"] == 4321.0
-        assert seen == [(vehicle.parameters, "RTL_ALT", 4321.0)]
+        assert observed == [(vehicle.parameters, "RTL_ALT", 4321.0)]
 
 
 def test_px4_integer_parameters() -> None:

@@ -17,8 +17,8 @@ UNKNOWN = ("_yawspeed", "_heading", "_voltage", "_vx", "_fix_type", "_rngfnd_dis
 
 @pytest.fixture
 def stage() -> Iterator[Stage]:
-    with on_stage(dronekit, connect={"rate": None}) as each:
-        yield each
+    with on_stage(dronekit, connect={"rate": None}) as opened:
+        yield opened
 
 
 def test_privates_state(stage: Stage) -> None:
@@ -50,7 +50,7 @@ def test_privates_state(stage: Stage) -> None:
 
 
 def test_privates_heartbeat(stage: Stage) -> None:
-    """``if vehicle._heartbeat_timeout: land()``: a flag, whatever the limit is."""
+    """``if vehicle._heartbeat_timeout: land()`` works: the attribute is a flag, not the limit."""
     vehicle = stage.vehicle
     assert vehicle._heartbeat_timeout is False
     assert vehicle._heartbeat_started is True

@@ -18,8 +18,8 @@ from for_each import for_each
 
 import aerokit.dronekit as dronekit
 
-for each in OTHER_NAMES:
-    importlib.import_module(f"aerokit.dronekit.{each}")
+for module in OTHER_NAMES:
+    importlib.import_module(f"aerokit.dronekit.{module}")
 
 
 def found(path: str) -> Any:
@@ -37,9 +37,9 @@ def notified() -> Iterator[Stage]:
 
 @pytest.fixture
 def stage() -> Iterator[Stage]:
-    with on_stage(dronekit, {"mode": 4}, READY, answer_streams) as each:
-        each.settle()
-        yield each
+    with on_stage(dronekit, {"mode": 4}, READY, answer_streams) as opened:
+        opened.settle()
+        yield opened
 
 
 # ---------------------------------------------------------------------------------------- names
@@ -96,16 +96,17 @@ def test_signature(path: str) -> None:
         found(path)(*[1] * len(wanted))
         return
     own = [
-        each
-        for name, each in inspect.signature(found(path)).parameters.items()
-        if name != "self" and each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)
+        parameter
+        for name, parameter in inspect.signature(found(path)).parameters.items()
+        if name != "self" and parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD)
     ]
-    by_position = [each for each in own if each.kind is not each.KEYWORD_ONLY]
-    assert [each.name for each in by_position[: len(wanted)]] == list(wanted)
-    assert all(each.default is not each.empty for each in own[len(wanted) :])
-    for each in by_position[: len(wanted)]:
-        default = ... if each.default is each.empty else getattr(each.default, "__name__", each.default)
-        assert default == wanted[each.name], each.name
+    by_position = [parameter for parameter in own if parameter.kind is not parameter.KEYWORD_ONLY]
+    assert [parameter.name for parameter in by_position[: len(wanted)]] == list(wanted)
+    assert all(parameter.default is not parameter.empty for parameter in own[len(wanted) :])
+    for parameter in by_position[: len(wanted)]:
+        is_required = parameter.default is parameter.empty
+        default = ... if is_required else getattr(parameter.default, "__name__", parameter.default)
+        assert default == wanted[parameter.name], parameter.name
 
 
 @pytest.mark.parametrize("name", ["add_attribute_listener", "remove_attribute_listener"])
@@ -188,7 +189,7 @@ def test_capabilities(notified: Stage) -> None:
     )
     for bit, name in enumerate(names):
         one = dronekit.Capabilities(1 << bit)
-        assert [each for each in names if getattr(one, each)] == [name]
+        assert [name for name in names if getattr(one, name)] == [name]
         assert getattr(one, name) is True
     assert notified.vehicle.capabilities.mission_int is True
     assert notified.vehicle.capabilities.ftp is False

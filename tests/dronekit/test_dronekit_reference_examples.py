@@ -18,9 +18,9 @@ import aerokit.dronekit as dronekit
 
 @pytest.fixture
 def stage() -> Iterator[Stage]:
-    with on_stage(dronekit, {"mode": 4}, READY, answer_streams) as each:
-        each.settle()
-        yield each
+    with on_stage(dronekit, {"mode": 4}, READY, answer_streams) as opened:
+        opened.settle()
+        yield opened
 
 
 def test_connect_bare_address() -> None:

@@ -57,8 +57,8 @@ def test_other_vehicles_do_not_change_attributes(copter: Stage) -> None:
     copter.beat(source=other)
     copter.report("GLOBAL_POSITION_INT", lat=471000000, lon=85000000, alt=30, relative_alt=40)
     copter.report("ATTITUDE", roll=0.5)
-    events, heard = copter.listen("*"), []
-    copter.vehicle.add_message_listener("VFR_HUD", lambda *_: heard.append(1))
+    events, received = copter.listen("*"), []
+    copter.vehicle.add_message_listener("VFR_HUD", lambda *_: received.append(1))
     copter.reached()
     for name, fields in (
         ("GLOBAL_POSITION_INT", {"lat": 7}),
@@ -75,7 +75,7 @@ def test_other_vehicles_do_not_change_attributes(copter: Stage) -> None:
         None,
     )
     assert not {name for _, name, _ in events} & {"attitude", "heading", "battery", "gps_0", "location"}
-    assert heard == []
+    assert received == []
 
 
 def test_parameters_of_other_systems_are_ignored(copter: Stage) -> None:
@@ -157,7 +157,7 @@ def test_lost_orders_are_repeated(copter: Stage) -> None:
 # -------------------------------------------------------------------------------- connecting
 
 
-def tell_streams(fc: FlightController) -> None:
+def send_streams(fc: FlightController) -> None:
     for name in ("ATTITUDE", "GLOBAL_POSITION_INT", "VFR_HUD", "GPS_RAW_INT", "SYS_STATUS"):
         fc.report(name)
 
@@ -197,7 +197,7 @@ def test_connect_vehicle_without_parameters_returns() -> None:
 @pytest.mark.parametrize("names", ["mode", ["mode", "armed"], ("attitude",)])
 def test_connect_wait_ready_accepts_names(names: Any) -> None:
     def prepare(fc: FlightController) -> None:
-        fc.answers["REQUEST_DATA_STREAM"] = lambda _: tell_streams(fc)
+        fc.answers["REQUEST_DATA_STREAM"] = lambda _: send_streams(fc)
 
     with on_stage(dronekit, {}, {"rate": 4, "wait_ready": names, "timeout": 10}, prepare) as stage:
         assert stage.vehicle.wait_ready(*([names] if isinstance(names, str) else names), timeout=1)
@@ -246,7 +246,7 @@ def test_subclass_with_own_attributes() -> None:
 
 def test_initialize_later() -> None:
     with FlightController(mode=5) as fc:
-        fc.answers["REQUEST_DATA_STREAM"] = lambda _: tell_streams(fc)
+        fc.answers["REQUEST_DATA_STREAM"] = lambda _: send_streams(fc)
         vehicle = dronekit.connect(fc.address, _initialize=False)
         assert (vehicle.armed, vehicle.is_armable, vehicle.system_status) == (False, False, None)
         vehicle.initialize(rate=7, heartbeat_timeout=100)
@@ -260,7 +260,7 @@ def test_initialize_later() -> None:
 
 def test_lost_link_reconnects() -> None:
     def prepare(fc: FlightController) -> None:
-        fc.answers["REQUEST_DATA_STREAM"] = lambda _: tell_streams(fc)
+        fc.answers["REQUEST_DATA_STREAM"] = lambda _: send_streams(fc)
 
     with on_stage(dronekit, {"link": "tcp", "mode": 4}, {"rate": 4}, prepare) as stage:
         streams = len(stage.fc.received("REQUEST_DATA_STREAM"))
@@ -317,20 +317,20 @@ def test_blocking_listener_does_not_stop_reception_or_heartbeat(copter: Stage) -
 
 
 def test_listeners_may_call_blocking_methods(copter: Stage) -> None:
-    seen: list[Any] = []
+    observed: list[Any] = []
 
     def use(vehicle: Any, name: str, value: Any) -> None:
-        seen.append(vehicle.parameters["FOO"])
-        seen.append(vehicle.parameters.set("FOO", 5))
+        observed.append(vehicle.parameters["FOO"])
+        observed.append(vehicle.parameters.set("FOO", 5))
         vehicle.wait_for_mode("LOITER", timeout=100)
-        seen.append(vehicle.mode.name)
-        seen.append(vehicle.wait_ready("mode", timeout=100))
+        observed.append(vehicle.mode.name)
+        observed.append(vehicle.wait_ready("mode", timeout=100))
         vehicle.arm(timeout=100)
-        seen.append(vehicle.armed)
+        observed.append(vehicle.armed)
 
     copter.vehicle.add_attribute_listener("heading", use)
     copter.report("VFR_HUD", heading=271)
-    assert seen == [1.0, True, "LOITER", True, True]
+    assert observed == [1.0, True, "LOITER", True, True]
 
 
 def test_listener_removing_itself_hides_nothing_from_next(copter: Stage) -> None:

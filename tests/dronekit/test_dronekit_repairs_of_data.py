@@ -25,11 +25,11 @@ def copter() -> Iterator[Stage]:
 
 def test_parameter_set_during_download_is_kept() -> None:
     def prepare(fc: FlightController) -> None:
-        def tell_two(_: Any) -> None:
+        def report_two(_: Any) -> None:
             fc.parameters.report("FOO")
             fc.parameters.report("BAR")
 
-        fc.answers["PARAM_REQUEST_LIST"] = tell_two
+        fc.answers["PARAM_REQUEST_LIST"] = report_two
         fc.answers["PARAM_REQUEST_READ"] = lambda _: None
 
     with on_stage(dronekit, prepare=prepare) as stage:
@@ -56,11 +56,11 @@ def test_unchanged_parameter_value_is_confirmed(copter: Stage) -> None:
     results: list[bool] = []
     told_before: list[bool] = []
 
-    def tell_later(frame: Any) -> None:
+    def report_later(frame: Any) -> None:
         told_before.append(bool(results))  # retries may arrive later
         answer(frame)
 
-    copter.fc.answers["PARAM_SET"] = tell_later
+    copter.fc.answers["PARAM_SET"] = report_later
     results.append(copter.vehicle.parameters.set("FOO", 1.0))
     assert (results, told_before[0]) == ([True], False)
     assert copter.fc.received("PARAM_SET")
@@ -119,7 +119,7 @@ def test_upload_answers_both_request_types_exactly(copter: Stage, asks_int: bool
 def test_lost_mission_items_are_requested_again(copter: Stage) -> None:
     copter.fc.missions.items = [HOME, FIRST, SECOND, THIRD]
     copter.fc.missions.lost = {1: 1, 3: 1}
-    assert [each.seq for each in downloaded(copter)] == [1, 2, 3]
+    assert [item.seq for item in downloaded(copter)] == [1, 2, 3]
 
 
 @pytest.mark.parametrize("autopilot", [3, 12], ids=["ArduPilot", "PX4"])

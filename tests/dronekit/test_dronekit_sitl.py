@@ -26,7 +26,7 @@ vehicle.close()
 sitl.stop()
 print(sitl.poll())
 """
-GIVEN = """\
+ADDRESSES_GIVEN = """\
 import sys
 from dronekit import connect
 vehicle = connect(sys.argv[1], wait_ready=False)
@@ -94,7 +94,7 @@ def test_sim_option_serves_vehicle(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     program = tmp_path / "program.py"
-    program.write_text(GIVEN)
+    program.write_text(ADDRESSES_GIVEN)
     instance = free_instance()
     port = 5760 + 10 * instance
     monkeypatch.setattr(

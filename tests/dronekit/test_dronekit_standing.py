@@ -24,15 +24,15 @@ LIMIT_S = 100.0
 
 @pytest.fixture
 def copter() -> Iterator[FlightController]:
-    with FlightController() as each:
-        yield each
+    with FlightController() as controller:
+        yield controller
 
 
 @pytest.fixture
 def vehicle(copter: FlightController) -> Iterator[dronekit.Vehicle]:
-    each = dronekit.connect(copter.address, rate=None)
-    yield each
-    each.close()
+    connected = dronekit.connect(copter.address, rate=None)
+    yield connected
+    connected.close()
 
 
 def lose_answers(copter: FlightController, *commands: int, does: bool) -> None:
@@ -62,7 +62,7 @@ def test_confirmed_order_is_not_repeated_against_pilot(copter: FlightController,
     copter.base_mode, copter.custom_mode = copter.base_mode & ~ARMED, LOITER
     copter.beat()
     vehicle._handler.calls.wait(LIMIT_S)
-    assert [each.command for each in copter.commands()] == [ARM, SET_MODE]
+    assert [command.command for command in copter.commands()] == [ARM, SET_MODE]
     assert (vehicle.armed, vehicle.mode.name) == (False, "LOITER")
 
 
@@ -86,8 +86,8 @@ def test_pilot_takeover_before_order_arrives_is_kept(
     copter.custom_mode = LOITER
     copter.beat()
     vehicle._handler.calls.wait(LIMIT_S)
-    assert [each.command for each in copter.commands()] == [REPOSITION, SET_MODE]
-    ends = sorted(each.message.partition("not sent again: ")[2].partition(";")[0] for each in caplog.records)
+    assert [command.command for command in copter.commands()] == [REPOSITION, SET_MODE]
+    ends = sorted(record.message.partition("not sent again: ")[2].partition(";")[0] for record in caplog.records)
     assert ends == ["another order was given", "the mode changed to LOITER"]
 
 
@@ -97,7 +97,7 @@ def test_disarming_does_not_wait_for_arming(copter: FlightController, vehicle: d
     copter.wait_for_command(ARM)
     vehicle.armed = False  # HEARTBEAT reports disarmed, but the arming may still be executed
     copter.wait_for("COMMAND_LONG", lambda frame: frame.command == ARM and frame.param1 == 0)
-    assert [each.param1 for each in copter.commands()] == [1, 0]
+    assert [command.param1 for command in copter.commands()] == [1, 0]
     copter.report("COMMAND_ACK", command=ARM, result=2)
     copter.report("COMMAND_ACK", command=ARM, result=2)  # so that closing does not wait
 
@@ -115,7 +115,7 @@ def test_disarm_during_arming_waits_for_answer(copter: FlightController, vehicle
     copter.report("COMMAND_ACK", command=ARM, result=0, **acks)
     disarming.join(LIMIT_S)
     assert not disarming.is_alive()
-    assert [each.param1 for each in copter.commands()] == [1, 0]
+    assert [command.param1 for command in copter.commands()] == [1, 0]
 
 
 @pytest.mark.parametrize("wait", ["arm", "wait_for_mode"])
@@ -145,7 +145,7 @@ def test_raw_setpoint_overrules_simple_goto(
     copter.wait_for("SET_POSITION_TARGET_LOCAL_NED", lambda _: True)
     copter.beat()
     vehicle._handler.calls.wait(LIMIT_S)
-    assert [each.command for each in copter.commands()] == [REPOSITION]
+    assert [command.command for command in copter.commands()] == [REPOSITION]
     assert "not sent again: another order was given" in caplog.text
 
 

@@ -139,7 +139,7 @@ CAPABILITIES = [
 
 def test_capabilities_from_bits() -> None:
     for bit, name in enumerate(CAPABILITIES):
-        assert [each for each, value in vars(Capabilities(1 << bit)).items() if value] == [name]
+        assert [attribute for attribute, value in vars(Capabilities(1 << bit)).items() if value] == [name]
     assert repr(Capabilities(0b100001)) == "Capabilities(mission_float, ftp)"
 
 

@@ -32,7 +32,7 @@ async def test_fleet_exit_during_action_makes_members_hold() -> None:
         assert not flying.done()
     result = await asyncio.wait_for(flying, 5)
     assert len(result.failed) == 3
-    assert {each.mode.name for each in copters.values()} == {"BRAKE"}
+    assert {copter.mode.name for copter in copters.values()} == {"BRAKE"}
 
 
 async def test_exception_in_block_propagates_and_members_hold_concurrently() -> None:
@@ -49,7 +49,7 @@ async def test_exception_in_block_propagates_and_members_hold_concurrently() -> 
             raise KeyError("mine")
     assert now() - began < 2.5  # concurrently, not one by one
     await asyncio.wait(flying, timeout=1)
-    assert [each.mode.name for each in copters] == ["BRAKE"] * 4
+    assert [copter.mode.name for copter in copters] == ["BRAKE"] * 4
 
 
 async def test_lost_link_loses_its_members_and_others_hold() -> None:
@@ -111,17 +111,17 @@ async def test_cancelled_action_leaves_no_tasks_or_subscriptions(after_s: float)
             lambda: stage.fleet.do(wait, stagger_s=1.0),
             follow,
         ):
-            before = attached_sinks(connection), [waiting_on_cells(each) for each in vehicles]
+            before = attached_sinks(connection), [waiting_on_cells(vehicle) for vehicle in vehicles]
             tasks = len(asyncio.all_tasks())
             started = now()
             with anyio.move_on_after(after_s):
                 await action()
             assert now() - started <= after_s + 2.0
             await anyio.sleep(20)
-            assert (attached_sinks(connection), [waiting_on_cells(each) for each in vehicles]) == before
+            assert (attached_sinks(connection), [waiting_on_cells(vehicle) for vehicle in vehicles]) == before
             assert len(asyncio.all_tasks()) == tasks
             assert not stage.fleet._context.actions
-        assert all(each.is_available for each in stage.fleet)
+        assert all(member.is_available for member in stage.fleet)
 
 
 async def test_exception_in_function_propagates_and_others_hold() -> None:

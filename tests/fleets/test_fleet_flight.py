@@ -45,7 +45,7 @@ async def test_ten_members_land_by_policy_after_one_is_lost() -> None:
         assert len(result) == 10
         assert result.is_complete
         await fleet.wait_at_altitude(10)
-        stage.forget()
+        stage.clear()
         stage.copters["north/4"].faults.silent = True
         result = await fleet.go_to(north(300))
         assert list(result.failed) == ["north/4"]
@@ -54,7 +54,7 @@ async def test_ten_members_land_by_policy_after_one_is_lost() -> None:
         assert all(not stage.copters[name].is_armed or stage.copters[name].motion.is_on_ground for name in others)
         assert all(stage.modes_ordered(name) == ["LAND"] for name in others)  # once, without a hold before
         assert stage.modes_ordered("north/4") == []
-        (lost,) = [each for each in fleet if each.state is MemberState.LOST]
+        (lost,) = [member for member in fleet if member.state is MemberState.LOST]
         assert lost.name == "north/4"
         received = stage.events()
         assert [type(event) for event in received] == [
@@ -80,7 +80,7 @@ async def test_lost_member_returns_and_is_available_again() -> None:
         assert "no heartbeat" in result.skipped["north/2"]
         stage.copters["north/2"].faults.silent = False
         await anyio.sleep(2)
-        assert [type(each) for each in stage.events()] == [MemberLost, MemberBack]
+        assert [type(event) for event in stage.events()] == [MemberLost, MemberBack]
         assert list(await stage.fleet.land()) == ["north/1", "north/2"]
 
 
@@ -128,7 +128,7 @@ async def test_policy_continue_others_does_not_stop_them() -> None:
         assert stage.fleet.members["north/1"].state is MemberState.FAILED
         stage.copters["north/1"].faults.commands.clear()
         assert (await stage.fleet.go_to(north(5))).is_complete
-        assert [each.state for each in stage.fleet] == [MemberState.ACTIVE] * 3
+        assert [member.state for member in stage.fleet] == [MemberState.ACTIVE] * 3
 
 
 async def test_policy_of_failed_members_group_applies() -> None:
@@ -159,7 +159,7 @@ async def test_policy_function_decides_per_member() -> None:
         await stage.take_off()
         stage.copters["north/1"].faults.refuse(MavCmd.DO_REPOSITION)
         result = await stage.fleet.go_to(north(20))
-        assert [(each.member, each.action, each.others) for each in failures] == [
+        assert [(failure.member, failure.action, failure.others) for failure in failures] == [
             ("north/1", "go_to", ("north/2", "north/3"))
         ]
         assert stage.modes_ordered("north/2") == ["LAND"]
@@ -196,7 +196,7 @@ async def test_cancellation_holds_all_members_at_once() -> None:
 async def test_cancellation_holds_members_that_have_arrived() -> None:
     async with open_stage(2) as stage:
         await stage.take_off()
-        here = {name: each.position.value for name, each in stage.fleet.vehicles.items()}
+        here = {name: vehicle.position.value for name, vehicle in stage.fleet.vehicles.items()}
         with anyio.move_on_after(15):
             await stage.fleet.go_to(
                 {"north/1": here["north/1"].offset(north_m=5), "north/2": here["north/2"].offset(north_m=300)}
@@ -221,14 +221,14 @@ async def test_member_taken_over_by_pilot_is_skipped_until_reclaimed() -> None:
         await anyio.sleep(2)
         member = stage.fleet.members["north/2"]
         assert (member.state, member.reason) == (MemberState.TAKEN_OVER, "the mode changed to LOITER")
-        stage.forget()
+        stage.clear()
         for order in (stage.fleet.go_to(north(10)), stage.fleet.hold(), stage.fleet.set_mode("GUIDED")):
             result = await order
             assert result.skipped == {"north/2": "taken over: the mode changed to LOITER"}
             assert result.is_complete
         assert stage.orders_to("north/2") == []
         stage.fleet.reclaim("north/2")
-        assert [type(each) for each in stage.events()] == [MemberTakenOver, MemberReclaimed]
+        assert [type(event) for event in stage.events()] == [MemberTakenOver, MemberReclaimed]
         assert len(await stage.fleet.land()) == 3
         assert stage.modes_ordered("north/2") == ["LAND"]
 
@@ -247,7 +247,7 @@ async def test_pilot_takeover_during_action_is_respected() -> None:
         await anyio.sleep(5)
         assert stage.modes == {"north/1": "BRAKE", "north/2": "LOITER", "north/3": "BRAKE"}
         assert "LOITER" in str(result.failed["north/2"])
-        assert [each.command for _, each in stage.orders_to("north/2")] == [MavCmd.DO_REPOSITION]
+        assert [command.command for _, command in stage.orders_to("north/2")] == [MavCmd.DO_REPOSITION]
         stage.pilot_takes("north/2", 9)
         (await stage.fleet.land()).raise_for_errors()
 
@@ -274,7 +274,7 @@ async def test_failed_arming_leaves_all_on_ground() -> None:
         result = await stage.fleet.take_off(10)
         assert list(result.failed) == ["north/2"]
         await anyio.sleep(3)
-        assert all(each.motion.is_on_ground for each in stage.copters.values())
+        assert all(copter.motion.is_on_ground for copter in stage.copters.values())
 
 
 async def test_barrier_waits_for_slowest_and_names_missing_members() -> None:
@@ -289,7 +289,7 @@ async def test_barrier_waits_for_slowest_and_names_missing_members() -> None:
         assert now() - began == pytest.approx(9.0, abs=0.5)
         with pytest.raises(FleetError, match="wait_at_altitude") as caught:
             await stage.fleet.wait_at_altitude(50, timeout=2)
-        (late,) = [each for each in caught.value.errors.values() if isinstance(each, OperationTimeout)]
+        (late,) = [error for error in caught.value.errors.values() if isinstance(error, OperationTimeout)]
         assert "north/1, north/2, north/3" in str(late)
 
 
@@ -328,7 +328,7 @@ async def test_stagger_delays_consecutive_members() -> None:
         (await stage.fleet.wait_ready()).raise_for_errors()
         (await stage.fleet.arm()).raise_for_errors()
         await stage.fleet.set_mode("GUIDED")
-        stage.forget()
+        stage.clear()
         await stage.fleet.take_off(5, stagger_s=2)
         times = [stage.orders_to(name)[0][0] for name in stage.copters]
         assert [later - times[0] for later in times] == pytest.approx([0.0, 2.0, 4.0], abs=0.3)

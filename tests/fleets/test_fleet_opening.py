@@ -29,7 +29,7 @@ pytestmark = pytest.mark.anyio
 
 
 def copters(*ids: int) -> list[SimulatedCopter]:
-    return [SimulatedCopter(system_id=each, boot_time_s=0.0, seed=each) for each in ids]
+    return [SimulatedCopter(system_id=system_id, boot_time_s=0.0, seed=system_id) for system_id in ids]
 
 
 async def test_fleet_accepts_connections_vehicles_and_links() -> None:
@@ -162,12 +162,12 @@ async def test_streams_have_events_and_states_of_all_members() -> None:
             event = await modes.get(timeout=5)
             assert isinstance(event, MemberEvent)
             assert (event.member, event.event.after) == ("south/2", "GUIDED")  # type: ignore[attr-defined]
-            seen: set[tuple[str, str]] = set()
+            observed: set[tuple[str, str]] = set()
             with anyio.fail_after(5):
                 async for state in states:
                     assert isinstance(state, StateUpdate)
-                    seen.add((state.member, state.state))
-                    if len(seen) == 8:
+                    observed.add((state.member, state.state))
+                    if len(observed) == 8:
                         break
             assert taken.get_nowait() is None
             with pytest.raises(SubscriptionOverflow):
@@ -209,7 +209,7 @@ async def test_fleet_methods_wrong_types_are_rejected_and_nothing_sent() -> None
         (await stage.fleet.wait_ready()).raise_for_errors()
         place = fleet.vehicles["north/1"].position.value
         line = aerokit.Formation.line(["north/2"], 5.0)
-        stage.forget()
+        stage.clear()
         wrong: list[tuple[str, tuple[Any, ...], dict[str, Any]]] = [
             ("take_off", ("ten",), {}),
             ("take_off", (-1,), {}),
@@ -248,7 +248,7 @@ async def test_fleet_methods_wrong_types_are_rejected_and_nothing_sent() -> None
                 if isinstance(done, FleetResult):
                     done.raise_for_errors()
             errors = caught.value.errors.values() if isinstance(caught.value, FleetError) else ()
-            assert all(isinstance(each, (InvalidArgument, OperationRejected)) for each in errors), name
+            assert all(isinstance(error, (InvalidArgument, OperationRejected)) for error in errors), name
         assert not stage.orders_to("north/1")
         assert not stage.orders_to("north/2")
 

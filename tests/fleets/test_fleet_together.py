@@ -33,7 +33,7 @@ pytestmark = pytest.mark.anyio
 
 
 def swapped(stage: Stage) -> dict[str, Position]:
-    here = {name: each.position.value for name, each in stage.fleet.vehicles.items()}
+    here = {name: vehicle.position.value for name, vehicle in stage.fleet.vehicles.items()}
     one, other = here
     return {one: here[other], other: here[one]}
 
@@ -41,7 +41,7 @@ def swapped(stage: Stage) -> dict[str, Position]:
 async def test_go_to_swapped_positions_flies_in_layers() -> None:
     async with open_stage(2, spacing_m=40, min_distance_m=5.0) as stage:
         await stage.take_off()
-        tracks = [record_track(each) for each in stage.copters.values()]
+        tracks = [record_track(copter) for copter in stage.copters.values()]
         targets = swapped(stage)
         (await stage.fleet.go_to(targets)).raise_for_errors()
         assert min_distance_m(*tracks)[0] > 4.0
@@ -71,7 +71,7 @@ async def test_go_to_refused_separation_sends_nothing() -> None:
 async def test_go_to_with_corridors_delays_starts() -> None:
     async with open_stage(2, spacing_m=30) as stage:
         await stage.take_off()
-        one, other = (each.position.value for each in stage.fleet.vehicles.values())
+        one, other = (vehicle.position.value for vehicle in stage.fleet.vehicles.values())
         targets = {
             "north/1": one.offset(north_m=30, east_m=30),
             "north/2": other.offset(north_m=30, east_m=-30),
@@ -79,7 +79,7 @@ async def test_go_to_with_corridors_delays_starts() -> None:
         plan = stage.fleet.plan_separation(targets, min_distance_m=8, by="corridors", speed_m_s=5, slack_s=2)
         assert plan.decision == "corridors"
         assert plan.delays_s["north/2"] >= 3
-        tracks = [record_track(each) for each in stage.copters.values()]
+        tracks = [record_track(copter) for copter in stage.copters.values()]
         (await stage.fleet.go_to(targets, separation=plan, speed_m_s=5)).raise_for_errors()
         assert min_distance_m(*tracks)[0] > 7
 
@@ -88,13 +88,13 @@ async def test_too_close_members_hold_if_program_flies_them() -> None:
     async with open_stage(3, spacing_m=20, min_distance_m=6.0) as stage:
         await stage.take_off()
         stage.pilot_takes("north/2")
-        stage.forget()
+        stage.clear()
         one = stage.fleet.vehicles["north/1"]
         with pytest.raises(OperationRejected, match="another order"):
             await one.go_to(stage.fleet.vehicles["north/3"].position.value)  # the vehicle's own go_to compares no paths
         await anyio.sleep(3)
         first = stage.events(TooClose)
-        assert [(each.member, each.other, each.ordered) for each in first] == [("north/1", "north/2", ("north/1",))]
+        assert [(event.member, event.other, event.ordered) for event in first] == [("north/1", "north/2", ("north/1",))]
         assert first[0].distance_m < 6
         assert stage.modes == {"north/1": "BRAKE", "north/2": "LOITER", "north/3": "GUIDED"}
         assert stage.orders_to("north/2") == []
@@ -108,7 +108,7 @@ async def test_too_close_report_only_sends_no_orders() -> None:
         await vehicle.go_to(vehicle.position.value.offset(east_m=-15))
         await vehicle.go_to(vehicle.position.value.offset(east_m=15))
         received = stage.events(TooClose)
-        assert [each.ordered for each in received] == [(), ()]  # once for each approach
+        assert [frame.ordered for frame in received] == [(), ()]  # once for each approach
         assert stage.mode_of("north/2") == "GUIDED"
 
 
@@ -135,13 +135,16 @@ async def test_missions_upload_and_start_together() -> None:
         (await stage.fleet.arm()).raise_for_errors()
         (await stage.fleet.start_missions()).raise_for_errors()
         starts = [
-            at for name in stage.copters for at, each in stage.orders_to(name) if each.command == MavCmd.MISSION_START
+            at
+            for name in stage.copters
+            for at, command in stage.orders_to(name)
+            if command.command == MavCmd.MISSION_START
         ]
         assert len(starts) == 3
         assert max(starts) - min(starts) < 0.5
         (await stage.fleet.wait_missions_finished(timeout=200)).raise_for_errors()
-        assert all(each.motion.is_on_ground for each in stage.copters.values())
-        assert all(each.state is MemberState.ACTIVE for each in stage.fleet)
+        assert all(copter.motion.is_on_ground for copter in stage.copters.values())
+        assert all(member.state is MemberState.ACTIVE for member in stage.fleet)
 
 
 async def test_start_missions_after_failed_upload_starts_none() -> None:
@@ -157,7 +160,7 @@ async def test_start_missions_after_failed_upload_starts_none() -> None:
         stage.copters["north/2"].faults.silent = False
         with pytest.raises(OperationRejected, match=r"call upload\(\) first"):
             await stage.fleet.start_missions()
-        assert all(each.motion.is_on_ground for each in stage.copters.values())
+        assert all(copter.motion.is_on_ground for copter in stage.copters.values())
 
 
 async def test_upload_conflicting_missions_is_rejected() -> None:
@@ -215,7 +218,7 @@ async def test_form_errors_name_action_and_member() -> None:
         assert done.action == "form"
         onto = Formation({"north/2": Offset(0.0, 20.0)})
         with pytest.raises(OperationRejected, match=r"^form: .*north/3.*nothing was sent"):
-            await stage.fleet.form(onto, leader="north/1")  # north/3 is there
+            await stage.fleet.form(onto, leader="north/1")  # north/3 occupies that place
         stage.copters["north/1"].faults.silent = True
         await anyio.sleep(2.5)
         with pytest.raises(ValueUnknownError, match=r"^north/1: position is"):
@@ -224,7 +227,7 @@ async def test_form_errors_name_action_and_member() -> None:
         with pytest.raises(ValueUnknownError, match=r"^north/1: position is"):
             await stage.fleet.go_to({"north/1": here.offset(up_m=20)})
         with pytest.raises(ValueUnknownError, match=r"^north/1: position is"):
-            await stage.fleet.go_to(lambda each: each.vehicle.position.fresh(1).offset(north_m=1))
+            await stage.fleet.go_to(lambda member: member.vehicle.position.fresh(1).offset(north_m=1))
 
 
 async def test_following_leader_lost_makes_followers_hold() -> None:
@@ -275,7 +278,7 @@ async def test_following_stopped_is_published_before_policy_completes() -> None:
                 stage.pilot_takes("north/3")
                 with anyio.fail_after(3):
                     assert "north/3" in await following.wait_stopped()
-        received = [each for each in stage.events() if isinstance(each, (FollowingStopped, PolicyCompleted))]
+        received = [event for event in stage.events() if isinstance(event, (FollowingStopped, PolicyCompleted))]
         assert len(received) == 1
         assert isinstance(received[0], FollowingStopped)
         assert received[0].orders == {"north/2": "land"}
@@ -347,13 +350,13 @@ def test_formation_offset_rotates_with_heading() -> None:
 
 async def test_send_corrections_sends_once_per_link() -> None:
     async with open_stage(2, networks=("north", "south")) as stage:
-        stage.forget()
+        stage.clear()
         message = b"\xd3\x00\xc8" + bytes(range(200)) + b"crc"
         assert stage.fleet.send_corrections(message) == 2
         for wire in stage.wires.values():
             sent = wire.all(m.GpsRtcmData)
-            assert b"".join(each.data[: each.len] for each in sent) == message
-            assert [each.flags & 7 for each in sent] == [0b001, 0b011]
+            assert b"".join(message.data[: message.len] for message in sent) == message
+            assert [message.flags & 7 for message in sent] == [0b001, 0b011]
         with pytest.raises(InvalidArgument, match="0 bytes"):
             stage.fleet.send_corrections(b"")
 
@@ -371,10 +374,10 @@ async def test_send_corrections_sends_once_per_link() -> None:
 )
 def test_rtcm_fragments_end_with_a_short_or_fourth_one(size: int, lengths: list[int]) -> None:
     pieces = fragments(bytes(size), 37)
-    assert [each.len for each in pieces] == lengths
-    assert {each.flags >> 3 for each in pieces} == {37 & 31}
-    assert [each.flags & 1 for each in pieces] == [int(len(lengths) > 1)] * len(lengths)
-    assert [each.flags >> 1 & 3 for each in pieces] == list(range(len(lengths)))
+    assert [piece.len for piece in pieces] == lengths
+    assert {piece.flags >> 3 for piece in pieces} == {37 & 31}
+    assert [piece.flags & 1 for piece in pieces] == [int(len(lengths) > 1)] * len(lengths)
+    assert [piece.flags >> 1 & 3 for piece in pieces] == list(range(len(lengths)))
 
 
 def test_rtcm_messages_are_split() -> None:
@@ -387,7 +390,9 @@ def test_rtcm_messages_are_split() -> None:
 
 async def test_px4_after_mission_end_is_not_taken_over() -> None:
     async with (
-        simulated_link([SimulatedPx4(system_id=each, boot_time_s=1.0, seed=each) for each in (1, 2)]) as link,
+        simulated_link(
+            [SimulatedPx4(system_id=system_id, boot_time_s=1.0, seed=system_id) for system_id in (1, 2)]
+        ) as link,
         fleet({"south": link}, count=2) as both,
     ):
         (await both.wait_ready()).raise_for_errors()
@@ -407,26 +412,28 @@ async def test_px4_after_mission_end_is_not_taken_over() -> None:
         (await both.start_missions()).raise_for_errors()
         (await both.wait_missions_finished(timeout=300)).raise_for_errors()
         await anyio.sleep(5)
-        assert [each.state for each in both] == [MemberState.ACTIVE] * 2
+        assert [vehicle.state for vehicle in both] == [MemberState.ACTIVE] * 2
         assert both.vehicles["south/2"].mode_name == "LOITER"
-        (await both["south/2"].go_to(lambda each: each.vehicle.position.value.offset(north_m=10))).raise_for_errors()
+        (
+            await both["south/2"].go_to(lambda member: member.vehicle.position.value.offset(north_m=10))
+        ).raise_for_errors()
         (await both.land()).raise_for_errors()
 
 
 async def test_px4_fleet_flies_and_detects_pilot() -> None:
-    px4s = [SimulatedPx4(system_id=each, boot_time_s=1.0, seed=each) for each in (1, 2)]
+    px4s = [SimulatedPx4(system_id=system_id, boot_time_s=1.0, seed=system_id) for system_id in (1, 2)]
     async with (
         simulated_link(px4s) as link,
         fleet({"south": link}, count=2, on_error="continue_others") as both,
     ):
         for order in (both.wait_ready(), both.arm(), both.take_off(10)):
             (await order).raise_for_errors()
-        (await both.go_to(lambda each: each.vehicle.position.value.offset(north_m=20))).raise_for_errors()
+        (await both.go_to(lambda member: member.vehicle.position.value.offset(north_m=20))).raise_for_errors()
         line = Formation.line(["south/2"], 10.0, frame="north")
         async with both.following(line, leader="south/1") as following:
             await anyio.sleep(20)
             assert following.error_m("south/2") < 1.5
-        assert [each.state for each in both] == [MemberState.ACTIVE] * 2
+        assert [vehicle.state for vehicle in both] == [MemberState.ACTIVE] * 2
         px4s[0].switch_to(POSITION)
         await anyio.sleep(2)
         (await both.land()).raise_for_errors()
@@ -434,7 +441,7 @@ async def test_px4_fleet_flies_and_detects_pilot() -> None:
 
 
 async def test_px4_mode_report_before_heartbeat_is_no_takeover() -> None:
-    px4s = [SimulatedPx4(system_id=each, boot_time_s=1.0, seed=each) for each in (1, 2)]
+    px4s = [SimulatedPx4(system_id=system_id, boot_time_s=1.0, seed=system_id) for system_id in (1, 2)]
     async with simulated_link(px4s) as link, fleet({"south": link}, count=2) as both:
         for order in (both.wait_ready(), both.arm(), both.take_off(6)):
             (await order).raise_for_errors()
@@ -452,13 +459,13 @@ async def test_px4_mode_report_before_heartbeat_is_no_takeover() -> None:
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(report_mode)
             (await both.land()).raise_for_errors()
-        assert [each.state for each in both] == [MemberState.ACTIVE] * 2
+        assert [vehicle.state for vehicle in both] == [MemberState.ACTIVE] * 2
 
 
 async def test_takeover_between_layers_stops_others_there() -> None:
     async with open_stage(3, spacing_m=40, min_distance_m=5.0, on_error="continue_others") as stage:
         await stage.take_off()
-        here = [each.position.value for each in stage.fleet.vehicles.values()]
+        here = [vehicle.position.value for vehicle in stage.fleet.vehicles.values()]
         targets = dict(zip(stage.copters, (here[1], here[0], here[2].offset(north_m=20)), strict=True))
 
         async def take() -> None:

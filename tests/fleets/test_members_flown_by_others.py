@@ -70,7 +70,7 @@ async def test_pilots_member_gets_no_orders_from_policies(
         await stage.fleet.wait_ready()
         await fly_by_another_station(stage, PILOTS)
         assert stage.fleet.members[PILOTS].state is MemberState.TAKEN_OVER
-        stage.forget()
+        stage.clear()
         with contextlib.suppress(AerokitError):
             await fail(stage)
         await anyio.sleep(4.0)
@@ -82,7 +82,7 @@ async def test_pilots_member_gets_no_orders_from_distance_monitor() -> None:
     async with open_stage(2, spacing_m=3.0, min_distance_m=10.0) as stage:
         await stage.fleet.wait_ready()
         await fly_by_another_station(stage, PILOTS)
-        stage.forget()
+        stage.clear()
         ours = stage.fleet.vehicles[OURS]
         await ours.set_mode("GUIDED")
         await ours.arm()
@@ -114,7 +114,7 @@ async def test_disarmed_member_gets_no_orders_from_policy() -> None:
         await stage.take_off()
         await stage.fleet.vehicles["north/3"].land()
         await stage.fleet.vehicles["north/3"].armed.wait_until(lambda armed: not armed, timeout=30)
-        stage.forget()
+        stage.clear()
 
         async def fail_first(member: Member) -> None:
             if member.name == "north/1":

@@ -103,19 +103,19 @@ def test_layers_keep_min_distance_at_any_speed(routes: list[Route], rest: list[L
     plan = separate_by_altitude(routes, stationary, least)
     rests = [Path(name, [PathPoint(0, *place)]) for name, place in stationary.items()]
     if plan.decision == "clear":
-        phases = [[Path.straight(each.name, each.start, each.target, 1.0) for each in routes]]
+        phases = [[Path.straight(route.name, route.start, route.target, 1.0) for route in routes]]
     elif plan.decision == "layers":
         heights = plan.heights_m
         stages: list[list[tuple[str, LocalPoint, LocalPoint]]] = [[], [], []]
-        for each in routes:
-            over_start = (*each.start[:2], heights[each.name])
-            over_target = (*each.target[:2], heights[each.name])
+        for route in routes:
+            over_start = (*route.start[:2], heights[route.name])
+            over_target = (*route.target[:2], heights[route.name])
             for stage, way in zip(
                 stages,
-                ((each.start, over_start), (over_start, over_target), (over_target, each.target)),
+                ((route.start, over_start), (over_start, over_target), (over_target, route.target)),
                 strict=True,
             ):
-                stage.append((each.name, *way))
+                stage.append((route.name, *way))
         phases = [[Path.straight(name, one, other, 1.0) for name, one, other in stage] for stage in stages]
     else:
         assert plan.decision == "refused"
@@ -134,7 +134,9 @@ def test_layers_keep_min_distance_at_any_speed(routes: list[Route], rest: list[L
 def test_corridors_keep_min_distance_within_slack(routes: list[Route], least: float) -> None:
     plan = separate_by_time(routes, {}, least, 5.0, slack_s=2.0, max_delay_s=60.0)
     if plan.decision == "corridors":
-        timed = [Path.straight(each.name, each.start, each.target, 5.0, plan.delays_s[each.name]) for each in routes]
+        timed = [
+            Path.straight(route.name, route.start, route.target, 5.0, plan.delays_s[route.name]) for route in routes
+        ]
         assert not find_conflicts(timed, least - 1e-6, slack_s=2.0)
     assert plan.decision in ("clear", "corridors", "refused")
 

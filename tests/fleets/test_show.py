@@ -108,7 +108,7 @@ async def test_show_failure_applies_policy() -> None:
 async def test_invalid_show_is_rejected() -> None:
     async with open_stage(2, min_distance_m=5.0) as stage:
         await stage.take_off(8)
-        stage.forget()
+        stage.clear()
         near = Show.from_points({"north/1": circle(0, 0, 5), "north/2": circle(0, 3, 5)})
         with pytest.raises(OperationRejected, match=r"within 2\.\d m"):
             await stage.fleet.fly_show(near, ORIGIN)
@@ -151,8 +151,8 @@ async def fly_many(networks: int, of_each: int, seconds: int) -> None:
             show = Show.from_points({name: circle(*place, seconds) for name, place in places.items()})
             report = await many.fly_show(show, ORIGIN, rate_hz=4, start_in_s=1)
             report.result.raise_for_errors()
-            assert max(each.max_m for each in report.tracks.values()) < 1.5
-            assert max(each.rms_m for each in report.tracks.values()) < 0.6
+            assert max(track.max_m for track in report.tracks.values()) < 1.5
+            assert max(track.rms_m for track in report.tracks.values()) < 0.6
             assert report.lag_spread_s is not None
             assert report.lag_spread_s < 0.1
             assert report.max_relative_error_m is not None
@@ -208,7 +208,7 @@ track = Path("a", [PathPoint(0, 0, 0, 10), PathPoint(10, 40, 0, 10), PathPoint(2
 @given(st.floats(-5, 25))
 def test_state_at_velocity_matches_position_change(at_s: float) -> None:
     (before, speed), (after, _) = state_at(track, at_s), state_at(track, at_s + 1e-3)
-    if not any(abs(at_s - each.t_s) < 2e-3 for each in track.points):
+    if not any(abs(at_s - point.t_s) < 2e-3 for point in track.points):
         moved = [(b - a) / 1e-3 for a, b in zip(before, after, strict=True)]
         assert moved == pytest.approx(list(speed), abs=1e-6)
 
@@ -232,7 +232,7 @@ def test_track_deviation_distinguishes_lag_from_offset(lag_s: float, offset: Loc
 
 def test_max_relative_error_compares_vectors_between_vehicles() -> None:
     other = track.replace(name="b")
-    times = [each / 2 for each in range(41)]
+    times = [tick / 2 for tick in range(41)]
 
     def shifted(by: float) -> list[tuple[float, LocalPoint]]:
         return [(at, (state_at(track, at)[0][0] + by, *state_at(track, at)[0][1:])) for at in times]

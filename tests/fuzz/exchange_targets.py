@@ -30,7 +30,7 @@ from aerokit.protocols.parameter_requests import ParameterReads, ParameterWrites
 
 __all__ = ["EXCHANGE_TARGETS"]
 
-MOST_ANSWERS, MOST_DEADLINES = 150, 3000
+MAX_ANSWERS, MAX_DEADLINES = 150, 3000
 MAX_TEXT_LENGTH = 4000
 _ITEMS = [MissionItem(16, MavFrame.GLOBAL_RELATIVE_ALT, x=473977420 + n, y=85455940, z=20.0) for n in range(5)]
 _WANTED = [Parameter("A", 1.5, ParameterType.REAL32), Parameter("B", 7, ParameterType.INT32)]
@@ -38,7 +38,7 @@ _NAMES = ("A", "B", "C", "_HASH_CHECK", "", "\ufffd" * 5)
 Op = MavFtpOpcode
 
 
-class _Talk:
+class _ScriptedExchange:
     """An exchange, its last request, and a clock."""
 
     def __init__(self, exchange: Exchange[Any], script: Script) -> None:
@@ -54,15 +54,15 @@ class _Talk:
             self.last = message
 
     def run(self) -> None:
-        for _ in range(MOST_ANSWERS):
+        for _ in range(MAX_ANSWERS):
             if self.exchange.done or not self.script.has_more:
                 break
             self._answer()
-        for _ in range(MOST_DEADLINES):
+        for _ in range(MAX_DEADLINES):
             if self.exchange.done:
                 break
             self._expire()
-        assert self.exchange.done, "it does not end"
+        assert self.exchange.done, "the exchange does not end"
         text = ""
         try:
             self.exchange.result()
@@ -72,12 +72,12 @@ class _Talk:
 
     def _expire(self) -> None:
         deadline = self.exchange.deadline
-        assert deadline is not None, "it waits for nothing, and has not ended"
+        assert deadline is not None, "the exchange has no deadline and has not ended"
         self.now = max(self.now, deadline)
         self.exchange.expire(self.now)
         self._take()
         later = self.exchange.deadline
-        assert self.exchange.done or later is None or later > deadline, "it spins"
+        assert self.exchange.done or later is None or later > deadline, "the exchange repeats without progress"
 
     def _answer(self) -> None:
         kind = self.script.byte()
@@ -186,7 +186,7 @@ EXCHANGES: dict[str, Callable[[], Exchange[Any]]] = {
 
 def _target(name: str) -> Target:
     def fuzz_one(data: bytes) -> None:
-        _Talk(EXCHANGES[name](), Script(data)).run()
+        _ScriptedExchange(EXCHANGES[name](), Script(data)).run()
 
     return Target(name, fuzz_one)
 

@@ -35,12 +35,12 @@ def fuzz_plan(data: bytes) -> None:
         plan = parse_plan(data.decode(errors="surrogateescape"))
     except FileFormatError:
         return
-    for each in (plan, plan.replace(mission=Mission(), source=plan.source), plan.replace(source="")):
+    for variant in (plan, plan.replace(mission=Mission(), source=plan.source), plan.replace(source="")):
         try:
-            text = format_plan(each)
+            text = format_plan(variant)
         except InvalidArgument:
             continue
-        assert parse_plan(text) == each
+        assert parse_plan(text) == variant
 
 
 def fuzz_waypoints(data: bytes) -> None:
@@ -71,7 +71,7 @@ def fuzz_parameter_file(data: bytes) -> None:
 
 
 def fuzz_parameter_pack(data: bytes) -> None:
-    """Each reader of packed files returns a table, or raises our error."""
+    """Each reader of packed files returns a table or raises FileFormatError."""
     with suppress(RemoteProtocolError):
         unpack_items(data)
     try:
@@ -106,9 +106,9 @@ def fuzz_camera_definition(data: bytes) -> None:
         camera = parse_definition(data)
     except FileFormatError:
         return
-    values = {name: each.options[-1].value for name, each in camera.settings.items() if each.options}
-    for told in ({}, values):
-        for name, each in camera.localized("de").settings.items():
+    values = {name: setting.options[-1].value for name, setting in camera.settings.items() if setting.options}
+    for values_read in ({}, values):
+        for name, setting in camera.localized("de").settings.items():
             assert name not in camera.dependencies(name)
             for value in (
                 0,
@@ -117,11 +117,11 @@ def fuzz_camera_definition(data: bytes) -> None:
                 b"A",
                 math.nan,
                 1 << 70,
-                *(one.value for one in camera.options(name, told)),
+                *(one.value for one in camera.options(name, values_read)),
             ):
                 with suppress(InvalidArgument):
-                    sent = camera.checked(name, value, told)
-                    assert setting_value(setting_bytes(sent, each.wire_type), each.wire_type) == sent
+                    sent = camera.checked(name, value, values_read)
+                    assert setting_value(setting_bytes(sent, setting.wire_type), setting.wire_type) == sent
 
 
 def fuzz_dialect(data: bytes) -> None:

@@ -102,25 +102,25 @@ class _Player:
         self.now = max(self.now, self.vehicle.now) + seconds
         self.vehicle.step(self.now)
 
-    def hear(self, data: bytes) -> None:
+    def deliver(self, data: bytes) -> None:
         self.now = max(self.now, self.vehicle.now)
         self.vehicle.receive(data, self.now)
 
-    def say(self, message: Message) -> None:
+    def send(self, message: Message) -> None:
         self._send(message.ID, message.encode())
 
     def _say_with(self, message_class: Callable[..., Message], *fields: float) -> None:
-        self.say(message_class(*fields))
+        self.send(message_class(*fields))
 
     def _send(self, message_id: int, payload: bytes) -> None:
         self.sequence += 1
-        self.hear(framed(message_id, payload, self.sequence))
+        self.deliver(framed(message_id, payload, self.sequence))
 
     def _wait(self) -> None:
         self.wait(self.script.byte() ** 2 / 255**2 * MAX_WAIT_S)
 
     def _noise(self) -> None:
-        self.hear(self.script.take(self.script.byte()))
+        self.deliver(self.script.take(self.script.byte()))
 
     def _target(self) -> tuple[int, int]:
         return self.vehicle.system_id, self.components[self.script.byte() % len(self.components)]
@@ -128,7 +128,7 @@ class _Player:
     def _command(self) -> None:
         command = COMMANDS[int.from_bytes(self.script.take(2), "little") % len(COMMANDS)]
         numbers = [self.script.number() for _ in range(7)]
-        self.say(m.CommandLong(*self._target(), command, 0, *numbers))
+        self.send(m.CommandLong(*self._target(), command, 0, *numbers))
 
     def _command_int(self) -> None:
         command = COMMANDS[int.from_bytes(self.script.take(2), "little") % len(COMMANDS)]
@@ -179,7 +179,7 @@ class _Player:
         if kind == 6 and not hasattr(self.vehicle, "guided") and math.isfinite(value):  # PX4 expects its bits
             (value,) = _F32.unpack(struct.pack("<i", max(-(1 << 31), min((1 << 31) - 1, int(value)))))
         try:
-            self.say(m.ParamSet(self.vehicle.system_id, 1, name, value, kind))
+            self.send(m.ParamSet(self.vehicle.system_id, 1, name, value, kind))
         except OverflowError:
             return
 
@@ -187,7 +187,7 @@ class _Player:
         """A complete upload of some items, and perhaps a mission start."""
         kind, count = self.script.byte() % 3, self.script.byte() % 6
         target = (self.vehicle.system_id, 1)
-        self.say(m.MissionCount(*target, count, kind))
+        self.send(m.MissionCount(*target, count, kind))
         for seq in range(count):
             command = self._plan_command(kind)
             frame = self.script.byte() % 22
@@ -203,10 +203,10 @@ class _Player:
         return 5100 if kind == 2 else COMMANDS[choice % len(COMMANDS)]
 
 
-def play(vehicle: SimulatedVehicle, data: bytes, most_steps: int = 60) -> None:
+def play(vehicle: SimulatedVehicle, data: bytes, max_steps: int = 60) -> None:
     """Run the script, and check that the vehicle survives and sends only valid frames."""
     player = _Player(vehicle, Script(data))
-    for _ in range(most_steps):
+    for _ in range(max_steps):
         if not player.script.has_more:
             break
         player.step()

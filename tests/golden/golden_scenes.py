@@ -104,14 +104,14 @@ async def connected(
 def north_of(vehicle: aerokit.Vehicle, *metres: float) -> list[aerokit.Position]:
     home = vehicle.home.value
     place = aerokit.Position(home.latitude_deg, home.longitude_deg, altitude_relative_m=10.0)
-    return [place.offset(north_m=each) for each in metres]
+    return [place.offset(north_m=distance) for distance in metres]
 
 
 def mission(vehicle: aerokit.Vehicle) -> Mission:
     return Mission(
         [
-            waypoint(each.latitude_deg, each.longitude_deg, altitude_relative_m=20)
-            for each in north_of(vehicle, 50, 100, 150)
+            waypoint(place.latitude_deg, place.longitude_deg, altitude_relative_m=20)
+            for place in north_of(vehicle, 50, 100, 150)
         ]
     )
 
@@ -271,7 +271,7 @@ async def guided_velocity(trace: Trace) -> None:
 
 @scene()
 async def guided_velocity_px4(trace: Trace) -> None:
-    """A stream of velocities to PX4: it needs set-points before it takes OFFBOARD."""
+    """A stream of velocities to PX4: it needs set-points before it accepts OFFBOARD."""
     async with connected(trace, px4(), airborne=True) as vehicle:
         await _velocity(trace, vehicle)
 
@@ -335,7 +335,7 @@ async def fence_and_rally(trace: Trace) -> None:
 
 @scene(show=[RATES])
 async def parameter_read_all(trace: Trace) -> None:
-    """Reading all parameters of PX4 message by message; two values are lost and asked for by index."""
+    """Reading all parameters of PX4 message by message; two values are lost and requested by index."""
     simulated = px4()
     simulated.faults.no_ftp = True
     async with connected(trace, simulated) as vehicle:
@@ -346,7 +346,7 @@ async def parameter_read_all(trace: Trace) -> None:
 
 @scene(show=[RATES])
 async def parameter_set(trace: Trace) -> None:
-    """Setting a parameter of ArduPilot: the value that comes back counts; then one whose answer is lost."""
+    """Setting a parameter of ArduPilot: the returned value counts; then another one whose answer is lost."""
     simulated = copter()
     async with connected(trace, simulated) as vehicle:
         await vehicle.parameters.set("WP_YAW_BEHAVIOR", 1)
@@ -357,7 +357,7 @@ async def parameter_set(trace: Trace) -> None:
 
 @scene(show=[RATES])
 async def parameter_renamed(trace: Trace) -> None:
-    """Setting a parameter by its newer name: the vehicle is asked which of the two it has."""
+    """Setting a parameter by its newer name: aerokit requests which of the two the vehicle has."""
     async with connected(trace, copter()) as vehicle:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ParameterRenamedWarning)
@@ -500,9 +500,9 @@ def dronekit_script() -> str:
             vehicle.close()
     orders = (m.CommandLong, m.CommandInt, m.SetMode, m.SetPositionTargetGlobalInt)
     lines = [
-        f"{each.message.NAME} {text_of(each.message)}"
-        for each in journal.messages
-        if isinstance(each.message, orders) and getattr(each.message, "command", 0) not in REQUESTS
+        f"{message.message.NAME} {text_of(message.message)}"
+        for message in journal.messages
+        if isinstance(message.message, orders) and getattr(message.message, "command", 0) not in REQUESTS
     ]
     return "".join(f"{line}\n" for line in dict.fromkeys(lines))
 

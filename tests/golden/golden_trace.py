@@ -176,7 +176,7 @@ def _texts_of_fields(message: Message) -> Iterator[str]:
 
 
 def _text_of_command(message: CommandLong | CommandInt) -> str:
-    """Its name with its parameters, up to the last one that is no zero; one that is about a message names it."""
+    """Return the command's name and its parameters up to the last non-zero one; message ids are shown as names."""
     if message.command in (MavCmd.SET_MESSAGE_INTERVAL, MavCmd.REQUEST_MESSAGE):
         assert isinstance(message, CommandLong)
         name = STANDARD[int(message.param1)].NAME
@@ -187,7 +187,7 @@ def _text_of_command(message: CommandLong | CommandInt) -> str:
         params += [message.param5, message.param6, message.param7]
     while len(params) > 1 and params[-1] == 0:
         params.pop()
-    text = f"{_in_enum('MAV_CMD', message.command)}({', '.join(_plain(each, '') for each in params)})"
+    text = f"{_in_enum('MAV_CMD', message.command)}({', '.join(_plain(param, '') for param in params)})"
     if isinstance(message, CommandInt):
         place = f"x={_plain(message.x, 'x')} y={_plain(message.y, 'y')} z={message.z:.4g}"
         return f"{text} {_in_enum('MAV_FRAME', message.frame)} {place}"

@@ -17,7 +17,7 @@ def test_golden_trace(name: str) -> None:
     kept = path.read_text(encoding="utf-8") if path.exists() else ""
     now = recorded(name)
     diff = difflib.unified_diff(kept.splitlines(), now.splitlines(), path.name, "now", lineterm="")
-    assert kept == now, "\n".join((*diff, f"if this is meant: python tests/golden/record.py {name}"))
+    assert kept == now, "\n".join((*diff, f"if the change is intended: python tests/golden/record.py {name}"))
 
 
 def test_each_golden_trace_has_a_scene() -> None:

@@ -33,4 +33,4 @@ def value_of(field: Field, dice: random.Random) -> Any:
 
 
 def anything(kind: type[Message], dice: random.Random) -> Message:
-    return kind(**{each.name: value_of(each, dice) for each in kind.FIELDS})
+    return kind(**{field.name: value_of(field, dice) for field in kind.FIELDS})

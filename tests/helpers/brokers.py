@@ -73,23 +73,23 @@ class Broker:
             self._process = None
 
     @asynccontextmanager
-    async def heard(self, login: tuple[str, str] | None = None) -> AsyncIterator[list[Any]]:
+    async def received(self, login: tuple[str, str] | None = None) -> AsyncIterator[list[Any]]:
         """Yield (topic, payload, retained) of each message."""
         from paho.mqtt import client as mqtt
 
-        heard: list[Any] = []
+        received: list[Any] = []
         subscribed: list[object] = []
         client: Any = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2)  # type: ignore[attr-defined]
         if login is not None:
             client.username_pw_set(*login)
         client.on_connect = lambda *_: client.subscribe("aerokit/#")
         client.on_subscribe = lambda *_: subscribed.append(1)
-        client.on_message = lambda _c, _d, got: heard.append((got.topic, bytes(got.payload), got.retain))
+        client.on_message = lambda _c, _d, got: received.append((got.topic, bytes(got.payload), got.retain))
         client.connect("127.0.0.1", self.port)
         client.loop_start()
         try:
             await eventually(lambda: bool(subscribed))
-            yield heard
+            yield received
         finally:
             client.disconnect()
             await asyncio.get_running_loop().run_in_executor(None, client.loop_stop)

@@ -80,7 +80,7 @@ class Stage:
         """A new place to the north for each call."""
         self.counter += 1
         places = [self.home.offset(north_m=100.0 * n, east_m=self.counter % 7) for n in range(1, 6)]
-        return Mission([waypoint(each.latitude_deg, each.longitude_deg, altitude_relative_m=20) for each in places])
+        return Mission([waypoint(place.latitude_deg, place.longitude_deg, altitude_relative_m=20) for place in places])
 
     def fence(self) -> Fence:
         self.counter += 1
@@ -132,7 +132,7 @@ class Stage:
     # -------------------------------------------------------------------------------- answers
 
     async def answers(self) -> None:
-        """Check that the vehicle still works, and reports what it does."""
+        """Check that the vehicle still executes commands and reports their effects."""
         await self.vehicle.command(MavCmd.REQUEST_MESSAGE, messages.AutopilotVersion.ID)
 
 

@@ -1,4 +1,4 @@
-"""How and where to call each public coroutine: one row for each name in `public_surface.awaited`."""
+"""Table of calls: one row for each public coroutine in `public_surface.awaited`, with its arguments and stage."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ class Call:
     order: Row | None = None
 
     def provocations(self, name: str) -> Table:
-        """How to provoke the errors that most calls document."""
+        """Provocations of the errors that most calls document."""
         rows: Table = {}
         for error, trouble in (("CommandRejected", refused), ("CommandTimeout", ignored)):
             if self.command is not None:
@@ -140,7 +140,7 @@ async def _open_connection(stage: Stage) -> None:
 
 
 async def _not_ready(stage: Stage) -> None:
-    await stage.vehicle.sensors.wait_until(lambda each: each.prearm_checks_pass is False, timeout=5)
+    await stage.vehicle.sensors.wait_until(lambda sensors: sensors.prearm_checks_pass is False, timeout=5)
     stage.simulated.faults.prearm_failures.clear()
     await stage.vehicle.wait_ready()
 

@@ -17,7 +17,7 @@ __all__ = ["camera_of", "settings_of"]
 def camera_of(stage: Stage) -> SimulatedCamera:
     """Reset the camera, except for its uptime."""
     simulated: Any = stage.simulated
-    camera = next((each for each in simulated.components if isinstance(each, SimulatedCamera)), None)
+    camera = next((component for component in simulated.components if isinstance(component, SimulatedCamera)), None)
     if camera is None:
         camera = SimulatedCamera()
         camera.join(simulated)

@@ -153,18 +153,18 @@ def _ignores(command: int) -> Trouble:
     return lambda stage: stage.camera.faults.ignore(command)
 
 
-def _is_not_known(stage: Stage) -> None:
+def _is_unknown(stage: Stage) -> None:
     stage.vehicle.camera_at(100).information.forget()
     for command in (Cmd.REQUEST_MESSAGE, Cmd.REQUEST_CAMERA_INFORMATION):
         stage.camera.faults.refuse(command)
 
 
-def _answers_nothing(stage: Stage) -> None:
+def _never_answers(stage: Stage) -> None:
     for command in (Cmd.IMAGE_START_CAPTURE, Cmd.REQUEST_MESSAGE):
         stage.camera.faults.ignore(command)
 
 
-async def _cannot_take(stage: Stage) -> None:
+async def _photo_without_card(stage: Stage) -> None:
     asyncio.get_running_loop().call_later(0.1, lambda: setattr(stage.camera.card, "is_inserted", False))
     await stage.vehicle.camera_at(100).take_photo()
 
@@ -208,11 +208,11 @@ CAMERA: Table = {
         (f"Camera.{name}", "OperationTimeout"): P(call(name, number=NOWHERE))
         for name in ARGUMENTS
     },
-    ("Camera.wait_found", "CommandRejected"): P(call("wait_found"), before=_is_not_known, alone=True),
-    ("Camera.take_photo", "OperationRejected"): P(_cannot_take, alone=True),
+    ("Camera.wait_found", "CommandRejected"): P(call("wait_found"), before=_is_unknown, alone=True),
+    ("Camera.take_photo", "OperationRejected"): P(_photo_without_card, alone=True),
     ("Camera.take_photo", "CommandTimeout"): P(
         call("take_photo"),
-        before=_answers_nothing,
+        before=_never_answers,
     ),
     ("Camera.read_picture", "NotSupported"): P(call("read_picture", PICTURE.replace(file_url=""))),
     ("Camera.read_picture", "FileError"): P(

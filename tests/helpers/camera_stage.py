@@ -32,15 +32,15 @@ def px4(*cameras: SimulatedCamera) -> SimulatedPx4:
 
 def commands_to(simulated: Any, *kinds: int) -> list[tuple[float, ...]]:
     """Record COMMAND_LONG received by a simulated device, as (command, parameters), in a list that grows."""
-    heard: list[tuple[float, ...]] = []
+    received: list[tuple[float, ...]] = []
 
     def note(message: m.CommandLong, _: object) -> None:
         if not kinds or message.command in kinds:
             params = (message.param1, message.param2, message.param3, message.param4)
-            heard.append((message.command, *params))
+            received.append((message.command, *params))
 
     if isinstance(simulated, SimulatedCamera):
         simulated.on(m.CommandLong, note)
     else:
         simulated.observe(m.CommandLong, note)
-    return heard
+    return received

@@ -1,4 +1,4 @@
-"""Calls about components beside the autopilot: successful, blocking, and failing ones."""
+"""Calls to components other than the autopilot: successful, blocking, and failing ones."""
 
 from __future__ import annotations
 
@@ -97,8 +97,8 @@ COMPONENTS_BLOCKING: dict[str, Callable[[Any], object]] = {
 def _with(*troubles: Callable[[SimulatedCamera], object]) -> Callable[[Stage], None]:
     def before(stage: Stage) -> None:
         camera = camera_of(stage)
-        for each in troubles:
-            each(camera)
+        for trouble in troubles:
+            trouble(camera)
 
     return before
 
@@ -107,7 +107,7 @@ def _silent(camera: SimulatedCamera) -> None:
     camera.faults.silent = True
 
 
-def _deaf_to_files(camera: SimulatedCamera) -> None:
+def _ignores_file_requests(camera: SimulatedCamera) -> None:
     camera.faults.no_ftp = True
 
 
@@ -154,6 +154,8 @@ COMPONENTS: Table = {
     ("Component.fetch", "InvalidArgument"): P(_call("fetch", "gopher://a"), before=_with()),
     ("Component.fetch", "FileFormatError"): P(_call("fetch", ADDRESS), before=_with(_too_large)),
     ("Component.fetch", "FileError"): P(_call("fetch", "mftp:///nowhere"), before=_with()),
-    ("Component.fetch", "FileTimeout"): P(_call("fetch", ADDRESS, idle_timeout_s=1.0), before=_with(_deaf_to_files)),
+    ("Component.fetch", "FileTimeout"): P(
+        _call("fetch", ADDRESS, idle_timeout_s=1.0), before=_with(_ignores_file_requests)
+    ),
     ("Component.fetch", "OperationRejected"): P(_call("fetch", "http://127.0.0.1:1/a.xml"), before=_with()),
 }

@@ -27,41 +27,43 @@ class Stage:
     fleet: Fleet
     copters: dict[str, SimulatedCopter]
     wires: dict[str, Wire]
-    told: Subscription[FleetEvent]
+    events_subscription: Subscription[FleetEvent]
 
     def mode_of(self, name: str) -> str:
         return self.copters[name].mode.name
 
     @property
     def modes(self) -> dict[str, str]:
-        return {name: each.mode.name for name, each in self.copters.items()}
+        return {name: copter.mode.name for name, copter in self.copters.items()}
 
     def orders_to(self, name: str) -> list[tuple[float, m.CommandLong | m.CommandInt]]:
-        """Return the commands that change what the member does, with their times."""
+        """Return the state-changing commands that the member received, with their times."""
         network, _, number = name.partition("/")
         return [
-            (at, each)
-            for at, each in self.wires[network].sent
-            if isinstance(each, (m.CommandLong, m.CommandInt))
-            and each.target_system == int(number)
-            and each.command in ORDERS
+            (at, message)
+            for at, message in self.wires[network].sent
+            if isinstance(message, (m.CommandLong, m.CommandInt))
+            and message.target_system == int(number)
+            and message.command in ORDERS
         ]
 
     def modes_ordered(self, name: str) -> list[str]:
         return [
-            CopterMode(int(each.param2)).name for _, each in self.orders_to(name) if each.command == MavCmd.DO_SET_MODE
+            CopterMode(int(command.param2)).name
+            for _, command in self.orders_to(name)
+            if command.command == MavCmd.DO_SET_MODE
         ]
 
-    def forget(self) -> None:
+    def clear(self) -> None:
         for wire in self.wires.values():
-            wire.forget()
+            wire.clear()
 
     def events(self, kind: type[FleetEvent] = FleetEvent) -> list[Any]:
         """Events until now."""
         found = []
-        while (event := self.told.get_nowait()) is not None:
+        while (event := self.events_subscription.get_nowait()) is not None:
             found.append(event)
-        return [each for each in found if isinstance(each, kind)]
+        return [event for event in found if isinstance(event, kind)]
 
     async def take_off(self, altitude_m: float = 10.0) -> None:
         """Get all members ready, armed and airborne, and clear the recorders."""
@@ -69,7 +71,7 @@ class Stage:
         (await self.fleet.arm()).raise_for_errors()
         (await self.fleet.take_off(altitude_m)).raise_for_errors()
         self.events()
-        self.forget()
+        self.clear()
 
     def pilot_takes(self, name: str, mode: int = CopterMode.LOITER) -> None:
         """Turn the mode switch of the remote control, with the throttle stick in the middle."""
@@ -108,9 +110,9 @@ async def open_stage(
                 )
                 for number in range(count)
             ]
-            copters |= {f"{network}/{each.system_id}": each for each in own}
+            copters |= {f"{network}/{name.system_id}": name for name in own}
             wires[network] = Wire(await stack.enter_async_context(simulated_link(own)))
         options.setdefault("count", len(copters))
         async with fleet(dict(wires), **options) as opened:
-            with opened.events(FleetEvent) as told:
-                yield Stage(opened, copters, wires, told)
+            with opened.events(FleetEvent) as events:
+                yield Stage(opened, copters, wires, events)

@@ -1,4 +1,4 @@
-"""A simulated vehicle in memory, a `Vehicle` connected to it, and a recorder of what it sends, on virtual time."""
+"""A simulated vehicle in memory, a connected `Vehicle`, and a recorder of its messages, on virtual time."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Wire(Link):
         assert self._receiver is not None
         self._receiver.bytes_received(data, None)
 
-    def forget(self) -> None:
+    def clear(self) -> None:
         self.sent.clear()
 
     def all(self, kind: type[M]) -> list[M]:
@@ -85,7 +85,9 @@ class Wire(Link):
 
     def mode_orders(self) -> list[int]:
         """Custom modes requested by MAV_CMD_DO_SET_MODE, in ArduPilot's encoding."""
-        return [int(each.param2) for each in self.commands(MavCmd.DO_SET_MODE) if isinstance(each, m.CommandLong)]
+        return [
+            int(command.param2) for command in self.commands(MavCmd.DO_SET_MODE) if isinstance(command, m.CommandLong)
+        ]
 
     def setpoints(self) -> list[tuple[float, Message]]:
         return [(at, message) for at, message in self.sent if isinstance(message, SETPOINTS)]
@@ -106,7 +108,7 @@ class Flight:
         await self.vehicle.arm()
         await self.vehicle.take_off(altitude_m)
         await anyio.sleep(3.0)
-        self.wire.forget()
+        self.wire.clear()
 
     def pilot_takes_over(self, mode: int = CopterMode.LOITER) -> None:
         """Turn the mode switch of the remote control, with the throttle stick in the middle."""
@@ -187,7 +189,7 @@ class Px4Flight:
         await self.vehicle.arm()
         await self.vehicle.take_off(altitude_m)
         await anyio.sleep(3.0)
-        self.wire.forget()
+        self.wire.clear()
 
 
 @asynccontextmanager

@@ -35,12 +35,12 @@ def for_each(names: str, rows: Iterable[Any]) -> Callable[[Check], Check]:
                 except (Exception, pytest.fail.Exception) as error:
                     what = ", ".join(str(value)[:MAX_LENGTH] for value in values.values())
                     failures.append(f"{what}: {type(error).__name__}: {error}")
-            assert count, "there is nothing to check"
+            assert count, "there are no cases to check"
             if failures:
                 pytest.fail("\n".join((f"{len(failures)} of {count}:", *failures)), pytrace=False)
 
         signature = inspect.signature(check)
-        own = [each for name, each in signature.parameters.items() if name not in keys]
+        own = [parameter for name, parameter in signature.parameters.items() if name not in keys]
         test.__signature__ = signature.replace(parameters=own)  # type: ignore[attr-defined]
         return test
 

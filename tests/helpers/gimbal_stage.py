@@ -32,18 +32,18 @@ async def mounted() -> AsyncIterator[Flight]:
     """A copter on the ground with a gimbal that its autopilot manages."""
     async with open_flight(copter_with_mount()) as flight:
         await flight.vehicle.wait_ready()
-        flight.wire.forget()
+        flight.wire.clear()
         yield flight
 
 
 @asynccontextmanager
-async def beside(*gimbals: SimulatedGimbal, copter: SimulatedCopter | None = None) -> AsyncIterator[Flight]:
+async def with_gimbals(*gimbals: SimulatedGimbal, copter: SimulatedCopter | None = None) -> AsyncIterator[Flight]:
     """A copter on the ground with gimbals that have their own ids and managers, which it has discovered."""
     copter = copter or SimulatedCopter(boot_time_s=0.0, components=gimbals)
     async with open_flight(copter) as flight:
         await flight.vehicle.wait_ready()
         await flight.vehicle.gimbal.controllers.wait_until(lambda _: True, timeout=3)
-        flight.wire.forget()
+        flight.wire.clear()
         yield flight
 
 
@@ -63,9 +63,9 @@ def takes_control(flight: Flight, component: int = 154, *, secondary: bool = Fal
 def configured(flight: Flight | Px4Flight) -> list[tuple[float, ...]]:
     """Params 1 to 4 and 7 of each gimbal control command sent."""
     sent: list[Any] = flight.wire.commands(CONFIGURE)
-    return [(each.param1, each.param2, each.param3, each.param4, each.param7) for each in sent]
+    return [(message.param1, message.param2, message.param3, message.param4, message.param7) for message in sent]
 
 
-def us(flight: Flight) -> tuple[int, int]:
+def own_ids(flight: Flight) -> tuple[int, int]:
     connection = flight.vehicle.connection
     return connection.source_system, connection.source_component

@@ -1,4 +1,4 @@
-"""Interferes with a program at a certain iteration of the event loop, and checks what is left of it afterwards."""
+"""Leak checks: interferes with a program at one iteration of the event loop, then counts its remaining resources."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 
 from aerokit.testing.clock import VirtualClockLoop
 
-__all__ = ["CountingLoop", "Left", "RealCountingLoop", "look", "run_and_do"]
+__all__ = ["CountingLoop", "RealCountingLoop", "Resources", "resources", "run_and_do"]
 
 Program = Callable[[], Awaitable[object]]
 
@@ -36,15 +36,15 @@ class _Counting:
 
 
 class CountingLoop(_Counting, VirtualClockLoop):
-    """On virtual time."""
+    """Counting loop on virtual time."""
 
 
 class RealCountingLoop(_Counting, asyncio.SelectorEventLoop):
-    """With real sockets."""
+    """Counting loop with real sockets."""
 
 
 @dataclass(frozen=True)
-class Left:
+class Resources:
     """Resources that a program could leak."""
 
     tasks: frozenset[Any] = frozenset()
@@ -54,11 +54,11 @@ class Left:
     threads: int = 0
 
 
-def look() -> Left:
+def resources() -> Resources:
     """Collect the current resources, except for the calling task."""
     loop: Any = asyncio.get_running_loop()
     current = asyncio.current_task()
-    return Left(
+    return Resources(
         frozenset(task for task in asyncio.all_tasks() if task is not current),
         tuple(repr(timer) for timer in loop._scheduled if not timer.cancelled()),
         len(loop._selector.get_map()),
@@ -95,7 +95,7 @@ def run_and_do(
     loop: Any = loop_class()
 
     async def main() -> asyncio.Task[object]:
-        before = look()
+        before = resources()
         task = asyncio.ensure_future(_as_coroutine(program))
         loop.run_in(turns, lambda: action(task))
         await asyncio.wait([task])
@@ -103,10 +103,10 @@ def run_and_do(
         for _ in range(5):  # sockets close in a later iteration
             await asyncio.sleep(0)
         patience = 300 if loop_class is RealCountingLoop else 0  # written data may linger for a second
-        while look() != before and patience:
+        while resources() != before and patience:
             await asyncio.sleep(0.01)
             patience -= 1
-        assert look() == before, f"after {turns} turns"
+        assert resources() == before, f"after {turns} turns"
         return task
 
     try:

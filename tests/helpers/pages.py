@@ -44,7 +44,7 @@ from aerokit.transport.address import LinkAddress
 
 ROOT = Path(__file__).parents[2]
 VEHICLE_RULE = "docs/how-to/index.md#how-to-read-the-code"
-"""The section that says that ``vehicle`` is connected."""
+"""Link to the section that defines ``vehicle`` as connected."""
 ADDRESS = "udpin:0.0.0.0:14550"
 NETWORK = "zenoh://"
 """Addresses with this prefix lead to the simulated copter, too."""

@@ -1,4 +1,4 @@
-"""How to provoke an error: the state of the vehicle, the preparation, and the call that must raise it."""
+"""A provoked error: the state of the vehicle, the preparation, and the call that must raise it."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode, MavResult
 from aerokit.protocols.ftp import FtpMessage
 
 __all__ = [
-    "FORGETTING",
+    "LOSING_STATE",
     "NONSENSE",
     "REFUSING",
     "Do",
     "Provocation",
     "Table",
     "accepted",
-    "falls_silent",
     "ignored",
     "later",
     "lost",
     "no_modes",
     "pilot",
     "refused",
+    "stops_sending",
 ]
 
 Do = Callable[[Stage], Awaitable[object]]
@@ -59,7 +59,7 @@ def ignored(command: int) -> Trouble:
     return lambda stage: stage.simulated.faults.ignore(command)
 
 
-def falls_silent(stage: Stage) -> None:
+def stops_sending(stage: Stage) -> None:
     """The link loses everything."""
     stage.simulated.faults.silent = True
 
@@ -137,5 +137,5 @@ NONSENSE = file_server(
     }
 )
 """A server whose files end early, whose CRC-32 has one byte, and whose lists never end."""
-FORGETTING = file_server({Op.CALCFILECRC: bytes(4)})
+LOSING_STATE = file_server({Op.CALCFILECRC: bytes(4)})
 """A server that confirms writing, but stores something else."""

@@ -97,14 +97,14 @@ class EventLog:
 
     def __init__(self, connection: Connection, *types: type[events.Event]) -> None:
         self.all: list[events.Event] = []
-        for each in types or (events.LinkSelected,):
-            connection.bus.attach_event(each, self.all.append)
+        for kind in types or (events.LinkSelected,):
+            connection.bus.attach_event(kind, self.all.append)
 
     @property
     def chosen(self) -> list[tuple[str, str]]:
         """Return (link, reason) of each change, without the first selection."""
         return [
-            (each.link, each.reason)
-            for each in self.all
-            if isinstance(each, events.LinkSelected) and each.before is not None
+            (event.link, event.reason)
+            for event in self.all
+            if isinstance(event, events.LinkSelected) and event.before is not None
         ]

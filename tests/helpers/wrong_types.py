@@ -173,10 +173,12 @@ def misuses_of(function: Callable[..., Any], name: str) -> Iterator[Misuse]:
     """Yield one function with each parameter wrong in each way."""
     parameters = inspect.signature(function).parameters
     needed = [
-        each for each in parameters.values() if each.default is each.empty and each.kind is not each.VAR_POSITIONAL
+        parameter
+        for parameter in parameters.values()
+        if parameter.default is parameter.empty and parameter.kind is not parameter.VAR_POSITIONAL
     ]
     for parameter in parameters.values():
-        others = [each for each in needed if each is not parameter]
+        others = [needed_parameter for needed_parameter in needed if needed_parameter is not parameter]
         for value in (*WRONG[str(parameter.annotation)], *_impossible(name, parameter)):
             args, kwargs = _arguments(parameter, value, others)
             yield Misuse(name, parameter.name, value, partial(function, *args, **kwargs))
@@ -195,14 +197,14 @@ def _arguments(
 ) -> tuple[list[object], dict[str, object]]:
     """Pass by name; positional-only parameters, and those before them, by position."""
     if wrong.kind is wrong.VAR_POSITIONAL:
-        first = [RIGHT[str(each.annotation)] for each in others if each.kind is each.POSITIONAL_OR_KEYWORD]
-        rest = {each.name: RIGHT[str(each.annotation)] for each in others if each.kind is each.KEYWORD_ONLY}
+        first = [RIGHT[str(other.annotation)] for other in others if other.kind is other.POSITIONAL_OR_KEYWORD]
+        rest = {other.name: RIGHT[str(other.annotation)] for other in others if other.kind is other.KEYWORD_ONLY}
         return [*first, value], rest
-    return [], {wrong.name: value} | {each.name: RIGHT[str(each.annotation)] for each in others}
+    return [], {wrong.name: value} | {other.name: RIGHT[str(other.annotation)] for other in others}
 
 
 def refusal_of(misuse: Misuse, error: BaseException | None) -> str | None:
-    """Describe what is wrong with the error; None if nothing is."""
+    """Describe the fault of the error; None if it is as documented."""
     if not isinstance(error, InvalidArgument):
         return f"{misuse!r}: {error!r}"
     return None if misuse.parameter in str(error) else f"{misuse!r} is not named: {error}"

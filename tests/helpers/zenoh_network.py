@@ -28,13 +28,13 @@ from aerokit.transport import create_link
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.messages import Heartbeat
 
-class Ears:
+class Receiver:
     def bytes_received(self, data, peer): pass
     def link_lost(self, error): sys.exit(str(error))
 
 async def main():
     link, encoder = create_link(sys.argv[1]), FrameEncoder(1, 1)
-    await link.open(Ears())
+    await link.open(Receiver())
     print("up", flush=True)
     while True:
         link.write(encoder.encode(Heartbeat(2, 3, 81, 4, 3)))
@@ -126,20 +126,20 @@ class HoldingProxy:
     async def _carry(self, source: asyncio.StreamReader, sink: asyncio.StreamWriter) -> None:
         held: list[bytes] = []
 
-        async def let_go() -> None:
+        async def flush() -> None:
             await self._flows.wait()
             sink.writelines(held)
             held.clear()
 
-        letting_go: asyncio.Task[None] | None = None
+        flushing: asyncio.Task[None] | None = None
         with contextlib.suppress(ConnectionError):
             while data := await source.read(65536):
                 held.append(data)
-                if self._flows.is_set() and (letting_go is None or letting_go.done()):
-                    await let_go()
+                if self._flows.is_set() and (flushing is None or flushing.done()):
+                    await flush()
                     continue
                 self.held_bytes += len(data)
-                if letting_go is None or letting_go.done():
-                    letting_go = asyncio.get_running_loop().create_task(let_go())
-                    self._tasks.add(letting_go)
+                if flushing is None or flushing.done():
+                    flushing = asyncio.get_running_loop().create_task(flush())
+                    self._tasks.add(flushing)
         sink.close()

@@ -27,7 +27,7 @@ STATION = Heartbeat(6, 8, 0, 0, 4, 3)
 
 
 class Program(AbstractAsyncContextManager["Program"]):
-    """One component behind a link, with what it sends and receives."""
+    """One component behind a link; sends messages and records received frames."""
 
     def __init__(
         self,
@@ -55,13 +55,13 @@ class Program(AbstractAsyncContextManager["Program"]):
         assert self.near is not None
         return Endpoint(self.near, name=name, **fields)
 
-    def say(self, *messages: Message) -> None:
-        """Send them, each by itself."""
+    def send(self, *messages: Message) -> None:
+        """Send the messages, one write each."""
         for message in messages:
             self.link.write(self.encoder.encode(message, time.time()))
 
     @property
-    def heard(self) -> list[str]:
+    def received(self) -> list[str]:
         """Names of the received messages, in order."""
         return [STANDARD[frame.message_id].NAME for frame in self.frames]
 
@@ -121,7 +121,7 @@ async def settle() -> None:
 
 
 async def until(condition: Callable[[], object]) -> None:
-    """Let the loop turn, on real sockets, until it holds."""
+    """Poll until the condition holds, with real sockets."""
     with anyio.fail_after(100):
         while not condition():  # noqa: ASYNC110
             await anyio.sleep(0.005)

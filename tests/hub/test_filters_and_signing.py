@@ -118,5 +118,5 @@ def test_rate_for_all_excludes_answers() -> None:
     filters = Filters(STANDARD, rates={"*": 5, "LOG_DATA": 100})
     assert filters.period(Attitude.ID) == pytest.approx(0.2)
     for name in ("PARAM_VALUE", "COMMAND_ACK", "LOG_ENTRY", "STATUSTEXT"):
-        assert filters.period(next(each.ID for each in STANDARD if name == each.NAME)) == 0.0
+        assert filters.period(next(kind.ID for kind in STANDARD if name == kind.NAME)) == 0.0
     assert filters.period(120) == pytest.approx(0.01)

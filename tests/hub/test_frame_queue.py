@@ -43,7 +43,9 @@ def test_full_queue_drops_telemetry_first_then_new_frames() -> None:
     for number in range(MAX_QUEUED_FRAMES):
         assert frames.put(held(b"t", MessageKind.TELEMETRY), number) == []
     for _ in range(MAX_QUEUED_FRAMES):
-        assert [(why, each.kind) for why, each in frames.put(held(b"x"), 0)] == [("queue_full", MessageKind.TELEMETRY)]
+        assert [(why, dropped.kind) for why, dropped in frames.put(held(b"x"), 0)] == [
+            ("queue_full", MessageKind.TELEMETRY)
+        ]
     last = held(b"last")
     assert frames.put(last, 0) == [("queue_full", last)]
     assert taken(frames) == [b"x"] * MAX_QUEUED_FRAMES
@@ -54,9 +56,9 @@ def test_late_orders_are_dropped_and_returned() -> None:
     frames.put(held(b"first", MessageKind.ORDER, since=0.0), 0)
     frames.put(held(b"part", since=0.0), 0)
     frames.put(held(b"second", MessageKind.ORDER, since=0.5), 0)
-    assert ORDER_MAX_AGE_S == 1.0, "docs/hub.md and docs/reliability.md promise a second"
+    assert ORDER_MAX_AGE_S == 1.0, "docs/hub.md and docs/reliability.md promise one second"
     assert frames.expire(1.0) == []
-    assert [(why, each.raw) for why, each in frames.expire(1.01)] == [("late", b"first")]
+    assert [(why, expired.raw) for why, expired in frames.expire(1.01)] == [("late", b"first")]
     assert taken(frames) == [b"part", b"second"]
     assert frames.expire(99.0) == []
 
@@ -79,9 +81,9 @@ def test_bounds_hold_and_every_frame_is_accounted_for(
         dropped += len(frames.expire(now))
         dropped += len(frames.put(held(bytes(size) * 40, kind, now), key))
         assert len(frames) <= MAX_QUEUED_FRAMES
-        assert sum(len(each.raw) for each in frames._frames.values()) == frames._bytes <= MAX_QUEUED_BYTES
+        assert sum(len(frame.raw) for frame in frames._frames.values()) == frames._bytes <= MAX_QUEUED_BYTES
         assert all(
-            now - each.since <= ORDER_MAX_AGE_S for each in frames._frames.values() if each.kind is MessageKind.ORDER
+            now - frame.since <= ORDER_MAX_AGE_S for frame in frames._frames.values() if frame.kind is MessageKind.ORDER
         )
     assert len(taken(frames)) + dropped == len(arrivals)
     assert frames._bytes == frames._orders == frames._telemetry == 0
@@ -120,14 +122,14 @@ def test_kind_of_message(name: str, is_for_one: bool, kind: MessageKind) -> None
 
 
 def test_telemetry_is_never_an_order_and_has_no_target() -> None:
-    names = {each.NAME: each for each in STANDARD}
+    names = {kind.NAME: kind for kind in STANDARD}
     for name in _PERIODIC.split():
         assert kind_of(name, is_for_one=False) is MessageKind.TELEMETRY
         fields = {field.name for field in names[name].FIELDS}
         instances = {
-            each
-            for each in fields
-            if each.endswith("_id") or each == "id" or each in ("instance", "port", "text", "name")
+            field
+            for field in fields
+            if field.endswith("_id") or field == "id" or field in ("instance", "port", "text", "name")
         }
         assert not instances or name == "MISSION_CURRENT", (name, instances)
         assert "target_system" not in fields

@@ -57,32 +57,34 @@ async def joined(*programs: Program, **fields: dict[str, Any]) -> AsyncIterator[
         for program in programs:
             await stack.enter_async_context(program)
         names = "abcdefgh"[: len(programs)]
-        endpoints = [each.endpoint(name, **fields.get(name, {})) for name, each in zip(names, programs, strict=True)]
+        endpoints = [
+            other_name.endpoint(name, **fields.get(name, {})) for name, other_name in zip(names, programs, strict=True)
+        ]
         yield await stack.enter_async_context(Hub(endpoints))
 
 
 def of(hub: Hub, name: str) -> EndpointStatistics:
-    return next(each for each in hub.endpoints if each.name == name)
+    return next(endpoint for endpoint in hub.endpoints if endpoint.name == name)
 
 
 @virtual
 async def test_frames_are_forwarded_unchanged() -> None:
     copter, station, tablet = Program(1, 1), Program(255, 190), Program(254, 190, version=1)
     async with joined(copter, station, tablet) as hub:
-        copter.say(COPTER, ATTITUDE)
+        copter.send(COPTER, ATTITUDE)
         await settle()
-        assert station.heard == tablet.heard == ["HEARTBEAT", "ATTITUDE"]
+        assert station.received == tablet.received == ["HEARTBEAT", "ATTITUDE"]
         assert copter.frames == []
-        assert [(each.system_id, each.component_id, each.sequence) for each in station.frames] == [
+        assert [(frame.system_id, frame.component_id, frame.sequence) for frame in station.frames] == [
             (1, 1, 0),
             (1, 1, 1),
         ]
-        tablet.say(STATION)
-        station.say(STATION, ORDER, ParamRequestList(7, 1))
+        tablet.send(STATION)
+        station.send(STATION, ORDER, ParamRequestList(7, 1))
         await settle()
-        assert copter.heard == ["HEARTBEAT", "HEARTBEAT", "COMMAND_LONG"]
+        assert copter.received == ["HEARTBEAT", "HEARTBEAT", "COMMAND_LONG"]
         assert copter.frames[0].version == 1
-        assert tablet.heard == ["HEARTBEAT", "ATTITUDE", "HEARTBEAT"]
+        assert tablet.received == ["HEARTBEAT", "ATTITUDE", "HEARTBEAT"]
         assert of(hub, "b").dropped == {"no_route": 1}
         assert of(hub, "a").systems == ((1, 1),)
 
@@ -99,10 +101,10 @@ async def test_hub_sends_nothing_of_its_own() -> None:
 async def test_frames_are_joined_except_to_autopilots() -> None:
     copter, station = Program(1, 1), Program(255, 190)
     async with joined(copter, station):
-        copter.say(COPTER)
+        copter.send(COPTER)
         await settle()
         copter.link.write(b"".join(copter.encoder.encode(ATTITUDE) for _ in range(60)))
-        station.say(STATION)
+        station.send(STATION)
         station.link.write(b"".join(station.encoder.encode(ORDER) for _ in range(3)))
         await settle()
         assert len(copter.pieces) == len(copter.frames) == 4
@@ -117,13 +119,13 @@ async def test_noise_and_unknown_messages() -> None:
     async with joined(copter, station) as hub:
         copter.link.write(UNKNOWN)
         copter.link.write(b"booting ...\r\n")
-        copter.say(COPTER)
+        copter.send(COPTER)
         copter.link.write(UNKNOWN)
-        copter.say(COPTER)
+        copter.send(COPTER)
         await settle()
         assert b"".join(station.pieces).count(b"mine") == 1
         assert b"booting" not in b"".join(station.pieces)
-        assert [each.message_id for each in station.frames] == [0, 51234, 0]
+        assert [frame.message_id for frame in station.frames] == [0, 51234, 0]
         assert of(hub, "a").bad_bytes == 13
         assert of(hub, "a").dropped == {"unknown": 1}
 
@@ -132,17 +134,17 @@ async def test_noise_and_unknown_messages() -> None:
 async def test_read_only_endpoint_receives_but_is_not_forwarded() -> None:
     copter, station, onlooker = Program(1, 1), Program(255, 190), Program(254, 190)
     async with joined(copter, station, onlooker, c={"read_only": True}) as hub:
-        copter.say(COPTER)
-        onlooker.say(STATION, ORDER)
+        copter.send(COPTER)
+        onlooker.send(STATION, ORDER)
         await settle()
-        assert onlooker.heard == ["HEARTBEAT"]
+        assert onlooker.received == ["HEARTBEAT"]
         assert copter.frames == []
-        assert station.heard == ["HEARTBEAT"]
+        assert station.received == ["HEARTBEAT"]
         assert of(hub, "c").dropped == {"read_only": 2}
         assert of(hub, "c").systems == ()
-        copter.say(CommandLong(254, 190, 400, 0, 0, 0, 0, 0, 0, 0, 0))  # nor does it draw what is for others
+        copter.send(CommandLong(254, 190, 400, 0, 0, 0, 0, 0, 0, 0, 0))  # and it does not attract messages for others
         await settle()
-        assert onlooker.heard == ["HEARTBEAT"]
+        assert onlooker.received == ["HEARTBEAT"]
 
 
 @virtual
@@ -151,15 +153,15 @@ async def test_filters_and_rates() -> None:
     filters = {"only": ("HEARTBEAT", "STATUSTEXT"), "block": ("STATUSTEXT",)}
     async with joined(copter, narrow, slow, b=filters, c={"rates": {"ATTITUDE": 4, "GLOBAL_*": 1}}) as hub:
         for _ in range(101):  # ten seconds
-            copter.say(ATTITUDE, GlobalPositionInt(0, 0, 0, 0, 0, 0, 0, 0, 0))
+            copter.send(ATTITUDE, GlobalPositionInt(0, 0, 0, 0, 0, 0, 0, 0, 0))
             await anyio.sleep(0.1)
-        copter.say(COPTER, Statustext(6, "hello"))
+        copter.send(COPTER, Statustext(6, "hello"))
         await settle()
-        assert narrow.heard == ["HEARTBEAT"]
-        assert slow.heard.count("ATTITUDE") in (40, 41)
-        assert slow.heard.count("GLOBAL_POSITION_INT") in (10, 11)
-        assert slow.heard[-2:] == ["HEARTBEAT", "STATUSTEXT"]
-        assert of(hub, "c").dropped["rate_limited"] == 202 - len(slow.heard) + 2
+        assert narrow.received == ["HEARTBEAT"]
+        assert slow.received.count("ATTITUDE") in (40, 41)
+        assert slow.received.count("GLOBAL_POSITION_INT") in (10, 11)
+        assert slow.received[-2:] == ["HEARTBEAT", "STATUSTEXT"]
+        assert of(hub, "c").dropped["rate_limited"] == 202 - len(slow.received) + 2
 
 
 @virtual
@@ -168,27 +170,27 @@ async def test_rates_apply_per_sender() -> None:
     other = Program(2, 1)
     async with joined(copter, other, station, c={"rates": {"ATTITUDE": 1}}):
         for program in (copter, other, copter, other):
-            program.say(ATTITUDE)
+            program.send(ATTITUDE)
         await settle()
-        assert [each.system_id for each in station.frames] == [1, 2]
+        assert [frame.system_id for frame in station.frames] == [1, 2]
 
 
 @virtual
 async def test_keys_are_not_forwarded() -> None:
     copter, station = Program(1, 1), Program(255, 190)
     async with joined(copter, station) as hub:
-        copter.say(COPTER)
-        station.say(SetupSigning(1, 1, bytes(range(32)), 7))
+        copter.send(COPTER)
+        station.send(SetupSigning(1, 1, bytes(range(32)), 7))
         await settle()
         assert copter.frames == []
         assert of(hub, "b").dropped == {"secret": 1}
 
 
-# --------------------------------------------------------------------------- a link that does not take more
+# ---------------------------------------------------------------------------------------------- a full link
 
 
 @asynccontextmanager
-async def beside_a_slow_one() -> AsyncIterator[tuple[Hub, SlowLink, Program, Program, list[HubEvent]]]:
+async def with_slow_link() -> AsyncIterator[tuple[Hub, SlowLink, Program, Program, list[HubEvent]]]:
     """A hub with a slow link, a vehicle and a station."""
     slow, copter, station = SlowLink(), Program(2, 1), Program(255, 190)
     async with (
@@ -207,20 +209,20 @@ async def beside_a_slow_one() -> AsyncIterator[tuple[Hub, SlowLink, Program, Pro
 
 @virtual
 async def test_slow_link_gets_newest_telemetry_and_whole_transfer() -> None:
-    async with beside_a_slow_one() as (hub, slow, copter, station, _):
+    async with with_slow_link() as (hub, slow, copter, station, _):
         for number in range(50):
-            copter.say(ATTITUDE, COPTER, ParamValue(f"P{number}", 1.0, 9, 50, number))
+            copter.send(ATTITUDE, COPTER, ParamValue(f"P{number}", 1.0, 9, 50, number))
             await anyio.sleep(0.02)
         await settle()
         assert slow.written == []
-        assert station.heard.count("ATTITUDE") == 50, "the others do not wait"
+        assert station.received.count("ATTITUDE") == 50, "other endpoints do not wait"
         assert of(hub, "slow").waiting == 52
         slow.unsent = 0
         await anyio.sleep(0.05)
         names = slow.names()
         assert (names.count("ATTITUDE"), names.count("HEARTBEAT"), names.count("PARAM_VALUE")) == (1, 1, 50)
         assert of(hub, "slow").dropped == {"superseded": 98}
-        copter.say(ATTITUDE)
+        copter.send(ATTITUDE)
         await settle()
         assert slow.names()[-1] == "ATTITUDE"
         assert of(hub, "slow").waiting == 0
@@ -228,10 +230,10 @@ async def test_slow_link_gets_newest_telemetry_and_whole_transfer() -> None:
 
 @virtual
 async def test_late_order_is_dropped_and_reported() -> None:
-    async with beside_a_slow_one() as (hub, slow, _, station, events):
-        station.say(ORDER, ParamRequestList(1, 1))
+    async with with_slow_link() as (hub, slow, _, station, events):
+        station.send(ORDER, ParamRequestList(1, 1))
         await anyio.sleep(0.9)
-        station.say(ORDER)
+        station.send(ORDER)
         await anyio.sleep(0.2)
         slow.unsent = 0
         await anyio.sleep(0.05)
@@ -244,13 +246,13 @@ async def test_late_order_is_dropped_and_reported() -> None:
 
 @virtual
 async def test_stalled_link_does_not_fill_the_memory() -> None:
-    async with beside_a_slow_one() as (hub, slow, copter, station, _):
+    async with with_slow_link() as (hub, slow, copter, station, _):
         for number in range(2000):
-            copter.say(Statustext(6, f"{number:050}"))
+            copter.send(Statustext(6, f"{number:050}"))
             if number % 100 == 0:
                 await settle()
         await settle()
-        assert station.heard.count("STATUSTEXT") == 2000
+        assert station.received.count("STATUSTEXT") == 2000
         assert of(hub, "slow").waiting <= 1024
         assert of(hub, "slow").dropped["queue_full"] >= 900
         slow.receiver.link_lost(LinkLost("gone"))
@@ -259,20 +261,20 @@ async def test_stalled_link_does_not_fill_the_memory() -> None:
 
 @virtual
 async def test_link_events_are_reported() -> None:
-    async with beside_a_slow_one() as (hub, slow, copter, station, events):
+    async with with_slow_link() as (hub, slow, copter, station, events):
         slow.receiver.link_stalled(77)
         slow.receiver.link_drained(2.5)
-        station.say(ORDER)
+        station.send(ORDER)
         await settle()
         slow.receiver.link_lost(LinkLost("slow:1: unplugged"))
-        assert [each.kind for each in events] == ["stalled", "drained", "order_dropped", "lost"]
+        assert [event.kind for event in events] == ["stalled", "drained", "order_dropped", "lost"]
         assert "unplugged" in events[-1].text
         assert not of(hub, "slow").is_open
-        station.say(ORDER)
-        copter.say(COPTER)
+        station.send(ORDER)
+        copter.send(COPTER)
         await settle()
         assert of(hub, "c").dropped == {"no_route": 1}
-        assert station.heard[-1] == "HEARTBEAT"
+        assert station.received[-1] == "HEARTBEAT"
 
 
 # ------------------------------------------------------------------------------------------ the border
@@ -282,13 +284,13 @@ async def test_link_events_are_reported() -> None:
 async def test_signed_outside_and_unsigned_inside() -> None:
     copter, station = Program(1, 1, signing=Signing(KEY)), Program(255, 190)
     async with joined(copter, station, a={"signing": Signing(KEY)}) as hub:
-        copter.say(COPTER)
-        station.say(STATION, ORDER)
+        copter.send(COPTER)
+        station.send(STATION, ORDER)
         await settle()
-        assert [each.incompat_flags for each in station.frames] == [0]
-        assert copter.heard == ["HEARTBEAT", "COMMAND_LONG"]
-        assert all(Signing(KEY).has_signed(each) for each in copter.frames)
-        assert [(each.system_id, each.sequence) for each in copter.frames] == [(255, 0), (255, 1)]
+        assert [frame.incompat_flags for frame in station.frames] == [0]
+        assert copter.received == ["HEARTBEAT", "COMMAND_LONG"]
+        assert all(Signing(KEY).has_signed(frame) for frame in copter.frames)
+        assert [(frame.system_id, frame.sequence) for frame in copter.frames] == [(255, 0), (255, 1)]
         assert of(hub, "a").dropped == {}
 
 
@@ -298,12 +300,12 @@ async def test_unsigned_frames_are_refused_and_reported_once() -> None:
     async with joined(copter, station, a={"signing": Signing(KEY)}) as hub:
         events: list[HubEvent] = []
         hub.on_event(events.append)
-        copter.say(COPTER, COPTER, ATTITUDE)
+        copter.send(COPTER, COPTER, ATTITUDE)
         await settle()
         assert station.frames == []
         assert of(hub, "a").dropped == {"refused": 3}
         assert of(hub, "a").systems == ()
-        assert [each.kind for each in events] == ["refused"]
+        assert [event.kind for event in events] == ["refused"]
         assert "1/1" in events[0].text
 
 
@@ -311,7 +313,7 @@ async def test_unsigned_frames_are_refused_and_reported_once() -> None:
 async def test_signatures_pass_where_the_hub_has_no_key() -> None:
     copter, station = Program(1, 1, signing=Signing(KEY)), Program(255, 190)
     async with joined(copter, station):
-        copter.say(COPTER)
+        copter.send(COPTER)
         await settle()
         assert Signing(KEY).has_signed(station.frames[0])
 
@@ -322,17 +324,17 @@ async def test_exhausted_key_stops_one_endpoint_only() -> None:
     async with joined(copter, station, tablet, b={"signing": Signing(KEY, timestamp=(1 << 48) - 1)}) as hub:
         events: list[HubEvent] = []
         hub.on_event(events.append)
-        copter.say(COPTER)
+        copter.send(COPTER)
         await settle()
-        copter.say(COPTER)
+        copter.send(COPTER)
         await settle()
-        assert tablet.heard == ["HEARTBEAT"] * 2
-        assert station.heard == ["HEARTBEAT"]
-        assert [each.kind for each in events] == ["internal_error"]
+        assert tablet.received == ["HEARTBEAT"] * 2
+        assert station.received == ["HEARTBEAT"]
+        assert [event.kind for event in events] == ["internal_error"]
         assert "exhausted" in events[0].text
 
 
-# ------------------------------------------------------------------------------- coming and going
+# ------------------------------------------------------------------ adding and removing endpoints
 
 
 @virtual
@@ -341,19 +343,19 @@ async def test_endpoints_are_added_and_removed() -> None:
     async with joined(copter, station) as hub, late:
         events: list[HubEvent] = []
         detach = hub.on_event(events.append)
-        told = await hub.add(late.endpoint("late"))
-        assert (told.name, told.is_open, told.peers) == ("late", True, 1)
-        copter.say(COPTER)
+        reported = await hub.add(late.endpoint("late"))
+        assert (reported.name, reported.is_open, reported.peers) == ("late", True, 1)
+        copter.send(COPTER)
         await settle()
-        assert late.heard == ["HEARTBEAT"]
+        assert late.received == ["HEARTBEAT"]
         await hub.remove("late")
-        assert [each.name for each in hub.endpoints] == ["a", "b"]
-        copter.say(COPTER)
+        assert [endpoint.name for endpoint in hub.endpoints] == ["a", "b"]
+        copter.send(COPTER)
         await settle()
         assert late.is_lost
-        assert late.heard == ["HEARTBEAT"]
-        assert station.heard == ["HEARTBEAT"] * 2
-        assert [(each.endpoint, each.kind) for each in events] == [("late", "opened"), ("late", "removed")]
+        assert late.received == ["HEARTBEAT"]
+        assert station.received == ["HEARTBEAT"] * 2
+        assert [(event.endpoint, event.kind) for event in events] == [("late", "opened"), ("late", "removed")]
         detach()
         detach()
         with pytest.raises(InvalidArgument, match=r"name = 'late' is not allowed: a, b"):
@@ -383,16 +385,16 @@ async def test_endpoint_exception_does_not_affect_others(monkeypatch: pytest.Mon
         events: list[HubEvent] = []
         hub.on_event(events.append)
         monkeypatch.setattr(hub._switch.router, "route", lambda *_: 1 / 0)  # type: ignore[union-attr]
-        copter.say(COPTER)
+        copter.send(COPTER)
         await settle()
         monkeypatch.undo()
-        copter.say(COPTER)
+        copter.send(COPTER)
         await settle()
-        assert [each.kind for each in events] == ["internal_error"]
-        assert station.heard == ["HEARTBEAT"]
+        assert [event.kind for event in events] == ["internal_error"]
+        assert station.received == ["HEARTBEAT"]
 
 
-class Phoenix:
+class ReopenableLinks:
     """Links of one address: the far end of the present one, and whether another can be opened."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -402,13 +404,13 @@ class Phoenix:
 
     def make(self, *_: object, **__: object) -> Link:
         near, far = memory_link_pair()
-        return Later(near, far, self)
+        return AttachedLater(near, far, self)
 
 
-class Later(SlowLink):
+class AttachedLater(SlowLink):
     """Stands for ``near`` where that can be opened."""
 
-    def __init__(self, near: MemoryLink, far: MemoryLink, phoenix: Phoenix) -> None:
+    def __init__(self, near: MemoryLink, far: MemoryLink, phoenix: ReopenableLinks) -> None:
         super().__init__()
         self._near, self._far, self._phoenix = near, far, phoenix
 
@@ -427,33 +429,33 @@ class Later(SlowLink):
 
 @virtual
 async def test_lost_link_is_reopened(monkeypatch: pytest.MonkeyPatch) -> None:
-    links, copter = Phoenix(monkeypatch), Program(1, 1)
+    links, copter = ReopenableLinks(monkeypatch), Program(1, 1)
     async with copter, Hub([copter.endpoint("a"), Endpoint("tcp:127.0.0.1:5760", name="b")]) as hub:
         events: list[HubEvent] = []
         hub.on_event(events.append)
         async with Program(255, 190, links.far[0]) as station:
-            station.say(STATION)
+            station.send(STATION)
             await settle()
             assert of(hub, "b").systems == ((255, 190),)
         links.can_be_opened = False
         await anyio.sleep(3)
-        assert [each.kind for each in events] == ["lost"]
+        assert [event.kind for event in events] == ["lost"]
         assert (of(hub, "b").is_open, of(hub, "b").peers, of(hub, "b").systems) == (False, 0, ())
         links.can_be_opened = True
-        copter.say(COPTER)
+        copter.send(COPTER)
         await anyio.sleep(10)
         async with Program(255, 190, links.far[-1]) as station:
-            copter.say(COPTER)
+            copter.send(COPTER)
             await settle()
-            assert station.heard == ["HEARTBEAT"]
-            assert [each.kind for each in events] == ["lost", "restored"]
+            assert station.received == ["HEARTBEAT"]
+            assert [event.kind for event in events] == ["lost", "restored"]
             assert of(hub, "b").is_open
             assert of(hub, "b").frames_in == 1, "it is still counted"
 
 
 @virtual
 async def test_endpoint_with_retry_open_may_open_later(monkeypatch: pytest.MonkeyPatch) -> None:
-    links, copter = Phoenix(monkeypatch), Program(1, 1)
+    links, copter = ReopenableLinks(monkeypatch), Program(1, 1)
     links.can_be_opened = False
     with pytest.raises(LinkOpenError, match="not there"):
         await Hub(["tcp:127.0.0.1:5760"]).__aenter__()
@@ -467,14 +469,14 @@ async def test_endpoint_with_retry_open_may_open_later(monkeypatch: pytest.Monke
         await anyio.sleep(6)
         assert of(hub, "b").is_open
         async with Program(255, 190, links.far[0]) as station:
-            copter.say(COPTER)
+            copter.send(COPTER)
             await settle()
-            assert station.heard == ["HEARTBEAT"]
+            assert station.received == ["HEARTBEAT"]
 
 
 @virtual
 async def test_removed_endpoint_with_retry_open_is_not_opened(monkeypatch: pytest.MonkeyPatch) -> None:
-    links = Phoenix(monkeypatch)
+    links = ReopenableLinks(monkeypatch)
     links.can_be_opened = False
     async with Hub([Endpoint("tcp:127.0.0.1:5760", name="b", retry_open=True)]) as hub:
         await anyio.sleep(1)
@@ -486,7 +488,7 @@ async def test_removed_endpoint_with_retry_open_is_not_opened(monkeypatch: pytes
 
 
 class Broadcast(SlowLink):
-    """One other side, which has an address all the same, as `UdpBroadcast` has."""
+    """A link with a single peer that has an address, like `UdpBroadcast`."""
 
     kept: list[Peer]
 
@@ -502,13 +504,13 @@ async def test_link_with_one_named_peer() -> None:
         assert not hasattr(link, "kept")
         link.receiver.bytes_received(Program(1, 1).encoder.encode(COPTER), ("10.0.0.7", 14550))
         assert link.kept[-1] == ("10.0.0.7", 14550)
-        station.say(ORDER)
+        station.send(ORDER)
         await settle()
-        assert link.names() == ["COMMAND_LONG"], "once, not to everybody and to it"
+        assert link.names() == ["COMMAND_LONG"], "once, not as a broadcast as well"
         assert of(hub, "a").peers == 1
 
 
-class Crowded(SlowLink):
+class ManyPeersLink(SlowLink):
     """A link with any number of peers."""
 
     forgotten: int = 0
@@ -522,26 +524,26 @@ class Crowded(SlowLink):
 
 @virtual
 async def test_many_peers_are_bounded_and_silent_ones_evicted() -> None:
-    link, station = Crowded(), Program(255, 190)
+    link, station = ManyPeersLink(), Program(255, 190)
     async with station, Hub([Endpoint(link, name="a"), station.endpoint("b")]) as hub:
-        hear, copter = link.receiver.bytes_received, Program(1, 1)
+        receive, copter = link.receiver.bytes_received, Program(1, 1)
         for number in range(600):
             await anyio.sleep(0.01)
-            hear(copter.encoder.encode(COPTER), "copter")
-            hear(b"noise", ("noise", number))
-            hear(FrameEncoder(2 + number % 200, 1).encode(ATTITUDE), ("peer", number))
+            receive(copter.encoder.encode(COPTER), "copter")
+            receive(b"noise", ("noise", number))
+            receive(FrameEncoder(2 + number % 200, 1).encode(ATTITUDE), ("peer", number))
         await settle()
         statistics = of(hub, "a")
         assert statistics.peers == 256
         assert link.forgotten == 601 - 256
         assert statistics.frames_in == 1200
         assert (1, 1) in statistics.systems
-        assert station.heard.count("HEARTBEAT") == 600
+        assert station.received.count("HEARTBEAT") == 600
 
 
 @virtual
 async def test_failed_open_closes_all_endpoints(monkeypatch: pytest.MonkeyPatch) -> None:
-    links, copter = Phoenix(monkeypatch), Program(1, 1)
+    links, copter = ReopenableLinks(monkeypatch), Program(1, 1)
     links.can_be_opened = False
     async with copter:
         hub = Hub([copter.endpoint("a"), "tcp:127.0.0.1:5760"])
@@ -626,16 +628,16 @@ async def test_recording_has_every_frame_once(tmp_path: Path) -> None:
         hub.record(path)
         with pytest.raises(BusyError):
             hub.record(path)
-        copter.say(COPTER, ATTITUDE)
-        station.say(STATION, ORDER, SetupSigning(1, 1, bytes(range(32)), 7))
-        onlooker.say(STATION)
+        copter.send(COPTER, ATTITUDE)
+        station.send(STATION, ORDER, SetupSigning(1, 1, bytes(range(32)), 7))
+        onlooker.send(STATION)
         station.link.write(copter.encoder.encode(COPTER))
         await anyio.sleep(1.5)
         copter.encoder.sequence -= 1
-        copter.say(COPTER)  # the same frame by another way
+        copter.send(COPTER)  # the same frame by another way
         await settle()
         assert of(hub, "a").dropped == {"duplicate": 1}
-        assert path.stat().st_size > 0, "it is flushed now and then"
+        assert path.stat().st_size > 0, "the file is flushed periodically"
     assert [raw[7] for _, raw in read_tlog(path)] == [0, 30, 0, 76, 0]
 
 
@@ -682,33 +684,33 @@ async def test_sixty_full_clients_cost_no_search_per_frame(monkeypatch: pytest.M
     monkeypatch.setattr(kinds, "fnmatchcase", match)
     kinds.kind_of.cache_clear()
     deaf, copter = [SlowLink(f"slow:{number}") for number in range(60)], Program(1, 1)
-    async with copter, Hub([copter.endpoint("copter"), *(Endpoint(each) for each in deaf)]) as hub:
-        for each in deaf:
-            each.unsent = 1 << 20
+    async with copter, Hub([copter.endpoint("copter"), *(Endpoint(link) for link in deaf)]) as hub:
+        for link in deaf:
+            link.unsent = 1 << 20
         for number in range(200):
-            copter.say(Statustext(6, f"{number}"), ATTITUDE)
+            copter.send(Statustext(6, f"{number}"), ATTITUDE)
         await settle()
-        assert sum(each.waiting for each in hub.endpoints) == 60 * 201
-        for each in deaf:
-            each.receiver.link_lost(LinkLost("gone"))
-        assert sum(each.dropped["link_lost"] for each in hub.endpoints[1:]) == 60 * 201
+        assert sum(endpoint.waiting for endpoint in hub.endpoints) == 60 * 201
+        for deaf_link in deaf:
+            deaf_link.receiver.link_lost(LinkLost("gone"))
+        assert sum(endpoint.dropped["link_lost"] for endpoint in hub.endpoints[1:]) == 60 * 201
     assert len(matched) < 100
 
 
 @virtual
 async def test_broadcast_order_reaches_each_vehicle_once() -> None:
-    """One vehicle has two radios, another one; a program and a camera hear it as well; it never comes back."""
+    """One vehicle has two radios, another has one; a program and a camera also receive it; its sender does not."""
     first, second = Program(1, 1), Program(1, 1)
     second.encoder.sequence = 100
     other, camera, station, program = Program(2, 1), Program(1, 100), Program(255, 190), Program(250, 190)
     everyone = first, second, other, camera, station, program
     async with joined(*everyone):
-        for each, heartbeat in zip(everyone, [COPTER] * 3 + [CAMERA] + [STATION] * 2, strict=True):
-            each.say(heartbeat)
+        for client, heartbeat in zip(everyone, [COPTER] * 3 + [CAMERA] + [STATION] * 2, strict=True):
+            client.send(heartbeat)
         await settle()
         for target in (0, 1), (0, 0):
-            station.say(CommandLong(*target, 400, 0, 1, 0, 0, 0, 0, 0, 0))
+            station.send(CommandLong(*target, 400, 0, 1, 0, 0, 0, 0, 0, 0))
             await settle()
-            assert [each.heard.count("COMMAND_LONG") for each in everyone] == [1, 0, 1, 1, 0, 1]
-            for each in everyone:
-                each.frames.clear()
+            assert [client.received.count("COMMAND_LONG") for client in everyone] == [1, 0, 1, 1, 0, 1]
+            for client in everyone:
+                client.frames.clear()

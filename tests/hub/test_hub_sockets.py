@@ -24,7 +24,7 @@ ORDER = CommandLong(1, 1, 400, 0, 1, 0, 0, 0, 0, 0, 0)
 
 
 def of(hub: Hub, name: str) -> EndpointStatistics:
-    return next(each for each in hub.endpoints if each.name == name)
+    return next(endpoint for endpoint in hub.endpoints if endpoint.name == name)
 
 
 def to(statistics: EndpointStatistics, scheme: str) -> Any:
@@ -37,13 +37,13 @@ async def test_clients_of_a_server_are_routed_separately() -> None:
         async with Program(1, 1, links[0]) as copter, Program(255, 190, links[1]) as station:
             async with Program(9, 9, links[2]) as silent:
                 await until(lambda: of(hub, "tcp").peers == 3)
-                copter.say(COPTER)
-                await until(lambda: silent.heard and station.heard)
-                station.say(STATION, ORDER)
-                await until(lambda: len(copter.heard) == 2)
-                await until(lambda: len(silent.heard) == 2)
-                assert silent.heard == ["HEARTBEAT", "HEARTBEAT"], "who says nothing hears what is for everybody"
-                assert copter.heard == ["HEARTBEAT", "COMMAND_LONG"]
+                copter.send(COPTER)
+                await until(lambda: silent.received and station.received)
+                station.send(STATION, ORDER)
+                await until(lambda: len(copter.received) == 2)
+                await until(lambda: len(silent.received) == 2)
+                assert silent.received == ["HEARTBEAT", "HEARTBEAT"], "a silent client receives broadcasts"
+                assert copter.received == ["HEARTBEAT", "COMMAND_LONG"]
             await until(lambda: of(hub, "tcp").peers == 2)
             assert of(hub, "tcp").systems == ((1, 1), (255, 190))
         await until(lambda: of(hub, "tcp").peers == 0)
@@ -53,20 +53,20 @@ async def test_clients_of_a_server_are_routed_separately() -> None:
 
 async def test_connecting_and_disconnecting_clients_are_reported() -> None:
     async with Hub([Endpoint("tcpin:127.0.0.1:0", name="tcp"), Endpoint("udpin:127.0.0.1:0")]) as hub:
-        told: list[HubEvent] = []
-        hub.on_event(told.append)
+        events: list[HubEvent] = []
+        hub.on_event(events.append)
         async with Program(1, 1, to(of(hub, "tcp"), "tcp")):
-            await until(lambda: told)
-            (joined,) = told
+            await until(lambda: events)
+            (joined,) = events
             assert (joined.endpoint, joined.kind) == ("tcp", "client_joined")
             assert joined.text.startswith("client 127.0.0.1:")
-        await until(lambda: len(told) == 2)
-        assert told[1].kind == "client_left"
-        assert told[1].text == joined.text.replace("has connected", "has disconnected")
+        await until(lambda: len(events) == 2)
+        assert events[1].kind == "client_left"
+        assert events[1].text == joined.text.replace("has connected", "has disconnected")
         async with Program(1, 1, to(hub.endpoints[1], "udpout")) as sender:
-            sender.say(COPTER)
+            sender.send(COPTER)
             await until(lambda: hub.endpoints[1].peers == 1)
-    assert [each.kind for each in told] == ["client_joined", "client_left"]
+    assert [event.kind for event in events] == ["client_joined", "client_left"]
 
 
 async def test_udp_senders_are_separate_and_noise_is_ignored() -> None:
@@ -77,15 +77,15 @@ async def test_udp_senders_are_separate_and_noise_is_ignored() -> None:
             Program(255, 190, links[1]) as station,
             Program(9, 9, links[2]) as noisy,
         ):
-            station.say(STATION)
+            station.send(STATION)
             noisy.link.write(b"GET / HTTP/1.0\r\n\r\n")
             await until(lambda: of(hub, "udp").peers == 1)
-            copter.say(COPTER)
-            await until(lambda: station.heard)
-            station.say(ORDER)
-            await until(lambda: copter.heard)
+            copter.send(COPTER)
+            await until(lambda: station.received)
+            station.send(ORDER)
+            await until(lambda: copter.received)
             assert of(hub, "udp").peers == 2
-            assert copter.heard == ["COMMAND_LONG"]
+            assert copter.received == ["COMMAND_LONG"]
             assert noisy.frames == []
             assert of(hub, "udp").bad_bytes >= 18
 
@@ -109,7 +109,7 @@ async def test_client_that_does_not_read_affects_no_other() -> None:
             ):
                 await until(lambda: of(hub, "tcp").peers == 2)
                 for number in range(4_000):
-                    copter.say(Statustext(6, f"{number:050}"))
+                    copter.send(Statustext(6, f"{number:050}"))
                     if number % 50 == 0:
                         await until(lambda: len(station.frames) > number - 200)  # noqa: B023
                 await until(lambda: len(station.frames) == 4_000)
@@ -127,14 +127,14 @@ async def test_two_hubs_in_a_circle_forward_frames_once() -> None:
         async with copter, station:
             await first.add(copter.endpoint("copter"))
             await second.add(station.endpoint("station"))
-            station.say(STATION)
-            await until(lambda: copter.heard)
+            station.send(STATION)
+            await until(lambda: copter.received)
             await until(lambda: of(first, "one").systems == ((255, 190),))
-            copter.say(COPTER)
-            await until(lambda: station.heard)
+            copter.send(COPTER)
+            await until(lambda: station.received)
             for _ in range(50):
-                copter.say(Statustext(6, "hello"))
-                station.say(ORDER)
+                copter.send(Statustext(6, "hello"))
+                station.send(ORDER)
                 await asyncio.sleep(0.001)
             await until(lambda: len(station.frames) == 51)
             await until(lambda: len(copter.frames) == 51)

@@ -1,4 +1,4 @@
-"""Hubs in a circle: what goes round ends, however long it takes, and a vehicle on two radios is no circle."""
+"""Hubs in a loop: looping frames are dropped at any delay, and a vehicle on two radios is not taken for a loop."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ def circle(latency_s: float, near: Endpoint, far: Endpoint) -> tuple[Hub, Hub]:
 def test_dead_vehicle_behind_hub_loop_is_silent(latency_s: float) -> None:
     async def main() -> None:
         program_link, far = memory_link_pair()
-        copter, told = SimulatedCopter(boot_time_s=0.0), list[HubEvent]()
+        copter, events = SimulatedCopter(boot_time_s=0.0), list[HubEvent]()
         async with simulated_link(copter) as link:
             near_hub, far_hub = circle(latency_s, Endpoint(far, name="program"), Endpoint(link, name="vehicle"))
-            far_hub.on_event(told.append)
+            far_hub.on_event(events.append)
             async with near_hub, far_hub, aerokit.connect(program_link) as vehicle:
                 await asyncio.sleep(10 + 10 * latency_s)
                 assert vehicle.heartbeat_age < latency_s + 2
@@ -48,7 +48,7 @@ def test_dead_vehicle_behind_hub_loop_is_silent(latency_s: float) -> None:
                 await asyncio.sleep(200)
                 assert vehicle.heartbeat_age > 195
                 assert vehicle.position.age > 195
-        loops = [each for each in told if each.kind == "loop"]
+        loops = [event for event in events if event.kind == "loop"]
         assert bool(loops) == (latency_s > 1)
         assert len(loops) <= 4, "once for each end and sender"
         assert not loops or "1/1" in loops[0].text
@@ -58,27 +58,27 @@ def test_dead_vehicle_behind_hub_loop_is_silent(latency_s: float) -> None:
 
 @pytest.mark.parametrize("latency_s", SLOW_S)
 def test_dead_station_behind_hub_loop_is_silent(latency_s: float) -> None:
-    """It says nothing but equal heartbeats; a vehicle that went on hearing them would not notice that it is alone."""
+    """It looped identical heartbeats; a vehicle that still received them would not detect the loss of its station."""
 
     async def main() -> None:
         station, copter = Program(255, 190), Program(1, 1)
         hubs = circle(latency_s, station.endpoint("station"), copter.endpoint("copter"))
         async with station, copter, hubs[0], hubs[1]:
             for _ in range(40):
-                station.say(STATION)
+                station.send(STATION)
                 await asyncio.sleep(1.0)
             await asyncio.sleep(20 * latency_s + 1)  # a few rounds of those that passed before it was clear
-            heard = len(copter.frames)
+            frames_before = len(copter.frames)
             await asyncio.sleep(200)
-            assert len(copter.frames) == heard
-            assert 40 <= heard <= 40 + 4 * MIN_LOOP_FRAMES
+            assert len(copter.frames) == frames_before
+            assert 40 <= frames_before <= 40 + 4 * MIN_LOOP_FRAMES
 
     run_virtual(main())
 
 
 def test_vehicle_that_left_its_port_does_not_circulate() -> None:
-    stage, told = Stage(), list[str]()
-    stage.router.on_change = lambda kind, source, port, before: told.append(f"{kind} {port} {before}")
+    stage, reported = Stage(), list[str]()
+    stage.router.on_change = lambda kind, source, port, before: reported.append(f"{kind} {port} {before}")
     encoder = FrameEncoder(1, 1)
     raws = [encoder.encode(Attitude(number, 0, 0, 0, 0, 0, 0)) for number in range(20)]
     for raw in raws:
@@ -91,7 +91,7 @@ def test_vehicle_that_left_its_port_does_not_circulate() -> None:
         assert passed < MIN_LOOP_FRAMES
     assert passed == 0
     assert stage.reason == "loop"
-    assert told == ["loop b None"]
+    assert reported == ["loop b None"]
 
 
 @settings(max_examples=40, deadline=None)
@@ -99,16 +99,16 @@ def test_vehicle_that_left_its_port_does_not_circulate() -> None:
 def test_frames_do_not_circulate_on_any_slow_network(network: Network) -> None:
     for number in range(20):
         for hub in range(len(network.routers)):
-            network.say(hub, COPTER if number % 5 == 0 else Attitude(number, 0, 0, 0, 0, 0, 0))
+            network.send(hub, COPTER if number % 5 == 0 else Attitude(number, 0, 0, 0, 0, 0, 0))
         network.now += 0.1
     network.run()  # which fails after 20,000 hops
 
 
-# --------------------------------------------------------------------- two radios are no circle
+# -------------------------------------------------------------------- two radios are not a loop
 
 
 def two_radios(stage: Stage, seconds: int, first: FrameEncoder, second: FrameEncoder, ports: str) -> set[str]:
-    """A vehicle on the ground, whose numbers differ from port to port; why what it says at port b was dropped."""
+    """A disarmed vehicle with a sequence counter for each port; returns the drop reasons of port b."""
     reasons = set()
     for _ in range(seconds):
         for step in range(4):
@@ -126,17 +126,17 @@ def two_radios(stage: Stage, seconds: int, first: FrameEncoder, second: FrameEnc
 
 @pytest.mark.parametrize("ahead", range(15, 256, 15))
 def test_vehicle_on_two_radios_is_no_loop(ahead: int) -> None:
-    stage, told = Stage(), list[str]()
-    stage.router.on_change = lambda kind, source, port, before: told.append(kind)
+    stage, reported = Stage(), list[str]()
+    stage.router.on_change = lambda kind, source, port, before: reported.append(kind)
     first, second = FrameEncoder(1, 1), FrameEncoder(1, 1)
     second.sequence = ahead
     reasons = two_radios(stage, 200, first, second, "ab")
     assert "loop" not in reasons
-    assert told == ["duplicate_sender"]
+    assert reported == ["duplicate_sender"]
     two_radios(stage, 5, first, second, "b")
-    assert told == ["duplicate_sender", "route_changed"]
-    stage.hear("c", STATION, 255, 190)
-    assert stage.hear("c", order(1), 255, 190) == {"b"}
+    assert reported == ["duplicate_sender", "route_changed"]
+    stage.receive("c", STATION, 255, 190)
+    assert stage.receive("c", order(1), 255, 190) == {"b"}
 
 
 def test_equal_frames_at_two_ports_are_forwarded_once() -> None:
@@ -153,7 +153,7 @@ def test_equal_frames_at_two_ports_are_forwarded_once() -> None:
 
 
 def test_heartbeats_over_two_radios_fall_back_to_second() -> None:
-    """Equal bytes and numbers ten seconds later: nothing tells them from a circle, until the first one has stopped."""
+    """Equal bytes and numbers ten seconds later look like a loop until the first radio is silent."""
     stage, first, second = Stage(), FrameEncoder(1, 1), FrameEncoder(1, 1)
     for count in range(60):
         stage.now += 1.0
@@ -174,14 +174,14 @@ def test_frame_received_once_elsewhere_is_no_loop() -> None:
         stage.pass_on("a", raw)
         stage.now += 5
         assert stage.pass_on("b", raw) == set("acd")
-        stage.hear("b", COPTER)  # something new each time
+        stage.receive("b", COPTER)  # something new each time
         stage.now += LOOP_WINDOW_S
 
 
 def test_restarted_program_with_equal_frames_is_no_loop() -> None:
-    """A client of TCP each time, whose numbers begin at 0: its orders are new ones."""
+    """Each time a new TCP client with sequence numbers from 0: its orders are new."""
     stage = Stage()
-    stage.hear("a", COPTER)
+    stage.receive("a", COPTER)
     encoder = FrameEncoder(255, 190)
     raws = [encoder.encode(message) for message in [STATION, order(1)] * 20]
     for name in ("e", "f", "g"):

@@ -49,7 +49,7 @@ class Stage:
         self.encoders: dict[tuple[str, int, int], FrameEncoder] = {}
         self.now = 100.0
 
-    def hear(self, port: str, message: Message, system: int = 1, component: int = 1) -> set[str]:
+    def receive(self, port: str, message: Message, system: int = 1, component: int = 1) -> set[str]:
         """Ports that get the frame."""
         key = port, system, component
         encoder = self.encoders.setdefault(key, FrameEncoder(system, component))
@@ -68,58 +68,58 @@ def stage() -> Stage:
 
 
 def test_broadcast_goes_to_all_other_ports(stage: Stage) -> None:
-    assert stage.hear("a", COPTER) == set("bcd")
-    assert stage.hear("a", ParamRequestList(0, 0)) == set("bcd")
-    assert stage.hear("a", ParamRequestList(0, 1)) == set("bcd")
+    assert stage.receive("a", COPTER) == set("bcd")
+    assert stage.receive("a", ParamRequestList(0, 0)) == set("bcd")
+    assert stage.receive("a", ParamRequestList(0, 1)) == set("bcd")
 
 
 def test_targeted_message_goes_to_its_port(stage: Stage) -> None:
-    stage.hear("a", COPTER)
-    stage.hear("b", STATION, 255, 190)
-    assert stage.hear("b", order(1), 255, 190) == {"a"}
-    assert stage.hear("b", order(1, 0), 255, 190) == {"a"}
-    assert stage.hear("a", order(255, 190)) == {"b"}
+    stage.receive("a", COPTER)
+    stage.receive("b", STATION, 255, 190)
+    assert stage.receive("b", order(1), 255, 190) == {"a"}
+    assert stage.receive("b", order(1, 0), 255, 190) == {"a"}
+    assert stage.receive("a", order(255, 190)) == {"b"}
 
 
 def test_message_for_unknown_target_is_dropped(stage: Stage) -> None:
-    assert stage.hear("a", order(7)) == set()
+    assert stage.receive("a", order(7)) == set()
     assert stage.reason == "no_route"
 
 
 def test_unknown_component_is_reached_by_its_system(stage: Stage) -> None:
-    stage.hear("a", COPTER)
-    stage.hear("b", CAMERA, 1, 100)
-    assert stage.hear("c", order(1, 154), 255, 190) == {"a", "b"}
-    assert stage.hear("c", order(1, 0), 255, 190) == {"a", "b"}
-    assert stage.hear("c", order(1, 100), 255, 190) == {"b"}
-    assert stage.hear("c", order(1, 1), 255, 190) == {"a"}
-    assert stage.hear("b", order(1, 1), 1, 100) == {"a"}
+    stage.receive("a", COPTER)
+    stage.receive("b", CAMERA, 1, 100)
+    assert stage.receive("c", order(1, 154), 255, 190) == {"a", "b"}
+    assert stage.receive("c", order(1, 0), 255, 190) == {"a", "b"}
+    assert stage.receive("c", order(1, 100), 255, 190) == {"b"}
+    assert stage.receive("c", order(1, 1), 255, 190) == {"a"}
+    assert stage.receive("b", order(1, 1), 1, 100) == {"a"}
 
 
 def test_frame_never_goes_back(stage: Stage) -> None:
-    stage.hear("a", COPTER)
-    assert stage.hear("a", order(1), 255, 190) == set()
+    stage.receive("a", COPTER)
+    assert stage.receive("a", order(1), 255, 190) == set()
     assert stage.reason == ""
 
 
 def test_ground_stations_with_shared_ids_all_receive(stage: Stage) -> None:
-    stage.hear("b", STATION, 255, 190)
-    stage.hear("c", STATION.__class__(6, 8, 0, 1, 4), 255, 190)
-    assert stage.hear("a", order(255, 190)) == {"b", "c"}
+    stage.receive("b", STATION, 255, 190)
+    stage.receive("c", STATION.__class__(6, 8, 0, 1, 4), 255, 190)
+    assert stage.receive("a", order(255, 190)) == {"b", "c"}
 
 
 def test_vehicle_on_two_links_gets_an_order_once(stage: Stage) -> None:
-    stage.hear("a", COPTER)
-    stage.hear("b", Heartbeat(2, 3, 81, 5, 3))
-    assert stage.hear("c", order(1), 255, 190) == {"a"}
-    assert stage.hear("c", order(1, 0), 255, 190) == {"a"}
+    stage.receive("a", COPTER)
+    stage.receive("b", Heartbeat(2, 3, 81, 5, 3))
+    assert stage.receive("c", order(1), 255, 190) == {"a"}
+    assert stage.receive("c", order(1, 0), 255, 190) == {"a"}
     stage.now += ROUTE_TIMEOUT_S + 0.1
-    stage.hear("b", Heartbeat(2, 3, 81, 6, 3))
-    assert stage.hear("c", order(1), 255, 190) == {"b"}
-    stage.hear("a", Heartbeat(2, 3, 81, 7, 3))  # it is back; there is no need to change again
-    assert stage.hear("c", order(1), 255, 190) == {"b"}
+    stage.receive("b", Heartbeat(2, 3, 81, 6, 3))
+    assert stage.receive("c", order(1), 255, 190) == {"b"}
+    stage.receive("a", Heartbeat(2, 3, 81, 7, 3))  # it is back; there is no need to change again
+    assert stage.receive("c", order(1), 255, 190) == {"b"}
     stage.router.remove(stage.nodes["b"])
-    assert stage.hear("c", order(1), 255, 190) == {"a"}
+    assert stage.receive("c", order(1), 255, 190) == {"a"}
 
 
 def test_copy_at_other_port_is_dropped_without_effect(stage: Stage) -> None:
@@ -128,7 +128,7 @@ def test_copy_at_other_port_is_dropped_without_effect(stage: Stage) -> None:
     for port in "bcd":
         assert stage.pass_on(port, raw) == set()
         assert stage.reason == "duplicate"
-    assert stage.hear("c", order(1), 255, 190) == {"a"}
+    assert stage.receive("c", order(1), 255, 190) == {"a"}
     assert stage.router.senders_at(stage.nodes["b"]) == []
 
 
@@ -157,75 +157,75 @@ def test_duplicate_window_has_at_least_its_length(stage: Stage) -> None:
 
 
 def test_removed_port_is_forgotten(stage: Stage) -> None:
-    stage.hear("a", COPTER)
-    stage.hear("b", STATION, 255, 190)
-    assert stage.hear("b", order(1), 255, 190) == {"a"}
+    stage.receive("a", COPTER)
+    stage.receive("b", STATION, 255, 190)
+    assert stage.receive("b", order(1), 255, 190) == {"a"}
     stage.router.remove(stage.nodes["a"])
-    assert stage.hear("b", order(1), 255, 190) == set()
+    assert stage.receive("b", order(1), 255, 190) == set()
     assert stage.reason == "no_route"
-    assert stage.hear("b", STATION, 255, 190) == {"c", "d"}
+    assert stage.receive("b", STATION, 255, 190) == {"c", "d"}
 
 
 def test_added_port_gets_broadcasts(stage: Stage) -> None:
-    stage.hear("a", COPTER)
+    stage.receive("a", COPTER)
     stage.router.add("e")
-    assert stage.hear("a", COPTER) == set("bcde")
+    assert stage.receive("a", COPTER) == set("bcde")
 
 
 def test_keys_are_dropped(stage: Stage) -> None:
-    stage.hear("a", COPTER)
-    assert stage.hear("b", SetupSigning(1, 1, bytes(32), 0), 255, 190) == set()
+    stage.receive("a", COPTER)
+    assert stage.receive("b", SetupSigning(1, 1, bytes(32), 0), 255, 190) == set()
     assert stage.reason == "secret"
 
 
 def test_radio_status_does_not_go_to_vehicles(stage: Stage) -> None:
-    stage.hear("a", COPTER)
-    stage.hear("b", STATION, 255, 190)
-    stage.hear("d", Heartbeat(2, 12, 0, 0, 3), 2, 1)
-    assert stage.hear("a", RadioStatus(0, 0, 0, 0, 0, 0, 0), 51, 68) == {"b", "c"}
+    stage.receive("a", COPTER)
+    stage.receive("b", STATION, 255, 190)
+    stage.receive("d", Heartbeat(2, 12, 0, 0, 3), 2, 1)
+    assert stage.receive("a", RadioStatus(0, 0, 0, 0, 0, 0, 0), 51, 68) == {"b", "c"}
 
 
 def test_unknown_messages_of_known_senders_are_forwarded(stage: Stage) -> None:
     assert stage.pass_on("a", UNKNOWN) == set()
     assert stage.reason == "unknown"
-    stage.hear("a", COPTER)
+    stage.receive("a", COPTER)
     assert stage.pass_on("a", UNKNOWN) == set("bcd")
     assert stage.pass_on("b", UNKNOWN) == set()
 
 
 def test_ports_filter_messages(stage: Stage) -> None:
     stage.wishes = {("b", Attitude.ID): None, ("c", Attitude.ID): 0.5, ("c", CommandLong.ID): 0.5}
-    assert stage.hear("a", Attitude(0, 0, 0, 0, 0, 0, 0)) == {"d"}
+    assert stage.receive("a", Attitude(0, 0, 0, 0, 0, 0, 0)) == {"d"}
     assert stage.rate_limited == (("c", 0.5),)
-    stage.hear("c", COPTER, 3)
-    assert stage.hear("a", order(3)) == {"c"}  # targeted messages are not rate-limited
+    stage.receive("c", COPTER, 3)
+    assert stage.receive("a", order(3)) == {"c"}  # targeted messages are not rate-limited
     stage.wishes[("c", CommandLong.ID)] = None
     stage.router.forget_plans()
-    assert stage.hear("a", order(3)) == set()
+    assert stage.receive("a", order(3)) == set()
 
 
 def test_vehicle_is_reported_once_per_port(stage: Stage) -> None:
-    told: list[str] = []
-    stage.router.on_vehicle = told.append
+    events: list[str] = []
+    stage.router.on_vehicle = events.append
     for _ in range(3):
-        stage.hear("a", COPTER)
-        stage.hear("b", STATION, 255, 190)
-        stage.hear("c", CAMERA, 1, 100)
-    assert told == ["a"]
+        stage.receive("a", COPTER)
+        stage.receive("b", STATION, 255, 190)
+        stage.receive("c", CAMERA, 1, 100)
+    assert events == ["a"]
 
 
 def test_flooded_tables_affect_no_known_sender(stage: Stage) -> None:
-    stage.hear("a", COPTER)
+    stage.receive("a", COPTER)
     for number in range(3 * MAX_ROUTES):
         stage.now += 0.001
-        stage.hear("b", Statustext(6, "x"), 2 + number % 250, number // 250)
+        stage.receive("b", Statustext(6, "x"), 2 + number % 250, number // 250)
         if number % 100 == 0:
-            stage.hear("a", COPTER)
+            stage.receive("a", COPTER)
     assert len(stage.router._senders) <= MAX_ROUTES
-    assert stage.hear("c", order(1), 255, 190) == {"a"}
+    assert stage.receive("c", order(1), 255, 190) == {"a"}
     for target in range(1, 256):
         for component in range(40):
-            stage.hear("b", order(target, component), 255, 190)
+            stage.receive("b", order(target, component), 255, 190)
     assert len(stage.nodes["b"].plans) <= MAX_PLANS
 
 
@@ -265,7 +265,7 @@ class Network:
     def _port(self, hub: int, name: tuple[int, int]) -> None:
         self.nodes[hub][name] = self.routers[hub].add(name)
 
-    def say(self, hub: int, message: Message) -> bytes:
+    def send(self, hub: int, message: Message) -> bytes:
         raw = self.encoders[hub].encode(message)
         self._post(hub, (-1, 0), raw)
         return raw
@@ -278,7 +278,7 @@ class Network:
         while self.heap:
             self.now, _, hub, port, raw = heapq.heappop(self.heap)
             self.hops += 1
-            assert self.hops < 20_000, "frames go round and round"
+            assert self.hops < 20_000, "frames loop"
             for out in self.routers[hub].route(self.nodes[hub][port], Frame.parse(raw), self.now).outs:
                 if out == (-1, 0):
                     self.got[hub][raw] += 1
@@ -300,16 +300,16 @@ def test_each_target_receives_once_on_any_network(network: Network, vehicles: bo
     hubs = range(len(network.routers))
     hello = COPTER if vehicles else STATION
     for _ in range(2):
-        said = {hub: network.say(hub, hello) for hub in hubs}
+        said = {hub: network.send(hub, hello) for hub in hubs}
         network.run()
         for hub in hubs:
             assert network.got[hub] == {raw: 1 for other, raw in said.items() if other != hub}
         network.got.clear()
     sender = data.draw(st.sampled_from(hubs))
     target = data.draw(st.sampled_from([hub for hub in hubs if hub != sender]))
-    raws = [network.say(sender, order(1 + target, component)) for component in (1, 0, 1)]
-    nobody = network.say(sender, order(200))
+    raws = [network.send(sender, order(1 + target, component)) for component in (1, 0, 1)]
+    unused = network.send(sender, order(200))
     network.run()
     assert network.got[target] == dict.fromkeys(raws, 1)
     assert not any(network.got[hub] for hub in hubs if hub != target)
-    assert nobody not in network.got[target]
+    assert unused not in network.got[target]

@@ -1,4 +1,4 @@
-"""Vehicles at several ports: their messages take one of them, whatever other components are received there."""
+"""Vehicles reachable at several ports: messages for them use one port, regardless of other components there."""
 
 from __future__ import annotations
 
@@ -11,93 +11,93 @@ from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.messages import Attitude, Heartbeat, ParamRequestList
 
 
-def a_camera_of_another_age() -> Stage:
-    """Vehicle and camera are heard at ports a and b; of each, another one was the first."""
+def vehicle_and_camera() -> Stage:
+    """Vehicle and camera are received at ports a and b, in a different order."""
     stage = Stage()
-    stage.hear("a", COPTER)
-    stage.hear("b", CAMERA, 1, 100)
+    stage.receive("a", COPTER)
+    stage.receive("b", CAMERA, 1, 100)
     for _ in range(2):  # the first is like the other port's: a copy
-        stage.hear("b", COPTER)
-        stage.hear("a", CAMERA, 1, 100)
-    stage.hear("c", STATION, 255, 190)
+        stage.receive("b", COPTER)
+        stage.receive("a", CAMERA, 1, 100)
+    stage.receive("c", STATION, 255, 190)
     return stage
 
 
 def test_system_message_goes_to_its_autopilot_once() -> None:
-    stage = a_camera_of_another_age()
-    assert stage.hear("c", order(1, 0), 255, 190) == {"a"}
-    assert stage.hear("c", order(1, 1), 255, 190) == {"a"}
-    assert stage.hear("c", order(1, 100), 255, 190) == {"b"}
-    assert len(stage.hear("c", order(1, 77), 255, 190)) == 1, "of a component that is not known"
+    stage = vehicle_and_camera()
+    assert stage.receive("c", order(1, 0), 255, 190) == {"a"}
+    assert stage.receive("c", order(1, 1), 255, 190) == {"a"}
+    assert stage.receive("c", order(1, 100), 255, 190) == {"b"}
+    assert len(stage.receive("c", order(1, 77), 255, 190)) == 1, "for an unknown component"
 
 
 def test_system_message_follows_a_moved_autopilot() -> None:
     stage = Stage()
     for port in "ab":
-        stage.hear(port, COPTER)
-        stage.hear(port, CAMERA, 1, 100)
-    stage.hear("c", STATION, 255, 190)
+        stage.receive(port, COPTER)
+        stage.receive(port, CAMERA, 1, 100)
+    stage.receive("c", STATION, 255, 190)
     stage.now += 1.0
-    stage.hear("a", CAMERA, 1, 100)
+    stage.receive("a", CAMERA, 1, 100)
     stage.now += ROUTE_TIMEOUT_S - 0.5
-    stage.hear("b", COPTER)
-    stage.hear("b", CAMERA, 1, 100)
-    assert stage.hear("c", order(1, 1), 255, 190) == {"b"}
-    assert stage.hear("c", order(1, 0), 255, 190) == {"b"}
+    stage.receive("b", COPTER)
+    stage.receive("b", CAMERA, 1, 100)
+    assert stage.receive("c", order(1, 1), 255, 190) == {"b"}
+    assert stage.receive("c", order(1, 0), 255, 190) == {"b"}
 
 
 def test_camera_at_own_port_gets_system_messages() -> None:
     stage = Stage()
-    stage.hear("a", COPTER)
-    stage.hear("b", CAMERA, 1, 100)
-    stage.hear("c", STATION, 255, 190)
-    assert stage.hear("c", order(1, 0), 255, 190) == {"a", "b"}
+    stage.receive("a", COPTER)
+    stage.receive("b", CAMERA, 1, 100)
+    stage.receive("c", STATION, 255, 190)
+    assert stage.receive("c", order(1, 0), 255, 190) == {"a", "b"}
 
 
 def test_returning_port_is_used_again() -> None:
-    """The vehicle was heard there long ago: until it is heard there again, the camera is reached there."""
+    """The vehicle was last received there long ago; the camera is reached there until the vehicle returns."""
     stage = Stage()
-    stage.hear("b", COPTER)
-    stage.hear("a", COPTER)
+    stage.receive("b", COPTER)
+    stage.receive("a", COPTER)
     stage.now += ROUTE_TIMEOUT_S + 1
-    stage.hear("a", COPTER)
+    stage.receive("a", COPTER)
     stage.now += ROUTE_TIMEOUT_S + 1
-    stage.hear("a", COPTER)
-    stage.hear("b", CAMERA, 1, 100)
-    stage.hear("c", STATION, 255, 190)
-    assert stage.hear("c", order(1, 0), 255, 190) == {"a", "b"}
-    stage.hear("b", COPTER)
-    assert stage.hear("c", order(1, 0), 255, 190) == {"a"}
+    stage.receive("a", COPTER)
+    stage.receive("b", CAMERA, 1, 100)
+    stage.receive("c", STATION, 255, 190)
+    assert stage.receive("c", order(1, 0), 255, 190) == {"a", "b"}
+    stage.receive("b", COPTER)
+    assert stage.receive("c", order(1, 0), 255, 190) == {"a"}
 
 
 def test_broadcast_order_reaches_a_vehicle_once() -> None:
-    stage = a_camera_of_another_age()
-    assert stage.hear("c", order(0, 0), 255, 190) == {"a", "d"}
-    assert stage.hear("c", ParamRequestList(0, 0), 255, 190) == {"a", "b", "d"}, "it orders nothing"
-    assert stage.hear("c", STATION, 255, 190) == {"a", "b", "d"}
+    stage = vehicle_and_camera()
+    assert stage.receive("c", order(0, 0), 255, 190) == {"a", "d"}
+    assert stage.receive("c", ParamRequestList(0, 0), 255, 190) == {"a", "b", "d"}, "it is not a command"
+    assert stage.receive("c", STATION, 255, 190) == {"a", "b", "d"}
     stage.now += ROUTE_TIMEOUT_S + 1
-    stage.hear("b", COPTER)
-    assert stage.hear("c", order(0, 0), 255, 190) >= {"b"}, "it is reached there now"
+    stage.receive("b", COPTER)
+    assert stage.receive("c", order(0, 0), 255, 190) >= {"b"}, "it is reached there now"
 
 
 def test_forged_senders_do_not_evict_a_gimbal() -> None:
     stage = Stage()
-    stage.hear("a", Heartbeat(26, 8, 0, 0, 3), 77, 154)
-    stage.hear("c", STATION, 255, 190)
+    stage.receive("a", Heartbeat(26, 8, 0, 0, 3), 77, 154)
+    stage.receive("c", STATION, 255, 190)
     stage.now += 0.1
     for number in range(MAX_ROUTES + 100):
-        stage.hear("b", Attitude(0, 0, 0, 0, 0, 0, 0), 2 + number % 240, 1 + number // 240)
-    assert stage.hear("c", order(77, 154), 255, 190) == {"a"}
+        stage.receive("b", Attitude(0, 0, 0, 0, 0, 0, 0), 2 + number % 240, 1 + number // 240)
+    assert stage.receive("c", order(77, 154), 255, 190) == {"a"}
 
 
 FIRST_ORDER = FrameEncoder(255, 190).encode(order(1))
-"""Of a program whose numbers start at 0, as those of an earlier program did."""
+"""First order of a program; its sequence numbers start at 0, like those of an earlier program."""
 
 
 def test_first_order_at_a_new_port_is_no_copy() -> None:
-    """Scripts one after the other, that order the same: the vehicle must hear the last of them, too."""
+    """Several scripts run one after another and send the same order: the vehicle must receive the last one too."""
     stage = Stage()
-    stage.hear("a", COPTER)
+    stage.receive("a", COPTER)
     assert stage.pass_on("c", FIRST_ORDER) == {"a"}
     for name in ("e", "f"):  # a client of TCP, a new port of UDP
         stage.now += 0.2
@@ -107,9 +107,9 @@ def test_first_order_at_a_new_port_is_no_copy() -> None:
 
 def test_first_order_after_port_removal_is_no_copy() -> None:
     stage = Stage()
-    stage.hear("a", COPTER)
+    stage.receive("a", COPTER)
     assert stage.pass_on("c", FIRST_ORDER) == {"a"}
-    assert stage.pass_on("d", FIRST_ORDER) == set(), "by another way that was there"
+    assert stage.pass_on("d", FIRST_ORDER) == set(), "over another route that existed"
     stage.router.remove(stage.nodes.pop("c"))
     stage.now += 0.1
     assert stage.pass_on("d", FIRST_ORDER) == {"a"}
@@ -117,21 +117,21 @@ def test_first_order_after_port_removal_is_no_copy() -> None:
 
 def test_first_order_at_same_port_later_is_no_copy() -> None:
     stage = Stage()
-    stage.hear("a", COPTER)
+    stage.receive("a", COPTER)
     assert stage.pass_on("c", FIRST_ORDER) == {"a"}
     stage.now += REPEAT_WINDOW_S / 2
-    assert stage.pass_on("c", FIRST_ORDER, is_late=True) == set(), "doubled on its way"
+    assert stage.pass_on("c", FIRST_ORDER, is_late=True) == set(), "duplicated by the network"
     stage.now += REPEAT_WINDOW_S
     assert stage.pass_on("c", FIRST_ORDER, is_late=True) == {"a"}
 
 
 @pytest.mark.parametrize("component", [0, 1])
 def test_vehicle_on_two_links_does_not_get_own_order(component: int) -> None:
-    """PX4 says its failsafes as orders to all of its own system; a camera at a port of its own hears them."""
+    """PX4 announces failsafes as commands to its whole system; a camera at another port receives them."""
     stage = Stage()
-    stage.hear("a", COPTER)
-    stage.hear("b", COPTER)  # like the other port's: a copy
-    stage.hear("b", COPTER)
-    stage.hear("c", CAMERA, 1, 100)
-    assert stage.hear("b", order(1, component)) == ({"c"} if component == 0 else set())
-    assert stage.hear("d", order(1, component), 255, 190) >= {"a"}
+    stage.receive("a", COPTER)
+    stage.receive("b", COPTER)  # like the other port's: a copy
+    stage.receive("b", COPTER)
+    stage.receive("c", CAMERA, 1, 100)
+    assert stage.receive("b", order(1, component)) == ({"c"} if component == 0 else set())
+    assert stage.receive("d", order(1, component), 255, 190) >= {"a"}

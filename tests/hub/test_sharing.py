@@ -42,7 +42,7 @@ def make(kind: str) -> tuple[SimulatedVehicle, str]:
 
 
 async def transfer_at_once(one: Vehicle, other: Vehicle, path: str, new: str) -> None:
-    """Each does all three kinds of transfers while the other does another one."""
+    """Each program runs all three kinds of transfers while the other one runs a different kind."""
     for this, that in ((one, other), (other, one)):
         parameters, _, data = await asyncio.gather(
             this.parameters.download(method="list", refresh=True),
@@ -132,7 +132,7 @@ def test_station_flies_and_the_program_sees_it() -> None:
     run_virtual(run())
 
 
-# ------------------------------------------------------------------------- what goes where
+# ------------------------------------------------------------------------------ forwarding
 
 
 class Stage:
@@ -152,7 +152,7 @@ async def stage(signing: Signing | None = None, vehicle: Program | None = None) 
         aerokit.open_connection(vehicle.near, signing=signing) as connection,
         shared(connection, [station.endpoint("station")]) as hub,
     ):
-        vehicle.say(COPTER)
+        vehicle.send(COPTER)
         await settle()
         yield Stage(vehicle, station, connection, hub)
 
@@ -170,9 +170,9 @@ def test_station_receives_vehicle_and_program() -> None:
         on.connection.send(ORDER)
         on.connection.send(ParamRequestList(0, 0))
         await settle()
-        assert [(each.system_id, each.message_id) for each in on.station.frames if each.system_id == 1] == [(1, 0)]
-        assert [each.message_id for each in on.station.frames if each.system_id == 255] == [0, 21]
-        assert on.vehicle.heard == ["HEARTBEAT", "COMMAND_LONG", "PARAM_REQUEST_LIST"]
+        assert [(frame.system_id, frame.message_id) for frame in on.station.frames if frame.system_id == 1] == [(1, 0)]
+        assert [frame.message_id for frame in on.station.frames if frame.system_id == 255] == [0, 21]
+        assert on.vehicle.received == ["HEARTBEAT", "COMMAND_LONG", "PARAM_REQUEST_LIST"]
 
     on_stage(play)
 
@@ -181,11 +181,11 @@ def test_vehicle_receives_station_frames_once() -> None:
     async def play(on: Stage) -> None:
         on.vehicle.frames.clear()
         on.station.frames.clear()
-        on.station.say(STATION, ORDER, ParamRequestList(77, 1), ParamRequestList(255, 190))
-        on.station.say(SetupSigning(1, 1, bytes(range(32)), 5))
+        on.station.send(STATION, ORDER, ParamRequestList(77, 1), ParamRequestList(255, 190))
+        on.station.send(SetupSigning(1, 1, bytes(range(32)), 5))
         await settle()
-        assert on.vehicle.heard == ["HEARTBEAT", "COMMAND_LONG"]
-        assert {(each.system_id, each.component_id) for each in on.vehicle.frames} == {(250, 190)}
+        assert on.vehicle.received == ["HEARTBEAT", "COMMAND_LONG"]
+        assert {(frame.system_id, frame.component_id) for frame in on.vehicle.frames} == {(250, 190)}
         assert on.station.frames == []
 
     on_stage(play)
@@ -193,29 +193,29 @@ def test_vehicle_receives_station_frames_once() -> None:
 
 def test_answers_go_to_their_target() -> None:
     async def play(on: Stage) -> None:
-        on.station.say(STATION)
+        on.station.send(STATION)
         await settle()
         on.station.frames.clear()
-        on.vehicle.say(ParamSet(250, 190, "A", 1.0, 9), ParamSet(255, 190, "B", 1.0, 9))
+        on.vehicle.send(ParamSet(250, 190, "A", 1.0, 9), ParamSet(255, 190, "B", 1.0, 9))
         await settle()
-        assert on.station.heard == ["PARAM_SET"]
+        assert on.station.received == ["PARAM_SET"]
 
     on_stage(play)
 
 
 def test_signing_program_signs_for_its_stations() -> None:
     async def play(on: Stage) -> None:
-        on.station.say(STATION, ORDER)
-        on.vehicle.say(Attitude(0, 0, 0, 0, 0, 0, 0))
+        on.station.send(STATION, ORDER)
+        on.vehicle.send(Attitude(0, 0, 0, 0, 0, 0, 0))
         await settle()
-        assert all(Signing(KEY).has_signed(each) for each in on.vehicle.frames)
-        assert [(each.system_id, each.message_id) for each in on.vehicle.frames] == [
+        assert all(Signing(KEY).has_signed(frame) for frame in on.vehicle.frames)
+        assert [(frame.system_id, frame.message_id) for frame in on.vehicle.frames] == [
             (255, 0),
             (250, 0),
             (250, 76),
         ]
-        assert {each.incompat_flags for each in on.station.frames} == {0}
-        assert {each.system_id for each in on.station.frames} == {1, 255}
+        assert {frame.incompat_flags for frame in on.station.frames} == {0}
+        assert {frame.system_id for frame in on.station.frames} == {1, 255}
 
     on_stage(play, signing=Signing(KEY), vehicle=Program(1, 1, signing=Signing(KEY)))
 
@@ -237,8 +237,8 @@ def test_sharing_ends_with_connection_but_not_vice_versa() -> None:
                 hub.on_event(events.append)
                 connection.close()
                 await settle()
-                assert [(each.endpoint, each.kind) for each in events] == [("program", "lost")]
-                again.say(STATION)
+                assert [(event.endpoint, event.kind) for event in events] == [("program", "lost")]
+                again.send(STATION)
                 await settle()
                 with pytest.raises(ConnectionClosed):
                     await hub.share(connection, name="again")
@@ -262,17 +262,17 @@ def test_sent_frame_observer_exception_does_not_affect_sharing(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     async def play(on: Stage) -> None:
-        told: list[bytes] = []
+        frames_sent: list[bytes] = []
         on.connection.observe_sent_frames(lambda raw: 1 / 0)
-        detach = on.connection.observe_sent_frames(told.append)
+        detach = on.connection.observe_sent_frames(frames_sent.append)
         on.connection.send(ORDER)
         on.connection.write_raw(on.station.encoder.encode(STATION))
         detach()
         detach()
         on.connection.send(ORDER)
-        assert [raw[7] for raw in told] == [76]
+        assert [raw[7] for raw in frames_sent] == [76]
         await settle()
-        assert on.vehicle.heard.count("COMMAND_LONG") == 2
+        assert on.vehicle.received.count("COMMAND_LONG") == 2
 
     on_stage(play)
     assert "ZeroDivisionError" in caplog.text

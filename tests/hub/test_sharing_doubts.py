@@ -27,12 +27,12 @@ def test_station_with_our_ids_is_reported_once(component: int) -> None:
             Program(255, component) as station,
             shared(connection, [station.endpoint("station")]),
         ):
-            told: list[events.Event] = []
-            connection.bus.attach_event(events.DuplicateSender, told.append)
+            reported: list[events.Event] = []
+            connection.bus.attach_event(events.DuplicateSender, reported.append)
             for _ in range(3):
-                station.say(Heartbeat(6, 8, 1, 0, 4))
+                station.send(Heartbeat(6, 8, 1, 0, 4))
                 await anyio.sleep(1)
-            assert [(each.system_id, each.component_id) for each in told] == (  # type: ignore[attr-defined]
+            assert [(event.system_id, event.component_id) for event in reported] == (  # type: ignore[attr-defined]
                 [(255, 190)] if component == 190 else []
             )
 

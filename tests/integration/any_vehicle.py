@@ -65,7 +65,7 @@ class Choice:
 
 @asynccontextmanager
 async def connected(choice: Choice) -> AsyncIterator[Vehicle]:
-    """It was switched on just now, unless it is at an address."""
+    """Connect to the vehicle, which was just started unless it is at an address."""
     async with served(choice) as address, connect(address, timeout=30) as vehicle:
         yield vehicle
 
@@ -82,12 +82,12 @@ def served(choice: Choice) -> AbstractAsyncContextManager[str | Link]:
     """The vehicle runs; gives what to connect to."""
     if choice.vehicle == "sim":
         return _simulated(choice)
-    return _binary(choice) if choice.is_binary else _given(choice.vehicle)
+    return _binary(choice) if choice.is_binary else _as_given(choice.vehicle)
 
 
 @asynccontextmanager
 async def served_on_two(choice: Choice) -> AsyncIterator[list[Link]]:
-    """The vehicle runs, with two ports of its own; a vehicle at an address is skipped."""
+    """Run the vehicle with two ports; skips the test for a vehicle at an address."""
     if choice.vehicle == "sim":
         ours, theirs = zip(*(memory_link_pair() for _ in range(2)), strict=True)
         async with SimulatorServer(_patient(choice), theirs, speedup=choice.speedup):
@@ -102,7 +102,7 @@ async def served_on_two(choice: Choice) -> AsyncIterator[list[Link]]:
 
 
 @asynccontextmanager
-async def _given(address: str) -> AsyncIterator[str]:
+async def _as_given(address: str) -> AsyncIterator[str]:
     yield address
 
 
@@ -126,7 +126,7 @@ def _patient(choice: Choice) -> SimulatedVehicle:
 
 @asynccontextmanager
 async def _binary(choice: Choice, more: Sequence[str] = ()) -> AsyncIterator[str]:
-    """It is started in an empty directory, and ended afterwards."""
+    """Start the binary in an empty directory, and terminate it afterwards."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         is_px4 = not choice.kind.is_ardupilot
         port = 14540 + min(INSTANCE, 9) if is_px4 else _free_port()
@@ -142,11 +142,11 @@ async def _binary(choice: Choice, more: Sequence[str] = ()) -> AsyncIterator[str
 
 
 def _ardupilot(choice: Choice, port: int, folder: Path) -> tuple[list[str], dict[str, str]]:
-    """It waits for us as long as a simulated one does that is as fast."""
+    """Return command and environment; its time-outs are those of a simulated vehicle at the same speed."""
     binary, kind = Path(choice.vehicle).resolve(), choice.kind
     files = [folder / "patience.parm"]
     files[0].write_text("".join(f"{name} {value:g}\n" for name, value in _longer(choice).items()))
-    source = next((each for each in binary.parents if (each / "Tools/autotest").is_dir()), None)
+    source = next((folder for folder in binary.parents if (folder / "Tools/autotest").is_dir()), None)
     if source is not None:
         files.insert(0, source / "Tools/autotest" / kind.defaults)
     command = [str(binary), "--model", kind.model, "--speedup", f"{choice.speedup:g}", f"-I{INSTANCE}"]

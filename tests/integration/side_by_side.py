@@ -92,7 +92,7 @@ PARAMETERS = {
 NEEDS_STICKS = frozenset(
     ("STABILIZE", "ACRO", "DRIFT", "SPORT", "FLIP", "THROW", "TURTLE", "ZIGZAG", "SYSTEMID", "AUTOTUNE", "GUIDED_NOGPS")
 )  # fmt: skip
-COPTER_MODES = tuple(each.name for each in CopterMode)
+COPTER_MODES = tuple(mode.name for mode in CopterMode)
 PX4_MODES = (
     "MANUAL",
     "ALTCTL",
@@ -189,7 +189,7 @@ class _Runner:
         here = vehicle.position.value
         self._here = here
         self._texts: list[str] = []
-        vehicle.status_text.observe(lambda _, told: self._texts.append(told.text), every_arrival=True)
+        vehicle.status_text.observe(lambda _, text: self._texts.append(text.text), every_arrival=True)
         self._doing: dict[str, Callable[..., Awaitable[object]]] = {
             "command": self._command, "command_int": self._command_int, "command_to": self._command_to,
             "set_mode": self._set_mode, "parameter": self._parameter, "mission": self._mission, "go_to": self._go_to,
@@ -214,7 +214,7 @@ class _Runner:
         await self._rest()
         vehicle = self.vehicle
         landed = vehicle.landed_state.latest == ON_GROUND
-        return Step(str(call), result, vehicle.mode.value.name, vehicle.is_armed, landed, self._said())
+        return Step(str(call), result, vehicle.mode.value.name, vehicle.is_armed, landed, self._texts_without_numbers())
 
     async def _result_of(self, call: Call) -> str:
         try:
@@ -244,8 +244,8 @@ class _Runner:
             await wait(self._scale)
         await wait(QUIET_S * self._scale)
 
-    def _said(self) -> tuple[str, ...]:
-        texts = (re.sub(r"-?\d+(\.\d+)?", "#", each.strip()) for each in self._texts if not NOT_COMPARED.match(each))
+    def _texts_without_numbers(self) -> tuple[str, ...]:
+        texts = (re.sub(r"-?\d+(\.\d+)?", "#", text.strip()) for text in self._texts if not NOT_COMPARED.match(text))
         return tuple(sorted(set(texts)))
 
     # ------------------------------------------------------------------------------------- calls
@@ -310,7 +310,7 @@ async def _beat(vehicle: Vehicle, interval_s: float) -> None:
 
 
 def run_simulated(kind: str, seed: int, speedup: float = 1.0, calls: int = CALLS) -> list[Step]:
-    """On virtual time."""
+    """Run the calls on a simulated vehicle, on virtual time."""
 
     async def main() -> list[Step]:
         latitude, longitude, altitude, heading = KINDS[kind].home
@@ -331,7 +331,7 @@ async def run_choice(choice: Choice, seed: int, calls: int = CALLS) -> list[Step
 
 
 def differences(real: list[Step], ours: list[Step]) -> list[str]:
-    """Line by line; from the first step on that left them in other states only that one counts."""
+    """Compare line by line, up to the first step that ends in different states."""
     found = []
     for number, (one, other) in enumerate(zip(real, ours, strict=True)):
         for what in ("result", "texts", "mode", "armed", "landed"):
@@ -370,10 +370,10 @@ def main() -> int:
             by_call[line[3:]].append(seed)
         if options.keep:
             options.keep.mkdir(exist_ok=True)
-            both = {"real": [asdict(each) for each in real], "ours": [asdict(each) for each in ours]}
+            both = {"real": [asdict(row) for row in real], "ours": [asdict(own) for own in ours]}
             (options.keep / f"{options.kind}-{seed}.json").write_text(json.dumps(both, indent=1))
     print("\nAll of them:")
-    for line, seeds in sorted(by_call.items(), key=lambda each: -len(each[1])):
+    for line, seeds in sorted(by_call.items(), key=lambda entry: -len(entry[1])):
         print(f"{len(seeds):3} × {line}  (seeds {', '.join(map(str, seeds[:5]))})")
     return 0
 

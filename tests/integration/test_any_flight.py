@@ -34,7 +34,7 @@ async def up(vehicle: Vehicle, choice: Choice) -> None:
 
 
 async def down(vehicle: Vehicle, choice: Choice) -> None:
-    """On the ground, in the water or where it stands, the motors off."""
+    """Land the vehicle, or disarm it, and wait until its motors are off."""
     if choice.kind.lands and vehicle.is_armed:
         await vehicle.land(timeout=choice.seconds(400))
     if not choice.kind.takes_off:
@@ -43,7 +43,7 @@ async def down(vehicle: Vehicle, choice: Choice) -> None:
 
 
 async def test_flight_by_orders(choice: Choice) -> None:
-    """It goes there at that speed, does not disarm in the air, turns, holds, returns, comes down."""
+    """It flies to a place at a speed, refuses to disarm in the air, turns, holds, returns and lands."""
     kind = choice.kind
     async with ready(choice) as vehicle:
         here = vehicle.position.value
@@ -68,7 +68,7 @@ async def test_flight_by_orders(choice: Choice) -> None:
 
 
 async def test_flight_by_velocities(choice: Choice) -> None:
-    """It moves as far as speed and time give, and stops afterwards; planes do not take velocities."""
+    """The distance is speed times time, then it stops; planes do not accept velocities."""
     async with ready(choice) as vehicle:
         if choice.kind.takes_velocities:
             await up(vehicle, choice)
@@ -80,7 +80,7 @@ async def test_flight_by_velocities(choice: Choice) -> None:
 
 
 async def fly_north(vehicle: Vehicle, choice: Choice) -> None:
-    """For ten seconds of its clock, which may go slower than it was asked to."""
+    """Ten seconds of the vehicle's clock, which may be slower than requested."""
     speed, milliseconds = choice.kind.speed_m_s, 10_000
     here = vehicle.position.fresh(within=5)
     stream = vehicle.guided.velocity(rate_hz=min(100, 10 * choice.speedup), valid_for_s=10, max_lag_s=10)

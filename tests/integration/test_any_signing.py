@@ -1,4 +1,4 @@
-"""A key for signing, on every vehicle: taken, used, not changed while armed, taken away. See `test_any_vehicle`."""
+"""A key for signing, on every vehicle: set, used, not changeable while armed, removed. See `test_any_vehicle`."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ def anyio_backend(choice: Choice) -> Any:
 
 
 @pytest.fixture(autouse=True)
-def _not_on_somebodys_vehicle(choice: Choice) -> None:
+def _skip_on_real_vehicle(choice: Choice) -> None:
     if choice.vehicle != "sim" and not Path(choice.vehicle).is_file():
         pytest.skip("a test that ends too soon would leave its key there")
 
 
 async def test_signing_key_is_installed(choice: Choice) -> None:
-    """PX4 on a computer has no USB port, where alone it takes one."""
+    """PX4 accepts a key over USB only, and its simulation has no USB port."""
     async with ready(choice) as vehicle:
         signing = Signing(KEY)
         if choice.vehicle != "sim" and not choice.kind.is_ardupilot:
@@ -51,7 +51,7 @@ async def test_signing_key_is_installed(choice: Choice) -> None:
                 await vehicle.setup_signing(Signing(OTHER))
             vehicle.send(m.SetupSigning(vehicle.system_id, 1, OTHER.secret, signing.timestamp))
             await vehicle.status_text.wait_until(
-                lambda each: "signing" in each.text and "armed" in each.text, timeout=choice.seconds(5)
+                lambda status: "signing" in status.text and "armed" in status.text, timeout=choice.seconds(5)
             )
             await vehicle.disarm()
         finally:

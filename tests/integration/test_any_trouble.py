@@ -14,7 +14,7 @@ from typing import Any
 import anyio
 import pytest
 from any_vehicle import Choice, served
-from order_air import Air, Disturbances
+from disturbed_link import Disturbances, DisturbedLink
 
 from aerokit import Vehicle, connect, fleet
 from aerokit import messages as m
@@ -49,12 +49,12 @@ def _is_a_copter(choice: Choice) -> None:
 
 
 @asynccontextmanager
-async def flying(choice: Choice, *, through_air: bool = True) -> AsyncIterator[tuple[Vehicle, Air]]:
-    """Some metres up, where it takes orders; the disturbances is good so far, if there is any."""
+async def flying(choice: Choice, *, through_disturbance: bool = True) -> AsyncIterator[tuple[Vehicle, DisturbedLink]]:
+    """A vehicle some metres up that accepts orders, over a link without disturbances so far."""
     async with served(choice) as served_at:
         link = served_at if isinstance(served_at, Link) else create_link(served_at)
-        air = Air(link)
-        async with connect(air if through_air else link, timeout=30) as vehicle:
+        path = DisturbedLink(link)
+        async with connect(path if through_disturbance else link, timeout=30) as vehicle:
             await vehicle.wait_ready(timeout=choice.seconds(120))
             name = "FS_GCS_ENABLE" if choice.kind.is_ardupilot else "NAV_DLL_ACT"
             async with vehicle.parameters.temporarily({name: 1 if choice.kind.is_ardupilot else 2}):
@@ -63,7 +63,7 @@ async def flying(choice: Choice, *, through_air: bool = True) -> AsyncIterator[t
                 await vehicle.arm(timeout=choice.seconds(10))
                 await vehicle.take_off(choice.kind.altitude_m, timeout=choice.seconds(120))
                 await anyio.sleep(choice.seconds(3) if choice.is_virtual else 3.0)
-                yield vehicle, air
+                yield vehicle, path
                 if vehicle.is_armed:
                     if vehicle.landed_state.latest != LANDED_ON_GROUND:
                         await vehicle.return_to_launch(timeout=choice.seconds(400))
@@ -74,21 +74,21 @@ def far(vehicle: Vehicle) -> Any:
     return vehicle.position.value.offset(north_m=DISTANCE_M)
 
 
-def sent(air: Air, command: int) -> int:
-    return sum(getattr(each.message, "command", None) == command for each in air.sent)
+def sent(path: DisturbedLink, command: int) -> int:
+    return sum(getattr(message.message, "command", None) == command for message in path.sent)
 
 
 class AnotherStation:
-    """Sends commands on the same link, by a name of its own."""
+    """Sends commands on the same link, with its own ids."""
 
-    def __init__(self, vehicle: Vehicle, air: Air) -> None:
-        self._vehicle, self._air = vehicle, air
+    def __init__(self, vehicle: Vehicle, path: DisturbedLink) -> None:
+        self._vehicle, self._path = vehicle, path
         self._encoder = FrameEncoder(ANOTHER_STATION, 190)
 
     def command(self, command: int, *params: float) -> None:
         padded = (*params, *(0.0,) * (7 - len(params)))
         target = (self._vehicle.system_id, self._vehicle.component_id)
-        self._air.link.write(self._encoder.encode(m.CommandLong(*target, command, 0, *padded)))
+        self._path.link.write(self._encoder.encode(m.CommandLong(*target, command, 0, *padded)))
 
     def return_to_launch(self) -> None:
         mode = self._vehicle.autopilot.mode_for("return")
@@ -97,47 +97,49 @@ class AnotherStation:
 
 
 async def test_lost_acks_send_nothing_twice(choice: Choice) -> None:
-    async with flying(choice) as (vehicle, air):
-        air.disturbances = Disturbances(command=MavCmd.DO_SET_MODE, lost_acks=9)
-        air.begin()
+    async with flying(choice) as (vehicle, path):
+        path.disturbances = Disturbances(command=MavCmd.DO_SET_MODE, lost_acks=9)
+        path.begin()
         await vehicle.return_to_launch(timeout=choice.seconds(400))
-        assert sent(air, MavCmd.DO_SET_MODE) == 1
+        assert sent(path, MavCmd.DO_SET_MODE) == 1
 
 
 async def test_takeover_by_other_station_during_lost_ack_keeps_vehicle(choice: Choice) -> None:
-    async with flying(choice) as (vehicle, air):
-        air.disturbances = Disturbances(command=MavCmd.DO_REPOSITION, lost_acks=9)
-        air.begin()
+    async with flying(choice) as (vehicle, path):
+        path.disturbances = Disturbances(command=MavCmd.DO_REPOSITION, lost_acks=9)
+        path.begin()
         async with anyio.create_task_group() as tasks:
 
             async def take_over() -> None:
                 await anyio.sleep(0.3)
-                AnotherStation(vehicle, air).return_to_launch()
+                AnotherStation(vehicle, path).return_to_launch()
 
             tasks.start_soon(take_over)
             with pytest.raises(OperationRejected):
                 await vehicle.go_to(far(vehicle))
         await anyio.sleep(5.0)
-        assert sent(air, MavCmd.DO_REPOSITION) == 1
-        assert sent(air, MavCmd.DO_SET_MODE) == 0
+        assert sent(path, MavCmd.DO_REPOSITION) == 1
+        assert sent(path, MavCmd.DO_SET_MODE) == 0
         assert vehicle.mode_name == "RTL"
 
 
 async def test_failsafe_during_real_outage_keeps_vehicle(choice: Choice) -> None:
     """Twelve seconds, with the failsafe for a lost ground station."""
-    async with flying(choice) as (vehicle, air):
-        air.begin()
-        air.disturbances = Disturbances(outage=(3.0, 15.0))
+    async with flying(choice) as (vehicle, path):
+        path.begin()
+        path.disturbances = Disturbances(outage=(3.0, 15.0))
         with pytest.raises((HeartbeatTimeout, OperationRejected)):
             await vehicle.go_to(far(vehicle))
         await vehicle.armed.wait_until(lambda _: vehicle.heartbeat_age < 1.0, timeout=20)
-        back_at = next(each.at for each in air.heartbeats if each.at > air.began_at + 15.0)
+        back_at = next(heartbeat.at for heartbeat in path.heartbeats if heartbeat.at > path.began_at + 15.0)
         await anyio.sleep(5.0)
-        assert sent(air, MavCmd.DO_SET_MODE) == 0
+        assert sent(path, MavCmd.DO_SET_MODE) == 0
         if choice.kind.is_ardupilot:
             assert vehicle.mode_name == "RTL"
-        else:  # It returns to its mode when it receives us again, and is then told to hold.
-            orders = [each.at for each in air.sent if getattr(each.message, "command", 0) == MavCmd.DO_REPOSITION]
+        else:  # It returns to its mode when it receives us again, and aerokit then commands a hold.
+            orders = [
+                message.at for message in path.sent if getattr(message.message, "command", 0) == MavCmd.DO_REPOSITION
+            ]
             assert not [at for at in orders[1:] if at < back_at]
 
 
@@ -145,14 +147,14 @@ async def test_blocked_program_leaves_the_failsafe_alone(choice: Choice) -> None
     """Blocked for 14 s, while HEARTBEATs wait in the socket; the call is cancelled when the program continues."""
     if not choice.is_binary:
         pytest.skip("a simulated vehicle would be blocked, too: tests/vehicle/commanding/orders/test_paused_program.py")
-    async with flying(choice, through_air=False) as (vehicle, _):
+    async with flying(choice, through_disturbance=False) as (vehicle, _):
         orders: list[int] = []
         vehicle.connection.observe_sent_frames(lambda raw: orders.append(command_in(raw)))
         asyncio.get_running_loop().call_later(3.0, time.sleep, 14.0)
         with anyio.move_on_after(6.0), pytest.raises((HeartbeatTimeout, OperationRejected)):
             await vehicle.go_to(far(vehicle))
         await anyio.sleep(3.0)
-        assert [each for each in orders if each in STEER] == [MavCmd.DO_REPOSITION]
+        assert [order for order in orders if order in STEER] == [MavCmd.DO_REPOSITION]
         assert vehicle.mode_name in ("RTL", "LAND")
 
 
@@ -163,13 +165,13 @@ def command_in(raw: bytes) -> int:
 
 
 async def test_fleet_member_taken_by_other_station_is_left_alone(choice: Choice) -> None:
-    """It is flown from before the fleet was opened; another member does not do its part."""
+    """It was flying before the fleet was opened; another member does not respond."""
     silent = SimulatedCopter(system_id=77, boot_time_s=0.0)
-    async with flying(choice) as (vehicle, air), simulated_link(silent) as link:
+    async with flying(choice) as (vehicle, path), simulated_link(silent) as link:
         connection = vehicle.connection
         connection.attached.discard(vehicle.system_id)  # Like another program that receives the same vehicle.
         async with fleet({"real": connection, "other": link}, count=2) as both:
-            air.begin()
+            path.begin()
             before = vehicle.mode_name
             assert both.members[f"real/{vehicle.system_id}"].state is MemberState.TAKEN_OVER
             with pytest.raises(FleetError):
@@ -177,15 +179,15 @@ async def test_fleet_member_taken_by_other_station_is_left_alone(choice: Choice)
             with anyio.move_on_after(2.0):
                 await both.barrier(lambda _: False, timeout=30.0)
             await anyio.sleep(2.0)
-            assert sent(air, MavCmd.DO_REPOSITION) == sent(air, MavCmd.DO_SET_MODE) == 0
+            assert sent(path, MavCmd.DO_REPOSITION) == sent(path, MavCmd.DO_SET_MODE) == 0
             assert vehicle.mode_name == before
 
 
 async def test_reboot_in_flight_ends_orders(choice: Choice) -> None:
     """ArduCopter obeys, by force, and falls; PX4 denies it and flies on."""
-    async with flying(choice) as (vehicle, air):
-        station = AnotherStation(vehicle, air)
-        air.begin()
+    async with flying(choice) as (vehicle, path):
+        station = AnotherStation(vehicle, path)
+        path.begin()
         error: AerokitError | None = None
         with anyio.move_on_after(30.0):
             async with anyio.create_task_group() as tasks:
@@ -200,7 +202,7 @@ async def test_reboot_in_flight_ends_orders(choice: Choice) -> None:
                 except AerokitError as caught:
                     error = caught
         assert error is not None
-        assert sent(air, MavCmd.DO_REPOSITION) <= 1 + (not choice.kind.is_ardupilot)  # PX4 holds by it
+        assert sent(path, MavCmd.DO_REPOSITION) <= 1 + (not choice.kind.is_ardupilot)  # PX4 holds by it
         if choice.kind.is_ardupilot:
             assert isinstance(error, (OperationRejected, HeartbeatTimeout))
-            assert sent(air, MavCmd.DO_SET_MODE) == 0
+            assert sent(path, MavCmd.DO_SET_MODE) == 0

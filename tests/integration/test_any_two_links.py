@@ -47,7 +47,7 @@ async def test_one_of_two_links_is_cut_in_flight(choice: Choice) -> None:
             bus.attach_event(events.LinkSelected, chosen.append)
             bus.attach_event(events.VehicleSilent, silent.append)
             await vehicle.wait_ready(timeout=choice.seconds(120))
-            await status.wait_until(lambda each: all(vehicle.system_id in link.systems for link in each), timeout=30)
+            await status.wait_until(lambda links: all(vehicle.system_id in link.systems for link in links), timeout=30)
             await anyio.sleep(3)  # the second one has to show that it leads to the same vehicle
             if choice.kind.guided is not None:
                 await vehicle.set_mode(choice.kind.guided)
@@ -61,9 +61,9 @@ async def test_one_of_two_links_is_cut_in_flight(choice: Choice) -> None:
                 await anyio.sleep(2)
                 become(first, DEAD)
                 with anyio.fail_after(2 if choice.is_virtual else 5):  # a busy machine takes longer
-                    while not chosen or vehicle.position.age > 1.0:  # noqa: ASYNC110 - ages are not told
+                    while not chosen or vehicle.position.age > 1.0:  # noqa: ASYNC110 - ages have no event
                         await anyio.sleep(0.1)
-                assert [(each.link, each.reason) for each in chosen] == [(second.address, "silent")]
+                assert [(event.link, event.reason) for event in chosen] == [(second.address, "silent")]
                 assert vehicle.link_state.value is LinkState.CONNECTED
             items = [
                 waypoint(start.latitude_deg + n * 1e-5, start.longitude_deg, altitude_relative_m=20.0)
@@ -76,6 +76,6 @@ async def test_one_of_two_links_is_cut_in_flight(choice: Choice) -> None:
                 await anyio.sleep(0.02)
                 become(second, DEAD)
             assert len((await vehicle.mission.download()).items) == 40
-            assert [(each.link, each.reason) for each in chosen[1:]] == [(first.address, "silent")]
+            assert [(event.link, event.reason) for event in chosen[1:]] == [(first.address, "silent")]
             await vehicle.land(timeout=choice.seconds(240))
             assert not silent

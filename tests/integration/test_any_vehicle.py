@@ -37,7 +37,7 @@ def anyio_backend(choice: Choice) -> Any:
 
 
 async def test_boot_until_ready(choice: Choice) -> None:
-    """It is not armed while it boots; then it reports its position and home, and does not move."""
+    """It is disarmed while booting; then it reports position and home, and does not move."""
     async with connected(choice) as vehicle:
         if choice.kind.is_ardupilot and choice.vehicle == "sim":
             with pytest.raises(CommandRejected):
@@ -120,7 +120,7 @@ async def test_messages_arrive_at_requested_rate(choice: Choice) -> None:
             while attitudes.get_nowait() is not None:
                 pass
             await anyio.sleep(2.0)
-            times = [each.time_boot_ms for each in iter(attitudes.get_nowait, None)]
+            times = [attitude.time_boot_ms for attitude in iter(attitudes.get_nowait, None)]
         seconds = (times[-1] - times[0]) / 1000
         assert 15 < (len(times) - 1) / seconds < 60
         await vehicle.command(REQUEST_MESSAGE, m.SystemTime.ID)
@@ -148,7 +148,7 @@ async def test_armed_and_disarmed(choice: Choice) -> None:
 
 
 async def test_reboot(choice: Choice) -> None:
-    """It is back, and its streams are requested again; PX4's own simulation refuses."""
+    """After the reboot its streams are requested again; PX4's simulation refuses to reboot."""
     async with ready(choice) as vehicle:
         if choice.vehicle != "sim" and not choice.kind.is_ardupilot:
             with pytest.raises(CommandRejected):
@@ -163,4 +163,4 @@ def around(vehicle: Vehicle, choice: Choice) -> Mission:
     """Two corners."""
     here, far, up = vehicle.position.value, choice.kind.travel_m, choice.kind.altitude_m
     corners = [here.offset(north_m=far), here.offset(north_m=far, east_m=far)]
-    return Mission([waypoint(each.latitude_deg, each.longitude_deg, altitude_relative_m=up) for each in corners])
+    return Mission([waypoint(corner.latitude_deg, corner.longitude_deg, altitude_relative_m=up) for corner in corners])

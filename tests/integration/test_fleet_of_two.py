@@ -26,7 +26,7 @@ pytest.importorskip("zenoh")
 pytestmark = pytest.mark.anyio
 
 ARDUCOPTER, PX4 = os.environ.get("AEROKIT_ARDUCOPTER"), os.environ.get("AEROKIT_PX4")
-BINARIES = [Path(each).resolve() for each in (ARDUCOPTER, PX4) if each]
+BINARIES = [Path(binary).resolve() for binary in (ARDUCOPTER, PX4) if binary]
 DEFAULTS = "Tools/autotest/default_params/copter.parm"
 SPEEDUP = 1.0 if ARDUCOPTER and PX4 else 8.0
 PX4_INSTANCE = 1  # its system id is one more
@@ -107,7 +107,7 @@ async def test_they_take_off_together_go_and_land_together() -> None:
 async def fly(address: str) -> None:
     async with aerokit.fleet({"field": address}, count=2, timeout=90) as fleet:
         assert sorted(fleet.vehicles) == ["field/1", f"field/{PX4_INSTANCE + 1}"]
-        firmwares = {each.autopilot.name for each in fleet.vehicles.values()}
+        firmwares = {vehicle.autopilot.name for vehicle in fleet.vehicles.values()}
         assert firmwares == {"ArduPilot", "PX4"}
         (await fleet.wait_ready(timeout=150)).raise_for_errors()
         for vehicle in fleet.vehicles.values():  # transfers pass, too

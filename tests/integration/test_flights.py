@@ -22,7 +22,7 @@ SPEEDUP = 40.0
 
 @contextmanager
 def pseudo_terminals() -> Iterator[tuple[str, str]]:
-    """Two serial ports joined by a wire: what goes into one comes out of the other."""
+    """Two serial ports joined by a wire: data written to one is read from the other."""
     pairs = [os.openpty(), os.openpty()]
     for pair in pairs:
         for end in pair:

@@ -71,12 +71,12 @@ async def test_udp_port_in_use() -> None:
 async def test_several_vehicles_on_one_port() -> None:
     """Each sends from its own port to ours; messages for one of them are sent to that one only."""
     copters = [SimulatedCopter(boot_time_s=0, system_id=system_id) for system_id in (1, 2, 3)]
-    heard: dict[int, list[int]] = {copter.system_id: [] for copter in copters}
+    received: dict[int, list[int]] = {copter.system_id: [] for copter in copters}
     for copter in copters:
         handler = copter.handlers[CommandLong.ID]
 
         def note(message: Any, channel: Any, copter: Any = copter, handler: Any = handler) -> None:
-            heard[copter.system_id].append(message.command)
+            received[copter.system_id].append(message.command)
             handler(message, channel)
 
         copter.handlers[CommandLong.ID] = note
@@ -92,8 +92,8 @@ async def test_several_vehicles_on_one_port() -> None:
         await vehicles[0].arm()
         assert [copter.motors.is_armed for copter in copters] == [False, True, False]
         assert [vehicle.is_armed for vehicle in vehicles] == [True, False, False]
-        assert 400 in heard[2]
-        assert 400 not in heard[1] + heard[3]
+        assert 400 in received[2]
+        assert 400 not in received[1] + received[3]
         await vehicles[2].set_mode("GUIDED")
         assert [vehicle.mode_name for vehicle in vehicles] == ["STABILIZE", "STABILIZE", "GUIDED"]
 

@@ -148,7 +148,7 @@ def test_private_message_round_trip(private: Dialect) -> None:
     decoded = private.decode(frame)
     assert decoded == message
     assert decoded.received_frame is frame
-    assert Framer().receive(raw) == [], "the standard does not know it"
+    assert Framer().receive(raw) == [], "it is not in the standard"
 
 
 @pytest.mark.parametrize(
@@ -331,7 +331,7 @@ def test_extended_dialect_merges_enums(private: Dialect) -> None:
     both = STANDARD.extended_by(private)
     commands = both.enum("MAV_CMD")
     assert (commands.WINCH_DROP, commands.NAV_TAKEOFF) == (60_000, 22)
-    assert commands.DO_SET_RESUME_REPEAT_DIST == 215, "ArduPilot's, which the private dialect has not"
+    assert commands.DO_SET_RESUME_REPEAT_DIST == 215, "ArduPilot's message, which is not in the private dialect"
     assert commands is both.enum("MAV_CMD")
     assert both.enum("MAV_RESULT") is enums.MavResult, "nothing was added"
     assert both.enum("WINCH_FLAGS") is private.enum("WINCH_FLAGS")
@@ -410,5 +410,5 @@ def test_char_arrays_with_bytes_in_any_dialect(tmp_path: Path) -> None:
     path.write_text(own)
     ack: Any = Dialect.from_xml(path)[324]
     assert ack is not messages.ParamExtAck
-    told = ack.decode(ack(param_id="A", param_value=b"\0\1", param_type=3, param_result=0, own=7).encode())
-    assert told.to_dict()["param_value"] == b"\0\1".ljust(128, b"\0")
+    decoded = ack.decode(ack(param_id="A", param_value=b"\0\1", param_type=3, param_result=0, own=7).encode())
+    assert decoded.to_dict()["param_value"] == b"\0\1".ljust(128, b"\0")

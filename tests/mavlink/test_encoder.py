@@ -89,7 +89,7 @@ def test_encode_error_names_field(make: Callable[[], Message], complaint: str) -
     with pytest.raises(InvalidArgument) as caught:
         encoder.encode(make())
     assert complaint in str(caught.value)
-    assert encoder.sequence == 0, "no number is used up"
+    assert encoder.sequence == 0, "the sequence number does not advance"
     assert caught.value.__cause__ is None
 
 

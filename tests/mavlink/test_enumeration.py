@@ -18,15 +18,15 @@ NAMES = [name for name in dir(enums) if isinstance(getattr(enums, name), type)]
 @for_each("name", NAMES)
 def test_both_enum_constructions_are_equal(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     quick: Any = getattr(enums, name)
-    members = [(each, int(value)) for each, value in quick.__members__.items()]
+    members = [(name, int(value)) for name, value in quick.__members__.items()]
     monkeypatch.setattr("aerokit.mavlink.message._simple_enum", None)
     usual: Any = make_enum(quick.__module__, name, issubclass(quick, IntFlag), quick.__doc__, members)
-    assert [(*each,) for each in usual.__members__.items()] == [(*each,) for each in quick.__members__.items()]
-    assert [repr(each) for each in usual] == [repr(each) for each in quick]
+    assert [(*pair,) for pair in usual.__members__.items()] == [(*pair,) for pair in quick.__members__.items()]
+    assert [repr(member) for member in usual] == [repr(member) for member in quick]
     assert (usual.__doc__, usual.__mro__[1:]) == (quick.__doc__, quick.__mro__[1:])
-    for each in quick:
-        assert pickle.loads(pickle.dumps(each)) is each
-        assert (quick(each.value), hash(each), f"{each}") == (each, hash(int(each)), str(int(each)))
+    for member in quick:
+        assert pickle.loads(pickle.dumps(member)) is member
+        assert (quick(member.value), hash(member), f"{member}") == (member, hash(int(member)), str(int(member)))
 
 
 def test_unnamed_flag_bits_are_kept() -> None:

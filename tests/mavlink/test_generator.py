@@ -30,7 +30,7 @@ def test_fingerprint_depends_on_xml(tmp_path: Path) -> None:
         (tmp_path / f"{stem}.xml").write_bytes((generator.xml_folder() / f"{stem}.xml").read_bytes())
     assert generator.fingerprint(tmp_path) == generator.fingerprint()
     (tmp_path / "minimal.xml").write_bytes((tmp_path / "minimal.xml").read_bytes().replace(b"\n", b"\r\n"))
-    assert generator.fingerprint(tmp_path) == generator.fingerprint(), "line ends are no difference"
+    assert generator.fingerprint(tmp_path) == generator.fingerprint(), "line endings do not matter"
     text = (tmp_path / "minimal.xml").read_text(encoding="utf-8").replace("system_status", "system_state")
     (tmp_path / "minimal.xml").write_text(text, encoding="utf-8")
     assert generator.fingerprint(tmp_path) != generator.fingerprint()

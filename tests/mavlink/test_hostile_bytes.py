@@ -1,4 +1,4 @@
-"""Hostile bytes: their processing costs, and how senders behind one peer are told apart."""
+"""Hostile bytes: their processing costs, and the distinction of senders behind one peer."""
 
 from __future__ import annotations
 
@@ -93,8 +93,8 @@ def test_framers_share_and_release_sender_limit() -> None:
     limit = SourceLimit(10)
     one, two = Framer(limit=limit), Framer(limit=limit)
     for system_id in range(1, 9):
-        for each in (one, two):
-            each.receive(FrameEncoder(system_id, 1).encode(HEARTBEAT))
+        for sender in (one, two):
+            sender.receive(FrameEncoder(system_id, 1).encode(HEARTBEAT))
     assert len(one.statistics.sources) + len(two.statistics.sources) == 10
     assert one.statistics.frames == two.statistics.frames == 8
     one.close()
@@ -269,7 +269,7 @@ def held_back(share: float, by: int) -> Disorder:
 
 def repeated(share: float) -> Disorder:
     def disorder(chance: random.Random, frames: list[bytes]) -> list[bytes]:
-        return [each for frame in frames for each in (frame, frame)[: 1 + (chance.random() < share)]]
+        return [copied for frame in frames for copied in (frame, frame)[: 1 + (chance.random() < share)]]
 
     return disorder
 

@@ -207,13 +207,13 @@ def test_integer_field_ranges() -> None:
 
 @pytest.mark.parametrize("kind", [messages.ParamExtValue, messages.ParamExtSet, messages.ParamExtAck])
 def test_char_arrays_with_bytes_keep_zeros(kind: type[Message]) -> None:
-    (field,) = (each for each in kind.FIELDS if each.name == "param_value")
+    (field,) = (field for field in kind.FIELDS if field.name == "param_value")
     assert (field.type, field.array_length, field.is_text) == ("char", 128, False)
     number = (1000).to_bytes(8, "little", signed=True)
-    values = {each.name: "A" if each.is_text else 1 for each in kind.FIELDS} | {"param_value": number}
-    told = received(kind(**values))
-    assert told.to_dict()["param_value"] == number.ljust(128, b"\0")
-    assert told.to_dict()["param_id"] == "A"
+    values = {field.name: "A" if field.is_text else 1 for field in kind.FIELDS} | {"param_value": number}
+    decoded = received(kind(**values))
+    assert decoded.to_dict()["param_value"] == number.ljust(128, b"\0")
+    assert decoded.to_dict()["param_id"] == "A"
     for wrong in ("text", bytes(129), 5):
         with pytest.raises(InvalidArgument, match=r"\.param_value = .* cannot be sent"):
             kind(**values | {"param_value": wrong}).encode()

@@ -98,14 +98,14 @@ def test_pymavlink_missing_attribute_raises() -> None:
         to_pymavlink(ATTITUDE).height  # noqa: B018
 
 
-@pytest.mark.parametrize(("target", "told"), [(9, 9), (0, 1), (None, 1)])
-def test_from_pymavlink_sets_target_system(target: int | None, told: int) -> None:
+@pytest.mark.parametrize(("target", "expected"), [(9, 9), (0, 1), (None, 1)])
+def test_from_pymavlink_sets_target_system(target: int | None, expected: int) -> None:
     theirs: Any = ardupilotmega.MAVLink_command_long_message(1, 2, 400, 0, 1, 0, 0, 0, 0, 0, 0)
     copied: Any = from_pymavlink(theirs, target)
-    assert (copied.target_system, copied.target_component, theirs.target_system) == (told, 2, told)
+    assert (copied.target_system, copied.target_component, theirs.target_system) == (expected, 2, expected)
     ours = messages.CommandLong(1, 2, 400, 0, 1, 0, 0, 0, 0, 0, 0)
     again: Any = from_pymavlink(ours, target)
-    assert (again.target_system, ours.target_system) == (told, 1)
+    assert (again.target_system, ours.target_system) == (expected, 1)
     assert from_pymavlink(messages.SystemTime(1, 2), target) == messages.SystemTime(1, 2)
     plain: Any = ardupilotmega.MAVLink_system_time_message(1, 2)
     assert from_pymavlink(plain, target) == messages.SystemTime(1, 2)

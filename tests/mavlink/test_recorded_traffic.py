@@ -71,11 +71,11 @@ def is_known(theirs: Any) -> bool:
 def test_recorded_frame_counts(flight: str) -> None:
     raws = records(flight)
     framer = Framer()
-    seen = sum(len(framer.receive(raw)) for raw in raws)
+    frame_count = sum(len(framer.receive(raw)) for raw in raws)
     statistics = framer.statistics
     assert len(raws) == (COUNTS if is_whole(flight) else SHORT_COUNTS)[flight]
     assert len({message_id(raw) for raw in raws}) == KINDS[flight]
-    assert statistics.frames == seen == len(raws)
+    assert statistics.frames == frame_count == len(raws)
     assert (statistics.bad_bytes, statistics.bad_crcs, statistics.unknown_ids) == (0, 0, 0)
     assert flight != "px4-quad" or {message_id(raw) for raw in raws} >= NOT_IN_PYMAVLINK
     if is_whole(flight):

@@ -61,7 +61,7 @@ class _Sender:
         """Append frames: one or several, lost, doubled, reordered, after a reboot, or in a burst."""
         chance, begin = self._chance, self.number
         self.number += chance.choice((1, 1, 1, 2, 3, 8))
-        frames = [each & 0xFF for each in range(begin, self.number) if chance.random() >= self._loss]
+        frames = [number & 0xFF for number in range(begin, self.number) if chance.random() >= self._loss]
         if chance.random() < 0.05:
             chance.shuffle(frames)
         if chance.random() < 0.05:
@@ -78,7 +78,7 @@ def random_summary(seed: int) -> str:
     source, now, verdicts, doubles = SourceStatistics(1, 1, senders[0].number), 0.0, [0, 0, 0], 0
     for _ in range(400):
         now += chance.choice((0.01, 0.01, 0.1, 0.4, 2.0 if chance.random() < 0.1 else 0.02))
-        for verdict in verdicts_of(source, [(now, each) for each in chance.choice(senders).next_numbers()]):
+        for verdict in verdicts_of(source, [(now, number) for number in chance.choice(senders).next_numbers()]):
             verdicts[verdict] += 1
         doubles += source.has_duplicates(now)
     return " ".join(map(str, (*verdicts, source.received, source.lost, doubles)))
@@ -122,7 +122,7 @@ def test_late_frames_are_subtracted_once() -> None:
     source = SourceStatistics(1, 1, 0)
     verdicts_of(source, numbers(0, 50))
     frames = (100, 60, 61, 50, 51, 52, 53)
-    assert verdicts_of(source, [(0.6, each) for each in frames]) == [
+    assert verdicts_of(source, [(0.6, frame) for frame in frames]) == [
         IN_ORDER,
         *[LATE] * 4,
         IN_ORDER,

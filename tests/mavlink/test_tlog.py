@@ -98,7 +98,7 @@ def test_tlog_skips_noise_between_records(parts: list[tuple[list[bytes], bytes]]
     good = [raw for _, raw in found if framer.receive(raw)]
     assert set(good) <= {raw for _, raw in records}
     missing = len(records) - sum(record in found for record in records)
-    assert missing <= 2 * len(parts), "noise hides at most its neighbours"
+    assert missing <= 2 * len(parts), "noise loses at most the adjacent frames"
 
 
 def test_tlog_concatenated_files() -> None:
@@ -117,7 +117,7 @@ def test_tlog_append_to_open_file(tmp_path: Path) -> None:
             writer.write(raw, when)
         writer.close()
         writer.close()
-        assert not file.closed, "it is the caller's"
+        assert not file.closed, "the caller closes its own file"
     assert list(read_tlog(path)) == first + second
 
 

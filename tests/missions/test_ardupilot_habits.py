@@ -16,7 +16,7 @@ def item(command: int, x: int = 0, y: int = 0, frame: int = RELATIVE) -> Mission
 def test_item_without_place_gets_mission_frame() -> None:
     speed, local = item(MavCmd.DO_CHANGE_SPEED), item(MavCmd.DO_CHANGE_SPEED, frame=MavFrame.LOCAL_NED)
     roi, unknown = item(MavCmd.DO_SET_ROI), item(60_000)
-    assert [each.frame for each in convert_from_ardupilot([speed, local, roi, unknown], None)] == [
+    assert [item.frame for item in convert_from_ardupilot([speed, local, roi, unknown], None)] == [
         MISSION,
         MavFrame.LOCAL_NED,
         RELATIVE,
@@ -34,7 +34,7 @@ def test_zero_place_becomes_previous_destination() -> None:
         item(MavCmd.NAV_WAYPOINT, 0, 5),
         item(MavCmd.NAV_LAND, frame=MavFrame.LOCAL_NED),
     ]
-    places = [(each.x, each.y) for each in convert_from_ardupilot(items, (46.5, 8.25))]
+    places = [(item.x, item.y) for item in convert_from_ardupilot(items, (46.5, 8.25))]
     assert places[0] == (465_000_000, 82_500_000)
     assert places[1:4] == [(470_000_000, 80_000_000), (DEFAULT_XY, DEFAULT_XY), (0, 0)]
     assert places[4:] == [(470_000_000, 80_000_000), (0, 5), (0, 0)]

@@ -54,7 +54,7 @@ def returned(item: MissionItem, **changes: object) -> MissionItem:
     return item.replace(**numbers).replace(**changes)
 
 
-ARDUPILOT = [  # what is sent, and what ArduPilot 4.7 returns
+ARDUPILOT = [  # (sent item, item returned by ArduPilot 4.7)
     (waypoint(*PLACE, altitude_relative_m=30.29, hold_s=2.5), {"param1": 2, "param4": 0, "z": f32(30.28)}),
     (waypoint(*PLACE, altitude_relative_m=30, acceptance_radius_m=7), {"param2": 0, "param4": 0}),  # Copter
     (

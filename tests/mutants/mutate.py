@@ -73,17 +73,17 @@ def _verdict(trials: Trials, mutation: Mutation, changed: str, tests: list[str],
     """
     while True:
         verdict, by = trials.run(mutation.path, changed, tests, reach.seconds)
-        test = next((each for each in tests if verdict == NOTICED and each in by), None)
+        test = next((test for test in tests if verdict == NOTICED and test in by), None)
         if test is None:
             return verdict, by
         if NO_SUCH_TEST in by:  # its name has the constant in it that was changed
-            tests = [each for each in tests if each != test]
+            tests = [node_id for node_id in tests if node_id != test]
             continue
-        upto = [each for each in tests[: tests.index(test) + 1] if _file_of(each) == _file_of(test)]
+        upto = [node_id for node_id in tests[: tests.index(test) + 1] if _file_of(node_id) == _file_of(test)]
         same = (SOURCE / mutation.path).read_text()
         if trials.run(mutation.path, same, upto, reach.seconds)[0] == SURVIVED:
             return verdict, by
-        tests = [each for each in tests if _file_of(each) != _file_of(test)]
+        tests = [node_id for node_id in tests if _file_of(node_id) != _file_of(test)]
 
 
 def _file_of(test: str) -> str:
@@ -137,7 +137,7 @@ def _sample(sources: Iterator[Path], size: int, chance: random.Random) -> Iterat
 
 
 def _tests_of(mutation: Mutation, reach: Reach, seconds: float) -> list[str]:
-    """The tests that run the line, as many as there is time for: those named after its file, then the quickest."""
+    """Return the tests that run the line, within the time limit: first those named after its file, then the fastest."""
     words = (Path(mutation.path).stem, *Path(mutation.path).stem.split("_"))
     near = reach.by_file.get(mutation.path, set())
     chosen, left = [], seconds

@@ -1,4 +1,4 @@
-"""Single changes of a source file: cosmic-ray's operators, and one of ours that takes a statement away."""
+"""Single changes of a source file: cosmic-ray's operators, and an operator that removes a statement."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SWAPS = {
 
 
 class RemoveStatement(Operator):  # type: ignore[misc]
-    """A call, a change of an object, a raise, a return or a continue that is gone: resends, checks, tables."""
+    """Removes a call, an assignment to an object, a raise, a return or a continue."""
 
     def mutation_positions(self, node: Any) -> Any:
         if node.type == "simple_stmt" and _does_something(node.children[0]):
@@ -107,11 +107,11 @@ def mutations_of(path: str, source: str) -> list[Mutation]:
 def _for_type_checkers(source: str) -> set[int]:
     """The lines below ``if TYPE_CHECKING``."""
     blocks = [
-        each
-        for each in ast.walk(ast.parse(source))
-        if isinstance(each, ast.If) and isinstance(each.test, ast.Name) and each.test.id == "TYPE_CHECKING"
+        node
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
     ]
-    return {line for each in blocks for line in range(each.lineno, (each.body[-1].end_lineno or 0) + 1)}
+    return {line for block in blocks for line in range(block.lineno, (block.body[-1].end_lineno or 0) + 1)}
 
 
 def _is_marker(node: Any) -> bool:

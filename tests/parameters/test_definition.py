@@ -48,7 +48,7 @@ def test_definition_file_is_parsed() -> None:
     assert (ev.default, ev.minimum, ev.maximum, ev.step) == (0.0, -3, 3, 0.5)
     mode = CAMERA.settings["CAM_MODE"]
     assert (mode.updates, mode.is_control) == (("CAM_ISO", "CAM_SHUTTER"), False)
-    assert [(each.name, each.value, each.excludes) for each in mode.options] == [
+    assert [(option.name, option.value, option.excludes) for option in mode.options] == [
         ("Photo", 0, ("CAM_VIDRES",)),
         ("Video", 1, ("CAM_QUALITY",)),
     ]
@@ -68,7 +68,7 @@ def test_definition_translations() -> None:
     for locale in ("de_DE", "de", "de_CH"):
         german = CAMERA.localized(locale).settings["CAM_WBMODE"]
         assert german.description == "Weißabgleich"
-        assert [each.name for each in german.options] == ["Auto", "Sonnig", "Bewölkt"]
+        assert [option.name for option in german.options] == ["Auto", "Sonnig", "Bewölkt"]
     assert CAMERA.localized("fr_FR") is CAMERA
     assert CAMERA.localized("de").checked("CAM_WBMODE", "Sonnig", {}) == 4
 
@@ -88,7 +88,7 @@ def test_invalid_definitions_are_ignored() -> None:
     assert list(camera.settings) == ["A", "B"]
     first = camera.settings["A"]
     assert (first.default, first.minimum, first.maximum, first.step) == (None, None, None, None)
-    assert [(each.name, each.ranges) for each in first.options] == [("one", ())]
+    assert [(option.name, option.ranges) for option in first.options] == [("one", ())]
     assert camera.settings["B"].type == "int8"
 
 
@@ -105,7 +105,7 @@ def test_excluded_setting_cannot_be_set() -> None:
 
 def test_range_applies_under_its_condition() -> None:
     assert len(CAMERA.options("CAM_ISO", {"CAM_MODE": 1})) == 5
-    assert [each.name for each in CAMERA.options("CAM_ISO", VIDEO_BY_HAND)] == ["100", "200", "400"]
+    assert [option.name for option in CAMERA.options("CAM_ISO", VIDEO_BY_HAND)] == ["100", "200", "400"]
     text = refusal(CAMERA, "CAM_ISO", 800, CAM_MODE=1, CAM_EXPMODE=1)
     assert text == "CAM_ISO = 800 is not allowed while CAM_MODE = Video: '100' (100), '200' (200), '400' (400)"
     assert "1/30" in refusal(CAMERA, "CAM_SHUTTER", "1/30", **VIDEO_BY_HAND)
@@ -144,13 +144,13 @@ def test_condition_evaluation(condition: str, values: dict[str, SettingValue], h
 
 def test_several_ranges_apply_together() -> None:
     def ruler(name: str, *allowed: int) -> str:
-        options = "".join(f'<roption name="{each}" value="{each}"/>' for each in allowed)
+        options = "".join(f'<roption name="{value}" value="{value}"/>' for value in allowed)
         return f"""<parameter name="{name}" type="uint8"><options><option name="on" value="1"><parameterranges>
             <parameterrange parameter="S">{options}</parameterrange></parameterranges></option></options></parameter>"""
 
     camera = of(f'{ruler("A", 1, 2)}{ruler("B", 2, 3)}<parameter name="S" type="uint8"/>')
     assert camera.dependencies("S") == ("A", "B")
-    assert [each.value for each in camera.options("S", {"A": 1, "B": 1})] == [2]
+    assert [option.value for option in camera.options("S", {"A": 1, "B": 1})] == [2]
     assert "while A = on, B = on: '2' (2)" in refusal(camera, "S", 3, A=1, B=1)
 
 
@@ -244,9 +244,9 @@ def test_setting_value_round_trip(given_value: tuple[SettingValue, MavParamExtTy
     except InvalidArgument:
         assert isinstance(value, str)  # half of a surrogate pair
         return
-    told = setting_value(setting_bytes(wanted, kind).ljust(128, b"\0"), kind)
-    assert told == wanted
-    assert settings_equal(told, value)
+    decoded = setting_value(setting_bytes(wanted, kind).ljust(128, b"\0"), kind)
+    assert decoded == wanted
+    assert settings_equal(decoded, value)
 
 
 @given(st.binary(max_size=128), st.integers(0, 255))

@@ -75,6 +75,6 @@ def test_options_equal_as_stored_are_kept() -> None:
         for name, options in (("B", both), ("C", one))
     )
     definition = parse_definition(file_of('<parameter name="A" type="float"/>' + dependencies))
-    assert [each.name for each in definition.options("A", {"B": 1, "C": 1})] == ["a"]
+    assert [option.name for option in definition.options("A", {"B": 1, "C": 1})] == ["a"]
     with pytest.raises(InvalidArgument):
         definition.checked("A", 0.2, {"B": 1, "C": 1})

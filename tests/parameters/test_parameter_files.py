@@ -222,7 +222,7 @@ def test_invalid_parameter_writes_nothing(values: dict[str, Any], text: str, tmp
     with pytest.raises(InvalidArgument, match=text):
         write_parameter_file(path, {"GOOD": 1, **values} if values else values)
     assert path.read_text() == "OLD,1\n"
-    assert [each.name for each in tmp_path.iterdir()] == ["a.param"]
+    assert [path.name for path in tmp_path.iterdir()] == ["a.param"]
 
 
 def test_unknown_parameter_file_format_is_rejected(tmp_path: Path) -> None:
@@ -238,11 +238,11 @@ def test_parameter_diff() -> None:
         [Parameter("A", to_float32(0.1), ParameterType.REAL32), Parameter("B", 5, ParameterType.INT8)]
     )
     differences = diff({"B": 6, "A": 0.1, "C": 1.25}, table)
-    assert [str(each) for each in differences] == ["B: 6 → 5", "C: 1.25 → missing"]
+    assert [str(difference) for difference in differences] == ["B: 6 → 5", "C: 1.25 → missing"]
     assert diff(table, table) == ()
     assert diff({"A": 1.0}, {"A": 1.05}, tolerance=0.1) == ()
-    assert [each.name for each in diff({"A": 1}, {"B": 1, "C": 1})] == ["A", "B", "C"]
-    assert [each.name for each in diff({"B": 4}, table, names={"B": 4})] == ["B"]
+    assert [difference.name for difference in diff({"A": 1}, {"B": 1, "C": 1})] == ["A", "B", "C"]
+    assert [difference.name for difference in diff({"B": 4}, table, names={"B": 4})] == ["B"]
     assert str(diff({"A": float("nan")}, {"A": 1e300})[0]) == "A: nan → 1e+300"
 
 

@@ -114,7 +114,7 @@ def test_converted_integer_round_trip(value: int) -> None:
     ("checks", "skipped"),
     [
         (1, 0),  # all checks
-        (0, -1),  # no checks, nor those of future versions
+        (0, -1),  # neither no checks nor the checks of future versions
         (72, 0x1FFFFE - 72),  # GPS and RC only
         (0x1FFFFE, 0),
         (3, 0),  # "all" overrides the other bits
@@ -153,7 +153,7 @@ def test_translate_values_of_whole_file() -> None:
     vehicle = {"WP_SPD", "RTL_ALT_M", "LOG_BITMASK", "WPNAV_RADIUS"}  # between the two versions
     values, renamed = translate_values(old, vehicle)
     assert values == {"WP_SPD": 5, "RTL_ALT_M": 15, "LOG_BITMASK": 65535, "WPNAV_RADIUS": 200, "UNKNOWN": 1}
-    assert [each.requested for each in renamed] == ["WPNAV_SPEED", "RTL_ALT"]
+    assert [warning.requested for warning in renamed] == ["WPNAV_SPEED", "RTL_ALT"]
     back, _ = translate_values(values, set(old), {"RTL_ALT": INT32})
     assert back == old
     both, renamed = translate_values({"WPNAV_SPEED": 100, "WP_SPD": 7}, {"WP_SPD"})

@@ -41,7 +41,7 @@ def as_message(reply: FtpMessage) -> FileTransferProtocol:
 
 
 def requests_in(messages: list[Message]) -> list[FtpMessage]:
-    return [FtpMessage.decode(each.payload) for each in messages if isinstance(each, FileTransferProtocol)]
+    return [FtpMessage.decode(message.payload) for message in messages if isinstance(message, FileTransferProtocol)]
 
 
 @dataclass

@@ -33,7 +33,7 @@ class Store:
     def __init__(self, stored: Sequence[MissionItem] = (), *, refuses: int | None = None) -> None:
         self.stored = list(stored)
         self.refuses = refuses
-        self.heard: list[Message] = []
+        self.received: list[Message] = []
         self.out: list[Message] = []
         self.deadline: float | None = None
         self.partner: tuple[int, int] | None = None
@@ -45,7 +45,7 @@ class Store:
         return self.partner is not None
 
     def receive(self, message: Message, now: float, sender: tuple[int, int] = GCS) -> None:
-        self.heard.append(message)
+        self.received.append(message)
         handler: Callable[..., None] | None = getattr(self, f"on_{message.NAME.lower()}", None)
         if handler is not None:
             handler(message, now, sender)

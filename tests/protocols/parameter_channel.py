@@ -44,7 +44,7 @@ class FakeVehicle:
     hash_first = False
 
     def __init__(self, parameters: Iterable[Parameter], *, bytewise: bool = False) -> None:
-        self.parameters = {each.name: each for each in parameters}
+        self.parameters = {parameter.name: parameter for parameter in parameters}
         self.bytewise = bytewise
         self.channel: Channel | None = None
 
@@ -130,7 +130,7 @@ class Channel:
         self._send()
         while not exchange.done:
             due = exchange.deadline
-            assert due is not None, "it waits for nothing, and has not ended"
+            assert due is not None, "the exchange has no deadline and has not ended"
             if self._events and self._events[0][0] <= due:
                 self.now, _, action = heapq.heappop(self._events)
                 action()
@@ -138,16 +138,18 @@ class Channel:
                 assert due >= self.now - 1e-9, "a deadline in the past"
                 self.now = due
                 exchange.expire(self.now)
-                assert exchange.done or exchange.deadline is None or exchange.deadline > due, "it spins"
+                assert exchange.done or exchange.deadline is None or exchange.deadline > due, (
+                    "the exchange repeats without progress"
+                )
             self._send()
-            assert self.now < limit_s, "it does not end"
+            assert self.now < limit_s, "the exchange does not end"
         return exchange.result()
 
     def kinds(self) -> Counter[str]:
-        return Counter(type(each).NAME for _, each in self.sent)
+        return Counter(type(message).NAME for _, message in self.sent)
 
     def all(self, kind: type[M]) -> list[M]:
-        return [each for _, each in self.sent if isinstance(each, kind)]
+        return [message for _, message in self.sent if isinstance(message, kind)]
 
     def _arrive(self, message: Message) -> None:
         assert self._exchange is not None

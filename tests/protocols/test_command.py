@@ -33,7 +33,7 @@ def ack(result: int, command: int = ARM, *, progress: int = 0, system: int = 255
 
 
 def confirmations(machine: CommandExchange) -> list[int]:
-    return [each.confirmation for each in machine.take_outbox() if isinstance(each, CommandLong)]
+    return [message.confirmation for message in machine.take_outbox() if isinstance(message, CommandLong)]
 
 
 def test_command_ends_with_accepted_ack() -> None:
@@ -49,11 +49,11 @@ def test_command_ends_with_accepted_ack() -> None:
 def test_command_retries_with_rising_confirmation_then_fails() -> None:
     machine = exchange(attempts=3)
     machine.start(0.0)
-    seen = confirmations(machine)
+    observed = confirmations(machine)
     for now in (1.0, 2.0):
         machine.expire(now)
-        seen += confirmations(machine)
-    assert seen == [0, 1, 2]
+        observed += confirmations(machine)
+    assert observed == [0, 1, 2]
     assert not machine.done
     machine.expire(3.0)
     with pytest.raises(CommandTimeout, match=r"MAV_CMD_COMPONENT_ARM_DISARM, sent 3 times within 3\.0 s"):

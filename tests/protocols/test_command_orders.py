@@ -44,7 +44,7 @@ def order(
 
 
 def confirmations(machine: CommandExchange) -> list[int]:
-    return [each.confirmation for each in machine.take_outbox() if isinstance(each, CommandLong)]
+    return [message.confirmation for message in machine.take_outbox() if isinstance(message, CommandLong)]
 
 
 def ack(result: int, progress: int = 0) -> CommandAck:
@@ -208,11 +208,11 @@ def test_ack_of_other_component_is_ignored(target: int, sender: int, is_ours: bo
 
 
 def test_progress_is_percentage_or_none() -> None:
-    told: list[int | None] = []
-    machine = order(on_progress=told.append, progress_timeout=3.0)
+    reported: list[int | None] = []
+    machine = order(on_progress=reported.append, progress_timeout=3.0)
     for percent in (0, 1, 100, 101):
         machine.receive(ack(IN_PROGRESS, percent), 0.5)
-    assert told == [None, 1, 100, None]
+    assert reported == [None, 1, 100, None]
     machine.expire(3.4)
     assert not machine.done
     machine.expire(3.5)

@@ -29,13 +29,13 @@ def table_of(count: int) -> list[Setting]:
 
 
 class FakeCamera(FakeVehicle):
-    """Answers as the standard says. Subclasses add faults."""
+    """A camera that answers according to the standard. Subclasses add faults."""
 
     tick_s = 0.02
 
     def __init__(self, table: Iterable[Setting]) -> None:
         super().__init__(())
-        self.table = {each.name: each for each in table}
+        self.table = {parameter.name: parameter for parameter in table}
         self.writes: list[SettingValue] = []
 
     def ext_value(self, name: str) -> m.ParamExtValue:
@@ -115,10 +115,10 @@ def test_setting_list_requests_gap_by_index() -> None:
 
     channel.is_lost = is_lost
     found: dict[str, Setting] = channel.run(listing())
-    assert list(found) == [each.name for each in table_of(12)]
-    assert [each.param_index for each in channel.all(m.ParamExtRequestRead)] == [5, 8, 11]
+    assert list(found) == [parameter.name for parameter in table_of(12)]
+    assert [request.param_index for request in channel.all(m.ParamExtRequestRead)] == [5, 8, 11]
     assert channel.kinds()["PARAM_EXT_REQUEST_LIST"] == 1
-    first = next(at for at, each in channel.sent if isinstance(each, m.ParamExtRequestRead))
+    first = next(at for at, message in channel.sent if isinstance(message, m.ParamExtRequestRead))
     assert first == pytest.approx(RTT_S + 6 * FakeCamera.tick_s)  # when the next one arrived, not at the end
 
 
@@ -157,7 +157,7 @@ def test_setting_list_ignores_unrelated_values() -> None:
     channel.at(0.0, lambda: channel.from_vehicle(stranger, component_id=2))
     channel.at(0.0, lambda: channel.from_vehicle(m.ParamExtValue("NONE", b"", T.UINT8, 3, 0xFFFF)))
     found: dict[str, Setting] = channel.run(listing())
-    assert list(found) == [each.name for each in table_of(3)]
+    assert list(found) == [parameter.name for parameter in table_of(3)]
     assert channel.kinds() == {"PARAM_EXT_REQUEST_LIST": 1}
 
 
@@ -234,7 +234,7 @@ def test_setting_read_of_silent_component_times_out() -> None:
 def test_setting_reads_are_exact_despite_losses(seed: int, loss: float, count: int) -> None:
     table = table_of(30)
     channel = Channel(FakeCamera(table), loss=loss, jitter_s=0.05, seed=seed)
-    answers = channel.run(reads(*(each.name for each in table[:count]), idle_timeout_s=60.0))
+    answers = channel.run(reads(*(parameter.name for parameter in table[:count]), idle_timeout_s=60.0))
     assert list(answers.values()) == table[:count]
 
 
@@ -330,7 +330,7 @@ def test_setting_write_lost_ack_is_read_back() -> None:
     channel.is_lost = lambda message: isinstance(message, m.ParamExtAck)
     assert channel.run(write(9)).value == 9
     assert camera.writes == [9]
-    assert [type(each) for _, each in channel.sent] == [m.ParamExtSet, m.ParamExtRequestRead]
+    assert [type(message) for _, message in channel.sent] == [m.ParamExtSet, m.ParamExtRequestRead]
 
 
 def test_lost_setting_write_is_repeated_after_read() -> None:
@@ -338,7 +338,7 @@ def test_lost_setting_write_is_repeated_after_read() -> None:
     channel = Channel(camera)
     channel.is_lost = lambda message: isinstance(message, m.ParamExtSet) and channel.now < 0.05
     assert channel.run(write(9)).value == 9
-    assert [type(each) for _, each in channel.sent] == [
+    assert [type(message) for _, message in channel.sent] == [
         m.ParamExtSet,
         m.ParamExtRequestRead,
         m.ParamExtSet,

@@ -100,7 +100,7 @@ def test_ftp_request_retries_with_same_sequence() -> None:
         assert request.deadline is not None
         times.append(request.deadline)
         request.expire(request.deadline)
-        assert all(each == sent for each in requests_in(request.take_outbox()))
+        assert all(request_sent == sent for request_sent in requests_in(request.take_outbox()))
     assert times[0] < 0.4
     assert times[-1] == pytest.approx(3.0)
     assert len(times) < 12
@@ -173,7 +173,7 @@ def test_ftp_request_is_renumbered_after_old_reply() -> None:
     for attempt in range(5):
         request.receive(as_message(stale), 0.1)
         again = requests_in(request.take_outbox())
-        assert len(again) == (attempt < 3)  # a server that always does that is given up
+        assert len(again) == (attempt < 3)  # the client abandons a server that always does that
         if again:
             assert again[0].sequence == sent.sequence + 1
             sent, stale = again[0], stale.replace(sequence=again[0].sequence + 1)

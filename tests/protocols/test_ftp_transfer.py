@@ -127,11 +127,11 @@ def test_download_requests_gap_during_burst() -> None:
     assert exchange.take_outbox() == []
     exchange.receive(as_message(reply_to(burst, content(239), offset=7 * 239, ahead=8)), 0.11)
     reads = requests_in(exchange.take_outbox())
-    assert [(each.opcode, each.offset) for each in reads] == [(Op.READFILE, 239 * n) for n in (1, 2, 3, 4)]
-    sequences = {each.sequence for each in reads}
+    assert [(read.opcode, read.offset) for read in reads] == [(Op.READFILE, 239 * n) for n in (1, 2, 3, 4)]
+    sequences = {read.sequence for read in reads}
     assert not sequences & set(range(burst.sequence, burst.sequence + 500))  # may be replies of the burst
     exchange.receive(as_message(reply_to(reads[0], content(239), offset=239)), 0.2)
-    assert [each.offset for each in requests_in(exchange.take_outbox())] == [239 * 5]
+    assert [request.offset for request in requests_in(exchange.take_outbox())] == [239 * 5]
 
 
 def test_download_ignores_blocks_of_other_bursts() -> None:
@@ -147,7 +147,7 @@ def test_download_ignores_blocks_of_other_bursts() -> None:
 def bursts_in(download: Download) -> list[int]:
     """Return the offsets of the bursts requested since."""
     requests = requests_in(download.exchange.take_outbox())
-    return [each.offset for each in requests if each.opcode == Op.BURSTREADFILE]
+    return [request.offset for request in requests if request.opcode == Op.BURSTREADFILE]
 
 
 def test_download_requests_next_burst_at_once() -> None:
@@ -264,11 +264,11 @@ def test_download_ends_on_read_error() -> None:
 
 
 def test_download_reports_progress() -> None:
-    told: list[TransferProgress] = []
-    download = Download(1000, on_progress=told.append)
+    reported: list[TransferProgress] = []
+    download = Download(1000, on_progress=reported.append)
     run(download.exchange, FileServer(bytearray(content(1000))))
-    assert [each.done for each in told] == [239, 478, 717, 956, 1000]
-    assert all(each.total == 1000 for each in told)
+    assert [event.done for event in reported] == [239, 478, 717, 956, 1000]
+    assert all(event.total == 1000 for event in reported)
 
 
 # ------------------------------------------------------------------------------------ uploads
@@ -296,7 +296,7 @@ def test_upload_respects_server_queue() -> None:
     upload = FtpUpload(make_client(), "/a", content(5000), session=1, round_trip=RoundTrip(0.1))
     upload.start(0.0)
     writes = requests_in(upload.take_outbox())
-    assert [(each.opcode, each.offset, each.size) for each in writes] == [
+    assert [(write.opcode, write.offset, write.size) for write in writes] == [
         (Op.WRITEFILE, 239 * n, 239) for n in range(4)
     ]
 

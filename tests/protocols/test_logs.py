@@ -44,8 +44,8 @@ def test_log_list_is_complete(count: int, first_id: int, latest_wins: bool, loss
     exchange = make_list(first_id)
     sent = run(exchange, vehicle, loss=loss, seed=seed)
     entries = exchange.result()
-    assert [each.id for each in entries] == list(range(first_id, first_id + count))
-    assert [each.size for each in entries] == list(range(count))
+    assert [entry.id for entry in entries] == list(range(first_id, first_id + count))
+    assert [entry.size for entry in entries] == list(range(count))
     assert sent < 100
 
 
@@ -58,7 +58,7 @@ def test_log_list_without_logs() -> None:
 def test_log_list_of_one_entry() -> None:
     exchange = make_list(start=2, end=2)
     run(exchange, LogVehicle([content(5), content(6), content(7)]))
-    assert [each.size for each in exchange.result()] == [6]
+    assert [log.size for log in exchange.result()] == [6]
 
 
 def test_log_list_without_answer_times_out() -> None:
@@ -145,7 +145,7 @@ def test_log_download_spaces_single_block_requests() -> None:
     exchange.take_outbox()
     for offset in (0, 4 * LOG_BLOCK):
         exchange.receive(LogData(1, offset, LOG_BLOCK, bytes(LOG_BLOCK)), 0.1)
-    asked = [each.ofs for each in exchange.take_outbox() if isinstance(each, LogRequestData)]
+    asked = [message.ofs for message in exchange.take_outbox() if isinstance(message, LogRequestData)]
     assert asked == [LOG_BLOCK, 2 * LOG_BLOCK]
     assert exchange.deadline == pytest.approx(0.1 + SPACING_S)
 

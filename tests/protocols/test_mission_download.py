@@ -43,7 +43,7 @@ def test_mission_download_restarts_eight_times() -> None:
     exchange.start(now)
     lists = 0
     while not exchange.done:
-        lists += sum(isinstance(each, m.MissionRequestList) for each in exchange.take_outbox())
+        lists += sum(isinstance(message, m.MissionRequestList) for message in exchange.take_outbox())
         now += 1.0
         exchange.receive(m.MissionCount(*GCS, 3), now)
         exchange.receive(m.MissionAck(*GCS, Result.ERROR), now)
@@ -58,13 +58,13 @@ def test_mission_download_restarts_eight_times() -> None:
 )
 def test_mission_download_restart_keeps_items(window: int, opaque_id: int, asked: list[int]) -> None:
     """PX4's items are requested one by one and in sequence; another opaque_id means another mission."""
-    told: list[TransferProgress] = []
-    exchange, held = download(window, round_trip=RoundTrip(0.1), on_progress=told.append), HELD[:3]
+    reported: list[TransferProgress] = []
+    exchange, held = download(window, round_trip=RoundTrip(0.1), on_progress=reported.append), HELD[:3]
 
     def answer(message: m.MissionCount | m.MissionItemInt | m.MissionAck, now: float) -> list[int]:
         exchange.take_outbox()
         exchange.receive(message, now)
-        return [each.seq for each in exchange.take_outbox() if isinstance(each, m.MissionRequestInt)]
+        return [message.seq for message in exchange.take_outbox() if isinstance(message, m.MissionRequestInt)]
 
     exchange.start(100.0)
     answer(m.MissionCount(*GCS, 3, 0, 7 if opaque_id else 0), 101.0)
@@ -72,7 +72,7 @@ def test_mission_download_restart_keeps_items(window: int, opaque_id: int, asked
     assert answer(m.MissionAck(*GCS, Result.ERROR), 103.0) == []
     kept = int(opaque_id == 7)
     assert answer(m.MissionCount(*GCS, 3, 0, opaque_id), 104.0) == asked
-    assert [each.done for each in told] == [0, 1, kept]
+    assert [event.done for event in reported] == [0, 1, kept]
     for seq in range(3):
         answer(to_wire(held[seq], seq, target_system=GCS[0], target_component=GCS[1], mission_type=0), 105.0)
     assert list(exchange.result().items) == held
@@ -102,7 +102,7 @@ def test_mission_download_is_exact_despite_losses(
     result = run(exchange, vehicle, Radio(seed, loss, doubling, jitter_s=jitter_s))
     if result.error is None:
         assert list(exchange.result().items) == held
-    else:  # PX4 gives up whenever requests are reordered
+    else:  # PX4 aborts when requests are reordered
         assert jitter_s or doubling
         assert isinstance(result.error, (MissionTimeout, MissionRejected))
     assert len(result.sent) <= 60 + 30 * number

@@ -242,19 +242,19 @@ def test_mission_upload_uses_float_form_if_needed() -> None:
 
 
 def test_mission_upload_reports_progress() -> None:
-    told: list[TransferProgress] = []
-    run(upload(NEW, on_progress=told.append), ArduPilotModel(), Radio())
-    assert [(each.done, each.total) for each in told] == [(count, 40) for count in range(41)]
+    reported: list[TransferProgress] = []
+    run(upload(NEW, on_progress=reported.append), ArduPilotModel(), Radio())
+    assert [(event.done, event.total) for event in reported] == [(count, 40) for count in range(41)]
 
 
 def test_mission_upload_progress_has_elapsed_time() -> None:
-    told: list[TransferProgress] = []
-    exchange = upload(NEW[:2], window=1, on_progress=told.append)
+    reported: list[TransferProgress] = []
+    exchange = upload(NEW[:2], window=1, on_progress=reported.append)
     exchange.start(100.0)
     for message, at in ((m.MissionRequestInt(*GCS, 0), 100.5), (m.MissionRequestInt(*GCS, 1), 101.0)):
         exchange.receive(message, at)
     exchange.receive(m.MissionAck(*GCS, Result.ACCEPTED), 102.0)
-    assert [(each.done, each.elapsed_s, each.rate) for each in told] == [
+    assert [(event.done, event.elapsed_s, event.rate) for event in reported] == [
         (0, 0.5, 0.0),
         (1, 1.0, 1.0),
         (2, 2.0, 1.0),
@@ -262,6 +262,6 @@ def test_mission_upload_progress_has_elapsed_time() -> None:
 
 
 def test_partial_upload_progress_counts_own_items() -> None:
-    told: list[TransferProgress] = []
-    run(upload(NEW[4:7], first=4, window=1, on_progress=told.append), ArduPilotModel(OLD), Radio())
-    assert [(each.done, each.total) for each in told] == [(count, 3) for count in range(4)]
+    reported: list[TransferProgress] = []
+    run(upload(NEW[4:7], first=4, window=1, on_progress=reported.append), ArduPilotModel(OLD), Radio())
+    assert [(event.done, event.total) for event in reported] == [(count, 3) for count in range(4)]

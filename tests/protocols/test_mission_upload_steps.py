@@ -1,4 +1,4 @@
-"""Mission uploads answer by answer: which answers count at once, which are verified first, and what is sent then."""
+"""Mission uploads answer by answer: answers accepted at once, answers verified first, and the reactions."""
 
 from __future__ import annotations
 
@@ -24,8 +24,10 @@ def upload(count: int = 4, **options: Any) -> MissionUpload:
 
 
 def sent_since(exchange: MissionUpload) -> list[int | str]:
-    """Return what was sent since: numbers of items, names of other messages."""
-    return [each.seq if isinstance(each, m.MissionItemInt) else each.NAME for each in exchange.take_outbox()]
+    """Return the messages sent since then: numbers of items, names of other messages."""
+    return [
+        message.seq if isinstance(message, m.MissionItemInt) else message.NAME for message in exchange.take_outbox()
+    ]
 
 
 def request_item(exchange: MissionUpload, seq: int, now: float) -> list[int | str]:
@@ -63,7 +65,7 @@ def test_upload_error_repeated_after_round_trip_fails() -> None:
     assert sent_since(exchange) == ["MISSION_COUNT"]
     assert request_item(exchange, 0, 1.0) == [0]
     assert request_item(exchange, 1, 1.1) == [1]
-    assert acknowledge(exchange, Result.ERROR, 1.15) == []  # item 1 is on its way
+    assert acknowledge(exchange, Result.ERROR, 1.15) == []  # item 1 is in transit
     assert acknowledge(exchange, Result.ERROR, 1.2) == []  # may have the same cause
     assert not exchange.done
     assert acknowledge(exchange, Result.ERROR, 1.25) == []

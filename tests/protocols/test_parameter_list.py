@@ -44,7 +44,7 @@ def lose_once(channel: Channel, *indices: int) -> None:
 
 
 def repeated_requests(channel: Channel) -> list[int]:
-    return [each.param_index for each in channel.all(m.ParamRequestRead)]
+    return [request.param_index for request in channel.all(m.ParamRequestRead)]
 
 
 # ---------------------------------------------------------------------------------- a good link
@@ -79,11 +79,11 @@ def test_parameter_list_ignores_hash() -> None:
 
 
 def test_parameter_list_reports_progress() -> None:
-    seen: list[TransferProgress] = []
-    Channel(FakeVehicle(table_of(30))).run(listing(on_progress=seen.append))
-    assert [each.done for each in seen] == list(range(1, 31))
-    assert {each.total for each in seen} == {30}
-    assert seen[-1].fraction == 1.0
+    observed: list[TransferProgress] = []
+    Channel(FakeVehicle(table_of(30))).run(listing(on_progress=observed.append))
+    assert [progress.done for progress in observed] == list(range(1, 31))
+    assert {progress.total for progress in observed} == {30}
+    assert observed[-1].fraction == 1.0
 
 
 def test_idle_timeout_must_be_positive() -> None:
@@ -99,7 +99,7 @@ def test_parameter_list_requests_gaps_at_once() -> None:
     lose_once(channel, 20, 21, 150)
     channel.run(listing())
     assert repeated_requests(channel) == [20, 21, 150]
-    times = [at for at, each in channel.sent if isinstance(each, m.ParamRequestRead)]
+    times = [at for at, message in channel.sent if isinstance(message, m.ParamRequestRead)]
     assert times[0] == pytest.approx(2 * channel.delay_s + FakeVehicle.tick_s * 4)  # with the value behind it
 
 
@@ -115,7 +115,7 @@ def test_parameter_list_waits_for_answer_before_retry() -> None:
 
     channel.is_lost = is_lost
     channel.run(listing())
-    times = [at for at, each in channel.sent if isinstance(each, m.ParamRequestRead)]
+    times = [at for at, message in channel.sent if isinstance(message, m.ParamRequestRead)]
     assert len(times) == 2
     assert times[1] - times[0] >= RTT_S
 
@@ -210,11 +210,11 @@ def test_parameter_list_index_beyond_count_sends_nothing() -> None:
     assert len(channel.sent) < 100
 
 
-# ------------------------------------------------------------------- the count changes meanwhile
+# --------------------------------------------------------- the count changes during the download
 
 
 class Growing(FakeVehicle):
-    """As ArduPilot: a group appears after ``shown_at`` values. The stream continues behind it with the old count."""
+    """A vehicle like ArduPilot: a group appears after ``shown_at`` values, while the stream keeps the old count."""
 
     shown_at = 60
     place = 80
@@ -226,13 +226,13 @@ class Growing(FakeVehicle):
             self.say(self.value(name, index), self.tick_s * (index // self.burst))
         begin = self.tick_s * (self.shown_at // self.burst + 1)
 
-        def go_on() -> None:
+        def continue_stream() -> None:
             rows = list(self.parameters.values())
             rows[self.place : self.place] = new
             count = len(rows)
-            self.parameters = {each.name: each for each in rows}
+            self.parameters = {row.name: row for row in rows}
             self.say(m.ParamValue("GROUP_0", 0.0, 2, count, 0xFFFF))
-            names = [each.name for each in rows]
+            names = [row.name for row in rows]
             shift = 3 if self.place < self.shown_at else 0
             for place, name in enumerate(names[self.shown_at + shift :]):
                 message = self.value(name, self.shown_at + place)
@@ -242,7 +242,7 @@ class Growing(FakeVehicle):
                 self.say(message, self.tick_s * (place // self.burst))
 
         assert self.channel is not None
-        self.channel.at(self.channel.now + begin, go_on)
+        self.channel.at(self.channel.now + begin, continue_stream)
 
 
 @pytest.mark.parametrize("place", [80, 20])
@@ -255,19 +255,19 @@ def test_parameter_list_includes_group_enabled_meanwhile(place: int) -> None:
 
 
 class Px4Growing(FakeVehicle):
-    """As PX4: count and indices are current; values inserted before the stream's position are skipped."""
+    """A vehicle like PX4: count and indices are current; values inserted before the stream's position are skipped."""
 
     def on_list(self) -> None:
         names = list(self.parameters)
         for place, name in enumerate(names):
             assert self.channel is not None
-            self.channel.at(self.channel.now + self.tick_s * (place // 5), partial(self.say_now, name))
+            self.channel.at(self.channel.now + self.tick_s * (place // 5), partial(self.report_value, name))
 
-    def say_now(self, name: str) -> None:
+    def report_value(self, name: str) -> None:
         if name == "PARAM_0050" and "INSERTED" not in self.parameters:
             rows = list(self.parameters.values())
             rows.insert(10, Parameter("INSERTED", 1, ParameterType.INT32))
-            self.parameters = {each.name: each for each in rows}
+            self.parameters = {row.name: row for row in rows}
         self.say(self.value(name, list(self.parameters).index(name)))
 
 
@@ -286,7 +286,7 @@ def test_parameter_list_finds_inserted_parameter() -> None:
     ],
 )
 def test_parameter_list_accepts_unstable_list_after_retries(count: int, names: list[str], asked: list[int]) -> None:
-    """Two of its parameters have the same name, and each answer reports another count."""
+    """Two of its parameters have the same name, and each answer reports a different count."""
 
     class ChangesCount(FakeVehicle):
         answers = 0

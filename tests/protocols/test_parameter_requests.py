@@ -106,7 +106,7 @@ def test_unanswered_name_is_rejected_by_probe() -> None:
 def test_many_unknown_names_need_few_messages() -> None:
     channel = Channel(FakeVehicle(table_of(10)))
     answers = channel.run(reads(*(f"NOPE_{i}" for i in range(100)), probe=True))
-    assert all(isinstance(each, ParameterRejected) for each in answers.values())
+    assert all(isinstance(answer, ParameterRejected) for answer in answers.values())
     assert len(channel.sent) < 600
 
 
@@ -131,8 +131,8 @@ def test_possibly_stale_value_is_accepted_second_time() -> None:
 def test_parameter_reads_are_exact_despite_losses(seed: int, loss: float, count: int) -> None:
     table = table_of(60)
     channel = Channel(FakeVehicle(table), loss=loss, seed=seed)
-    answers = channel.run(reads(*(each.name for each in table[:count]), probe=True))
-    assert [value(each) for each in answers.values()] == [each.value for each in table[:count]]
+    answers = channel.run(reads(*(parameter.name for parameter in table[:count]), probe=True))
+    assert [value(answer) for answer in answers.values()] == [parameter.value for parameter in table[:count]]
     assert len(channel.sent) < 100 + 6 * count
 
 
@@ -166,8 +166,8 @@ def test_parameter_write_is_confirmed_by_value_and_type(bytewise: bool, number: 
 def test_parameter_writes_use_window() -> None:
     table = table_of(50)
     channel = Channel(FakeVehicle(table))
-    answers = channel.run(writes(*(each.replace(value=1) for each in table)))
-    assert {value(each) for each in answers.values()} == {1}
+    answers = channel.run(writes(*(name.replace(value=1) for name in table)))
+    assert {value(answer) for answer in answers.values()} == {1}
     assert channel.kinds() == {"PARAM_SET": 50}
     assert channel.now < 0.6
 
@@ -209,15 +209,15 @@ def test_value_before_write_does_not_confirm() -> None:
     vehicle = FakeVehicle(table)
     channel = Channel(vehicle, delay_s=0.05)
     channel.at(0.0, lambda: channel.from_vehicle(m.ParamValue("P29", 1.0, 6, 30, 0xFFFF)))
-    channel.run(writes(*(each.replace(value=1) for each in table)))
-    assert {each.value for each in vehicle.parameters.values()} == {1}
+    channel.run(writes(*(name.replace(value=1) for name in table)))
+    assert {parameter.value for parameter in vehicle.parameters.values()} == {1}
 
 
 def test_integer_reported_as_float_is_confirmed() -> None:
     class DefaultAsFloat(FakeVehicle):
         def value(self, name: str, index: int | None) -> m.ParamValue:
-            told = self.parameters[name]
-            return m.ParamValue(name, float(told.value), 9, 1, 0xFFFF)
+            reported = self.parameters[name]
+            return m.ParamValue(name, float(reported.value), 9, 1, 0xFFFF)
 
     channel = Channel(DefaultAsFloat([Parameter("A", 0, INT8)]))
     answer = channel.run(writes(Parameter("A", 3, INT8)))["A"]
@@ -254,9 +254,9 @@ def test_other_value_is_accepted_when_repeated_consecutively() -> None:
     exchange = writes(Parameter("A", 5, INT32), bytewise=True, before={"A": 0.0}, recent=["A"])
     exchange.start(0.0)
     done = []
-    for number, told in enumerate((4, 5, 4, 4)):
+    for number, reported in enumerate((4, 5, 4, 4)):
         exchange.take_outbox()
-        exchange.receive(m.ParamValue("A", to_wire(told, INT32, True), 6, 1, 0xFFFF), 1.0 + number)
+        exchange.receive(m.ParamValue("A", to_wire(reported, INT32, True), 6, 1, 0xFFFF), 1.0 + number)
         done.append(exchange.done)
     assert done == [False, False, False, True]
     assert value(exchange.result()["A"]) == 4
@@ -297,10 +297,10 @@ def test_parameter_writes_arrive_despite_losses(seed: int, loss: float, count: i
     table = table_of(count)
     vehicle = FakeVehicle(table)
     channel = Channel(vehicle, loss=loss, seed=seed)
-    before = {each.name: each.value for each in table}
-    answers = channel.run(writes(*(each.replace(value=101) for each in table), before=before))
-    assert {value(each) for each in answers.values()} == {101}
-    assert {each.value for each in vehicle.parameters.values()} == {101}
+    before = {parameter.name: parameter.value for parameter in table}
+    answers = channel.run(writes(*(name.replace(value=101) for name in table), before=before))
+    assert {value(answer) for answer in answers.values()} == {101}
+    assert {parameter.value for parameter in vehicle.parameters.values()} == {101}
     assert len(channel.sent) < 50 + 6 * count
 
 

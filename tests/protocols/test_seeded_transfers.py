@@ -43,14 +43,14 @@ class Trouble:
         self.idle_timeout_s = dice.choice((2.0, 10.0))
         self.size = dice.choice((0, 1, 239, 240, 3000, 7001))
         self.is_bytewise = dice.random() < 0.5
-        self.told: list[TransferProgress] = []
+        self.reported: list[TransferProgress] = []
 
     @property
     def options(self) -> dict[str, Any]:
         return {
             "round_trip": self.round_trip,
             "idle_timeout_s": self.idle_timeout_s,
-            "on_progress": self.told.append,
+            "on_progress": self.reported.append,
         }
 
     def channel(self, parameters: list[Parameter]) -> Channel:
@@ -99,7 +99,7 @@ def list_logs(trouble: Trouble) -> bool:
     vehicle = log_vehicle.LogVehicle(logs, first, latest_wins=trouble.is_bytewise)
     exchange = LogList(1, 1, first_id=first, **trouble.options)
     log_vehicle.run(exchange, vehicle, loss=trouble.loss, seed=trouble.seed)
-    return [each.size for each in exchange.result()] == list(range(len(logs)))
+    return [log.size for log in exchange.result()] == list(range(len(logs)))
 
 
 def read_log(trouble: Trouble) -> bool:
@@ -120,7 +120,7 @@ def list_parameters(trouble: Trouble) -> bool:
 
 def read_parameters(trouble: Trouble) -> bool:
     table = table_of(30)
-    names = [*(each.name for each in trouble.dice.sample(table, 12)), "NOT_THERE"]
+    names = [*(parameter.name for parameter in trouble.dice.sample(table, 12)), "NOT_THERE"]
     exchange = ParameterReads(1, 1, names, bytewise=trouble.is_bytewise, probe=True, own_system=255, **trouble.options)
     answers = trouble.channel(table).run(exchange)
     return all(isinstance(answers[name], Parameter) or trouble.loss > 0.5 for name in names[:-1])
@@ -128,16 +128,16 @@ def read_parameters(trouble: Trouble) -> bool:
 
 def set_parameters(trouble: Trouble) -> bool:
     table = table_of(30)
-    before = {each.name: each.value for each in table}
-    wanted = [each.replace(value=each.value + 1, index=None) for each in trouble.dice.sample(table, 12)]
+    before = {parameter.name: parameter.value for parameter in table}
+    wanted = [parameter.replace(value=parameter.value + 1, index=None) for parameter in trouble.dice.sample(table, 12)]
     exchange = ParameterWrites(
         1, 1, wanted, bytewise=trouble.is_bytewise, before=before, recent=[wanted[0].name], **trouble.options
     )
     channel = trouble.channel(table)
     answers = channel.run(exchange)
-    confirmed = [each for each in wanted if isinstance(answers[each.name], Parameter)]
-    return trouble.loss > 0.5 or [channel.vehicle.parameters[each.name].value for each in confirmed] == [
-        each.value for each in wanted
+    confirmed = [parameter for parameter in wanted if isinstance(answers[parameter.name], Parameter)]
+    return trouble.loss > 0.5 or [channel.vehicle.parameters[parameter.name].value for parameter in confirmed] == [
+        parameter.value for parameter in wanted
     ]
 
 
@@ -175,14 +175,14 @@ TRANSFERS: list[Callable[[Trouble], bool]] = [
 ]
 
 
-@pytest.mark.parametrize("transfer", TRANSFERS, ids=lambda each: each.__name__)
+@pytest.mark.parametrize("transfer", TRANSFERS, ids=lambda transfer: transfer.__name__)
 def test_transfer_over_bad_link_arrives_or_explains(transfer: Callable[[Trouble], bool]) -> None:
     faults = [f"seed {seed}: {fault}" for seed in SEEDS if (fault := fault_of(transfer, seed))]
     assert not faults, "\n".join(faults)
 
 
 def fault_of(transfer: Callable[[Trouble], bool], seed: int) -> str:
-    """Return what is wrong with the transfer; empty if nothing."""
+    """Return a description of the fault; empty if the transfer is correct."""
     trouble = Trouble(seed)
     try:
         return "" if transfer(trouble) else "what arrived is not what was sent"

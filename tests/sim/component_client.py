@@ -17,19 +17,19 @@ M = TypeVar("M", bound=Message)
 class ComponentClient(Client):
     def ask(self, component: int, command: int, *params: float, system: int | None = None) -> list[int]:
         """Return the results of answers that arrive at once."""
-        first = len(self.heard)
+        first = len(self.received)
         numbers = [*params, *(0.0,) * (7 - len(params))]
         system = self.vehicle.system_id if system is None else system
         self.send(m.CommandLong(system, component, command, 0, *numbers))
-        return [ack.result for _, ack in self.heard[first:] if isinstance(ack, m.CommandAck)]
+        return [ack.result for _, ack in self.received[first:] if isinstance(ack, m.CommandAck)]
 
     def request(self, component: int, kind: type[M], *params: float) -> list[M]:
         """Return the messages that REQUEST_MESSAGE brings."""
-        first = len(self.heard)
+        first = len(self.received)
         self.ask(component, MavCmd.REQUEST_MESSAGE, kind.ID, *params)
-        return [message for _, message in self.heard[first:] if isinstance(message, kind)]
+        return [message for _, message in self.received[first:] if isinstance(message, kind)]
 
-    def said_by(self, component: int, kind: type[M], *, system: int | None = None) -> list[M]:
+    def messages_from(self, component: int, kind: type[M], *, system: int | None = None) -> list[M]:
         wanted = (self.vehicle.system_id if system is None else system, component)
         return [message for message in self.all(kind) if source(message) == wanted]
 
@@ -50,5 +50,5 @@ def settled(vehicle: SimulatedVehicle, **ids: int) -> ComponentClient:
     """Return a client three seconds after the start."""
     client = ComponentClient(vehicle, **ids)
     client.run(3.0)
-    client.forget()
+    client.clear()
     return client

@@ -43,7 +43,7 @@ class FtpClient:
     def answers(self, seconds: float = 0.1) -> list[FtpPacket]:
         self.client.run(seconds)
         answers = [FtpPacket.parse(message) for message in self.client.all(m.FileTransferProtocol)]
-        self.client.forget()
+        self.client.clear()
         return answers
 
     def ask(
@@ -55,7 +55,7 @@ class FtpClient:
         offset: int = 0,
         session: int = 0,
     ) -> FtpPacket:
-        self.client.forget()
+        self.client.clear()
         self.send(opcode, data, size=size, offset=offset, session=session)
         (answer,) = self.answers()
         return answer
@@ -72,7 +72,7 @@ class FtpClient:
         return tuple(answer.data[: answer.size])
 
     def burst(self, seconds: float = 1.0, *, size: int = BLOCK, offset: int = 0) -> list[FtpPacket]:
-        self.client.forget()
+        self.client.clear()
         self.send(Op.BURSTREADFILE, size=size, offset=offset)
         return self.answers(seconds)
 

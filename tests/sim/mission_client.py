@@ -55,16 +55,16 @@ def results(client: Client) -> list[int]:
 
 def upload(client: Client, items: Sequence[MissionItem], mission_type: int = 0) -> int:
     """Send the requested items; return the result."""
-    first = len(client.heard)
+    first = len(client.received)
     client.send(m.MissionCount(1, 1, len(items), mission_type))
     for _ in range(len(items) + 1):
-        new = [heard for _, heard in client.heard[first:]]
-        acks = [heard for heard in new if isinstance(heard, m.MissionAck)]
+        new = [received for _, received in client.received[first:]]
+        acks = [received for received in new if isinstance(received, m.MissionAck)]
         if acks:
             return acks[-1].type
-        asked = [heard.seq for heard in new if isinstance(heard, m.MissionRequest | m.MissionRequestInt)]
+        asked = [received.seq for received in new if isinstance(received, m.MissionRequest | m.MissionRequestInt)]
         client.send(message(items[asked[-1]], asked[-1], mission_type))
-    acks = [heard for _, heard in client.heard[first:] if isinstance(heard, m.MissionAck)]
+    acks = [received for _, received in client.received[first:] if isinstance(received, m.MissionAck)]
     return acks[-1].type
 
 

@@ -58,14 +58,14 @@ class Pair:
         vehicle.channels[0].streams = Streams()
 
     def run(self, exchange: Exchange[ResultT], *, limit_s: float = 900.0) -> ResultT:
-        """Return the result, or raise the error. Deadlines must neither be in the past nor repeat without progress."""
+        """Return the result or raise the error. Fails if a deadline is in the past or repeats without progress."""
         end = self.now + limit_s
         exchange.start(self.now)
         self._send(exchange)
         while not exchange.done:
-            assert exchange.deadline is not None, "it waits for nothing, and has not ended"
+            assert exchange.deadline is not None, "the exchange has no deadline and has not ended"
             assert exchange.deadline >= self.now - 1e-9, "a deadline in the past"
-            assert self.now < end, "it does not end"
+            assert self.now < end, "the exchange does not end"
             self._next(exchange)
             self._send(exchange)
         return exchange.result()
@@ -86,7 +86,9 @@ class Pair:
         else:
             self.now = deadline
             exchange.expire(self.now)
-            assert exchange.done or exchange.deadline is None or exchange.deadline > deadline, "it spins"
+            assert exchange.done or exchange.deadline is None or exchange.deadline > deadline, (
+                "the exchange repeats without progress"
+            )
 
     def _next_due(self) -> float:
         arrival = self._arrivals[0][0] if self._arrivals else float("inf")

@@ -25,7 +25,7 @@ class Client:
         self.vehicle = vehicle
         self.target = (vehicle.system_id, vehicle.component_id)
         self.now = 0.0
-        self.heard: list[tuple[float, Message]] = []
+        self.received: list[tuple[float, Message]] = []
         self.framer = Framer()
         self._encoder = FrameEncoder(system_id, component_id)
         vehicle.step(0.0)
@@ -37,7 +37,7 @@ class Client:
 
     def command(self, command: int, *params: float) -> int | None:
         """Return the result; None if there is no answer at once."""
-        first = len(self.heard)
+        first = len(self.received)
         numbers = [*params, *(0.0,) * (7 - len(params))]
         self.send(m.CommandLong(*self.target, command, 0, *numbers))
         return self.ack_since(first, command)
@@ -45,13 +45,13 @@ class Client:
     def command_int(
         self, command: int, frame: int, *params: float, x: int = 0, y: int = 0, z: float = 0.0
     ) -> int | None:
-        first = len(self.heard)
+        first = len(self.received)
         one, two, three, four = (*params, *(0.0,) * (4 - len(params)))
         self.send(m.CommandInt(*self.target, frame, command, 0, 0, one, two, three, four, x, y, z))
         return self.ack_since(first, command)
 
     def ack_since(self, first: int, command: int) -> int | None:
-        for _, message in self.heard[first:]:
+        for _, message in self.received[first:]:
             if isinstance(message, m.CommandAck) and message.command == command:
                 return message.result
         return None
@@ -64,7 +64,7 @@ class Client:
     def listen(self) -> None:
         self._ask_for_texts()
         for frame in self.framer.receive(self.vehicle.take_outbox(), self.now):
-            self.heard.append((self.now, STANDARD.decode(frame)))
+            self.received.append((self.now, STANDARD.decode(frame)))
 
     def run(self, seconds: float) -> None:
         end = self.now + seconds
@@ -82,7 +82,7 @@ class Client:
         return self.now - start
 
     def all(self, kind: type[M]) -> list[M]:
-        return [message for _, message in self.heard if isinstance(message, kind)]
+        return [message for _, message in self.received if isinstance(message, kind)]
 
     def last(self, kind: type[M]) -> M:
         return self.all(kind)[-1]
@@ -91,8 +91,8 @@ class Client:
     def texts(self) -> list[str]:
         return [message.text for message in self.all(m.Statustext)]
 
-    def forget(self) -> None:
-        self.heard.clear()
+    def clear(self) -> None:
+        self.received.clear()
 
 
 def ready_copter(**options: object) -> tuple[SimulatedCopter, Client]:
@@ -100,7 +100,7 @@ def ready_copter(**options: object) -> tuple[SimulatedCopter, Client]:
     copter = SimulatedCopter(boot_time_s=0.0, **options)  # type: ignore[arg-type]
     client = Client(copter)
     client.run(3.0)
-    client.forget()
+    client.clear()
     return copter, client
 
 
@@ -111,7 +111,7 @@ def flying_copter(altitude_m: float = 10.0, **options: object) -> tuple[Simulate
     assert client.command(MavCmd.COMPONENT_ARM_DISARM, 1) == 0
     assert client.command(MavCmd.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude_m) == 0
     client.run_until(lambda: not copter.is_landed and not copter.mode.is_taking_off, 60.0)
-    client.forget()
+    client.clear()
     return copter, client
 
 

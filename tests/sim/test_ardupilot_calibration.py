@@ -37,7 +37,7 @@ def test_compass_calibration_reports_progress() -> None:
     client.run(20.0)
     assert {report.cal_status for report in client.all(m.MagCalReport)} == {MagCalStatus.SUCCESS}
     assert client.command(MavCmd.DO_ACCEPT_MAG_CAL, 0) == ACCEPTED
-    client.forget()
+    client.clear()
     client.run(2.0)
     assert not client.all(m.MagCalReport)
 
@@ -93,7 +93,7 @@ def booting(kind: str) -> tuple[Any, Client]:
     client = Client(vehicle)
     client.run_until(lambda: vehicle.is_initialised)
     client.run(0.5)
-    client.forget()
+    client.clear()
     return vehicle, client
 
 

@@ -36,7 +36,7 @@ def guided(kind: str, mode: int) -> tuple[Any, Client]:
         client.run_until(lambda: vehicle.altitude_m > 48.0)
     assert set_mode(client, mode) == 0
     client.run(0.2)
-    client.forget()
+    client.clear()
     return vehicle, client
 
 

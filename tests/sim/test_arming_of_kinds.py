@@ -16,7 +16,7 @@ KINDS = [SimulatedPlane, SimulatedRover, SimulatedSub]
 
 def arming_refusals(client: Client) -> list[str]:
     """Try to arm and return the reasons of the refusal."""
-    client.forget()
+    client.clear()
     result = client.command(ARM, 1)
     assert (result == MavResult.ACCEPTED) != any(text.startswith("Arm: ") for text in client.texts)
     return [text.removeprefix("Arm: ") for text in client.texts if text.startswith("Arm: ")]

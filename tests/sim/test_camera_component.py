@@ -34,9 +34,9 @@ def fitted(**options: object) -> tuple[SimulatedCamera, ComponentClient]:
 def test_camera_sends_its_own_heartbeat() -> None:
     _, client = fitted()
     client.run(3.0)
-    heartbeats = client.said_by(CAMERA, m.Heartbeat)
+    heartbeats = client.messages_from(CAMERA, m.Heartbeat)
     assert [heartbeat.type for heartbeat in heartbeats] == [MavType.CAMERA] * 3
-    assert len(client.said_by(1, m.Heartbeat)) == 3
+    assert len(client.messages_from(1, m.Heartbeat)) == 3
 
 
 def test_camera_information_is_sent_on_request() -> None:
@@ -124,9 +124,9 @@ def test_lost_image_reports_are_sent_on_request() -> None:
     client.run(3.0)
     camera.faults.silent = False
     client.run(3.0)
-    heard = {image.image_index for image in client.all(m.CameraImageCaptured)}
+    received = {image.image_index for image in client.all(m.CameraImageCaptured)}
     (status,) = client.request(CAMERA, m.CameraCaptureStatus)
-    missing = set(range(status.image_count)) - heard
+    missing = set(range(status.image_count)) - received
     assert missing == {1, 2, 3}
     (again,) = client.request(CAMERA, m.CameraImageCaptured, 2)
     assert again.image_index == 2
@@ -154,7 +154,7 @@ def test_formatting_reports_progress() -> None:
     camera, client = fitted()
     client.ask(CAMERA, START, 0, 0, 1)
     client.run(1.0)
-    client.forget()
+    client.clear()
     client.ask(CAMERA, MavCmd.STORAGE_FORMAT, 1, 1, 1)
     client.run(3.0)
     acks = [(ack.result, ack.progress) for ack in client.all(m.CommandAck)]
@@ -175,8 +175,8 @@ def test_video_needs_video_mode() -> None:
     assert client.ask(CAMERA, MavCmd.VIDEO_START_CAPTURE) == BUSY
     assert client.ask(CAMERA, MavCmd.SET_CAMERA_MODE, 0, CameraMode.IMAGE) == BUSY
     client.run(3.5)
-    told = client.all(m.CameraCaptureStatus)
-    assert [(status.video_status, status.recording_time_ms) for status in told] == [
+    reported = client.all(m.CameraCaptureStatus)
+    assert [(status.video_status, status.recording_time_ms) for status in reported] == [
         (1, 0), (1, 1000), (1, 2000), (1, 3000),
     ]  # fmt: skip
     assert client.ask(CAMERA, MavCmd.VIDEO_STOP_CAPTURE) == DONE
@@ -208,7 +208,7 @@ def test_missing_capabilities_are_unsupported() -> None:
 def test_video_streams_are_listed_and_switched() -> None:
     _, client = fitted(streams=["rtsp://10.0.0.1/main", "udp://10.0.0.1:5600"])
     streams = client.request(CAMERA, m.VideoStreamInformation, 0)
-    assert [(each.stream_id, each.count) for each in streams] == [(1, 2), (2, 2)]
+    assert [(stream.stream_id, stream.count) for stream in streams] == [(1, 2), (2, 2)]
     assert client.request(CAMERA, m.VideoStreamInformation, 2)[0].uri == "udp://10.0.0.1:5600"
     assert client.ask(CAMERA, MavCmd.VIDEO_STOP_STREAMING, 2) == DONE
     flags = [status.flags for status in client.request(CAMERA, m.VideoStreamStatus, 0)]
@@ -225,13 +225,13 @@ def test_message_intervals_apply_to_the_component() -> None:
     client.run(2.2)
     assert len(client.all(m.CameraCaptureStatus)) == 5
     assert client.ask(CAMERA, interval, m.CameraCaptureStatus.ID, -1) == DONE
-    client.forget()
+    client.clear()
     client.run(2.0)
     assert not client.all(m.CameraCaptureStatus)
     assert client.ask(CAMERA, interval, m.Attitude.ID, 500_000) == DENIED
 
 
-# ----------------------------------------------------------------------------------- several of them
+# ----------------------------------------------------------------------------------- several cameras
 
 
 def test_commands_are_handled_by_their_target() -> None:
@@ -243,7 +243,7 @@ def test_commands_are_handled_by_their_target() -> None:
     assert (one.image_count, two.image_count) == (0, 1)
     assert [source(image) for image in client.all(m.CameraImageCaptured)] == [(1, 101)]
     assert client.ask(102, START, 0, 0, 1) == []
-    client.forget()
+    client.clear()
     client.ask(0, START, 0, 0, 1)
     client.run(0.3)
     assert (one.image_count, two.image_count) == (1, 2)
@@ -261,7 +261,7 @@ def test_camera_with_its_own_system_id() -> None:
     camera = SimulatedCamera(100, system_id=42)
     _, client = copter_with(camera)
     client.run(2.0)
-    assert client.said_by(100, m.Heartbeat, system=42)
+    assert client.messages_from(100, m.Heartbeat, system=42)
     assert client.ask(100, START, 0, 0, 1) == []
     assert client.ask(100, START, 0, 0, 1, system=42) == DONE
 
@@ -273,11 +273,11 @@ def test_faults_apply_to_the_component_only() -> None:
     assert client.texts == ["card is slow"]
     assert source(client.last(m.Statustext)) == (1, CAMERA)
     camera.faults.silent = True
-    client.forget()
+    client.clear()
     assert client.ask(CAMERA, START, 0, 0, 1) == []
     client.run(3.0)
-    assert not client.said_by(CAMERA, m.Heartbeat)
-    assert client.said_by(1, m.Heartbeat)
+    assert not client.messages_from(CAMERA, m.Heartbeat)
+    assert client.messages_from(1, m.Heartbeat)
     camera.faults.silent = False
     camera.faults.drop_incoming = 1
     assert client.ask(CAMERA, START, 0, 0, 1) == []
@@ -294,9 +294,9 @@ def test_reboot_ends_series_and_keeps_images() -> None:
     client.run(6.0)
     assert camera.image_count == taken
     assert client.ask(CAMERA, START, 0, 0, 1) == DONE
-    client.forget()
+    client.clear()
     client.run(2.05)
-    assert len(client.said_by(CAMERA, m.Heartbeat)) == 2
+    assert len(client.messages_from(CAMERA, m.Heartbeat)) == 2
 
 
 @pytest.mark.parametrize("make", [SimulatedPx4, SimulatedCopter])
@@ -322,7 +322,7 @@ def test_repeated_stream_request_keeps_its_rate() -> None:
     _, client = fitted()
     for interval_us in (1e6, -1, 1e6, 2e6, 1e6):
         client.ask(CAMERA, MavCmd.SET_MESSAGE_INTERVAL, m.CameraCaptureStatus.ID, interval_us)
-    client.forget()
+    client.clear()
     client.run(10.0)
     assert len(client.all(m.CameraCaptureStatus)) == 10
 
@@ -367,7 +367,7 @@ def test_tracking_status_is_reported() -> None:
     assert status.tracking_status == 2
     assert client.ask(CAMERA, MavCmd.CAMERA_STOP_TRACKING) == DONE
     assert client.request(CAMERA, m.CameraTrackingImageStatus)[0].tracking_mode == 0
-    assert client.request(CAMERA, m.CameraTrackingGeoStatus) == [], "it looks to the horizon"
+    assert client.request(CAMERA, m.CameraTrackingGeoStatus) == [], "it points at the horizon"
 
 
 def test_thermal_camera_reports_its_range() -> None:
@@ -375,8 +375,8 @@ def test_thermal_camera_reports_its_range() -> None:
     assert without.ask(CAMERA, MavCmd.REQUEST_MESSAGE, m.CameraThermalRange.ID) == FAILED
     assert without.ask(CAMERA, MavCmd.SET_CAMERA_SOURCE, 0, 2) == DENIED
     _, client = fitted(thermal_celsius=(-10.0, 90.0), streams=["rtsp://a/light", "rtsp://a/warm"])
-    (told,) = client.request(CAMERA, m.CameraThermalRange)
-    assert (told.stream_id, told.min, told.max, told.max_point_x) == (2, -10.0, 90.0, 1.0)
+    (reported,) = client.request(CAMERA, m.CameraThermalRange)
+    assert (reported.stream_id, reported.min, reported.max, reported.max_point_x) == (2, -10.0, 90.0, 1.0)
     light, warm = client.request(CAMERA, m.VideoStreamInformation, 0)
     assert (light.flags, warm.flags) == (1, 7)
     assert client.request(CAMERA, m.CameraInformation)[0].flags & CameraCapFlags.HAS_THERMAL_RANGE
@@ -405,6 +405,6 @@ def test_lost_messages_drop_single_messages() -> None:
     client.run(3.0)
     assert [image.image_index for image in client.all(m.CameraImageCaptured)] == [2]
     client.vehicle.faults.lose(m.Heartbeat)
-    client.forget()
+    client.clear()
     client.run(3.0)
     assert len(client.all(m.Heartbeat)) == 5, "one of the two heartbeats of a second"

@@ -19,7 +19,7 @@ def test_arming_in_guided_sends_text() -> None:
     assert client.all(m.HomePosition), "home moves to where it is armed"
     client.run(1.0)
     assert client.last(m.Heartbeat).base_mode & MavModeFlag.SAFETY_ARMED
-    assert client.command(ARM, 1) == MavResult.ACCEPTED, "twice is no error"
+    assert client.command(ARM, 1) == MavResult.ACCEPTED, "arming twice is accepted"
 
 
 def test_arming_refusal_text_follows_acknowledgement() -> None:
@@ -27,7 +27,7 @@ def test_arming_refusal_text_follows_acknowledgement() -> None:
     copter.faults.prearm_failures = ["Compass not healthy", "Hardware safety switch"]
     assert client.command(ARM, 1) == MavResult.FAILED
     assert client.texts == ["Arm: Compass not healthy", "Arm: Hardware safety switch"]
-    kinds = [type(message) for _, message in client.heard]
+    kinds = [type(message) for _, message in client.received]
     assert kinds[0] is m.CommandAck
 
 
@@ -45,12 +45,12 @@ def test_arming_needs_position_in_guided_only() -> None:
 def test_arming_reasons_change_during_boot() -> None:
     copter = SimulatedCopter(boot_time_s=41.5)
     client = Client(copter)
-    seen = []
+    observed = []
     while copter.uptime < 42.0:
         copter.mode = copter.guided
-        seen += copter.arming.reasons()[:1] or ["none"]
+        observed += copter.arming.reasons()[:1] or ["none"]
         client.run(0.05)
-    assert list(dict.fromkeys(seen)) == [
+    assert list(dict.fromkeys(observed)) == [
         "System not initialised",
         "GPS 1: not healthy",
         "GPS 1: Bad fix",
@@ -70,7 +70,7 @@ def test_arming_in_returning_modes_is_refused() -> None:
     set_mode(client, CopterMode.AUTO)
     assert client.command(ARM, 1) == MavResult.FAILED
     assert client.texts[-1] == "Arm: Mode requires mission"
-    assert client.command(ARM, 1, FORCE) == MavResult.ACCEPTED, "force passes over it"
+    assert client.command(ARM, 1, FORCE) == MavResult.ACCEPTED, "force overrides it"
 
 
 def test_raised_throttle_prevents_arming_in_stick_modes() -> None:

@@ -38,7 +38,7 @@ def booting(boot_time_s: float = REAL_TIME_S, rate: int = 10) -> tuple[Simulated
 
 
 def first(client: Client, kind: type[Message]) -> float:
-    return next(now for now, message in client.heard if isinstance(message, kind))
+    return next(now for now, message in client.received if isinstance(message, kind))
 
 
 def test_boot_texts_match_recording() -> None:
@@ -104,7 +104,7 @@ def test_system_state_leaves_boot_after_ready() -> None:
 def test_no_streams_without_request() -> None:
     client = Client(SimulatedCopter(boot_time_s=1.0))
     client.run(12.0)
-    kinds = {type(message) for _, message in client.heard}
+    kinds = {type(message) for _, message in client.received}
     assert kinds == {m.Heartbeat, m.Statustext, m.HomePosition, m.GpsGlobalOrigin, m.Timesync}
     assert len(client.all(m.Heartbeat)) == 12
 
@@ -141,7 +141,7 @@ def test_home_position_quaternion_is_nan() -> None:
     assert client.command(MavCmd.GET_HOME_POSITION) == 0
     home = client.last(m.HomePosition)
     assert all(math.isnan(part) for part in home.q)
-    kinds = [type(message) for _, message in client.heard]
+    kinds = [type(message) for _, message in client.received]
     assert kinds.index(m.HomePosition) < kinds.index(m.CommandAck), "sent before the answer"
 
 
@@ -153,12 +153,12 @@ def test_reboot_is_silent_and_resets_vehicle() -> None:
     client.run(5.0)
     assert client.command(MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, 1) == 0
     client.run(0.2)
-    client.forget()
+    client.clear()
     client.run(1.0)
-    assert client.heard == []
+    assert client.received == []
     client.run(4.0)
     assert "ArduPilot Ready" in client.texts
-    assert client.all(m.Attitude) == [], "stream rates are forgotten"
+    assert client.all(m.Attitude) == [], "stream rates are reset"
     client.send(m.RequestDataStream(1, 1, MavDataStream.ALL, 4, 1))
     client.run(1.0)
     assert client.last(m.Attitude).time_boot_ms < 6000

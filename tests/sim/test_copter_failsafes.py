@@ -95,7 +95,7 @@ def test_lost_radio_prevents_arming() -> None:
     copter.faults.rc_lost = True
     client.run(2.0)
     assert client.texts == ["Radio Failsafe - Disarming"]
-    client.forget()
+    client.clear()
     assert client.command(MavCmd.COMPONENT_ARM_DISARM, 1) == MavResult.FAILED
     assert client.texts == ["Arm: Radio failsafe on"]
 
@@ -142,7 +142,7 @@ def test_battery_failsafe_acts_at_low_and_critical() -> None:
     assert copter.mode.number == CopterMode.RTL
     assert client.texts[0].startswith("Battery 1 is low 9.8")
     assert client.texts[1] == "Battery Failsafe"
-    client.forget()
+    client.clear()
     copter.battery.percent = 2.0
     client.run(3.0)
     assert copter.mode.number == CopterMode.LAND
@@ -186,7 +186,7 @@ def test_battery_failsafe_on_ground_disarms() -> None:
     copter, client = ready_copter(parameters={**BATTERY, "DISARM_DELAY": 0.0})
     assert set_mode(client, CopterMode.GUIDED) == MavResult.ACCEPTED
     assert client.command(MavCmd.COMPONENT_ARM_DISARM, 1) == MavResult.ACCEPTED
-    client.forget()
+    client.clear()
     copter.battery.percent = 10.0
     client.run(3.0)
     assert client.texts[1:] == ["Disarming motors", "Battery Failsafe - Disarming"]

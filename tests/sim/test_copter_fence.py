@@ -109,7 +109,7 @@ def test_mode_change_during_breach_suspends_fence_ten_seconds() -> None:
     copter, client = flying_copter(parameters={**ENABLED, "FENCE_ALT_MAX": 25.0})
     copter.parameters["FENCE_ALT_MAX"] = 8.0
     client.run(0.5)
-    client.forget()
+    client.clear()
     assert set_mode(client, CopterMode.GUIDED) == MavResult.ACCEPTED
     client.run(5.0)
     assert copter.mode.number == CopterMode.GUIDED
@@ -119,7 +119,7 @@ def test_mode_change_during_breach_suspends_fence_ten_seconds() -> None:
 def test_fence_option_refuses_mode_changes_during_breach() -> None:
     copter, client = flying_copter(parameters={**ENABLED, "FENCE_OPTIONS": 1.0})
     fly_east(copter, client)
-    client.forget()
+    client.clear()
     assert set_mode(client, CopterMode.GUIDED) == MavResult.FAILED
     client.run(0.1)
     assert client.texts == ["Mode change to GUIDED failed: in fence recovery"]
@@ -166,7 +166,7 @@ def test_arming_outside_fence_is_refused() -> None:
     inside = [(10.0, 10.0), (20.0, 10.0), (20.0, 20.0)]
     upload(copter, *(corner(copter, n, e, count=3, inside=True) for n, e in inside))
     client.run(1.0)
-    client.forget()
+    client.clear()
     assert client.command(ARM, 1) == MavResult.FAILED
     assert client.texts == ["Arm: Vehicle breaching Polygon fence"]
 

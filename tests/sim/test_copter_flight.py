@@ -388,7 +388,7 @@ def test_brake_holds_position_and_loiter_follows_throttle() -> None:
     client.send(m.RcChannelsOverride(1, 1, 1500, 1250, 0, 1500, 0, 0, 0, 0))  # forward, throttle released
     client.run(3.0)
     assert copter.motion.ground_speed_m_s > 3.0
-    assert speed(copter)[2] > 1.0, "the released throttle is low: it descends"
+    assert speed(copter)[2] > 1.0, "the override's end leaves the throttle low, so it descends"
 
 
 def test_stabilize_with_low_throttle_descends() -> None:

@@ -28,9 +28,9 @@ def test_all_streams_match_recorded_copter() -> None:
     client.send(m.SetPositionTargetLocalNed(0, 1, 1, 1, 3576, 5, 0, -10, 0, 0, 0, 0, 0, 0, 0, 0))
     client.send(m.RequestDataStream(1, 1, MavDataStream.ALL, 10, 1))
     client.run(5.0)
-    kinds = {message.NAME for _, message in client.heard}
+    kinds = {message.NAME for _, message in client.received}
     assert kinds - {"TIMESYNC"} == STREAMED_BY_A_REAL_COPTER
-    per_second = len(client.heard) / 5.0
+    per_second = len(client.received) / 5.0
     assert per_second == pytest.approx(275, rel=0.05)
 
 
@@ -41,7 +41,7 @@ def test_stream_group_starts_and_stops_alone() -> None:
     assert len(client.all(m.Attitude)) == pytest.approx(20, abs=1)
     assert client.all(m.VfrHud) == []
     client.send(m.RequestDataStream(1, 1, MavDataStream.EXTRA1, 4, 0))
-    client.forget()
+    client.clear()
     client.run(2.0)
     assert client.all(m.Attitude) == []
 
@@ -55,9 +55,9 @@ def test_message_interval_sets_rate_by_id() -> None:
     assert len(client.all(m.AttitudeQuaternion)) == pytest.approx(10, abs=1)
     assert interval(client, m.Attitude.ID, -1) == MavResult.ACCEPTED
     assert interval(client, m.AttitudeQuaternion.ID, 0) == MavResult.ACCEPTED
-    client.forget()
+    client.clear()
     client.run(2.0)
-    assert {type(message) for _, message in client.heard} == {m.Heartbeat}
+    assert {type(message) for _, message in client.received} == {m.Heartbeat}
 
 
 def test_invalid_message_intervals_are_refused() -> None:
@@ -75,7 +75,7 @@ def test_heartbeat_interval_can_be_changed() -> None:
     client.run(2.0)
     assert len(client.all(m.Heartbeat)) >= 10
     interval(client, m.Heartbeat.ID, 0)
-    client.forget()
+    client.clear()
     client.run(5.0)
     assert len(client.all(m.Heartbeat)) <= 6
 
@@ -96,9 +96,9 @@ def test_get_message_interval_returns_interval() -> None:
 def test_requested_message_follows_acknowledgement() -> None:
     _, client = ready_copter()
     assert client.command(MavCmd.REQUEST_MESSAGE, m.SysStatus.ID) == MavResult.ACCEPTED
-    assert [type(message) for _, message in client.heard] == [m.CommandAck, m.SysStatus]
+    assert [type(message) for _, message in client.received] == [m.CommandAck, m.SysStatus]
     assert client.command(MavCmd.REQUEST_MESSAGE, 12345) == MavResult.FAILED
-    client.forget()
+    client.clear()
     assert client.command(MavCmd.REQUEST_MESSAGE, m.DistanceSensor.ID) == MavResult.ACCEPTED
     assert client.all(m.DistanceSensor) == [], "accepted, but there is no sensor"
 
@@ -110,7 +110,7 @@ def test_available_modes_can_be_requested() -> None:
     assert [mode.mode_index for mode in modes] == list(range(1, len(modes) + 1))
     assert {mode.number_modes for mode in modes} == {len(modes)}
     assert {(mode.custom_mode, mode.mode_name) for mode in modes} >= {(4, "GUIDED"), (6, "RTL"), (9, "LAND")}
-    client.forget()
+    client.clear()
     client.command(MavCmd.REQUEST_MESSAGE, m.AvailableModes.ID, 2)
     assert [mode.mode_index for mode in client.all(m.AvailableModes)] == [2]
     client.run(11.0)
@@ -126,7 +126,7 @@ def test_unsupported_commands_and_streams_can_be_configured() -> None:
     _, client = ready_copter(stream_groups=False)
     client.send(m.RequestDataStream(1, 1, MavDataStream.ALL, 4, 1))
     client.run(2.0)
-    assert {type(message) for _, message in client.heard} == {m.Heartbeat}
+    assert {type(message) for _, message in client.received} == {m.Heartbeat}
 
 
 def test_range_finder_reports_height() -> None:
@@ -187,7 +187,7 @@ def test_timesync_is_answered_and_ping_is_not() -> None:
     assert answer.ts1 == 123_456_789
     assert answer.tc1 == pytest.approx(copter.uptime * 1e9)
     client.send(m.Timesync(5, 6))
-    assert len(client.all(m.Timesync)) == 1, "an answer is not answered"
+    assert len(client.all(m.Timesync)) == 1, "an answer gets no reply"
     client.send(m.Ping(99, 7, 0, 0))
     assert client.all(m.Ping) == []
 
@@ -218,7 +218,7 @@ def test_parameter_can_be_read_and_set() -> None:
     echo = client.last(m.ParamValue)
     assert (echo.param_id, echo.param_value, echo.param_index) == ("WPNAV_SPEED", 525.0, 0xFFFF)
     client.send(m.ParamSet(1, 1, "DISARM_DELAY", 300.7, 2))
-    assert client.last(m.ParamValue).param_value == 127.0, "an INT8 holds no more"
+    assert client.last(m.ParamValue).param_value == 127.0, "the limit of an INT8"
 
 
 def test_unknown_parameter_gets_no_answer() -> None:
@@ -227,7 +227,7 @@ def test_unknown_parameter_gets_no_answer() -> None:
     client.send(m.ParamRequestRead(1, 1, "", 9999))
     client.send(m.ParamSet(1, 1, "NO_SUCH_PARAM", 1.0, 9))
     client.send(m.ParamSet(1, 1, "WPNAV_SPEED", float("nan"), 9))
-    assert client.heard == []
+    assert client.received == []
 
 
 def test_flight_parameter_takes_effect() -> None:

@@ -80,7 +80,7 @@ def fly(
     second, encoder = vehicle.open_channel(), FrameEncoder(255, 190)
     vehicle.step(0.0)
     first = b""
-    for when, message in sorted([*calls, *((cut, None) for cut in cuts), (END_S, None)], key=lambda each: each[0]):
+    for when, message in sorted([*calls, *((cut, None) for cut in cuts), (END_S, None)], key=lambda entry: entry[0]):
         if message is None:
             vehicle.step(when)
         else:
@@ -121,10 +121,10 @@ class StoringReceiver:
     """Stores received bytes with their times."""
 
     def __init__(self) -> None:
-        self.heard: list[tuple[float, bytes]] = []
+        self.received: list[tuple[float, bytes]] = []
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
-        self.heard.append((asyncio.get_running_loop().time(), data))
+        self.received.append((asyncio.get_running_loop().time(), data))
 
     def link_lost(self, error: LinkLost) -> None:
         """Called when the owner closes the link."""
@@ -141,7 +141,7 @@ async def serve(seed: int) -> list[tuple[float, bytes]]:
         for message in (STREAMS, ARM, TAKE_OFF):
             link.write(encoder.encode(message))
         await asyncio.sleep(8.0)
-    return ears.heard
+    return ears.received
 
 
 def test_server_sends_equal_bytes_at_equal_times() -> None:

@@ -66,7 +66,7 @@ def test_plane_report_only_keeps_mode() -> None:
 def test_plane_breach_refuses_mode_changes_and_clears_silently() -> None:
     plane, client = flying_plane(**HIGH_FENCE)
     lower_max_altitude(client, plane)
-    client.forget()
+    client.clear()
     assert set_mode(client, PlaneMode.LOITER) == MavResult.FAILED
     assert client.texts == ["Mode change to LOITER denied, in fence recovery"]
     plane.parameters["FENCE_ALT_MAX"] = 100.0

@@ -28,7 +28,7 @@ def ready_px4(**options: object) -> tuple[SimulatedPx4, Client]:
     px4 = SimulatedPx4(fast_rate_hz=2.0, boot_time_s=1.0, parameter_count=100, **options)  # type: ignore[arg-type]
     client = Client(px4)
     client.run(2.0)
-    client.forget()
+    client.clear()
     return px4, client
 
 
@@ -37,7 +37,7 @@ def flying_px4() -> tuple[SimulatedPx4, Client]:
     assert client.command(MavCmd.NAV_TAKEOFF, 0, 0, 0, NAN, NAN, NAN, NAN) == 0
     assert client.command(ARM, 1) == 0
     client.run_until(lambda: not px4.is_landed, 40.0)
-    client.forget()
+    client.clear()
     return px4, client
 
 
@@ -83,7 +83,7 @@ class Port:
 
     def texts(self) -> list[str]:
         decoded = map(STANDARD.decode, self.framer.receive(self.channel.take_outbox(), self.px4.now))
-        return [each.text.strip() for each in decoded if isinstance(each, m.Statustext)]
+        return [message.text.strip() for message in decoded if isinstance(message, m.Statustext)]
 
 
 def test_px4_texts_go_only_to_links_with_a_ground_station() -> None:
@@ -226,9 +226,9 @@ async def test_copter_reboot_closes_tcp_connections() -> None:
         await reader.read(1)
         reboot = m.CommandLong(1, 1, MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, 0, 1, *(0.0,) * 6)
         writer.write(FrameEncoder(255, 190).encode(reboot))
-        heard = await asyncio.wait_for(reader.read(), 10.0)
-        answers = [STANDARD.decode(each) for each in Framer().receive(heard, 0.0)]
-        assert any(isinstance(each, m.CommandAck) and each.result == 0 for each in answers)
+        received = await asyncio.wait_for(reader.read(), 10.0)
+        answers = [STANDARD.decode(message) for message in Framer().receive(received, 0.0)]
+        assert any(isinstance(answer, m.CommandAck) and answer.result == 0 for answer in answers)
         writer.close()
         again, writer = await asyncio.open_connection(host, int(port))
         assert await asyncio.wait_for(again.read(1), 10.0)

@@ -40,12 +40,12 @@ def degrees(gimbal: SimulatedGimbal) -> list[float]:
 def test_information_is_sent_on_request() -> None:
     _, client = fitted(pitch_deg=(-80.0, 10.0))
     client.run(2.0)
-    assert client.said_by(GIMBAL, m.Heartbeat)[0].type == MavType.GIMBAL
+    assert client.messages_from(GIMBAL, m.Heartbeat)[0].type == MavType.GIMBAL
     (device,) = client.request(GIMBAL, m.GimbalDeviceInformation)
     (manager,) = client.request(GIMBAL, m.GimbalManagerInformation)
     assert manager.gimbal_device_id == GIMBAL
-    for told in (device, manager):
-        assert (told.pitch_min, told.pitch_max) == pytest.approx((math.radians(-80), math.radians(10)))
+    for reported in (device, manager):
+        assert (reported.pitch_min, reported.pitch_max) == pytest.approx((math.radians(-80), math.radians(10)))
     status = client.last(m.GimbalManagerStatus)
     assert (status.gimbal_device_id, status.primary_control_sysid) == (GIMBAL, 0)
 
@@ -55,7 +55,7 @@ def test_attitude_is_streamed() -> None:
     client.run(2.0)
     assert len(client.all(m.GimbalDeviceAttitudeStatus)) == pytest.approx(20, abs=1)
     client.ask(GIMBAL, MavCmd.SET_MESSAGE_INTERVAL, m.GimbalDeviceAttitudeStatus.ID, -1)
-    client.forget()
+    client.clear()
     client.run(1.0)
     assert not client.all(m.GimbalDeviceAttitudeStatus)
 
@@ -177,11 +177,11 @@ def test_commands_select_one_of_two_gimbals() -> None:
     assert client.ask(171, POINT, -10, 0, NAN, NAN, 0, 0, 154) == DENIED
     client.run(1.0)
     assert (degrees(one)[1], degrees(two)[1]) == pytest.approx((0.0, -10.0))
-    client.forget()
+    client.clear()
     client.ask(0, MavCmd.REQUEST_MESSAGE, m.GimbalManagerInformation.ID)
     client.run(0.1)
-    told = {source(each): each.gimbal_device_id for each in client.all(m.GimbalManagerInformation)}
-    assert told == {(1, 1): 1, (1, 154): 154, (1, 171): 171}
+    reported = {source(message): message.gimbal_device_id for message in client.all(m.GimbalManagerInformation)}
+    assert reported == {(1, 1): 1, (1, 154): 154, (1, 171): 171}
 
 
 def test_camera_has_direction_of_its_gimbal() -> None:

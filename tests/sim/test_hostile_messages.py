@@ -20,7 +20,7 @@ KEY = SigningKey(bytes(range(32)))
 
 
 def replies_of(vehicle: SimulatedVehicle, *frames: bytes) -> list[Message]:
-    """Return what the vehicle sends in the three seconds after these bytes."""
+    """Return the messages that the vehicle sends in the three seconds after these bytes."""
     vehicle.step(vehicle.now + 3.0)
     vehicle.take_outbox()
     for frame in frames:

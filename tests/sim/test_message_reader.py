@@ -13,29 +13,29 @@ PING = m.Ping(1, 2, 0, 0)
 def test_reader_returns_wanted_messages_with_their_sender() -> None:
     encoder = FrameEncoder(255, 190)
     data = encoder.encode(HEARTBEAT) + encoder.encode(PING)
-    (heard,) = MessageReader({m.Ping.ID}).messages(data, 1.0, None)
-    assert heard == PING
-    assert heard.received_frame is not None
-    assert heard.received_frame.system_id == 255
+    (received,) = MessageReader({m.Ping.ID}).messages(data, 1.0, None)
+    assert received == PING
+    assert received.received_frame is not None
+    assert received.received_frame.system_id == 255
     assert MessageReader(None).messages(data, 1.0, None) == [HEARTBEAT, PING]
 
 
 def test_reader_keeps_partial_frames_by_peer() -> None:
     frame, other = FrameEncoder(255, 190).encode(PING), FrameEncoder(254, 190).encode(HEARTBEAT)
-    hearing = MessageReader(None)
-    assert hearing.messages(frame[:9], 0.0, "one") == []
-    assert hearing.messages(other, 0.0, "two") == [HEARTBEAT]
-    assert hearing.messages(frame[9:], 0.0, "one") == [PING]
+    reader = MessageReader(None)
+    assert reader.messages(frame[:9], 0.0, "one") == []
+    assert reader.messages(other, 0.0, "two") == [HEARTBEAT]
+    assert reader.messages(frame[9:], 0.0, "one") == [PING]
 
 
 def test_shared_reader_decodes_once() -> None:
     frame = FrameEncoder(255, 190).encode(PING)
-    hearing = SharedMessageReader()
+    reader = SharedMessageReader()
     for _ in range(3):
-        assert hearing.messages(frame[:9], 0.0, None) == []
-    hearing.forget()
-    first = hearing.messages(frame[9:], 0.1, None)
+        assert reader.messages(frame[:9], 0.0, None) == []
+    reader.forget()
+    first = reader.messages(frame[9:], 0.1, None)
     assert first == [PING]
-    assert hearing.messages(frame[9:], 0.2, None) is first
-    hearing.forget()
-    assert hearing.messages(b"", 0.3, None) == []
+    assert reader.messages(frame[9:], 0.2, None) is first
+    reader.forget()
+    assert reader.messages(b"", 0.3, None) == []

@@ -24,7 +24,7 @@ _ENDS = (*LAST, MavCmd.DO_FLIGHTTERMINATION, MavCmd.COMPONENT_ARM_DISARM)
 def test_any_command_with_nan_params_is_answered(kind: str, number: float) -> None:
     devices = (SimulatedCamera(), SimulatedGimbal())
     client = settled(simulated(kind, boot_time_s=0.0, components=devices, parameter_count=100))
-    for command in (*(each for each in MavCmd if each not in LAST), *LAST):
+    for command in (*(kind for kind in MavCmd if kind not in LAST), *LAST):
         for first in (number, 0.0, 1.0, 2.0):
             client.send(m.CommandLong(0, 0, command, 0, first, *(number,) * 6))
             assert all(math.isfinite(when) for when, *_ in client.vehicle._timers), command
@@ -50,7 +50,7 @@ def test_commands_with_nan_params_in_flight_are_answered(kind: str, number: floa
     client.ask(1, MavCmd.NAV_TAKEOFF, *(math.nan,) * 6, 10.0 if kind == "copter" else math.nan)
     client.run(8.0)
     assert vehicle.motion.down < -2.0
-    for command in (each for each in MavCmd if each not in _ENDS):
+    for command in (kind for kind in MavCmd if kind not in _ENDS):
         client.send(m.CommandLong(0, 0, command, 0, *(number,) * 7))
         client.send(m.CommandLong(0, 0, command, 0, 1.0, *(number,) * 6))
         client.run(0.04)

@@ -35,9 +35,9 @@ def test_list_equals_the_parameters(kind: str, radio: FaultModel, seed: int) -> 
 def test_list_hash_equals_px4_hash(radio: FaultModel, seed: int) -> None:
     pair = Pair(vehicle_of("px4"), radio, seed)
     table = pair.run(ParameterList(1, 1, bytewise=True))
-    told = pair.run(ParameterReads(1, 1, ["_HASH_CHECK"], bytewise=True))["_HASH_CHECK"]
-    assert isinstance(told, Parameter)
-    assert int(told.value) == px4_hash(table)
+    reported = pair.run(ParameterReads(1, 1, ["_HASH_CHECK"], bytewise=True))["_HASH_CHECK"]
+    assert isinstance(reported, Parameter)
+    assert int(reported.value) == px4_hash(table)
 
 
 @each

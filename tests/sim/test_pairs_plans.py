@@ -81,6 +81,6 @@ def test_set_current_selects_the_item(kind: str, radio: FaultModel, seed: int, s
     pair = Pair(vehicle, radio, seed)
     vehicle.channels[0].streams.set_interval(MissionCurrent.ID, 1.0, pair.now)
     pair.run(SetCurrentItem(1, 1, seq, idle_timeout_s=60))
-    told = vehicle.build(MissionCurrent.ID)
-    assert isinstance(told, MissionCurrent)
-    assert told.seq == seq
+    reported = vehicle.build(MissionCurrent.ID)
+    assert isinstance(reported, MissionCurrent)
+    assert reported.seq == seq

@@ -47,7 +47,7 @@ def test_early_radio_recovery_restores_mode() -> None:
     plane, client = flying_plane(PlaneMode.FLY_BY_WIRE_A)
     plane.faults.rc_lost = True
     client.run(2.0)
-    client.forget()
+    client.clear()
     plane.faults.rc_lost = False
     client.run(1.5)
     assert client.texts == [
@@ -64,7 +64,7 @@ def test_late_radio_recovery_keeps_mode() -> None:
     plane, client = flying_plane(PlaneMode.CRUISE)
     plane.faults.rc_lost = True
     client.run(7.0)
-    client.forget()
+    client.clear()
     plane.faults.rc_lost = False
     client.run(1.0)
     assert client.texts == ["Throttle failsafe off", "RC Long Failsafe Cleared"]
@@ -144,7 +144,7 @@ def test_long_failsafe_waits_for_end_of_take_off() -> None:
     assert set_mode(client, PlaneMode.TAKEOFF) == MavResult.ACCEPTED
     plane.arming.arm()
     client.run(1.0)
-    client.forget()
+    client.clear()
     lose_ground_station(client, 5.5)
     assert plane.mode.is_taking_off
     assert client.texts == ["GCS Failsafe On: TAKEOFF"]
@@ -208,7 +208,7 @@ def test_low_battery_returns_and_critical_lacks_landing_sequence() -> None:
     assert client.last(m.Heartbeat).system_status == MavState.CRITICAL
     assert not healthy(client, Sensor.BATTERY)
     assert set_mode(client, PlaneMode.LOITER) == MavResult.ACCEPTED
-    client.forget()
+    client.clear()
     drain(plane, client, CRITICAL)
     assert client.texts[0].startswith("Battery 1 is critical 9.")
     assert client.texts[1:] == ["Unable to start landing sequence"]

@@ -34,7 +34,7 @@ def ready_px4(**options: object) -> tuple[SimulatedPx4, Client]:
     px4 = SimulatedPx4(fast_rate_hz=5.0, home=PX4_HOME, **options)  # type: ignore[arg-type]
     client = Client(px4)
     client.run(5.0)
-    client.forget()
+    client.clear()
     return px4, client
 
 
@@ -44,13 +44,13 @@ def flying_px4(altitude_m: float = 10.0, **options: object) -> tuple[SimulatedPx
     assert client.command(ARM, 1) == MavResult.ACCEPTED
     client.run_until(lambda: px4.mode == (4, 3), 40.0)
     client.run(5.0)
-    client.forget()
+    client.clear()
     return px4, client
 
 
 def set_mode(client: Client, main: int, sub: int = 0) -> list[int]:
     """Return both answers."""
-    client.forget()
+    client.clear()
     client.command(MavCmd.DO_SET_MODE, 1, main, sub)
     return [ack.result for ack in client.all(m.CommandAck)]
 
@@ -72,7 +72,7 @@ def stream_velocity(client: Client, seconds: float, velocity: tuple[float, float
 def test_default_streams_are_sent() -> None:
     client = Client(SimulatedPx4(home=PX4_HOME))
     client.run(30.0)
-    kinds = Counter(message.NAME for _, message in client.heard)
+    kinds = Counter(message.NAME for _, message in client.received)
     assert kinds["ATTITUDE"] == pytest.approx(30 * 50, rel=0.05)
     assert kinds["HEARTBEAT"] == pytest.approx(30, abs=1)
     assert kinds["GPS_RAW_INT"] == pytest.approx(150, abs=5)
@@ -125,7 +125,7 @@ def test_arming_denial_sends_texts_after_acknowledgement() -> None:
         "Arming denied: Resolve system health failures first\t"[50:],
         "Preflight Fail: Compass 0 fault",
     ]
-    assert type(client.heard[0][1]) is m.CommandAck
+    assert type(client.received[0][1]) is m.CommandAck
     assert client.command(ARM, 1, 21196.0) == MavResult.TEMPORARILY_REJECTED, "external commands are always checked"
 
 
@@ -225,7 +225,7 @@ def test_return_climbs_lands_and_disarms_at_home() -> None:
     there = px4.frame.to_global(34.0, 23.0, 0.0)
     client.command(MavCmd.DO_REPOSITION, -1, 1, 0, NAN, there.latitude_e7 / 1e7, there.longitude_e7 / 1e7, 502.4)
     client.run(20.0)
-    client.forget()
+    client.clear()
     assert client.command(MavCmd.NAV_RETURN_TO_LAUNCH) == MavResult.ACCEPTED
     highest = 0.0
 
@@ -338,7 +338,7 @@ def test_attitude_setpoints() -> None:
 def test_requested_message_precedes_its_acknowledgement() -> None:
     _, client = ready_px4()
     assert client.command(MavCmd.REQUEST_MESSAGE, m.AutopilotVersion.ID) == MavResult.ACCEPTED
-    assert [type(message) for _, message in client.heard] == [m.AutopilotVersion, m.CommandAck]
+    assert [type(message) for _, message in client.received] == [m.AutopilotVersion, m.CommandAck]
     version = client.last(m.AutopilotVersion)
     assert (version.flight_sw_version, version.capabilities) == (17891392, 0xE8FF)
     assert client.command(MavCmd.REQUEST_MESSAGE, 12345) == MavResult.DENIED
@@ -382,7 +382,7 @@ def test_integer_parameters_are_encoded_bytewise() -> None:
     cells = next(v for v in values if v.param_id == "BAT1_N_CELLS")
     assert cells.param_type == MavParamType.INT32
     assert struct.unpack("<i", struct.pack("<f", cells.param_value)) == (4,)
-    client.forget()
+    client.clear()
     bits = struct.unpack("<f", struct.pack("<i", 2))[0]
     client.send(m.ParamSet(1, 1, "COM_LOW_BAT_ACT", bits, MavParamType.INT32))
     assert px4.parameters["COM_LOW_BAT_ACT"] == 2
@@ -406,7 +406,7 @@ def test_lost_gps_drops_the_position() -> None:
     client.run(3.0)
     assert client.last(m.GpsRawInt).fix_type < 3
     assert client.command(ARM, 1) == MavResult.TEMPORARILY_REJECTED
-    client.forget()
+    client.clear()
     client.run(2.0)
     assert client.all(m.GlobalPositionInt) == []
 
@@ -424,9 +424,9 @@ def test_reboot_resets_the_state() -> None:
     px4, client = ready_px4()
     assert client.command(MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, 1) == MavResult.ACCEPTED
     client.run(0.3)
-    client.forget()
+    client.clear()
     client.run(1.2)
-    assert client.heard == []
+    assert client.received == []
     client.run(6.0)
     assert px4.is_ready
     assert client.all(m.Statustext)[0].id == 0

@@ -23,7 +23,7 @@ def ready(**options: object) -> tuple[SimulatedPx4, Client]:
     px4 = SimulatedPx4(fast_rate_hz=2.0, boot_time_s=1.0, parameter_count=100, home=PX4_HOME, **options)  # type: ignore[arg-type]
     client = Client(px4)
     client.run(2.0)
-    client.forget()
+    client.clear()
     return px4, client
 
 
@@ -32,7 +32,7 @@ def flying() -> tuple[SimulatedPx4, Client]:
     client.command(MavCmd.NAV_TAKEOFF, 0, 0, 0, NAN, NAN, NAN, 499.4)
     client.command(ARM, 1)
     client.run_until(lambda: px4.mode == HOLD, 40.0)
-    client.forget()
+    client.clear()
     return px4, client
 
 
@@ -93,7 +93,7 @@ def test_some_modes_cannot_be_armed_in() -> None:
 def test_each_arming_after_the_first_starts_log() -> None:
     _, client = ready(unix_time_at_boot=1_790_000_000.0)
     for logs in (0, 1):
-        client.forget()
+        client.clear()
         client.command(ARM, 1)
         assert sum(text.startswith("[logger] ./log/2026-09-21/14_13_2") for text in client.texts) == logs
         client.command(ARM, 0)
@@ -130,7 +130,7 @@ def test_forced_disarm_during_take_off_allows_new_flight() -> None:
     client.command(ARM, 0, 21196)
     client.run(3.0)
     assert px4.is_landed
-    client.forget()
+    client.clear()
     client.command(MavCmd.NAV_TAKEOFF, 0, 0, 0, NAN, NAN, NAN, 492.4)
     client.command(ARM, 1)
     client.run(6.0)
@@ -188,11 +188,11 @@ def test_vtol_mission_is_rejected() -> None:
 def test_rates_depend_on_the_link_mode(mode: str, attitude_hz: float, status_hz: float, imu_hz: float) -> None:
     _, client = ready(link_modes=[mode])
     client.run(10.0)
-    seen = Counter(type(message) for _, message in client.heard)
-    assert seen[m.Attitude] == pytest.approx(attitude_hz * 10, abs=2)
-    assert seen[m.SysStatus] == pytest.approx(status_hz * 10, abs=1)
-    assert seen[m.HighresImu] == pytest.approx(imu_hz * 10, abs=2)
-    assert seen[m.Heartbeat] == seen[m.MissionCurrent] == 10
+    observed = Counter(type(message) for _, message in client.received)
+    assert observed[m.Attitude] == pytest.approx(attitude_hz * 10, abs=2)
+    assert observed[m.SysStatus] == pytest.approx(status_hz * 10, abs=1)
+    assert observed[m.HighresImu] == pytest.approx(imu_hz * 10, abs=2)
+    assert observed[m.Heartbeat] == observed[m.MissionCurrent] == 10
 
 
 def test_origin_is_sent_once_on_each_link() -> None:
@@ -204,7 +204,7 @@ def test_origin_is_sent_once_on_each_link() -> None:
     px4.step(client.now + 5.0)
     kinds = [frame.message_id for frame in client.framer.receive(other.take_outbox(), client.now)]
     assert kinds.count(m.GpsGlobalOrigin.ID) == 1
-    assert interval(client, m.GpsGlobalOrigin.ID) == 1_000_000, "what it says all the same"
+    assert interval(client, m.GpsGlobalOrigin.ID) == 1_000_000, "messages that are always sent"
 
 
 def test_further_links_use_the_last_mode() -> None:
@@ -232,13 +232,13 @@ def test_message_interval_reports_as_the_firmware() -> None:
     assert client.command(MavCmd.SET_MESSAGE_INTERVAL, m.Heartbeat.ID, 1e6) == MavResult.FAILED
     assert client.command(MavCmd.SET_MESSAGE_INTERVAL, m.MissionCurrent.ID, 1e6) == MavResult.FAILED
     assert client.command(MavCmd.SET_MESSAGE_INTERVAL, m.HighresImu.ID, 1e5) == MavResult.ACCEPTED
-    client.forget()
+    client.clear()
     client.run(2.0)
     assert len(client.all(m.HighresImu)) == pytest.approx(20, abs=1)
     client.command(MavCmd.SET_MESSAGE_INTERVAL, m.Attitude.ID, 0)
     assert interval(client, m.Attitude.ID) == 66_666, "the link's own rate, not the simulator's"
     client.command(MavCmd.REQUEST_MESSAGE, m.StorageInformation.ID)
-    assert interval(client, m.StorageInformation.ID) == 0, "what was asked for once"
+    assert interval(client, m.StorageInformation.ID) == 0, "requested once"
 
 
 REQUESTED = (
@@ -261,7 +261,7 @@ REQUESTED = (
 def test_messages_on_request(kind: type[m.Heartbeat]) -> None:
     _, client = ready()
     assert client.command(MavCmd.REQUEST_MESSAGE, kind.ID) == MavResult.ACCEPTED
-    assert isinstance(client.heard[0][1], kind)
+    assert isinstance(client.received[0][1], kind)
     client.last(kind).encode()
 
 

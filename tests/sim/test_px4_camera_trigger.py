@@ -47,7 +47,7 @@ def test_series_runs_until_stopped() -> None:
     assert client.ask(1, SWITCH, 1, 1, 0) == DONE
     client.run(2.2)
     assert client.ask(1, SWITCH, -1, -1, 1) == DONE
-    assert [each.seq for each in client.all(m.CameraTrigger)] == [0, 1, 2, 3, 4]
+    assert [message.seq for message in client.all(m.CameraTrigger)] == [0, 1, 2, 3, 4]
     client.run(2.0)
     assert px4.camera_trigger.sequence == 5
     assert client.ask(1, SWITCH, -1, -1, 0) == DONE

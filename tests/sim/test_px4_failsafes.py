@@ -37,7 +37,7 @@ def flying(altitude_m: float = 20.0, **parameters: float) -> tuple[SimulatedPx4,
     assert station.command(MavCmd.COMPONENT_ARM_DISARM, 1) == MavResult.ACCEPTED
     station.run(30.0)
     assert px4.mode == HOLD
-    station.forget()
+    station.clear()
     return px4, station
 
 
@@ -163,7 +163,7 @@ def test_required_station_prevents_arming() -> None:
 def test_lost_sticks_trigger_return_unless_excepted(excepted: int, mode: tuple[int, int]) -> None:
     px4, station = flying(COM_RCL_EXCEPT=excepted, COM_FAIL_ACT_T=0.0)
     station.run(2.0)
-    assert px4.mode == HOLD, "sticks that never were are not missed"
+    assert px4.mode == HOLD, "without sticks there is no failsafe"
     for _ in range(5):
         station.send(m.ManualControl(1, 0, 0, 500, 0, 0))
         station.run(0.1)

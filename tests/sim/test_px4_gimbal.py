@@ -22,10 +22,10 @@ ACCEPTED, DENIED = MavResult.ACCEPTED, MavResult.DENIED
 @pytest.fixture
 def client() -> Client:
     px4 = SimulatedPx4(boot_time_s=1.0, parameters={"MNT_MODE_IN": 4.0})
-    each = Client(px4)
-    each.run(3.0)
-    each.forget()
-    return each
+    connected = Client(px4)
+    connected.run(3.0)
+    connected.clear()
+    return connected
 
 
 @pytest.fixture
@@ -41,18 +41,18 @@ def gimbal(client: Client) -> SimulatedPx4:
 
 def angles(client: Client) -> list[float]:
     client.run(0.3)
-    told = client.last(m.GimbalDeviceAttitudeStatus)
-    return [round(math.degrees(each), 1) for each in euler_from_quaternion(*told.q)]
+    reported = client.last(m.GimbalDeviceAttitudeStatus)
+    return [round(math.degrees(angle), 1) for angle in euler_from_quaternion(*reported.q)]
 
 
 def test_commands_without_gimbal_are_not_answered() -> None:
-    each = Client(SimulatedPx4(boot_time_s=1.0))
-    each.run(3.0)
-    assert each.command(POINT, -10, 0, NAN, NAN, LEVEL) is None
-    assert each.command(CONFIGURE, 255, 190) is None
-    assert each.command(MavCmd.DO_MOUNT_CONTROL, 0, 0, 0, 0, 0, 0, 2) is None
-    assert each.command(MavCmd.REQUEST_MESSAGE, m.GimbalManagerInformation.ID) == DENIED
-    assert each.all(m.GimbalDeviceAttitudeStatus) == []
+    connected = Client(SimulatedPx4(boot_time_s=1.0))
+    connected.run(3.0)
+    assert connected.command(POINT, -10, 0, NAN, NAN, LEVEL) is None
+    assert connected.command(CONFIGURE, 255, 190) is None
+    assert connected.command(MavCmd.DO_MOUNT_CONTROL, 0, 0, 0, 0, 0, 0, 2) is None
+    assert connected.command(MavCmd.REQUEST_MESSAGE, m.GimbalManagerInformation.ID) == DENIED
+    assert connected.all(m.GimbalDeviceAttitudeStatus) == []
 
 
 def test_messages_are_streamed_and_sent_on_request(client: Client) -> None:
@@ -60,24 +60,24 @@ def test_messages_are_streamed_and_sent_on_request(client: Client) -> None:
     assert len(client.all(m.GimbalDeviceAttitudeStatus)) == pytest.approx(20, abs=2)
     assert len(client.all(m.GimbalManagerStatus)) == pytest.approx(2, abs=1)
     assert client.command(MavCmd.REQUEST_MESSAGE, m.GimbalManagerInformation.ID) == ACCEPTED
-    told = client.last(m.GimbalManagerInformation)
-    assert (told.gimbal_device_id, told.cap_flags) == (1, 132530)
-    assert math.degrees(told.pitch_min) == pytest.approx(-45)
+    reported = client.last(m.GimbalManagerInformation)
+    assert (reported.gimbal_device_id, reported.cap_flags) == (1, 132530)
+    assert math.degrees(reported.pitch_min) == pytest.approx(-45)
 
 
 def test_commands_without_control_are_denied(client: Client) -> None:
     assert client.command(POINT, -30, 0, NAN, NAN, LEVEL) == DENIED
     assert client.command(CONFIGURE, -2, -2, -1, -1) == ACCEPTED
-    assert gimbal(client).gimbal.in_control == (1, 1), "whoever asks is PX4 itself"
+    assert gimbal(client).gimbal.in_control == (1, 1), "PX4 itself sends the request"
     assert client.command(POINT, -30, 0, NAN, NAN, LEVEL) == DENIED
     assert client.command(CONFIGURE, -3, -3, -1, -1) == ACCEPTED
-    assert gimbal(client).gimbal.in_control == (1, 1), "what is not ours is not let go"
+    assert gimbal(client).gimbal.in_control == (1, 1), "control of another station is not released"
     assert client.command(CONFIGURE, 255, 190, 7, 7) == ACCEPTED
     assert client.command(POINT, -30, 20, NAN, NAN, LEVEL) == ACCEPTED
     assert angles(client) == [0, -30, 20]
     client.command(MavCmd.REQUEST_MESSAGE, m.GimbalManagerStatus.ID)
-    told = client.last(m.GimbalManagerStatus)
-    assert (told.primary_control_sysid, told.secondary_control_sysid) == (255, 0)
+    reported = client.last(m.GimbalManagerStatus)
+    assert (reported.primary_control_sysid, reported.secondary_control_sysid) == (255, 0)
     assert client.command(CONFIGURE, -3, -3, -1, -1) == ACCEPTED
     assert gimbal(client).gimbal.in_control == (0, 0)
 
@@ -87,7 +87,7 @@ def test_frames_neutral_and_retracted(claimed: Client) -> None:
     assert angles(claimed) == [0, -30, 90]
     assert claimed.last(m.GimbalDeviceAttitudeStatus).flags == LOCKED
     assert claimed.command(POINT, NAN, NAN, NAN, NAN, RETRACT) == ACCEPTED
-    assert angles(claimed) == [0, -30, 90], "taken, and nothing done"
+    assert angles(claimed) == [0, -30, 90], "accepted without effect"
     assert claimed.command(POINT, NAN, NAN, NAN, NAN, NEUTRAL) == ACCEPTED
     assert angles(claimed) == [0, 0, 0]
     assert claimed.last(m.GimbalDeviceAttitudeStatus).flags == 32

@@ -23,7 +23,7 @@ def ready_plane(**parameters: float) -> tuple[SimulatedPx4Plane, Client]:
     plane = SimulatedPx4Plane(fast_rate_hz=1.0, boot_time_s=1.0, parameter_count=150, parameters=parameters)
     client = Client(plane)
     client.run(2.0)
-    client.forget()
+    client.clear()
     return plane, client
 
 
@@ -146,7 +146,7 @@ def test_mission_from_climb_out_to_roll_out() -> None:
     plane.missions.replace(0, [*items, item(plane, MavCmd.NAV_LAND, 0, 0, 0)])
     assert client.command(MavCmd.MISSION_START) == MavResult.ACCEPTED
     client.run_until(lambda: not plane.is_armed, 400.0)
-    assert list(dict.fromkeys(each.seq for each in client.all(m.MissionItemReached))) == [0, 1, 2, 3, 4]
+    assert list(dict.fromkeys(report.seq for report in client.all(m.MissionItemReached))) == [0, 1, 2, 3, 4]
     assert away_m(plane) < 150.0
 
 

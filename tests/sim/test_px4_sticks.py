@@ -32,7 +32,7 @@ class Pilot(Client):
             self.run(0.1)
 
     def set_mode(self, main: int, sub: int = 0) -> list[int]:
-        self.forget()
+        self.clear()
         self.command(MavCmd.DO_SET_MODE, 1, main, sub)
         return [ack.result for ack in self.all(m.CommandAck)]
 
@@ -41,7 +41,7 @@ def ready(**parameters: float) -> tuple[SimulatedPx4, Pilot]:
     px4 = SimulatedPx4(fast_rate_hz=2.0, boot_time_s=1.0, parameter_count=100, parameters=parameters)
     pilot = Pilot(px4)
     pilot.run(2.0)
-    pilot.forget()
+    pilot.clear()
     return px4, pilot
 
 

@@ -61,22 +61,22 @@ def test_streams_are_played_at_their_times(path: Path) -> None:
     vehicle = RecordedVehicle(path)
     client = Client(vehicle)
     client.run(vehicle.recording.duration_s + 1.0)
-    framer, told = Framer(), Counter[str]()
+    framer, reported = Framer(), Counter[str]()
     start, times = None, []
     for stamp, raw in read_tlog(path):
         for frame in framer.receive(raw):
             if frame.system_id == 1:
                 start = stamp if start is None else start
                 message = STANDARD.decode(frame)
-                told[message.NAME] += 1
+                reported[message.NAME] += 1
                 times += [stamp - start] * isinstance(message, m.Heartbeat)
-    heard = Counter(message.NAME for _, message in client.heard)
+    received = Counter(message.NAME for _, message in client.received)
     for name in ("HEARTBEAT", "GLOBAL_POSITION_INT", "STATUSTEXT", "GPS_RAW_INT", "MISSION_CURRENT"):
-        assert heard[name] == told[name] > 0
+        assert received[name] == reported[name] > 0
     for name in ("COMMAND_ACK", "PARAM_VALUE", "MISSION_ITEM_INT", "TIMESYNC"):
-        assert heard[name] == 0
+        assert received[name] == 0
     assert client.framer.statistics.bad_bytes == 0
-    heartbeats = [time for time, message in client.heard if isinstance(message, m.Heartbeat)]
+    heartbeats = [time for time, message in client.received if isinstance(message, m.Heartbeat)]
     assert all(-1e-6 <= ours - theirs <= 0.051 for ours, theirs in zip(heartbeats, times, strict=True))
 
 
@@ -92,7 +92,7 @@ def test_vehicle_is_silent_after_the_end() -> None:
 def test_repeat_and_start_offset() -> None:
     client = Client(vehicle_of((20.0, m.Statustext(6, "half time"), (7, 1)), repeat=True, start_s=10.0))
     client.run(60.0)
-    assert [time for time, message in client.heard if isinstance(message, m.Statustext)] == pytest.approx(
+    assert [time for time, message in client.received if isinstance(message, m.Statustext)] == pytest.approx(
         [10, 50], abs=0.06
     )
 
@@ -137,7 +137,7 @@ def test_commands_get_recorded_answers_and_delays() -> None:
         assert not client.all(m.CommandAck)
         client.run(0.2)
         results.append(client.last(m.CommandAck).result)
-        client.forget()
+        client.clear()
     client.command(400, 0.0)
     client.run(0.2)
     results.append(client.last(m.CommandAck).result)
@@ -164,7 +164,7 @@ def test_progress_and_double_acknowledgements_are_repeated() -> None:
 def test_recorded_message_is_sent_on_request() -> None:
     client = Client(RecordedVehicle(PX4))
     client.run(5.0)
-    client.forget()
+    client.clear()
     assert client.command(MavCmd.REQUEST_MESSAGE, m.Attitude.ID) == MavResult.ACCEPTED
     assert client.all(m.Attitude)
     assert client.command(MavCmd.REQUEST_MESSAGE, m.Rpm.ID) == MavResult.UNSUPPORTED
@@ -193,8 +193,8 @@ def test_parameter_list_has_no_gaps() -> None:
     client = parameter_client()
     client.send(m.ParamRequestList(7, 1))
     client.run(0.1)
-    told = [(v.param_id, v.param_value, v.param_index, v.param_count) for v in client.all(m.ParamValue)]
-    assert told == [("A", 1.0, 0, 2), ("B", 2.0, 1, 2)]
+    reported = [(v.param_id, v.param_value, v.param_index, v.param_count) for v in client.all(m.ParamValue)]
+    assert reported == [("A", 1.0, 0, 2), ("B", 2.0, 1, 2)]
 
 
 def test_parameter_values_follow_the_recording() -> None:
@@ -215,7 +215,7 @@ def test_only_recorded_sets_are_accepted() -> None:
 def test_unknown_parameters_follow_the_recording() -> None:
     silent = parameter_client()
     silent.send(m.ParamRequestRead(7, 1, "NO_SUCH", -1))
-    assert len(silent.heard) == 1
+    assert len(silent.received) == 1
     client = parameter_client((3.0, m.ParamError(*GROUND, "X", -1, MavParamError.DOES_NOT_EXIST), (7, 1)))
     client.send(m.ParamRequestRead(7, 1, "NO_SUCH", -1))
     assert client.last(m.ParamError).error == MavParamError.DOES_NOT_EXIST
@@ -306,11 +306,11 @@ def test_program_runs_with_a_recording(path: Path, firmware: str, items: int) ->
 
 
 def test_playback_is_deterministic() -> None:
-    def told(step: float) -> bytes:
+    def output_with(step: float) -> bytes:
         vehicle, data = RecordedVehicle(PX4), b""
         for number in range(round(20 / step) + 1):
             vehicle.step(number * step)
             data += vehicle.take_outbox()
         return data
 
-    assert told(0.01) == told(5.0)
+    assert output_with(0.01) == output_with(5.0)

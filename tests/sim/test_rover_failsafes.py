@@ -37,7 +37,7 @@ def test_radio_failsafe_executes_configured_action(action: int, mode: int) -> No
     rover.faults.rc_lost = True
     client.run(1.9)
     assert client.texts == []
-    assert not healthy(client, Sensor.RC_RECEIVER), "half a second is enough for that"
+    assert not healthy(client, Sensor.RC_RECEIVER), "the change takes half a second"
     client.run(1.1)
     assert client.texts == ["Radio Failsafe"]
     assert rover.mode.number == mode

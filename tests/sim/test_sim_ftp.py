@@ -22,7 +22,7 @@ def copter_ftp(**options: object) -> tuple[SimulatedCopter, FtpClient]:
     copter = SimulatedCopter(boot_time_s=0.0, parameter_count=80, **options)  # type: ignore[arg-type]
     client = Client(copter)
     client.run(1.0)
-    client.forget()
+    client.clear()
     return copter, FtpClient(client)
 
 
@@ -30,7 +30,7 @@ def px4_ftp(**options: object) -> tuple[SimulatedPx4, FtpClient]:
     px4 = SimulatedPx4(boot_time_s=0.0, parameter_count=70, fast_rate_hz=1.0, **options)  # type: ignore[arg-type]
     client = Client(px4)
     client.run(1.0)
-    client.forget()
+    client.clear()
     return px4, FtpClient(client)
 
 
@@ -174,7 +174,7 @@ def test_ardupilot_repeats_its_last_reply() -> None:
     ftp.upload("/t", b"123")
     first = ftp.ask(Op.REMOVEFILE, "/t")
     ftp.send(Op.REMOVEFILE, "/t", sequence=ftp.sequence)
-    assert ftp.answers() == [first], "and not that there is no such file"
+    assert ftp.answers() == [first], "the same reply, not FILENOTFOUND"
     assert "/t" not in vehicle.files
 
 
@@ -248,8 +248,8 @@ def test_ardupilot_serves_missions_as_files() -> None:
     ftp.data(Op.TERMINATESESSION)
     home = MissionItem(16, 0, x=-353632610, y=1491652299, z=584.0)
     item = MissionItem(16, 3, x=-353600000, y=1491600000, z=20.0)
-    numbers = [(0.0,) * 4 + (each.x, each.y, each.z, seq, 16, 0, 0, each.frame, 0, 1, 0)
-               for seq, each in enumerate((home, item))]  # fmt: skip
+    numbers = [(0.0,) * 4 + (mission_item.x, mission_item.y, mission_item.z, seq, 16, 0, 0, mission_item.frame, 0, 1, 0)
+               for seq, mission_item in enumerate((home, item))]  # fmt: skip
     content = struct.pack("<HHHHH", 0x763D, 0, 0, 0, 2) + b"".join(
         struct.pack("<4fiifHHBBBBBB", *row) for row in numbers
     )
@@ -259,7 +259,7 @@ def test_ardupilot_serves_missions_as_files() -> None:
     assert (downloaded[:10], downloaded[48:]) == (content[:10], content[48:])
     for broken in (b"", b"short", content[:-1], content[:-38] + bytes(38), b"\0\0" + content[2:]):
         ftp.upload("@MISSION/mission.dat", broken)
-        assert len(vehicle.missions.items(0)) == 2, "acknowledged, and without effect"
+        assert len(vehicle.missions.items(0)) == 2, "acknowledged without effect"
 
 
 # ------------------------------------------------------------------------------------------ PX4
@@ -295,7 +295,7 @@ def test_px4_has_one_session_per_port() -> None:
     ftp.send(Op.OPENFILERO, "/t")
     assert [answer.opcode for answer in ftp.answers()] == [Op.NAK]
     assert px4.ftp.open_sessions == 1
-    assert other.take_outbox()[7:10] != b"\x6e\0\0", "nobody asked there"
+    assert other.take_outbox()[7:10] != b"\x6e\0\0", "no request came from there"
 
 
 def test_px4_burst_ignores_size_and_ends_at_35_kb() -> None:
@@ -315,7 +315,7 @@ def test_px4_keeps_reporting_eexist() -> None:
     _, ftp = px4_ftp()
     ftp.data(Op.CREATEDIRECTORY, "/a")
     assert ftp.refusal(Op.CREATEDIRECTORY, "/a") == (Err.FILEEXISTS,)
-    assert ftp.refusal(77) == (Err.FILEEXISTS,), "as seen: an errno is never forgotten"
+    assert ftp.refusal(77) == (Err.FILEEXISTS,), "as measured: the server keeps an errno"
     assert ftp.refusal(Op.OPENFILERO, "/none") == (Err.FILENOTFOUND,)
     assert ftp.refusal(77) == (Err.UNKNOWNCOMMAND,)
     assert ftp.refusal(Op.CALCFILECRC, "/none") == (Err.FILENOTFOUND,)

@@ -23,12 +23,12 @@ HOME_E7 = (-353632610, 1491652299)
 @pytest.fixture
 def client() -> Client:
     """A client of a copter on the ground that faces east."""
-    _, each = ready_copter(parameters=WITH_GIMBAL, heading_deg=90.0)
-    return each
+    _, connected = ready_copter(parameters=WITH_GIMBAL, heading_deg=90.0)
+    return connected
 
 
 def status(client: Client) -> m.GimbalDeviceAttitudeStatus:
-    client.forget()
+    client.clear()
     assert client.command(MavCmd.REQUEST_MESSAGE, m.GimbalDeviceAttitudeStatus.ID) == ACCEPTED
     client.run(0.05)
     return client.last(m.GimbalDeviceAttitudeStatus)
@@ -36,7 +36,7 @@ def status(client: Client) -> m.GimbalDeviceAttitudeStatus:
 
 def angles(client: Client) -> list[int]:
     """Return roll, pitch and yaw from the nose in whole degrees."""
-    return [round(math.degrees(each)) for each in euler_from_quaternion(*status(client).q)]
+    return [round(math.degrees(angle)) for angle in euler_from_quaternion(*status(client).q)]
 
 
 def mount(client: Client, mode: int, pitch: float = 0, roll: float = 0, yaw: float = 0) -> int | None:
@@ -47,7 +47,7 @@ def manage(client: Client, *params: float) -> int | None:
     return client.command(MavCmd.DO_GIMBAL_MANAGER_PITCHYAW, *params)
 
 
-# ------------------------------------------------------------------------------------ what it tells
+# ----------------------------------------------------------------------------------------- messages
 
 
 def test_commands_without_gimbal_fail() -> None:
@@ -72,9 +72,9 @@ def test_attitude_is_streamed_and_sent_on_request(client: Client) -> None:
     client.send(m.RequestDataStream(1, 1, MavDataStream.EXTRA3, 10, 1))
     client.run(1.0)
     assert len(client.all(m.GimbalDeviceAttitudeStatus)) >= 10
-    told = status(client)
-    assert (told.flags, told.gimbal_device_id) == (FOLLOWS, 1)
-    assert math.isnan(told.delta_yaw)
+    reported = status(client)
+    assert (reported.flags, reported.gimbal_device_id) == (FOLLOWS, 1)
+    assert math.isnan(reported.delta_yaw)
     for kind in (m.GimbalManagerInformation, m.GimbalManagerStatus):
         assert client.command(MavCmd.REQUEST_MESSAGE, kind.ID) == ACCEPTED
     client.run(0.1)
@@ -97,7 +97,7 @@ def test_mount_command_is_relative_to_the_nose(client: Client) -> None:
     assert mount(client, MavMountMode.MAVLINK_TARGETING, -45, 50, 350) == ACCEPTED
     assert angles(client) == [30, -45, -10]
     assert status(client).flags == FOLLOWS
-    client.forget()
+    client.clear()
     assert mount(client, MavMountMode.MAVLINK_TARGETING, -100) == FAILED
     client.run(0.1)
     assert client.texts == ["Mount: invalid angle targets"]
@@ -166,11 +166,11 @@ def test_manager_messages_control_the_gimbal(client: Client) -> None:
 
 def test_control_is_stored_and_reported(client: Client) -> None:
     def configure(system: float, component: float) -> list[tuple[int, int]]:
-        client.forget()
+        client.clear()
         assert client.command(MavCmd.DO_GIMBAL_MANAGER_CONFIGURE, system, component) == ACCEPTED
         client.run(0.1)
-        told = client.all(m.GimbalManagerStatus)
-        return [(each.primary_control_sysid, each.primary_control_compid) for each in told]
+        reported = client.all(m.GimbalManagerStatus)
+        return [(event.primary_control_sysid, event.primary_control_compid) for event in reported]
 
     assert configure(-2, -2) == [(255, 190)]
     assert configure(255, 190) == []
@@ -180,7 +180,7 @@ def test_control_is_stored_and_reported(client: Client) -> None:
     assert configure(255, 190) == [(255, 190)]
     assert configure(-3, -3) == [(0, 0)]
     assert client.command(MavCmd.DO_GIMBAL_MANAGER_CONFIGURE, -4, 0) == FAILED
-    assert manage(client, -10, 0, NAN, NAN) == ACCEPTED, "nobody has to be in control"
+    assert manage(client, -10, 0, NAN, NAN) == ACCEPTED, "no controller is required"
 
 
 # -------------------------------------------------------------------------------------- places

@@ -22,19 +22,19 @@ def vehicle_with(kind: str, logs: tuple[SimulatedLog, ...] = LOGS) -> tuple[Vehi
         vehicle = SimulatedPx4(boot_time_s=0.0, parameter_count=70, fast_rate_hz=1.0, logs=logs)
     client = Client(vehicle)
     client.run(1.0)
-    client.forget()
+    client.clear()
     return vehicle, client
 
 
 def entries(client: Client, start: int = 0, end: int = ALL) -> list[m.LogEntry]:
-    client.forget()
+    client.clear()
     client.send(m.LogRequestList(1, 1, start, end))
     client.run(0.2)
     return client.all(m.LogEntry)
 
 
 def data(client: Client, log_id: int, offset: int = 0, count: int = EVERYTHING) -> list[m.LogData]:
-    client.forget()
+    client.clear()
     client.send(m.LogRequestData(1, 1, log_id, offset, count))
     client.run(0.5)
     return client.all(m.LogData)
@@ -131,7 +131,7 @@ def test_px4_needs_list_first_and_replaces_transfers() -> None:
     _, client = vehicle_with("px4")
     assert data(client, 0) == []
     entries(client)
-    client.forget()
+    client.clear()
     client.send(m.LogRequestData(1, 1, 2, 0, EVERYTHING))
     client.send(m.LogRequestData(1, 1, 0, 0, EVERYTHING))
     client.run(0.5)
@@ -146,6 +146,6 @@ def test_armed_ardupilot_sends_no_logs() -> None:
     assert client.command(MavCmd.COMPONENT_ARM_DISARM, 1) == 0
     assert entries(client) == []
     assert data(client, 1) == []
-    assert "Disarm for log download" not in client.texts, "it says so once"
+    assert "Disarm for log download" not in client.texts, "reported once"
     assert client.command(MavCmd.COMPONENT_ARM_DISARM, 0) == 0
     assert len(entries(client)) == 3

@@ -47,7 +47,7 @@ def start(*items: MissionItem, **parameters: float) -> tuple[SimulatedCopter, Cl
     assert upload(client, [HOME, *items]) == MavResult.ACCEPTED
     set_mode(client, CopterMode.GUIDED)
     assert client.command(ARM, 1) == MavResult.ACCEPTED
-    client.forget()
+    client.clear()
     assert client.command(START) == MavResult.ACCEPTED
     return copter, client
 
@@ -330,7 +330,7 @@ def start_px4(*items: MissionItem) -> tuple[SimulatedPx4, Client]:
     client = Client(px4)
     client.run(2.0)
     assert upload(client, items) == 0
-    client.forget()
+    client.clear()
     assert client.command(START) == MavResult.ACCEPTED
     return px4, client
 

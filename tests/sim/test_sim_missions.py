@@ -44,7 +44,7 @@ def copter_and_client() -> tuple[SimulatedCopter, Client]:
     copter = SimulatedCopter(boot_time_s=0.0)
     client = Client(copter)
     client.run(2.0)
-    client.forget()
+    client.clear()
     return copter, client
 
 
@@ -52,7 +52,7 @@ def px4_and_client(version: str = "1.17.0-alpha") -> tuple[SimulatedPx4, Client]
     px4 = SimulatedPx4(fast_rate_hz=1.0, boot_time_s=0.5, version=version)
     client = Client(px4)
     client.run(1.0)
-    client.forget()
+    client.clear()
     return px4, client
 
 
@@ -176,7 +176,7 @@ def test_ardupilot_denies_others_during_an_upload() -> None:
     copter, client = copter_and_client()
     other = Client(copter, system_id=255, component_id=77)
     client.send(m.MissionCount(1, 1, 2, 0))
-    other.forget()
+    other.clear()
     for message in (
         m.MissionCount(1, 1, 2, 0),
         m.MissionRequestList(1, 1, 0),
@@ -283,9 +283,9 @@ def test_ardupilot_fence_and_rally_need_mavlink_2() -> None:
     client.send(m.MissionClearAll(1, 1, ALL_TYPES))
     client.send(item_message(0, 4))
     assert results(client) == [R.UNSUPPORTED] * 4
-    first = len(client.heard)
+    first = len(client.received)
     client.send(m.MissionRequestInt(1, 1, 0, 7))
-    assert len(client.heard) == first
+    assert len(client.received) == first
     copter.channels[0].version = 1
     client.send(m.MissionRequestList(1, 1, FENCE_TYPE))
     client.run(0.1)
@@ -382,7 +382,7 @@ def test_px4_retries_four_times_a_second_for_five_seconds() -> None:
 def test_px4_repeats_its_count_until_the_first_request() -> None:
     px4, client = px4_and_client()
     upload(client, [item(RETURN, 2)])
-    client.forget()
+    client.clear()
     client.send(m.MissionRequestList(1, 1, 0))
     client.run(1.0)
     assert len(client.all(m.MissionCount)) == 4
@@ -396,7 +396,7 @@ def test_px4_repeats_its_count_until_the_first_request() -> None:
 def test_px4_downloads_in_order_only() -> None:
     px4, client = px4_and_client()
     upload(client, [item(RETURN, 2)] * 3)
-    client.forget()
+    client.clear()
     client.send(m.MissionRequestList(1, 1, 0))
     for seq in (0, 0, 1, 1, 2):
         client.send(m.MissionRequestInt(1, 1, seq, 0))
@@ -406,7 +406,7 @@ def test_px4_downloads_in_order_only() -> None:
     assert results(client) == [R.ERROR]
     assert client.texts == ["WPM: REJ. CMD: Req. WP was unexpected\t"]
     assert not is_open(px4)
-    client.forget()
+    client.clear()
     client.send(m.MissionRequestInt(1, 1, 0, 0))
     assert client.all(m.MissionItemInt) == []
 
@@ -419,7 +419,7 @@ def test_px4_refuses_other_stations_during_a_transfer() -> None:
     other.now = client.now
     other.send(m.MissionCount(1, 1, 2, 0))
     assert other.last(m.MissionAck).type == R.ERROR
-    other.forget()
+    other.clear()
     other.send(item_message(0))
     other.send(m.MissionRequestList(1, 1, 0))
     other.send(m.MissionClearAll(1, 1, 0))
@@ -440,7 +440,7 @@ def test_px4_refuses_other_stations_during_a_transfer() -> None:
 def test_px4_repeats_a_lost_last_acknowledgement() -> None:
     _, client = px4_and_client()
     upload(client, [item(RETURN, 2)] * 2)
-    client.forget()
+    client.clear()
     client.send(item_message(1))
     assert results(client) == [R.ACCEPTED]
 

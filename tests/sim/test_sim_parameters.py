@@ -41,12 +41,12 @@ def a_px4(**options: object) -> tuple[SimulatedPx4, Client]:
 def ready(vehicle: SimulatedCopter | SimulatedPx4) -> Client:
     client = Client(vehicle)
     client.run(1.0)
-    client.forget()
+    client.clear()
     return client
 
 
-def told(client: Client, message: Message, seconds: float = 0.1) -> list[m.ParamValue]:
-    client.forget()
+def answers(client: Client, message: Message, seconds: float = 0.1) -> list[m.ParamValue]:
+    client.clear()
     client.send(message)
     client.run(seconds)
     return client.all(m.ParamValue)
@@ -84,7 +84,7 @@ def test_each_ardupilot_firmware_has_a_table() -> None:
 
 def test_enabling_a_feature_changes_the_count() -> None:
     copter = parameters_of("copter")
-    assert copter["BATT2_CAPACITY"] == 3300, "there by name at any time"
+    assert copter["BATT2_CAPACITY"] == 3300, "always readable by name"
     assert "BATT2_CAPACITY" not in copter.names
     copter["BATT2_MONITOR"] = 4
     assert len(copter) == 1362
@@ -105,7 +105,7 @@ def test_enabling_a_feature_changes_the_count() -> None:
 def test_ardupilot_stores_single_precision(type_: int, value: float, kept: float) -> None:
     copter, client = a_copter(parameter_count=80)
     copter.parameters.add("X", 0, type_)
-    (echo,) = told(client, m.ParamSet(1, 1, "X", value, REAL))
+    (echo,) = answers(client, m.ParamSet(1, 1, "X", value, REAL))
     assert (echo.param_value, echo.param_type, echo.param_index) == (kept, type_, 0xFFFF)
     assert copter.parameters["X"] == kept
 
@@ -129,7 +129,7 @@ def test_ardupilot_list_restarts_and_runs_at_2000_hz() -> None:
 
 def test_ardupilot_list_uses_30_percent_of_slow_link() -> None:
     _, client = a_copter(link_bytes_per_s=5760)
-    values = told(client, m.ParamRequestList(1, 1), 2.0)
+    values = answers(client, m.ParamRequestList(1, 1), 2.0)
     assert len(values) * 37 == pytest.approx(2 * 0.3 * 5760, rel=0.05)
 
 
@@ -139,7 +139,7 @@ def test_ardupilot_queues_twenty_reads() -> None:
         client.vehicle.receive(client._encoder.encode(m.ParamRequestRead(1, 1, "", index)), client.now)
     client.run(0.1)
     assert [value.param_index for value in client.all(m.ParamValue)] == list(range(20 + 1))
-    assert [v.param_index for v in told(client, m.ParamRequestRead(1, 1, "RTL_ALT", -1))] == [0xFFFF]
+    assert [v.param_index for v in answers(client, m.ParamRequestRead(1, 1, "RTL_ALT", -1))] == [0xFFFF]
 
 
 def test_ardupilot_released_version_sends_parameter_errors() -> None:
@@ -152,24 +152,24 @@ def test_ardupilot_released_version_sends_parameter_errors() -> None:
     _, silent = a_copter(parameter_count=80)
     _, frank = a_copter(parameter_count=80, parameter_errors=True)
     for question, code, index in questions:
-        assert told(silent, question) == []
-        assert told(frank, question) == []
+        assert answers(silent, question) == []
+        assert answers(frank, question) == []
         (error,) = frank.all(m.ParamError)
         assert (error.error, error.param_index, error.target_system) == (code, index, 255)
     assert silent.all(m.ParamError) == []
-    assert len(told(frank, m.ParamSet(1, 1, "RTL_ALT", 1000.0, REAL))) == 2
+    assert len(answers(frank, m.ParamSet(1, 1, "RTL_ALT", 1000.0, REAL))) == 2
 
 
 def test_faults_clamp_protect_and_mute_parameters() -> None:
     copter, client = a_copter(parameter_count=100, parameter_errors=True)
     copter.faults.parameter_limits["RTL_ALT"] = (300.0, 8000.0)
-    assert told(client, m.ParamSet(1, 1, "RTL_ALT", 10.0, REAL))[0].param_value == 300.0
+    assert answers(client, m.ParamSet(1, 1, "RTL_ALT", 10.0, REAL))[0].param_value == 300.0
     copter.faults.read_only_parameters.add("RTL_ALT")
-    assert told(client, m.ParamSet(1, 1, "RTL_ALT", 500.0, REAL))[0].param_value == 300.0
+    assert answers(client, m.ParamSet(1, 1, "RTL_ALT", 500.0, REAL))[0].param_value == 300.0
     assert client.all(m.ParamError)[0].error == MavParamError.PERMISSION_DENIED
     assert "Param write denied (RTL_ALT)" in client.texts
     copter.faults.mute_parameters.add("RTL_ALT")
-    names = [value.param_id for value in told(client, m.ParamRequestList(1, 1), 1.0)]
+    names = [value.param_id for value in answers(client, m.ParamRequestList(1, 1), 1.0)]
     assert len(names) == 99
     assert "RTL_ALT" not in names
 
@@ -251,15 +251,15 @@ def test_px4_hash_excludes_volatile_parameters() -> None:
             crc = zlib.crc32(row.name.encode() + value, crc)
     assert px4.parameters.row("CAL_ACC0_XOFF").is_volatile
 
-    def told_hash() -> int:
-        (answer,) = told(client, m.ParamRequestRead(1, 1, "_HASH_CHECK", -1))
+    def reported_hash() -> int:
+        (answer,) = answers(client, m.ParamRequestRead(1, 1, "_HASH_CHECK", -1))
         return bits_of(answer)
 
-    assert told_hash() == crc ^ 0xFFFFFFFF
+    assert reported_hash() == crc ^ 0xFFFFFFFF
     px4.parameters["CAL_ACC0_XOFF"] = 1.0
-    assert told_hash() == crc ^ 0xFFFFFFFF
+    assert reported_hash() == crc ^ 0xFFFFFFFF
     px4.parameters["MPC_XY_CRUISE"] = 6.0
-    assert told_hash() != crc ^ 0xFFFFFFFF
+    assert reported_hash() != crc ^ 0xFFFFFFFF
 
 
 def test_px4_sends_hash_first_except_on_restart() -> None:
@@ -272,14 +272,14 @@ def test_px4_sends_hash_first_except_on_restart() -> None:
     assert [v.param_id for v in values].count("_HASH_CHECK") == 1
     assert (values[0].param_id, values[0].param_index) == ("_HASH_CHECK", 0xFFFF)
     assert [v.param_index for v in values[-910:]] == list(range(910))
-    assert told(client, m.ParamRequestList(0, 0), 1.0) == []
+    assert answers(client, m.ParamRequestList(0, 0), 1.0) == []
 
 
 @pytest.mark.parametrize("value", [0, 1, -1, -5_000_000, 0x7F800001, -(2**31), 2**31 - 1])
 def test_px4_stores_every_bit(value: int) -> None:
     px4, client = a_px4(parameter_count=70)
     px4.parameters["COM_LOW_BAT_ACT"] = value
-    (echo,) = told(client, m.ParamRequestRead(1, 1, "COM_LOW_BAT_ACT", -1))
+    (echo,) = answers(client, m.ParamRequestRead(1, 1, "COM_LOW_BAT_ACT", -1))
     assert bits_of(echo) == value & 0xFFFFFFFF
     payload = bytearray(m.ParamSet(1, 1, "COM_RC_IN_MODE", 0.0, INT32).encode())
     payload[:4] = struct.pack("<i", value)
@@ -293,10 +293,10 @@ def test_px4_stores_every_bit(value: int) -> None:
 def test_px4_confirms_a_change_twice() -> None:
     px4, client = a_px4(parameter_count=70)
     index = px4.parameters.index("MIS_TAKEOFF_ALT")
-    first, second = told(client, m.ParamSet(1, 1, "MIS_TAKEOFF_ALT", 3.0, REAL))
+    first, second = answers(client, m.ParamSet(1, 1, "MIS_TAKEOFF_ALT", 3.0, REAL))
     assert (first.param_index, second.param_index, first.param_value) == (index, index, 3.0)
-    assert len(told(client, m.ParamSet(1, 1, "MIS_TAKEOFF_ALT", 3.0, REAL))) == 1
-    (nan,) = told(client, m.ParamSet(1, 1, "MIS_TAKEOFF_ALT", math.nan, REAL))
+    assert len(answers(client, m.ParamSet(1, 1, "MIS_TAKEOFF_ALT", 3.0, REAL))) == 1
+    (nan,) = answers(client, m.ParamSet(1, 1, "MIS_TAKEOFF_ALT", math.nan, REAL))
     assert math.isnan(nan.param_value)
     assert math.isnan(px4.parameters["MIS_TAKEOFF_ALT"])
 
@@ -313,10 +313,10 @@ def test_px4_sends_parameter_errors_since_1_17() -> None:
     _, new = a_px4(parameter_count=70)
     _, old = a_px4(parameter_count=70, version="1.16.1")
     for question, code in questions:
-        assert told(new, question) == []
+        assert answers(new, question) == []
         (error,) = new.all(m.ParamError)
         assert error.error == code
-        assert told(old, question) == []
+        assert answers(old, question) == []
         assert old.all(m.ParamError) == []
 
 
@@ -328,7 +328,7 @@ def test_px4_serves_the_pack_if_enabled() -> None:
     size = int.from_bytes(ftp.data(Op.OPENFILERO, "@PARAM/param.pck?withdefaults=1"), "little")
     ftp.data(Op.TERMINATESESSION)
     content = ftp.download("@PARAM/param.pck?withdefaults=1")
-    assert len(content) == size, "an open tells the exact size"
+    assert len(content) == size, "opening reports the exact size"
     table = unpack_parameters(content)
     assert table.values_by_name() == {name: px4.parameters[name] for name in px4.parameters}
     assert table["CA_ROTOR_COUNT" if "CA_ROTOR_COUNT" in table else "BAT1_N_CELLS"].default == 0
@@ -350,7 +350,7 @@ def test_px4_accepts_packs_in_order_only() -> None:
     ftp.data(Op.WRITEFILE, first)
     assert px4.parameters[names[0]] != 77, "before the end"
     assert ftp.refusal(Op.WRITEFILE, second, offset=478) == (Err.FAILERRNO, 22)
-    assert ftp.refusal(Op.WRITEFILE, second, offset=239) == (Err.FAILERRNO, 22), "a gap spoils it"
+    assert ftp.refusal(Op.WRITEFILE, second, offset=239) == (Err.FAILERRNO, 22), "a gap makes it invalid"
     assert ftp.refusal(Op.TERMINATESESSION) == (Err.FAILERRNO, 22)
     assert px4.ftp.open_sessions == 0
 

@@ -96,7 +96,7 @@ def test_rc_channels_raw_is_sent_in_mavlink_1_only() -> None:
 
 def calibrate(client: Client, *params: float) -> tuple[int | None, list[str]]:
     """Return the result of a calibration and the texts until then."""
-    client.forget()
+    client.clear()
     result = client.command(MavCmd.PREFLIGHT_CALIBRATION, *params)
     client.run(1.5)
     result = client.ack_since(0, MavCmd.PREFLIGHT_CALIBRATION) if result is None else result
@@ -123,7 +123,7 @@ def test_calibration_while_armed_is_refused() -> None:
     _, client = ready_copter()
     assert client.command(MavCmd.COMPONENT_ARM_DISARM, 1) == ACCEPTED
     assert calibrate(client, 1) == (FAILED, ["Disarm to allow calibration"])
-    client.forget()
+    client.clear()
     assert client.command(MavCmd.DO_START_MAG_CAL, 0, 1, 1) == FAILED
     client.run(0.1)
     assert client.texts == ["Disarm to allow compass calibration"]

@@ -47,12 +47,12 @@ class DecodingReceiver:
         self.send(m.CommandLong(system_id, 1, command, 0, *params, *(0.0,) * (7 - len(params))))
 
     async def wait_for(self, condition: Callable[[Message], bool]) -> Message:
-        seen = 0
+        observed = 0
         while True:
-            for message in self.messages[seen:]:
+            for message in self.messages[observed:]:
                 if condition(message):
                     return message
-            seen = len(self.messages)
+            observed = len(self.messages)
             self._heard.clear()
             await self._heard.wait()
 

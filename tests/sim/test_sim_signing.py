@@ -55,13 +55,13 @@ class Station:
         return any(isinstance(ack, m.CommandAck) and ack.result == MavResult.ACCEPTED for ack in answers)
 
     def read(self) -> list[Frame]:
-        """Return what the vehicle has sent since the last call."""
+        """Return the messages that the vehicle sent since the last call."""
         found = self.framer.receive(self.channel.take_outbox())
         self.frames += found
         return found
 
     def run(self, seconds: float) -> list[Frame]:
-        """Return what the vehicle sends in this time."""
+        """Return the messages that the vehicle sends in this time."""
         self.read()
         self.vehicle.step(self.vehicle.now + seconds)
         return self.read()
@@ -272,13 +272,13 @@ def test_px4_announces_key_changes() -> None:
 
 def test_px4_accepts_unsigned_heartbeats_only() -> None:
     px4, station = px4_with_station(signing_key=KEY)
-    heard: list[int] = []
-    px4.handlers[m.Heartbeat.ID] = lambda message, _: heard.append(message.ID)
+    received: list[int] = []
+    px4.handlers[m.Heartbeat.ID] = lambda message, _: received.append(message.ID)
     for signing in (None, Signing(WRONG)):
         station.encoder.signing = signing
         assert not station.answers_command()
         station.send(m.Heartbeat(6, 8, 0, 0, 4))
-    assert len(heard) == 2
+    assert len(received) == 2
     station.setup(bytes(32), 0)
     assert px4.signing.key == KEY
     station.encoder.signing = Signing(KEY, timestamp=STAMP)

@@ -71,7 +71,7 @@ def test_messages_to_others_are_ignored() -> None:
     assert client.all(m.CommandAck) == []
     for target in ((1, 1), (1, 0), (0, 0), (1, 99)):
         client.send(m.CommandLong(*target, MavCmd.DO_SEND_BANNER, 0, 0, 0, 0, 0, 0, 0, 0))
-    assert len(client.all(m.CommandAck)) == 4, "ArduPilot takes what is for a component that is not there, too"
+    assert len(client.all(m.CommandAck)) == 4, "ArduPilot also executes messages for a missing component"
 
 
 def test_answers_are_addressed_to_the_sender() -> None:
@@ -100,10 +100,10 @@ def test_channels_have_separate_rates() -> None:
     second = copter.open_channel(version=1)
     client.send(m.RequestDataStream(1, 1, MavDataStream.EXTRA1, 10, 1))
     client.run(2.5)
-    heard = [STANDARD.decode(frame) for frame in Framer().receive(second.take_outbox())]
+    received = [STANDARD.decode(frame) for frame in Framer().receive(second.take_outbox())]
     assert len(client.all(m.Attitude)) >= 24
-    assert {type(message) for message in heard} == {m.Heartbeat}
-    assert all(message.received_frame and message.received_frame.version == 1 for message in heard)
+    assert {type(message) for message in received} == {m.Heartbeat}
+    assert all(message.received_frame and message.received_frame.version == 1 for message in received)
 
 
 def test_datagrams_hold_whole_frames() -> None:
@@ -148,7 +148,7 @@ def test_seed_determines_random_loss() -> None:
         client.send(m.RequestDataStream(1, 1, MavDataStream.ALL, 10, 1))
         copter.faults.loss = 0.3
         client.run(10.0)
-        counts.append(len(client.heard))
+        counts.append(len(client.received))
     assert counts[0] == counts[1]
     assert 0.6 < counts[0] / (10 * 10 * 27) < 0.8
 
@@ -158,11 +158,11 @@ def test_silent_and_frozen_faults() -> None:
     copter.faults.silent = True
     client.run(3.0)
     assert client.command(MavCmd.DO_SEND_BANNER) is None
-    assert client.heard == []
+    assert client.received == []
     copter.faults.silent, copter.faults.frozen = False, True
     uptime = copter.uptime
     client.run(3.0)
-    assert client.heard == []
+    assert client.received == []
     assert copter.uptime > uptime
     copter.faults.frozen = False
     client.run(1.5)
@@ -188,12 +188,12 @@ def test_command_faults() -> None:
     assert client.command(banner) == 0
     copter.faults.ignore(banner, times=1)
     assert client.command(banner) is None
-    client.forget()
+    client.clear()
     copter.faults.lose_ack(banner)
     assert client.command(banner) is None
-    assert len(client.texts) == 3, "it was done all the same"
+    assert len(client.texts) == 3, "it was executed nevertheless"
     copter.faults.repeat_ack(banner, 2, times=1)
-    client.forget()
+    client.clear()
     client.command(banner)
     assert len(client.all(m.CommandAck)) == 2
 
@@ -207,7 +207,7 @@ def test_delayed_and_progressing_answers() -> None:
     assert client.all(m.CommandAck) == []
     client.run(0.2)
     assert client.last(m.CommandAck).result == 0
-    client.forget()
+    client.clear()
     copter.faults.report_progress(banner, (10, 90), interval_s=0.5)
     client.command(banner)
     client.run(2.0)

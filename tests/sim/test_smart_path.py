@@ -74,7 +74,7 @@ def test_path_without_position_is_deactivated() -> None:
     assert "SmartRTL deactivated: bad position" in client.texts
     rover.faults.gps_lost = False
     client.run(3.0)
-    client.forget()
+    client.clear()
     assert set_mode(client, RoverMode.SMART_RTL) == MavResult.FAILED
     assert client.texts == ["Flight mode change failed"]
 

@@ -57,7 +57,7 @@ def booted(kind: str, **options: object) -> tuple[ArduPilotVehicle, Client]:
     vehicle = CLASSES[kind](boot_time_s=0.0, **options)  # type: ignore[arg-type]
     client = Client(vehicle)
     client.run(3.0)
-    client.forget()
+    client.clear()
     return vehicle, client
 
 
@@ -73,7 +73,7 @@ def test_all_streams_match_recording(kind: str) -> None:
     _, client = booted(kind)
     all_streams(client, 4)
     client.run(3.0)
-    received = {message.NAME for _, message in client.heard}
+    received = {message.NAME for _, message in client.received}
     assert received - {"HEARTBEAT", "PARAM_VALUE"} == IN_ALL_STREAMS | OWN_STREAMS[kind]
 
 
@@ -92,7 +92,7 @@ def test_stream_parameters_start_streams_at_boot(kind: str, rates: dict[type, in
     counts = {message: len(client.all(message)) / 4.0 for message in rates}
     assert counts == pytest.approx(rates, abs=0.5)
     if not rates:
-        assert {message.NAME for _, message in client.heard} == {"HEARTBEAT"}
+        assert {message.NAME for _, message in client.received} == {"HEARTBEAT"}
 
 
 def test_plane_saves_and_announces_requested_rates() -> None:
@@ -103,7 +103,7 @@ def test_plane_saves_and_announces_requested_rates() -> None:
     assert (value.param_id, value.param_value, value.param_index) == ("MAV1_EXTRA1", 5.0, 0xFFFF)
     assert client.command(MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, 1) == MavResult.ACCEPTED
     client.run(3.0)
-    client.forget()
+    client.clear()
     client.run(2.0)
     assert len(client.all(m.Attitude)) == pytest.approx(10, abs=1)
     assert plane.parameters["MAV1_EXTRA1"] == 5.0
@@ -119,13 +119,13 @@ def test_other_kinds_reset_requested_rates_at_reboot(kind: str) -> None:
     assert client.all(m.ParamValue) == []
     assert client.command(MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, 1) == MavResult.ACCEPTED
     client.run(3.0)
-    client.forget()
+    client.clear()
     client.run(2.0)
     assert vehicle.parameters["MAV1_EXTRA1"] == before
     assert len(client.all(m.Attitude)) == pytest.approx(2 * before, abs=1)
 
 
-# --------------------------------------------------------------------------------------- by its id
+# -------------------------------------------------------------------------- requests by message id
 
 
 @every_kind
@@ -349,10 +349,10 @@ def test_boot_matches_recording(kind: str) -> None:
     flags = dict.fromkeys(report.flags for report in client.all(m.EkfStatusReport))
     assert list(flags) == [1024, 0, 167, 831]
     first = next(
-        now for now, message in client.heard if isinstance(message, m.EkfStatusReport) and message.flags == 831
+        now for now, message in client.received if isinstance(message, m.EkfStatusReport) and message.flags == 831
     )
     assert first == pytest.approx(real_time, abs=0.3)
-    home = next(now for now, message in client.heard if isinstance(message, m.HomePosition))
+    home = next(now for now, message in client.received if isinstance(message, m.HomePosition))
     assert home == pytest.approx(19.2 if kind == "sub" else 9.5, abs=0.6)
 
 
@@ -453,7 +453,7 @@ def test_available_modes_match_recording(kind: str) -> None:
 def test_copter_enters_available_modes_on_ground() -> None:
     _, client = booted("copter")
     for number in range(31):
-        client.forget()
+        client.clear()
         accepted = set_mode(client, number) == MavResult.ACCEPTED
         client.run(0.1)
         assert accepted == (number in MODES["copter"] and number not in COPTER_REFUSES), number
@@ -467,7 +467,7 @@ def test_plane_refuses_unavailable_modes_on_ground() -> None:
     _, client = booted("plane")
     refused = {PlaneMode.INITIALIZING: 16, PlaneMode.THERMAL: 24}
     for number in (3, 4, 8, 14, *refused.values()):
-        client.forget()
+        client.clear()
         accepted = set_mode(client, number) == MavResult.ACCEPTED
         client.run(0.1)
         assert accepted == (number not in refused.values())

@@ -38,14 +38,14 @@ def test_track_has_true_positions() -> None:
 
 
 def test_recording_does_not_change_the_bytes() -> None:
-    def told(*, recorded: bool) -> list[object]:
+    def traffic(*, recorded: bool) -> list[object]:
         copter, client = flying_copter()
         if recorded:
             record_track(copter)
         client.run(3.0)
-        return [(time, message) for time, message in client.heard]
+        return [(time, message) for time, message in client.received]
 
-    assert told(recorded=True) == told(recorded=False)
+    assert traffic(recorded=True) == traffic(recorded=False)
 
 
 def test_a_reboot_does_not_end_a_track() -> None:

@@ -18,7 +18,7 @@ def ready(vehicle: ArduPilotVehicle) -> Client:
     """Boot the vehicle until it has a position."""
     client = Client(vehicle)
     client.run(3.0)
-    client.forget()
+    client.clear()
     return client
 
 
@@ -41,7 +41,7 @@ def flying_plane(mode: int = PlaneMode.LOITER, /, **parameters: float) -> tuple[
     if mode != PlaneMode.TAKEOFF:
         assert set_mode(client, mode) == 0
     client.run(0.1)
-    client.forget()
+    client.clear()
     return plane, client
 
 
@@ -56,7 +56,7 @@ def driving_rover(north: float = 200.0, east: float = 0.0, /, **parameters: floa
     arm(client, RoverMode.GUIDED)
     rover.guided.go_to((north, east, 0.0))
     client.run(1.0)
-    client.forget()
+    client.clear()
     return rover, client
 
 
@@ -71,7 +71,7 @@ def armed_sub(mode: int = SubMode.ALT_HOLD, /, **parameters: float) -> tuple[Sim
     sub.motion.down = 5.0
     arm(client, mode)
     client.run(0.5)
-    client.forget()
+    client.clear()
     return sub, client
 
 

@@ -1,4 +1,4 @@
-"""One round of a day's work: connect, fly, lose the radio, reboot, unplug, plug in again; and the remaining objects."""
+"""One soak round: connect, fly, lose the radio, reboot, unplug, plug in again; and the remaining objects."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from aerokit.events import LinkRestored
 from aerokit.sim import SimulatedCopter, SimulatedPx4, open_simulator
 from aerokit.sim.kinds import scale_timeouts
 
-__all__ = ["Left", "fly_round", "left"]
+__all__ = ["ProcessObjects", "count_objects", "fly_round"]
 
 SPEEDUP = 8.0
 """Faster, a busy machine starves the simulated vehicles rather than the library."""
@@ -26,7 +26,7 @@ LIMIT_S = 200.0
 
 
 @dataclass(frozen=True)
-class Left:
+class ProcessObjects:
     """Objects of the process between two rounds."""
 
     tasks: int
@@ -36,14 +36,16 @@ class Left:
     resident_kb: int
 
 
-def left() -> Left:
+def count_objects() -> ProcessObjects:
     """Count the present objects; call it on the loop."""
     gc.collect()
     pages = int(Path("/proc/self/statm").read_text().split()[1]) if Path("/proc").is_dir() else 0
     folder = Path("/proc/self/fd")
     descriptors = len(list(folder.iterdir())) if folder.is_dir() else 0
     resident_kb = pages * os.sysconf("SC_PAGE_SIZE") // 1024
-    return Left(len(asyncio.all_tasks()), threading.active_count(), descriptors, len(gc.get_objects()), resident_kb)
+    return ProcessObjects(
+        len(asyncio.all_tasks()), threading.active_count(), descriptors, len(gc.get_objects()), resident_kb
+    )
 
 
 async def fly_round(number: int) -> None:

@@ -1,4 +1,4 @@
-"""A few rounds leave no more than two did; `nox -s soak` runs for an hour."""
+"""A few rounds leave no more objects than two rounds; `nox -s soak` runs for an hour."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import sys
 import time
 
 import pytest
-from soak_rounds import Left, fly_round, left
+from soak_rounds import ProcessObjects, count_objects, fly_round
 
 MINUTES = float(os.environ.get("AEROKIT_SOAK_MINUTES", "0"))
 pytestmark = [pytest.mark.anyio, pytest.mark.timeout(120 + 120 * MINUTES)]
@@ -24,12 +24,12 @@ def anyio_backend() -> str:
 
 @pytest.mark.exhaustive
 async def test_soak_rounds_leak_nothing(capsys: pytest.CaptureFixture[str]) -> None:
-    begin: Left | None = None
+    begin: ProcessObjects | None = None
     end, count, until = None, 0, time.monotonic() + 60 * MINUTES
     while count < WARM + ROUNDS or time.monotonic() < until:
         await fly_round(count)
         count += 1
-        end = left()
+        end = count_objects()
         if count == WARM:
             begin = end
         if MINUTES:

@@ -109,9 +109,9 @@ def test_every_member_has_a_twin(original: type, twin: type, name: str) -> None:
     assert kind_of(original, name) == kind_of(twin, name)
     if kind_of(original, name) == "method":
         assert not inspect.iscoroutinefunction(getattr(twin, name))
-        given, wanted = (inspect.signature(getattr(each, name)).parameters for each in (twin, original))
-        assert [(each.name, each.kind, each.default) for each in given.values()] == [
-            (each.name, each.kind, each.default) for each in wanted.values()
+        given, wanted = (inspect.signature(getattr(cls, name)).parameters for cls in (twin, original))
+        assert [(parameter.name, parameter.kind, parameter.default) for parameter in given.values()] == [
+            (parameter.name, parameter.kind, parameter.default) for parameter in wanted.values()
         ]
 
 
@@ -239,7 +239,7 @@ def test_rate_lasts_for_its_block(vehicle: aerokit.sync.Vehicle) -> None:
         assert vibrations.get(timeout=100)
 
 
-# ------------------------------------------------------------------------- ends of all kinds
+# -------------------------------------------------------------------- ends of the connection
 
 
 def test_close_is_idempotent_and_ends_thread() -> None:
@@ -403,8 +403,8 @@ def test_links_cell_of_several_links() -> None:
         with aerokit.sync.connect([address, "udpin:127.0.0.1:0"], rates={}) as vehicle:
             links = vehicle.connection.links
             assert isinstance(links, aerokit.sync.StateCell)
-            states = links.wait_until(lambda each: each[0].state is LinkState.CONNECTED, timeout=100)
-            assert [each.link.split(":")[0] for each in states] == ["tcp", "udpin"]
+            states = links.wait_until(lambda statuses: statuses[0].state is LinkState.CONNECTED, timeout=100)
+            assert [state.link.split(":")[0] for state in states] == ["tcp", "udpin"]
             assert links.value[0].used_for == (1,)
         with aerokit.sync.connect(address, rates={}) as vehicle:
             assert vehicle.connection.links is None
@@ -466,11 +466,11 @@ def test_exception_in_flight_logs_vehicle_state(caplog: pytest.LogCaptureFixture
     assert "vehicle 1 was left: in GUIDED, still armed, " in caplog.text
 
 
-# --------------------------------------------------------------------------- parts that are read first
+# -------------------------------------------------------------------------- first access to components
 
 
 def test_part_can_be_first_read_in_predicate(vehicle: aerokit.sync.Vehicle) -> None:
-    """Which runs on the loop's thread, while another thread reads it first, too."""
+    """The predicate runs on the loop's thread while another thread reads the component for the first time."""
     entered = threading.Event()
 
     def looks(_: object) -> bool:
@@ -500,7 +500,7 @@ def test_gimbals_are_found_and_controlled() -> None:
         aerokit.sync.connect(address) as vehicle,
     ):
         assert vehicle.gimbals.discover() == (1, 171)
-        assert [each.device_id for each in vehicle.gimbals] == [1, 171]
+        assert [gimbal.device_id for gimbal in vehicle.gimbals] == [1, 171]
         assert len(vehicle.gimbals) == 2
         with vehicle.gimbals[171].control() as control:
             vehicle.gimbals[171].point(-20.0, 0.0, frame="vehicle")

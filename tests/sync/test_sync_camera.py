@@ -24,7 +24,7 @@ def test_camera() -> None:
         assert vehicle.camera.captures() == [capture]
         assert vehicle.camera.capture.value == capture
         with vehicle.camera.photo_interval(0.1, count=3) as captures:
-            assert [each.index for each in captures] == [1, 2, 3]
+            assert [capture.index for capture in captures] == [1, 2, 3]
             assert captures.missed == 0
         with vehicle.camera.video():
             assert vehicle.camera.status.wait_until(lambda status: status.is_recording, timeout=100)

@@ -49,13 +49,13 @@ def test_call_soon_on_loop_during_calls_of_other_threads(loop: LoopThread) -> No
             loop.run(nothing)
 
     askers = [threading.Thread(target=ask, daemon=True) for _ in range(3)]
-    for each in askers:
-        each.start()
+    for asker in askers:
+        asker.start()
     asking = threading.Thread(target=loop.run, args=(ask_itself,), daemon=True)
     asking.start()
-    for each in (*askers, asking):
-        each.join(LIMIT_S)
-        assert not each.is_alive()
+    for thread in (*askers, asking):
+        thread.join(LIMIT_S)
+        assert not thread.is_alive()
     assert asked
 
 
@@ -70,11 +70,11 @@ def test_close_on_loop_during_calls_of_other_threads(loop: LoopThread) -> None:
             ends.append(type(error))
 
     askers = [threading.Thread(target=ask, daemon=True) for _ in range(3)]
-    for each in askers:
-        each.start()
+    for asker in askers:
+        asker.start()
     loop.call_soon(loop.close)
-    for each in askers:
-        each.join(LIMIT_S)
+    for thread in askers:
+        thread.join(LIMIT_S)
     assert ends == [ConnectionClosed] * 3
 
 
@@ -203,14 +203,14 @@ Place = tuple[str, int]
 
 
 def interrupted_at(place: Place | None, use: Callable[[list[LoopThread]], object] = uses_of_the_loop) -> set[Place]:
-    """Raise KeyboardInterrupt where the main thread first comes to this place; the places where it has been."""
-    seen: set[Place] = set()
+    """Raise KeyboardInterrupt when the main thread first reaches this place; return the places it has visited."""
+    observed: set[Place] = set()
 
     def trace(frame: FrameType, event: str, argument: object) -> Any:
         here = (frame.f_code.co_filename, frame.f_lineno)
-        if event != "line" or here in seen:
+        if event != "line" or here in observed:
             return trace
-        seen.add(here)
+        observed.add(here)
         if here == place:
             raise KeyboardInterrupt
         return trace
@@ -223,11 +223,11 @@ def interrupted_at(place: Place | None, use: Callable[[list[LoopThread]], object
         sys.settrace(before)
         for loop in loops:  # where closing was interrupted, it can be closed again
             loop.close()
-    return seen
+    return observed
 
 
 def test_run_shielded_completes_wherever_ctrl_c_arrives() -> None:
-    """At every line of ours but those before it can be noticed: the calls themselves."""
+    """Interrupt at every line of aerokit except the calls themselves, where it cannot be noticed yet."""
     done: list[int] = []
 
     async def work() -> None:
@@ -265,7 +265,7 @@ def test_run_shielded_completes_wherever_ctrl_c_arrives() -> None:
 
 
 def test_ctrl_c_is_never_lost_and_leaves_no_threads() -> None:
-    """At every line that the main thread runs, ours and those of threading; contextlib and pytest are not meant."""
+    """Interrupt at every line that the main thread runs in aerokit and threading, but not in contextlib and pytest."""
     ours = ("loop_thread.py", "thread_future.py", "threading.py")
     places = sorted(place for place in interrupted_at(None) if place[0].endswith(ours))
     assert len(places) > 80

@@ -34,7 +34,7 @@ def test_parameters_are_read_and_written(vehicle: aerokit.sync.Vehicle) -> None:
     assert len(parameters.download()) == len(parameters.table) == 100
     assert parameters.set("RTL_ALT", 2000).outcome == "set"
     assert parameters.get("RTL_ALT") == parameters.read("RTL_ALT").value == 2000
-    assert [each.name for each in parameters.diff({"RTL_ALT": 1500, "LAND_SPEED": 50})] == ["RTL_ALT"]
+    assert [difference.name for difference in parameters.diff({"RTL_ALT": 1500, "LAND_SPEED": 50})] == ["RTL_ALT"]
     assert "RTL_ALT" in parameters.changed_from_default()
     assert parameters.upload({"RTL_ALT": 1500})["RTL_ALT"].value == 1500
     assert parameters.set_many({"NO_SUCH_ONE": 1})["NO_SUCH_ONE"].outcome == "failed"
@@ -46,7 +46,7 @@ def test_parameter_blocks_restore_values(vehicle: aerokit.sync.Vehicle, copter: 
     assert copter.parameters["RTL_ALT"] == 1500
     with pytest.raises(ParameterRejected), vehicle.parameters.transaction() as transaction:
         transaction.set("RTL_ALT", 2000)
-        assert [each.name for each in transaction.changes] == ["RTL_ALT"]
+        assert [change.name for change in transaction.changes] == ["RTL_ALT"]
         transaction.set("NO_SUCH_ONE", 1)
     assert copter.parameters["RTL_ALT"] == 1500
 

@@ -59,15 +59,15 @@ def misuse_it(misuse: Misuse) -> BaseException | None:
 def test_wrong_types_are_rejected_and_nothing_sent(owner: str, flight: tuple[aerokit.sync.Vehicle, Journal]) -> None:
     vehicle, journal = flight
     left_out = LEFT_OUT.get(owner, frozenset())
-    wrong = [refusal_of(each, misuse_it(each)) for each in misuses(OWNERS[owner](vehicle), leave_out=left_out)]
+    wrong = [refusal_of(misuse, misuse_it(misuse)) for misuse in misuses(OWNERS[owner](vehicle), leave_out=left_out)]
     assert not (found := list(filter(None, wrong))), "\n".join(found)
-    kinds = {type(heard.message) for heard in journal.messages}
+    kinds = {type(entry.message) for entry in journal.messages}
     assert kinds <= set(ASKED_BY_ITSELF)
 
 
 @pytest.mark.parametrize("function", [aerokit.sync.connect, aerokit.sync.open_connection])
 def test_wrong_types_open_no_link(function: Callable[..., Any]) -> None:
-    wrong = [refusal_of(each, misuse_it(each)) for each in misuses_of(function, function.__name__)]
+    wrong = [refusal_of(misuse, misuse_it(misuse)) for misuse in misuses_of(function, function.__name__)]
     assert not (found := list(filter(None, wrong))), "\n".join(found)
 
 

@@ -22,8 +22,8 @@ BLOCKING: dict[str, Any] = {
 
 
 def threads() -> list[str]:
-    """Those that run: another test's that Ctrl-C had kept from starting are in ``threading``'s list for ever."""
-    return [each.name for each in threading.enumerate() if each.name.startswith("aerokit") and each.is_alive()]
+    """Return the running threads. Threads whose start a Ctrl-C interrupted stay in ``threading``'s list."""
+    return [thread.name for thread in threading.enumerate() if thread.name.startswith("aerokit") and thread.is_alive()]
 
 
 @pytest.mark.anyio
@@ -51,7 +51,7 @@ def test_asynchronous_connect_with_plain_with_raises(name: str) -> None:
 
 @pytest.mark.parametrize("name", ASYNCHRONOUS)
 def test_asynchronous_connect_without_asyncio_raises(name: str) -> None:
-    """As trio runs a coroutine."""
+    """The coroutine is run without asyncio, as trio would do."""
     opened: Any = ASYNCHRONOUS[name]("udpin:127.0.0.1:0")
     with pytest.raises(InvalidArgument, match=rf"{name}\(…\) requires asyncio, and .* use aerokit.sync") as caught:
         opened.__aenter__().send(None)
@@ -76,7 +76,7 @@ def test_asynchronous_connect_used_before_entering_raises(name: str) -> None:
 
 
 def misuse(word: str, opened: Any) -> Any:
-    """A coroutine that does so."""
+    """Return a coroutine that misuses the block in the way named by ``word``."""
 
     async def wait() -> None:
         await opened

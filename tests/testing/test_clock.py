@@ -110,14 +110,14 @@ def test_deadlock_error_names_the_waiting_task(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_silent_socket_raises_after_deadlock_timeout() -> None:
-    async def listen_in_vain() -> None:
+    async def receive_without_sender() -> None:
         left, right = socket.socketpair()
         with left, right:
             left.setblocking(False)
             await asyncio.get_running_loop().sock_recv(left, 1)
 
     loop = VirtualClockLoop(deadlock_timeout_s=0.01)
-    task = loop.create_task(listen_in_vain())
+    task = loop.create_task(receive_without_sender())
     with pytest.raises(DeadlockError, match="no socket or thread woke the loop"):
         loop.run_until_complete(task)
     task.cancel()

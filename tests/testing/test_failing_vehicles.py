@@ -168,7 +168,7 @@ def test_vehicle_error_ends_polling_program() -> None:
 
 
 def test_vehicle_error_ends_poll_if_ctrl_c_is_ignored() -> None:
-    """Background jobs of scripts ignore Ctrl-C, and it must stay ignored."""
+    """Background jobs of shell scripts ignore Ctrl-C, and it must stay ignored."""
     before, has_continued = signal.signal(signal.SIGINT, signal.SIG_IGN), False
     try:
         with pytest.raises(VehicleError), serve_flight() as flight:

@@ -48,7 +48,7 @@ def test_failed_test_saves_recording_and_report(pytester: pytest.Pytester) -> No
         ["recording in kept*test_it.py-test_one.tlog", "report in kept*test_it.py-test_one.html"]
     )
     kept = pytester.path / "kept"
-    assert sorted(each.name for each in kept.iterdir()) == [
+    assert sorted(path.name for path in kept.iterdir()) == [
         *("test_it.py-test_one.html", "test_it.py-test_one.svg", "test_it.py-test_one.tlog"),
         *("test_it.py-test_two.1.html", "test_it.py-test_two.2.html", "test_it.py-test_two.svg"),
         "test_it.py-test_two.tlog",

@@ -30,7 +30,7 @@ async def test_journal_has_texts_and_messages() -> None:
     journal.assert_received_command(MavCmd.NAV_LAND, times=0)
     assert [order.param7 for order in journal.of(messages.CommandLong) if order.command == 22] == [10]
     assert len(journal.of(messages.Heartbeat)) >= 5
-    times = [heard.time_s for heard in journal.messages]
+    times = [received.time_s for received in journal.messages]
     assert times == sorted(times)
 
 

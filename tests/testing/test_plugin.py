@@ -269,9 +269,9 @@ def test_invalid_use_is_explained(pytester: pytest.Pytester) -> None:
     """
     result = run(pytester, source)
     result.assert_outcomes(errors=2, failed=1)
-    told = result.stdout.str()
+    reported = result.stdout.str()
     for text in ("'balloon' is not one of: copter", "use the fixture `fleet`", "flight.run(main)"):
-        assert text in told
+        assert text in reported
 
 
 def test_own_fixture_is_reported_once(pytester: pytest.Pytester) -> None:

@@ -26,11 +26,11 @@ async def test_faults_start_and_end_on_time() -> None:
     async with open_flight() as flight:
         await flight.vehicle.wait_ready()
         flight.faults.lose_gps(after_s=2, for_s=3)
-        seen = []
+        observed = []
         for _ in range(6):
-            seen.append(flight.faults.all.gps_lost)
+            observed.append(flight.faults.all.gps_lost)
             await anyio.sleep(1.001)
-        assert seen == [False, False, True, True, True, False]
+        assert observed == [False, False, True, True, True, False]
 
 
 async def test_scheduled_faults_survive_hang_and_reboot() -> None:
@@ -101,19 +101,19 @@ def packets_through(seed: int) -> tuple[int, int]:
     async def main() -> tuple[int, int]:
         async with open_flight(seed=seed) as flight:
             flight.faults.drop_packets(0.2)
-            heard = 0
+            received = 0
 
             def count(*_: Any) -> None:
-                nonlocal heard
-                heard += 1
+                nonlocal received
+                received += 1
 
             flight.simulated.on(messages.Heartbeat, count)
             with flight.vehicle.subscribe(messages.Heartbeat, capacity=200) as heartbeats:
                 await anyio.sleep(100)
-                told = 0
+                reported = 0
                 while heartbeats.get_nowait() is not None:
-                    told += 1
-            return heard, told
+                    reported += 1
+            return received, reported
 
     return run_virtual(main())
 

@@ -20,7 +20,7 @@ class FarEnd:
         self.device = os.ttyname(slave)
         self._slave: int | None = slave  # held until the link has it: without any holder it hangs up
         os.set_blocking(self.fd, False)
-        self.heard = Recorder()
+        self.recorder = Recorder()
 
     def reads(self) -> None:
         asyncio.get_running_loop().add_reader(self.fd, self._read)
@@ -28,7 +28,7 @@ class FarEnd:
     def _read(self) -> None:
         with contextlib.suppress(BlockingIOError):
             try:
-                self.heard.bytes_received(os.read(self.fd, 65536), None)
+                self.recorder.bytes_received(os.read(self.fd, 65536), None)
             except OSError:  # hung up
                 asyncio.get_running_loop().remove_reader(self.fd)
 

@@ -27,7 +27,7 @@ LOOPS: list[Any] = [
 ]
 
 
-def each_of(loops: list[Any]) -> Callable[[AsyncTest], AsyncTest]:
+def on_loops(loops: list[Any]) -> Callable[[AsyncTest], AsyncTest]:
     """A decorator that runs an async test on each of these loops."""
 
     def decorate(test: AsyncTest) -> AsyncTest:
@@ -36,7 +36,7 @@ def each_of(loops: list[Any]) -> Callable[[AsyncTest], AsyncTest]:
     return decorate
 
 
-each_loop = each_of(LOOPS)
+each_loop = on_loops(LOOPS)
 """Runs an async test on stock asyncio and on uvloop."""
 
 TRAFFIC: list[list[bytes]] = [
@@ -51,7 +51,7 @@ each_traffic = pytest.mark.parametrize("pieces", TRAFFIC, ids=["frame", "words",
 
 
 class Recorder:
-    """A receiver that keeps everything, and lets a test wait for it."""
+    """A receiver that records all callbacks and can wait for them."""
 
     def __init__(self) -> None:
         self.pieces: list[tuple[bytes, Peer]] = []
@@ -94,7 +94,7 @@ class Recorder:
 
 
 async def eventually(condition: Callable[[], bool]) -> None:
-    """Lets the loop turn until a condition holds that nobody signals; 100 s are for hung tests only."""
+    """Poll the loop until a condition holds that has no event; only hung tests take 100 s."""
     with anyio.fail_after(100):
         while not condition():  # noqa: ASYNC110
             await asyncio.sleep(0)

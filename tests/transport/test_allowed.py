@@ -90,14 +90,14 @@ async def test_open_connection_has_its_own_peers() -> None:
 
 @each_loop
 async def test_udp_accepts_only_allowed_peers() -> None:
-    link, heard = UdpListen("127.0.0.1", 0, peers="127.0.0.2"), Recorder()
-    await link.open(heard)
+    link, recorder = UdpListen("127.0.0.1", 0, peers="127.0.0.2"), Recorder()
+    await link.open(recorder)
     with socket.socket(type=socket.SOCK_DGRAM) as stranger, socket.socket(type=socket.SOCK_DGRAM) as vehicle:
         stranger.bind(("127.0.0.1", 0))
         vehicle.bind(("127.0.0.2", 0))
         for sender, data in ((stranger, b"no"), (vehicle, b"yes"), (stranger, b"no"), (vehicle, b"!")):
             sender.sendto(data, link.local_address)
-        await heard.until_data(b"yes!")
+        await recorder.until_data(b"yes!")
         assert link.peers == (vehicle.getsockname(),)
     link.close()
     await link.wait_closed()
@@ -105,21 +105,21 @@ async def test_udp_accepts_only_allowed_peers() -> None:
 
 @each_loop
 async def test_tcp_accepts_only_allowed_peers() -> None:
-    link, heard = TcpListen("127.0.0.1", 0, peers=["10.0.0.7", "fd00::/8"]), Recorder()
-    await link.open(heard)
+    link, recorder = TcpListen("127.0.0.1", 0, peers=["10.0.0.7", "fd00::/8"]), Recorder()
+    await link.open(recorder)
     client, answered = TcpConnect(*link.local_address), Recorder()
     await client.open(answered)
     assert "closed the connection" in str(await answered.until_lost()) or answered.losses
     assert link.peers == ()
-    for each in (client, link):
-        each.close()
-        await each.wait_closed()
+    for endpoint in (client, link):
+        endpoint.close()
+        await endpoint.wait_closed()
 
 
-# ------------------------------------------------------------- a receiver that says who is a peer
+# ------------------------------------------------------------ a receiver that decides about peers
 
 
-class Keeper(Recorder):
+class PeerKeeper(Recorder):
     keeps_peers = True
 
 
@@ -128,14 +128,14 @@ class Keeper(Recorder):
 async def test_only_kept_peers_are_written_to(wrap: Any) -> None:
     inner = UdpListen("127.0.0.1", 0)
     link: Link = wrap(inner)
-    heard = Keeper()
-    await link.open(heard)
+    keeper = PeerKeeper()
+    await link.open(keeper)
     with socket.socket(type=socket.SOCK_DGRAM) as one, socket.socket(type=socket.SOCK_DGRAM) as two:
         for sender in (one, two):
             sender.bind(("127.0.0.1", 0))
             sender.setblocking(False)
             sender.sendto(b"x", inner.local_address)
-        await heard.until(lambda: len(heard.pieces) == 2)
+        await keeper.until(lambda: len(keeper.pieces) == 2)
         assert inner.peers == ()
         link.keep_peer(one.getsockname())
         assert link.host_of(one.getsockname()) == "127.0.0.1"
@@ -173,28 +173,28 @@ async def test_noise_evicts_no_vehicle_from_udp_port() -> None:
 @each_loop
 async def test_silent_client_makes_room_for_another(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tcp, "MAX_CLIENTS", 1)
-    link, heard = TcpListen("127.0.0.1", 0), Keeper()
-    await link.open(heard)
-    mute, mute_heard = TcpConnect(*link.local_address), Recorder()
-    await mute.open(mute_heard)
+    link, keeper = TcpListen("127.0.0.1", 0), PeerKeeper()
+    await link.open(keeper)
+    mute, mute_recorder = TcpConnect(*link.local_address), Recorder()
+    await mute.open(mute_recorder)
     await eventually(lambda: len(link.peers) == 1)
-    vehicle, vehicle_heard = TcpConnect(*link.local_address), Recorder()
-    await vehicle.open(vehicle_heard)
-    await mute_heard.until_lost()
+    vehicle, vehicle_recorder = TcpConnect(*link.local_address), Recorder()
+    await vehicle.open(vehicle_recorder)
+    await mute_recorder.until_lost()
     vehicle.write(b"frame")
-    await heard.until_data(b"frame")
+    await keeper.until_data(b"frame")
     link.keep_peer(link.peers[0])
-    third, third_heard = TcpConnect(*link.local_address), Recorder()
-    await third.open(third_heard)
-    await third_heard.until_lost()
-    assert vehicle_heard.losses == []
+    third, third_recorder = TcpConnect(*link.local_address), Recorder()
+    await third.open(third_recorder)
+    await third_recorder.until_lost()
+    assert vehicle_recorder.losses == []
     link.forget_peer(link.peers[0])
     fourth = TcpConnect(*link.local_address)
     await fourth.open(Recorder())
-    await vehicle_heard.until_lost()
-    for each in (mute, vehicle, third, fourth, link):
-        each.close()
-        await each.wait_closed()
+    await vehicle_recorder.until_lost()
+    for endpoint in (mute, vehicle, third, fourth, link):
+        endpoint.close()
+        await endpoint.wait_closed()
 
 
 # ------------------------------------------------------------------------------------ udpbcast
@@ -208,11 +208,11 @@ async def test_broadcast_resumes_after_silence_and_accepts_other_port(
         for sock in (everybody, first):
             sock.bind(("127.0.0.1", 0))
             sock.setblocking(False)
-        link, heard = UdpBroadcast(*everybody.getsockname()), Recorder()
-        await link.open(heard)
+        link, recorder = UdpBroadcast(*everybody.getsockname()), Recorder()
+        await link.open(recorder)
         port = link.local_address[1]
         first.sendto(b"1", ("127.0.0.1", port))
-        await heard.until_data(b"1")
+        await recorder.until_data(b"1")
         link.write(b"to first")
         await eventually(lambda: received(first) == b"to first")
         with socket.socket(type=socket.SOCK_DGRAM) as again:
@@ -223,7 +223,7 @@ async def test_broadcast_resumes_after_silence_and_accepts_other_port(
             link.write(b"anybody?")
             await eventually(lambda: received(everybody) == b"anybody?")
             again.sendto(b"2", ("127.0.0.1", port))
-            await heard.until(lambda: heard.data.endswith(b"2"))
+            await recorder.until(lambda: recorder.data.endswith(b"2"))
             monkeypatch.setattr(udp, "REMOTE_TIMEOUT_S", 3600.0)
             link.write(b"to again")
             await eventually(lambda: received(again) == b"to again")
@@ -239,18 +239,18 @@ def test_silent_vehicle_is_searched_by_broadcast() -> None:
 async def test_vehicle_on_broadcast_link_may_change_port() -> None:
     with socket.socket(type=socket.SOCK_DGRAM) as everybody:
         everybody.bind(("127.0.0.1", 0))
-        link, heard = UdpBroadcast(*everybody.getsockname()), Keeper()
-        await link.open(heard)
+        link, keeper = UdpBroadcast(*everybody.getsockname()), PeerKeeper()
+        await link.open(keeper)
         with socket.socket(type=socket.SOCK_DGRAM) as one, socket.socket(type=socket.SOCK_DGRAM) as two:
             for sock in (one, two):
                 sock.bind(("127.0.0.1", 0))
                 sock.setblocking(False)
             one.sendto(b"1", ("127.0.0.1", link.local_address[1]))
-            await heard.until_data(b"1")
+            await keeper.until_data(b"1")
             link.keep_peer(one.getsockname())
             two.sendto(b"2", ("127.0.0.1", link.local_address[1]))
-            await heard.until_data(b"12")
-            assert heard.peers == [one.getsockname(), two.getsockname()]
+            await keeper.until_data(b"12")
+            assert keeper.peers == [one.getsockname(), two.getsockname()]
             link.keep_peer(two.getsockname())
             link.write(b"found")
             await eventually(lambda: received(two) == b"found")
@@ -267,7 +267,7 @@ async def test_message_for_silent_vehicle_is_not_broadcast(monkeypatch: pytest.M
             sock.bind(("127.0.0.1", 0))
             sock.setblocking(False)
         link = UdpBroadcast(*everybody.getsockname())
-        await link.open(Keeper())
+        await link.open(PeerKeeper())
         link.keep_peer(one.getsockname())
         monkeypatch.setattr(udp, "REMOTE_TIMEOUT_S", -1.0)
         link.write(b"an order", one.getsockname())

@@ -41,7 +41,7 @@ def frames(count: int, version: int = 2) -> list[bytes]:
 
 
 def carried(path: FaultyPath, data: list[bytes], now: float = 0.0) -> list[tuple[float, bytes]]:
-    return [arrival for each in data for arrival in path.carry(each, now)]
+    return [arrival for datagram in data for arrival in path.carry(datagram, now)]
 
 
 # --------------------------------------------------------------------------------------- one direction
@@ -73,14 +73,14 @@ def test_shares_are_met(fault: str, share: float) -> None:
     path = FaultyPath(FaultModel(**options), 1)
     sent = frames(count)
     arrived = [data for _, data in carried(path, sent)]
-    seen = {
+    observed = {
         "loss": count - len(arrived),
         "duplication": len(arrived) - count,
         "reordering": path.reordered,
         "corruption": sum(a != b for a, b in zip(sent, arrived, strict=False)) if fault == "corruption" else 0,
     }[fault]
     assert (
-        seen
+        observed
         == {
             "loss": path.lost,
             "duplication": path.duplicated,
@@ -88,7 +88,7 @@ def test_shares_are_met(fault: str, share: float) -> None:
             "corruption": path.corrupted,
         }[fault]
     )
-    assert seen / count == pytest.approx(share, abs=0.03)
+    assert observed / count == pytest.approx(share, abs=0.03)
 
 
 def test_changing_one_share_keeps_other_faults() -> None:
@@ -103,10 +103,10 @@ def test_changing_one_share_keeps_other_faults() -> None:
 def test_jitter_keeps_order_and_reordering_does_not() -> None:
     sent = frames(200)
     path = FaultyPath(FaultModel(delay_s=0.05, jitter_s=0.1))
-    due = [when for n, each in enumerate(sent) for when, _ in path.carry(each, n * 0.001)]
+    due = [when for n, message in enumerate(sent) for when, _ in path.carry(message, n * 0.001)]
     assert due == sorted(due)
     path = FaultyPath(FaultModel(reordering=0.1, overtaken_s=0.02))
-    due = [when for n, each in enumerate(sent) for when, _ in path.carry(each, n * 0.001)]
+    due = [when for n, message in enumerate(sent) for when, _ in path.carry(message, n * 0.001)]
     assert sum(before > after for before, after in pairwise(due)) == pytest.approx(path.reordered, abs=5)
 
 
@@ -232,8 +232,8 @@ async def test_faulty_writes_arrive_unsplit_in_order(pieces: list[bytes], model:
 @each_loop
 async def test_udp_peers_are_separate_and_answered() -> None:
     listening = FaultyLink(UdpListen("127.0.0.1", 0), DELAYED)
-    heard = Recorder()
-    await listening.open(heard)
+    recorder = Recorder()
+    await listening.open(recorder)
     assert listening.address.startswith("faulty(udpin:127.0.0.1:")
     assert ":0)" not in listening.address
     assert isinstance(listening.link, UdpListen)
@@ -242,8 +242,8 @@ async def test_udp_peers_are_separate_and_answered() -> None:
     for number, (remote, answer) in enumerate(zip(remotes, answers, strict=True)):
         await remote.open(answer)
         remote.write(b"hello %d" % number)
-    await heard.until(lambda: len(heard.pieces) == 2)
-    for data, peer in heard.pieces:
+    await recorder.until(lambda: len(recorder.pieces) == 2)
+    for data, peer in recorder.pieces:
         listening.write(b"re: " + data, peer)
     for number, answer in enumerate(answers):
         await answer.until_data(b"re: hello %d" % number)
@@ -274,7 +274,7 @@ def test_closed_link_lingers_briefly() -> None:
         near, right = FaultyLink(inner, FaultModel(delay_s=30.0)), Recorder()
         await near.open(Recorder())
         await far.open(right)
-        near.write(b"never heard")
+        near.write(b"never received")
         near.close()
         await near.wait_closed()
         assert asyncio.get_running_loop().time() == pytest.approx(1.0)
@@ -366,7 +366,7 @@ def test_dropped_writes_include_link_and_queue() -> None:
             near.write(bytes(20))
         assert near.dropped_writes == near.outgoing.overflowed == 40
         await asyncio.sleep(10.0)
-        assert near.dropped_writes == 40 + 10 - near.outgoing.lost  # nobody has opened the other end
+        assert near.dropped_writes == 40 + 10 - near.outgoing.lost  # the other end is not open
         near.close()
         far.close()
 

@@ -23,12 +23,12 @@ from aerokit.transport.zenoh.keys import Beacon, Stamp
 Event = tuple[float, int, str, Any]
 Holds = tuple[Sequence[tuple[float, float]], Sequence[tuple[float, float]]]
 
-clocks = st.tuples(st.floats(-1e6, 1e6), st.sampled_from([1.0, 0.9999, 1.0001]))  # what it shows at 0, and its rate
+clocks = st.tuples(st.floats(-1e6, 1e6), st.sampled_from([1.0, 0.9999, 1.0001]))  # its offset and its rate
 delays = st.one_of(st.floats(0, 0.5), st.floats(0, 20))
 holds = st.lists(st.tuples(st.floats(0, 12), st.floats(0, 10)), max_size=3)  # begins, lasts
 
 
-class World:
+class SimulatedNetwork:
     """A vehicle side that sends beacons, a client that sends continuously, and a network with arbitrary delays."""
 
     def __init__(
@@ -68,8 +68,8 @@ class World:
             (begun, rate), (begun_too, rate_too) = self.vehicle_clock, self.client_clock
             vehicle, client = begun + rate * now, begun_too + rate_too * now
             if kind == "beacon":
-                self.at(self.arrival(now, 0), "heard", self.checker.beacon(vehicle))
-            elif kind == "heard":
+                self.at(self.arrival(now, 0), "received", self.checker.beacon(vehicle))
+            elif kind == "received":
                 self.tracker.receive_beacon(what, client)
             elif kind == "send":
                 stamp = self.tracker.stamp(client)
@@ -87,7 +87,7 @@ class World:
 def test_accepted_datagrams_are_at_most_two_seconds_old(
     vehicle: tuple[float, float], client: tuple[float, float], delays: list[float]
 ) -> None:
-    world = World(vehicle, client, iter(delays))
+    world = SimulatedNetwork(vehicle, client, iter(delays))
     world.run(15)
     for sent, accepted in world.accepted:
         assert accepted - sent <= MAX_DELAY_S * 1.001
@@ -99,7 +99,7 @@ def test_accepted_datagrams_are_at_most_two_seconds_old(
 def test_datagrams_delayed_by_partition_are_refused(
     vehicle: tuple[float, float], client: tuple[float, float], delay: float, holds: Holds
 ) -> None:
-    world = World(vehicle, client, repeat(delay), holds)
+    world = SimulatedNetwork(vehicle, client, repeat(delay), holds)
     world.run(25)
     for sent, accepted in world.accepted:
         assert accepted - sent <= MAX_DELAY_S * 1.001
@@ -114,7 +114,7 @@ def test_working_network_accepts_everything(
     vehicle: tuple[float, float], client: tuple[float, float], delays: list[float]
 ) -> None:
     steady = max(delays)  # in order
-    world = World(vehicle, client, iter([steady] * 200))
+    world = SimulatedNetwork(vehicle, client, iter([steady] * 200))
     world.run(15)
     assert world.refused == []
     assert all(sent <= steady for sent in world.unsent)  # before the first beacon
@@ -183,7 +183,7 @@ def test_estimated_delay_never_exceeds_the_real_one(
     theirs: tuple[float, float], ours: tuple[float, float], sent: list[tuple[float, float]]
 ) -> None:
     estimator = DelayEstimator()
-    for delay, at in sorted(sent, key=lambda each: sum(each)):
+    for delay, at in sorted(sent, key=lambda times: sum(times)):
         now = at + delay
         late = estimator.delay(theirs[0] + theirs[1] * at, ours[0] + ours[1] * now)
         assert 0 <= late <= delay + 0.02

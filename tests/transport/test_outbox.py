@@ -23,18 +23,18 @@ from aerokit.transport.outbox import WRITE_TIMEOUT_S, Outbox
 pytestmark = pytest.mark.anyio
 
 COMMAND = messages.CommandLong(1, 1, 400, 0, *(0.0,) * 7)
-on_linux = pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells what the system has not sent")
+on_linux = pytest.mark.skipif(sys.platform != "linux", reason="only Linux reports unsent bytes")
 
 
-class Line:
+class ManualTransport:
     """A transport that takes ``room`` bytes and sends none of them until ``flow`` is called."""
 
     def __init__(self, room: int, limit: int = 100) -> None:
         self.sent: list[bytes] = []
         self.pending, self.room, self.dropped = 0, room, 0
-        self.told: list[bool] = []
+        self.events: list[bool] = []
         self.outbox = Outbox(
-            self._take, lambda: self.pending, limit=limit, dropped=self._drop, stalled=self.told.append
+            self._take, lambda: self.pending, limit=limit, dropped=self._drop, stalled=self.events.append
         )
 
     def _take(self, data: bytes) -> None:
@@ -52,7 +52,7 @@ class Line:
 
 
 async def test_accepted_data_passes_at_once_without_timer() -> None:
-    line = Line(room=1000)
+    line = ManualTransport(room=1000)
     line.outbox.write(b"one")
     line.outbox.write(b"two")
     assert line.sent == [b"one", b"two"]
@@ -61,11 +61,11 @@ async def test_accepted_data_passes_at_once_without_timer() -> None:
     await anyio.sleep(0.5)
     assert line.outbox._timer is None
     await anyio.sleep(100)
-    assert line.told == []
+    assert line.events == []
 
 
 async def test_kept_data_leaves_whole_in_order_and_joined() -> None:
-    line = Line(room=1)
+    line = ManualTransport(room=1)
     for word in (b"a", b"bb", b"ccc"):
         line.outbox.write(word)
     assert (line.sent, line.outbox.unsent_bytes) == ([b"a"], 6)
@@ -74,7 +74,7 @@ async def test_kept_data_leaves_whole_in_order_and_joined() -> None:
 
 
 async def test_kept_data_is_limited() -> None:
-    line = Line(room=1, limit=100)
+    line = ManualTransport(room=1, limit=100)
     for _ in range(1000):
         line.outbox.write(bytes(30))
     assert line.outbox.unsent_bytes == 30 + 90
@@ -82,7 +82,7 @@ async def test_kept_data_is_limited() -> None:
 
 
 async def test_data_older_than_a_second_is_not_written() -> None:
-    line = Line(room=1)
+    line = ManualTransport(room=1)
     line.outbox.write(b"taken")
     line.outbox.write(b"too late")
     await anyio.sleep(WRITE_TIMEOUT_S - 0.1)
@@ -93,7 +93,7 @@ async def test_data_older_than_a_second_is_not_written() -> None:
 
 
 async def test_limit_of_a_second_is_exact() -> None:
-    line = Line(room=1)
+    line = ManualTransport(room=1)
     line.outbox.write(b"taken")
     line.outbox.write(b"too late")
     until = asyncio.get_running_loop().time() + WRITE_TIMEOUT_S
@@ -104,7 +104,7 @@ async def test_limit_of_a_second_is_exact() -> None:
 
 
 async def test_late_writes_are_dropped_without_another_write() -> None:
-    line = Line(room=1)
+    line = ManualTransport(room=1)
     line.outbox.write(b"taken")
     line.outbox.write(b"too late")
     await anyio.sleep(2)
@@ -112,43 +112,43 @@ async def test_late_writes_are_dropped_without_another_write() -> None:
 
 
 async def test_stall_is_reported_once_and_stops_forwarding() -> None:
-    """The system takes more for a long while: what it has is beyond recall, so it is not given any more."""
-    line = Line(room=1000)
+    """The operating system would accept more, but accepted data cannot be recalled, so the link sends no more."""
+    line = ManualTransport(room=1000)
     for _ in range(5):
         line.outbox.write(b"heartbeat")
         await anyio.sleep(0.9)
-    assert line.told == [True]
+    assert line.events == [True]
     assert len(line.sent) == 2
     line.flow()
     await anyio.sleep(0.3)
-    assert line.told == [True, False]
+    assert line.events == [True, False]
     await anyio.sleep(0.1)
     line.outbox.write(b"again")
     assert line.sent[-1] == b"again"
 
 
 async def test_data_written_during_stall_leaves_afterwards() -> None:
-    line = Line(room=1000)
+    line = ManualTransport(room=1000)
     line.outbox.write(b"taken")
     await anyio.sleep(1.4)
     line.outbox.write(b"in time")
-    assert (line.told, line.sent) == ([True], [b"taken"])
-    line.pending = 0  # it was never full: nobody says resume
+    assert (line.events, line.sent) == ([True], [b"taken"])
+    line.pending = 0  # it was never full, so no resume callback comes
     await anyio.sleep(0.3)
-    assert (line.told, line.sent) == ([True, False], [b"taken", b"in time"])
+    assert (line.events, line.sent) == ([True, False], [b"taken", b"in time"])
 
 
 async def test_slow_link_is_not_stalled() -> None:
-    line = Line(room=10_000)
+    line = ManualTransport(room=10_000)
     for _ in range(200):
         line.outbox.write(bytes(10))
         line.pending -= min(line.pending, 6)
         await anyio.sleep(0.1)
-    assert line.told == []
+    assert line.events == []
 
 
 async def test_discarded_data_never_leaves() -> None:
-    line = Line(room=1)
+    line = ManualTransport(room=1)
     line.outbox.write(b"taken")
     line.outbox.write(b"order")
     line.outbox.discard()
@@ -158,17 +158,17 @@ async def test_discarded_data_never_leaves() -> None:
 
 
 async def test_discarding_is_no_progress() -> None:
-    line = Line(room=1000)
+    line = ManualTransport(room=1000)
     for _ in range(8):
         line.outbox.write(b"x" * 10)
         await anyio.sleep(0.2)
         line.pending -= 5
         line.outbox.reclaimed(5)
-    assert line.told == [True]
+    assert line.events == [True]
 
 
 async def test_closed_stalled_outbox_forwards_nothing() -> None:
-    line = Line(room=1)
+    line = ManualTransport(room=1)
     line.outbox.write(b"taken")
     await anyio.sleep(1.5)
     line.outbox.write(b"order")
@@ -178,7 +178,7 @@ async def test_closed_stalled_outbox_forwards_nothing() -> None:
 
 
 async def test_closed_outbox_forwards_data_in_time() -> None:
-    line = Line(room=1)
+    line = ManualTransport(room=1)
     line.outbox.write(b"taken")
     line.outbox.write(b"in time")
     line.outbox.close()
@@ -196,7 +196,7 @@ async def radio() -> FaultyLink:
     return FaultyLink(near)
 
 
-def heard_by(radio: FaultyLink) -> Recorder:
+def recorder_of(radio: FaultyLink) -> Recorder:
     recorder = radio.link.far_end._receiver  # type: ignore[attr-defined]
     assert isinstance(recorder, Recorder)
     return recorder
@@ -210,45 +210,45 @@ async def connection(radio: FaultyLink) -> AsyncIterator[Connection]:
 
 
 async def test_connection_reports_stall_and_drain(radio: FaultyLink, connection: Connection) -> None:
-    told: list[events.Event] = []
-    connection.bus.attach_event(events.LinkStalled, told.append)
-    connection.bus.attach_event(events.LinkDrained, told.append)
+    changes: list[events.Event] = []
+    connection.bus.attach_event(events.LinkStalled, changes.append)
+    connection.bus.attach_event(events.LinkDrained, changes.append)
     radio.stall()
     connection.send(COMMAND)
     assert connection.unsent_bytes == radio.unsent_bytes > 0
     await anyio.sleep(4)
-    assert [type(each) for each in told] == [events.LinkStalled]
+    assert [type(event) for event in changes] == [events.LinkStalled]
     radio.drain()
     await anyio.sleep(1)
-    assert isinstance(told[-1], events.LinkDrained)
-    assert told[-1].stalled_s == pytest.approx(3, abs=0.6)
+    assert isinstance(changes[-1], events.LinkDrained)
+    assert changes[-1].stalled_s == pytest.approx(3, abs=0.6)
     assert connection.unsent_bytes == 0
 
 
 async def test_order_during_stall_does_not_arrive_later(radio: FaultyLink, connection: Connection) -> None:
-    before = heard_by(radio).data
+    before = recorder_of(radio).data
     radio.stall()
     connection.send(COMMAND)
     await anyio.sleep(1.5)
     assert radio.dropped_writes >= 1
     radio.drain()
     await anyio.sleep(0.01)
-    assert COMMAND.encode()[:20] not in heard_by(radio).data[len(before) :]
+    assert COMMAND.encode()[:20] not in recorder_of(radio).data[len(before) :]
 
 
 async def test_discarded_order_does_not_arrive(radio: FaultyLink, connection: Connection) -> None:
-    before = heard_by(radio).data
+    before = recorder_of(radio).data
     radio.stall()
     connection.send(COMMAND)
     connection.discard_unsent()
     assert connection.unsent_bytes == 0
     radio.drain()
     await anyio.sleep(0.1)
-    assert heard_by(radio).data == before
+    assert recorder_of(radio).data == before
 
 
 async def test_kernel_data_is_reported_and_arrives_late(radio: FaultyLink, connection: Connection) -> None:
-    before = heard_by(radio).data
+    before = recorder_of(radio).data
     radio.stall(system_bytes=40)
     connection.send(COMMAND)
     connection.discard_unsent()
@@ -256,7 +256,7 @@ async def test_kernel_data_is_reported_and_arrives_late(radio: FaultyLink, conne
     assert connection.unsent_bytes >= 40
     radio.drain()
     await anyio.sleep(0.1)
-    assert len(heard_by(radio).data) > len(before)
+    assert len(recorder_of(radio).data) > len(before)
     await anyio.sleep(0.2)
     assert connection.unsent_bytes == 0
 
@@ -273,9 +273,9 @@ async def test_kernel_buffer_size_limits_undiscardable_data(radio: FaultyLink, c
 
 async def test_reconnecting_link_forwards_outbox_calls(radio: FaultyLink) -> None:
     async with open_connection(ReconnectingLink(lambda: radio)) as connection:
-        told: list[events.Event] = []
-        connection.bus.attach_event(events.LinkStalled, told.append)
-        connection.bus.attach_event(events.LinkDrained, told.append)
+        changes: list[events.Event] = []
+        connection.bus.attach_event(events.LinkStalled, changes.append)
+        connection.bus.attach_event(events.LinkDrained, changes.append)
         radio.stall()
         await anyio.sleep(2.9)
         assert connection.unsent_bytes > 0
@@ -283,7 +283,7 @@ async def test_reconnecting_link_forwards_outbox_calls(radio: FaultyLink) -> Non
         assert connection.unsent_bytes == 0
         radio.drain()
         await anyio.sleep(0.5)
-        assert [type(each) for each in told] == [events.LinkStalled, events.LinkDrained]
+        assert [type(event) for event in changes] == [events.LinkStalled, events.LinkDrained]
 
 
 async def test_links_without_outbox_have_nothing_unsent() -> None:
@@ -309,14 +309,14 @@ def deaf() -> Iterator[socket.socket]:
 class Listener(Recorder):
     def __init__(self) -> None:
         super().__init__()
-        self.told: list[bool] = []
+        self.events: list[bool] = []
 
     def link_stalled(self, unsent_bytes: int) -> None:
         assert unsent_bytes > 0
-        self.told.append(True)
+        self.events.append(True)
 
     def link_drained(self, stalled_s: float) -> None:
-        self.told.append(False)
+        self.events.append(False)
 
 
 async def read_until(connection: socket.socket, mark: bytes) -> bytes:
@@ -327,7 +327,7 @@ async def read_until(connection: socket.socket, mark: bytes) -> bytes:
 
 
 async def fill(link: TcpConnect | SerialLink, frame: bytes) -> int:
-    """Write until something waits with us; the number of frames that were taken before."""
+    """Write until data waits in the outbox; return the number of frames accepted before."""
     for count in range(1000):
         link.write(frame)
         stream = next(iter(link._streams)) if isinstance(link, TcpConnect) else link
@@ -372,9 +372,9 @@ async def test_tcp_stall_is_reported_until_it_drains(deaf: socket.socket, monkey
     with connection:
         connection.setblocking(False)
         await fill(client, bytes(280))
-        await eventually(lambda: listener.told[:1] == [True])
+        await eventually(lambda: listener.events[:1] == [True])
         reading = asyncio.ensure_future(read_until(connection, b"never"))
-        await eventually(lambda: listener.told[-1:] == [False] and not client.unsent_bytes)
+        await eventually(lambda: listener.events[-1:] == [False] and not client.unsent_bytes)
         reading.cancel()
         client.close()
         await client.wait_closed()
@@ -392,7 +392,7 @@ async def test_closing_a_stalled_tcp_connection_discards_its_bytes(
     connection, _ = deaf.accept()
     with connection:
         await fill(client, bytes(280))
-        await eventually(lambda: listener.told[-1:] == [True])
+        await eventually(lambda: listener.events[-1:] == [True])
         client.close()
         await client.wait_closed()
         with pytest.raises(ConnectionResetError):
@@ -417,7 +417,7 @@ async def test_data_waiting_for_serial_line_can_be_discarded() -> None:
         far.reads()
         await eventually(lambda: not link.unsent_bytes)
         link.write(b"after")
-        await far.heard.until(lambda: far.heard.data.endswith(b"after"))
-        assert b"an order" not in far.heard.data
+        await far.recorder.until(lambda: far.recorder.data.endswith(b"after"))
+        assert b"an order" not in far.recorder.data
         link.close()
         await link.wait_closed()

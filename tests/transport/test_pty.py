@@ -15,7 +15,7 @@ from aerokit.transport import Peer, PtyLink, parse_address
 posix_only = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
 
 
-class Heard:
+class RecordingReceiver:
     """The receiver of a test."""
 
     def __init__(self) -> None:
@@ -39,16 +39,16 @@ def test_addresses_of_pseudo_terminals() -> None:
 @posix_only
 def test_bytes_pass_a_pseudo_terminal_unchanged() -> None:
     async def both_ways() -> None:
-        link, heard = PtyLink(), Heard()
-        await link.open(heard)
+        link, recorder = PtyLink(), RecordingReceiver()
+        await link.open(recorder)
         other = os.open(link.address.removeprefix("pty:"), os.O_RDWR | os.O_NOCTTY)
         every_byte = bytes(range(256))
         os.write(other, every_byte)
-        while len(heard.data) < 256:
-            heard.came.clear()
-            await heard.came.wait()
+        while len(recorder.data) < 256:
+            recorder.came.clear()
+            await recorder.came.wait()
         link.write(every_byte)
-        assert (heard.data, os.read(other, 1000)) == (every_byte, every_byte)
+        assert (recorder.data, os.read(other, 1000)) == (every_byte, every_byte)
         os.close(other)
         link.close()
         await link.wait_closed()
@@ -65,10 +65,10 @@ def test_unread_data_is_dropped_and_files_are_kept(tmp_path: Path) -> None:
     async def run() -> None:
         link = PtyLink(str(taken))
         with pytest.raises(LinkOpenError, match="exists"):
-            await link.open(Heard())
+            await link.open(RecordingReceiver())
         link.close()
         link = PtyLink(str(dead))
-        await link.open(Heard())
+        await link.open(RecordingReceiver())
         for _ in range(100):
             link.write(bytes(1000))
         assert link.dropped_writes > 10
@@ -83,11 +83,11 @@ def test_unread_data_is_dropped_and_files_are_kept(tmp_path: Path) -> None:
 
 @posix_only
 def test_closed_pty_is_not_polled() -> None:
-    """Another file may have the number soon."""
+    """Another file may reuse the file descriptor."""
 
     async def close() -> None:
         link = PtyLink()
-        await link.open(Heard())
+        await link.open(RecordingReceiver())
         ours = link._ends[0]
         link.close()
         await link.wait_closed()

@@ -40,7 +40,7 @@ class Plug(BaseLink):
         self.device.tried_at.append(asyncio.get_running_loop().time())
         self._released.clear()
         await anyio.sleep(self.device.opening_takes_s)
-        if not self.device.is_there:
+        if not self.device.is_present:
             raise OSError(errno.ENODEV, "no such device")
         self.device.plugs.append(self)
         if self.device.greeting:
@@ -56,7 +56,7 @@ class Plug(BaseLink):
         else:
             self.device.written.append(data)
 
-    def hear(self, data: bytes) -> None:
+    def receive(self, data: bytes) -> None:
         self._deliver(data)
 
     def pull(self) -> None:
@@ -67,7 +67,7 @@ class Device:
     """The other end of the cable."""
 
     def __init__(self) -> None:
-        self.is_there = True
+        self.is_present = True
         self.opening_takes_s = self.releasing_takes_s = 0.0
         self.greeting = b""
         self.plugs: list[Plug] = []
@@ -78,29 +78,29 @@ class Device:
         return Plug(self)
 
     def unplug(self, *, gone: bool = True) -> None:
-        self.is_there = not gone
+        self.is_present = not gone
         self.plugs[-1].pull()
 
 
-class Told(Recorder):
+class InterruptionRecorder(Recorder):
     """A receiver with interruption callbacks."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.told: list[str] = []
+        self.events: list[str] = []
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
-        self.told.append(data.decode())
+        self.events.append(data.decode())
         super().bytes_received(data, peer)
 
     def link_interrupted(self, error: LinkLost) -> None:
-        self.told.append(f"away: {error}")
+        self.events.append(f"away: {error}")
 
     def link_restored(self, away_s: float) -> None:
-        self.told.append(f"back after {away_s:.1f} s")
+        self.events.append(f"back after {away_s:.1f} s")
 
     def link_lost(self, error: LinkLost) -> None:
-        self.told.append(f"lost: {error}")
+        self.events.append(f"lost: {error}")
         super().link_lost(error)
 
 
@@ -108,32 +108,32 @@ def lines(caplog: pytest.LogCaptureFixture) -> list[tuple[str, str]]:
     return [(record.levelname, record.getMessage()) for record in caplog.records if record.name == "aerokit"]
 
 
-# ------------------------------------------------------------------------------ opening it the first time
+# ------------------------------------------------------------------------------------------ first opening
 
 
 async def test_first_opening_behaves_as_the_link() -> None:
-    device, heard = Device(), Told()
-    device.is_there = False
+    device, recorder = Device(), InterruptionRecorder()
+    device.is_present = False
     link = ReconnectingLink(device.plug)
     assert link.address == "device"
     for _ in range(2):
         with pytest.raises(LinkOpenError, match="cannot open device: no such device"):
-            await link.open(heard)
+            await link.open(recorder)
     link.write(b"before")
     await anyio.sleep(60)
     assert len(device.tried_at) == 2
-    device.is_there = True
-    await link.open(heard)
+    device.is_present = True
+    await link.open(recorder)
     link.write(b"after")
-    device.plugs[0].hear(b"hello")
+    device.plugs[0].receive(b"hello")
     with pytest.raises(BusyError):
-        await link.open(heard)
+        await link.open(recorder)
     link.close()
     link.close()
     await link.wait_closed()
     with pytest.raises(ConnectionClosed):
-        await link.open(heard)
-    assert (heard.told, device.written, link.dropped_writes) == (["hello"], [b"after"], 0)
+        await link.open(recorder)
+    assert (recorder.events, device.written, link.dropped_writes) == (["hello"], [b"after"], 0)
 
 
 async def test_wrong_address_is_refused_before_opening() -> None:
@@ -145,9 +145,9 @@ async def test_wrong_address_is_refused_before_opening() -> None:
 
 
 async def test_retry_delays_grow_until_restored(caplog: pytest.LogCaptureFixture) -> None:
-    device, heard = Device(), Told()
+    device, recorder = Device(), InterruptionRecorder()
     link = ReconnectingLink(device.plug)
-    await link.open(heard)
+    await link.open(recorder)
     device.tried_at[:] = [asyncio.get_running_loop().time()]
     with caplog.at_level(logging.INFO, "aerokit"):
         device.unplug()
@@ -156,16 +156,16 @@ async def test_retry_delays_grow_until_restored(caplog: pytest.LogCaptureFixture
         assert [later - sooner for sooner, later in pairwise(device.tried_at)] == pytest.approx(
             [0.2, 0.4, 0.8, 1.6, 3.2, 5, 5, 5]
         )
-        device.is_there = True
+        device.is_present = True
         await anyio.sleep(0.5)
         assert len(device.plugs) == 2
         link.write(b"is anybody there?")
         assert link.is_away
-        device.plugs[1].hear(b"yes")
+        device.plugs[1].receive(b"yes")
         device.unplug()
         await anyio.sleep(0.3)
         assert device.tried_at[-1] - device.tried_at[-2] == pytest.approx(0.5, abs=0.11)
-    assert heard.told == ["away: device: unplugged", "back after 26.4 s", "yes", "away: device: unplugged"]
+    assert recorder.events == ["away: device: unplugged", "back after 26.4 s", "yes", "away: device: unplugged"]
     assert device.written == [b"is anybody there?"]
     assert link.dropped_writes == 1
     lost, back = (
@@ -195,14 +195,14 @@ async def test_dropped_writes_of_all_links_are_added() -> None:
 
 
 async def test_silent_open_link_is_restored_after_a_while() -> None:
-    device, heard = Device(), Told()
+    device, recorder = Device(), InterruptionRecorder()
     link = ReconnectingLink(device.plug)
-    await link.open(heard)
+    await link.open(recorder)
     device.unplug(gone=False)
     await anyio.sleep(0.2 + STABLE_AFTER_S - 0.01)
     assert link.is_away
     await anyio.sleep(0.02)
-    assert heard.told[1:] == ["back after 1.2 s"]
+    assert recorder.events[1:] == ["back after 1.2 s"]
     link.close()
     await link.wait_closed()
 
@@ -210,16 +210,16 @@ async def test_silent_open_link_is_restored_after_a_while() -> None:
 async def test_server_that_closes_connections_stays_lost(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    device, heard = Device(), Told()
+    device, recorder = Device(), InterruptionRecorder()
     link = ReconnectingLink(device.plug)
-    await link.open(heard)
+    await link.open(recorder)
     with caplog.at_level(logging.INFO, "aerokit"):
         device.unplug(gone=False)
         for _ in range(200):
             await anyio.sleep(0.1)
             if len(device.plugs) > 1 and link._is_up:
                 device.unplug(gone=False)
-    assert heard.told == ["away: device: unplugged"]
+    assert recorder.events == ["away: device: unplugged"]
     assert len(lines(caplog)) == 1
     assert len(device.plugs) < 12
     link.close()
@@ -227,13 +227,13 @@ async def test_server_that_closes_connections_stays_lost(
 
 
 async def test_data_and_loss_before_open_returns() -> None:
-    device, heard = Device(), Told()
+    device, recorder = Device(), InterruptionRecorder()
     device.greeting = b"hello"
     link = ReconnectingLink(device.plug)
-    heard.at_each_piece = lambda data, peer: device.plugs[-1].pull() if len(device.plugs) in (1, 2) else None
-    await link.open(heard)
+    recorder.at_each_piece = lambda data, peer: device.plugs[-1].pull() if len(device.plugs) in (1, 2) else None
+    await link.open(recorder)
     await anyio.sleep(2)
-    assert heard.told == [
+    assert recorder.events == [
         "hello",
         "away: device: unplugged",
         "back after 0.2 s",
@@ -242,29 +242,29 @@ async def test_data_and_loss_before_open_returns() -> None:
         "back after 0.2 s",
         "hello",
     ]
-    assert len(device.tried_at) == 3  # by one opener, who was at it when the second was lost
+    assert len(device.tried_at) == 3  # by one opening task, which was still running at the second loss
     link.close()
     await link.wait_closed()
 
 
 async def test_link_closed_in_interruption_callback_stays_closed() -> None:
-    class Leaving(Told):
+    class ClosingRecorder(InterruptionRecorder):
         def link_interrupted(self, error: LinkLost) -> None:
             super().link_interrupted(error)
             link.close()
 
-    device, heard = Device(), Leaving()
+    device, recorder = Device(), ClosingRecorder()
     link = ReconnectingLink(device.plug)
-    await link.open(heard)
+    await link.open(recorder)
     device.unplug(gone=False)
     await link.wait_closed()
     await anyio.sleep(60)
     assert len(device.tried_at) == 1
-    assert heard.told == ["away: device: unplugged"]
+    assert recorder.events == ["away: device: unplugged"]
 
 
 async def test_lost_link_is_released_before_the_next_opens() -> None:
-    """A serial port is not shared; not even with the link that had it before."""
+    """A serial port is exclusive, even against the previous link of the same program."""
     device = Device()
     device.releasing_takes_s = 0.7
     link = ReconnectingLink(device.plug)
@@ -281,13 +281,13 @@ async def test_lost_link_is_released_before_the_next_opens() -> None:
 
 
 async def test_receiver_without_interruption_callbacks() -> None:
-    device, heard = Device(), Recorder()
+    device, recorder = Device(), Recorder()
     link = ReconnectingLink(device.plug, min_delay_s=1, max_delay_s=1)
-    await link.open(heard)
+    await link.open(recorder)
     device.unplug(gone=False)
     await anyio.sleep(1.1)
-    device.plugs[1].hear(b"again")
-    assert (heard.data, heard.losses) == (b"again", [])
+    device.plugs[1].receive(b"again")
+    assert (recorder.data, recorder.losses) == (b"again", [])
     link.close()
     await link.wait_closed()
 
@@ -304,66 +304,66 @@ async def test_peers_are_of_the_current_link() -> None:
     await link.wait_closed()
 
 
-# ----------------------------------------------------------------------------- what cannot be mended
+# ---------------------------------------------------------------------------------- permanent errors
 
 
 async def test_end_of_recording_ends_the_link(tmp_path: Path) -> None:
     path = tmp_path / "empty.tlog"
     path.write_bytes(b"")
-    heard = Told()
+    recorder = InterruptionRecorder()
     link = ReconnectingLink(lambda: Replay(path))
-    await link.open(heard)
-    error = await heard.until_lost()
+    await link.open(recorder)
+    error = await recorder.until_lost()
     assert isinstance(error, RecordingEnded)
     await anyio.sleep(60)
-    assert len(heard.told) == 1
+    assert len(recorder.events) == 1
     with pytest.raises(BusyError):
-        await link.open(heard)
+        await link.open(recorder)
     await link.wait_closed()
 
 
 async def test_failing_factory_ends_the_link() -> None:
-    device, heard = Device(), Told()
+    device, recorder = Device(), InterruptionRecorder()
     links: list[Callable[[], Plug]] = [device.plug]
     link = ReconnectingLink(lambda: links.pop()())
-    await link.open(heard)
+    await link.open(recorder)
     device.unplug()
-    error = await heard.until_lost()
+    error = await recorder.until_lost()
     assert str(error) == "device cannot be reopened: pop from empty list"
     assert isinstance(error.__cause__, IndexError)
     link.close()
     await link.wait_closed()
 
 
-# ------------------------------------------------------------------------------- nothing is left
+# ----------------------------------------------------------------------------------------- leaks
 
 
-async def lose_it_twice(heard: Told) -> None:
+async def lose_it_twice(recorder: InterruptionRecorder) -> None:
     """Opens a link to a device that is unplugged, away for a while, back, and unplugged again."""
     device = Device()
     device.opening_takes_s = device.releasing_takes_s = 0.05
     link = ReconnectingLink(device.plug)
     try:
-        await link.open(heard)
+        await link.open(recorder)
         device.unplug()
         await anyio.sleep(0.5)
-        device.is_there = True
+        device.is_present = True
         await anyio.sleep(2)
-        device.plugs[1].hear(b"again")
+        device.plugs[1].receive(b"again")
         device.unplug()
         await anyio.sleep(1)
     finally:
-        told = list(heard.told)
+        events = list(recorder.events)
         link.close()
         with anyio.CancelScope(shield=True):
             await link.wait_closed()
-        assert heard.told == told
+        assert recorder.events == events
         assert not device.plugs or not device.plugs[-1]._receiver
 
 
 def test_cancelled_reconnect_leaves_nothing_behind() -> None:
     for turns in range(60):
-        run_and_do(lambda: lose_it_twice(Told()), turns, lambda task: task.cancel())
+        run_and_do(lambda: lose_it_twice(InterruptionRecorder()), turns, lambda task: task.cancel())
 
 
 def test_closed_reconnect_leaves_nothing_behind() -> None:
@@ -373,12 +373,12 @@ def test_closed_reconnect_leaves_nothing_behind() -> None:
         device = Device()
         device.opening_takes_s = device.releasing_takes_s = 0.05
         made.append(ReconnectingLink(device.plug))
-        link, heard = made[-1], Told()
+        link, recorder = made[-1], InterruptionRecorder()
         try:
-            await link.open(heard)
+            await link.open(recorder)
             device.unplug()
             await anyio.sleep(0.5)
-            device.is_there = True
+            device.is_present = True
             await anyio.sleep(2)
         except (ConnectionClosed, LinkOpenError):
             pass
@@ -409,20 +409,20 @@ def test_closed_after_its_loop() -> None:
 
 
 async def test_reopen_on_request() -> None:
-    device, heard = Device(), Told()
+    device, recorder = Device(), InterruptionRecorder()
     link = ReconnectingLink(device.plug)
     link.reopen()  # it is not open yet
-    await link.open(heard)
+    await link.open(recorder)
     link.reopen()
     link.reopen()
     assert link.is_away
     await anyio.sleep(0.3)
-    device.plugs[0].hear(b"too late")
-    device.plugs[1].hear(b"hello")
+    device.plugs[0].receive(b"too late")
+    device.plugs[1].receive(b"hello")
     link.close()
     await link.wait_closed()
     assert len(device.plugs) == 2
-    assert heard.told == [
+    assert recorder.events == [
         "away: device was closed to be reopened",
         "back after 0.3 s",
         "hello",

@@ -35,14 +35,14 @@ def replay_times(path: Path, speed: float | None) -> list[float]:
     """Arrival time of each frame on the loop's clock, and of the end."""
 
     async def main() -> list[float]:
-        loop, heard = asyncio.get_running_loop(), Recorder()
+        loop, recorder = asyncio.get_running_loop(), Recorder()
         times: list[float] = []
-        heard.at_each_piece = lambda data, peer: times.append(loop.time())
+        recorder.at_each_piece = lambda data, peer: times.append(loop.time())
         link = Replay(path, speed)
-        await link.open(heard)
-        error = await heard.until_lost()
+        await link.open(recorder)
+        error = await recorder.until_lost()
         assert f"end of recording after {len(times)} frames" in str(error)
-        assert [data for data, _ in heard.pieces] == [frame(number) for number in range(len(times))]
+        assert [data for data, _ in recorder.pieces] == [frame(number) for number in range(len(times))]
         await link.wait_closed()
         return [*times, loop.time()]
 
@@ -73,42 +73,42 @@ def test_empty_recording_ends_at_once(tmp_path: Path) -> None:
 
 @each_loop
 async def test_other_tasks_run_during_fast_replay(tmp_path: Path) -> None:
-    heard, loop, seen = Recorder(), asyncio.get_running_loop(), list[int]()
+    recorder, loop, observed = Recorder(), asyncio.get_running_loop(), list[int]()
 
     def look() -> None:
-        seen.append(len(heard.pieces))
-        if not heard.losses:
+        observed.append(len(recorder.pieces))
+        if not recorder.losses:
             loop.call_soon(look)
 
     link = Replay(recording(tmp_path, range(1000)), None)
-    await link.open(heard)
+    await link.open(recorder)
     look()
-    await heard.until_lost()
-    steps = [after - before for before, after in itertools.pairwise(seen)]
+    await recorder.until_lost()
+    steps = [after - before for before, after in itertools.pairwise(observed)]
     assert max(steps) <= replay.MAX_FRAMES_PER_ITERATION
-    assert len(heard.pieces) == link.frames == 1000
+    assert len(recorder.pieces) == link.frames == 1000
 
 
 @each_loop
 async def test_replay_closed_inside_callback_delivers_nothing(tmp_path: Path) -> None:
-    link, heard = Replay(recording(tmp_path, range(5)), None), Recorder()
-    heard.at_each_piece = lambda data, peer: link.close()
-    await link.open(heard)
-    await heard.until_data(frame(0))
+    link, recorder = Replay(recording(tmp_path, range(5)), None), Recorder()
+    recorder.at_each_piece = lambda data, peer: link.close()
+    await link.open(recorder)
+    await recorder.until_data(frame(0))
     await asyncio.sleep(0)
     await link.wait_closed()
-    assert heard.data == frame(0)
-    assert heard.losses == []
+    assert recorder.data == frame(0)
+    assert recorder.losses == []
 
 
 @each_loop
 async def test_closing_before_first_frame_closes_the_file(tmp_path: Path) -> None:
-    link, heard = Replay(recording(tmp_path, range(5))), Recorder()
-    await link.open(heard)
+    link, recorder = Replay(recording(tmp_path, range(5))), Recorder()
+    await link.open(recorder)
     link.close()
     await link.wait_closed()
     await asyncio.sleep(0)
-    assert heard.pieces == []
+    assert recorder.pieces == []
 
 
 @each_loop
@@ -136,9 +136,9 @@ def test_file_failing_later_is_a_lost_link(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(replay, "read_tlog", failing)
 
     async def main() -> str:
-        heard = Recorder()
-        await Replay(tmp_path / "flight.tlog").open(heard)
-        return str(await heard.until_lost())
+        recorder = Recorder()
+        await Replay(tmp_path / "flight.tlog").open(recorder)
+        return str(await recorder.until_lost())
 
     assert "reading the recording failed: Input/output error" in run_virtual(main())
 
@@ -165,6 +165,6 @@ def test_closed_between_frames_has_no_timer(tmp_path: Path) -> None:
         left = asyncio.all_tasks() - {asyncio.current_task()}
         assert not left
         loop: Any = asyncio.get_running_loop()
-        return len([each for each in loop._scheduled if not each.cancelled()])
+        return len([timer for timer in loop._scheduled if not timer.cancelled()])
 
     assert run_virtual(main()) == 0

@@ -26,36 +26,36 @@ pytestmark = pytest.mark.skipif(os.name != "posix", reason="needs pseudo-termina
 async def test_serial_bytes_pass_both_ways(pieces: list[bytes]) -> None:
     with far_end() as far:
         far.reads()
-        link, heard = SerialLink(far.device, 115200), Recorder()
-        await link.open(heard)
+        link, recorder = SerialLink(far.device, 115200), Recorder()
+        await link.open(recorder)
         for piece in pieces:
             link.write(piece)
-        await far.heard.until_data(b"".join(pieces))
+        await far.recorder.until_data(b"".join(pieces))
         await far.sends(b"".join(pieces))
-        await heard.until_data(b"".join(pieces))
-        assert heard.peers == [None]
+        await recorder.until_data(b"".join(pieces))
+        assert recorder.peers == [None]
         link.write(b"")
         link.close()
         await link.wait_closed()
-    assert heard.losses == []
+    assert recorder.losses == []
     assert link.dropped_writes == 0
 
 
 @each_loop
 async def test_unplugging_loses_the_link_once() -> None:
     with far_end() as far:
-        link, heard = SerialLink(far.device), Recorder()
-        await link.open(heard)
+        link, recorder = SerialLink(far.device), Recorder()
+        await link.open(recorder)
         await far.sends(b"last words")
-        await heard.until_data(b"last words")
+        await recorder.until_data(b"last words")
         far.unplug()
-        error = await heard.until_lost()
+        error = await recorder.until_lost()
         assert str(error).startswith(f"serial://{far.device}:57600: the device failed: ")
         link.write(b"into the void")
         await link.wait_closed()
         link.close()
         await link.wait_closed()
-        assert len(heard.losses) == 1
+        assert len(recorder.losses) == 1
         with pytest.raises(ConnectionClosed):
             await link.open(Recorder())
 
@@ -63,15 +63,15 @@ async def test_unplugging_loses_the_link_once() -> None:
 @each_loop
 async def test_unplugging_noticed_by_write_is_reported_later() -> None:
     with far_end() as far:
-        link, heard = SerialLink(far.device), Recorder()
-        await link.open(heard)
+        link, recorder = SerialLink(far.device), Recorder()
+        await link.open(recorder)
         far.unplug()
         link.write(b"x")
         link.write(b"y")
-        assert heard.losses == []
-        await heard.until_lost()
+        assert recorder.losses == []
+        await recorder.until_lost()
         await link.wait_closed()
-        assert len(heard.losses) == 1
+        assert len(recorder.losses) == 1
 
 
 @each_loop
@@ -90,10 +90,10 @@ async def test_full_line_uses_bounded_memory_and_never_blocks() -> None:
         link.write(frame)
         assert link.dropped_writes == before + 1
         far.reads()
-        await far.heard.until(lambda: len(far.heard.data) == written * 280 - 280)
+        await far.recorder.until(lambda: len(far.recorder.data) == written * 280 - 280)
         await eventually(lambda: not link.unsent_bytes)
         link.write(b"again")
-        await far.heard.until(lambda: far.heard.data.endswith(b"again"))
+        await far.recorder.until(lambda: far.recorder.data.endswith(b"again"))
         link.close()
         await link.wait_closed()
 
@@ -102,8 +102,8 @@ async def test_full_line_uses_bounded_memory_and_never_blocks() -> None:
 async def test_close_is_bounded_without_a_reader(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(serial, "LINGER_S", 0.03)
     with far_end() as far:
-        link, heard = SerialLink(far.device, 57600), Recorder()
-        await link.open(heard)
+        link, recorder = SerialLink(far.device, 57600), Recorder()
+        await link.open(recorder)
         for _ in range(60):
             link.write(bytes(280))
             await asyncio.sleep(0)
@@ -111,7 +111,7 @@ async def test_close_is_bounded_without_a_reader(monkeypatch: pytest.MonkeyPatch
         with anyio.fail_after(100):
             await link.wait_closed()
         assert not link._port.is_open
-        assert heard.losses == []
+        assert recorder.losses == []
 
 
 @each_loop
@@ -125,23 +125,23 @@ async def test_data_written_before_close_is_sent() -> None:
         link.write(b"too late")
         far.reads()
         await link.wait_closed()
-        await far.heard.until_data(data)
+        await far.recorder.until_data(data)
 
 
 @each_loop
 async def test_no_callback_after_close() -> None:
     with far_end() as far:
-        link, heard = SerialLink(far.device), Recorder()
-        heard.at_each_piece = lambda data, peer: link.close()
-        await link.open(heard)
+        link, recorder = SerialLink(far.device), Recorder()
+        recorder.at_each_piece = lambda data, peer: link.close()
+        await link.open(recorder)
         await far.sends(b"first")
-        await heard.until_data(b"first")
+        await recorder.until_data(b"first")
         await far.sends(b"second")
         await link.wait_closed()
         far.unplug()
         await asyncio.sleep(0)
-        assert heard.data == b"first"
-        assert heard.losses == []
+        assert recorder.data == b"first"
+        assert recorder.losses == []
 
 
 @each_loop

@@ -22,10 +22,10 @@ HOSTS = pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
 
 @contextlib.asynccontextmanager
 async def listening(host: str = "127.0.0.1") -> AsyncIterator[tuple[TcpListen, Recorder]]:
-    listener, heard = TcpListen(host, 0), Recorder()
-    await listener.open(heard)
+    listener, recorder = TcpListen(host, 0), Recorder()
+    await listener.open(recorder)
     try:
-        yield listener, heard
+        yield listener, recorder
     finally:
         listener.close()
         await listener.wait_closed()
@@ -46,25 +46,25 @@ async def connected(listener: TcpListen) -> AsyncIterator[tuple[TcpConnect, Reco
 @each_traffic
 @HOSTS
 async def test_tcp_bytes_pass_both_ways(host: str, pieces: list[bytes]) -> None:
-    async with listening(host) as (listener, heard), connected(listener) as (client, answered):
+    async with listening(host) as (listener, recorder), connected(listener) as (client, answered):
         for piece in pieces:
             client.write(piece)
-        await heard.until_data(b"".join(pieces))
-        assert heard.peers == list(listener.peers) != [None]
+        await recorder.until_data(b"".join(pieces))
+        assert recorder.peers == list(listener.peers) != [None]
         for piece in pieces:
-            listener.write(piece, heard.peers[0])
+            listener.write(piece, recorder.peers[0])
         await answered.until_data(b"".join(pieces))
         assert answered.peers == [None]
         assert client.local_address[0] == host
-    assert heard.losses == answered.losses == []
+    assert recorder.losses == answered.losses == []
     assert listener.dropped_writes == client.dropped_writes == 0
 
 
 @each_loop
 async def test_small_writes_are_sent_at_once() -> None:
-    async with listening() as (listener, heard), connected(listener) as (client, _):
+    async with listening() as (listener, recorder), connected(listener) as (client, _):
         client.write(b"x")
-        await heard.until_data(b"x")
+        await recorder.until_data(b"x")
         for link_stream in (*client._streams, *listener._streams):
             assert link_stream._transport is not None
             sock = link_stream._transport.get_extra_info("socket")
@@ -73,42 +73,42 @@ async def test_small_writes_are_sent_at_once() -> None:
 
 @each_loop
 async def test_losing_one_client_does_not_lose_the_link() -> None:
-    async with listening() as (listener, heard):
-        async with connected(listener) as (staying, staying_heard):
+    async with listening() as (listener, recorder):
+        async with connected(listener) as (staying, staying_recorder):
             staying.write(b"a")
-            await heard.until_data(b"a")
-            async with connected(listener) as (leaving, leaving_heard):
+            await recorder.until_data(b"a")
+            async with connected(listener) as (leaving, leaving_recorder):
                 leaving.write(b"b")
-                await heard.until_data(b"ab")
-                stays, leaves = heard.peers
+                await recorder.until_data(b"ab")
+                stays, leaves = recorder.peers
                 listener.write(b"to both")
                 listener.write(b", and you", leaves)
-                await leaving_heard.until_data(b"to both, and you")
-                await staying_heard.until_data(b"to both")
+                await leaving_recorder.until_data(b"to both, and you")
+                await staying_recorder.until_data(b"to both")
             await eventually(lambda: len(listener.peers) == 1)
             listener.write(b"gone", leaves)
             assert listener.dropped_writes == 1
             listener.write(b"!")
-            await staying_heard.until_data(b"to both!")
+            await staying_recorder.until_data(b"to both!")
             assert listener.peers == (stays,)
-        assert heard.losses == []
+        assert recorder.losses == []
 
 
 @each_loop
 async def test_clients_beyond_the_limit_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tcp, "MAX_CLIENTS", 1)
-    async with listening() as (listener, heard), connected(listener) as (client, _):
+    async with listening() as (listener, recorder), connected(listener) as (client, _):
         client.write(b"x")
-        await heard.until_data(b"x")
+        await recorder.until_data(b"x")
         async with connected(listener) as (_, turned_away):
             assert "closed the connection" in str(await turned_away.until_lost())
 
 
 @each_loop
 async def test_server_end_of_stream_loses_the_link_once() -> None:
-    async with listening() as (listener, heard), connected(listener) as (client, answered):
+    async with listening() as (listener, recorder), connected(listener) as (client, answered):
         client.write(b"x")
-        await heard.until_data(b"x")
+        await recorder.until_data(b"x")
         listener.write(b"goodbye")
         listener.close()
         error = await answered.until_lost()
@@ -119,7 +119,7 @@ async def test_server_end_of_stream_loses_the_link_once() -> None:
         with pytest.raises(BusyError, match="is lost"):
             await client.open(Recorder())
     assert len(answered.losses) == 1
-    assert heard.losses == []
+    assert recorder.losses == []
 
 
 @each_loop
@@ -174,9 +174,9 @@ async def test_peer_that_does_not_read_costs_bounded_memory(
 
 @each_loop
 async def test_write_to_closing_connection_is_counted_as_dropped() -> None:
-    async with listening() as (listener, heard), connected(listener) as (client, _):
+    async with listening() as (listener, recorder), connected(listener) as (client, _):
         client.write(b"x")
-        await heard.until_data(b"x")
+        await recorder.until_data(b"x")
         for end in (client, listener):
             (stream,) = end._streams
             assert stream._transport is not None
@@ -188,23 +188,23 @@ async def test_write_to_closing_connection_is_counted_as_dropped() -> None:
 @each_loop
 async def test_data_written_before_close_arrives() -> None:
     data = bytes(range(256)) * 4096
-    async with listening() as (listener, heard), connected(listener) as (client, _):
+    async with listening() as (listener, recorder), connected(listener) as (client, _):
         client.write(data)
         client.close()
         client.write(b"too late")
         await client.wait_closed()
-        await heard.until_data(data)
+        await recorder.until_data(data)
 
 
 @each_loop
 async def test_tcp_close_inside_callback_ends_all_callbacks() -> None:
-    async with listening() as (listener, heard), connected(listener) as (client, answered):
-        heard.at_each_piece = lambda data, peer: listener.close()
+    async with listening() as (listener, recorder), connected(listener) as (client, answered):
+        recorder.at_each_piece = lambda data, peer: listener.close()
         client.write(b"first")
         await answered.until_lost()
         await listener.wait_closed()
-        assert heard.data == b"first"
-        assert heard.losses == []
+        assert recorder.data == b"first"
+        assert recorder.losses == []
         assert listener.peers == ()
 
 
@@ -217,11 +217,11 @@ async def test_refused_connection_has_hint_and_can_be_retried() -> None:
         await client.open(answered)
     assert caught.value.errno == errno.ECONNREFUSED
     await client.wait_closed()
-    listener, heard = TcpListen(*address), Recorder()
-    await listener.open(heard)
+    listener, recorder = TcpListen(*address), Recorder()
+    await listener.open(recorder)
     await client.open(answered)
     client.write(b"hello")
-    await heard.until_data(b"hello")
+    await recorder.until_data(b"hello")
     for link in (client, listener):
         link.close()
         await link.wait_closed()
@@ -232,25 +232,25 @@ async def test_refused_connection_has_hint_and_can_be_retried() -> None:
 @each_loop
 async def test_every_address_of_a_name_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
-        nobody = SocketAddress(socket.AF_INET, server.getsockname())
-    async with listening("::1") as (listener, heard):
-        somebody = SocketAddress(socket.AF_INET6, listener.local_address)
+        unused = SocketAddress(socket.AF_INET, server.getsockname())
+    async with listening("::1") as (listener, recorder):
+        other = SocketAddress(socket.AF_INET6, listener.local_address)
 
         async def resolve(host: str, port: int, kind: socket.SocketKind) -> list[SocketAddress]:
-            return [nobody, somebody]
+            return [unused, other]
 
         monkeypatch.setattr(tcp, "resolve", resolve)
         client = TcpConnect("vehicle.example", listener.local_address[1])
         await client.open(Recorder())
         client.write(b"x")
-        await heard.until_data(b"x")
+        await recorder.until_data(b"x")
         client.close()
         await client.wait_closed()
 
 
 @contextlib.contextmanager
 def deaf_server() -> Iterator[tuple[str, int]]:
-    """A server whose queue is full: connecting to it neither succeeds nor fails."""
+    """A server with a full accept queue: a connection attempt neither succeeds nor fails."""
     with contextlib.ExitStack() as stack:
         server = stack.enter_context(socket.socket())
         server.bind(("127.0.0.1", 0))
@@ -288,14 +288,14 @@ async def test_cancelled_at_any_iteration_leaves_nothing_behind() -> None:
     async with listening() as (listener, _):
         for turns in range(10):
             for link in (TcpConnect(*listener.local_address), TcpListen("127.0.0.1", 0)):
-                heard = Recorder()
-                task = asyncio.ensure_future(link.open(heard))
+                recorder = Recorder()
+                task = asyncio.ensure_future(link.open(recorder))
                 for _ in range(turns):
                     await asyncio.sleep(0)
                 if task.cancel():
                     with pytest.raises(asyncio.CancelledError):
                         await task
-                assert heard.losses == []
+                assert recorder.losses == []
                 link.close()
                 with anyio.fail_after(100):
                     await link.wait_closed()
@@ -305,7 +305,7 @@ async def test_cancelled_at_any_iteration_leaves_nothing_behind() -> None:
 @each_loop
 async def test_client_connecting_while_closing_is_closed() -> None:
     """The system had accepted it already."""
-    async with listening() as (listener, heard):
+    async with listening() as (listener, recorder):
         pass
     ours, theirs = socket.socketpair()
     theirs.setblocking(False)
@@ -315,11 +315,11 @@ async def test_client_connecting_while_closing_is_closed() -> None:
         with anyio.fail_after(100):
             assert await loop.sock_recv(theirs, 1) == b""
             await listener.wait_closed()
-    assert (listener.peers, heard.losses) == ((), [])
+    assert (listener.peers, recorder.losses) == ((), [])
 
 
 @each_loop
-@pytest.mark.parametrize("turns", [0, 1, 3, 4, 5, 6])  # at 2 asyncio itself drops it, and says so
+@pytest.mark.parametrize("turns", [0, 1, 3, 4, 5, 6])  # at 2 asyncio drops the connection itself, and logs it
 async def test_just_accepted_client_is_closed_with_the_link(turns: int) -> None:
     link = TcpListen("127.0.0.1", 0)
     await link.open(Recorder())
@@ -330,7 +330,7 @@ async def test_just_accepted_client_is_closed_with_the_link(turns: int) -> None:
         link.close()
         await link.wait_closed()
         client.setblocking(False)
-        with contextlib.suppress(ConnectionResetError):  # nobody has accepted it yet
+        with contextlib.suppress(ConnectionResetError):  # the server has not accepted it yet
             assert client.recv(1) == b""
         assert len(asyncio.all_tasks()) == before
 
@@ -366,13 +366,13 @@ class Listener(Recorder):
 
     def __init__(self) -> None:
         super().__init__()
-        self.told: list[tuple[str, Peer]] = []
+        self.events: list[tuple[str, Peer]] = []
 
     def peer_joined(self, peer: Peer) -> None:
-        self.told.append(("joined", peer))
+        self.events.append(("joined", peer))
 
     def peer_left(self, peer: Peer) -> None:
-        self.told.append(("left", peer))
+        self.events.append(("left", peer))
 
 
 @pytest.mark.parametrize("wrap", [lambda link: link, lambda link: ReconnectingLink(lambda: link), FaultyLink])
@@ -382,14 +382,14 @@ async def test_clients_are_reported_before_they_send(wrap: Callable[[Any], Any])
     listener, server = Listener(), wrap(inner)
     await server.open(listener)
     _, first = await asyncio.open_connection(*inner.local_address)
-    await eventually(lambda: len(listener.told) == 1)
+    await eventually(lambda: len(listener.events) == 1)
     _, second = await asyncio.open_connection(*inner.local_address)
-    await eventually(lambda: len(listener.told) == 2)
-    one, other = (peer for _, peer in listener.told)
+    await eventually(lambda: len(listener.events) == 2)
+    one, other = (peer for _, peer in listener.events)
     assert one == first.get_extra_info("sockname")
     first.close()
-    await eventually(lambda: len(listener.told) == 3)
-    assert listener.told == [("joined", one), ("joined", other), ("left", one)]
+    await eventually(lambda: len(listener.events) == 3)
+    assert listener.events == [("joined", one), ("joined", other), ("left", one)]
     second.close()
     server.close()
     await server.wait_closed()
@@ -402,10 +402,10 @@ async def test_unread_data_of_one_client_affects_no_other() -> None:
     with socket.socket() as stalled:
         stalled.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         stalled.connect(server.local_address)
-        await eventually(lambda: len(listener.told) == 1)
+        await eventually(lambda: len(listener.events) == 1)
         reader, writer = await asyncio.open_connection(*server.local_address)
-        await eventually(lambda: len(listener.told) == 2)
-        slow, quick = (peer for _, peer in listener.told)
+        await eventually(lambda: len(listener.events) == 2)
+        slow, quick = (peer for _, peer in listener.events)
         server.write(bytes(100_000), slow)
         server.write(b"x" * 100, quick)
         assert await reader.readexactly(100) == b"x" * 100

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
-from link_harness import LOOPS, Recorder, each_loop, each_of, each_traffic, eventually
+from link_harness import LOOPS, Recorder, each_loop, each_traffic, eventually, on_loops
 
 from aerokit.errors import BusyError, ConnectionClosed, LinkOpenError
 from aerokit.transport import (
@@ -37,7 +37,7 @@ class LoopWithoutReaders(asyncio.SelectorEventLoop):
 WITHOUT_READERS = pytest.param(("asyncio", {"loop_factory": LoopWithoutReaders}), id="no add_reader")
 
 
-each_loop_and_the_fallback = each_of([*LOOPS, WITHOUT_READERS])
+each_loop_and_the_fallback = on_loops([*LOOPS, WITHOUT_READERS])
 
 
 @contextlib.contextmanager
@@ -54,35 +54,35 @@ def plain_socket(host: str = "127.0.0.1") -> Iterator[socket.socket]:
 @HOSTS
 async def test_datagrams_pass_both_ways(host: str, pieces: list[bytes]) -> None:
     listener, caller = UdpListen(host, 0), UdpConnect(host, 0)
-    heard, answered = Recorder(), Recorder()
-    await listener.open(heard)
+    recorder, answered = Recorder(), Recorder()
+    await listener.open(recorder)
     caller = UdpConnect(host, listener.local_address[1])
     await caller.open(answered)
     for piece in pieces:
         caller.write(piece)
-    await heard.until_data(b"".join(pieces))
-    assert [data for data, _ in heard.pieces] == pieces
-    assert heard.peers == list(listener.peers)
+    await recorder.until_data(b"".join(pieces))
+    assert [data for data, _ in recorder.pieces] == pieces
+    assert recorder.peers == list(listener.peers)
     for piece in pieces:
-        listener.write(piece, heard.peers[0])
+        listener.write(piece, recorder.peers[0])
     await answered.until_data(b"".join(pieces))
     assert answered.peers == [None]
     for link in (listener, caller):
         link.close()
         await link.wait_closed()
-    assert heard.losses == answered.losses == []
+    assert recorder.losses == answered.losses == []
     assert listener.dropped_writes == caller.dropped_writes == 0
 
 
 @each_loop_and_the_fallback
 async def test_listener_writes_to_all_senders() -> None:
-    listener, heard = UdpListen("127.0.0.1", 0), Recorder()
-    await listener.open(heard)
+    listener, recorder = UdpListen("127.0.0.1", 0), Recorder()
+    await listener.open(recorder)
     listener.write(b"nobody is there yet")
     with plain_socket() as first, plain_socket() as second:
         for sock in (first, second, first):
             sock.sendto(b"hello", listener.local_address)
-        await heard.until_data(b"hello" * 3)
+        await recorder.until_data(b"hello" * 3)
         assert listener.peers == (first.getsockname(), second.getsockname())
         listener.write(b"to both")
         listener.write(b"to the second", second.getsockname())
@@ -96,12 +96,12 @@ async def test_listener_writes_to_all_senders() -> None:
 @each_loop
 async def test_least_recent_peer_is_forgotten_first(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(udp, "MAX_PEERS", 2)
-    listener, heard = UdpListen("127.0.0.1", 0), Recorder()
-    await listener.open(heard)
+    listener, recorder = UdpListen("127.0.0.1", 0), Recorder()
+    await listener.open(recorder)
     with plain_socket() as first, plain_socket() as second, plain_socket() as third:
         for sock in (first, second, first, third):
             sock.sendto(b"x", listener.local_address)
-        await heard.until_data(b"xxxx")
+        await recorder.until_data(b"xxxx")
         assert listener.peers == (third.getsockname(), first.getsockname())
         listener.write(b"?", second.getsockname())
     assert listener.dropped_writes == 1
@@ -111,21 +111,21 @@ async def test_least_recent_peer_is_forgotten_first(monkeypatch: pytest.MonkeyPa
 @each_loop
 async def test_burst_is_read_in_bounded_iterations(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(udp, "MAX_BURST_DATAGRAMS", 4)
-    listener, heard = UdpListen("127.0.0.1", 0), Recorder()
-    await listener.open(heard)
+    listener, recorder = UdpListen("127.0.0.1", 0), Recorder()
+    await listener.open(recorder)
     loop = asyncio.get_running_loop()
     seen_between_turns: list[int] = []
 
     def count() -> None:
-        seen_between_turns.append(len(heard.pieces))
-        if len(heard.pieces) < 10:
+        seen_between_turns.append(len(recorder.pieces))
+        if len(recorder.pieces) < 10:
             loop.call_soon(count)
 
     with plain_socket() as sock:
         for n in range(10):
             sock.sendto(bytes([n]), listener.local_address)
         loop.call_soon(count)
-        await heard.until_data(bytes(range(10)))
+        await recorder.until_data(bytes(range(10)))
     assert 4 in seen_between_turns
     assert 8 in seen_between_turns
     listener.close()
@@ -192,44 +192,44 @@ class FullSocket:
 
 @each_loop_and_the_fallback
 async def test_broadcast_uses_only_the_peer_that_answers() -> None:
-    broadcast, heard = UdpBroadcast("127.255.255.255", 14550), Recorder()
+    broadcast, recorder = UdpBroadcast("127.255.255.255", 14550), Recorder()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle, plain_socket() as other:
         vehicle.bind(("0.0.0.0", 0))
         vehicle.settimeout(20.0)
         broadcast = UdpBroadcast("127.255.255.255", vehicle.getsockname()[1])
-        await broadcast.open(heard)
+        await broadcast.open(recorder)
         broadcast.write(b"who is there?")
         data, source = vehicle.recvfrom(100)
         assert data == b"who is there?"
         vehicle.sendto(b"me", source)
-        await heard.until_data(b"me")
+        await recorder.until_data(b"me")
         other.sendto(b"me too", source)
         broadcast.write(b"hello you")
         assert vehicle.recvfrom(100) == (b"hello you", source)
         vehicle.sendto(b"!", source)
-        await heard.until_data(b"me!")
-        assert heard.peers == [None]
+        await recorder.until_data(b"me!")
+        assert recorder.peers == [None]
     broadcast.close()
     await broadcast.wait_closed()
 
 
 @each_loop_and_the_fallback
 async def test_udp_close_inside_callback_ends_all_callbacks() -> None:
-    listener, heard = UdpListen("127.0.0.1", 0), Recorder()
-    await listener.open(heard)
+    listener, recorder = UdpListen("127.0.0.1", 0), Recorder()
+    await listener.open(recorder)
     address = listener.local_address
-    heard.at_each_piece = lambda data, peer: listener.close()
+    recorder.at_each_piece = lambda data, peer: listener.close()
     with plain_socket() as sock:
         for piece in (b"first", b"second", b"third"):
             sock.sendto(piece, address)
-        await heard.until_data(b"first")
+        await recorder.until_data(b"first")
         await listener.wait_closed()
         for _ in range(3):
             await asyncio.sleep(0)
-    assert heard.data == b"first"
+    assert recorder.data == b"first"
     listener.write(b"after the end")
     listener.close()
-    assert heard.losses == []
+    assert recorder.losses == []
 
 
 @each_loop_and_the_fallback
@@ -313,7 +313,7 @@ def test_host_of_peer_ignores_its_port(kind: Any) -> None:
 
 @each_loop
 @pytest.mark.parametrize(
-    ("error", "told"),
+    ("error", "messages"),
     [
         (ConnectionRefusedError(errno.ECONNREFUSED, "refused"), []),
         (OSError(errno.ENETUNREACH, "no network"), []),
@@ -324,17 +324,17 @@ def test_host_of_peer_ignores_its_port(kind: Any) -> None:
     ],
     ids=str,
 )
-async def test_only_permanent_errors_end_a_udp_link(error: Exception, told: list[str]) -> None:
-    link, heard = UdpListen("127.0.0.1", 0), Recorder()
-    await link.open(heard)
+async def test_only_permanent_errors_end_a_udp_link(error: Exception, messages: list[str]) -> None:
+    link, recorder = UdpListen("127.0.0.1", 0), Recorder()
+    await link.open(recorder)
     udp._DatagramProtocol(link).error_received(error)
     await asyncio.sleep(0)
-    assert [str(each) for each in heard.losses] == [f"{link.address}: {each}" for each in told]
+    assert [str(loss) for loss in recorder.losses] == [f"{link.address}: {event}" for event in messages]
     link.close()
     await link.wait_closed()
 
 
-class Gatherer(Recorder):
+class BurstRecorder(Recorder):
     """Receiver that records the ends of bursts."""
 
     def __init__(self) -> None:
@@ -348,7 +348,7 @@ class Gatherer(Recorder):
 @pytest.mark.parametrize("wrap", [lambda link: link, lambda link: ReconnectingLink(lambda: link)])
 @pytest.mark.anyio
 async def test_end_of_burst_is_reported(wrap: Callable[[Any], Any]) -> None:
-    inner, gatherer = UdpListen("127.0.0.1", 0), Gatherer()
+    inner, gatherer = UdpListen("127.0.0.1", 0), BurstRecorder()
     link = wrap(inner)
     assert not link.reports_bursts
     await link.open(gatherer)
@@ -360,7 +360,7 @@ async def test_end_of_burst_is_reported(wrap: Callable[[Any], Any]) -> None:
     assert link.reports_bursts
     assert gatherer.bursts[-1] == 3
     assert len(gatherer.bursts) <= 3
-    for each in (link, sender):
-        each.close()
-        await each.wait_closed()
+    for endpoint in (link, sender):
+        endpoint.close()
+        await endpoint.wait_closed()
     assert not inner.reports_bursts

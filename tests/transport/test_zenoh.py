@@ -44,14 +44,14 @@ def frame(message: Message = ARM) -> bytes:
 @each_loop
 async def test_zenoh_bytes_pass_both_ways() -> None:
     port = free_port()
-    async with serving(port) as (vehicle, heard), client(port, "&client=ground") as (link, answered):
+    async with serving(port) as (vehicle, recorder), client(port, "&client=ground") as (link, answered):
         frames = [frame(ParamRequestList(1, 1)) for _ in range(100)]
-        for each in frames:
-            link.write(each)
-        await heard.until_data(b"".join(frames))
-        assert heard.peers == ["ground"] == list(vehicle.peers)
-        for each in PIECES:
-            vehicle.write(each, "ground")
+        for received_frame in frames:
+            link.write(received_frame)
+        await recorder.until_data(b"".join(frames))
+        assert recorder.peers == ["ground"] == list(vehicle.peers)
+        for piece in PIECES:
+            vehicle.write(piece, "ground")
         await answered.until_data(b"".join(PIECES))
         vehicle.write(b"to all")
         await answered.until_data(b"".join(PIECES) + b"to all")
@@ -61,17 +61,17 @@ async def test_zenoh_bytes_pass_both_ways() -> None:
         assert vehicle.dropped_writes == 1
         assert vehicle.has_peer("ground") > vehicle.has_peer("stranger")
         assert link.dropped_writes == link.late_frames == vehicle.late_datagrams == 0
-    assert heard.losses == []
+    assert recorder.losses == []
 
 
 async def test_only_complete_frames_of_a_client_pass() -> None:
     port = free_port()
-    async with serving(port) as (_, heard), client(port) as (link, _told):
+    async with serving(port) as (_, recorder), client(port) as (link, _client_recorder):
         link.write(b"noise")
         link.write(frame()[:10])
         link.write(last := frame(ParamRequestList(1, 1)))
-        await eventually(lambda: heard.data != b"")
-        assert heard.data == last
+        await eventually(lambda: recorder.data != b"")
+        assert recorder.data == last
 
 
 async def test_closed_vehicle_side_is_a_lost_link() -> None:
@@ -124,14 +124,14 @@ async def test_name_in_use() -> None:
 
 async def test_zenoh_link_is_opened_once(tmp_path: Path) -> None:
     port = free_port()
-    async with serving(port) as (vehicle, _), client(port) as (link, _told):
-        for each in (vehicle, link):
+    async with serving(port) as (vehicle, _), client(port) as (link, _client_recorder):
+        for endpoint in (vehicle, link):
             with pytest.raises(BusyError):
-                await each.open(Recorder())
-    for each in (vehicle, link):
+                await endpoint.open(Recorder())
+    for opened in (vehicle, link):
         with pytest.raises(ConnectionClosed):
-            await each.open(Recorder())
-        each.write(b"nothing happens")
+            await opened.open(Recorder())
+        opened.write(b"nothing happens")
     wrong = tmp_path / "zenoh.json5"
     wrong.write_text("{ mode: 7 }")
     with pytest.raises(InvalidArgument, match="zenoh://north/alpha: config="):
@@ -153,10 +153,10 @@ async def test_without_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
 
 async def test_orders_held_back_by_broken_connection_are_refused() -> None:
     port = free_port()
-    async with serving(port) as (vehicle, heard), HoldingProxy(port) as line:  # noqa: SIM117 - the line's port
-        async with client(line.port, "&client=ground") as (link, told):
+    async with serving(port) as (vehicle, recorder), HoldingProxy(port) as line:  # noqa: SIM117 - the line's port
+        async with client(line.port, "&client=ground") as (link, client_recorder):
             link.write(before := frame())
-            await heard.until_data(before)
+            await recorder.until_data(before)
             line.hold()
             written = 0
             while link.dropped_writes == 0:  # until no beacon has come for two seconds
@@ -168,35 +168,35 @@ async def test_orders_held_back_by_broken_connection_are_refused() -> None:
             await asyncio.sleep(0.5)  # until the youngest of them is too old: its stamp is one period older than it
             line.release()
             await eventually(lambda: vehicle.late_datagrams >= written - 1)
-            assert heard.data == before  # not one of them
-            await eventually(lambda: ("COMMAND_LONG", "it came too late", None) in told.refused)
-            assert set(told.answers) == {()}
+            assert recorder.data == before  # not one of them
+            await eventually(lambda: ("COMMAND_LONG", "it came too late", None) in client_recorder.refused)
+            assert set(client_recorder.answers) == {()}
 
             def goes_through() -> bool:
                 link.write(frame())
-                return heard.data != before
+                return recorder.data != before
 
             await eventually(goes_through)
-            assert told.losses == []
+            assert client_recorder.losses == []
 
 
 @pytest.mark.exhaustive
 async def test_killed_router_returns() -> None:
     port = free_port()
     with router(port) as first:
-        async with serving(port, how="connect") as (vehicle, heard), reconnecting(port) as (link, told):
+        async with serving(port, how="connect") as (vehicle, recorder), reconnecting(port) as (link, client_recorder):
             link.write(frame())
-            await eventually(lambda: heard.data != b"")
+            await eventually(lambda: recorder.data != b"")
             first.kill()
             first.wait()
-            await eventually(lambda: told.interruptions == 1)
-            heard.pieces.clear()
+            await eventually(lambda: client_recorder.interruptions == 1)
+            recorder.pieces.clear()
             link.write(frame())  # into the void
             with router(port):
-                await eventually(lambda: told.restored == 1)
-                assert heard.pieces == []
+                await eventually(lambda: client_recorder.restored == 1)
+                assert recorder.pieces == []
                 link.write(late := frame())
-                await heard.until_data(late)
+                await recorder.until_data(late)
                 assert len(vehicle.peers) == 1
 
 
@@ -205,13 +205,13 @@ async def test_killed_vehicle_side_is_replaced() -> None:
     port = free_port()
     address = f"zenohin://north/alpha?connect=tcp/127.0.0.1:{port}"
     with router(port), process(VEHICLE_SIDE, address) as first:
-        async with reconnecting(port) as (_, told):
-            await eventually(lambda: told.data != b"")
+        async with reconnecting(port) as (_, client_recorder):
+            await eventually(lambda: client_recorder.data != b"")
             first.kill()
-            await eventually(lambda: told.interruptions >= 1)
-            told.pieces.clear()
+            await eventually(lambda: client_recorder.interruptions >= 1)
+            client_recorder.pieces.clear()
             with process(VEHICLE_SIDE, address):
-                await eventually(lambda: told.restored >= 1 and told.data != b"")
+                await eventually(lambda: client_recorder.restored >= 1 and client_recorder.data != b"")
 
 
 async def test_late_client_finds_vehicle_side_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -233,20 +233,20 @@ async def test_two_programs_order_the_same_vehicle() -> None:
     port = free_port()
     with router(port):
         async with (
-            serving(port, how="connect") as (vehicle, heard),
+            serving(port, how="connect") as (vehicle, recorder),
             client(port, "&client=one") as (one, _),
-            client(port, "&client=two") as (two, told),
+            client(port, "&client=two") as (two, client_recorder),
         ):
             one.write(frame())
             await eventually(lambda: vehicle.lease_holder == "one" == two.lease_holder)
-            heard.pieces.clear()
+            recorder.pieces.clear()
             two.write(frame())
             two.write(frame(SET_POINT))
             two.write(read := frame(ParamRequestList(1, 1)))
-            await eventually(lambda: len(told.refused) == 2)
-            assert told.refused[0] == ("COMMAND_LONG", "one has control", "one")
-            assert len(told.answers[0]) == 2
-            assert heard.data == read
+            await eventually(lambda: len(client_recorder.refused) == 2)
+            assert client_recorder.refused[0] == ("COMMAND_LONG", "one has control", "one")
+            assert len(client_recorder.answers[0]) == 2
+            assert recorder.data == read
             assert vehicle.refused_frames == 2 == two.dropped_writes
             one.close()
             await one.wait_closed()
@@ -263,7 +263,7 @@ async def test_two_programs_order_the_same_vehicle() -> None:
                     lambda: no.refused == [("COMMAND_LONG", "this link is read-only (control=never)", None)]
                 )
                 two.write(frame())
-                await eventually(lambda: told.refused[-1] == ("COMMAND_LONG", "three has control", "three"))
+                await eventually(lambda: client_recorder.refused[-1] == ("COMMAND_LONG", "three has control", "three"))
 
 
 async def test_router_restricts_reading_and_ordering(tmp_path: Path) -> None:
@@ -286,23 +286,23 @@ async def test_router_restricts_reading_and_ordering(tmp_path: Path) -> None:
             transport: {{ auth: {{ usrpwd: {{ user: "{user}", password: "{password}" }} }} }} }}"""
         )
     with router(port, str(files["router"])):
-        vehicle, heard = create_link(f"zenohin://north/alpha?config={files['alpha']}"), Recorder()
+        vehicle, received = create_link(f"zenohin://north/alpha?config={files['alpha']}"), Recorder()
         pilot, onlooker = (
             create_link(f"zenoh://north/alpha?client={name}&config={files[name]}") for name in ("ground-1", "onlooker")
         )
         liar = create_link(f"zenohin://north/beta?config={files['ground-1']}")
-        seen, told = RefusalRecorder(), RefusalRecorder()
-        opened = ((vehicle, heard), (pilot, told), (onlooker, seen), (liar, Recorder()))
+        observed, client_recorder = RefusalRecorder(), RefusalRecorder()
+        opened = ((vehicle, received), (pilot, client_recorder), (onlooker, observed), (liar, Recorder()))
         for link, receiver in opened:
             await link.open(receiver)
         vehicle.write(b"telemetry")
-        for each in (seen, told):
-            await each.until_data(b"telemetry")
+        for recorder in (observed, client_recorder):
+            await recorder.until_data(b"telemetry")
         onlooker.write(frame())
         liar.write(b"a vehicle that is none")
         pilot.write(order := frame())
-        await heard.until_data(order)
-        assert heard.peers == ["ground-1"]
+        await received.until_data(order)
+        assert received.peers == ["ground-1"]
         with pytest.raises(LinkOpenError, match=r"no vehicle side named beta in the fleet north \(available: alpha\)"):
             await create_link(f"zenoh://north/beta?timeout=0.3&config={files['onlooker']}").open(RefusalRecorder())
         for link, _ in opened:
@@ -311,10 +311,10 @@ async def test_router_restricts_reading_and_ordering(tmp_path: Path) -> None:
             await link.wait_closed()
 
 
-# ------------------------------------------------------------------------------------ nothing is left
+# ---------------------------------------------------------------------------------------------- leaks
 
 
-def what_is_left() -> tuple[int, int]:
+def open_resources() -> tuple[int, int]:
     gc.collect()
     return threading.active_count(), len(os.listdir("/proc/self/fd"))
 
@@ -323,20 +323,20 @@ def what_is_left() -> tuple[int, int]:
 async def test_closed_links_leave_nothing() -> None:
     async def once() -> None:
         port = free_port()
-        async with serving(port) as (vehicle, heard), client(port) as (link, answered):
+        async with serving(port) as (vehicle, recorder), client(port) as (link, answered):
             vehicle.write(b"x")
             link.write(frame())
-            await eventually(lambda: heard.data != b"" and answered.data != b"")
+            await eventually(lambda: recorder.data != b"" and answered.data != b"")
             link._session.put("aerokit/north/alpha/from/all", b"y", attachment=b"")
-        heard.pieces.clear()
+        recorder.pieces.clear()
         await asyncio.sleep(0.05)
-        assert heard.pieces == []  # no callback after close
+        assert recorder.pieces == []  # no callback after close
 
     await once()
-    before = what_is_left()
+    before = open_resources()
     for _ in range(3):
         await once()
-    await eventually(lambda: what_is_left() <= (before[0] + 6, before[1]))  # threads of the loop's executor
+    await eventually(lambda: open_resources() <= (before[0] + 6, before[1]))  # threads of the loop's executor
 
 
 @pytest.mark.parametrize("after_s", [0, 0.001, 0.005, 0.02, 0.3])
@@ -413,7 +413,7 @@ def test_recorder_of_harness_is_a_refusal_listener() -> None:
 
 
 async def test_foreign_keys_do_not_block_clients(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A client is greeted by its token; whoever just puts on its key is forgotten when there is no room."""
+    """A client is accepted by its liveliness token; a peer that only publishes on its key is dropped at the limit."""
     link, now = ZenohListen("north", "alpha"), 100.0
     monkeypatch.setattr(link, "_now", lambda: now)
     for number in range(MAX_CLIENTS):
@@ -428,7 +428,7 @@ async def test_foreign_keys_do_not_block_clients(monkeypatch: pytest.MonkeyPatch
 
 
 async def test_duplicated_datagram_reaches_vehicle_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Doubled on its way, or replayed by somebody on the network: an order is carried out once, and in order."""
+    """Duplicated by the network or replayed by an attacker, an order is executed once and in order."""
     link, taken = ZenohListen("north", "alpha"), list[bytes]()
     monkeypatch.setattr(link, "_now", lambda: 100.0)
     monkeypatch.setattr(link, "_deliver", lambda data, peer: taken.append(data))
@@ -441,14 +441,14 @@ async def test_duplicated_datagram_reaches_vehicle_once(monkeypatch: pytest.Monk
 
 
 async def test_payload_larger_than_datagram_is_ignored() -> None:
-    """On either side: nobody who may publish on the network fills the other's memory or keeps its loop busy."""
+    """On either side, a publisher on the network cannot fill the memory or block the event loop."""
     port = free_port()
-    async with serving(port) as (vehicle, heard), client(port, "&client=ground") as (link, answered):
+    async with serving(port) as (vehicle, recorder), client(port, "&client=ground") as (link, answered):
         link.write(orders := frame(ParamRequestList(1, 1)))
-        await heard.until_data(orders)
+        await recorder.until_data(orders)
         for far in (vehicle, link):
             far.write(orders * 10_000, "ground" if far is vehicle else None)
         link.write(orders)
         vehicle.write(b"small", "ground")
-        await heard.until_data(orders + orders)
+        await recorder.until_data(orders + orders)
         await answered.until_data(b"small")

@@ -1,4 +1,4 @@
-"""One client orders; the others only read, and get notices."""
+"""One client sends commands; the others only read, and receive notices."""
 
 from __future__ import annotations
 
@@ -161,12 +161,12 @@ def test_setpoint_notices_are_limited_and_counted() -> None:
     lease = ControlLease()
     lease.take("one", 0.0)
     client = ClientFilter("two", lease)
-    told = [each for n in range(40) for each in client.receive(send(SET_POINT), "free", n * 0.05)[1]]
-    assert 3 <= len(told) <= 5
-    assert sum(each.count for each in told) <= 40
-    assert told[1].count == 10
+    events = [message for n in range(40) for message in client.receive(send(SET_POINT), "free", n * 0.05)[1]]
+    assert 3 <= len(events) <= 5
+    assert sum(event.count for event in events) <= 40
+    assert events[1].count == 10
     assert client.refused == 40
-    assert all(each.answer == b"" for each in told)
+    assert all(event.answer == b"" for event in events)
 
 
 def test_late_orders_are_refused_without_answer() -> None:
@@ -181,9 +181,9 @@ def test_unknown_messages_are_orders() -> None:
     lease = ControlLease()
     assert ClientFilter("one", lease).receive(unknown + send(HEARTBEAT), "free", 0.0)[0] == unknown + send(HEARTBEAT)
     assert lease.holder(0.0) == "one"
-    passed, told = ClientFilter("two", lease).receive(unknown + send(HEARTBEAT), "free", 0.0)
+    passed, events = ClientFilter("two", lease).receive(unknown + send(HEARTBEAT), "free", 0.0)
     assert passed == send(HEARTBEAT)
-    assert [each.message for each in told] == ["message 16777214"] or told[0].message.startswith("message ")
+    assert [event.message for event in events] == ["message 16777214"] or events[0].message.startswith("message ")
 
 
 @given(st.lists(st.sampled_from([*ORDERS, *READS]), max_size=20), st.binary(max_size=40))

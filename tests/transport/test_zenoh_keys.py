@@ -72,7 +72,7 @@ fields = st.dictionaries(
 )
 
 
-@given(st.binary() | fields.map(lambda each: json.dumps(each).encode()))
+@given(st.binary() | fields.map(lambda content: json.dumps(content).encode()))
 def test_decoding_never_raises(data: bytes) -> None:
     Beacon.decode(data)
     RefusalNotice.decode(data)

@@ -1,4 +1,4 @@
-"""Two machines, as network namespaces with a cable between them, which is pulled out; where the system allows it."""
+"""Two machines, as network namespaces with a cable between them that is pulled out; needs privileges."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ VEHICLE = """
 import asyncio, sys
 from aerokit.transport import create_link
 
-class Ears:
-    def bytes_received(self, data, peer): print("heard", len(data), flush=True)
+class Receiver:
+    def bytes_received(self, data, peer): print("received", len(data), flush=True)
     def link_lost(self, error): sys.exit(str(error))
 
 async def main():
     link = create_link("zenohin://north/alpha?listen=tcp/10.99.7.1:7447")
-    await link.open(Ears())
+    await link.open(Receiver())
     print("up", flush=True)
     while await asyncio.to_thread(sys.stdin.readline):
         print("late", link.late_datagrams, flush=True)
@@ -37,13 +37,13 @@ from aerokit.transport import create_link
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.messages import CommandLong
 
-class Ears:
+class Receiver:
     def bytes_received(self, data, peer): pass
     def link_lost(self, error): sys.exit(str(error))
 
 async def main():
     link, encoder = create_link("zenoh://north/alpha?connect=tcp/10.99.7.1:7447"), FrameEncoder(255, 190)
-    await link.open(Ears())
+    await link.open(Receiver())
     print("up", flush=True)
     while (line := await asyncio.to_thread(sys.stdin.readline)):
         until_dropped, dropped = line.startswith("until dropped"), link.dropped_writes
@@ -85,7 +85,7 @@ def machines() -> Iterator[tuple[str, str]]:
 
 
 class Program:
-    """One in a namespace, which answers lines with lines."""
+    """A process in a network namespace, which answers each line with a line."""
 
     def __init__(self, namespace: str, program: str) -> None:
         self.running = subprocess.Popen(
@@ -118,17 +118,17 @@ def test_unplugged_cable(machines: tuple[str, str]) -> None:
     one, two = machines
     with Program(one, VEHICLE) as vehicle, Program(two, CLIENT) as client:
         assert client.ask("until sent") == "done"
-        assert vehicle.line().startswith("heard")
+        assert vehicle.line().startswith("received")
         ip("-n", one, "link", "set", "cable", "down")
         assert client.ask("until dropped") == "done"  # for two seconds it is written into the void
         ip("-n", one, "link", "set", "cable", "up")
         assert client.ask("until sent") == "done"  # a beacon has come
-        heard = late = 0
-        while not (heard and late):  # TCP had kept them, and brings them
+        recorder = late = 0
+        while not (recorder and late):  # TCP had kept them, and brings them
             line = vehicle.ask("late?")
-            while line.startswith("heard"):
-                heard += 1
+            while line.startswith("received"):
+                recorder += 1
                 line = vehicle.line()
             late = int(line.split()[1])
             time.sleep(0.05)
-        assert heard <= 5
+        assert recorder <= 5

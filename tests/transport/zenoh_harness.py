@@ -1,4 +1,4 @@
-"""Both sides of a name on a zenoh network, with receivers that keep all."""
+"""Both sides of a name on a zenoh network, with receivers that record all data."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ async def serving(port: int, name: str = "alpha", how: str = "listen") -> AsyncI
     """A vehicle side that listens on a port, or connects to it."""
     link = create_link(f"zenohin://north/{name}?{how}=tcp/127.0.0.1:{port}")
     assert isinstance(link, ZenohListen)
-    heard = Recorder()
-    await link.open(heard)
+    recorder = Recorder()
+    await link.open(recorder)
     try:
-        yield link, heard
+        yield link, recorder
     finally:
         link.close()
         await link.wait_closed()

@@ -1,4 +1,4 @@
-"""Arguments of wrong types: our error with the argument's name, and not a byte goes out; for every public method."""
+"""Arguments of wrong types, for every public method: InvalidArgument names the argument, and nothing is sent."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ async def misuse_it(misuse: Misuse) -> BaseException | None:
 async def quiet_flight() -> AsyncIterator[Flight]:
     async with in_the_air() as flight:
         await flight.vehicle.wait_ready()
-        flight.wire.forget()
+        flight.wire.clear()
         yield flight
 
 
@@ -91,8 +91,8 @@ async def test_connection_unused_does_nothing(owner: str) -> None:
             error = await misuse_it(misuse)
             wrong.append(refusal_of(misuse, error))
         assert not (found := list(filter(None, wrong))), "\n".join(found)
-        heard = [message for _, message in flight.wire.sent if not isinstance(message, m.Heartbeat)]
-        assert heard == []
+        received = [message for _, message in flight.wire.sent if not isinstance(message, m.Heartbeat)]
+        assert received == []
         assert flight.copter.mode.number == mode
         assert flight.copter.is_armed
 

@@ -350,10 +350,10 @@ class _Sink(Generic[T]):
         raise NotImplementedError
 
     def forget(self) -> None:
-        """Handle that the value became unknown."""
+        """Called when the value became unknown."""
 
     def fail(self, error: BaseException) -> None:
-        """Handle that the cell was closed."""
+        """Called when the cell was closed."""
 
 
 class _Waiter(_Sink[T]):

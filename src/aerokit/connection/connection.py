@@ -409,47 +409,47 @@ class Connection:
             self.fail(error)
 
     def link_interrupted(self, error: LinkLost) -> None:
-        """Handle that the link was lost and is being reopened."""
+        """Called when the link was lost and is being reopened."""
         self._state_watch.mark_lost(self._clock())
         self.bus.publish(LinkInterrupted(self._clock(), 0, error))
 
     def link_restored(self, away_s: float) -> None:
-        """Handle that the link is open again."""
+        """Called when the link is open again after an interruption."""
         self._receiver.reset()
         self._state_watch.record_activity(self._clock())
         self.bus.publish(LinkRestored(self._clock(), 0, away_s))
 
     def link_stalled(self, unsent_bytes: int) -> None:
-        """Handle that written data does not leave."""
+        """Called when written data has stopped leaving this machine."""
         self.bus.publish(LinkStalled(self._clock(), 0, unsent_bytes))
 
     def link_drained(self, stalled_s: float) -> None:
-        """Handle that written data leaves again."""
+        """Called when written data leaves this machine again."""
         self.bus.publish(LinkDrained(self._clock(), 0, stalled_s))
 
     def member_link_changed(self, link: int, is_available: bool) -> None:
-        """Handle that one of several links was lost or is available again."""
+        """Called when one of several links was lost or is available again."""
         if self._multilink is not None:
             self._multilink.link_changed(link, is_available)
 
     def member_link_stalled(self, link: int, is_stalled: bool) -> None:
-        """Handle that data written to one of several links does not leave, or leaves again."""
+        """Called when data written to one of several links has stopped leaving, or leaves again."""
         if self._multilink is not None:
             self._multilink.link_stalled(link, is_stalled)
 
     def member_link_open_failed(self, link: int, error: LinkOpenError) -> None:
-        """Handle that one of several links could not be opened and will be retried."""
+        """Called when one of several links could not be opened and will be retried."""
         if self._multilink is not None:
             self._multilink.link_open_failed(link, error)
 
     def order_refused(self, message: str, reason: str, lease_holder: str | None, answers: tuple[bytes, ...]) -> None:
-        """Handle that the other end of a zenoh network refused one of our commands."""
+        """Called when the vehicle side of a zenoh network refused one of our commands."""
         self.bus.publish(OrderRefused(self._clock(), 0, message, reason, lease_holder))
         for answer in answers:  # not through a framer: its counters are for received frames only
             self.bus.deliver(Frame.parse(answer, self._clock()))
 
     def link_lost(self, error: LinkLost) -> None:
-        """Handle that the link was lost for good: all waiters get this error."""
+        """Called when the link is lost permanently; all waiting calls raise this error."""
         self._end(error)
 
     # ------------------------------------------------------------------------------- internal

@@ -64,7 +64,7 @@ class ExchangeRun(Generic[ResultT]):
             self._after_step()
 
     def link_chosen(self, system_id: int, event: LinkSelected) -> None:
-        """Handle that another of several links is used from now on."""
+        """Inform the exchange that the connection now uses another of several links."""
         if event.system_id == system_id and event.before is not None:
             self._exchange.link_changed(self._connection.now())
             self._after_step()

@@ -178,9 +178,9 @@ class Routes:
         return 0 < (route.sequence - frame.sequence) & 0xFF < 128
 
     def peers_of(self, system_id: int, component_id: int, message: Message | None = None) -> Collection[Peer]:
-        """Return the peers to which a message for this component goes; for component 0 or an unknown one, its system.
+        """Return the peers that receive a message for this component, or for its system if it is 0 or unknown.
 
-        Peers that send under the ids of another are left out: they would execute what is for all components.
+        Peers that send under the ids of another peer are excluded, because they would execute broadcasts.
         """
         if system_id == 0:
             return EVERY_PEER

@@ -1387,7 +1387,6 @@ class Parameters(TwinOf["AsyncParameters"]):
             idle_timeout_s: fail after this many seconds without progress.
             timeout: seconds in total.
             on_progress: called with the number of parameters, or bytes of the file, so far and in total.
-            on_progress: called with parameters, or bytes of the file, done and in total.
 
         Raises:
             ParameterTimeout: the list is incomplete; ``missing`` has the indices, ``table`` what has arrived.

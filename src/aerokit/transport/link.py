@@ -29,7 +29,7 @@ class Receiver(Protocol):
         """Process a datagram, or any part of a stream."""
 
     def link_lost(self, error: LinkLost) -> None:
-        """Handle that the link was lost. Called at most once, as the last callback."""
+        """Called when the link is lost, at most once and as the last callback."""
 
 
 @runtime_checkable
@@ -37,10 +37,10 @@ class DrainListener(Receiver, Protocol):
     """A receiver that is notified when written data does not leave."""
 
     def link_stalled(self, unsent_bytes: int) -> None:
-        """Handle that no waiting data has left for a second. Commands in it may arrive late or never."""
+        """Called when no waiting data has left for a second. Commands in it may arrive late or never."""
 
     def link_drained(self, stalled_s: float) -> None:
-        """Handle that data leaves again, after ``stalled_s`` seconds."""
+        """Called when data leaves again, after ``stalled_s`` seconds."""
 
 
 @runtime_checkable
@@ -48,7 +48,7 @@ class OrderRefusalListener(Receiver, Protocol):
     """A receiver that is notified when the other end of a zenoh network refuses a command (docs/network.md)."""
 
     def order_refused(self, message: str, reason: str, lease_holder: str | None, answers: tuple[bytes, ...]) -> None:
-        """Handle that a message with this name was not forwarded to the vehicle.
+        """Called when a message with this name was not forwarded to the vehicle.
 
         ``lease_holder`` is the client that has control, if that is the reason. ``answers`` are frames by which a
         vehicle would reject the command; some messages have none.
@@ -79,10 +79,10 @@ class PeerListener(Receiver, Protocol):
     """A receiver that is notified of connecting and disconnecting peers, i.e. the clients of a TCP server."""
 
     def peer_joined(self, peer: Peer) -> None:
-        """Handle that a peer has connected. It may never send anything."""
+        """Called when a peer has connected. It may never send anything."""
 
     def peer_left(self, peer: Peer) -> None:
-        """Handle that a peer has disconnected."""
+        """Called when a peer has disconnected."""
 
 
 def keeps_peers(receiver: Receiver) -> bool:

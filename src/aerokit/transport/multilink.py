@@ -33,13 +33,13 @@ class MemberLinkListener(Receiver, Protocol):
     """A receiver that is notified of the state of each link."""
 
     def member_link_changed(self, link: int, is_available: bool) -> None:
-        """Handle that a link was lost or is available again."""
+        """Called when a link was lost or is available again."""
 
     def member_link_stalled(self, link: int, is_stalled: bool) -> None:
-        """Handle that data written to a link does not leave, or leaves again."""
+        """Called when data written to a link has stopped leaving, or leaves again."""
 
     def member_link_open_failed(self, link: int, error: LinkOpenError) -> None:
-        """Handle that the first two attempts to open a link failed. It is retried. Called once per link."""
+        """Called when the first two attempts to open a link have failed. It is retried. Called once per link."""
 
 
 class MultiLink(Link):

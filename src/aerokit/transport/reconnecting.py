@@ -58,10 +58,10 @@ class InterruptionListener(Receiver, Protocol):
     """A receiver that is notified when its link is lost and restored."""
 
     def link_interrupted(self, error: LinkLost) -> None:
-        """Handle that the link was lost and is being reopened."""
+        """Called when the link was lost and is being reopened."""
 
     def link_restored(self, away_s: float) -> None:
-        """Handle that the link is open again after ``away_s`` seconds. A new byte stream starts."""
+        """Called when the link is open again after ``away_s`` seconds. A new byte stream starts."""
 
 
 class ReconnectingLink(Link):

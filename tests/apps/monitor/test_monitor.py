@@ -80,7 +80,7 @@ async def stage(count: int = 2, size: tuple[int, int] = (80, 24)) -> AsyncIterat
                 await anyio.sleep(6)
                 app.update_view()
                 await pilot.pause()
-                wire.forget()
+                wire.clear()
                 yield Stage(app, pilot, wire, copters)
             model.close()
             await commands.aclose()

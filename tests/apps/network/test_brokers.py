@@ -61,7 +61,7 @@ def waiting(publisher: Any) -> dict[str, bytes]:
 async def test_mqtt_states_match_schema(broker: Broker) -> None:
     by_name = {each["properties"]["state"]["const"]: each for each in SCHEMA["oneOf"]}
     async with (
-        broker.heard() as received,
+        broker.received() as received,
         simulated_link(SimulatedCopter()) as link,
         aerokit.connect(link) as vehicle,
         publishing(vehicle, address(broker.port), rate_hz=20),
@@ -84,7 +84,7 @@ async def test_mqtt_broker_restart_reconnects(broker: Broker, caplog: pytest.Log
 
     line = HoldingProxy(broker.port)
     async with line, publisher_for(address(line.port)) as publisher:
-        async with broker.heard() as received:
+        async with broker.received() as received:
             publisher.put("1/mode", b"first")
             await eventually(lambda: any(each[1] == b"first" for each in received))
         broker.kill()
@@ -94,7 +94,7 @@ async def test_mqtt_broker_restart_reconnects(broker: Broker, caplog: pytest.Log
             publisher.put(f"1/{number}", b"old")
         assert len(waiting(publisher)) == 0
         await broker.start()
-        async with broker.heard() as received:  # subscribes before any message passes
+        async with broker.received() as received:  # subscribes before any message passes
             again = HoldingProxy(broker.port)
             again.port = line.port
             async with again:
@@ -167,7 +167,7 @@ async def test_mqtt_password_is_never_shown(tmp_path: Path, caplog: pytest.LogCa
                 pass
         login = f"{USER}:{quote(PASSWORD, safe='')}@"
         async with (
-            broker.heard((USER, PASSWORD)) as received,
+            broker.received((USER, PASSWORD)) as received,
             publisher_for(address(port, login)) as publisher,
         ):
             publisher.put("1/mode", b"1")
@@ -213,10 +213,10 @@ async def test_mqtt_block_exit_and_cancellation_release_everything(broker: Broke
 
 async def test_mqtt_alive_topic_shows_presence(broker: Broker) -> None:
     alive = "aerokit/north/alpha/alive"
-    async with broker.heard() as received, HoldingProxy(broker.port) as line:
+    async with broker.received() as received, HoldingProxy(broker.port) as line:
         async with publisher_for(address(line.port)):
             await eventually(lambda: (alive, b"online", False) in received)
-            async with broker.heard() as later:  # a later subscriber gets the retained message
+            async with broker.received() as later:  # a later subscriber gets the retained message
                 await eventually(lambda: (alive, b"online", True) in later)
         await eventually(lambda: received[-1][:2] == (alive, b"offline"))
         async with publisher_for(address(line.port)):
@@ -228,7 +228,7 @@ async def test_mqtt_alive_topic_shows_presence(broker: Broker) -> None:
 async def test_bridge_mqtt_publishes_states(broker: Broker, capsys: pytest.CaptureFixture[str]) -> None:
     network = address(broker.port, f"{USER}:geheim@")
     options = make_parser("bridge").parse_args(["bridge", "mqtt", network, "--json", "--rate", "20"])
-    async with broker.heard() as received, simulated_link(SimulatedCopter()) as options.address:
+    async with broker.received() as received, simulated_link(SimulatedCopter()) as options.address:
         command = asyncio.get_running_loop().create_task(options.run(options))
         await eventually(lambda: topic("1/mode") in {each[0] for each in received})
         os.kill(os.getpid(), signal.SIGINT)

@@ -45,7 +45,7 @@ async def test_commands_fly_vehicle() -> None:
 @pytest.mark.parametrize("is_open", [False, True])
 async def test_command_without_token_is_refused(is_open: bool) -> None:
     async with open_stage(open_reading=is_open) as stage:
-        stage.flight.wire.forget()
+        stage.flight.wire.clear()
         wrong = [None, "Bearer ", f"Bearer {TOKEN}x", f"Basic {TOKEN}", "Bearer ä"]
         for authorization in wrong:
             headers = {b"Idempotency-Key": b"12345678"}
@@ -79,7 +79,7 @@ async def test_command_without_token_is_refused(is_open: bool) -> None:
 )
 async def test_invalid_arguments_send_nothing(order: str, body: object, text: str) -> None:
     async with open_stage() as stage:
-        stage.flight.wire.forget()
+        stage.flight.wire.clear()
         answer = await stage.submit(order, body)
         assert (answer.status_code, answer.json()["status"]) == (400, 400)
         assert text in answer.json()["detail"]
@@ -200,7 +200,7 @@ async def test_silent_vehicle_accepts_safe_commands_only() -> None:
     async with open_stage() as stage:
         stage.flight.copter.faults.silent = True
         await anyio.sleep(5)
-        stage.flight.wire.forget()
+        stage.flight.wire.clear()
         answer = await stage.submit("arm")
         assert (answer.status_code, answer.json()["error"]) == (503, "HeartbeatTimeout")
         assert stage.flight.wire.commands(MavCmd.COMPONENT_ARM_DISARM) == []
@@ -312,7 +312,7 @@ async def test_upload_with_repeated_key_is_sent_once() -> None:
         key = {"Idempotency_Key": "upload-1"}
         plan = plan_of(2)
         assert (await stage.submit("mission/upload", {"plan": plan}, **key)).status_code == 200
-        stage.flight.wire.forget()
+        stage.flight.wire.clear()
         again = await stage.submit("mission/upload", {"plan": plan}, **key)
         other = await stage.submit("mission/upload", {"plan": plan_of(3)}, **key)
         assert (again.status_code, again.json()["state"], other.status_code) == (200, "done", 409)
@@ -330,7 +330,7 @@ async def test_upload_with_repeated_key_is_sent_once() -> None:
 )
 async def test_invalid_plan_sends_nothing(plan: object, text: str) -> None:
     async with open_stage() as stage:
-        stage.flight.wire.forget()
+        stage.flight.wire.clear()
         answer = await stage.submit("mission/upload", {"name": "x.plan", "plan": plan})
         assert answer.status_code == 400
         assert text in answer.json()["detail"]

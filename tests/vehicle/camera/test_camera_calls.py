@@ -160,7 +160,7 @@ async def test_cells_are_polled_while_in_use() -> None:
         await anyio.sleep(30.0)
         asked = len(commands)
         assert 5 <= asked <= 12
-        assert {each[1] for each in commands} == {m.CameraCaptureStatus.ID}
+        assert {command[1] for command in commands} == {m.CameraCaptureStatus.ID}
         await anyio.sleep(20.0)
         assert len(commands) == asked
         await vehicle.camera.storage.wait_until(bool, timeout=5)
@@ -362,7 +362,7 @@ async def test_track_point_reports_until_lost() -> None:
         await anyio.sleep(1.0)
         updated_at = one.tracking.updated_at
         await anyio.sleep(3.0)
-        assert one.tracking.updated_at == updated_at, "nothing is asked for any more"
+        assert one.tracking.updated_at == updated_at, "no more requests"
 
 
 async def test_tracked_position_on_earth_is_reported() -> None:
@@ -403,7 +403,7 @@ async def test_streams_are_listed_and_selected() -> None:
     camera = SimulatedCamera(streams=URIS, thermal_celsius=(-5.0, 80.0))
     async with on_board(camera) as vehicle:
         streams = await vehicle.camera.load_streams()
-        assert [(each.number, each.count, each.uri) for each in streams] == [
+        assert [(stream.number, stream.count, stream.uri) for stream in streams] == [
             (number, 3, uri) for number, uri in enumerate(URIS, start=1)
         ]
         first, _, warm = streams
@@ -413,7 +413,7 @@ async def test_streams_are_listed_and_selected() -> None:
         await vehicle.camera.select_stream(2)
         assert camera.running_streams == {2}
         reported = await vehicle.camera.streams.wait_until(
-            lambda reported: [each.is_running for each in reported] == [False, True, False], timeout=7
+            lambda reported: [event.is_running for event in reported] == [False, True, False], timeout=7
         )
         assert len(reported) == 3
         await vehicle.camera.stop_streaming()
@@ -482,14 +482,14 @@ async def test_legacy_camera_gets_legacy_requests() -> None:
         assert (await vehicle.camera.status.wait_until(lambda _: True, timeout=5)).image_count == 2
         commands = commands_to(camera, REQUEST)
         await vehicle.camera.load_storage()
-        assert commands == [], "what it does not know is not tried again"
+        assert commands == [], "unknown messages are not requested again"
 
 
 async def test_set_mode_without_settings_message_trusts_the_ack() -> None:
     camera = SimulatedCamera()
     builders = camera.builders
     camera.builders = lambda: {  # type: ignore[method-assign]
-        message_id: each for message_id, each in builders().items() if message_id != m.CameraSettings.ID
+        message_id: builder for message_id, builder in builders().items() if message_id != m.CameraSettings.ID
     }
     async with on_board(camera) as vehicle:
         camera.faults.lose(m.CameraSettings, times=100)

@@ -72,8 +72,8 @@ async def test_captures_after_log_reset_are_new() -> None:
         await anyio.sleep(100)
         for _ in range(2):
             await vehicle.camera.take_photo()
-        assert [each.index for each in reported] == [0, 1, 2, 0, 1]
-        assert [each.index for each in vehicle.camera.captures()] == [0, 1]
+        assert [event.index for event in reported] == [0, 1, 2, 0, 1]
+        assert [capture.index for capture in vehicle.camera.captures()] == [0, 1]
         camera.faults.lose(m.CameraImageCaptured, times=1)
         third = await vehicle.camera.take_photo()
         assert third.index == 2
@@ -96,9 +96,9 @@ async def test_log_reset_with_first_capture_lost() -> None:
 async def test_repeated_capture_is_not_new() -> None:
     async with capture_flight() as (flight, reported):
         camera = flight.vehicle.camera_at(100)
-        for each in (image(0, boot_ms=1000), image(1, boot_ms=2000), image(0, boot_ms=1000)):
-            inject(flight, each, 100)
-        assert [each.index for each in reported] == [0, 1]
+        for report in (image(0, boot_ms=1000), image(1, boot_ms=2000), image(0, boot_ms=1000)):
+            inject(flight, report, 100)
+        assert [event.index for event in reported] == [0, 1]
         assert camera.capture.value.index == 1
         inject(flight, status(2, boot_ms=3000), 100)
         inject(flight, status(1, boot_ms=1500), 100)  # arrived out of order
@@ -114,8 +114,8 @@ async def test_log_reset_is_detected_by_time(later: dict[str, Any]) -> None:
         camera = flight.vehicle.camera_at(100)
         inject(flight, image(5, **before), 100)
         inject(flight, image(2, **later), 100)
-        assert [each.index for each in camera.captures()] == [2]
-        assert [each.index for each in reported] == [5, 2]
+        assert [capture.index for capture in camera.captures()] == [2]
+        assert [event.index for event in reported] == [5, 2]
 
 
 async def test_single_corrupt_index_does_not_reset_the_log() -> None:
@@ -124,11 +124,11 @@ async def test_single_corrupt_index_does_not_reset_the_log() -> None:
         for index in (0, 1, 2_000_000_000, 2, 3):
             await anyio.sleep(1)
             inject(flight, image(index, boot_ms=round(anyio.current_time() * 1000)), 100)
-        assert [each.index for each in camera.captures()] == [0, 1, 2, 3, 2_000_000_000]
+        assert [capture.index for capture in camera.captures()] == [0, 1, 2, 3, 2_000_000_000]
         for index in (5000, 5001, 4):  # captures are missed before the count restarts
             await anyio.sleep(1)
             inject(flight, image(index, boot_ms=round(anyio.current_time() * 1000)), 100)
-        assert [each.index for each in camera.captures()] == [4]
+        assert [capture.index for capture in camera.captures()] == [4]
 
 
 async def test_camera_feedback_index_wraps_at_16_bits() -> None:
@@ -136,8 +136,8 @@ async def test_camera_feedback_index_wraps_at_16_bits() -> None:
         camera = flight.vehicle.camera_at(1)
         for index in (0, 65534, 65535, 0, 1, 2):  # ArduPilot sends zeros before the first picture
             inject(flight, feedback(index))
-        assert [each.index for each in reported] == [65533, 65534, 65535, 0, 1]
-        assert [each.index for each in camera.captures()] == [0, 1]
+        assert [event.index for event in reported] == [65533, 65534, 65535, 0, 1]
+        assert [capture.index for capture in camera.captures()] == [0, 1]
 
 
 # --------------------------------------------------------------------------------- invalid numbers
@@ -207,7 +207,7 @@ async def test_px4_trigger_and_image_messages_are_one_capture() -> None:
         await anyio.sleep(0.5)
         inject(flight, image(5))
         await anyio.sleep(0.5)
-        assert [each.index for each in reported] == [5]
+        assert [event.index for event in reported] == [5]
         (capture,) = camera.captures()
         assert capture.success is True  # the message with the result wins
         assert camera.capture.value == capture
@@ -278,8 +278,8 @@ async def test_temporary_refusal_is_polled_again() -> None:
         await vehicle.camera.status.wait_until(lambda _: True, timeout=20)
 
 
-@pytest.mark.parametrize("who", ["camera", "vehicle"])
-async def test_refusal_is_forgotten_after_reboot(who: str) -> None:
+@pytest.mark.parametrize("rebooted", ["camera", "vehicle"])
+async def test_refusal_is_forgotten_after_reboot(rebooted: str) -> None:
     camera = SimulatedCamera()
     async with on_board(camera) as vehicle:
         await vehicle.camera.wait_found()
@@ -287,7 +287,7 @@ async def test_refusal_is_forgotten_after_reboot(who: str) -> None:
         camera.faults.refuse(MavCmd.REQUEST_CAMERA_CAPTURE_STATUS, MavResult.UNSUPPORTED, times=1)
         with pytest.raises(OperationTimeout):
             await vehicle.camera.status.wait_until(lambda _: True, timeout=20)
-        if who == "camera":
+        if rebooted == "camera":
             camera.faults.silent = True
             await anyio.sleep(30)
             camera.faults.silent = False
@@ -351,14 +351,14 @@ async def test_load_captures_is_bounded_for_huge_counts() -> None:
         began = anyio.current_time()
         assert await vehicle.camera.load_captures(timeout=5.0) == []  # stops after three missing captures
         assert anyio.current_time() - began < 6
-        assert {each[2] for each in commands} <= {0, *range(1_999_980_000, 2_000_000_000)}
+        assert {command[2] for command in commands} <= {0, *range(1_999_980_000, 2_000_000_000)}
 
 
 # --------------------------------------------------------------------------------------- command line
 
 
 def names(directory: Path) -> list[str]:
-    return sorted(each.name for each in directory.iterdir())
+    return sorted(path.name for path in directory.iterdir())
 
 
 async def test_definition_does_not_overwrite_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -368,8 +368,8 @@ async def test_definition_does_not_overwrite_files(tmp_path: Path, capsys: pytes
         camera.files.put("/DCIM/101/IMG_0001.JPG", b"another")
         other = capture.replace(file_url="mftp:///DCIM/101/IMG_0001.JPG")
         options = Namespace(to=tmp_path, json=False)
-        for each in (capture, other, other.replace(index=1)):
-            assert await _show(options, vehicle.camera, each)
+        for photo in (capture, other, other.replace(index=1)):
+            assert await _show(options, vehicle.camera, photo)
         assert names(tmp_path) == [
             "00000-IMG_0001-2.JPG",
             "00000-IMG_0001.JPG",

@@ -58,21 +58,21 @@ async def test_corrupt_index_does_not_block_the_event_loop(when: int) -> None:
         camera = flight.vehicle.camera_at(1)
         given: list[int] = []
 
-        def lie() -> None:
+        def send_false_position() -> None:
             flight.wire.deliver(FrameEncoder(1, 1).encode(picture(FAR)))
 
         with anyio.fail_after(60):
             async with camera.photo_interval(1.0) as captures:
                 if when == 0:
-                    lie()
+                    send_false_position()
                 async for capture in captures:
                     given.append(capture.index)
                     if len(given) == when:
-                        lie()
+                        send_false_position()
                     if len(given) == 6:
                         break
         assert captures.missed == 0
-        true = [each for each in given if each != FAR]
+        true = [order for order in given if order != FAR]
         assert len(true) >= 5
         assert true == list(range(true[0], true[0] + len(true)))
 
@@ -128,7 +128,7 @@ async def test_lost_video_start_does_not_undo_later_stop() -> None:
             await anyio.sleep(0.5)
             await vehicle.camera.stop_video()
         await anyio.sleep(5)
-        assert [each[0] for each in commands] == [START_VIDEO, STOP_VIDEO]
+        assert [command[0] for command in commands] == [START_VIDEO, STOP_VIDEO]
 
 
 async def test_series_end_does_not_stop_the_next_series() -> None:
@@ -141,8 +141,8 @@ async def test_series_end_does_not_stop_the_next_series() -> None:
                 raise KeyError
         commands = commands_to(camera, START, STOP)
         async with vehicle.camera.photo_interval(1.0, count=8) as captures:
-            assert len([each async for each in captures]) == 8
-        assert [each[0] for each in commands] == [STOP, START]
+            assert len([capture async for capture in captures]) == 8
+        assert [command[0] for command in commands] == [STOP, START]
 
 
 async def test_video_block_end_does_not_stop_newer_recording() -> None:
@@ -179,7 +179,7 @@ async def test_older_zoom_and_its_stop_are_not_resent() -> None:
             async with vehicle.camera.zooming():
                 await vehicle.camera.zoom_to(70)
         await anyio.sleep(5)
-        reported: list[Any] = [each[1:3] for each in commands]
+        reported: list[Any] = [command[1:3] for command in commands]
         assert reported[0] == (2, 10)
         assert reported[-1] == (2, 70)
         assert reported.count((2, 10)) == 1
@@ -232,7 +232,7 @@ async def test_vehicle_block_end_stops_camera_operations(kind: str) -> None:
             await anyio.sleep(3)
             commands = commands_to(camera, stops[kind])
         await anyio.sleep(1)
-        assert [each[0] for each in commands] == [stops[kind]]
+        assert [command[0] for command in commands] == [stops[kind]]
         assert 0 in commands[0][2:3] or kind in ("photo_interval", "video")
         taken = camera.image_count
         await anyio.sleep(30)
@@ -244,7 +244,7 @@ async def test_finished_block_leaves_no_finish_callback() -> None:
     camera = SimulatedCamera()
     async with on_board(camera) as vehicle:
         async with vehicle.camera.photo_interval(1.0, count=2) as captures:
-            assert len([each async for each in captures]) == 2
+            assert len([capture async for capture in captures]) == 2
         async with vehicle.camera.zooming():
             pass
         assert vehicle.camera._link.on_finish == []
@@ -295,7 +295,7 @@ async def test_unacknowledged_operation_is_stopped() -> None:
             async with vehicle.camera.zooming():
                 pass
         await anyio.sleep(5)
-        assert [each[1:3] for each in commands] == [(1, 1), (1, 0)]
+        assert [command[1:3] for command in commands] == [(1, 1), (1, 0)]
 
 
 # ------------------------------------------------------------------------------------ silent cameras
@@ -309,8 +309,8 @@ async def test_order_is_not_resent_to_silent_camera() -> None:
         await flight.vehicle.camera.wait_found()
 
         def sent() -> int:
-            orders = [each for _, each in flight.wire.sent if isinstance(each, m.CommandLong)]
-            return len([each for each in orders if each.command == ZOOM])
+            orders = [message for _, message in flight.wire.sent if isinstance(message, m.CommandLong)]
+            return len([order for order in orders if order.command == ZOOM])
 
         camera.faults.silent = True
         await anyio.sleep(10)

@@ -106,7 +106,7 @@ async def test_lost_photo_order_is_resent_on_evidence(lost: int) -> None:
         capture = await vehicle.camera.take_photo()
         assert (capture.index, camera.image_count) == (0, 1)
         assert len(commands) == lost + 1
-        assert len({each[4] for each in commands}) == 1, "the number of the order stays"
+        assert len({command[4] for command in commands}) == 1, "the sequence number of the order is kept"
 
 
 async def test_photo_order_with_lost_ack_is_not_resent() -> None:
@@ -183,11 +183,11 @@ async def test_series_yields_captures_in_order_and_ends() -> None:
         await vehicle.camera.wait_found()
         commands = commands_to(camera, START, STOP)
         async with vehicle.camera.photo_interval(1.0, count=4) as captures:
-            found = [each.index async for each in captures]
+            found = [capture.index async for capture in captures]
         assert found == [0, 1, 2, 3]
         assert captures.missed == 0
         assert commands == [(START, 0.0, 1.0, 4.0, 0.0)]
-        assert [each.index for each in vehicle.camera.captures()] == found
+        assert [capture.index for capture in vehicle.camera.captures()] == found
 
 
 async def test_series_requests_missing_captures() -> None:
@@ -196,9 +196,9 @@ async def test_series_requests_missing_captures() -> None:
         await vehicle.camera.wait_found()
         async with vehicle.camera.photo_interval(1.0, count=8) as captures:
             found = []
-            async for each in captures:
-                found.append(each.index)
-                if each.index in (1, 5):
+            async for capture in captures:
+                found.append(capture.index)
+                if capture.index in (1, 5):
                     camera.faults.lose(m.CameraImageCaptured, times=2)
         assert found == list(range(8))
         assert captures.missed == 0
@@ -208,8 +208,8 @@ async def test_series_block_end_stops_the_series() -> None:
     camera = SimulatedCamera()
     async with on_board(camera) as vehicle:
         async with vehicle.camera.photo_interval(0.5) as captures:
-            async for each in captures:
-                if each.index == 2:
+            async for capture in captures:
+                if capture.index == 2:
                     break
         taken = camera.image_count
         await anyio.sleep(3.0)
@@ -247,8 +247,8 @@ async def test_series_ended_by_camera_is_rejected() -> None:
         found = []
         with pytest.raises(OperationRejected, match="ended the series after 3 pictures"):
             async with vehicle.camera.photo_interval(0.5, count=6) as captures:
-                async for each in captures:
-                    found.append(each.success)
+                async for capture in captures:
+                    found.append(capture.success)
         assert found == [True, True, False]
 
 
@@ -257,8 +257,8 @@ async def test_silent_camera_ends_the_series_wait() -> None:
     async with on_board(camera) as vehicle:
         with pytest.raises(OperationTimeout, match="takes pictures, but reports no more of them"):
             async with vehicle.camera.photo_interval(0.5) as captures:
-                async for each in captures:
-                    camera.faults.silent = each.index == 2
+                async for capture in captures:
+                    camera.faults.silent = capture.index == 2
 
 
 async def test_lost_series_order_is_resent() -> None:
@@ -267,11 +267,11 @@ async def test_lost_series_order_is_resent() -> None:
         await vehicle.camera.wait_found()
         camera.faults.ignore(START, times=1)
         async with vehicle.camera.photo_interval(1.0, count=2) as captures:
-            assert [each.index async for each in captures] == [0, 1]
+            assert [capture.index async for capture in captures] == [0, 1]
         camera.faults.lose_ack(START)
         commands = commands_to(camera, START)
         async with vehicle.camera.photo_interval(2.0, count=2) as captures:
-            assert [each.index async for each in captures] == [2, 3]
+            assert [capture.index async for capture in captures] == [2, 3]
         assert len(commands) == 1
 
 
@@ -283,7 +283,7 @@ async def test_load_captures_requests_earlier_pictures() -> None:
             camera.faults.lose(m.CameraImageCaptured, times=1)
             await anyio.sleep(1.0)
         assert vehicle.camera.captures() == []
-        assert [each.index for each in await vehicle.camera.load_captures()] == [0, 1, 2]
+        assert [capture.index for capture in await vehicle.camera.load_captures()] == [0, 1, 2]
 
 
 # ---------------------------------------------------------------------- cameras attached to the autopilot
@@ -303,7 +303,7 @@ async def test_ardupilot_camera_reports_by_camera_feedback() -> None:
         copter.faults.lose(m.CameraFeedback, times=1)
         assert (await vehicle.camera.take_photo()).index == 1
         async with vehicle.camera.photo_interval(1.0, count=3) as captures:
-            assert [each.index async for each in captures] == [2, 3, 4]
+            assert [capture.index async for capture in captures] == [2, 3, 4]
         async with vehicle.camera.photo_interval(0.5):
             await anyio.sleep(2.0)
         taken = copter.camera.image_count
@@ -317,9 +317,9 @@ async def test_ardupilot_missed_captures_are_counted() -> None:
     async with on_board(vehicle=copter) as vehicle:
         async with vehicle.camera.photo_interval(1.0, count=6) as captures:
             found = []
-            async for each in captures:
-                found.append(each.index)
-                if each.index == 1:
+            async for capture in captures:
+                found.append(capture.index)
+                if capture.index == 1:
                     copter.faults.lose(m.CameraFeedback, times=2)
         assert captures.missed == 6 - len(found) > 0
         assert found == sorted(found)
@@ -334,9 +334,9 @@ async def test_px4_trigger_takes_photos() -> None:
         capture = await vehicle.camera.take_photo()
         assert (capture.camera, capture.index, capture.success) == (1, 0, True)
         assert capture.place is not None
-        assert [each[0] for each in commands] == [MavCmd.DO_DIGICAM_CONTROL]
+        assert [command[0] for command in commands] == [MavCmd.DO_DIGICAM_CONTROL]
         async with vehicle.camera.photo_interval(1.0, count=3) as captures:
-            found = [each.index async for each in captures]
+            found = [capture.index async for capture in captures]
         assert found == [capture.index + 1, capture.index + 2, capture.index + 3]
         with pytest.raises(NotSupported, match="is a trigger output, which only takes pictures; nothing was sent"):
             await vehicle.camera.zoom_to(10)
@@ -373,14 +373,14 @@ async def test_captures_are_published_without_using_a_camera() -> None:
     camera, other = SimulatedCamera(), SimulatedCamera(101)
     async with on_board(camera, other) as vehicle:
         with vehicle.subscribe(ImageCaptured, capacity=20) as events:
-            for each in (camera, other, camera):
-                each.captures.take()
+            for source in (camera, other, camera):
+                source.captures.take()
                 await anyio.sleep(1.0)
             reported = []
             while (event := events.get_nowait()) is not None:
                 reported.append((event.camera, event.index, event.component_id))
         assert reported == [(100, 0, 100), (101, 0, 101), (100, 1, 100)]
-        assert [each.index for each in vehicle.camera_at(101).captures()] == [0]
+        assert [capture.index for capture in vehicle.camera_at(101).captures()] == [0]
 
 
 async def test_autopilot_camera_captures_are_published_once() -> None:
@@ -432,6 +432,6 @@ async def test_bad_radio_neither_repeats_nor_misses_photos(seed: int) -> None:
             assert (capture.index, camera.image_count) == (number, number + 1)
             await anyio.sleep(0.5)
         async with vehicle.camera.photo_interval(1.0, count=12) as captures:
-            assert [each.index async for each in captures] == list(range(8, 20))
+            assert [capture.index async for capture in captures] == list(range(8, 20))
             assert captures.missed == 0
         assert camera.image_count == 20

@@ -47,7 +47,7 @@ def test_geotag_writes_position_time_and_direction() -> None:
     assert (gps[5], float(gps[6])) == (b"\0", 634.25)
     assert (gps[16], float(gps[17])) == ("T", 271.25)
     assert gps[29] == "2026:09:21"
-    assert [float(each) for each in gps[7]] == pytest.approx([14.0, 13.0, 20.75])
+    assert [float(number) for number in gps[7]] == pytest.approx([14.0, 13.0, 20.75])
     assert more[0x9003] == "2026:09:21 14:13:20"
     assert more[0x9011] == "+00:00"
     assert float(more[0x9405]) == -90.0
@@ -121,7 +121,7 @@ def test_geotag_file_is_written_atomically(tmp_path: Path) -> None:
     assert picture.read_bytes() == copy.read_bytes() == geotagged(GREY_JPEG, CAPTURE)
     with pytest.raises(FileNotFoundError):
         geotag_file(tmp_path / "none.jpg", CAPTURE)
-    assert sorted(each.name for each in tmp_path.iterdir()) == ["a.jpg", "b.jpg"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.jpg", "b.jpg"]
 
 
 def test_captures_csv_lists_captures(tmp_path: Path) -> None:

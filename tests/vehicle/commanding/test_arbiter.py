@@ -28,7 +28,7 @@ COPTER = autopilot_for(Heartbeat(2, 3, 81, 0, 4, 3))
 
 
 class Stage:
-    """An arbiter, and heartbeats at the test's word."""
+    """An arbiter, and heartbeats on demand."""
 
     def __init__(self, mode: Mode | None = LOITER, armed: bool | None = True) -> None:
         self.now, self.open = 0.0, ExitStack()
@@ -40,9 +40,9 @@ class Stage:
         )
         self.arbiter = CommandArbiter(lambda: self.now, cast("Telemetry", cells))
         if mode is not None and armed is not None:
-            self.tell(mode, armed)
+            self.report(mode, armed)
 
-    def tell(self, mode: Mode, armed: bool = True, *, after: float = 1.0, state: int = MavState.ACTIVE) -> None:
+    def report(self, mode: Mode, armed: bool = True, *, after: float = 1.0, state: int = MavState.ACTIVE) -> None:
         self.now += after
         self.mode.set(mode, HEARTBEAT)
         self.state.set(state, HEARTBEAT)
@@ -77,44 +77,46 @@ def test_auxiliary_order_ignores_reports_after_block() -> None:
     stage = Stage()
     with stage.arbiter.auxiliary_order() as aside:
         assert aside.modes == ()
-        stage.tell(LOITER)
-    stage.tell(RTL)
+        stage.report(LOITER)
+    stage.report(RTL)
     assert aside.end == ""
     with pytest.raises(KeyError), stage.arbiter.auxiliary_order() as aside:
         raise KeyError
-    stage.tell(BRAKE)
+    stage.report(BRAKE)
     assert aside.end == ""
 
 
-# ------------------------------------------------------------------------------ somebody else
+# ---------------------------------------------------------------------------------- takeovers
 
 
-@pytest.mark.parametrize("told", [[LOITER], [GUIDED], [LOITER, LOITER, GUIDED, GUIDED]])
-def test_mode_before_and_own_modes_are_no_takeover(told: list[Mode]) -> None:
+@pytest.mark.parametrize("modes", [[LOITER], [GUIDED], [LOITER, LOITER, GUIDED, GUIDED]])
+def test_mode_before_and_own_modes_are_no_takeover(modes: list[Mode]) -> None:
     stage = Stage()
     order = stage.arbiter.order(GUIDED)
-    for mode in told:
-        stage.tell(mode)
+    for mode in modes:
+        stage.report(mode)
     assert order.end == ""
 
 
-@pytest.mark.parametrize("told", [[RTL], [GUIDED, LOITER], [GUIDED, RTL, GUIDED], [LOITER, RTL, LOITER]])
-def test_other_mode_ends_order_permanently(told: list[Mode]) -> None:
-    """The mode before, too, once the vehicle was in the one that was ordered."""
+@pytest.mark.parametrize("modes", [[RTL], [GUIDED, LOITER], [GUIDED, RTL, GUIDED], [LOITER, RTL, LOITER]])
+def test_other_mode_ends_order_permanently(modes: list[Mode]) -> None:
+    """The previous mode also ends the order, once the ordered mode was reported."""
     stage = Stage()
     order = stage.arbiter.order(GUIDED)
-    for mode in told:
-        stage.tell(mode)
+    for mode in modes:
+        stage.report(mode)
     assert (
-        order.end == order.takeover_reason == f"the mode changed to {next(m for m in told[1:] or told if m != GUIDED)}"
+        order.end
+        == order.takeover_reason
+        == f"the mode changed to {next(m for m in modes[1:] or modes if m != GUIDED)}"
     )
 
 
 def test_first_takeover_is_reported() -> None:
     stage = Stage()
     order = stage.arbiter.order(GUIDED)
-    stage.tell(RTL)
-    stage.tell(BRAKE, armed=False)
+    stage.report(RTL)
+    stage.report(BRAKE, armed=False)
     stage.arbiter.on_reboot()
     assert order.end == "the mode changed to RTL"
 
@@ -122,10 +124,10 @@ def test_first_takeover_is_reported() -> None:
 def test_disarming_or_reboot_ends_order() -> None:
     stage = Stage()
     order = stage.arbiter.order(GUIDED)
-    stage.tell(LOITER, armed=False)
+    stage.report(LOITER, armed=False)
     assert order.end == "the vehicle disarmed"
     order = stage.arbiter.order(GUIDED)
-    stage.tell(LOITER, armed=False)
+    stage.report(LOITER, armed=False)
     assert order.end == ""  # it was so before
     stage.arbiter.on_reboot()
     assert order.end == "the vehicle rebooted"
@@ -134,18 +136,18 @@ def test_disarming_or_reboot_ends_order() -> None:
 def test_disarming_counts_only_after_arming() -> None:
     stage = Stage(armed=False)
     order = stage.arbiter.order(GUIDED)
-    stage.tell(LOITER, armed=True)
+    stage.report(LOITER, armed=True)
     assert order.end == ""
-    stage.tell(LOITER, armed=False)
+    stage.report(LOITER, armed=False)
     assert order.end == "the vehicle disarmed"
 
 
 def test_first_reported_mode_becomes_mode_before() -> None:
     stage = Stage(mode=None)
     order = stage.arbiter.order(GUIDED)
-    stage.tell(RTL)
+    stage.report(RTL)
     assert order.end == ""
-    stage.tell(BRAKE)
+    stage.report(BRAKE)
     assert order.end == "the mode changed to BRAKE"
 
 
@@ -155,12 +157,12 @@ def test_first_reported_mode_becomes_mode_before() -> None:
 def test_previous_orders_mode_while_active_is_no_takeover() -> None:
     stage = Stage()
     stage.arbiter.order(GUIDED)
-    stage.tell(GUIDED)
+    stage.report(GUIDED)
     order = stage.arbiter.order(BRAKE)
-    stage.tell(GUIDED)
+    stage.report(GUIDED)
     assert order.end == ""
-    stage.tell(BRAKE)
-    stage.tell(GUIDED)
+    stage.report(BRAKE)
+    stage.report(GUIDED)
     assert order.end == "the mode changed to GUIDED"
 
 
@@ -170,7 +172,7 @@ def test_unreported_ordered_mode_in_doubt_is_no_takeover(in_doubt: bool, end: st
     stage.arbiter.order(GUIDED)
     stage.arbiter.mode_is_in_doubt = in_doubt
     order = stage.arbiter.order(BRAKE)
-    stage.tell(GUIDED)
+    stage.report(GUIDED)
     assert order.end == end
 
 
@@ -182,7 +184,7 @@ def test_abandoned_mode_within_three_seconds_is_no_takeover(after_s: float, end:
     stage.arbiter.mode_is_in_doubt = False
     stage.now += after_s
     order = stage.arbiter.order(BRAKE)
-    stage.tell(GUIDED)
+    stage.report(GUIDED)
     assert order.end == end
 
 
@@ -192,16 +194,16 @@ def test_raw_order_accepts_any_mode_for_three_seconds(after_s: float, end: str) 
     own = stage.arbiter.raw_order()
     order = stage.arbiter.order(GUIDED)
     assert own.end == "another order was given"
-    stage.tell(RTL, after=after_s)
+    stage.report(RTL, after=after_s)
     assert order.end == end
 
 
 def test_raw_order_named_mode_is_no_takeover() -> None:
     stage = Stage()
     own = stage.arbiter.raw_order(modes=[GUIDED])
-    stage.tell(GUIDED)
+    stage.report(GUIDED)
     assert (own.end, stage.arbiter.may_be_executing) == ("", True)
-    stage.tell(RTL)  # within three seconds: nothing is sent again after a pilot's mode
+    stage.report(RTL)  # within three seconds: nothing is sent again after a pilot's mode
     assert (own.end, stage.arbiter.may_be_executing) == ("the mode changed to RTL", False)
 
 
@@ -209,7 +211,7 @@ def test_raw_order_ends_with_any_mode_change() -> None:
     stage = Stage()
     own = stage.arbiter.raw_order()
     with stage.arbiter.sending(own) as sending:
-        stage.tell(RTL, after=0.5)
+        stage.report(RTL, after=0.5)
         assert sending.end == "the mode changed to RTL"
 
 
@@ -222,12 +224,12 @@ def test_raw_order_ends_with_any_mode_change() -> None:
     ],
 )
 def test_mode_is_in_doubt_until_result_is_known(error: Exception | None, in_doubt: bool, settles_at: float) -> None:
-    helm, seen = Stage().arbiter, list[bool]()
+    helm, observed = Stage().arbiter, list[bool]()
     with nullcontext() if error is None else pytest.raises(type(error)), helm.changing_mode():
-        seen.append(helm.mode_is_in_doubt)
+        observed.append(helm.mode_is_in_doubt)
         if error is not None:
             raise error
-    assert [*seen, helm.mode_is_in_doubt] == [True, in_doubt]
+    assert [*observed, helm.mode_is_in_doubt] == [True, in_doubt]
     assert helm.mode_settles_at == settles_at
 
 
@@ -257,64 +259,64 @@ def sending(stage: Stage, **options: Any) -> SentCommand:
 
 def test_sent_command_mode_reported_ends_permanently() -> None:
     stage = Stage()
-    each = sending(stage, modes=(GUIDED,))
-    stage.tell(LOITER)
-    assert (each.end, each.is_confirmed) == ("", False)
-    stage.tell(GUIDED)
-    assert (each.end, each.is_confirmed) == ("its effect was reported", True)
-    stage.tell(RTL)
-    assert each.end == "its effect was reported"
+    attempt = sending(stage, modes=(GUIDED,))
+    stage.report(LOITER)
+    assert (attempt.end, attempt.is_confirmed) == ("", False)
+    stage.report(GUIDED)
+    assert (attempt.end, attempt.is_confirmed) == ("its effect was reported", True)
+    stage.report(RTL)
+    assert attempt.end == "its effect was reported"
 
 
 def test_sent_command_armed_as_ordered_ends() -> None:
     for armed in (True, False):
         stage = Stage(armed=not armed)
-        each = sending(stage, armed=armed)
-        stage.tell(LOITER, armed=not armed)
-        assert each.end == ""
-        stage.tell(LOITER, armed=armed)
-        assert each.is_confirmed
+        attempt = sending(stage, armed=armed)
+        stage.report(LOITER, armed=not armed)
+        assert attempt.end == ""
+        stage.report(LOITER, armed=armed)
+        assert attempt.is_confirmed
 
 
 def test_unchanged_state_is_no_effect() -> None:
     stage = Stage(GUIDED)
-    each = sending(stage, modes=(GUIDED, LOITER), armed=True)
-    stage.tell(GUIDED)
-    assert not each.is_confirmed
-    stage.tell(LOITER)
-    assert each.is_confirmed
+    attempt = sending(stage, modes=(GUIDED, LOITER), armed=True)
+    stage.report(GUIDED)
+    assert not attempt.is_confirmed
+    stage.report(LOITER)
+    assert attempt.is_confirmed
 
 
 def test_sent_command_ends_with_order_or_effect() -> None:
     stage, done = Stage(), list[int]()
-    each = sending(stage, is_done=lambda: bool(done))
-    stage.tell(RTL)
-    assert each.end == "the mode changed to RTL"
+    attempt = sending(stage, is_done=lambda: bool(done))
+    stage.report(RTL)
+    assert attempt.end == "the mode changed to RTL"
     done.append(1)
-    assert each.end == "its effect was reported"
+    assert attempt.end == "its effect was reported"
     done.clear()
-    assert each.end == "its effect was reported"
+    assert attempt.end == "its effect was reported"
 
 
 def test_sent_command_records_heartbeats_within_its_block() -> None:
     stage = Stage()
-    with stage.arbiter.sending(stage.arbiter.order(GUIDED)) as each:
-        assert each.heartbeat_at == -math.inf
-        stage.tell(LOITER)
-        assert each.heartbeat_at == 2.0
-    stage.tell(LOITER)
-    assert each.heartbeat_at == 2.0
+    with stage.arbiter.sending(stage.arbiter.order(GUIDED)) as attempt:
+        assert attempt.heartbeat_at == -math.inf
+        stage.report(LOITER)
+        assert attempt.heartbeat_at == 2.0
+    stage.report(LOITER)
+    assert attempt.heartbeat_at == 2.0
 
 
 def test_commands_are_classified_as_orders_or_questions() -> None:
-    assert {MavCmd(each).name for each in CHANGED_BY_COMMAND} == {
+    assert {MavCmd(number).name for number in CHANGED_BY_COMMAND} == {
         *("NAV_WAYPOINT", "NAV_LOITER_UNLIM", "NAV_LOITER_TURNS", "NAV_LOITER_TIME", "NAV_RETURN_TO_LAUNCH"),
         *("NAV_LAND", "NAV_TAKEOFF", "NAV_VTOL_TAKEOFF", "NAV_VTOL_LAND", "DO_SET_MODE", "DO_REPOSITION"),
         *("DO_FLIGHTTERMINATION", "DO_ORBIT", "DO_PAUSE_CONTINUE", "OVERRIDE_GOTO", "MISSION_START"),
         "COMPONENT_ARM_DISARM",
     }
-    for each in QUESTIONS - {MavCmd.SET_MESSAGE_INTERVAL, MavCmd.RUN_PREARM_CHECKS}:
-        assert MavCmd(each).name.startswith(("REQUEST_", "GET_")), "what changes something is no question"
+    for number in QUESTIONS - {MavCmd.SET_MESSAGE_INTERVAL, MavCmd.RUN_PREARM_CHECKS}:
+        assert MavCmd(number).name.startswith(("REQUEST_", "GET_")), "a command that changes something is not a query"
     assert len(QUESTIONS) == 11
 
 
@@ -331,31 +333,31 @@ def test_order_failsafe_ends_it_permanently(state: int) -> None:
     stage = Stage()
     order = stage.arbiter.order(GUIDED)
     with stage.arbiter.sending(order) as sending, stage.arbiter.auxiliary_order() as aside:
-        stage.tell(GUIDED, state=state)
+        stage.report(GUIDED, state=state)
         assert "failsafe" in order.end
         assert sending.end == aside.end == order.end
-        stage.tell(GUIDED)
+        stage.report(GUIDED)
         assert "failsafe" in order.end
     assert not stage.arbiter.order(GUIDED).may_move
 
 
 def test_order_during_failsafe_is_valid_until_next_failsafe() -> None:
     stage = Stage()
-    stage.tell(LOITER, state=MavState.CRITICAL)
+    stage.report(LOITER, state=MavState.CRITICAL)
     order = stage.arbiter.order(GUIDED)
-    stage.tell(GUIDED, state=MavState.CRITICAL)
+    stage.report(GUIDED, state=MavState.CRITICAL)
     assert not order.end
-    stage.tell(GUIDED)
+    stage.report(GUIDED)
     assert not order.end
-    stage.tell(GUIDED, state=MavState.CRITICAL)
+    stage.report(GUIDED, state=MavState.CRITICAL)
     assert "failsafe" in order.end
 
 
 def test_order_worse_failsafe_ends_it() -> None:
     stage = Stage()
-    stage.tell(LOITER, state=MavState.CRITICAL)
+    stage.report(LOITER, state=MavState.CRITICAL)
     order = stage.arbiter.order(GUIDED)
-    stage.tell(GUIDED, state=MavState.EMERGENCY)
+    stage.report(GUIDED, state=MavState.EMERGENCY)
     assert "MAV_STATE_EMERGENCY" in order.end
 
 
@@ -367,12 +369,12 @@ def test_land_and_return_orders_survive_failsafe(mode: Mode) -> None:
         stage.arbiter.sending(order, modes=[mode]) as sending,
         stage.arbiter.auxiliary_order(ends_flight=True) as disarm,
     ):
-        stage.tell(LOITER, state=MavState.CRITICAL)
+        stage.report(LOITER, state=MavState.CRITICAL)
         assert (order.end, sending.end, disarm.end) == ("", "", "")
         assert "failsafe" in order.failsafe
 
 
-# --------------------------------------------------------------------------------- who flies it
+# ----------------------------------------------------------------------- control of the vehicle
 
 
 def arm(stage: Stage, *, is_refused: bool = False) -> None:
@@ -390,29 +392,29 @@ def arm(stage: Stage, *, is_refused: bool = False) -> None:
 def test_vehicle_armed_by_program_is_flown_until_takeover() -> None:
     stage = Stage(armed=False)
     arm(stage)
-    stage.tell(LOITER, True, after=0.8)
+    stage.report(LOITER, True, after=0.8)
     assert stage.arbiter.is_flown_by_program
-    stage.tell(RTL)
+    stage.report(RTL)
     assert not stage.arbiter.is_flown_by_program
 
 
 def test_late_armed_report_is_programs_without_other_report() -> None:
     stage = Stage(armed=False)
     arm(stage)
-    stage.tell(LOITER, True, after=6.0)  # HEARTBEATs were lost
+    stage.report(LOITER, True, after=6.0)  # HEARTBEATs were lost
     assert stage.arbiter.is_flown_by_program
 
 
 def test_vehicle_armed_by_pilot_is_not_flown_by_program() -> None:
     stage = Stage(armed=False)
     arm(stage, is_refused=True)
-    stage.tell(LOITER, True, after=1.0)
+    stage.report(LOITER, True, after=1.0)
     assert not stage.arbiter.is_flown_by_program
     stage = Stage(armed=False)
     arm(stage)
     for _ in range(4):
-        stage.tell(LOITER, False)  # he disarmed it at once
-    stage.tell(LOITER, True)
+        stage.report(LOITER, False)  # he disarmed it at once
+    stage.report(LOITER, True)
     assert not stage.arbiter.is_flown_by_program
 
 
@@ -435,9 +437,9 @@ def test_refused_order_does_not_change_flown_by_program() -> None:
 def test_failsafe_is_cleared_by_new_order() -> None:
     stage = Stage()
     stage.arbiter.order(GUIDED)
-    stage.tell(GUIDED)
-    stage.tell(GUIDED, state=MavState.CRITICAL)
-    stage.tell(GUIDED)
+    stage.report(GUIDED)
+    stage.report(GUIDED, state=MavState.CRITICAL)
+    stage.report(GUIDED)
     assert not flies(stage)
     stage.arbiter.clear_failsafe()
     assert flies(stage)
@@ -446,11 +448,11 @@ def test_failsafe_is_cleared_by_new_order() -> None:
 def test_posted_mode_after_order_is_no_takeover() -> None:
     stage = Stage()
     order = stage.arbiter.order(GUIDED)
-    stage.tell(GUIDED)
+    stage.report(GUIDED)
     with stage.arbiter.post(["mode"], modes=[RTL]):
-        stage.tell(RTL)
+        stage.report(RTL)
     assert not order.has_lost_mode
-    stage.tell(LOITER)
+    stage.report(LOITER)
     assert order.has_lost_mode
 
 

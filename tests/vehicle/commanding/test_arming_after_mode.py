@@ -24,13 +24,13 @@ async def _in_rtl() -> AsyncIterator[Px4Flight]:
         await flight.vehicle.wait_ready()
         flight.px4.switch_to(RTL)
         await anyio.sleep(2.0)
-        flight.wire.forget()
+        flight.wire.clear()
         yield flight
 
 
-def _told_to_arm(flight: Px4Flight) -> bool:
+def _has_arm_command(flight: Px4Flight) -> bool:
     sent = flight.wire.commands(MavCmd.COMPONENT_ARM_DISARM)
-    return any(isinstance(each, CommandLong) and each.param1 == 1 for each in sent)
+    return any(isinstance(message, CommandLong) and message.param1 == 1 for message in sent)
 
 
 async def test_disarm_while_the_mode_changes_ends_arm() -> None:
@@ -48,7 +48,7 @@ async def test_disarm_while_the_mode_changes_ends_arm() -> None:
             await anyio.sleep(0.02)
             await flight.vehicle.disarm()
         assert "superseded by another arm or disarm command" in str(ended[0])
-        assert not _told_to_arm(flight)
+        assert not _has_arm_command(flight)
         assert not true_point(flight.px4).armed
 
 
@@ -62,7 +62,7 @@ async def test_arm_vehicle_silent_after_mode_change_sends_no_arm() -> None:
         with pytest.raises(HeartbeatTimeout, match="the arm command was not sent"):
             await flight.vehicle.arm()
         end()
-        assert not _told_to_arm(flight)
+        assert not _has_arm_command(flight)
 
 
 async def test_raw_arm_after_abandoned_arm_stays_armed() -> None:

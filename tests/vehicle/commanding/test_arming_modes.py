@@ -1,4 +1,4 @@
-"""Modes in which a vehicle does not arm: left before arming, named when asked, and no reason to wait."""
+"""Modes in which a vehicle does not arm: left before arming, named in the reasons, and not waited for."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ARM = MavCmd.COMPONENT_ARM_DISARM
 
 
 async def test_program_runs_twice_in_one_process() -> None:
-    """After the first flight a copter stands there in RTL."""
+    """After the first flight a copter is on the ground in RTL."""
     async with open_flight() as flight:
         for _ in range(2):
             await flight.vehicle.wait_ready()
@@ -40,7 +40,7 @@ async def test_arm_with_mode_changes_mode_first() -> None:
 async def test_arm_in_unarmable_mode_raises_before_sending() -> None:
     async with open_flight() as flight:
         await flight.vehicle.wait_ready()
-        flight.wire.forget()
+        flight.wire.clear()
         with pytest.raises(InvalidArgument, match=r"mode = 'LAND' .*cannot arm in LAND, only in ACRO, .*GUIDED"):
             await flight.vehicle.arm(mode="LAND")
         with pytest.raises(InvalidArgument, match="NOWHERE"):
@@ -52,7 +52,7 @@ async def test_arm_in_unarmable_mode_raises_before_sending() -> None:
 async def test_arm_in_flight_keeps_mode() -> None:
     async with in_the_air() as flight:
         await flight.vehicle.set_mode("LAND")
-        flight.wire.forget()
+        flight.wire.clear()
         await flight.vehicle.arm()
         with pytest.raises(OperationRejected, match="arm: the vehicle is armed already, in LAND; nothing was sent"):
             await flight.vehicle.arm(mode="GUIDED")
@@ -94,18 +94,18 @@ async def test_plane_in_autoland_arms_in_passive_mode() -> None:
 
 
 async def test_missing_for_flight_names_lost_link() -> None:
-    """Results based on old values say so."""
+    """A result that is based on old values contains the lost link."""
     async with open_flight() as flight:
         await flight.vehicle.wait_ready()
         flight.copter.faults.silent = True
         await anyio.sleep(20.0)
         reasons = await flight.vehicle.why_not_armable()
-        assert any("heartbeats (the last one 2" in each for each in reasons)
-        assert any("position (no GLOBAL_POSITION_INT" in each for each in reasons)
+        assert any("heartbeats (the last one 2" in reason for reason in reasons)
+        assert any("position (no GLOBAL_POSITION_INT" in reason for reason in reasons)
 
 
 async def test_missing_for_flight_without_link_lists_all() -> None:
-    """At once, with values that are still young; and only a heartbeat of after it brings it back."""
+    """The link is lost at once although values are recent, and only a later heartbeat restores it."""
     async with open_flight() as flight:
         vehicle, connection = flight.vehicle, flight.vehicle.connection
         await vehicle.wait_ready()
@@ -114,7 +114,7 @@ async def test_missing_for_flight_without_link_lists_all() -> None:
         await anyio.sleep(0.5)
         with pytest.raises(OperationTimeout, match=r"heartbeats \(the last one .* s ago, the link is lost\)"):
             await vehicle.wait_ready(timeout=2.0)
-        assert any("the link is lost" in each for each in await vehicle.why_not_armable())
+        assert any("the link is lost" in reason for reason in await vehicle.why_not_armable())
         connection.link_restored(3.0)
         with pytest.raises(OperationTimeout, match="the link is lost"):
             await vehicle.wait_ready(timeout=0.2)
@@ -124,13 +124,13 @@ async def test_missing_for_flight_without_link_lists_all() -> None:
 
 
 async def test_abandoned_arm_of_armed_vehicle_does_not_disarm() -> None:
-    """On the ground, armed by its pilot; the program asks again and is cancelled at once."""
+    """The vehicle is armed on the ground; a second arm() is cancelled at once."""
     async with open_flight() as flight:
         await flight.vehicle.wait_ready()
         await flight.vehicle.arm()
-        flight.wire.forget()
+        flight.wire.clear()
         with anyio.move_on_after(0.001):
             await flight.vehicle.arm()
         await anyio.sleep(5.0)
-        assert [each.param1 for each in flight.wire.commands(ARM)] == [1.0]
+        assert [command.param1 for command in flight.wire.commands(ARM)] == [1.0]
         assert flight.vehicle.is_armed

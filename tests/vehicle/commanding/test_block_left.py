@@ -27,7 +27,7 @@ async def test_block_left_after_cancelled_flight_warns_that_vehicle_holds(
             scope.deadline = anyio.current_time() + 2
             await flight.vehicle.go_to(flight.vehicle.position.value.offset(north_m=500))
     assert scope.cancelled_caught
-    (record,) = [each for each in caplog.records if "was left: " in each.message]
+    (record,) = [record for record in caplog.records if "was left: " in record.message]
     assert (record.name, record.levelname) == ("aerokit", "WARNING")
     assert record.message.startswith("the block of vehicle 1 was left: holding in BRAKE, still armed, ")
 
@@ -59,12 +59,12 @@ async def test_block_left_warns_only_with_active_order(
             await vehicle.arm()
             await vehicle.take_off(10.0)
 
-        async def left_after(*orders: Callable[[aerokit.Vehicle], Awaitable[object]]) -> str:
+        async def log_after(*orders: Callable[[aerokit.Vehicle], Awaitable[object]]) -> str:
             caplog.clear()
             with pytest.raises(ZeroDivisionError):
                 async with aerokit.connect(connection) as vehicle:
-                    for each in orders:
-                        await each(vehicle)
+                    for order in orders:
+                        await order(vehicle)
                     raise ZeroDivisionError
             return caplog.text
 
@@ -79,16 +79,16 @@ async def test_block_left_warns_only_with_active_order(
             assert vehicle.mode_name == "GUIDED"
             assert vehicle.taken_over == ""
 
-        assert "was left: " not in await left_after(lambda vehicle: vehicle.why_not_armable())
+        assert "was left: " not in await log_after(lambda vehicle: vehicle.why_not_armable())
         async with vehicles_on(connection) as vehicles:  # as `aerokit status` does it
             await anyio.sleep(2)
             assert list(vehicles) == [1]
         assert "was left: " not in caplog.text
-        assert "was left: in LOITER" in await left_after(lambda vehicle: vehicle.set_mode("LOITER"))
-        assert "was left: " not in await left_after(lambda vehicle: vehicle.set_mode("GUIDED"), pilot_takes)
-        assert "was left: in GUIDED" in await left_after(send_mode)
-        assert "was left: " not in await left_after(lambda vehicle: vehicle.set_speed(5.0))
-        assert "was left: " not in await left_after(send_mode, pilot_takes)
+        assert "was left: in LOITER" in await log_after(lambda vehicle: vehicle.set_mode("LOITER"))
+        assert "was left: " not in await log_after(lambda vehicle: vehicle.set_mode("GUIDED"), pilot_takes)
+        assert "was left: in GUIDED" in await log_after(send_mode)
+        assert "was left: " not in await log_after(lambda vehicle: vehicle.set_speed(5.0))
+        assert "was left: " not in await log_after(send_mode, pilot_takes)
 
 
 async def test_block_left_warns_program_that_armed(caplog: pytest.LogCaptureFixture) -> None:
@@ -131,7 +131,7 @@ async def test_vehicle_block_leaves_nothing_on_connection() -> None:
                 assert attached_sinks(connection) > before
                 assert connection.boot_clocks
             await anyio.sleep(2.0)
-            wire.forget()
+            wire.clear()
             assert attached_sinks(connection) == before
             assert not connection.boot_clocks
             await anyio.sleep(5.0)
@@ -156,7 +156,7 @@ async def test_block_left_with_stream_in_other_task_holds() -> None:
 
 
 async def test_block_left_with_flight_in_other_task_holds(caplog: pytest.LogCaptureFixture) -> None:
-    """The flight's task is gone: the vehicle is told to hold before the connection ends."""
+    """The flight's task has ended: aerokit commands a hold before it closes the connection."""
     ended: list[Exception] = []
     copter = SimulatedCopter(boot_time_s=0.0)
     async with simulated_link(copter) as link, anyio.create_task_group() as tasks:

@@ -50,7 +50,7 @@ async def test_plan_with_far_item_is_not_uploaded(grounded: Flight, kind: str) -
     here, far = grounded.vehicle.position.value, exchanged(grounded)
     if kind == "mission":
         places = [here.offset(north_m=50.0), far]
-        items = [waypoint(each.latitude_deg, each.longitude_deg, altitude_relative_m=20) for each in places]
+        items = [waypoint(place.latitude_deg, place.longitude_deg, altitude_relative_m=20) for place in places]
         with pytest.raises(InvalidArgument, match="more than max_distance_m"):
             await grounded.vehicle.mission.upload(Mission(items))
         await grounded.vehicle.mission.upload(Mission(items), max_distance_m=2.1e7)

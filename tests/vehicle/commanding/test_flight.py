@@ -101,7 +101,7 @@ async def test_take_off_while_landing_is_rejected(flying: Flight) -> None:
     vehicle = flying.vehicle
     await vehicle.set_mode("LAND")
     await vehicle.landed_state.wait_until(lambda state: state == MavLandedState.LANDING, timeout=10)
-    flying.wire.forget()
+    flying.wire.clear()
     with pytest.raises(OperationRejected, match=r"is already landing"):
         await vehicle.take_off(20.0)
     assert not flying.wire.mode_orders()
@@ -111,7 +111,7 @@ async def test_take_off_while_landing_is_rejected(flying: Flight) -> None:
 
 async def test_take_off_disarmed_sends_nothing(grounded: Flight) -> None:
     await grounded.vehicle.set_mode("GUIDED")
-    grounded.wire.forget()
+    grounded.wire.clear()
     with pytest.raises(OperationRejected, match="not armed"):
         await grounded.vehicle.take_off(10.0)
     assert not grounded.wire.mode_orders()
@@ -248,7 +248,7 @@ async def test_take_off_ends_when_it_is_disarmed(grounded: Flight) -> None:
 
 
 async def test_take_off_after_cancelled_one_continues(grounded: Flight) -> None:
-    """The hold of the first one must not be sent after the second one's order."""
+    """The hold of the first call must not be sent after the order of the second call."""
     vehicle = grounded.vehicle
     await vehicle.set_mode("GUIDED")
     await vehicle.arm()
@@ -390,10 +390,10 @@ async def test_go_to_without_do_reposition_sends_the_older_message() -> None:
         await flight.vehicle.go_to(target)
         assert flight.copter.motion.north == pytest.approx(40.0, abs=2.5)
         sent = flight.wire.all(m.SetPositionTargetGlobalInt)
-        assert {each.type_mask for each in sent} == {0x0DF8}  # velocity, acceleration, yaw and yaw rate ignored
-        assert {each.coordinate_frame for each in sent} == {6}
+        assert {message.type_mask for message in sent} == {0x0DF8}  # velocity, acceleration, yaw and yaw rate ignored
+        assert {message.coordinate_frame for message in sent} == {6}
         assert sent[0].lat_int == round(target.latitude_deg * 1e7)
-        flight.wire.forget()
+        flight.wire.clear()
         await anyio.sleep(5.0)
         assert not flight.wire.setpoints()  # nothing is resent once the call has ended
 
@@ -402,7 +402,7 @@ async def test_go_to_legacy_message_stops_after_cancellation() -> None:
     copter = SimulatedCopter(boot_time_s=0.0, unsupported_commands=[MavCmd.DO_REPOSITION])
     async with in_the_air(copter=copter) as flight:
         await cancelled_after(3.0, flight.vehicle.go_to(north_of_home(flight, 200.0)))
-        flight.wire.forget()
+        flight.wire.clear()
         await anyio.sleep(5.0)
         assert not flight.wire.setpoints()
         assert flight.copter.mode.number == BRAKE
@@ -558,7 +558,7 @@ async def test_hold_stops(flying: Flight) -> None:
     assert speed_of(flying.copter) < 0.1
 
 
-# ----------------------------------------------------------------------------------- on the way
+# ---------------------------------------------------------------------------- during the flight
 
 
 async def test_set_speed(flying: Flight) -> None:
@@ -590,7 +590,7 @@ async def test_set_heading_absolute_and_relative(flying: Flight) -> None:
     assert math.degrees(flying.copter.motion.yaw) == pytest.approx(60.0, abs=3.0)
     await vehicle.set_heading(40.0, relative=True, rate_deg_s=20.0, tolerance_deg=1.0)
     assert math.degrees(flying.copter.motion.yaw) == pytest.approx(100.0, abs=4.0)
-    absolute, left, right = (each for each in flying.wire.commands(MavCmd.CONDITION_YAW))
+    absolute, left, right = (command for command in flying.wire.commands(MavCmd.CONDITION_YAW))
     assert (absolute.param1, absolute.param3, absolute.param4) == (90.0, 0.0, 0.0)
     assert left.param1 == pytest.approx(60.0, abs=1.5)
     assert (left.param3, left.param4) == (-1.0, 0.0)

@@ -47,7 +47,7 @@ async def guided(simulated: SimulatedVehicle) -> AsyncIterator[Vehicle]:
 
 
 async def test_rover_go_to_with_home_at_sea_level_arrives() -> None:
-    """As with real rovers, home was set before the altitude was known."""
+    """Home was set before the altitude was known, as with real rovers."""
     async with guided(SimulatedRover(boot_time_s=1.0)) as vehicle:
         here = vehicle.position.value
         x, y = round(here.latitude_deg * 1e7), round(here.longitude_deg * 1e7)
@@ -138,7 +138,7 @@ async def test_sub_position_is_sent_three_times_then_every_five_seconds() -> Non
 
 
 async def test_go_to_vehicle_does_not_move_times_out() -> None:
-    """Its thrusters do nothing: neither an order nor a stream waits without limit."""
+    """Its thrusters have no effect: neither an order nor a stream waits without a limit."""
     sub = SimulatedSub(boot_time_s=1.0)
     async with guided(sub) as vehicle:
         there = vehicle.position.value.offset(north_m=30)

@@ -40,9 +40,9 @@ BRAKE, GUIDED, LOITER = CopterMode.BRAKE, CopterMode.GUIDED, CopterMode.LOITER
 NORTH = VelocitySetpoint(north_m_s=3.0)
 
 
-async def stays_quiet(flight: Flight, seconds: float = 6.0) -> None:
+async def sends_nothing(flight: Flight, seconds: float = 6.0) -> None:
     """Assert that nothing more is sent and the vehicle stands still in its hold mode."""
-    flight.wire.forget()
+    flight.wire.clear()
     await anyio.sleep(seconds)
     assert flight.wire.setpoints() == []
 
@@ -52,7 +52,7 @@ async def stays_quiet(flight: Flight, seconds: float = 6.0) -> None:
 
 async def first_sent(flight: Flight, stream: SetpointStream[Any], setpoint: object = None) -> Any:
     async with stream:
-        flight.wire.forget()
+        flight.wire.clear()
         if setpoint is not None:
             stream.set(setpoint)
         await anyio.sleep(0.25)
@@ -122,7 +122,7 @@ async def test_attitude(flying: Flight) -> None:
 @pytest.mark.parametrize("rate_hz", [2.0, 10.0, 40.0])
 async def test_setpoint_stream_rate_is_kept(flying: Flight, rate_hz: float) -> None:
     async with flying.vehicle.guided.velocity(rate_hz=rate_hz) as stream:
-        flying.wire.forget()
+        flying.wire.clear()
         await stream.fly(NORTH, 5.0)
         times = [at for at, _ in flying.wire.setpoints()]
     gaps = [later - earlier for earlier, later in itertools.pairwise(times)]
@@ -130,7 +130,7 @@ async def test_setpoint_stream_rate_is_kept(flying: Flight, rate_hz: float) -> N
     assert len(times) == pytest.approx(5.0 * rate_hz, abs=1)
 
 
-# ------------------------------------------------------------------------------- what it does
+# ---------------------------------------------------------------------------------- behaviour
 
 
 async def test_setpoint_stream_is_flown(flying: Flight) -> None:
@@ -150,7 +150,7 @@ async def test_body_velocity_is_in_body_frame(flying: Flight) -> None:
 
 
 async def test_body_velocity_with_heading_keeps_heading(flying: Flight) -> None:
-    """In MAV_FRAME_BODY_NED ArduPilot counts yaw from where the nose points; users give degrees from north."""
+    """In MAV_FRAME_BODY_NED ArduPilot measures yaw from the nose; users give degrees from north."""
     await flying.vehicle.set_heading(40.0)
     async with flying.vehicle.guided.body_velocity() as stream:
         await stream.fly(BodyVelocitySetpoint(forward_m_s=2.0, yaw_deg=180.0), 10.0)
@@ -167,7 +167,7 @@ async def test_setpoint_stream_entry_changes_to_guided(flying: Flight) -> None:
         assert flying.copter.motion.north == pytest.approx(10.0, abs=0.5)
 
 
-# ------------------------------------------------------------------------------ how it ends
+# ------------------------------------------------------------------------ end of the stream
 
 
 async def test_block_left_normally_vehicle_holds(flying: Flight) -> None:
@@ -175,7 +175,7 @@ async def test_block_left_normally_vehicle_holds(flying: Flight) -> None:
         await stream.fly(NORTH, 3.0)
     assert not stream.is_running
     assert flying.vehicle.mode_name == "BRAKE"
-    await stays_quiet(flying)
+    await sends_nothing(flying)
     assert speed_of(flying.copter) < 0.1
 
 
@@ -185,7 +185,7 @@ async def test_setpoint_stream_body_raises_holds(flying: Flight) -> None:
             await stream.fly(NORTH, 3.0)
             _ = 1 / 0
     assert flying.wire.mode_orders()[-1] == BRAKE  # It was sent before the exception left the block.
-    await stays_quiet(flying)
+    await sends_nothing(flying)
     assert flying.copter.mode.number == BRAKE
     assert speed_of(flying.copter) < 0.1
 
@@ -198,7 +198,7 @@ async def test_setpoint_stream_cancelled_holds(flying: Flight) -> None:
     with anyio.move_on_after(4.0):
         await fly_on()
     assert flying.wire.mode_orders()[-1] == BRAKE
-    await stays_quiet(flying)
+    await sends_nothing(flying)
     assert flying.copter.mode.number == BRAKE
 
 
@@ -212,11 +212,11 @@ async def test_setpoint_stream_cancelled_while_entering_holds() -> None:
         assert scope.cancelled_caught
         await anyio.sleep(3.0)
         assert flying.copter.mode.number == BRAKE
-        await stays_quiet(flying)
+        await sends_nothing(flying)
 
 
 async def test_program_cancelled_leaves_nothing() -> None:
-    """The order to hold goes out although connection and loop are about to end."""
+    """The hold command is sent although the connection and the loop are about to end."""
     flight: Flight | None = None
     with anyio.move_on_after(30.0):
         async with in_the_air() as flight, flight.vehicle.guided.velocity() as stream:
@@ -235,7 +235,7 @@ async def test_setpoint_stream_not_fed_stops(flying: Flight) -> None:
             last = flying.wire.setpoints()[-1][0]
             assert fed_at + 0.8 <= last <= fed_at + 1.01
             assert flying.copter.mode.number == BRAKE
-    await stays_quiet(flying)
+    await sends_nothing(flying)
 
 
 async def test_setpoint_stream_stop_is_raised_once(flying: Flight) -> None:
@@ -243,7 +243,7 @@ async def test_setpoint_stream_stop_is_raised_once(flying: Flight) -> None:
         await anyio.sleep(2.0)
         with pytest.raises(SetpointStreamStopped, match="told to hold"):
             stream.set(NORTH)
-    await stays_quiet(flying)
+    await sends_nothing(flying)
 
 
 async def test_setpoint_stream_exit_by_exception_keeps_it(flying: Flight) -> None:
@@ -270,20 +270,20 @@ async def test_setpoint_stream_loop_blocked_stops(flying: Flight) -> None:
         async with flying.vehicle.guided.velocity(valid_for_s=60.0, max_lag_s=0.5) as stream:
             stream.set(NORTH)
             await anyio.sleep(2.0)
-            flying.wire.forget()
+            flying.wire.clear()
             block_loop(2.0)
             await anyio.sleep(1.0)
             assert not stream.is_running
             assert not flying.wire.setpoints()  # no stale one after the blockade
             assert flying.wire.mode_orders()[0] == BRAKE
-    await stays_quiet(flying)
+    await sends_nothing(flying)
     assert flying.copter.mode.number == BRAKE
 
 
 async def test_setpoint_stream_short_loop_delay_continues(flying: Flight) -> None:
     async with flying.vehicle.guided.velocity(max_lag_s=0.5) as stream:
         await stream.fly(NORTH, 1.0)
-        flying.wire.forget()
+        flying.wire.clear()
         block_loop(0.4)
         await stream.fly(NORTH, 1.0)
         assert stream.is_running
@@ -298,12 +298,12 @@ async def test_setpoint_stream_pilot_takes_over_stops(flying: Flight) -> None:
             await anyio.sleep(1.0)
     assert "told to hold" not in str(caught.value)
     assert BRAKE not in flying.wire.mode_orders()
-    await stays_quiet(flying)
+    await sends_nothing(flying)
     assert flying.copter.mode.number == LOITER
 
 
 async def test_setpoint_stream_takeover_before_exit_sends_no_hold() -> None:
-    """The stream has not noticed yet; the vehicle is the pilot's all the same."""
+    """The stream has not noticed the takeover yet; the pilot keeps control."""
     async with in_the_air() as flying:
         with pytest.raises(SetpointStreamStopped, match="left GUIDED for LOITER"):
             async with flying.vehicle.guided.velocity(rate_hz=2.0) as stream:
@@ -322,7 +322,7 @@ async def test_land_ends_with_disarming(flying: Flight) -> None:
             await stream.fly(NORTH, 1.0)
             flying.copter.arming.disarm()
             await stream.fly(NORTH, 3.0)
-    await stays_quiet(flying)
+    await sends_nothing(flying)
 
 
 async def test_setpoint_stream_survives_disarm_and_arm(grounded: Flight) -> None:
@@ -333,7 +333,7 @@ async def test_setpoint_stream_survives_disarm_and_arm(grounded: Flight) -> None
             assert stream.is_running
             grounded.copter.arming.disarm()
             await stream.fly(VelocitySetpoint(), 3.0)
-    await stays_quiet(grounded)
+    await sends_nothing(grounded)
 
 
 async def test_setpoint_stream_connection_lost_raises(flying: Flight) -> None:
@@ -389,7 +389,7 @@ async def test_setpoint_stream_outside_block_or_reused_raises(flying: Flight) ->
     with pytest.raises(SetpointStreamStopped):
         async with stream:
             raise AssertionError("entered twice")
-    await stays_quiet(flying)
+    await sends_nothing(flying)
 
 
 BAD: list[Callable[[Any], object]] = [
@@ -423,7 +423,7 @@ async def test_block_left_after_silence_warns_nothing_was_sent(flying: Flight) -
             flying.copter.faults.silent = True
             while flying.vehicle.heartbeat_age <= 2.6:
                 await stream.fly(NORTH, 0.1)
-            flying.wire.forget()
+            flying.wire.clear()
     assert not flying.wire.mode_orders()
 
 
@@ -452,9 +452,9 @@ async def test_invalid_setpoint_keeps_previous(flying: Flight) -> None:
         for wrong in (math.nan, 1e39):
             with pytest.raises(InvalidArgument):
                 stream.set(VelocitySetpoint(wrong))
-        flying.wire.forget()
+        flying.wire.clear()
         await anyio.sleep(1.0)
-        assert {each.vx for each in flying.wire.all(m.SetPositionTargetLocalNed)} == {3.0}
+        assert {message.vx for message in flying.wire.all(m.SetPositionTargetLocalNed)} == {3.0}
 
 
 async def test_unsupported_setpoint_kinds_raise() -> None:
@@ -483,14 +483,14 @@ async def test_px4_stream_starts_before_offboard_request() -> None:
             first = flight.wire.setpoints()[0][0]
             asked = next(
                 at
-                for at, each in flight.wire.sent
-                if isinstance(each, m.CommandLong) and each.command == MavCmd.DO_SET_MODE
+                for at, message in flight.wire.sent
+                if isinstance(message, m.CommandLong) and message.command == MavCmd.DO_SET_MODE
             )
             assert asked - first >= 0.9
             await stream.fly(NORTH, 6.0)
             assert flight.px4.motion.velocity_north == pytest.approx(3.0, abs=0.3)
         assert flight.vehicle.mode_name == "LOITER"
-        flight.wire.forget()
+        flight.wire.clear()
         await anyio.sleep(5.0)
         assert not flight.wire.setpoints()
 
@@ -502,7 +502,7 @@ async def test_px4_refuses_offboard() -> None:
         with pytest.raises(CommandRejected, match="Offboard denied"):
             async with flight.vehicle.guided.velocity():
                 raise AssertionError("entered")
-        flight.wire.forget()
+        flight.wire.clear()
         await anyio.sleep(5.0)
         assert not flight.wire.setpoints()
         assert flight.vehicle.mode_name == "LOITER"
@@ -526,7 +526,7 @@ async def test_px4_setpoint_stream_exit_by_exception_holds() -> None:
                 _ = 1 / 0
         await anyio.sleep(5.0)
         assert flight.vehicle.mode_name == "LOITER"
-        flight.wire.forget()
+        flight.wire.clear()
         await anyio.sleep(5.0)
         assert not flight.wire.setpoints()
         assert math.hypot(flight.px4.motion.velocity_north, flight.px4.motion.velocity_east) < 0.2
@@ -541,7 +541,7 @@ async def test_px4_setpoint_stream_cancelled_while_entering_holds() -> None:
                     await anyio.sleep(0.05)
             await anyio.sleep(6.0)
             assert flight.vehicle.mode_name == "LOITER"
-            flight.wire.forget()
+            flight.wire.clear()
             await anyio.sleep(3.0)
             assert not flight.wire.setpoints()
 
@@ -562,7 +562,7 @@ async def test_px4_entry_cancelled_before_offboard_request_keeps_pilot() -> None
 async def test_setpoint_stream_stops_after_silence(
     phase: float,
 ) -> None:
-    """Whenever the second begins in which silence is looked for."""
+    """The result does not depend on the phase of the one-second silence check."""
     async with in_the_air() as flight:
         await anyio.sleep(phase)
         silent_since = math.inf

@@ -50,7 +50,7 @@ async def test_arm_command_lost_is_not_repeated(grounded: Flight) -> None:
 
 async def test_disarm_order_is_lost_is_repeated(grounded: Flight) -> None:
     await grounded.vehicle.arm()
-    grounded.wire.forget()
+    grounded.wire.clear()
     grounded.copter.faults.ignore(ARM, times=1)
     await grounded.vehicle.disarm()
     first, second = grounded.wire.commands(ARM)
@@ -150,7 +150,7 @@ async def test_disarm_in_the_air_is_refused_and_forced(flying: Flight) -> None:
     assert flying.vehicle.is_armed
     await flying.vehicle.disarm(force=True)
     assert not flying.copter.is_armed
-    assert [each.param2 for each in flying.wire.commands(ARM)] == [0.0, 21196.0]
+    assert [command.param2 for command in flying.wire.commands(ARM)] == [0.0, 21196.0]
 
 
 async def test_late_ack_of_cancelled_command_is_ignored() -> None:
@@ -202,11 +202,11 @@ async def test_why_not_armable_unanswered_request_is_repeated(grounded: Flight) 
 async def test_why_not_armable_waits_for_status_texts(grounded: Flight) -> None:
     async with anyio.create_task_group() as tasks:
 
-        async def say_it_late() -> None:
+        async def report_late() -> None:
             await anyio.sleep(0.9)
             grounded.wire.deliver(FrameEncoder(1, 1).encode(Statustext(2, "PreArm: Gyros inconsistent")))
 
-        tasks.start_soon(say_it_late)
+        tasks.start_soon(report_late)
         assert await grounded.vehicle.why_not_armable() == ["PreArm: Gyros inconsistent"]
 
 
@@ -291,4 +291,4 @@ async def test_state_older_than_five_seconds_is_missing_for_flight(grounded: Fli
     await anyio.sleep(4.5)
     assert grounded.vehicle.missing_for_flight() == []
     await anyio.sleep(1.5)
-    assert any("no SYS_STATUS for" in each for each in grounded.vehicle.missing_for_flight())
+    assert any("no SYS_STATUS for" in reason for reason in grounded.vehicle.missing_for_flight())

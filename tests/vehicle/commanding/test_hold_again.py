@@ -1,4 +1,4 @@
-"""Hold after an abandoned flight: sent at once, and repeated until it is obeyed."""
+"""Hold after an abandoned flight: sent at once, and repeated until it is executed."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ async def test_hold_is_sent_in_same_iteration() -> None:
 
 async def test_hold_pending_ends_with_confirmation() -> None:
     async with in_the_air() as flight:
-        holding, told = flight.vehicle._context.flight_cleanup, list[bool]()
-        told.append(holding.is_hold_pending)
+        holding, reported = flight.vehicle._context.flight_cleanup, list[bool]()
+        reported.append(holding.is_hold_pending)
         await give_up(flight)
-        told.append(holding.is_hold_pending)
+        reported.append(holding.is_hold_pending)
         await anyio.sleep(3.0)
-        told.append(holding.is_hold_pending)
+        reported.append(holding.is_hold_pending)
         assert flight.copter.mode.number == BRAKE
-        assert told == [False, True, False]
+        assert reported == [False, True, False]
 
 
 async def test_px4_hold_is_sent_in_same_iteration() -> None:
@@ -73,9 +73,9 @@ async def test_hold_ignored_is_repeated_three_times(
         flight.copter.faults.ignore(MavCmd.DO_SET_MODE)
         await give_up(flight)
         await anyio.sleep(60.0)
-        told = [each for each in caplog.messages if "is not confirmed yet" in each]
-        assert len(told) == 3
-        flight.wire.forget()
+        reported = [message for message in caplog.messages if "is not confirmed yet" in message]
+        assert len(reported) == 3
+        flight.wire.clear()
         await anyio.sleep(60.0)
         assert not flight.wire.mode_orders()
 
@@ -85,7 +85,7 @@ async def test_refused_hold_warns_once(caplog: pytest.LogCaptureFixture) -> None
         flight.copter.faults.refuse(MavCmd.DO_SET_MODE, MavResult.DENIED)
         await give_up(flight)
         await anyio.sleep(10.0)
-        (record,) = [each for each in caplog.records if "does not hold" in each.message]
+        (record,) = [record for record in caplog.records if "does not hold" in record.message]
         assert record.message.startswith("the vehicle does not hold after an abandoned flight: ")
         assert flight.wire.mode_orders() == [BRAKE]
 
@@ -97,7 +97,7 @@ async def test_pending_hold_is_dropped_after_takeover() -> None:
         with anyio.move_on_after(6.0):
             await flight.vehicle.go_to(flight.vehicle.position.value.offset(north_m=200))
         assert flight.vehicle.is_hold_pending
-        flight.wire.forget()
+        flight.wire.clear()
         flight.pilot_takes_over()
         flight.copter.faults.silent = False
         await anyio.sleep(5.0)

@@ -23,7 +23,7 @@ ARM = MavCmd.COMPONENT_ARM_DISARM
 
 def ordered(flight: Flight) -> list[float]:
     """1 for each order to arm that was sent, 0 for each to disarm."""
-    return [each.param1 for each in flight.wire.commands(ARM)]
+    return [command.param1 for command in flight.wire.commands(ARM)]
 
 
 async def test_arming_after_abandoned_order_is_undone(grounded: Flight) -> None:
@@ -52,7 +52,7 @@ async def test_late_arming_counts_only_later_reports(grounded: Flight) -> None:
 
 @pytest.mark.parametrize("ends", ["cancelled", "unanswered"])
 async def test_vehicle_armed_before_order_stays_armed(flying: Flight, ends: str) -> None:
-    """It flies: that it is armed is nothing that this order has done."""
+    """It is flying, so this order has not armed it."""
     if ends == "cancelled":
         with anyio.move_on_after(0.0):
             await flying.vehicle.arm()
@@ -65,11 +65,11 @@ async def test_vehicle_armed_before_order_stays_armed(flying: Flight, ends: str)
 
 
 async def test_late_disarm_continues_after_watch_time(grounded: Flight) -> None:
-    """It armed in the last moment, and the first order to disarm is lost."""
+    """It armed at the last moment, and the first disarm command is lost."""
     await grounded.vehicle.set_mode("GUIDED")
     grounded.copter.faults.ignore(ARM)
-    told_at = grounded.vehicle.armed.updated_at
-    await grounded.vehicle.armed.wait_until(lambda _: grounded.vehicle.armed.updated_at > told_at)
+    reported_at = grounded.vehicle.armed.updated_at
+    await grounded.vehicle.armed.wait_until(lambda _: grounded.vehicle.armed.updated_at > reported_at)
     await anyio.sleep(0.7)  # of the second from one heartbeat to the next
     with anyio.move_on_after(0.0):
         await grounded.vehicle.arm()
@@ -95,7 +95,7 @@ async def test_failed_late_disarm_logs_error(grounded: Flight, caplog: pytest.Lo
     await grounded.vehicle.armed.wait_until(bool, timeout=5)
     grounded.copter.faults.refuse(ARM, MavResult.FAILED)
     await anyio.sleep(5.0)
-    (record,) = [each for each in caplog.records if each.levelname == "ERROR"]
+    (record,) = [record for record in caplog.records if record.levelname == "ERROR"]
     assert "an abandoned arm command has armed the vehicle, and it could not be disarmed" in record.message
     assert grounded.copter.is_armed
 
@@ -157,7 +157,7 @@ async def test_arm_is_not_repeated_after_pilot_disarmed(kind: str) -> None:
         with pytest.raises(AerokitError):
             await flight.vehicle.arm()
         await anyio.sleep(ARM_WATCH_S)
-        assert [each.param1 for each in flight.wire.commands(ARM)] == [1]
+        assert [command.param1 for command in flight.wire.commands(ARM)] == [1]
         assert not simulated.is_armed
 
 
@@ -172,8 +172,8 @@ async def test_pilot_disarming_and_arming_later_stays_armed(grounded: Flight) ->
     """Our command was accepted and armed it; no HEARTBEAT reported that before the pilot disarmed."""
     await grounded.vehicle.set_mode("STABILIZE")
     grounded.copter.parameters["DISARM_DELAY"] = 0.0
-    told_at = grounded.vehicle.armed.updated_at
-    await grounded.vehicle.armed.wait_until(lambda _: grounded.vehicle.armed.updated_at > told_at)
+    reported_at = grounded.vehicle.armed.updated_at
+    await grounded.vehicle.armed.wait_until(lambda _: grounded.vehicle.armed.updated_at > reported_at)
     asyncio.get_running_loop().call_later(0.3, grounded.copter.arming.disarm)
     with anyio.move_on_after(0.2):
         await grounded.vehicle.arm()
@@ -217,7 +217,7 @@ async def test_arming_after_watch_time_is_left_alone(grounded: Flight) -> None:
 async def test_late_arming_is_undone_only_with_timely_ack(
     grounded: Flight, ack_delay_s: float, is_undone: bool
 ) -> None:
-    """Without its ack, an arming seconds after the order may be a pilot's."""
+    """Without an ack, arming seconds after the order may be the pilot's."""
     await grounded.vehicle.set_mode("GUIDED")
     grounded.copter.faults.ignore(ARM)
     with anyio.move_on_after(0.0):

@@ -1,4 +1,4 @@
-"""Two orders at once, where the second needs the command that the first waits for: the newest is the one that holds."""
+"""Two orders at once, where the second needs the command that the first waits for: the newest one counts."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from contextlib import asynccontextmanager, suppress
 
 import anyio
 import pytest
-from order_air import Air, Disturbances
+from disturbed_link import Disturbances, DisturbedLink
 
 import aerokit
 from aerokit.errors import AerokitError
@@ -25,22 +25,22 @@ from aerokit.testing.track import true_point
 
 pytestmark = pytest.mark.anyio
 
-Stage = tuple[SimulatedCopter, aerokit.Vehicle, Air]
+Stage = tuple[SimulatedCopter, aerokit.Vehicle, DisturbedLink]
 
 
 @asynccontextmanager
 async def _copter(*, flies: bool) -> AsyncIterator[Stage]:
     copter = SimulatedCopter(boot_time_s=0.0)
     async with simulated_link(copter) as link:
-        air = Air(link)
-        async with aerokit.connect(air, rates={GlobalPositionInt: 4.0}) as vehicle:
+        path = DisturbedLink(link)
+        async with aerokit.connect(path, rates={GlobalPositionInt: 4.0}) as vehicle:
             await vehicle.wait_ready()
             await vehicle.set_mode("GUIDED")
             if flies:
                 await vehicle.arm()
                 await vehicle.take_off(10.0)
             await anyio.sleep(1.3)
-            yield copter, vehicle, air
+            yield copter, vehicle, path
 
 
 async def _ended(order: Awaitable[object]) -> None:
@@ -48,44 +48,44 @@ async def _ended(order: Awaitable[object]) -> None:
         await order
 
 
-def _prepare(air: Air, disturbances: Disturbances) -> None:
-    air.disturbances = disturbances
-    air.begin()
+def _prepare(path: DisturbedLink, disturbances: Disturbances) -> None:
+    path.disturbances = disturbances
+    path.begin()
 
 
-def _commands(air: Air, command: int) -> list[tuple[float, float]]:
+def _commands(path: DisturbedLink, command: int) -> list[tuple[float, float]]:
     """Return when the command was sent, and its param1 (176: param2)."""
     return [
         (
-            each.at - air.began_at,
-            each.message.param2 if command == MavCmd.DO_SET_MODE else each.message.param1,
+            message.at - path.began_at,
+            message.message.param2 if command == MavCmd.DO_SET_MODE else message.message.param1,
         )
-        for each in air.sent
-        if isinstance(each.message, (CommandLong, CommandInt)) and each.message.command == command
+        for message in path.sent
+        if isinstance(message.message, (CommandLong, CommandInt)) and message.message.command == command
     ]
 
 
 async def test_order_superseded_while_waiting_is_not_sent() -> None:
-    async with _copter(flies=True) as (copter, vehicle, air):
+    async with _copter(flies=True) as (copter, vehicle, path):
         there = vehicle.position.value.offset(north_m=8)
-        _prepare(air, Disturbances(command=MavCmd.DO_SET_MODE, lost_acks=9, lost_commands=9))
+        _prepare(path, Disturbances(command=MavCmd.DO_SET_MODE, lost_acks=9, lost_commands=9))
         async with anyio.create_task_group() as tasks:
             for order in (vehicle.set_mode("LOITER"), vehicle.land()):
                 tasks.start_soon(_ended, order)
             await anyio.sleep(0.1)
             await vehicle.go_to(there, timeout=30)
         assert true_point(copter).mode == "GUIDED"
-        assert CopterMode.LAND not in [mode for at, mode in _commands(air, MavCmd.DO_SET_MODE) if at >= 0.1]
+        assert CopterMode.LAND not in [mode for at, mode in _commands(path, MavCmd.DO_SET_MODE) if at >= 0.1]
 
 
 async def test_order_does_not_wait_for_superseded_one() -> None:
-    async with _copter(flies=True) as (_, vehicle, air):
-        _prepare(air, Disturbances(command=MavCmd.DO_SET_MODE, lost_acks=1, lost_commands=1))
+    async with _copter(flies=True) as (_, vehicle, path):
+        _prepare(path, Disturbances(command=MavCmd.DO_SET_MODE, lost_acks=1, lost_commands=1))
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(_ended, vehicle.set_mode("LOITER"))
             await anyio.sleep(0.1)
             await vehicle.hold()
-        assert [(round(at, 2), mode) for at, mode in _commands(air, MavCmd.DO_SET_MODE)] == [
+        assert [(round(at, 2), mode) for at, mode in _commands(path, MavCmd.DO_SET_MODE)] == [
             (0.0, CopterMode.LOITER),
             (0.1, CopterMode.BRAKE),
         ]
@@ -93,40 +93,40 @@ async def test_order_does_not_wait_for_superseded_one() -> None:
 
 async def test_takeover_while_order_waits_keeps_vehicle() -> None:
     """Both commands are the program's own, so that the second waits for the answer to the first."""
-    async with _copter(flies=True) as (copter, vehicle, air):
-        _prepare(air, Disturbances(command=MavCmd.DO_CHANGE_SPEED, lost_acks=9))
+    async with _copter(flies=True) as (copter, vehicle, path):
+        _prepare(path, Disturbances(command=MavCmd.DO_CHANGE_SPEED, lost_acks=9))
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(_ended, vehicle.command(MavCmd.DO_CHANGE_SPEED, 1, 3, -1, attempt_timeout=3))
             await anyio.sleep(0.1)
             tasks.start_soon(_ended, vehicle.set_speed(7))
             copter.rc[2] = 1500
             copter.set_mode(CopterMode.ALT_HOLD)
-        assert len(_commands(air, MavCmd.DO_CHANGE_SPEED)) == 1
+        assert len(_commands(path, MavCmd.DO_CHANGE_SPEED)) == 1
 
 
 async def test_disarm_supersedes_arm_immediately() -> None:
-    async with _copter(flies=False) as (copter, vehicle, air):
-        _prepare(air, Disturbances(command=MavCmd.COMPONENT_ARM_DISARM, lost_acks=9, lost_commands=1))
+    async with _copter(flies=False) as (copter, vehicle, path):
+        _prepare(path, Disturbances(command=MavCmd.COMPONENT_ARM_DISARM, lost_acks=9, lost_commands=1))
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(_ended, vehicle.arm())
             await anyio.sleep(0.1)
             tasks.start_soon(_ended, vehicle.disarm())
-        sent = _commands(air, MavCmd.COMPONENT_ARM_DISARM)
+        sent = _commands(path, MavCmd.COMPONENT_ARM_DISARM)
         assert [(round(at, 2), arms) for at, arms in sent[:2]] == [(0.0, 1.0), (0.1, 0.0)]
         assert [arms for _, arms in sent[2:]].count(1.0) == 0
         assert not true_point(copter).armed
 
 
 async def test_arm_and_disarm_commands_supersede_each_other() -> None:
-    async with _copter(flies=False) as (copter, vehicle, air):
-        _prepare(air, Disturbances(command=MavCmd.COMPONENT_ARM_DISARM, lost_acks=9, lost_commands=2))
+    async with _copter(flies=False) as (copter, vehicle, path):
+        _prepare(path, Disturbances(command=MavCmd.COMPONENT_ARM_DISARM, lost_acks=9, lost_commands=2))
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(_ended, vehicle.arm())
             await asyncio.sleep(0.1)
             tasks.start_soon(_ended, vehicle.command(MavCmd.COMPONENT_ARM_DISARM, 0))
             await asyncio.sleep(0.1)
             await vehicle.arm()
-        sent = _commands(air, MavCmd.COMPONENT_ARM_DISARM)
+        sent = _commands(path, MavCmd.COMPONENT_ARM_DISARM)
         assert [arms for _, arms in sent] == [1.0, 0.0, 1.0]
         assert true_point(copter).armed
 
@@ -135,11 +135,11 @@ async def test_arm_and_disarm_commands_supersede_each_other() -> None:
 async def test_legacy_set_mode_is_not_sent_for_ended_order(
     legacy: MavCmd,
 ) -> None:
-    """It would be sent 0.3 s after the refusal, whose reasons are waited for."""
-    async with _copter(flies=True) as (copter, vehicle, air):
+    """It would be sent 0.3 s after the refusal, because the refusal waits for its reasons."""
+    async with _copter(flies=True) as (copter, vehicle, path):
         copter.faults.refuse(legacy, MavResult.UNSUPPORTED)
         there = vehicle.position.value.offset(north_m=8)
-        _prepare(air, Disturbances())
+        _prepare(path, Disturbances())
         async with anyio.create_task_group() as tasks:
             order = vehicle.set_mode("LAND") if legacy == MavCmd.DO_SET_MODE else vehicle.go_to(there)
             tasks.start_soon(_ended, order)
@@ -147,23 +147,23 @@ async def test_legacy_set_mode_is_not_sent_for_ended_order(
             await vehicle.set_heading(90.0)
         await anyio.sleep(2.0)
         old = [
-            each
-            for each in air.sent
-            if isinstance(each.message, SetPositionTargetGlobalInt)
-            or (isinstance(each.message, SetMode) and each.message.custom_mode == CopterMode.LAND)
+            message
+            for message in path.sent
+            if isinstance(message.message, SetPositionTargetGlobalInt)
+            or (isinstance(message.message, SetMode) and message.message.custom_mode == CopterMode.LAND)
         ]
         assert not old
         assert true_point(copter).mode == "GUIDED"
 
 
 async def test_raw_command_supersedes_action() -> None:
-    async with _copter(flies=True) as (_, vehicle, air):
+    async with _copter(flies=True) as (_, vehicle, path):
         there = vehicle.position.value.offset(north_m=100)
-        _prepare(air, Disturbances(command=MavCmd.DO_REPOSITION, lost_acks=9))
+        _prepare(path, Disturbances(command=MavCmd.DO_REPOSITION, lost_acks=9))
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(_ended, vehicle.go_to(there, timeout=8))
             await anyio.sleep(0.3)
             vehicle.send(CommandLong(1, 1, MavCmd.DO_PAUSE_CONTINUE, 0, *(0.0,) * 7))
         await anyio.sleep(2.0)
-        assert len(_commands(air, MavCmd.DO_REPOSITION)) == 1
-        assert _commands(air, MavCmd.DO_SET_MODE) == []
+        assert len(_commands(path, MavCmd.DO_REPOSITION)) == 1
+        assert _commands(path, MavCmd.DO_SET_MODE) == []

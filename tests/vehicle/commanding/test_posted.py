@@ -55,11 +55,11 @@ class Stage:
         cells = SimpleNamespace(
             mode=self.mode, armed=self.armed, system_status=self.state, autopilot=COPTER, is_vtol=False
         )
-        told = cast("Telemetry", cells)
-        self.arbiter = CommandArbiter(lambda: self.now, told)
-        self.tell(mode, armed)
+        reported = cast("Telemetry", cells)
+        self.arbiter = CommandArbiter(lambda: self.now, reported)
+        self.report(mode, armed)
 
-    def tell(self, mode: Mode, armed: bool = False, state: int = MavState.ACTIVE) -> None:
+    def report(self, mode: Mode, armed: bool = False, state: int = MavState.ACTIVE) -> None:
         self.now += 1.0
         self.mode.set(mode, HEARTBEAT)
         self.state.set(state, HEARTBEAT)
@@ -83,30 +83,30 @@ def end_of(order: Order) -> str:
 def test_posted_order_failsafe_ends_it() -> None:
     stage = Stage(armed=True)
     mode, arm = stage.post("mode", mode=GUIDED), stage.post("arm", armed=True)
-    stage.tell(STABILIZE, armed=True, state=MavState.CRITICAL)
+    stage.report(STABILIZE, armed=True, state=MavState.CRITICAL)
     assert "failsafe" in end_of(mode)
     assert "failsafe" in end_of(arm)
     disarm = stage.post("arm", armed=False)
-    stage.tell(STABILIZE, armed=True)
-    stage.tell(STABILIZE, armed=True, state=MavState.CRITICAL)
+    stage.report(STABILIZE, armed=True)
+    stage.report(STABILIZE, armed=True, state=MavState.CRITICAL)
     assert not end_of(disarm)
 
 
 def test_effect_requires_change() -> None:
     stage = Stage()
     order = stage.post("mode", "motion", mode=GUIDED)
-    stage.tell(STABILIZE)
+    stage.report(STABILIZE)
     assert end_of(order) == ""
-    stage.tell(GUIDED)
-    stage.tell(STABILIZE)
+    stage.report(GUIDED)
+    stage.report(STABILIZE)
     assert end_of(order) == TOLD
     there = Stage(GUIDED).post("mode", "motion", mode=GUIDED)
     assert end_of(there) == ""
     stage = Stage()
     arm, again = stage.post("arm", armed=True), None
-    stage.tell(STABILIZE, True)
+    stage.report(STABILIZE, True)
     again = stage.post("arm", armed=True)
-    stage.tell(STABILIZE, True)
+    stage.report(STABILIZE, True)
     assert (end_of(arm), end_of(again)) == (TOLD, "")
 
 
@@ -115,18 +115,18 @@ def test_posted_mode_reported_keeps_late_mode_of_previous_order() -> None:
     stage = Stage(GUIDED, True)
     stage.post("mode", "motion", mode=LOITER)
     again = stage.post("mode", "motion", mode=GUIDED)
-    stage.tell(GUIDED, True)
-    stage.tell(LOITER, True)
+    stage.report(GUIDED, True)
+    stage.report(LOITER, True)
     assert end_of(again) == ""
-    stage.tell(GUIDED, True)
+    stage.report(GUIDED, True)
     assert end_of(again) == TOLD
 
 
 def test_unordered_mode_is_takeover() -> None:
     stage = Stage(GUIDED, True)
     motion, disarm = stage.post("motion"), stage.post("arm", armed=False)
-    stage.tell(LOITER, True)
-    stage.tell(GUIDED, True)
+    stage.report(LOITER, True)
+    stage.report(GUIDED, True)
     assert (end_of(motion), end_of(disarm)) == (TAKEN, "")
 
 
@@ -134,25 +134,25 @@ def test_recently_ordered_mode_is_no_takeover() -> None:
     stage = Stage()
     mode, motion = stage.post("mode", "motion", mode=GUIDED), stage.post("motion")
     assert (end_of(mode), end_of(motion)) == ("", "")
-    stage.tell(GUIDED)
+    stage.report(GUIDED)
     assert end_of(motion) == ""
     stage.now += OWN_MODES_MAX_AGE_S
     late = stage.post("motion")
-    stage.tell(STABILIZE)
-    stage.tell(GUIDED)
+    stage.report(STABILIZE)
+    stage.report(GUIDED)
     assert end_of(late) == TAKEN
     stage = Stage()
     stage.arbiter.order(GUIDED)
     of_an_action = stage.post("arm", armed=True)
-    stage.tell(GUIDED)
+    stage.report(GUIDED)
     assert end_of(of_an_action) == ""
 
 
 def test_disarming_ends_posted_motion() -> None:
     stage = Stage(GUIDED, True)
     motion, mode, arm = stage.post("motion"), stage.post("mode"), stage.post("arm", armed=True)
-    stage.tell(GUIDED, False)
-    stage.tell(GUIDED, True)
+    stage.report(GUIDED, False)
+    stage.report(GUIDED, True)
     assert (end_of(motion), end_of(mode), end_of(arm)) == ("the vehicle disarmed", "", TOLD)
 
 
@@ -205,8 +205,8 @@ def long(command: int) -> m.CommandLong:
     ("message", "subjects"),
     [
         (m.SetMode(1, 1, 5), {"mode", "motion"}),
-        *((long(each), {"mode", "motion"}) for each in (SET_MODE, 20, 21, 84, 85, 185, 252, 300)),
-        *((long(each), {"motion"}) for each in (16, 17, 18, 19, 22, 34, 192, 193)),
+        *((long(number), {"mode", "motion"}) for number in (SET_MODE, 20, 21, 84, 85, 185, 252, 300)),
+        *((long(number), {"motion"}) for number in (16, 17, 18, 19, 22, 34, 192, 193)),
         (long(ARM), {"arm"}),
         (long(178), set()),
         (m.CommandInt(1, 0, 6, 192, *(0,) * 9), {"motion"}),
@@ -226,10 +226,10 @@ def test_raw_messages_have_subjects(message: Any, subjects: set[str]) -> None:
 
 @pytest.mark.anyio
 async def test_posted_mode_arm_take_off_without_waiting(grounded: Flight) -> None:
-    """Each goes out at once, while the one before is not answered; lost answers are made good."""
+    """Each is sent at once, before the previous one is acknowledged; lost acks are compensated."""
     vehicle, wire = grounded.vehicle, grounded.wire
-    for each in (SET_MODE, ARM):
-        grounded.copter.faults.lose_ack(each, times=1)
+    for command in (SET_MODE, ARM):
+        grounded.copter.faults.lose_ack(command, times=1)
     guided = vehicle.autopilot.find_mode("GUIDED")
 
     async def mode() -> None:
@@ -248,9 +248,11 @@ async def test_posted_mode_arm_take_off_without_waiting(grounded: Flight) -> Non
 
     started = now()
     async with anyio.create_task_group() as tasks:
-        for each_of in (mode, arm, take_off):
-            tasks.start_soon(each_of)
-    sent = [at for each in (SET_MODE, ARM, TAKEOFF) for at, message in wire.sent if message in wire.commands(each)]
+        for action in (mode, arm, take_off):
+            tasks.start_soon(action)
+    sent = [
+        at for command in (SET_MODE, ARM, TAKEOFF) for at, message in wire.sent if message in wire.commands(command)
+    ]
     assert sent == [started] * 3  # Once each: HEARTBEAT reported the effects of the unacknowledged commands.
     await vehicle.position.wait_until(lambda here: (here.altitude_relative_m or 0) > 4.5, timeout=20)
 
@@ -281,9 +283,9 @@ async def test_message_to_other_system_is_no_order(flying: Flight) -> None:
         m.SetPositionTargetLocalNed(0, vehicle.system_id + 1, 1, 1, 0x0DC7, *(0,) * 11),
     )
     with vehicle.posted("motion") as order:
-        for each in others:
-            vehicle.send(each)
-            assert (each.NAME, order.end) == (each.NAME, "")
+        for other in others:
+            vehicle.send(other)
+            assert (other.NAME, order.end) == (other.NAME, "")
         vehicle.send(m.SetPositionTargetLocalNed(0, 0, 0, 1, 0x0DC7, *(0,) * 11))  # to everybody
         assert order.end == NEWER
 
@@ -347,7 +349,7 @@ async def test_posted_order_ends_action_without_hold() -> None:
 async def test_posted_mode_before_flight_is_no_takeover() -> None:
     """The flight is ordered before HEARTBEAT reports the mode: no takeover, and the flight is monitored."""
     async with in_the_air(latency_s=0.5) as flight:
-        vehicle, told = flight.vehicle, flight.vehicle.telemetry.armed
+        vehicle, reported = flight.vehicle, flight.vehicle.telemetry.armed
         loiter = vehicle.autopilot.find_mode("LOITER")
 
         async def post() -> None:
@@ -355,16 +357,16 @@ async def test_posted_mode_before_flight_is_no_takeover() -> None:
                 await order.command(SET_MODE, *vehicle.autopilot.mode_order(loiter).params)
                 await order.wait_confirmed(5)
 
-        before = told.updated_at
-        await told.wait_until(lambda _: told.updated_at > before, timeout=5)
+        before = reported.updated_at
+        await reported.wait_until(lambda _: reported.updated_at > before, timeout=5)
         await anyio.sleep(0.45)
-        seen = list[Any]()
-        flight.vehicle.telemetry.mode.observe(lambda _, mode: seen.append(str(mode)))
+        observed = list[Any]()
+        flight.vehicle.telemetry.mode.observe(lambda _, mode: observed.append(str(mode)))
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(post)
             await anyio.sleep(0.6)
             await vehicle.go_to(vehicle.position.value.offset(north_m=30))
-        assert seen == ["LOITER", "GUIDED"]
+        assert observed == ["LOITER", "GUIDED"]
 
 
 @pytest.mark.anyio
@@ -386,7 +388,7 @@ async def test_posted_order_errors_say_why(grounded: Flight) -> None:
             await order.wait_confirmed(2)
     with pytest.raises(InvalidArgument, match="no subject is given"), vehicle.posted():
         pass
-    grounded.wire.forget()
+    grounded.wire.clear()
     with pytest.raises(InvalidArgument, match="requires armed=True or armed=False"), vehicle.posted("arm"):
         pass
     with pytest.raises(InvalidArgument, match="the block of this order was left"):
@@ -430,8 +432,8 @@ async def test_disarm_before_armed_report_keeps_pilots_arming(is_posted: bool) -
         vehicle, armed = flight.vehicle, flight.vehicle.telemetry.armed
         await vehicle.wait_ready()
         await vehicle.set_mode("STABILIZE")
-        told_at = armed.updated_at
-        await armed.wait_until(lambda _: armed.updated_at > told_at)
+        reported_at = armed.updated_at
+        await armed.wait_until(lambda _: armed.updated_at > reported_at)
         flight.copter.faults.lose_ack(ARM, times=2)
         with anyio.move_on_after(0.55):
             await vehicle.arm()
@@ -450,7 +452,7 @@ async def test_disarm_before_armed_report_keeps_pilots_arming(is_posted: bool) -
             await armed.wait_until(lambda value: not value)
             flight.copter.arming.arm()
             await anyio.sleep(5)
-        assert [each.param1 for each in flight.wire.commands(ARM)] == [1, 0]
+        assert [command.param1 for command in flight.wire.commands(ARM)] == [1, 0]
         assert vehicle.is_armed
 
 
@@ -473,8 +475,8 @@ async def test_set_heading_after_refused_mode_returns_to_guided() -> None:
     """RTL is active and not reported yet, LAND is refused: the last report of GUIDED does not suffice."""
     async with in_the_air(latency_s=0.1) as flight:
         vehicle, faults, armed = flight.vehicle, flight.copter.faults, flight.vehicle.telemetry.armed
-        told_at = armed.updated_at
-        await armed.wait_until(lambda _: armed.updated_at > told_at)
+        reported_at = armed.updated_at
+        await armed.wait_until(lambda _: armed.updated_at > reported_at)
         faults.lose(m.Heartbeat, times=1)
         with anyio.move_on_after(0.05):
             await vehicle.set_mode("RTL")
@@ -509,14 +511,14 @@ async def test_set_mode_base_mode_and_temporary_rejection_are_handled(grounded: 
 @pytest.mark.anyio
 @pytest.mark.parametrize("is_back", [False, True])
 async def test_posted_mode_is_not_repeated_in_silence_or_after_takeover(is_back: bool) -> None:
-    """Only a HEARTBEAT shows who is in control after a TEMPORARILY_REJECTED."""
+    """After a TEMPORARILY_REJECTED, only a HEARTBEAT shows which party is in control."""
     async with in_the_air() as flight:
         vehicle, faults = flight.vehicle, flight.copter.faults
         land = vehicle.autopilot.find_mode("LAND")
         faults.refuse(SET_MODE, MavResult.TEMPORARILY_REJECTED, times=1)
         faults.heartbeats_stopped = True
         await anyio.sleep(8)
-        flight.wire.forget()
+        flight.wire.clear()
         flight.pilot_takes_over()
         async with anyio.create_task_group() as tasks:
 
@@ -615,5 +617,5 @@ def test_mode_ordered_ten_seconds_ago_is_takeover(waited_s: float, end: str) -> 
     stage.post("mode", mode=GUIDED)
     stage.now += waited_s
     motion = stage.post("motion")
-    stage.tell(GUIDED)
+    stage.report(GUIDED)
     assert end_of(motion) == end

@@ -41,7 +41,7 @@ async def test_px4_take_off_uses_amsl_altitude_and_ends_in_loiter() -> None:
     async with open_px4() as flight:
         await flight.vehicle.wait_ready()
         await flight.vehicle.arm()
-        flight.wire.forget()
+        flight.wire.clear()
         await flight.vehicle.take_off(12.0)
         (command,) = flight.wire.commands(MavCmd.NAV_TAKEOFF)
         assert isinstance(command, m.CommandLong)
@@ -56,7 +56,7 @@ async def test_px4_take_off_uses_amsl_altitude_and_ends_in_loiter() -> None:
 async def test_take_off_is_not_repeated_after_mode_report(
     monkeypatch: pytest.MonkeyPatch, tells_landed_state: bool
 ) -> None:
-    """It starts in LOITER, where it also ends, and stands for a second while the motors spin up."""
+    """It starts and ends in LOITER, and stays on the ground for a second while the motors spin up."""
     async with open_px4() as flight:
         await flight.vehicle.wait_ready()
         await flight.vehicle.set_mode("LOITER")
@@ -120,7 +120,7 @@ async def test_go_to_with_speed_and_heading(flying: Px4Flight) -> None:
 
 
 async def test_px4_go_to_cancelled_stops_in_place(flying: Px4Flight) -> None:
-    """A PX4 on its way is in LOITER too: the mode alone would let it fly on."""
+    """A PX4 that flies to a destination is in LOITER as well, so setting the mode would not stop it."""
     with anyio.move_on_after(5.0) as scope:
         await flying.vehicle.go_to(north_of_home(flying, 300.0))
     assert scope.cancelled_caught
@@ -193,10 +193,10 @@ async def test_land_current_mode_before_heartbeat_ends_landing(
     flying: Px4Flight, monkeypatch: pytest.MonkeyPatch, is_taken: bool
 ) -> None:
     """It leaves LAND when it disarms; CURRENT_MODE arrives up to a second before the HEARTBEAT."""
-    told: list[str] = []
+    reported: list[str] = []
 
     def look() -> None:
-        told.append(flying.vehicle.taken_over)
+        reported.append(flying.vehicle.taken_over)
 
     monkeypatch.setattr(flying.vehicle.telemetry, "landed_state", StateCell[int]("landed_state", now, "nothing"))
     async with anyio.create_task_group() as tasks:
@@ -209,12 +209,12 @@ async def test_land_current_mode_before_heartbeat_ends_landing(
             else:
                 while flying.px4.is_armed:  # noqa: ASYNC110
                     await anyio.sleep(0.01)
-            heard = flying.vehicle.armed.updated_at
+            received = flying.vehicle.armed.updated_at
             flying.px4.send(m.CurrentMode(0, custom_mode(flying.px4.mode), custom_mode(flying.px4.mode)))
             await flying.vehicle.mode.wait_until(lambda mode: mode.name != "LAND")
-            assert flying.vehicle.armed.updated_at == heard, "no HEARTBEAT came meanwhile"
+            assert flying.vehicle.armed.updated_at == received, "no HEARTBEAT came meanwhile"
             look()
-            await flying.vehicle.armed.wait_until(lambda _: flying.vehicle.armed.updated_at > heard)
+            await flying.vehicle.armed.wait_until(lambda _: flying.vehicle.armed.updated_at > received)
             look()
 
         tasks.start_soon(current_mode)
@@ -223,7 +223,7 @@ async def test_land_current_mode_before_heartbeat_ends_landing(
                 await flying.vehicle.land()
         else:
             await flying.vehicle.land()
-    assert told == (["", "the mode changed to POSCTL"] if is_taken else ["", "the mode changed to LOITER"])
+    assert reported == (["", "the mode changed to POSCTL"] if is_taken else ["", "the mode changed to LOITER"])
 
 
 async def test_reboot() -> None:
@@ -251,5 +251,5 @@ async def test_second_ack_of_cancelled_mode_is_not_taken_for_next(
         monkeypatch.undo()
         flight.px4.faults.ignore(MavCmd.DO_SET_MODE, times=1)
         await vehicle.land(timeout=60.0)
-        modes = [each for each in flight.wire.commands(MavCmd.DO_SET_MODE) if isinstance(each, m.CommandLong)]
-        assert [int(each.param3) for each in modes] == [5, 6, 6]
+        modes = [command for command in flight.wire.commands(MavCmd.DO_SET_MODE) if isinstance(command, m.CommandLong)]
+        assert [int(mode.param3) for mode in modes] == [5, 6, 6]

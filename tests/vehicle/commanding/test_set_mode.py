@@ -108,7 +108,7 @@ async def test_available_modes_name_is_accepted() -> None:
 
 
 async def test_available_modes_are_requested_until_received() -> None:
-    """The link is bad when the vehicle connects: its own modes are asked for again."""
+    """The link is bad when the vehicle connects: its list of modes is requested again."""
     copter = CopterWithAScript(boot_time_s=0.0)
     copter.faults.ignore(MavCmd.REQUEST_MESSAGE)
     async with open_flight(copter) as flight:
@@ -138,7 +138,7 @@ async def test_px4_mode_has_main_and_sub_mode(mode: str | int, params: tuple[flo
     async with open_px4() as flight:
         await flight.vehicle.wait_ready()
         await flight.vehicle.set_mode("ALTCTL")
-        flight.wire.forget()
+        flight.wire.clear()
         await flight.vehicle.set_mode(mode)
         (command,) = flight.wire.commands(MavCmd.DO_SET_MODE)
         assert (command.param1, command.param2, command.param3) == params

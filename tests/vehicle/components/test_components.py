@@ -40,20 +40,20 @@ async def on_board(*components: SimulatedCamera | SimulatedGimbal) -> AsyncItera
 async def test_components_are_listed_with_kind_and_age() -> None:
     async with on_board(SimulatedCamera(), SimulatedCamera(101), SimulatedGimbal()) as vehicle:
         reported = vehicle.components.value
-        assert [(each.component_id, each.device_id, each.kind) for each in reported] == [
+        assert [(event.component_id, event.device_id, event.kind) for event in reported] == [
             (1, 0, "autopilot"),
             (100, 0, "camera"),
             (101, 0, "camera"),
             (154, 0, "gimbal"),
         ]
-        assert all(0 <= vehicle.connection.now() - each.received_at <= 1.5 for each in reported)
+        assert all(0 <= vehicle.connection.now() - event.received_at <= 1.5 for event in reported)
 
 
 async def test_new_component_is_added_to_the_list() -> None:
     camera = SimulatedCamera()
     camera.faults.silent = True
     async with on_board(camera) as vehicle:
-        assert [each.kind for each in vehicle.components.value] == ["autopilot"]
+        assert [component.kind for component in vehicle.components.value] == ["autopilot"]
         assert vehicle.component(100).is_silent
         assert vehicle.component(100).kind == "unknown"
         camera.faults.silent = False
@@ -64,7 +64,7 @@ async def test_new_component_is_added_to_the_list() -> None:
 
 async def test_devices_attached_to_autopilot_are_listed() -> None:
     async with on_board() as vehicle:
-        assert [each.device_id for each in vehicle.components.value] == [0]
+        assert [component.device_id for component in vehicle.components.value] == [0]
         source = m.GimbalDeviceAttitudeStatus(0, 0, 0, 0, (1.0, 0.0, 0.0, 0.0), 0, 0, 0, 0)
         assert source.gimbal_device_id == 0
     device = m.GimbalDeviceAttitudeStatus(0, 0, 0, 0, (1.0, 0.0, 0.0, 0.0), 0, 0, 0, 0, gimbal_device_id=2)
@@ -88,7 +88,7 @@ async def test_component_messages_at_requested_rate() -> None:
                 came.append(status)
             assert slow.get_nowait() is None
         assert 35 <= len(came) <= 41
-        assert {each.received_frame.component_id for each in came if each.received_frame} == {101}
+        assert {message.received_frame.component_id for message in came if message.received_frame} == {101}
 
 
 async def test_message_cell_is_per_component() -> None:
@@ -139,7 +139,9 @@ async def test_lost_answer_is_requested_again() -> None:
 
 async def test_request_where_selects_the_message() -> None:
     async with on_board(SimulatedCamera(streams=["rtsp://127.0.0.1/a", "rtsp://127.0.0.1/b"])) as vehicle:
-        stream = await vehicle.component(100).request(m.VideoStreamInformation, where=lambda each: each.stream_id == 2)
+        stream = await vehicle.component(100).request(
+            m.VideoStreamInformation, where=lambda stream_information: stream_information.stream_id == 2
+        )
         assert stream.uri == "rtsp://127.0.0.1/b"
 
 
@@ -161,7 +163,7 @@ async def test_all_discovered_components_are_published() -> None:
             while (event := found.get_nowait()) is not None:
                 assert isinstance(event, VehicleFound | ComponentFound)
                 reported.append((type(event), event.system_id, event.component_id))
-        assert sorted(reported, key=lambda each: each[1:]) == [
+        assert sorted(reported, key=lambda report: report[1:]) == [
             (VehicleFound, 1, 1),
             (ComponentFound, 1, 100),
             (VehicleFound, 2, 1),
@@ -172,8 +174,8 @@ async def test_all_discovered_components_are_published() -> None:
 async def first_vehicles(connection: Connection, count: int) -> list[tuple[int, int, int]]:
     found = []
     with anyio.fail_after(5.0):
-        async for each in connection.vehicles():
-            found.append((each.system_id, each.vehicle_type, each.autopilot))
+        async for vehicle in connection.vehicles():
+            found.append((vehicle.system_id, vehicle.vehicle_type, vehicle.autopilot))
             if len(found) == count:
                 return sorted(found)
     raise AssertionError("the connection goes on, and so does the search")
@@ -194,7 +196,7 @@ async def test_vehicle_search_continues_while_nothing_is_found() -> None:
             late.faults.silent = False
 
         tasks.start_soon(wake)
-        assert [each[0] for each in await first_vehicles(connection, 2)] == [1, 2]
+        assert [vehicle[0] for vehicle in await first_vehicles(connection, 2)] == [1, 2]
 
 
 async def test_autopilot_is_a_component() -> None:

@@ -45,7 +45,7 @@ class WebServer:
         self.server.block_on_close = False
         self.address = f"http://127.0.0.1:{self.server.server_port}"
 
-    def says(self, path: str, content: bytes, *, status: int = 200, length: int | None = None) -> str:
+    def serve_content(self, path: str, content: bytes, *, status: int = 200, length: int | None = None) -> str:
         def answer(handler: BaseHTTPRequestHandler) -> None:
             handler.send_response(status)
             handler.send_header("Content-Length", str(len(content) if length is None else length))
@@ -89,16 +89,16 @@ async def fetched(uri: str, idle_timeout_s: float = PATIENCE_S) -> bytes:
 
 
 async def test_definition_is_fetched_from_the_web(web_server: WebServer) -> None:
-    place = web_server.says("/camera.xml", own_definition())
+    place = web_server.serve_content("/camera.xml", own_definition())
     assert len(parse_definition(await fetched(place)).settings) == 12
     assert await fetched(web_server.leads("/latest", place)) == own_definition()
 
 
 async def test_web_server_errors_are_operation_rejected(web_server: WebServer) -> None:
     with pytest.raises(OperationRejected, match="404"):
-        await fetched(web_server.says("/gone", b"", status=404))
+        await fetched(web_server.serve_content("/gone", b"", status=404))
     with pytest.raises(OperationRejected, match=r"5 bytes are missing|IncompleteRead"):
-        await fetched(web_server.says("/cut", b"12345", length=10))
+        await fetched(web_server.serve_content("/cut", b"12345", length=10))
     with pytest.raises(OperationRejected, match="could not be fetched"):
         await fetched("http://127.0.0.1:1/camera.xml")
     with pytest.raises(OperationRejected, match="could not be fetched"):
@@ -118,7 +118,7 @@ async def test_redirect_loop_is_an_error(web_server: WebServer) -> None:
 
 async def test_oversized_web_file_is_refused(web_server: WebServer) -> None:
     with pytest.raises(FileFormatError, match="more than 16 MB"):
-        await fetched(web_server.says("/large", bytes(MAX_FILE_SIZE + 1)))
+        await fetched(web_server.serve_content("/large", bytes(MAX_FILE_SIZE + 1)))
 
 
 async def test_silent_web_server_times_out(web_server: WebServer) -> None:
@@ -134,13 +134,13 @@ async def test_cancelled_fetch_leaves_no_thread(web_server: WebServer) -> None:
     """The server keeps sending single bytes of its header."""
     loop, has_begun = asyncio.get_running_loop(), asyncio.Event()
 
-    def drip(handler: BaseHTTPRequestHandler) -> None:
+    def send_slowly(handler: BaseHTTPRequestHandler) -> None:
         loop.call_soon_threadsafe(has_begun.set)
         handler.wfile.write(b"HTTP/1.1 200 OK\r\nX-Long: ")
         while not web_server.is_over.wait(0.01):
             handler.wfile.write(b"x")
 
-    web_server.answers["/drip"] = drip
+    web_server.answers["/drip"] = send_slowly
     async with anyio.create_task_group() as group:
         group.start_soon(fetched, f"{web_server.address}/drip")
         await has_begun.wait()

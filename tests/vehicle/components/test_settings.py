@@ -47,7 +47,7 @@ class Bench:
             camera.vehicle.observe(kind, lambda message, _: self.sent.append(message))
 
     def all(self, kind: type[Message]) -> list[Any]:
-        return [each for each in self.sent if isinstance(each, kind)]
+        return [message for message in self.sent if isinstance(message, kind)]
 
     @property
     def values(self) -> dict[str, Any]:
@@ -321,7 +321,7 @@ async def test_unknown_deciding_settings_are_read_first() -> None:
         await shelf.settings.fetch_definition()
         with pytest.raises(InvalidArgument, match="excluded by CAM_EXPMODE = Auto"):
             await shelf.settings.set("CAM_ISO", "400")
-        assert {each.param_id for each in shelf.all(m.ParamExtRequestRead)} == {
+        assert {request.param_id for request in shelf.all(m.ParamExtRequestRead)} == {
             "CAM_MODE",
             "CAM_EXPMODE",
             "CAM_ISO",
@@ -345,7 +345,7 @@ async def test_absent_settings_are_requested_once(is_downloaded: bool) -> None:
             assert shelf.all(m.ParamExtRequestRead)
         shelf.sent.clear()
         await shelf.settings.set("CAM_WBMODE", "Cloudy")
-        assert [type(each) for each in shelf.sent] == [m.ParamExtSet]
+        assert [type(message) for message in shelf.sent] == [m.ParamExtSet]
 
 
 async def test_options_depend_on_other_settings() -> None:
@@ -373,7 +373,7 @@ async def test_dependent_settings_are_read_again() -> None:
         await settings.set("CAM_ISO", 1600)
         shelf.sent.clear()
         await settings.set("CAM_EXPMODE", "Auto")
-        asked = [each.param_id for each in shelf.all(m.ParamExtRequestRead)]
+        asked = [request.param_id for request in shelf.all(m.ParamExtRequestRead)]
         assert asked == ["CAM_ISO", "CAM_SHUTTER", "CAM_EV"]
         assert settings.table["CAM_ISO"].value == shelf.values["CAM_ISO"] == 200
 
@@ -428,7 +428,7 @@ async def test_component_files() -> None:
     async with on_board(SimulatedCamera(101)) as shelf:
         shelf.camera.files.put("/DCIM/0001.jpg", bytes(range(256)) * 40)
         files = shelf.component.files
-        assert [each.name for each in await files.list("/DCIM")] == ["0001.jpg"]
+        assert [file.name for file in await files.list("/DCIM")] == ["0001.jpg"]
         assert await files.read("/DCIM/0001.jpg") == bytes(range(256)) * 40
         await files.write("/notes.txt", b"seen")
         assert shelf.camera.files.get("/notes.txt") == b"seen"

@@ -48,23 +48,23 @@ async def fleet() -> AsyncIterator[Fleet]:
 
 
 async def test_take_photo_of_component_camera() -> None:
-    async with fleet() as each:
+    async with fleet() as devices:
         with (
-            each.one.subscribe(m.CameraImageCaptured, capacity=10) as mine,
-            each.two.subscribe(m.CameraImageCaptured, capacity=10) as others,
+            devices.one.subscribe(m.CameraImageCaptured, capacity=10) as mine,
+            devices.two.subscribe(m.CameraImageCaptured, capacity=10) as others,
         ):
-            await each.one.command(START, 0, 0, 1, component_id=100)
+            await devices.one.command(START, 0, 0, 1, component_id=100)
             with anyio.fail_after(2.0):
                 image = await mine.get()
             assert image.image_index == 0
             await anyio.sleep(1.0)
             assert others.get_nowait() is None
-        assert [camera.image_count for camera in each.cameras] == [1, 0]
+        assert [camera.image_count for camera in devices.cameras] == [1, 0]
 
 
 async def test_cameras_answer_their_own_program() -> None:
-    async with fleet() as each:
-        each.cameras[1].faults.refuse(START, MavResult.TEMPORARILY_REJECTED)
+    async with fleet() as devices:
+        devices.cameras[1].faults.refuse(START, MavResult.TEMPORARILY_REJECTED)
 
         async def order(vehicle: aerokit.Vehicle, results: list[int]) -> None:
             try:
@@ -77,22 +77,22 @@ async def test_cameras_answer_their_own_program() -> None:
         one: list[int] = []
         two: list[int] = []
         async with anyio.create_task_group() as tasks:
-            tasks.start_soon(order, each.one, one)
-            tasks.start_soon(order, each.two, two)
+            tasks.start_soon(order, devices.one, one)
+            tasks.start_soon(order, devices.two, two)
         assert (one, two) == ([MavResult.ACCEPTED], [MavResult.TEMPORARILY_REJECTED])
 
 
 async def test_autopilot_and_camera_requests_run_concurrently() -> None:
     """The same command to two components: acknowledgements are matched by component."""
-    async with fleet() as each:
+    async with fleet() as devices:
         information = m.CameraInformation.ID
 
         async def ask_the_camera() -> None:
-            await each.one.command(MavCmd.REQUEST_MESSAGE, information, component_id=100)
+            await devices.one.command(MavCmd.REQUEST_MESSAGE, information, component_id=100)
 
         async def ask_the_autopilot() -> None:
             with pytest.raises(CommandRejected):
-                await each.one.command(MavCmd.REQUEST_MESSAGE, m.StorageInformation.ID)
+                await devices.one.command(MavCmd.REQUEST_MESSAGE, m.StorageInformation.ID)
 
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(ask_the_autopilot)
@@ -100,38 +100,38 @@ async def test_autopilot_and_camera_requests_run_concurrently() -> None:
 
 
 async def test_format_storage_reports_progress() -> None:
-    async with fleet() as each:
+    async with fleet() as devices:
         percents: list[int | None] = []
-        await each.two.command(
+        await devices.two.command(
             MavCmd.STORAGE_FORMAT, 1, 1, component_id=100, on_progress=percents.append, attempt_timeout=3.0
         )
-        assert percents == [None, 25, 50, 75]  # devices that do not know the progress send 0
+        assert percents == [None, 25, 50, 75]  # devices without a progress value send 0
 
 
 async def test_gimbal_obeys_its_controller() -> None:
-    async with fleet() as each:
+    async with fleet() as devices:
         point = MavCmd.DO_GIMBAL_MANAGER_PITCHYAW
         with pytest.raises(CommandRejected) as refusal:
-            await each.two.command(point, -30, 0, NAN, NAN, component_id=154)
+            await devices.two.command(point, -30, 0, NAN, NAN, component_id=154)
         assert refusal.value.result == MavResult.DENIED
-        await each.two.command(MavCmd.DO_GIMBAL_MANAGER_CONFIGURE, -2, -2, -1, -1, component_id=154)
-        await each.two.command(point, -30, 0, NAN, NAN, component_id=154)
+        await devices.two.command(MavCmd.DO_GIMBAL_MANAGER_CONFIGURE, -2, -2, -1, -1, component_id=154)
+        await devices.two.command(point, -30, 0, NAN, NAN, component_id=154)
         await anyio.sleep(1.0)
-        assert [round(gimbal.angles()[1], 2) for gimbal in each.gimbals] == [0.0, -0.52]
+        assert [round(gimbal.angles()[1], 2) for gimbal in devices.gimbals] == [0.0, -0.52]
 
 
 async def test_devices_do_not_change_vehicle_state() -> None:
-    async with fleet() as each:
-        await each.one.wait_ready()
-        await each.two.wait_ready()
-        each.cameras[0].send_text(4, "lens cap")
-        await each.one.command(START, 0, 0.5, 0, component_id=100)
-        await each.one.set_mode("GUIDED")
-        await each.one.arm()
-        await each.one.take_off(5.0)
-        assert each.one.is_armed
-        assert not each.two.is_armed
-        assert each.one.component_id == 1
-        assert each.cameras[0].image_count > 5
-        last = each.cameras[0].captures.images[-1]
+    async with fleet() as devices:
+        await devices.one.wait_ready()
+        await devices.two.wait_ready()
+        devices.cameras[0].send_text(4, "lens cap")
+        await devices.one.command(START, 0, 0.5, 0, component_id=100)
+        await devices.one.set_mode("GUIDED")
+        await devices.one.arm()
+        await devices.one.take_off(5.0)
+        assert devices.one.is_armed
+        assert not devices.two.is_armed
+        assert devices.one.component_id == 1
+        assert devices.cameras[0].image_count > 5
+        last = devices.cameras[0].captures.images[-1]
         assert last.relative_alt > 3000

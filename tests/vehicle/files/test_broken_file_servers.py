@@ -160,11 +160,11 @@ async def test_listing_invalid_size_is_none(grounded: Flight) -> None:
 
 
 async def test_write_of_vanished_file_raises(grounded: Flight) -> None:
-    def forgetful(request: FtpMessage) -> Iterator[FtpMessage]:
+    def lacks_checksums(request: FtpMessage) -> Iterator[FtpMessage]:
         missing = request.opcode == MavFtpOpcode.CALCFILECRC
         yield nak(request, MavFtpErr.FILENOTFOUND) if missing else ack(request, bytes(4))
 
-    serve(grounded, forgetful)
+    serve(grounded, lacks_checksums)
     with pytest.raises(FileError, match="no such file"):
         await grounded.vehicle.files.write("/a", b"data")
 

@@ -57,7 +57,7 @@ class Bench:
         return bytes(file.read(0, 10_000_000))
 
     def sent(self) -> list[FtpMessage]:
-        return [FtpMessage.decode(each.payload) for each in self.wire.all(m.FileTransferProtocol)]
+        return [FtpMessage.decode(message.payload) for message in self.wire.all(m.FileTransferProtocol)]
 
     async def all_closed(self) -> None:
         """Check that within seconds the vehicle has no open session, and no task waits here."""
@@ -272,7 +272,7 @@ async def test_local_disk_errors_propagate(ardupilot: Bench, tmp_path: Path) -> 
     assert names_in(tmp_path) == []
 
 
-# ----------------------------------------------------------------------------- kinds of end
+# ------------------------------------------------------------------ errors and cancellation
 
 
 async def test_cancellation_at_any_time_closes_the_session(bench: Bench) -> None:
@@ -395,7 +395,7 @@ async def test_write_is_verified(ardupilot: Bench, monkeypatch: pytest.MonkeyPat
 
 
 def names_in(directory: Path) -> list[str]:
-    return sorted(each.name for each in directory.iterdir())
+    return sorted(path.name for path in directory.iterdir())
 
 
 def frame_of(message: m.FileTransferProtocol) -> bytes:
@@ -423,7 +423,7 @@ def test_transfer_over_bad_radio(make: Any, loss: float, seed: int) -> None:
                 assert await vehicle.files.read(f"{root}/x") == DATA[:8000]
                 await vehicle.files.make_directory(f"{root}/d")
                 await vehicle.files.rename(f"{root}/x", f"{root}/d/x")
-                assert [each.name for each in await vehicle.files.list(f"{root}/d")] == ["x"]
+                assert [entry.name for entry in await vehicle.files.list(f"{root}/d")] == ["x"]
                 await vehicle.files.remove(f"{root}/d/x")
                 await vehicle.files.remove_directory(f"{root}/d")
                 radio.outgoing.model = radio.incoming.model = FaultModel(delay_s=0.05)

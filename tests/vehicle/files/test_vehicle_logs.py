@@ -40,7 +40,7 @@ class Bench:
         kinds = (m.LogRequestList, m.LogRequestData, m.LogRequestEnd, m.LogErase, m.FileTransferProtocol)
         return sum(len(self.wire.all(kind)) for kind in kinds)
 
-    async def all_quiet(self) -> None:
+    async def wait_idle(self) -> None:
         for _ in range(100):
             if not self.server.is_busy and not self.simulated.ftp.open_sessions:
                 return
@@ -74,7 +74,7 @@ async def ardupilot() -> AsyncIterator[Bench]:
 
 async def test_list_returns_logs(bench: Bench) -> None:
     entries = await bench.logs.list()
-    assert [each.size for each in entries] == [each.size for each in bench.server.logs]
+    assert [entry.size for entry in entries] == [log.size for log in bench.server.logs]
     assert entries[0].id == bench.vehicle.autopilot.first_log_id
     assert entries[0].time_utc == datetime.fromtimestamp(bench.server.logs[0].time_utc, tz=timezone.utc)
 
@@ -84,12 +84,12 @@ async def test_read_by_messages_and_mavftp(bench: Bench) -> None:
         for method in ("auto", "log"):
             assert await bench.logs.read(entry, method=method) == bench.content(number)
         assert await bench.logs.read(entry.id) == bench.content(number)
-    await bench.all_quiet()
+    await bench.wait_idle()
 
 
 async def test_read_by_mavftp(ardupilot: Bench) -> None:
     entries = await ardupilot.logs.list()
-    ardupilot.wire.forget()
+    ardupilot.wire.clear()
     assert await ardupilot.logs.read(entries[0], method="ftp") == ardupilot.content(0)
     assert not ardupilot.wire.all(m.LogRequestData)
 
@@ -100,7 +100,7 @@ async def test_in_flight_only_mavftp_works(ardupilot: Bench) -> None:
     await ardupilot.vehicle.wait_ready()
     await ardupilot.vehicle.arm()
     assert await ardupilot.logs.read(entries[0]) == ardupilot.content(0)
-    ardupilot.wire.forget()
+    ardupilot.wire.clear()
     with pytest.raises(FileTimeout, match="does not answer"):
         await ardupilot.logs.read(entries[0], method="log", idle_timeout_s=2.0)
     assert not ardupilot.wire.all(m.FileTransferProtocol)
@@ -118,7 +118,7 @@ async def test_download_resumes(bench: Bench, tmp_path: Path) -> None:
 
     with anyio.CancelScope() as scope:
         await bench.logs.download(entry, to, method="log", on_progress=stop)
-    await bench.all_quiet()
+    await bench.wait_idle()
     (part,) = names_in(tmp_path)
     assert part.startswith("flight.bin.log")
     reported: list[TransferProgress] = []
@@ -168,10 +168,10 @@ async def test_growing_log_is_read_to_its_current_end(
             await bench.logs.download(entry, tmp_path / "flight.bin", method=method)
         assert bench.content(-1).startswith(content)
         assert bench.content(-1).startswith((tmp_path / "flight.bin").read_bytes())
-        texts = [each.getMessage() for each in caplog.records]
+        texts = [record.getMessage() for record in caplog.records]
         assert f"log {entry.id} was still being written: listed with {entry.size} byt" in texts[0]
         assert f"downloaded with {len(content)}" in texts[0]
-        await bench.all_quiet()
+        await bench.wait_idle()
 
 
 async def test_complete_log_is_not_reported_as_growing(ardupilot: Bench, caplog: pytest.LogCaptureFixture) -> None:
@@ -179,7 +179,7 @@ async def test_complete_log_is_not_reported_as_growing(ardupilot: Bench, caplog:
     with caplog.at_level("INFO", "aerokit"):
         await ardupilot.logs.read(entry, method="log")
         await ardupilot.logs.read(entry, method="ftp")
-    assert not [each for each in caplog.records if "being written" in each.getMessage()]
+    assert not [record for record in caplog.records if "being written" in record.getMessage()]
 
 
 async def test_log_ended_since_listing_is_read_in_flight(ardupilot: Bench) -> None:
@@ -227,7 +227,7 @@ async def test_resumed_download_of_growing_log_is_complete(ardupilot: Bench, tmp
 
 
 async def test_invalid_log_arguments_are_refused(bench: Bench) -> None:
-    bench.wire.forget()
+    bench.wire.clear()
     logs: Any = bench.logs
     for log in (-1, 65536, "1"):
         with pytest.raises(InvalidArgument, match="log"):
@@ -256,7 +256,7 @@ async def test_cancellation_at_any_time_ends_the_transfer(bench: Bench) -> None:
     for milliseconds in range(0, 300, 37):
         with anyio.move_on_after(milliseconds / 1000):
             await bench.logs.read(entry, method="log")
-        await bench.all_quiet()
+        await bench.wait_idle()
     assert await bench.logs.read(entry, method="log") == bench.content(0)
 
 
@@ -265,7 +265,7 @@ async def test_timeout_limits_the_whole_call(bench: Bench) -> None:
     with pytest.raises(FileTimeout, match=r"not done within 0\.1 s") as raised:
         await bench.logs.read(entry, method="log", timeout=0.1)
     assert raised.value.missing
-    await bench.all_quiet()
+    await bench.wait_idle()
 
 
 async def test_log_path_identifies_files() -> None:
@@ -290,7 +290,7 @@ async def test_log_path_identifies_files() -> None:
 
 
 def names_in(directory: Path) -> list[str]:
-    return sorted(each.name for each in directory.iterdir())
+    return sorted(path.name for path in directory.iterdir())
 
 
 @pytest.mark.parametrize("make", [SimulatedCopter, SimulatedPx4])
@@ -307,7 +307,7 @@ def test_transfer_over_bad_radio(make: Any, loss: float, seed: int) -> None:
                 radio.outgoing.model = radio.incoming.model = model
                 logs = simulated.storage.logs
                 entries = await vehicle.logs.list()
-                assert [each.size for each in entries] == [each.size for each in logs.logs]
+                assert [entry.size for entry in entries] == [log.size for log in logs.logs]
                 assert await vehicle.logs.read(entries[-1], method="log") == logs.logs[-1].make()
                 radio.outgoing.model = radio.incoming.model = FaultModel(delay_s=0.05)
                 await anyio.sleep(5.0)

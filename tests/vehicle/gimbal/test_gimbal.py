@@ -55,7 +55,9 @@ async def test_gimbal_points_and_reports_attitude() -> None:
     async with in_the_air(copter=with_gimbal()) as flight:
         gimbal = flight.vehicle.gimbal
         await gimbal.point(-45.0, 90.0, wait=False)
-        reported = await gimbal.attitude.wait_until(lambda each: abs((each.pitch_deg or 0.0) + 45) < 1, timeout=5)
+        reported = await gimbal.attitude.wait_until(
+            lambda attitude: abs((attitude.pitch_deg or 0.0) + 45) < 1, timeout=5
+        )
         assert reported.yaw_deg == pytest.approx(90, abs=2)
         assert gimbal.attitude.source == Source(1, 1, "GIMBAL_DEVICE_ATTITUDE_STATUS")
         (command,) = flight.wire.commands(PITCHYAW)
@@ -96,7 +98,7 @@ async def test_attitude_request_ends_with_the_last_watcher() -> None:
 async def test_point_with_roll_uses_mount_command() -> None:
     async with in_the_air(copter=with_gimbal()) as flight:
         await flight.vehicle.set_heading(90.0, tolerance_deg=1.0)
-        flight.wire.forget()
+        flight.wire.clear()
         await flight.vehicle.gimbal.point(-45.0, 80.0, roll_deg=5.0, wait=False)
         (command,) = flight.wire.commands(MOUNT)
         assert params(command) == pytest.approx((-45, 5, -10, 2), abs=2)
@@ -108,7 +110,7 @@ async def test_denied_order_claims_control_until_release() -> None:
         flight.copter.faults.refuse(PITCHYAW, DENIED)
         with pytest.raises(CommandRejected):
             await flight.vehicle.gimbal.point(-45.0, 0.0, wait=False)
-        assert [len(flight.wire.commands(each)) for each in (PITCHYAW, CONFIGURE)] == [2, 1]
+        assert [len(flight.wire.commands(command)) for command in (PITCHYAW, CONFIGURE)] == [2, 1]
         assert params(flight.wire.commands(CONFIGURE)[0])[:2] == (
             255,
             flight.vehicle.connection.source_component,
@@ -117,19 +119,19 @@ async def test_denied_order_claims_control_until_release() -> None:
         flight.copter.faults.refuse(CONFIGURE, MavResult.ACCEPTED)
         for _ in range(2):
             await flight.vehicle.gimbal.release()
-        assert [params(each)[:2] for each in flight.wire.commands(CONFIGURE)[1:]] == [(-3, -3)]
+        assert [params(command)[:2] for command in flight.wire.commands(CONFIGURE)[1:]] == [(-3, -3)]
 
 
 async def test_old_firmware_gets_mount_messages() -> None:
     async with open_flight() as flight:
-        for each in (PITCHYAW, MOUNT):
-            flight.copter.faults.refuse(each, UNSUPPORTED)
+        for command in (PITCHYAW, MOUNT):
+            flight.copter.faults.refuse(command, UNSUPPORTED)
         for _ in range(2):
             await flight.vehicle.gimbal.point(-45.5, 90.0, wait=False)
-        assert [len(flight.wire.commands(each)) for each in (PITCHYAW, MOUNT)] == [1, 1]
+        assert [len(flight.wire.commands(command)) for command in (PITCHYAW, MOUNT)] == [1, 1]
         control = flight.wire.all(m.MountControl)
-        assert [(each.input_a, each.input_b, each.input_c) for each in control] == [(-4550, 0, 9000)] * 2
-        assert [each.mount_mode for each in flight.wire.all(m.MountConfigure)] == [2, 2]
+        assert [(message.input_a, message.input_b, message.input_c) for message in control] == [(-4550, 0, 9000)] * 2
+        assert [message.mount_mode for message in flight.wire.all(m.MountConfigure)] == [2, 2]
 
 
 async def test_standalone_gimbal_is_reported_and_first_one_wins() -> None:
@@ -171,7 +173,7 @@ async def test_angles_out_of_range_are_refused(wrong: float, grounded: Flight) -
     for pitch, yaw, roll in ((wrong, 0.0, 0.0), (0.0, wrong, 0.0), (0.0, 0.0, wrong)):
         with pytest.raises(InvalidArgument, match=r"_deg = .* is not allowed"):
             await gimbal.point(pitch, yaw, roll_deg=roll)
-    assert not [each for kind in (PITCHYAW, MOUNT) for each in grounded.wire.commands(kind)]
+    assert not [command for kind in (PITCHYAW, MOUNT) for command in grounded.wire.commands(kind)]
 
 
 # ------------------------------------------------------------------------------------------------ regions of interest
@@ -228,7 +230,7 @@ async def test_set_home_without_command_int() -> None:
         wanted = place(flight, altitude_amsl_m=flight.vehicle.home.value.altitude_amsl_m)
         await flight.vehicle.set_home(wanted)
         assert flight.vehicle.home.value.position.distance_to(wanted) < 1.0  # precision of a 32-bit float
-        kinds = [type(each) for each in flight.wire.commands(MavCmd.DO_SET_HOME)]
+        kinds = [type(command) for command in flight.wire.commands(MavCmd.DO_SET_HOME)]
         assert kinds == [m.CommandInt, m.CommandLong]
 
 

@@ -16,11 +16,11 @@ from gimbal_stage import (
     CONFIGURE,
     OTHER,
     PITCHYAW,
-    beside,
     configured,
     mounted,
+    own_ids,
     takes_control,
-    us,
+    with_gimbals,
 )
 
 from aerokit import errors, events
@@ -54,15 +54,15 @@ class Boom(Exception):
 
 async def test_control_is_taken_confirmed_and_released() -> None:
     gimbal = SimulatedGimbal()
-    async with beside(gimbal) as flight:
+    async with with_gimbals(gimbal) as flight:
         async with flight.vehicle.gimbal.control() as control:
-            assert gimbal.primary == us(flight)
+            assert gimbal.primary == own_ids(flight)
             assert (control.is_held, control.is_primary) == (True, True)
-            assert flight.vehicle.gimbal.controllers.value.primary == us(flight)
+            assert flight.vehicle.gimbal.controllers.value.primary == own_ids(flight)
             await flight.vehicle.gimbal.point(-20.0, 0.0, frame="vehicle")
         assert gimbal.primary == (0, 0)
         assert not control.is_held
-        assert configured(flight)[0] == (*us(flight), *KEEP, 154)
+        assert configured(flight)[0] == (*own_ids(flight), *KEEP, 154)
         assert configured(flight)[-1] == (-3, -3, *KEEP, 154)
 
 
@@ -70,17 +70,17 @@ async def test_control_requests_status_from_autopilot() -> None:
     async with mounted() as flight:
         for _ in range(2):
             async with flight.vehicle.gimbal.control():
-                assert flight.copter.gimbal.in_control == us(flight)
+                assert flight.copter.gimbal.in_control == own_ids(flight)
             assert flight.copter.gimbal.in_control == (0, 0)
-        assert configured(flight)[0] == (*us(flight), *KEEP, 0)
+        assert configured(flight)[0] == (*own_ids(flight), *KEEP, 0)
 
 
 async def test_secondary_control_coexists_with_primary() -> None:
     gimbal = SimulatedGimbal()
-    async with beside(gimbal) as flight:
+    async with with_gimbals(gimbal) as flight:
         takes_control(flight)
         async with flight.vehicle.gimbal.control(secondary=True) as control:
-            assert (gimbal.primary, gimbal.secondary) == (OTHER, us(flight))
+            assert (gimbal.primary, gimbal.secondary) == (OTHER, own_ids(flight))
             assert not control.is_primary
             await flight.vehicle.gimbal.point(-20.0, 0.0, frame="vehicle")
             takes_control(flight, secondary=True)
@@ -91,7 +91,7 @@ async def test_secondary_control_coexists_with_primary() -> None:
 @pytest.mark.parametrize("how", ["raises", "is cancelled"])
 async def test_control_released_without_waiting(how: str) -> None:
     gimbal = SimulatedGimbal()
-    async with beside(gimbal) as flight:
+    async with with_gimbals(gimbal) as flight:
         left_at = math.nan
         with anyio.CancelScope() as scope:
             try:
@@ -110,12 +110,12 @@ async def test_control_released_without_waiting(how: str) -> None:
 
 async def test_background_release_is_retried_until_acknowledged() -> None:
     gimbal = SimulatedGimbal()
-    async with beside(gimbal) as flight:
+    async with with_gimbals(gimbal) as flight:
         with pytest.raises(Boom):
             async with flight.vehicle.gimbal.control():
                 gimbal.faults.drop_incoming = 1
                 raise Boom
-        assert gimbal.primary == us(flight)
+        assert gimbal.primary == own_ids(flight)
         await anyio.sleep(3.0)
         assert gimbal.primary == (0, 0)
 
@@ -123,7 +123,7 @@ async def test_background_release_is_retried_until_acknowledged() -> None:
 async def test_vehicle_block_end_releases_control() -> None:
     gimbal = SimulatedGimbal()
     async with anyio.create_task_group() as tasks:
-        async with beside(gimbal) as flight:
+        async with with_gimbals(gimbal) as flight:
 
             async def hold() -> None:
                 async with flight.vehicle.gimbal.control():
@@ -131,7 +131,7 @@ async def test_vehicle_block_end_releases_control() -> None:
 
             tasks.start_soon(hold)
             await anyio.sleep(1.0)
-            assert gimbal.primary == us(flight)
+            assert gimbal.primary == own_ids(flight)
             await anyio.lowlevel.checkpoint()
         assert configured(flight)[-1] == (-3, -3, *KEEP, 154)
         tasks.cancel_scope.cancel()
@@ -139,7 +139,7 @@ async def test_vehicle_block_end_releases_control() -> None:
 
 async def test_lost_control_publishes_event_and_ends_waits() -> None:
     gimbal = SimulatedGimbal(slew_deg_s=5.0)
-    async with beside(gimbal) as flight:
+    async with with_gimbals(gimbal) as flight:
         with flight.vehicle.subscribe(events.GimbalControlLost) as lost:
             async with flight.vehicle.gimbal.control() as control:
                 asyncio.get_running_loop().call_later(1.0, takes_control, flight)
@@ -158,12 +158,12 @@ async def test_lost_control_publishes_event_and_ends_waits() -> None:
             assert (event.gimbal_device_id, event.is_primary) == (154, True)
             assert (event.to_system_id, event.to_component_id) == OTHER
         await anyio.sleep(1.0)
-        assert gimbal.primary == OTHER, "nothing is given back that somebody else has"
+        assert gimbal.primary == OTHER, "control that another station has is not released"
 
 
 async def test_unnoticed_loss_raises_on_block_exit() -> None:
     gimbal = SimulatedGimbal()
-    async with beside(gimbal) as flight:
+    async with with_gimbals(gimbal) as flight:
         with pytest.raises(GimbalTaken):
             async with flight.vehicle.gimbal.control():
                 takes_control(flight)
@@ -177,7 +177,7 @@ async def test_unnoticed_loss_raises_on_block_exit() -> None:
 
 async def test_losing_one_of_two_controls_keeps_the_other() -> None:
     gimbal = SimulatedGimbal()
-    async with beside(gimbal) as flight:
+    async with with_gimbals(gimbal) as flight:
         async with flight.vehicle.gimbal.control() as primary:
             with pytest.raises(GimbalTaken):
                 async with flight.vehicle.gimbal.control(secondary=True) as secondary:
@@ -190,7 +190,7 @@ async def test_losing_one_of_two_controls_keeps_the_other() -> None:
 
 async def test_out_of_order_status_does_not_lose_control() -> None:
     gimbal = SimulatedGimbal()
-    async with beside(gimbal) as flight, flight.vehicle.gimbal.control() as control:
+    async with with_gimbals(gimbal) as flight, flight.vehicle.gimbal.control() as control:
         status = m.GimbalManagerStatus(gimbal.time_boot_ms - 700, 0, 154, *OTHER, 0, 0)
         flight.wire.deliver(FrameEncoder(1, 154).encode(status))
         assert control.is_held
@@ -199,7 +199,7 @@ async def test_out_of_order_status_does_not_lose_control() -> None:
 
 
 async def test_second_control_block_is_busy() -> None:
-    async with beside(SimulatedGimbal()) as flight:
+    async with with_gimbals(SimulatedGimbal()) as flight:
         gimbal = flight.vehicle.gimbal
         async with gimbal.control() as control:
             for again in (gimbal.control(), flight.vehicle.gimbals[154].control()):
@@ -218,7 +218,7 @@ async def test_second_control_block_is_busy() -> None:
 
 async def test_new_block_keeps_control_despite_unanswered_release() -> None:
     gimbal = SimulatedGimbal()
-    async with beside(gimbal) as flight:
+    async with with_gimbals(gimbal) as flight:
         control = flight.vehicle.gimbal.control
         gimbal.faults.lose_ack(CONFIGURE, times=5)
         with pytest.raises(CommandTimeout):
@@ -226,7 +226,7 @@ async def test_new_block_keeps_control_despite_unanswered_release() -> None:
                 pass
         async with control() as held:
             await anyio.sleep(8.0)
-            assert gimbal.primary == us(flight)
+            assert gimbal.primary == own_ids(flight)
             assert held.is_held
         await anyio.sleep(1.0)
         assert gimbal.primary == (0, 0)
@@ -234,7 +234,7 @@ async def test_new_block_keeps_control_despite_unanswered_release() -> None:
 
 async def test_cancelled_attempt_keeps_control_of_another_task() -> None:
     gimbal = SimulatedGimbal()
-    async with beside(gimbal) as flight:
+    async with with_gimbals(gimbal) as flight:
         gimbal.faults.delay_ack(CONFIGURE, 0.6, times=1)
 
         async def give_up() -> None:
@@ -248,14 +248,14 @@ async def test_cancelled_attempt_keeps_control_of_another_task() -> None:
             gimbal.faults.clear()
             async with flight.vehicle.gimbals[154].control() as control:
                 await anyio.sleep(3.0)
-                assert gimbal.primary == us(flight)
+                assert gimbal.primary == own_ids(flight)
                 assert control.is_held
 
 
 @pytest.mark.parametrize("end", ["left", "refused"])
 async def test_deferred_release_is_sent_by_later_block(end: str) -> None:
     gimbal = SimulatedGimbal()
-    async with beside(gimbal) as flight:
+    async with with_gimbals(gimbal) as flight:
         control = flight.vehicle.gimbal.control
         with pytest.raises(Boom):
             async with control():
@@ -275,17 +275,17 @@ async def test_deferred_release_is_sent_by_later_block(end: str) -> None:
 
 async def test_unconfirmed_secondary_control_is_released() -> None:
     gimbal = SimulatedGimbal()
-    async with beside(gimbal) as flight, flight.vehicle.gimbal.control():
+    async with with_gimbals(gimbal) as flight, flight.vehicle.gimbal.control():
         gimbal.faults.lose_ack(CONFIGURE, times=4)
         with pytest.raises(CommandTimeout):
             async with flight.vehicle.gimbal.control(secondary=True):
                 pass
         await anyio.sleep(1.0)
-        assert (gimbal.primary, gimbal.secondary) == (us(flight), (0, 0))
+        assert (gimbal.primary, gimbal.secondary) == (own_ids(flight), (0, 0))
 
 
 async def test_until_lost_raises_when_block_ends() -> None:
-    async with beside(SimulatedGimbal()) as flight:
+    async with with_gimbals(SimulatedGimbal()) as flight:
         async with flight.vehicle.gimbal.control() as control:
             waits = asyncio.ensure_future(control.until_lost())
             await anyio.sleep(0.5)
@@ -295,7 +295,7 @@ async def test_until_lost_raises_when_block_ends() -> None:
 
 async def test_control_refused_or_unconfirmed_raises() -> None:
     gimbal = SimulatedGimbal()
-    async with beside(gimbal) as flight:
+    async with with_gimbals(gimbal) as flight:
         gimbal.faults.refuse(CONFIGURE, MavResult.TEMPORARILY_REJECTED, times=1)
         with pytest.raises(CommandRejected):
             async with flight.vehicle.gimbal.control():
@@ -331,12 +331,12 @@ async def test_px4_retract_and_look_at_system_are_not_supported() -> None:
 
 async def test_control_is_released_after_silence() -> None:
     gimbal = SimulatedGimbal()
-    async with beside(gimbal) as flight:
+    async with with_gimbals(gimbal) as flight:
         with pytest.raises(OperationTimeout, match="not sent yet, because the vehicle is silent"):
             async with flight.vehicle.gimbal.control():
                 flight.copter.faults.silent = True
                 await anyio.sleep(4.0)
-        assert gimbal.primary == us(flight)
+        assert gimbal.primary == own_ids(flight)
         flight.copter.faults.silent = False
         await anyio.sleep(3.0)
         assert gimbal.primary == (0, 0)
@@ -348,15 +348,15 @@ async def test_control_is_released_after_silence() -> None:
 def pitchyaws(flight: Any) -> list[tuple[float, float]]:
     """Streamed rates in degrees per second."""
     return [
-        (round(math.degrees(each.pitch_rate), 2), round(math.degrees(each.yaw_rate), 2))
-        for each in flight.wire.all(m.GimbalManagerSetPitchyaw)
+        (round(math.degrees(message.pitch_rate), 2), round(math.degrees(message.yaw_rate), 2))
+        for message in flight.wire.all(m.GimbalManagerSetPitchyaw)
     ]
 
 
 @pytest.mark.parametrize("frame", ["vehicle", "earth"])
 async def test_rates_are_streamed_and_end_with_zero(frame: Any) -> None:
     gimbal = SimulatedGimbal()
-    async with beside(gimbal) as flight, flight.vehicle.gimbal.control():
+    async with with_gimbals(gimbal) as flight, flight.vehicle.gimbal.control():
         async with flight.vehicle.gimbal.rates(0.0, 0.0, frame=frame, rate_hz=10.0) as stream:
             was_running = stream.is_running
             await stream.turn(-10.0, 20.0, 2.0)
@@ -376,7 +376,7 @@ async def test_rates_are_streamed_and_end_with_zero(frame: Any) -> None:
 @pytest.mark.parametrize("how", ["raises", "is cancelled"])
 async def test_rates_cancelled_end_with_zero_without_waiting(how: str) -> None:
     gimbal = SimulatedGimbal()
-    async with beside(gimbal) as flight, flight.vehicle.gimbal.control():
+    async with with_gimbals(gimbal) as flight, flight.vehicle.gimbal.control():
         stream = flight.vehicle.gimbal.rates(-5.0, 0.0)
         with anyio.CancelScope() as scope:
             try:
@@ -399,7 +399,7 @@ async def test_rates_cancelled_end_with_zero_without_waiting(how: str) -> None:
 
 async def test_unanswered_first_rates_end_with_zero() -> None:
     gimbal = SimulatedGimbal()
-    async with beside(gimbal) as flight, flight.vehicle.gimbal.control():
+    async with with_gimbals(gimbal) as flight, flight.vehicle.gimbal.control():
         gimbal.faults.lose_ack(PITCHYAW, times=None)
         with pytest.raises(CommandTimeout):
             async with flight.vehicle.gimbal.rates(0.0, 5.0):
@@ -408,14 +408,14 @@ async def test_unanswered_first_rates_end_with_zero() -> None:
         here = gimbal.angles()
         await anyio.sleep(2.0)
         assert gimbal.angles() == here
-        assert math.degrees(here[2]) > 5, "it had obeyed"
+        assert math.degrees(here[2]) > 5, "it had executed the command"
         commands: list[Any] = flight.wire.commands(PITCHYAW)
         assert (commands[-1].param3, commands[-1].param4) == (0, 0)
 
 
 async def test_refused_first_rates_send_no_zero() -> None:
     gimbal = SimulatedGimbal()
-    async with beside(gimbal) as flight, flight.vehicle.gimbal.control():
+    async with with_gimbals(gimbal) as flight, flight.vehicle.gimbal.control():
         gimbal.faults.refuse(PITCHYAW, MavResult.TEMPORARILY_REJECTED, times=1)
         with pytest.raises(CommandRejected):
             async with flight.vehicle.gimbal.rates(0.0, 5.0):
@@ -426,21 +426,21 @@ async def test_refused_first_rates_send_no_zero() -> None:
 
 async def test_rates_stay_with_their_gimbal() -> None:
     one, two = SimulatedGimbal(154), SimulatedGimbal(171)
-    async with beside(one, two) as flight:
+    async with with_gimbals(one, two) as flight:
         flight.wire.deliver(FrameEncoder(1, 1).encode(m.GimbalManagerStatus(0, 0, 154, 0, 0, 0, 0)))
         flight.copter.faults.refuse(PITCHYAW, MavResult.ACCEPTED)
         async with flight.vehicle.gimbal.rates(0.0, 5.0) as stream:
             one.faults.silent = True
             await stream.turn(0.0, 5.0, 15.0)
         commands: list[Any] = flight.wire.commands(PITCHYAW)
-        assert {each.target_component for each in commands} == {1}
-        assert {each.target_component for each in flight.wire.all(m.GimbalManagerSetPitchyaw)} == {1}
+        assert {command.target_component for command in commands} == {1}
+        assert {message.target_component for message in flight.wire.all(m.GimbalManagerSetPitchyaw)} == {1}
         assert flight.vehicle.gimbals.ids == (171, 154)
 
 
 async def test_stale_rates_stop_the_stream() -> None:
     gimbal = SimulatedGimbal()
-    async with beside(gimbal) as flight, flight.vehicle.gimbal.control():
+    async with with_gimbals(gimbal) as flight, flight.vehicle.gimbal.control():
         with pytest.raises(SetpointStreamStopped, match="no new rates came for"):
             async with flight.vehicle.gimbal.rates(-5.0, 0.0, valid_for_s=1.0):
                 await anyio.sleep(3.0)
@@ -461,7 +461,7 @@ async def test_stale_rates_stop_the_stream() -> None:
 @pytest.mark.parametrize("silence_s", [0.0, 30.0])
 async def test_silent_manager_stops_rates(silence_s: float) -> None:
     gimbal = SimulatedGimbal(yaw_deg=(-9999.0, 9999.0))
-    async with beside(gimbal) as flight, flight.vehicle.gimbal.control():
+    async with with_gimbals(gimbal) as flight, flight.vehicle.gimbal.control():
         began = now()
         with pytest.raises(SetpointStreamStopped, match="manager has been silent for 3"):
             async with flight.vehicle.gimbal.rates(0.0, 5.0) as stream:
@@ -480,7 +480,7 @@ async def test_silent_manager_stops_rates(silence_s: float) -> None:
 
 async def test_newer_order_stops_rates_without_zero() -> None:
     gimbal = SimulatedGimbal()
-    async with beside(gimbal) as flight, flight.vehicle.gimbal.control():
+    async with with_gimbals(gimbal) as flight, flight.vehicle.gimbal.control():
         with pytest.raises(SetpointStreamStopped, match="another order was given"):
             async with flight.vehicle.gimbal.rates(-5.0, 0.0) as stream:
                 await anyio.sleep(0.3)
@@ -492,13 +492,13 @@ async def test_newer_order_stops_rates_without_zero() -> None:
 
 async def test_lost_control_stops_rates() -> None:
     gimbal = SimulatedGimbal()
-    async with beside(gimbal) as flight, flight.vehicle.gimbal.control():
+    async with with_gimbals(gimbal) as flight, flight.vehicle.gimbal.control():
         with pytest.raises(GimbalTaken):
             async with flight.vehicle.gimbal.rates(-5.0, 0.0) as stream:
                 await anyio.sleep(0.3)
                 takes_control(flight)
                 await anyio.sleep(0.3)
-                flight.wire.forget()
+                flight.wire.clear()
                 await stream.turn(-5.0, 0.0, 1.0)
         assert not flight.wire.all(m.GimbalManagerSetPitchyaw)
         assert not flight.wire.commands(PITCHYAW)
@@ -506,10 +506,10 @@ async def test_lost_control_stops_rates() -> None:
 
 async def test_denied_rates_claim_control() -> None:
     gimbal = SimulatedGimbal()
-    async with beside(gimbal) as flight:
+    async with with_gimbals(gimbal) as flight:
         async with flight.vehicle.gimbal.rates(-5.0, 0.0) as stream:
             await stream.turn(-5.0, 0.0, 1.0)
-        assert gimbal.primary == us(flight)
+        assert gimbal.primary == own_ids(flight)
         assert math.degrees(gimbal.angles()[1]) == pytest.approx(-5, abs=1)
 
 
@@ -535,7 +535,7 @@ async def test_px4_rates_use_set_attitude() -> None:
 
 
 async def test_rates_are_validated_and_entered_once() -> None:
-    async with beside(SimulatedGimbal()) as flight:
+    async with with_gimbals(SimulatedGimbal()) as flight:
         gimbal = flight.vehicle.gimbal
         for wrong in (
             {"pitch_deg_s": 800.0},
@@ -564,7 +564,7 @@ async def test_rates_are_validated_and_entered_once() -> None:
 async def px4_with_gimbal() -> AsyncIterator[Px4Flight]:
     async with open_px4(SimulatedPx4(boot_time_s=1.0, parameters={"MNT_MODE_IN": 4.0})) as flight:
         await flight.vehicle.wait_ready()
-        flight.wire.forget()
+        flight.wire.clear()
         yield flight
 
 

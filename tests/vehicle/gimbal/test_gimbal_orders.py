@@ -8,7 +8,7 @@ import math
 import anyio
 import pytest
 from flight_harness import Flight, in_the_air, now, open_flight
-from gimbal_stage import CONFIGURE, MOUNT, PITCHYAW, REQUEST, beside, copter_with_mount, mounted
+from gimbal_stage import CONFIGURE, MOUNT, PITCHYAW, REQUEST, copter_with_mount, mounted, with_gimbals
 
 from aerokit import Position
 from aerokit import messages as m
@@ -35,7 +35,7 @@ LEVEL, LOCKED = 12, 28
 
 
 def degrees(gimbal: SimulatedGimbal) -> list[float]:
-    return [math.degrees(each) for each in gimbal.angles()]
+    return [math.degrees(angle) for angle in gimbal.angles()]
 
 
 # ------------------------------------------------------------------------------------------- pointing
@@ -43,7 +43,7 @@ def degrees(gimbal: SimulatedGimbal) -> list[float]:
 
 async def test_point_returns_when_reached() -> None:
     gimbal = SimulatedGimbal(slew_deg_s=30.0)
-    async with beside(gimbal) as flight:
+    async with with_gimbals(gimbal) as flight:
         began = now()
         await flight.vehicle.gimbal.point(-60.0, 90.0, tolerance_deg=1.0)
         assert now() - began == pytest.approx(3.0, abs=1.2)
@@ -53,7 +53,7 @@ async def test_point_returns_when_reached() -> None:
 
 
 async def test_point_without_wait_returns_when_accepted() -> None:
-    async with beside(SimulatedGimbal(slew_deg_s=10.0)) as flight:
+    async with with_gimbals(SimulatedGimbal(slew_deg_s=10.0)) as flight:
         began = now()
         await flight.vehicle.gimbal.point(-60.0, 90.0, wait=False)
         assert now() - began < 0.5
@@ -67,13 +67,13 @@ async def test_vehicle_frame_yaw_turns_with_the_vehicle() -> None:
         assert degrees(gimbal)[1:] == pytest.approx([-20, -30], abs=0.5)
         await flight.vehicle.gimbal.point(-20.0, 60.0)
         assert flight.vehicle.gimbal.attitude.value.yaw_from_nose_deg == pytest.approx(-30, abs=4)
-        flags = [int(each.param5) for each in flight.wire.commands(PITCHYAW)]  # type: ignore[union-attr]
+        flags = [int(command.param5) for command in flight.wire.commands(PITCHYAW)]  # type: ignore[union-attr]
         assert flags[0] == LEVEL
         assert flags[-1] == LOCKED
 
 
 async def test_straight_down_ignores_yaw() -> None:
-    async with beside(SimulatedGimbal()) as flight:
+    async with with_gimbals(SimulatedGimbal()) as flight:
         await flight.vehicle.gimbal.point(-90.0, 123.0)
 
 
@@ -84,12 +84,12 @@ async def test_autopilot_attitude_is_requested_while_pointing() -> None:
         assert (command.target_component, command.param7) == (1, 0)  # type: ignore[union-attr]
         await anyio.sleep(1.0)
         asked = flight.wire.commands(MavCmd.SET_MESSAGE_INTERVAL)
-        of_it = [each.param2 for each in asked if each.param1 == m.GimbalDeviceAttitudeStatus.ID]
+        of_it = [request.param2 for request in asked if request.param1 == m.GimbalDeviceAttitudeStatus.ID]
         assert of_it == [250_000, 0]
 
 
 async def test_unreachable_angle_timeout_reports_attitude() -> None:
-    async with beside(SimulatedGimbal(pitch_deg=(-45.0, 10.0))) as flight:
+    async with with_gimbals(SimulatedGimbal(pitch_deg=(-45.0, 10.0))) as flight:
         with pytest.raises(OperationTimeout) as caught:
             await flight.vehicle.gimbal.point(-80.0, 0.0, timeout=4.0)
         assert "not reached within 4 s: it points to pitch -45.0" in str(caught.value)
@@ -97,7 +97,7 @@ async def test_unreachable_angle_timeout_reports_attitude() -> None:
 
 
 async def test_timeout_reports_device_errors() -> None:
-    async with beside(SimulatedGimbal(attitude_rate_hz=0.0)) as flight:
+    async with with_gimbals(SimulatedGimbal(attitude_rate_hz=0.0)) as flight:
         status = m.GimbalDeviceAttitudeStatus(0, 0, 0, 32, (1, 0, 0, 0), 0, 0, 0, 16)
         copter = flight.copter
         copter.every(0.2, lambda: copter.send(status, None, (1, 154)))
@@ -115,7 +115,7 @@ async def test_gimbal_without_attitude_times_out() -> None:
 
 async def test_attitude_before_the_order_does_not_count() -> None:
     gimbal = SimulatedGimbal()
-    async with beside(gimbal) as flight:
+    async with with_gimbals(gimbal) as flight:
         await flight.vehicle.gimbal.point(-10.0, 0.0)
         gimbal.faults.silent = True
         flight.copter.faults.refuse(PITCHYAW, MavResult.ACCEPTED)
@@ -125,7 +125,7 @@ async def test_attitude_before_the_order_does_not_count() -> None:
 
 async def test_newer_order_ends_earlier_wait() -> None:
     gimbal = SimulatedGimbal(slew_deg_s=10.0)
-    async with beside(gimbal) as flight:
+    async with with_gimbals(gimbal) as flight:
         ends: list[str] = []
 
         async def point() -> None:
@@ -158,7 +158,7 @@ async def test_vehicle_roi_ends_gimbal_wait() -> None:
 
 
 async def test_reboot_ends_pointing_wait() -> None:
-    async with beside(SimulatedGimbal(slew_deg_s=1.0)) as flight:
+    async with with_gimbals(SimulatedGimbal(slew_deg_s=1.0)) as flight:
 
         async def reboot() -> None:
             await anyio.sleep(1.0)
@@ -171,14 +171,14 @@ async def test_reboot_ends_pointing_wait() -> None:
 
 
 async def test_silent_vehicle_ends_pointing_wait() -> None:
-    async with beside(SimulatedGimbal(slew_deg_s=1.0)) as flight:
+    async with with_gimbals(SimulatedGimbal(slew_deg_s=1.0)) as flight:
 
-        async def fall_silent() -> None:
+        async def stop_sending() -> None:
             await anyio.sleep(1.0)
             flight.copter.faults.silent = True
 
         async with anyio.create_task_group() as tasks:
-            tasks.start_soon(fall_silent)
+            tasks.start_soon(stop_sending)
             with pytest.raises(HeartbeatTimeout):
                 await flight.vehicle.gimbal.point(-80.0, 0.0, timeout=40.0)
 
@@ -197,7 +197,7 @@ async def test_mode_change_does_not_end_pointing_wait() -> None:
 @pytest.mark.parametrize(("name", "flag"), [("neutral", Flags.NEUTRAL), ("retract", Flags.RETRACT)])
 async def test_neutral_returns_when_flagged_and_still(name: str, flag: int) -> None:
     gimbal = SimulatedGimbal(slew_deg_s=30.0)
-    async with beside(gimbal) as flight:
+    async with with_gimbals(gimbal) as flight:
         await flight.vehicle.gimbal.point(-60.0, 0.0, frame="vehicle")
         began = now()
         await getattr(flight.vehicle.gimbal, name)()
@@ -214,7 +214,7 @@ async def test_old_mount_neutral_uses_mount_mode(name: str, mode: int) -> None:
     async with mounted() as flight:
         flight.copter.faults.refuse(PITCHYAW, MavResult.UNSUPPORTED)
         await getattr(flight.vehicle.gimbal, name)()
-        assert [each.param7 for each in flight.wire.commands(MOUNT)] == [mode]  # type: ignore[union-attr]
+        assert [command.param7 for command in flight.wire.commands(MOUNT)] == [mode]  # type: ignore[union-attr]
         await getattr(flight.vehicle.gimbal, name)(wait=False)
         assert len(flight.wire.commands(PITCHYAW)) == 1
 
@@ -228,9 +228,9 @@ def place(flight: Flight, **metres: float) -> Position:
 
 @pytest.mark.parametrize("kind", ["autopilot", "beside"])
 async def test_look_at_tracks_until_stop_looking(kind: str) -> None:
-    is_beside = kind == "beside"
+    has_own_manager = kind == "beside"
     fitted = SimulatedCopter(boot_time_s=0.0, components=[SimulatedGimbal()])
-    async with in_the_air(20.0, copter=fitted if is_beside else copter_with_mount()) as flight:
+    async with in_the_air(20.0, copter=fitted if has_own_manager else copter_with_mount()) as flight:
         vehicle = flight.vehicle
         await vehicle.gimbals.discover()
         async with vehicle.gimbal.control():
@@ -240,7 +240,7 @@ async def test_look_at_tracks_until_stop_looking(kind: str) -> None:
             assert reported.yaw_deg == pytest.approx(90, abs=6)
             assert reported.pitch_deg == pytest.approx(-33.7, abs=6)
             await vehicle.gimbal.stop_looking()
-        target_component = 154 if is_beside else 1
+        target_component = 154 if has_own_manager else 1
         for command in (MavCmd.DO_SET_ROI_LOCATION, MavCmd.DO_SET_ROI_NONE):
             (sent,) = flight.wire.commands(command)
             assert sent.target_component == target_component
@@ -255,11 +255,11 @@ async def test_look_at_system_follows_reported_position() -> None:
             m.GlobalPositionInt(0, x, y, round(there.altitude_amsl_m * 1e3), 20000, 0, 0, 0, 0)
         )
 
-        def tell() -> None:
+        def report() -> None:
             flight.copter.receive(reported, flight.copter.now)
             flight.wire.deliver(reported)
 
-        flight.copter.every(0.5, tell)
+        flight.copter.every(0.5, report)
         await flight.vehicle.gimbal.look_at_system(7)
         attitude = flight.vehicle.gimbal.attitude.value
         assert attitude.yaw_deg == pytest.approx(270, abs=6)
@@ -311,7 +311,7 @@ async def test_limits_apply_only_after_information() -> None:
 
 
 async def test_information_of_component_gimbal() -> None:
-    async with beside(SimulatedGimbal(pitch_deg=(-80.0, 10.0))) as flight:
+    async with with_gimbals(SimulatedGimbal(pitch_deg=(-80.0, 10.0))) as flight:
         reported = await flight.vehicle.gimbal.information()
         assert (reported.gimbal_device_id, reported.manager_component_id) == (154, 154)
         assert reported.pitch_deg == (-80.0, 10.0)
@@ -369,15 +369,15 @@ async def test_several_gimbals_are_discovered() -> None:
         gimbals = flight.vehicle.gimbals
         assert await gimbals.discover() == (1, 154, 171)
         assert len(gimbals) == 3
-        assert [each.device_id for each in gimbals] == [1, 154, 171]
+        assert [gimbal.device_id for gimbal in gimbals] == [1, 154, 171]
         await gimbals[171].point(-30.0, 0.0, frame="vehicle")
         assert (degrees(one)[1], degrees(two)[1]) == pytest.approx((0, -30), abs=3)
         await gimbals[1].point(-10.0, 0.0, frame="vehicle")
         assert gimbals[1].attitude.value.pitch_deg == pytest.approx(-10, abs=3)
         assert flight.vehicle.gimbal.device_id == 1
-        to = [(each.target_component, each.param7) for each in flight.wire.commands(PITCHYAW)]  # type: ignore[union-attr]
+        to = [(command.target_component, command.param7) for command in flight.wire.commands(PITCHYAW)]  # type: ignore[union-attr]
         assert to == [(171, 171), (171, 171), (1, 1)]
-        claimed = [each.target_component for each in flight.wire.commands(CONFIGURE)]
+        claimed = [command.target_component for command in flight.wire.commands(CONFIGURE)]
         assert claimed == [171]
 
 
@@ -387,7 +387,7 @@ async def test_first_gimbal_is_the_autopilots() -> None:
         assert flight.vehicle.gimbal.attitude.source == Source(1, 154, "GIMBAL_DEVICE_ATTITUDE_STATUS")
         await flight.vehicle.gimbal.point(0.0, 0.0, frame="vehicle")
         assert flight.vehicle.gimbals[1].attitude.value.pitch_deg == pytest.approx(0, abs=3)
-        assert [each.target_component for each in flight.wire.commands(PITCHYAW)] == [1]
+        assert [command.target_component for command in flight.wire.commands(PITCHYAW)] == [1]
 
 
 async def test_undiscovered_gimbal_is_asked_for_its_manager() -> None:
@@ -399,7 +399,7 @@ async def test_undiscovered_gimbal_is_asked_for_its_manager() -> None:
 
 async def test_autopilot_manages_component_gimbal() -> None:
     """PX4 with a MAVLink gimbal: the autopilot takes precedence over the gimbal as manager."""
-    async with beside(SimulatedGimbal()) as flight:
+    async with with_gimbals(SimulatedGimbal()) as flight:
         flight.wire.deliver(FrameEncoder(1, 1).encode(m.GimbalManagerStatus(0, 0, 154, 0, 0, 0, 0)))
         flight.copter.faults.refuse(PITCHYAW, MavResult.ACCEPTED)
         await flight.vehicle.gimbals[154].point(0.0, 0.0, frame="vehicle", wait=False)
@@ -417,7 +417,7 @@ async def test_number_of_gimbals_is_bounded() -> None:
         assert len(gimbals) == MAX_GIMBALS
         with pytest.raises(BusyError):
             gimbals.get(250)
-        assert len({id(each) for each in gimbals}) == MAX_GIMBALS
+        assert len({id(gimbal) for gimbal in gimbals}) == MAX_GIMBALS
         assert gimbals.get(1) is gimbals.get(1)
     with pytest.raises(InvalidArgument):
         gimbals.get(0)
@@ -439,7 +439,7 @@ def attitude_of(number: int, q: tuple[float, ...] = (1, 0, 0, 0)) -> m.GimbalDev
 
 
 async def test_foreign_device_id_is_ignored() -> None:
-    async with beside(SimulatedGimbal()) as flight:
+    async with with_gimbals(SimulatedGimbal()) as flight:
         report(flight, 154, attitude_of(9))
         report(flight, 30, attitude_of(154, (0, 1, 0, 0)))
         assert flight.vehicle.gimbals.ids == (154,)
@@ -460,7 +460,7 @@ async def test_device_ids_are_own_id_or_number() -> None:
 
 async def test_gone_gimbal_is_no_longer_first() -> None:
     one, two = SimulatedGimbal(154), SimulatedGimbal(171)
-    async with beside(one, two) as flight:
+    async with with_gimbals(one, two) as flight:
         vehicle = flight.vehicle
         await anyio.sleep(3.0)
         one.faults.silent = True
@@ -468,7 +468,7 @@ async def test_gone_gimbal_is_no_longer_first() -> None:
         assert vehicle.gimbals.ids == (154, 171)
         await anyio.sleep(3.0)
         assert vehicle.gimbals.ids == (171, 154)
-        assert [each.device_id for each in vehicle.gimbals] == [171, 154]
+        assert [gimbal.device_id for gimbal in vehicle.gimbals] == [171, 154]
         await vehicle.gimbal.point(-20.0, 0.0, frame="vehicle")
         assert degrees(two)[1] == pytest.approx(-20, abs=3)
         source = vehicle.gimbal.attitude.source
@@ -481,10 +481,10 @@ async def test_gone_gimbal_is_no_longer_first() -> None:
 
 async def test_first_gimbal_is_kept_after_link_outage() -> None:
     one, two = SimulatedGimbal(154), SimulatedGimbal(171)
-    async with beside(one, two) as flight:
+    async with with_gimbals(one, two) as flight:
         await anyio.sleep(12.0)
-        for each in (flight.copter, one, two):
-            each.faults.silent = True
+        for simulated in (flight.copter, one, two):
+            simulated.faults.silent = True
         await anyio.sleep(15.0)
         report(flight, 171, attitude_of(0))
         assert flight.vehicle.gimbals.ids == (154, 171)
@@ -495,7 +495,7 @@ async def test_first_gimbal_is_kept_after_link_outage() -> None:
 
 async def test_gimbal_in_use_stays_first() -> None:
     one, two = SimulatedGimbal(154), SimulatedGimbal(171)
-    async with beside(one, two) as flight:
+    async with with_gimbals(one, two) as flight:
         await flight.vehicle.gimbals[171].point(-30.0, 0.0, frame="vehicle")
         one.faults.refuse(PITCHYAW, MavResult.ACCEPTED)
         asyncio.get_running_loop().call_later(1.0, setattr, one.faults, "silent", True)
@@ -504,12 +504,12 @@ async def test_gimbal_in_use_stays_first() -> None:
 
 
 async def test_foreign_status_does_not_redirect_orders() -> None:
-    async with beside(SimulatedGimbal()) as flight:
+    async with with_gimbals(SimulatedGimbal()) as flight:
         report(flight, 191, m.GimbalManagerStatus(0, 0, 154, 9, 9, 0, 0))
         assert flight.vehicle.gimbal.controllers.value.primary != (9, 9)
         report(flight, 191, m.GimbalManagerInformation(0, 0, 154, 0, 0, 0, 0, 0, 0))
         await flight.vehicle.gimbal.point(-20.0, 0.0, frame="vehicle")
-        assert {each.target_component for each in flight.wire.commands(PITCHYAW)} == {154}
+        assert {command.target_component for command in flight.wire.commands(PITCHYAW)} == {154}
 
 
 @pytest.mark.parametrize("number", [0, 30])
@@ -521,12 +521,12 @@ async def test_gimbal_of_any_id_manages_itself(number: int) -> None:
         report(flight, 191, m.GimbalManagerInformation(0, 0, 30, 0, 0, 0, 0, 0, 0))
         with pytest.raises(CommandTimeout):
             await gimbals[30].point(0.0, 0.0, wait=False)
-        assert {each.target_component for each in flight.wire.commands(PITCHYAW)} == {30}
+        assert {command.target_component for command in flight.wire.commands(PITCHYAW)} == {30}
 
 
 async def test_gone_manager_is_replaced() -> None:
     gimbal = SimulatedGimbal()
-    async with beside(gimbal) as flight:
+    async with with_gimbals(gimbal) as flight:
         gimbal.faults.silent = True
         status = m.GimbalManagerStatus(0, 0, 154, 9, 9, 0, 0)
         await anyio.sleep(9.0)
@@ -558,7 +558,7 @@ async def test_nan_attitude_is_unknown(wrong: float) -> None:
     async with open_flight() as flight:
         attitude = flight.vehicle.gimbal.attitude
         for place in range(4):
-            report(flight, 154, attitude_of(0, tuple(wrong if place == each else 0.5 for each in range(4))))
+            report(flight, 154, attitude_of(0, tuple(wrong if place == index else 0.5 for index in range(4))))
             reported = attitude.value
             assert (reported.pitch_deg, reported.roll_deg, reported.yaw_deg, reported.yaw_from_nose_deg) == (None,) * 4
 

@@ -65,7 +65,7 @@ async def test_ardupilot_counts_an_extra_circle() -> None:
     wider = FENCE.replace(circles=[FenceCircle(place(0, 0), 450.0), FENCE.circles[1]])
     async with open_flight() as flight:
         await flight.vehicle.fence.upload(FENCE, method="items")
-        flight.wire.forget()
+        flight.wire.clear()
         await flight.vehicle.fence.upload(wider, method="items")
         assert len(flight.wire.all(m.MissionItemInt)) == 1
         assert wider.matches(await flight.vehicle.fence.download(), ItemStorage.ARDUPILOT)

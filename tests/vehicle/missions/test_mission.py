@@ -41,7 +41,7 @@ async def armed(opened: Any, *ends: MissionItem) -> AsyncIterator[AnyFlight]:
         if isinstance(flight, Flight):
             await flight.vehicle.set_mode("GUIDED")
         await flight.vehicle.arm()
-        flight.wire.forget()
+        flight.wire.clear()
         yield flight
 
 
@@ -58,7 +58,7 @@ async def reaches(flight: AnyFlight, item: int) -> None:
     await flight.vehicle.mission.current.wait_until(lambda current: (current or 0) >= item, timeout=60)
 
 
-# ------------------------------------------------------------------------------------ to its end
+# ------------------------------------------------------------------------------------ completion
 
 
 @pytest.mark.parametrize(
@@ -75,14 +75,14 @@ async def test_mission_from_takeoff_to_end(opened: Any, end: MissionItem | None)
             if end is not None:
                 assert vehicle.landed_state.value == 1 or not vehicle.is_armed
             await anyio.sleep(0.1)
-            seen = all_of(reported)
-        reached = [event.item for event in seen if isinstance(event, events.MissionItemReached)]
+            observed = all_of(reported)
+        reached = [event.item for event in observed if isinstance(event, events.MissionItemReached)]
         assert reached == sorted(set(reached))
         assert reached[:2] == [0, 1]  # PX4 may leave one out
         assert mission.reached == reached[-1]
-        current = [event.after for event in seen if isinstance(event, events.MissionCurrentChanged)]
+        current = [event.after for event in observed if isinstance(event, events.MissionCurrentChanged)]
         assert [item for item in current if item][:2] == [1, 2]
-        assert sum(isinstance(event, events.MissionFinished) for event in seen) == 1
+        assert sum(isinstance(event, events.MissionFinished) for event in observed) == 1
 
 
 async def test_without_mission_state_last_item_is_the_end(
@@ -186,7 +186,7 @@ async def test_count_and_current_without_mission() -> None:
         assert other.vehicle.mission.current.value is None
 
 
-# ---------------------------------------------------------------------------------- take-over
+# ---------------------------------------------------------------------------------- takeovers
 
 
 async def test_pilot_mode_change_ends_wait_finished() -> None:
@@ -258,7 +258,7 @@ async def test_start_is_refused_when_impossible(opened: Any) -> None:
         await flight.vehicle.wait_ready()
         mission = flight.vehicle.mission
         await mission.upload(short_mission(flight))
-        flight.wire.forget()
+        flight.wire.clear()
         with pytest.raises(OperationRejected, match=r"not armed: call arm\(\) first; nothing was sent"):
             await mission.start()
         with pytest.raises(OperationRejected, match="not armed"):
@@ -286,7 +286,7 @@ async def test_refused_start_has_the_vehicles_reasons() -> None:
 async def test_active_mission_is_replaced_but_not_cleared() -> None:
     async with armed(open_flight) as flight:
         await flight.vehicle.mission.start()
-        flight.wire.forget()
+        flight.wire.clear()
         await flight.vehicle.mission.upload(Mission([*short_mission(flight), return_to_launch()]))
         assert flight.wire.all(m.MissionCount)  # ArduPilot cannot empty it for a file
         assert flight.vehicle.mission.count.value == 4

@@ -32,7 +32,7 @@ from aerokit.sim import SimulatedCopter
 pytestmark = pytest.mark.anyio
 
 UNKNOWN = MissionItem(31_000, 3)
-"""No autopilot supports this command, which shows only when it is sent."""
+"""No autopilot supports this command, but only the upload reveals that."""
 
 
 def held_by(flight: Flight | Px4Flight) -> Mission:
@@ -114,7 +114,7 @@ async def test_px4_equal_plan_is_not_sent() -> None:
         mission = flight.vehicle.mission
         await mission.upload(long_mission(12))
         await anyio.sleep(1.5)
-        flight.wire.forget()
+        flight.wire.clear()
         await mission.upload(long_mission(12))
         assert sent_for_plans(flight.wire) == []
         await mission.upload(long_mission(12), only_changes=False)
@@ -127,16 +127,16 @@ async def test_ardupilot_gets_only_changed_items() -> None:
     async with open_flight() as flight:
         mission = flight.vehicle.mission
         await mission.upload(long_mission(40))
-        flight.wire.forget()
+        flight.wire.clear()
         await mission.upload(changed(long_mission(40), 3, 4, 20), method="items")
         assert holds(flight, changed(long_mission(40), 3, 4, 20))
         parts = [(part.start_index, part.end_index) for part in flight.wire.all(m.MissionWritePartialList)]
         assert parts == [(4, 5), (21, 21)]  # home is item 0
         assert len(flight.wire.all(m.MissionItemInt)) == 3
-        flight.wire.forget()
+        flight.wire.clear()
         await mission.upload(changed(long_mission(40), 3, 4, 20))
         assert not flight.wire.all(m.MissionItemInt)
-        flight.wire.forget()
+        flight.wire.clear()
         await mission.upload(
             changed(long_mission(40), *range(0, 40, 2)), method="items"
         )  # too many differences for a partial upload
@@ -220,13 +220,13 @@ async def test_wrong_readback_is_verification_failed() -> None:
 
 
 async def test_mission_file_is_compared_exactly(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Items that go through 32-bit floats are not, and a file does not."""
+    """A file is compared exactly; items are not, because they are converted to 32-bit floats."""
     async with open_flight() as flight:
         items = flight.copter.missions
         replace = items.replace
 
         def keep_something_else(type_: int, given: Any, **options: Any) -> Any:
-            return replace(type_, [each.replace(x=each.x + 3 * (each.frame == 3)) for each in given], **options)
+            return replace(type_, [item.replace(x=item.x + 3 * (item.frame == 3)) for item in given], **options)
 
         monkeypatch.setattr(items, "replace", keep_something_else)
         mission = long_mission(1)
@@ -261,7 +261,7 @@ async def test_ftp_method_without_mavftp_is_not_supported() -> None:
 )
 async def test_invalid_plan_is_not_sent(plan: Any, options: dict[str, Any], text: str) -> None:
     async with open_flight() as flight:
-        flight.wire.forget()
+        flight.wire.clear()
         with pytest.raises(InvalidArgument, match=text):
             await flight.vehicle.mission.upload(plan, **options)
         assert sent_for_plans(flight.wire) == []

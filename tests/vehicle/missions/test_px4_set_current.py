@@ -20,15 +20,15 @@ async def _start_mission(flight: Px4Flight) -> None:
     await flight.take_off()
     here = flight.vehicle.position.value
     places = [here.offset(north_m=50.0 * number) for number in (1, 2, 3)]
-    items = [missions.waypoint(each.latitude_deg, each.longitude_deg, altitude_relative_m=10) for each in places]
+    items = [missions.waypoint(place.latitude_deg, place.longitude_deg, altitude_relative_m=10) for place in places]
     await flight.vehicle.mission.upload(missions.Mission(items))
     await flight.vehicle.mission.start()
     await anyio.sleep(1.5)
-    flight.wire.forget()
+    flight.wire.clear()
 
 
-@pytest.mark.parametrize("who", ["a pilot", "the program"])
-async def test_set_current_is_not_resent_after_takeover(who: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("party", ["a pilot", "the program"])
+async def test_set_current_is_not_resent_after_takeover(party: str, monkeypatch: pytest.MonkeyPatch) -> None:
     async with open_px4() as flight:
         await _start_mission(flight)
         monkeypatch.setattr(SetCurrentItem, "receive", lambda *_: None)  # it is never confirmed
@@ -36,7 +36,7 @@ async def test_set_current_is_not_resent_after_takeover(who: str, monkeypatch: p
 
             async def interfere() -> None:
                 await anyio.sleep(0.3)
-                if who == "a pilot":
+                if party == "a pilot":
                     flight.px4.switch_to(POSITION)
                 else:
                     await flight.vehicle.command(MavCmd.NAV_RETURN_TO_LAUNCH)

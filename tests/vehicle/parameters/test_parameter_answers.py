@@ -62,7 +62,7 @@ async def test_ardupilot_names_are_sent_in_upper_case(grounded: Flight) -> None:
     assert (await parameters.set("land_speed", 60)).value == 60
     assert await parameters.get("Land_Speed") == 60
     assert "land_speed" not in parameters.table
-    assert {each.param_id for each in grounded.wire.all(ParamSet)} == {"LAND_SPEED"}
+    assert {write.param_id for write in grounded.wire.all(ParamSet)} == {"LAND_SPEED"}
 
 
 async def test_echo_of_previous_write_confirms_nothing(grounded: Flight) -> None:

@@ -41,7 +41,7 @@ async def test_temporary_values_are_restored() -> None:
         parameters = flight.vehicle.parameters
         async with parameters.temporarily({"RTL_ALT": 2000, "LAND_SPEED": 60}) as results:
             assert values(flight) == (2000, 60)
-            assert {each.outcome for each in results.values()} == {"set"}
+            assert {result.outcome for result in results.values()} == {"set"}
         assert values(flight) == BEFORE
         assert parameters.table["RTL_ALT"].value == 1500
 
@@ -137,7 +137,7 @@ async def test_invalid_temporary_values_are_refused() -> None:
         with pytest.raises(InvalidArgument):
             async with flight.vehicle.parameters.temporarily({"RTL_ALT": 2000, "LAND_SPEED": 1e9}):
                 pytest.fail("the block was entered")
-        assert {each.param_value for each in flight.wire.all(messages.ParamSet)} <= {1500.0, 50.0}
+        assert {write.param_value for write in flight.wire.all(messages.ParamSet)} <= {1500.0, 50.0}
         assert values(flight) == BEFORE
 
 
@@ -196,7 +196,7 @@ async def test_successful_transaction_keeps_values() -> None:
         async with flight.vehicle.parameters.transaction() as transaction:
             assert (await transaction.set("RTL_ALT", 2000)).outcome == "set"
             await transaction.set_many({"LAND_SPEED": 60, "RTL_ALT": 2500})
-            assert [(each.name, each.before, each.after) for each in transaction.changes] == [
+            assert [(change.name, change.before, change.after) for change in transaction.changes] == [
                 ("RTL_ALT", 1500, 2500),
                 ("LAND_SPEED", 50, 60),
             ]

@@ -52,7 +52,7 @@ def px4(**options: Any) -> SimulatedPx4:
 
 
 def sent_writes(flight: Flight | Px4Flight) -> list[str]:
-    return [each.param_id for each in flight.wire.all(messages.ParamSet)]
+    return [write.param_id for write in flight.wire.all(messages.ParamSet)]
 
 
 def reads_and_lists(flight: Flight | Px4Flight) -> int:
@@ -61,7 +61,7 @@ def reads_and_lists(flight: Flight | Px4Flight) -> int:
 
 
 def files_in(directory: Path) -> list[str]:
-    return [each.name for each in directory.iterdir()]
+    return [path.name for path in directory.iterdir()]
 
 
 class ParameterEvents:
@@ -177,12 +177,12 @@ async def test_concurrent_downloads_are_one() -> None:
 
 
 async def test_download_progress_ends_with_the_total() -> None:
-    seen: list[TransferProgress] = []
+    observed: list[TransferProgress] = []
     async with open_flight(copter()) as flight:
-        await flight.vehicle.parameters.download(method="list", on_progress=seen.append)
-        assert (seen[-1].done, seen[-1].total) == (120, 120)
-        await flight.vehicle.parameters.download(method="ftp", refresh=True, on_progress=seen.append)
-        assert seen[-1].done == seen[-1].total or seen[-1].total is None
+        await flight.vehicle.parameters.download(method="list", on_progress=observed.append)
+        assert (observed[-1].done, observed[-1].total) == (120, 120)
+        await flight.vehicle.parameters.download(method="ftp", refresh=True, on_progress=observed.append)
+        assert observed[-1].done == observed[-1].total or observed[-1].total is None
 
 
 async def test_incomplete_list_names_missing_indices() -> None:
@@ -421,7 +421,7 @@ async def test_set_many_returns_one_result_each() -> None:
         wanted = {"RTL_ALT": 2000, "LAND_SPEED": 60, "NO_SUCH_ONE": 1, "WPNAV_SPEED": 700}
         results = await flight.vehicle.parameters.set_many(wanted)
         assert list(results) == list(wanted)
-        outcomes = {name: each.outcome for name, each in results.items()}
+        outcomes = {name: result.outcome for name, result in results.items()}
         assert outcomes == {
             "RTL_ALT": "set",
             "LAND_SPEED": "failed",
@@ -452,12 +452,12 @@ async def test_upload_sends_only_differences(method: Any, tmp_path: Path) -> Non
     async with open_flight(simulated) as flight:
         parameters = flight.vehicle.parameters
         table = await parameters.download()
-        changed = [name for name, each in table.items() if each.type is ParameterType.REAL32][:15]
+        changed = [name for name, other_name in table.items() if other_name.type is ParameterType.REAL32][:15]
         values = table.values_by_name() | {name: table[name].value + 1.25 for name in changed}
         received = ParameterEvents(flight)
         results = await parameters.upload(values, method=method)
-        assert {name for name, each in results.items() if each.outcome == "set"} == set(changed)
-        assert {each.outcome for each in results.values()} == {"set", "unchanged"}
+        assert {name for name, result in results.items() if result.outcome == "set"} == set(changed)
+        assert {result.outcome for result in results.values()} == {"set", "unchanged"}
         assert {name: simulated.parameters[name] for name in changed} == pytest.approx(
             {name: values[name] for name in changed}
         )
@@ -471,15 +471,15 @@ async def test_upload_by_file_is_verified(tmp_path: Path) -> None:
     simulated = copter()
     async with open_flight(simulated) as flight:
         parameters = flight.vehicle.parameters
-        found = {each.name: (each.before, each.after) for each in await parameters.diff(path)}
+        found = {difference.name: (difference.before, difference.after) for difference in await parameters.diff(path)}
         assert found == {"RTL_ALT": (1500, 2500), "NO_SUCH_ONE": (None, 1)}
         results = await parameters.upload(path)
-        assert {name: each.outcome for name, each in results.items()} == {
+        assert {name: result.outcome for name, result in results.items()} == {
             "RTL_ALT": "set",
             "LAND_SPEED": "unchanged",
             "NO_SUCH_ONE": "failed",
         }
-        assert [each.name for each in await parameters.diff(path)] == ["NO_SUCH_ONE"]
+        assert [difference.name for difference in await parameters.diff(path)] == ["NO_SUCH_ONE"]
 
 
 async def test_upload_by_file_sets_the_rest() -> None:
@@ -496,7 +496,7 @@ async def test_upload_by_file_sets_the_rest() -> None:
 
 @pytest.mark.parametrize("method", ["ftp", "auto"])
 async def test_refused_upload_file_raises_or_falls_back(monkeypatch: pytest.MonkeyPatch, method: Any) -> None:
-    """With the requested method."""
+    """The requested method decides: a file transfer raises, an automatic choice falls back."""
 
     async def refused(*_: Any, **__: Any) -> None:
         raise FileError("write: not today", path="@PARAM/param.pck", code=MavFtpErr.FAIL)
@@ -512,7 +512,7 @@ async def test_refused_upload_file_raises_or_falls_back(monkeypatch: pytest.Monk
             assert sent_writes(flight) == []
         else:
             results = await parameters.upload(wanted, method=method)
-            changed = [name for name, each in results.items() if each.outcome != "unchanged"]
+            changed = [name for name, result in results.items() if result.outcome != "unchanged"]
             assert sorted(set(sent_writes(flight))) == sorted(changed) != []
 
 
@@ -522,13 +522,17 @@ async def test_upload_reads_back_singly_or_by_list(more: int) -> None:
     async with open_flight(copter(400)) as flight:
         parameters = flight.vehicle.parameters
         table = await parameters.download()
-        wanted = {each.name: each.value + 1 for each in table.values() if each.type == ParameterType.REAL32}
+        wanted = {
+            parameter.name: parameter.value + 1
+            for parameter in table.values()
+            if parameter.type == ParameterType.REAL32
+        }
         wanted = dict(list(wanted.items())[: MAX_READ_BACK + more])
         assert len(wanted) == MAX_READ_BACK + more
-        flight.wire.forget()
+        flight.wire.clear()
         results = await parameters.upload(wanted, method="ftp")
-        assert {each.outcome for each in results.values()} == {"set"}
-        assert {name: each.value for name, each in results.items()} == pytest.approx(wanted, rel=1e-6)
+        assert {result.outcome for result in results.values()} == {"set"}
+        assert {name: result.value for name, result in results.items()} == pytest.approx(wanted, rel=1e-6)
         assert (reads_and_lists(flight) >= MAX_READ_BACK) is not bool(more)
 
 
@@ -577,7 +581,7 @@ async def test_renamed_parameter_is_set_without_commands() -> None:
         with pytest.warns(ParameterRenamedWarning):
             await flight.vehicle.parameters.set("WP_SPD", 7.5)
         await asyncio.sleep(1)
-        asked = [each.param1 for each in flight.wire.commands(MavCmd.SET_MESSAGE_INTERVAL)]
+        asked = [command.param1 for command in flight.wire.commands(MavCmd.SET_MESSAGE_INTERVAL)]
         assert messages.ParamValue.ID not in asked
 
 
@@ -587,9 +591,11 @@ async def test_doubtful_parameter_raises_the_parameter_rate() -> None:
             await flight.vehicle.parameters.get("NO_SUCH_ONE")
         await asyncio.sleep(1)
         asked = [
-            each for each in flight.wire.commands(MavCmd.SET_MESSAGE_INTERVAL) if each.param1 == messages.ParamValue.ID
+            command
+            for command in flight.wire.commands(MavCmd.SET_MESSAGE_INTERVAL)
+            if command.param1 == messages.ParamValue.ID
         ]
-        assert {each.param2 for each in asked} == {20_000, 0}
+        assert {request.param2 for request in asked} == {20_000, 0}
 
 
 async def test_renamed_parameters_in_files_and_blocks() -> None:
@@ -600,9 +606,11 @@ async def test_renamed_parameters_in_files_and_blocks() -> None:
             parameters = flight.vehicle.parameters
             with pytest.warns(ParameterRenamedWarning) as warned:
                 differences = await parameters.diff({"WP_SPD": 8.0, "SYSID_THISMAV": 1})
-            assert [str(each.message).split()[0] for each in warned] == ["WP_SPD", "SYSID_THISMAV"]
-            assert {each.filename for each in warned} == {__file__}
-            assert [(each.name, each.before, each.after) for each in differences] == [("WPNAV_SPEED", 1000, 800)]
+            assert [str(warning.message).split()[0] for warning in warned] == ["WP_SPD", "SYSID_THISMAV"]
+            assert {warning.filename for warning in warned} == {__file__}
+            assert [(difference.name, difference.before, difference.after) for difference in differences] == [
+                ("WPNAV_SPEED", 1000, 800)
+            ]
             assert (await parameters.upload({"WP_SPD": 8.0}))["WP_SPD"].outcome == "set"
             async with parameters.temporarily({"WP_SPD": 5.0}):
                 assert simulated.parameters["WPNAV_SPEED"] == 500
@@ -649,7 +657,7 @@ async def test_metadata_only_adds_notes(tmp_path: Path) -> None:
 
 
 def hash_requests(flight: Px4Flight) -> list[str]:
-    return [each.param_id for each in flight.wire.all(messages.ParamRequestRead)]
+    return [request.param_id for request in flight.wire.all(messages.ParamRequestRead)]
 
 
 async def test_cached_list_takes_one_request(tmp_path: Path) -> None:
@@ -671,12 +679,12 @@ async def test_changed_hash_invalidates_the_cache(tmp_path: Path) -> None:
         await flight.vehicle.parameters.download(cache=tmp_path)
         simulated.parameters["COM_RC_IN_MODE"] = 4
         flight.vehicle.parameters._access.forget()
-        flight.wire.forget()
+        flight.wire.clear()
         table = await flight.vehicle.parameters.download(cache=tmp_path)
         assert table["COM_RC_IN_MODE"].value == 4
         assert len(flight.wire.all(messages.ParamRequestList)) == 1
         flight.vehicle.parameters._access.forget()
-        flight.wire.forget()
+        flight.wire.clear()
         await flight.vehicle.parameters.download(cache=tmp_path)
         assert hash_requests(flight) == ["_HASH_CHECK"]
         assert not flight.wire.all(messages.ParamRequestList)
@@ -733,7 +741,7 @@ async def test_ardupilot_is_not_cached(tmp_path: Path) -> None:
 
 
 def test_signalling_nan_bits_are_kept() -> None:
-    """Explains the tests with -5,000,000."""
+    """Shows the reason for the tests with -5,000,000."""
     bits = struct.unpack("<I", struct.pack("<i", -5_000_000))[0]
     assert bits & 0x7F800000 == 0x7F800000
     assert bits & 0x007FFFFF

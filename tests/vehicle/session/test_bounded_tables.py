@@ -26,7 +26,7 @@ from aerokit.vehicle.state.telemetry import MAX_MODE_NAMES
 pytestmark = pytest.mark.anyio
 
 
-def hear(flight: Flight, encoder: FrameEncoder, message: Message) -> None:
+def deliver(flight: Flight, encoder: FrameEncoder, message: Message) -> None:
     flight.wire.deliver(encoder.encode(message))
 
 
@@ -34,9 +34,9 @@ async def test_parameter_names() -> None:
     async with open_flight() as flight:
         encoder = FrameEncoder(1, 1)
         for number in range(MAX_PARAMETERS + 100):
-            hear(flight, encoder, ParamValue(f"P{number}", float(number), 9, 65535, 65535))
+            deliver(flight, encoder, ParamValue(f"P{number}", float(number), 9, 65535, 65535))
         assert len(flight.vehicle.parameters.table) == MAX_PARAMETERS
-        hear(flight, encoder, ParamValue("P7", 8.5, 9, 65535, 65535))
+        deliver(flight, encoder, ParamValue("P7", 8.5, 9, 65535, 65535))
         assert flight.vehicle.parameters.table["P7"].value == 8.5
 
 
@@ -56,15 +56,15 @@ def test_parameter_beyond_table_limit_is_not_requested_repeatedly() -> None:
         exchange.receive(ParamValue(f"P{number}", 1.0, 9, count, number), 0.0)
     for _ in range(3):
         exchange.receive(ParamValue(f"P{count - 1}", 1.0, 9, count, count - 1), 0.1)
-    asked = [each for each in exchange.take_outbox() if isinstance(each, ParamRequestRead)]
-    assert [each.param_index for each in asked] == [count - 1]
+    asked = [message for message in exchange.take_outbox() if isinstance(message, ParamRequestRead)]
+    assert [request.param_index for request in asked] == [count - 1]
 
 
 async def test_mode_names() -> None:
     async with open_flight() as flight:
         encoder = FrameEncoder(1, 1)
         for number in range(MAX_MODE_NAMES + 50):
-            hear(flight, encoder, AvailableModes(255, number % 256, 0, 10_000 + number, 0, f"NEW {number}"))
+            deliver(flight, encoder, AvailableModes(255, number % 256, 0, 10_000 + number, 0, f"NEW {number}"))
         assert len(flight.vehicle.telemetry.mode_names) <= MAX_MODE_NAMES
 
 
@@ -92,7 +92,7 @@ def test_peers_of_a_simulated_vehicle() -> None:
 
 
 def test_bus_plans_are_bounded() -> None:
-    """One for each subscribed system and message, and none for others."""
+    """There is one entry for each subscribed system and message, and no other."""
     bus = Bus()
     bus.attach(Heartbeat, lambda _: None)
     for system_id in range(1, 256):

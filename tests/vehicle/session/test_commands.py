@@ -1,4 +1,4 @@
-"""Any command by number, rebooting, and what two commands at once have to do with each other."""
+"""Any command by number, rebooting, and concurrent commands."""
 
 from __future__ import annotations
 
@@ -100,11 +100,11 @@ async def test_command_retries_increment_confirmation(grounded: Flight) -> None:
     grounded.copter.faults.ignore(BANNER, times=2)
     started = now()
     await grounded.vehicle.command(BANNER, retries=3)
-    assert [each.confirmation for each in grounded.wire.commands(BANNER)] == [0, 1, 2]  # type: ignore[union-attr]
+    assert [command.confirmation for command in grounded.wire.commands(BANNER)] == [0, 1, 2]  # type: ignore[union-attr]
     assert 1.5 <= now() - started <= 3.1  # each time right after a heartbeat
 
 
-async def while_it_talks(flight: Flight, call: Awaitable[object]) -> None:
+async def with_text_during(flight: Flight, call: Awaitable[object]) -> None:
     """Await a call; half a second later the vehicle sends a status text."""
     loop = asyncio.get_running_loop()
     loop.call_later(0.5, flight.copter.send_text, 4, "Terrain data missing")
@@ -115,7 +115,7 @@ async def test_command_timeout_lists_link_state(grounded: Flight) -> None:
     grounded.copter.faults.ignore(BANNER)
     started = now()
     with pytest.raises(CommandTimeout) as caught:
-        await while_it_talks(grounded, grounded.vehicle.command(BANNER, retries=2, attempt_timeout=1.0))
+        await with_text_during(grounded, grounded.vehicle.command(BANNER, retries=2, attempt_timeout=1.0))
     assert now() - started == pytest.approx(3.0, abs=0.6)
     text = str(caught.value)
     assert "no COMMAND_ACK for MAV_CMD_DO_SEND_BANNER, sent 3 times within" in text
@@ -126,10 +126,10 @@ async def test_command_timeout_lists_link_state(grounded: Flight) -> None:
 
 async def test_progress_extends_the_deadline_and_is_reported(grounded: Flight) -> None:
     grounded.copter.faults.report_progress(BANNER, (10, 50, 90), interval_s=4.0)
-    seen: list[int | None] = []
+    observed: list[int | None] = []
     started = now()
-    await grounded.vehicle.command(BANNER, on_progress=seen.append)
-    assert seen == [10, 50, 90]
+    await grounded.vehicle.command(BANNER, on_progress=observed.append)
+    assert observed == [10, 50, 90]
     assert now() - started == pytest.approx(12.0, abs=0.1)
     assert len(grounded.wire.commands(BANNER)) == 1
 
@@ -249,7 +249,9 @@ async def test_reboot_waits_for_return_and_resets_state(grounded: Flight) -> Non
     assert grounded.copter.uptime < 10.0
     await vehicle.wait_ready(timeout=30.0)
     assert vehicle.version.is_known
-    rates = [each for each in grounded.wire.commands(MavCmd.SET_MESSAGE_INTERVAL) if each.param1 == m.Attitude.ID]
+    rates = [
+        command for command in grounded.wire.commands(MavCmd.SET_MESSAGE_INTERVAL) if command.param1 == m.Attitude.ID
+    ]
     assert len(rates) >= 1  # streams are asked for again
     assert vehicle.attitude.fresh(within=0.5)
 
@@ -264,8 +266,8 @@ async def test_reboot_time_is_requested_after_ack(
     await grounded.vehicle.reboot()
     detach()
     sent = grounded.wire.sent
-    ordered = next(i for i, (_, each) in enumerate(sent) if getattr(each, "command", 0) == REBOOT)
-    requested_at = [at for at, each in sent[ordered:] if isinstance(each, m.Timesync)]
+    ordered = next(i for i, (_, message) in enumerate(sent) if getattr(message, "command", 0) == REBOOT)
+    requested_at = [at for at, message in sent[ordered:] if isinstance(message, m.Timesync)]
     assert requested_at[:1] == answered_at
 
 
@@ -352,7 +354,7 @@ async def test_raw_command_ack_lost_is_sent_once(grounded: Flight, is_int: bool)
 
 async def test_raw_question_ack_lost_is_repeated(grounded: Flight) -> None:
     grounded.copter.faults.ignore(MavCmd.REQUEST_MESSAGE, times=3)
-    grounded.wire.forget()
+    grounded.wire.clear()
     await grounded.vehicle.command(MavCmd.REQUEST_MESSAGE, m.HomePosition.ID)
     assert len(grounded.wire.commands(MavCmd.REQUEST_MESSAGE)) == 4
 
@@ -370,7 +372,7 @@ async def test_raw_command_own_mode_is_no_takeover(
     flying: Flight, command: int, params: tuple[float, ...], mode: str
 ) -> None:
     await flying.vehicle.command(command, *params)
-    await flying.vehicle.mode.wait_until(lambda told: told.name == mode, timeout=3)
+    await flying.vehicle.mode.wait_until(lambda reported: reported.name == mode, timeout=3)
     await anyio.sleep(5.0)
     assert flying.vehicle.taken_over == ""
     flying.pilot_takes_over(CopterMode.STABILIZE)
@@ -380,7 +382,7 @@ async def test_raw_command_own_mode_is_no_takeover(
 
 async def test_takeover_after_raw_command_is_reported(flying: Flight) -> None:
     await flying.vehicle.command(MavCmd.NAV_RETURN_TO_LAUNCH)
-    await flying.vehicle.mode.wait_until(lambda told: told.name == "RTL", timeout=3)
+    await flying.vehicle.mode.wait_until(lambda reported: reported.name == "RTL", timeout=3)
     flying.pilot_takes_over(CopterMode.STABILIZE)
     await anyio.sleep(1.2)
     assert "STABILIZE" in flying.vehicle.taken_over

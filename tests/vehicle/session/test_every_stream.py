@@ -1,4 +1,4 @@
-"""``vehicle.streams``: all that a vehicle streams, asked for again when it does not come."""
+"""``vehicle.streams``: all streams of a vehicle, requested again when missing."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ def interval(flight: Flight, kind: type[Message]) -> float:
 
 def requests(flight: Flight | Px4Flight) -> list[tuple[int, int, int, int]]:
     return [
-        (each.target_component, each.req_stream_id, each.req_message_rate, each.start_stop)
-        for each in flight.wire.all(m.RequestDataStream)
+        (message.target_component, message.req_stream_id, message.req_message_rate, message.start_stop)
+        for message in flight.wire.all(m.RequestDataStream)
     ]
 
 
@@ -32,7 +32,7 @@ async def test_streams_arrive_at_requested_rate() -> None:
     async with open_flight(rates={}) as flight:
         with flight.vehicle.streams(8):
             await anyio.sleep(30.0)
-            assert requests(flight) == [(0, 0, 8, 1)], "asked once: it is heard"
+            assert requests(flight) == [(0, 0, 8, 1)], "requested once: it arrives"
             assert interval(flight, m.Attitude) == pytest.approx(1 / 8, rel=0.1)
             assert interval(flight, m.ServoOutputRaw) == pytest.approx(1 / 8, rel=0.1)
 
@@ -45,10 +45,10 @@ async def test_reboot_requests_streams_again() -> None:
             await anyio.sleep(15.0)
             assert requests(flight)[0] == (0, 0, 1, 1)
             assert len(requests(flight)) > 1
-        flight.wire.forget()
+        flight.wire.clear()
         flight.copter.restart()
         await anyio.sleep(15.0)
-        assert not requests(flight), "nobody wants them any more"
+        assert not requests(flight), "they have no subscriber left"
 
 
 async def test_missing_stream_request_interval_grows() -> None:
@@ -65,10 +65,12 @@ async def test_streams_of_px4_requests_missing_states() -> None:
         with flight.vehicle.streams(2):
             await anyio.sleep(10.0)
             assert not requests(flight)
-            missing = [each.param1 for each in flight.wire.commands(MavCmd.SET_MESSAGE_INTERVAL)]
+            missing = [command.param1 for command in flight.wire.commands(MavCmd.SET_MESSAGE_INTERVAL)]
             assert all(flight.vehicle.telemetry.cells[name].is_known for name in ("attitude", "position", "gps"))
         await anyio.sleep(5.0)
-        given_back = [each.param1 for each in flight.wire.commands(MavCmd.SET_MESSAGE_INTERVAL) if each.param2 == 0]
+        given_back = [
+            command.param1 for command in flight.wire.commands(MavCmd.SET_MESSAGE_INTERVAL) if command.param2 == 0
+        ]
         assert sorted(given_back) == sorted(set(missing))
 
 

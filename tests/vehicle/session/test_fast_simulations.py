@@ -90,7 +90,7 @@ async def test_real_time_simulation_keeps_limits() -> None:
 
 @pytest.mark.parametrize(("speedup", "passed"), [(1.0, 3.0), (20.0, 0.5)])
 async def test_blocked_time_is_no_silence(speedup: float, passed: float) -> None:
-    """In real time it is caught up; faster, all but half a simulated second of it is left out."""
+    """In real time the pause is caught up; at higher speeds all but half a simulated second is skipped."""
     copter = SimulatedCopter(boot_time_s=0.0)
     async with simulated_link(copter, speedup=speedup):
         await anyio.sleep(1.0)

@@ -158,7 +158,7 @@ def tasks() -> int:
     return len(asyncio.all_tasks())
 
 
-async def nothing_is_left_of(steps: list[tuple[int, float | None]], airborne: bool, latency_s: float) -> None:
+async def nothing_remains_of(steps: list[tuple[int, float | None]], airborne: bool, latency_s: float) -> None:
     alone = tasks()
     opened = in_the_air if airborne else open_flight
     async with opened(latency_s=latency_s) as flight:
@@ -172,7 +172,7 @@ async def nothing_is_left_of(steps: list[tuple[int, float | None]], airborne: bo
         await after_the_dust_has_settled(flight)
         assert (tasks(), waiting_on_cells(vehicle)) == before
         assert attached_sinks(connection) <= sinks + NEW_STREAMS
-        flight.wire.forget()
+        flight.wire.clear()
         await anyio.sleep(3.0)
         assert not flight.wire.setpoints()  # No set-point is supplied, so none is sent.
     assert attached_sinks(connection) <= 1  # the connection's own
@@ -185,13 +185,13 @@ async def nothing_is_left_of(steps: list[tuple[int, float | None]], airborne: bo
 def test_any_sequence_with_any_cancellation(
     steps: list[tuple[int, float | None]], airborne: bool, latency_s: float
 ) -> None:
-    run_virtual(nothing_is_left_of(steps, airborne, latency_s))
+    run_virtual(nothing_remains_of(steps, airborne, latency_s))
 
 
 @given(leave_after=st.floats(0.0, 12.0), how=st.sampled_from(["cancel", "raise", "return", "unplug"]))
 @settings(max_examples=16)
 def test_setpoint_stream_exit_in_flight_holds(leave_after: float, how: str) -> None:
-    """Also while connecting: the block ends at once and takes all operations with it."""
+    """Also while connecting: the block and all its operations end at once."""
 
     async def flying(flight: Flight) -> None:
         vehicle = flight.vehicle

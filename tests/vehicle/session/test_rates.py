@@ -22,8 +22,8 @@ SET_INTERVAL = MavCmd.SET_MESSAGE_INTERVAL
 
 
 def asked(flight: Flight, kind: type[Message]) -> list[float]:
-    """The intervals in seconds that this message was asked for."""
-    return [each.param2 / 1e6 for each in flight.wire.commands(SET_INTERVAL) if each.param1 == kind.ID]
+    """Return the requested intervals of this message in seconds."""
+    return [command.param2 / 1e6 for command in flight.wire.commands(SET_INTERVAL) if command.param1 == kind.ID]
 
 
 def interval(flight: Flight, kind: type[Message]) -> float:
@@ -33,9 +33,9 @@ def interval(flight: Flight, kind: type[Message]) -> float:
 
 def group_requests(flight: Flight) -> dict[int, list[tuple[int, int]]]:
     requests: dict[int, list[tuple[int, int]]] = {}
-    for each in flight.wire.all(m.RequestDataStream):
-        assert (each.target_system, each.target_component) == (1, 1)
-        requests.setdefault(each.req_stream_id, []).append((each.req_message_rate, each.start_stop))
+    for message in flight.wire.all(m.RequestDataStream):
+        assert (message.target_system, message.target_component) == (1, 1)
+        requests.setdefault(message.req_stream_id, []).append((message.req_message_rate, message.start_stop))
     return requests
 
 
@@ -128,7 +128,7 @@ async def test_rate_request_lost_is_sent_again() -> None:
 async def test_reboot_requests_all_rates_again(grounded: Flight) -> None:
     with grounded.vehicle.rate(m.RawImu, 20.0):
         await anyio.sleep(10.0)
-        grounded.wire.forget()
+        grounded.wire.clear()
         grounded.copter.restart()
         await anyio.sleep(10.0)
         assert asked(grounded, m.Attitude) == pytest.approx([0.1])
@@ -150,15 +150,15 @@ async def test_missing_sensor_is_not_requested_continuously() -> None:
 
 
 async def test_answered_timesync_is_requested_immediately_again() -> None:
-    """Each question in vain doubles the pause, until one is answered."""
+    """Each unanswered request doubles the pause."""
     async with open_flight(rates={}) as flight, AsyncExitStack() as requests:
         await anyio.sleep(3.0)
         for times, hz in ((3, 20.0), (1, 50.0)):
-            flight.wire.forget()
+            flight.wire.clear()
             flight.copter.faults.ignore(SET_INTERVAL, times=times)
             requests.enter_context(flight.vehicle.rate(m.RawImu, hz))
             await anyio.sleep(40.0)
-            at = [when for when, each in flight.wire.sent if isinstance(each, m.CommandLong)]
+            at = [when for when, message in flight.wire.sent if isinstance(message, m.CommandLong)]
             gaps = [later - earlier for earlier, later in itertools.pairwise(at)]
             assert gaps == pytest.approx([3.0, 5.0, 9.0][:times], abs=1.01)
 
@@ -259,7 +259,7 @@ async def test_rates_old_firmware_gets_request_data_stream() -> None:
 async def test_rates_old_firmware_group_uses_highest_rate() -> None:
     async with open_flight(old_copter()) as flight:
         await anyio.sleep(2.0)
-        flight.wire.forget()
+        flight.wire.clear()
         with flight.vehicle.rate(m.Ahrs2, 30.0):
             await anyio.sleep(1.5)
             assert group_requests(flight) == {MavDataStream.EXTRA1: [(30, 1)]}
@@ -270,7 +270,7 @@ async def test_rates_old_firmware_group_uses_highest_rate() -> None:
 async def test_rates_old_firmware_requested_again_after_reboot() -> None:
     async with open_flight(old_copter()) as flight:
         await anyio.sleep(10.0)
-        flight.wire.forget()
+        flight.wire.clear()
         flight.copter.restart()
         await anyio.sleep(10.0)
         assert group_requests(flight)[MavDataStream.EXTRA1]

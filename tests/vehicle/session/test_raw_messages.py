@@ -1,4 +1,4 @@
-"""Any message of the vehicle as it came, in a cell."""
+"""Any message of the vehicle as a cell."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ async def test_px4_set_heading_turns_and_keeps_speed(heading_deg: float, yaw: fl
         (command,) = flight.wire.commands(MavCmd.DO_REPOSITION)
         params = params_of(command)
         assert params[:4] == pytest.approx([-1.0, 1.0, 0.0, yaw])
-        assert all(math.isnan(each) for each in params[4:])
+        assert all(math.isnan(param) for param in params[4:])
 
 
 async def test_speed_and_roi_are_raw_commands(flying: Flight) -> None:
@@ -152,12 +152,12 @@ async def test_px4_arms_when_ready_in_new_mode() -> None:
         await flight.vehicle.mode.wait_until(lambda mode: mode.name == "OFFBOARD")
         await anyio.sleep(1.0)
         await flight.vehicle.arm()
-        modes = [at for at, each in flight.wire.sent if getattr(each, "command", 0) == MavCmd.DO_SET_MODE]
-        arms = [at for at, each in flight.wire.sent if getattr(each, "command", 0) == MavCmd.COMPONENT_ARM_DISARM]
+        modes = [at for at, message in flight.wire.sent if getattr(message, "command", 0) == MavCmd.DO_SET_MODE]
+        arms = [at for at, message in flight.wire.sent if getattr(message, "command", 0) == MavCmd.COMPONENT_ARM_DISARM]
         assert arms[0] - modes[0] < 2.5
 
 
-# ----------------------------------------------------------------- answers nobody waits for
+# ------------------------------------------------------------------------- unexpected answers
 
 
 @pytest.fixture
@@ -265,7 +265,7 @@ async def test_px4_setpoint_stream_not_fed_after_entry_holds() -> None:
                 await anyio.sleep(5.0)
 
 
-# ---------------------------------------------------------------------- left in a silence
+# ---------------------------------------------------------------- block left in a silence
 
 
 async def test_block_left_with_unconfirmed_hold_warns(caplog: pytest.LogCaptureFixture) -> None:
@@ -298,7 +298,7 @@ async def test_hold_in_silence_is_sent_after_heartbeat() -> None:
                     await anyio.sleep(2.0)
                     flight.copter.faults.silent = True
                     await events.get(timeout=10.0)
-                    flight.wire.forget()
+                    flight.wire.clear()
                     scope.cancel()
         await anyio.sleep(5.0)
         assert not flight.wire.mode_orders()
@@ -317,7 +317,7 @@ async def test_takeover_in_silence_keeps_vehicle() -> None:
                 flight.copter.faults.silent = True
                 await anyio.sleep(5.0)
                 scope.cancel()
-        flight.wire.forget()
+        flight.wire.clear()
         flight.pilot_takes_over()
         flight.copter.faults.silent = False
         await anyio.sleep(4.0)

@@ -45,7 +45,7 @@ async def two_vehicles() -> AsyncIterator[Two]:
         ):
             await one.wait_ready()
             await two.wait_ready()
-            wire.forget()
+            wire.clear()
             yield Two(first, second, one, two, wire)
 
 
@@ -68,11 +68,11 @@ async def test_commands_reach_only_addressed_vehicle() -> None:
     async with two_vehicles() as both:
         await both.two.arm()
         assert not both.first.is_armed
-        assert {each.target_system for each in both.wire.commands(MavCmd.COMPONENT_ARM_DISARM)} == {2}
+        assert {command.target_system for command in both.wire.commands(MavCmd.COMPONENT_ARM_DISARM)} == {2}
         await both.one.set_mode("ALT_HOLD")
         assert both.second.mode.number == CopterMode.STABILIZE
-        sent = [each for _, each in both.wire.sent if not isinstance(each, m.Timesync)]
-        assert {getattr(each, "target_system", None) for each in sent} == {None, 1, 2}  # no broadcasts
+        sent = [message for _, message in both.wire.sent if not isinstance(message, m.Timesync)]
+        assert {getattr(message, "target_system", None) for message in sent} == {None, 1, 2}  # no broadcasts
 
 
 async def test_both_vehicles_fly_concurrently() -> None:
@@ -96,11 +96,11 @@ async def test_equal_commands_to_two_vehicles_are_concurrent() -> None:
         both.first.faults.ignore(MavCmd.DO_SEND_BANNER)
         async with anyio.create_task_group() as tasks:
 
-            async def in_vain() -> None:
+            async def command_without_answer() -> None:
                 with pytest.raises(CommandTimeout):
                     await both.one.command(MavCmd.DO_SEND_BANNER)
 
-            tasks.start_soon(in_vain)
+            tasks.start_soon(command_without_answer)
             await anyio.sleep(0.01)
             started = now()
             ack = await both.two.command(MavCmd.DO_SEND_BANNER)
@@ -146,13 +146,13 @@ async def test_subscription_separates_events_and_messages() -> None:
 async def test_reboot_of_one_vehicle_keeps_other() -> None:
     async with two_vehicles() as both:
         await anyio.sleep(8.0)
-        both.wire.forget()
+        both.wire.clear()
         await both.two.reboot()
         await anyio.sleep(5.0)
         assert both.one.position.fresh(within=0.5)
         assert both.first.uptime > 10.0
         requests = both.wire.commands(MavCmd.SET_MESSAGE_INTERVAL)
-        asked = {each.target_system for each in requests if each.param1 != m.DistanceSensor.ID}
+        asked = {request.target_system for request in requests if request.param1 != m.DistanceSensor.ID}
         assert asked == {2}
 
 
@@ -252,7 +252,7 @@ async def test_autopilot_with_other_component_id_is_accepted() -> None:
 
 
 async def test_gimbal_works_while_autopilot_is_silent() -> None:
-    """Its heartbeats come from the same system; the vehicle is silent all the same."""
+    """Its heartbeats come from the same system, but the vehicle counts as silent."""
     copter = SimulatedCopter(boot_time_s=0.0)
     async with simulated_link(copter) as link:
         wire = Wire(link)
@@ -320,8 +320,8 @@ async def test_found_event_is_published_once_per_autopilot() -> None:
         with connection.subscribe(VehicleFound, capacity=10) as found:
             async with aerokit.connect(connection, system_id=1):
                 await anyio.sleep(5.0)
-            told = [await found.get(timeout=1.0), await found.get(timeout=1.0)]
-            assert [(each.system_id, each.component_id) for each in told] == [(1, 1), (2, 1)]
+            reported = [await found.get(timeout=1.0), await found.get(timeout=1.0)]
+            assert [(event.system_id, event.component_id) for event in reported] == [(1, 1), (2, 1)]
             assert found.get_nowait() is None
 
 
@@ -332,7 +332,9 @@ async def test_connect_uses_recent_heartbeat_only(silent_s: float, is_found: boo
         await anyio.sleep(3.2)
         copter.faults.silent = True
         heard_at = max(
-            each.received_frame.received_at for each in connection.heartbeats.values() if each.received_frame
+            heartbeat.received_frame.received_at
+            for heartbeat in connection.heartbeats.values()
+            if heartbeat.received_frame
         )
         await anyio.sleep(heard_at + silent_s - now())
         try:

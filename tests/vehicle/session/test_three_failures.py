@@ -34,17 +34,17 @@ async def test_twenty_unanswered_commands_delay_nothing_else(grounded: Flight) -
     for command in silent:
         grounded.copter.faults.ignore(command)
 
-    async def in_vain(command: int) -> None:
+    async def command_without_answer(command: int) -> None:
         with pytest.raises(CommandTimeout):
             await vehicle.command(command)
 
     async with anyio.create_task_group() as tasks:
         for command in silent:
-            tasks.start_soon(in_vain, command)
+            tasks.start_soon(command_without_answer, command)
         await anyio.sleep(0.5)
 
         started = now()
-        assert vehicle.attitude.value is not None  # a property never talks to anybody
+        assert vehicle.attitude.value is not None  # a property never sends a request
         assert vehicle.mode.fresh(within=1.5)
         assert now() == started
 
@@ -76,11 +76,11 @@ async def test_silent_vehicle_delays_only_its_own_calls() -> None:
         flight.copter.faults.silent = True
         async with anyio.create_task_group() as tasks:
 
-            async def in_vain() -> None:
+            async def command_without_answer() -> None:
                 with pytest.raises(CommandTimeout):
                     await flight.vehicle.arm()
 
-            tasks.start_soon(in_vain)
+            tasks.start_soon(command_without_answer)
             await anyio.sleep(2.0)
             started = now()
             assert flight.vehicle.position.value.latitude_deg < 0
@@ -224,7 +224,7 @@ class SilentVehicle:
 
 
 def test_program_with_timed_out_calls_exits() -> None:
-    """In a process of its own, on a real socket: the interpreter itself has to come to its end."""
+    """A separate process with a real socket: the interpreter must exit."""
     with SilentVehicle() as silent:
         finished = subprocess.run(
             [sys.executable, "-W", "error", "-c", textwrap.dedent(PROGRAM), f"udpin:127.0.0.1:{silent.port}"],
@@ -233,7 +233,7 @@ def test_program_with_timed_out_calls_exits() -> None:
             timeout=30,  # It takes two seconds; a comparable library was reported never to end.
             check=False,
         )
-    told = ["connected", "timeout", "timeout", "timeout", "cancelled", "left", "done"]
-    assert finished.stdout.split() == told, finished.stderr
+    reported = ["connected", "timeout", "timeout", "timeout", "cancelled", "left", "done"]
+    assert finished.stdout.split() == reported, finished.stderr
     assert "an arm command may still be executed" in finished.stderr  # it never was answered
     assert finished.returncode == 0

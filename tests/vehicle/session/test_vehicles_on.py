@@ -33,14 +33,14 @@ async def test_vehicles_on_connects_each_and_closes_at_end() -> None:
                 await both.wait()
             assert sorted(found) == [1, 7]
             await vehicles[7].position.wait_until(lambda place: True, timeout=10)
-            told = overview(vehicles[7])
-            assert (told["system_id"], told["autopilot"], told["link"]["state"]) == (7, "PX4", "connected")
-            assert told["states"]["position"]["value"]["latitude_deg"] == pytest.approx(
+            reported = overview(vehicles[7])
+            assert (reported["system_id"], reported["autopilot"], reported["link"]["state"]) == (7, "PX4", "connected")
+            assert reported["states"]["position"]["value"]["latitude_deg"] == pytest.approx(
                 vehicles[7].position.value.latitude_deg
             )
-            assert 0 <= told["states"]["position"]["age_s"] < 5
-            assert told["states"]["armed"]["value"] is False
-            json.dumps(told, allow_nan=False)
+            assert 0 <= reported["states"]["position"]["age_s"] < 5
+            assert reported["states"]["armed"]["value"] is False
+            json.dumps(reported, allow_nan=False)
             with pytest.raises(BusyError):
                 async with aerokit.connect(connection, system_id=1):
                     raise AssertionError

@@ -296,7 +296,7 @@ async def test_terminal_ipython_without_gui_asyncio_is_named(
     async with open_flight():
         block_loop(3.0)
         await anyio.sleep(1.0)
-    named = ["%gui asyncio" in each.getMessage() for each in caplog.records]
+    named = ["%gui asyncio" in record.getMessage() for record in caplog.records]
     assert named == ([True, True] if gui is None else [False])
 
 

@@ -75,7 +75,7 @@ class Stage:
         )
         self.encoder = FrameEncoder(1, 1)
 
-    def hear(self, message: Message, *, component_id: int = 1) -> None:
+    def receive(self, message: Message, *, component_id: int = 1) -> None:
         encoder = self.encoder if component_id == 1 else FrameEncoder(1, component_id)
         (frame,) = Framer().receive(encoder.encode(message), self.at)
         for take in self.bus.takers.get(type(message), ()):
@@ -87,7 +87,7 @@ class Stage:
     def _decoded(frame: Frame) -> Message:
         return STANDARD.decode(frame)
 
-    def told(self) -> Counter[type[Any]]:
+    def event_counts(self) -> Counter[type[Any]]:
         return Counter(map(type, self.bus.published))
 
 
@@ -101,15 +101,15 @@ def attitude(boot_ms: int) -> Attitude:
 class Watched(Stage):
     def __init__(self) -> None:
         super().__init__()
-        self.reboots_told = 0
+        self.reported_reboots = 0
         self.watch = VehicleWatch(self.connection, 1, 1, self._count)
 
     def _count(self) -> None:
-        self.reboots_told += 1
+        self.reported_reboots += 1
 
     def clock(self, boot_ms: int, *, after: float = 0.1) -> int:
         self.at += after
-        self.hear(attitude(boot_ms))
+        self.receive(attitude(boot_ms))
         return self.watch.reboots
 
 
@@ -120,7 +120,7 @@ def test_decreased_running_time_is_reboot() -> None:
     assert stage.clock(150) == 0
     assert stage.clock(250, after=0.11) == 1
     assert stage.clock(350) == 1
-    assert (stage.reboots_told, stage.told()[VehicleRebooted]) == (1, 1)
+    assert (stage.reported_reboots, stage.event_counts()[VehicleRebooted]) == (1, 1)
 
 
 def test_time_three_seconds_earlier_is_late_message() -> None:
@@ -166,12 +166,12 @@ def test_decreased_constant_time_is_no_reboot() -> None:
 def test_messages_of_other_components_are_ignored() -> None:
     stage = Watched()
     stage.clock(100_000)
-    stage.hear(Timesync(100_000_000_000, 5))
+    stage.receive(Timesync(100_000_000_000, 5))
     for count in range(10):
         stage.at += 0.1
-        stage.hear(attitude(100 * count + 1), component_id=154)
-        stage.hear(SystemTime(0, 100 * count + 1), component_id=154)
-        stage.hear(Timesync((100 * count + 1) * 1_000_000, 5), component_id=154)
+        stage.receive(attitude(100 * count + 1), component_id=154)
+        stage.receive(SystemTime(0, 100 * count + 1), component_id=154)
+        stage.receive(Timesync((100 * count + 1) * 1_000_000, 5), component_id=154)
     assert stage.watch.reboots == 0
 
 
@@ -180,7 +180,7 @@ def test_boot_time_is_extrapolated() -> None:
     clock = stage.boot_clocks[1, 1]
     assert clock(0.0) is None
     stage.at = 100.0
-    stage.hear(SystemTime(1_700_000_000_000_000, 5000))
+    stage.receive(SystemTime(1_700_000_000_000_000, 5000))
     assert clock(101.5) == 6500.0
     stage.clock(65_000, after=6.0)  # ten times as fast
     assert clock(107.0) == 75_000.0
@@ -200,10 +200,10 @@ def test_ordered_reboot_is_detected_immediately() -> None:
 
 def test_timesync_request_of_vehicle_is_ignored() -> None:
     stage = Watched()
-    stage.hear(Timesync(100_000_000_000, 5))
+    stage.receive(Timesync(100_000_000_000, 5))
     with stage.watch.expecting_reboot():
         stage.at += 1.0
-        stage.hear(Timesync(0, 6))
+        stage.receive(Timesync(0, 6))
     assert stage.watch.reboots == 0
 
 
@@ -234,10 +234,10 @@ def test_silence_event_is_published_once_after_limit() -> None:
         stage.watch.check()
         assert stage.watch.is_silent is silent
     for component_id, silent in ((154, True), (1, False)):
-        stage.hear(HEARTBEAT, component_id=component_id)
+        stage.receive(HEARTBEAT, component_id=component_id)
         assert stage.watch.is_silent is silent
-    assert (stage.told()[VehicleSilent], stage.told()[VehicleRecovered]) == (1, 1)
-    (back,) = [each for each in stage.bus.published if isinstance(each, VehicleRecovered)]
+    assert (stage.event_counts()[VehicleSilent], stage.event_counts()[VehicleRecovered]) == (1, 1)
+    (back,) = [event for event in stage.bus.published if isinstance(event, VehicleRecovered)]
     assert back.silent_for_s == 9.0
 
 
@@ -248,7 +248,7 @@ class Measured(Stage):
     def __init__(self) -> None:
         super().__init__()
         self.reports, self.answers = list[LinkReport](), list[tuple[float, int]]()
-        self.watch = LinkWatch(self.connection, 1, 1, self.reports.append, lambda *each: self.answers.append(each))
+        self.watch = LinkWatch(self.connection, 1, 1, self.reports.append, lambda *answer: self.answers.append(answer))
 
     def request_time(self) -> Timesync:
         self.watch.request_time()
@@ -269,13 +269,13 @@ def test_round_trip_uses_first_answer() -> None:
     assert (question.tc1, question.ts1) == (0, 5_000_000_000)
     answer = Timesync(77_000_000, question.ts1)
     stage.at = 5.1
-    stage.hear(answer, component_id=154)
-    stage.hear(Timesync(0, question.ts1))
-    stage.hear(Timesync(77_000_000, 12345))
+    stage.receive(answer, component_id=154)
+    stage.receive(Timesync(0, question.ts1))
+    stage.receive(Timesync(77_000_000, 12345))
     assert stage.watch.round_trip_s is None
-    stage.hear(answer)
+    stage.receive(answer)
     stage.at = 5.9
-    stage.hear(answer)  # a second copy of it
+    stage.receive(answer)  # a second copy of it
     assert stage.watch.round_trip_s == pytest.approx(0.1)
     assert stage.answers == [(5.0, 77)]
 
@@ -292,10 +292,10 @@ def test_loss_and_rates_of_a_second() -> None:
     assert (report.loss_percent, report.frames_per_s) == (100.0, 0.0)
 
 
-# ------------------------------------------------------------------------------- standing still
+# ------------------------------------------------------------------------------------------- stalls
 
 
-class Standing:
+class StallStage:
     def __init__(self) -> None:
         self.at = 0.0
         self.cell = StateCell[Position]("position", lambda: self.at, "GLOBAL_POSITION_INT")
@@ -304,7 +304,7 @@ class Standing:
         )
         self.stillness = StallDetector(cast("VehicleSession", session))
 
-    def tell(self, place: Position | None, at: float) -> str | None:
+    def receive(self, place: Position | None, at: float) -> str | None:
         self.at = at
         if place is not None:
             self.cell.set(place, Source(1, 1, "GLOBAL_POSITION_INT"))
@@ -316,10 +316,10 @@ HERE = Position(47.0, 8.0)
 
 @pytest.mark.parametrize("altitudes", [{}, {"altitude_relative_m": 5.0}, {"altitude_amsl_m": 5.0}])
 def test_stall_detector_reports_after_twelve_seconds(altitudes: dict[str, float]) -> None:
-    order_status, here = Standing(), Position(47.0, 8.0, **altitudes)
+    order_status, here = StallStage(), Position(47.0, 8.0, **altitudes)
     for at in range(12):
-        assert order_status.tell(here, float(at)) is None
-    assert order_status.tell(here, 12.0) == "it accepted the order and has not moved for 12 s"
+        assert order_status.receive(here, float(at)) is None
+    assert order_status.receive(here, 12.0) == "it accepted the order and has not moved for 12 s"
 
 
 @pytest.mark.parametrize(
@@ -333,30 +333,30 @@ def test_stall_detector_reports_after_twelve_seconds(altitudes: dict[str, float]
     ],
 )
 def test_stall_detector_small_movement_counts(further: Position, moves: bool) -> None:
-    order_status = Standing()
+    order_status = StallStage()
     here = HERE if further.altitude_relative_m is None else HERE.replace(altitude_relative_m=5.0)
     for at in range(12):
-        order_status.tell(here, float(at))
-    assert (order_status.tell(further, 12.0) is None) is moves
-    assert (order_status.tell(further, 23.0) is None) is moves
+        order_status.receive(here, float(at))
+    assert (order_status.receive(further, 12.0) is None) is moves
+    assert (order_status.receive(further, 23.0) is None) is moves
 
 
 def test_position_older_than_two_seconds_is_unknown() -> None:
-    order_status = Standing()
-    assert order_status.tell(None, 0.0) is None
-    assert order_status.tell(HERE, 1.0) is None
-    assert order_status.tell(None, 3.1) is None
+    order_status = StallStage()
+    assert order_status.receive(None, 0.0) is None
+    assert order_status.receive(HERE, 1.0) is None
+    assert order_status.receive(None, 3.1) is None
     for at in range(4, 16):
-        assert order_status.tell(HERE, float(at)) is None
-    assert order_status.tell(None, 17.0) is not None
-    assert order_status.tell(None, 17.1) is None
+        assert order_status.receive(HERE, float(at)) is None
+    assert order_status.receive(None, 17.0) is not None
+    assert order_status.receive(None, 17.1) is None
 
 
 @pytest.mark.parametrize(("speed_m_s", "wanted"), [(SLOW_M_S, True), (0.99 * SLOW_M_S, False)])
 def test_stall_velocity_threshold(speed_m_s: float, wanted: bool) -> None:
-    nobody = cast("VehicleContext", None)  # A velocity needs no context.
-    assert wants_motion(VelocitySetpoint(east_m_s=speed_m_s), nobody) is wanted
-    assert wants_motion(BodyVelocitySetpoint(right_m_s=speed_m_s), nobody) is wanted
+    unused = cast("VehicleContext", None)  # A velocity needs no context.
+    assert wants_motion(VelocitySetpoint(east_m_s=speed_m_s), unused) is wanted
+    assert wants_motion(BodyVelocitySetpoint(right_m_s=speed_m_s), unused) is wanted
 
 
 @pytest.mark.parametrize(
@@ -372,7 +372,7 @@ def test_stall_global_position_requires_distance(away_m: float, wanted: bool) ->
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize(("off_m", "wanted"), [(0.0, False), (2.9, False), (3.1, True), (-3.1, True)])
 def test_stall_local_position_requires_distance(axis: int, off_m: float, wanted: bool) -> None:
-    """By the distance along each axis."""
+    """The distance along each axis counts."""
     here = LocalPosition(-5.0, 7.0, -10.0, 0.0, 0.0, 0.0)
     telemetry = SimpleNamespace(local_position=SimpleNamespace(latest=here))
     session = SimpleNamespace(autopilot=SimpleNamespace(arrival_radius_m=3.0 / FAR), telemetry=telemetry)

@@ -1,7 +1,7 @@
 """Flights of real firmware: the cells' values are plausible, and agree with pymavlink at the end.
 
-Uses the recordings beside the project (``../shared/traces``) if present, else the project's own, which contain the
-essential parts of two of these flights; a flight in neither is skipped.
+Uses the recordings in ``../shared/traces`` if present, else the project's own, which contain the essential parts of two
+of these flights; a flight in neither is skipped.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ def note(items: list[Any], item: Any) -> None:
 Flights = Callable[[str], Flight]
 
 
-# ------------------------------------------------------------------------- what happened on the way
+# ------------------------------------------------------------------------- events during the flight
 
 
 def test_copter(flights: Flights) -> None:
@@ -147,7 +147,7 @@ def test_px4(flights: Flights) -> None:
     assert [reason for reason in reasons if reason] == ["heading estimate not stable"]
 
 
-# ----------------------------------------------------------------------- what pymavlink says at the end
+# ---------------------------------------------------------------------------- comparison with pymavlink
 
 
 def theirs(flight: Flight) -> dict[str, Any]:

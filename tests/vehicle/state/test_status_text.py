@@ -41,28 +41,30 @@ def test_status_text_trailing_tabs_are_removed() -> None:
 
 def test_status_text_chunks_are_joined() -> None:
     texts = StatusTextAssembler()
-    told = [text for each in chunks(LONG) for text in texts.receive(each, 1.0)]
-    assert told == [StatusText(4, LONG, 1.0)]
+    texts_read = [text for chunk in chunks(LONG) for text in texts.receive(chunk, 1.0)]
+    assert texts_read == [StatusText(4, LONG, 1.0)]
 
 
 def test_status_text_full_chunks_end_with_empty_chunk() -> None:
     texts = StatusTextAssembler()
-    told = [text.text for each in chunks("x" * 100) for text in texts.receive(each, 1.0)]
-    assert told == ["x" * 100]
+    texts_read = [text.text for chunk in chunks("x" * 100) for text in texts.receive(chunk, 1.0)]
+    assert texts_read == ["x" * 100]
 
 
 @given(st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=300))
 def test_status_text_round_trip_any_text(text: str) -> None:
     texts = StatusTextAssembler()
-    told = [each.text for chunk in chunks(text) for each in texts.receive(chunk, 0.0)]
-    assert told == [text.rstrip()]
+    texts_read = [message.text for chunk in chunks(text) for message in texts.receive(chunk, 0.0)]
+    assert texts_read == [text.rstrip()]
 
 
 def test_status_texts_of_components_and_ids_are_separate() -> None:
     texts = StatusTextAssembler()
     first, second = chunks(LONG, 1), chunks(LONG.upper(), 2)
-    told = [text.text for pair in zip(first, second, strict=True) for each in pair for text in texts.receive(each, 0.0)]
-    assert told == [LONG, LONG.upper()]
+    texts_read = [
+        text.text for pair in zip(first, second, strict=True) for chunk in pair for text in texts.receive(chunk, 0.0)
+    ]
+    assert texts_read == [LONG, LONG.upper()]
 
 
 def test_status_text_chunk_missing_is_marked() -> None:
@@ -102,14 +104,14 @@ def test_status_text_id_reused_ends_previous_text() -> None:
     texts = StatusTextAssembler()
     texts.receive(chunks(LONG)[0], 0.0)
     texts.receive(chunks(LONG)[1], 0.0)
-    told = [text.text for each in chunks("Another " + LONG) for text in texts.receive(each, 0.5)]
-    assert told == [LONG[:100].rstrip() + "…", "Another " + LONG]
+    texts_read = [text.text for chunk in chunks("Another " + LONG) for text in texts.receive(chunk, 0.5)]
+    assert texts_read == [LONG[:100].rstrip() + "…", "Another " + LONG]
 
 
 def test_status_text_repeated_chunk_is_used_once() -> None:
     texts = StatusTextAssembler()
-    told = [text.text for each in chunks(LONG) for _ in range(2) for text in texts.receive(each, 0.0)]
-    assert told[0] == LONG
+    texts_read = [text.text for chunk in chunks(LONG) for _ in range(2) for text in texts.receive(chunk, 0.0)]
+    assert texts_read[0] == LONG
 
 
 def test_recent_texts_by_time() -> None:
@@ -136,15 +138,15 @@ def test_status_text_open_limit_drops_oldest() -> None:
     texts = StatusTextAssembler()
     for number in range(1, MAX_OPEN + 2):
         texts.receive(chunks("y" * 70, number)[0], 0.0)
-    told = [text.text for number in (2, 1) for text in texts.receive(chunks("y" * 70, number)[1], 0.1)]
-    assert told == ["y" * 70, "…" + "y" * 20]
+    texts_read = [text.text for number in (2, 1) for text in texts.receive(chunks("y" * 70, number)[1], 0.1)]
+    assert texts_read == ["y" * 70, "…" + "y" * 20]
 
 
 def test_status_text_is_limited_to_twenty_chunks() -> None:
     texts = StatusTextAssembler()
-    told = [texts.receive(_received(Statustext(6, "", 7, seq), b"z" * 50), 0.0) for seq in range(MAX_CHUNKS)]
-    assert told[:-1] == [[]] * (MAX_CHUNKS - 1)
-    assert told[-1] == [StatusText(6, "z" * 50 * MAX_CHUNKS, 0.0)]
+    texts_read = [texts.receive(_received(Statustext(6, "", 7, seq), b"z" * 50), 0.0) for seq in range(MAX_CHUNKS)]
+    assert texts_read[:-1] == [[]] * (MAX_CHUNKS - 1)
+    assert texts_read[-1] == [StatusText(6, "z" * 50 * MAX_CHUNKS, 0.0)]
 
 
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 5), st.binary(max_size=50), st.floats(0, 1)), max_size=40))
@@ -168,7 +170,7 @@ def test_severity_names() -> None:
 
 @pytest.mark.parametrize("text", ["", "\t", "   "])
 def test_empty_texts(text: str) -> None:
-    assert [each.text for each in StatusTextAssembler().receive(Statustext(6, text), 0.0)] == [""]
+    assert [message.text for message in StatusTextAssembler().receive(Statustext(6, text), 0.0)] == [""]
 
 
 def test_every_state_message_is_in_standard_dialect() -> None:
@@ -176,13 +178,13 @@ def test_every_state_message_is_in_standard_dialect() -> None:
 
 
 def test_status_text_repetition_requires_same_text_and_sequence() -> None:
-    """Only the last chunk once more is a frame that came by another way."""
+    """A repeated last chunk alone is a frame that arrived over another route."""
     texts = StatusTextAssembler()
     first, second, other = chunks("a" * 50 + "b" * 50 + "c")[:2] + chunks("a" * 50 + "d" * 50)[1:2]
-    assert [text for each in (first, second, second) for text in texts.receive(each, 0.0)] == []
+    assert [text for message in (first, second, second) for text in texts.receive(message, 0.0)] == []
     cut = texts.receive(other, 1.0)
     assert [text.text.startswith("a" * 50 + "b" * 50) for text in cut] == [True]
     texts = StatusTextAssembler()
     same = chunks("a" * 50 + "a" * 50 + "c")
-    assert [text for each in same[:2] for text in texts.receive(each, 0.0)] == []
+    assert [text for message in same[:2] for text in texts.receive(message, 0.0)] == []
     assert len(texts.receive(same[0], 1.0)) == 1

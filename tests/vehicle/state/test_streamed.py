@@ -83,7 +83,7 @@ def take(telemetry: Telemetry, message: Message, at: float, component_id: int = 
 def test_table_lists_every_cell_of_message(telemetry: Telemetry, name: str) -> None:
     telemetry.receive(ANYTHING.get(name) or ones(message_type(name)))
     changed = {cell.name for cell in telemetry.cells.values() if cell.is_known}
-    assert changed == {told.name for told, _ in SOURCES[name]}
+    assert changed == {reported.name for reported, _ in SOURCES[name]}
 
 
 @pytest.mark.parametrize(
@@ -91,7 +91,7 @@ def test_table_lists_every_cell_of_message(telemetry: Telemetry, name: str) -> N
 )
 def test_instance_field_is_read_from_payload(name: str, field: str) -> None:
     message = ANYTHING[name]
-    fields = {each.name: getattr(message, each.name) for each in message.FIELDS}
+    fields = {field.name: getattr(message, field.name) for field in message.FIELDS}
     body = frame_of(message_type(name)(**{**fields, field: 201})).body
     assert body[9 + offset_of(message_type(name), field)] == 201
 
@@ -99,7 +99,7 @@ def test_instance_field_is_read_from_payload(name: str, field: str) -> None:
 def test_unread_value_is_not_decoded(telemetry: Telemetry, clock: Clock) -> None:
     stream = telemetry.streams[MESSAGE_IDS["Attitude"]]
     take(telemetry, messages.Attitude(0, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0), 100.0)
-    assert not stream.pending, "the first is worked out at once: everybody can see that it is known"
+    assert not stream.pending, "the first message is decoded at once, so that is_known is true"
     take(telemetry, messages.Attitude(0, 0.2, 0.0, 0.0, 0.0, 0.0, 0.0), 100.5)
     take(telemetry, messages.Attitude(0, 0.3, 0.0, 0.0, 0.0, 0.0, 0.0), 101.0)
     clock.now = 103.0
@@ -118,12 +118,12 @@ def test_status_texts_of_other_components_are_ignored(telemetry: Telemetry) -> N
 def test_observers_see_every_frame(telemetry: Telemetry) -> None:
     take(telemetry, messages.VfrHud(3.0, 4.0, 10, 50, 20.0, 0.5), 100.0)
     take(telemetry, messages.VfrHud(3.0, 5.0, 10, 50, 20.0, 0.5), 100.1)
-    seen: list[tuple[float | None, float]] = []
-    end = telemetry.ground_speed_m_s.observe(lambda before, after: seen.append((before, after)))
+    observed: list[tuple[float | None, float]] = []
+    end = telemetry.ground_speed_m_s.observe(lambda before, after: observed.append((before, after)))
     for number in range(3):
         take(telemetry, messages.VfrHud(3.0, 6.0 + number, 10, 50, 20.0, 0.5), 100.2 + number / 10)
     end()
-    assert seen == [(5.0, 6.0), (6.0, 7.0), (7.0, 8.0)]
+    assert observed == [(5.0, 6.0), (6.0, 7.0), (7.0, 8.0)]
     take(telemetry, messages.VfrHud(3.0, 9.0, 10, 50, 20.0, 0.5), 100.6)
     assert telemetry.streams[MESSAGE_IDS["VfrHud"]].pending
     assert telemetry.ground_speed_m_s.value == 9.0
@@ -134,7 +134,7 @@ def test_pending_frames_of_two_batteries_are_kept(telemetry: Telemetry) -> None:
         for number in (0, 1):
             battery = messages.BatteryStatus(number, 1, 1, 2500, (12000, *[65535] * 9), 100, 10, 10, percent - number)
             take(telemetry, battery, 100.0 + (90 - percent) / 100)
-    assert [each.remaining_percent for each in telemetry.batteries.value] == [80, 79]
+    assert [battery.remaining_percent for battery in telemetry.batteries.value] == [80, 79]
 
 
 def test_instance_field_truncated_is_zero(telemetry: Telemetry) -> None:
@@ -163,13 +163,13 @@ def test_value_age_is_of_last_frame(telemetry: Telemetry, clock: Clock, ends: in
     clock.now = 104.5
     assert telemetry.batteries.fresh(1.0) == telemetry.batteries.value
     assert telemetry.batteries.updated_at == 104.0
-    assert [each.id for each in telemetry.batteries.value] == [0, 1, 2]
+    assert [battery.id for battery in telemetry.batteries.value] == [0, 1, 2]
 
 
 def test_pending_frames_are_kept_per_instance(telemetry: Telemetry) -> None:
     for number in (0, *range(256)):
         take(telemetry, battery(number, number % 100), 100.0)
-    assert [each.remaining_percent for each in telemetry.batteries.value] == [n % 100 for n in range(256)]
+    assert [battery.remaining_percent for battery in telemetry.batteries.value] == [n % 100 for n in range(256)]
 
 
 def test_better_source_wins_in_any_read_order(telemetry: Telemetry) -> None:
@@ -238,12 +238,12 @@ def test_cells_can_be_read_by_other_threads(telemetry: Telemetry) -> None:
 
 
 def test_decoded_message_is_reused(telemetry: Telemetry) -> None:
-    bus, seen = Bus(), list[Message]()
+    bus, observed = Bus(), list[Message]()
     stream = telemetry.streams[MESSAGE_IDS["Attitude"]]
     bus.attach_lazily(messages.Attitude, stream.take)
-    bus.attach(messages.Attitude, seen.append)
+    bus.attach(messages.Attitude, observed.append)
     for at in (100.0, 100.5):
         bus.deliver(frame_of(ANYTHING["Attitude"], at))
     (pending,) = stream.pending.values()
-    assert pending is seen[1]
+    assert pending is observed[1]
     assert telemetry.attitude.value.yaw_deg == pytest.approx(17.19, abs=0.01)

@@ -220,7 +220,7 @@ def test_wind_of_both_autopilots(telemetry: Telemetry) -> None:
     assert telemetry.wind.value.speed_m_s == 5.0
 
 
-# ------------------------------------------------------------------------------ several of a kind
+# -------------------------------------------------------------------- several devices of one kind
 
 
 def gps(fix_type: int = 3, satellites: int = 9) -> messages.GpsRawInt:
@@ -387,11 +387,11 @@ def test_mission_time_vibration_version(telemetry: Telemetry) -> None:
 
 
 def test_status_texts_are_published_and_kept(telemetry: Telemetry, clock: Clock) -> None:
-    seen: list[str] = []
-    telemetry.status_text.observe(lambda _, text: seen.append(text.text))
+    observed: list[str] = []
+    telemetry.status_text.observe(lambda _, text: observed.append(text.text))
     for clock.now in (1.0, 2.0):
         telemetry.receive(messages.Statustext(4, "PreArm: RC not found"))
-    assert seen == ["PreArm: RC not found"] * 2
+    assert observed == ["PreArm: RC not found"] * 2
     assert [text.at for text in telemetry.texts_since(1.5)] == [2.0]
 
 
@@ -403,7 +403,7 @@ def test_status_text_end_lost_is_delivered_in_time(telemetry: Telemetry, clock: 
     assert telemetry.status_text.value.text == "x" * 50 + "…"
 
 
-# ------------------------------------------------------------------------------------ as a whole
+# ------------------------------------------------------------------------------- whole telemetry
 
 
 def test_forget_keeps_status_texts(telemetry: Telemetry) -> None:

@@ -120,12 +120,12 @@ FROM_NOSE, FROM_NORTH, LOCK = (
 
 
 def test_mount_status_is_in_hundredths_of_degrees() -> None:
-    told = gimbal.from_status(messages.MountStatus(1, 1, -4512, 150, 9001))
-    assert told == gimbal.GimbalAttitude(-45.12, 1.5, 90.01)
+    attitude = gimbal.from_status(messages.MountStatus(1, 1, -4512, 150, 9001))
+    assert attitude == gimbal.GimbalAttitude(-45.12, 1.5, 90.01)
 
 
 @pytest.mark.parametrize(
-    ("yaw", "absolute", "heading", "told"),
+    ("yaw", "absolute", "heading", "expected"),
     [
         (10.0, 0.0, 355.0, 5.0),
         (10.0, -90.0, 355.0, 270.0),
@@ -135,11 +135,11 @@ def test_mount_status_is_in_hundredths_of_degrees() -> None:
     ],
 )
 def test_mount_yaw_follows_vehicle_heading(
-    yaw: float, absolute: float, heading: float | None, told: float | None
+    yaw: float, absolute: float, heading: float | None, expected: float | None
 ) -> None:
     message = messages.MountOrientation(0, 1.25, -30.5, yaw, absolute)
     from_nose = yaw if math.isfinite(yaw) else None
-    assert gimbal.from_orientation(message, heading) == gimbal.GimbalAttitude(-30.5, 1.25, told, from_nose)
+    assert gimbal.from_orientation(message, heading) == gimbal.GimbalAttitude(-30.5, 1.25, expected, from_nose)
 
 
 def pointing(q: tuple[float, ...], flags: int = 0, delta_yaw: float = 0.0) -> Any:
@@ -149,7 +149,8 @@ def pointing(q: tuple[float, ...], flags: int = 0, delta_yaw: float = 0.0) -> An
 def turned(roll_deg: float, pitch_deg: float, yaw_deg: float) -> tuple[float, ...]:
     """The quaternion of yaw, then pitch, then roll."""
     (sr, cr), (sp, cp), (sy, cy) = (
-        (math.sin(math.radians(each) / 2), math.cos(math.radians(each) / 2)) for each in (roll_deg, pitch_deg, yaw_deg)
+        (math.sin(math.radians(angle) / 2), math.cos(math.radians(angle) / 2))
+        for angle in (roll_deg, pitch_deg, yaw_deg)
     )
     return (
         cr * cp * cy + sr * sp * sy,
@@ -179,27 +180,27 @@ def test_gimbal_yaw_from_nose_or_north_is_converted(
     flags: int, delta_deg: float, heading: float | None, yaw_deg: float, from_nose_deg: float | None
 ) -> None:
     message = pointing(turned(10, -20, 30), flags, math.radians(delta_deg))
-    told = gimbal.from_device(message, heading)
-    assert told == gimbal.GimbalAttitude(-20.0, 10.0, yaw_deg, from_nose_deg)
+    attitude = gimbal.from_device(message, heading)
+    assert attitude == gimbal.GimbalAttitude(-20.0, 10.0, yaw_deg, from_nose_deg)
 
 
 @given(angles, st.floats(-89, 89), angles, st.floats(0.1, 10))
 def test_gimbal_angles_match_rotation(roll: float, pitch: float, yaw: float, length: float) -> None:
     """For any length of the quaternion."""
-    q = tuple(length * each for each in turned(roll, pitch, yaw))
-    told = gimbal.from_device(pointing(q, FROM_NORTH), None)
-    assert told.pitch_deg == pytest.approx(pitch, abs=0.02)
-    assert told.roll_deg == pytest.approx(roll, abs=0.02)
-    assert math.remainder((told.yaw_deg or 0.0) - yaw, 360) == pytest.approx(0, abs=0.02)
+    q = tuple(length * component for component in turned(roll, pitch, yaw))
+    attitude = gimbal.from_device(pointing(q, FROM_NORTH), None)
+    assert attitude.pitch_deg == pytest.approx(pitch, abs=0.02)
+    assert attitude.roll_deg == pytest.approx(roll, abs=0.02)
+    assert math.remainder((attitude.yaw_deg or 0.0) - yaw, 360) == pytest.approx(0, abs=0.02)
 
 
 @pytest.mark.parametrize("pitch_deg", [-90.0, 90.0])
 @pytest.mark.parametrize("roll_deg", [0.0, 25.0])
 def test_vertical_camera_rotation_is_yaw(pitch_deg: float, roll_deg: float) -> None:
-    told = gimbal.from_device(pointing(turned(roll_deg, pitch_deg, 40), FROM_NORTH), None)
-    assert told == gimbal.GimbalAttitude(pitch_deg, 0.0, 40.0 - math.copysign(roll_deg, pitch_deg))
+    attitude = gimbal.from_device(pointing(turned(roll_deg, pitch_deg, 40), FROM_NORTH), None)
+    assert attitude == gimbal.GimbalAttitude(pitch_deg, 0.0, 40.0 - math.copysign(roll_deg, pitch_deg))
 
 
 def test_zero_quaternion_has_no_attitude() -> None:
-    told = gimbal.from_device(pointing((0.0, 0.0, 0.0, 0.0), FROM_NORTH), None)
-    assert told == gimbal.GimbalAttitude(None, None, None)
+    attitude = gimbal.from_device(pointing((0.0, 0.0, 0.0, 0.0), FROM_NORTH), None)
+    assert attitude == gimbal.GimbalAttitude(None, None, None)

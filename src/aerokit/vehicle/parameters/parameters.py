@@ -122,7 +122,6 @@ class Parameters(ReadOnly):
             idle_timeout_s: fail after this many seconds without progress.
             timeout: seconds in total.
             on_progress: called with the number of parameters, or bytes of the file, so far and in total.
-            on_progress: called with parameters, or bytes of the file, done and in total.
 
         Raises:
             ParameterTimeout: the list is incomplete; ``missing`` has the indices, ``table`` what has arrived.

@@ -7,9 +7,9 @@ import random
 from dataclasses import dataclass, replace
 
 from call_table import Row
-from order_air import Disturbances, Silence
-from order_airs import TwoLinks
-from order_hub import Side, ThroughHub, Ways
+from disturbed_hub import Side, ThroughHub, Ways
+from disturbed_link import Disturbances, Silence
+from disturbed_link_pair import TwoLinks
 
 RIGHT_AFTER_S = 0.001
 """Seconds after which everything sent with the call has left."""
@@ -87,7 +87,7 @@ def random_case_over_two(row: Row, autopilot: str, seed: int) -> Case:
 
 
 def random_case_through_hub(row: Row, autopilot: str, seed: int) -> Case:
-    """The same through a hub, the bad air on either side of it, where the hub's endpoint may be full, or go away and
+    """The same through a hub, with disturbances on either side, where the hub's endpoint may be full, or go away and
     come back; or there are two ways between the hub and one of them.
     """
     case = random_case(row, autopilot, seed)

@@ -1,4 +1,4 @@
-"""One flight of the order table by a fleet of three, each in its own air, and the policy for failures."""
+"""One flight of the order table by a fleet of three, each on its own disturbed link, and the policy for failures."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 
 import anyio
 from call_table import Row
-from order_air import Air, TrafficEntry
+from disturbed_link import DisturbedLink, TrafficEntry
 from order_cases import Case, random_case
-from order_flights import WATCH_S, Flown, Simulated, go_to_place, set_up, somebody_acts, take_over
+from order_flights import WATCH_S, Flown, Simulated, another_party_acts, go_to_place, set_up, take_over
 from order_judge import faults, orders_in
 from order_table import ARM, ROWS, SET_MODE
 
@@ -78,9 +78,9 @@ def random_fleet_case(action: str, policy: PolicyName, seed: int) -> FleetCase:
 
 def _row(action: str, autopilot: str) -> Row:
     """Return the row, with the modes of the policies."""
-    row = next(each for each in ROWS if each.name == action and autopilot in each.on)
+    row = next(entry for entry in ROWS if entry.name == action and autopilot in entry.on)
     copter, px4 = row.modes
-    return replace(row, modes=((*copter, *(each[0] for each in OWN)), (*px4, *(each[1] for each in OWN))))
+    return replace(row, modes=((*copter, *(modes[0] for modes in OWN)), (*px4, *(modes[1] for modes in OWN))))
 
 
 def faults_of(case: FleetCase) -> list[str]:
@@ -89,22 +89,25 @@ def faults_of(case: FleetCase) -> list[str]:
 
 
 async def _fly(case: FleetCase) -> list[str]:
-    cases = {name: replace(each, disturbances=replace(each.disturbances)) for name, each in case.members.items()}
-    vehicles = {name: set_up(each) for name, each in cases.items()}
+    cases = {name: replace(member, disturbances=replace(member.disturbances)) for name, member in case.members.items()}
+    vehicles = {name: set_up(case) for name, case in cases.items()}
     async with AsyncExitStack() as stack:
-        airs = {name: Air(await stack.enter_async_context(simulated_link(each))) for name, each in vehicles.items()}
-        fleet = await stack.enter_async_context(aerokit.fleet(dict(airs), count=len(airs), on_error=case.policy))
+        paths = {
+            name: DisturbedLink(await stack.enter_async_context(simulated_link(vehicle)))
+            for name, vehicle in vehicles.items()
+        }
+        fleet = await stack.enter_async_context(aerokit.fleet(dict(paths), count=len(paths), on_error=case.policy))
         with fleet.events(PolicyApplied) as news:
-            flown = await _give(case, cases, vehicles, airs, fleet)
+            flown = await _give(case, cases, vehicles, paths, fleet)
             ordered: list[PolicyApplied] = []
-            while isinstance(each := news.get_nowait(), PolicyApplied):
-                ordered.append(each)
+            while isinstance(event := news.get_nowait(), PolicyApplied):
+                ordered.append(event)
     found = list(_of_the_policy(case, ordered))
     for name, one in flown.items():
         if name == case.of_others:
-            found += [f"{name}: {each.message.NAME} was sent" for each in orders_in(one.air)]
+            found += [f"{name}: {order.message.NAME} was sent" for order in orders_in(one.traffic)]
             continue
-        one.fresh_at = tuple(each.at for each in ordered if f"{name}/1" in each.orders)
+        one.fresh_at = tuple(order_set.at for order_set in ordered if f"{name}/1" in order_set.orders)
         if one.fresh_at and case.policy != "hold_others":
             # It continues, also when cancelled.
             one.error = AerokitError("the policy had another order for it")
@@ -115,11 +118,11 @@ async def _fly(case: FleetCase) -> list[str]:
 def _of_the_policy(case: FleetCase, ordered: list[PolicyApplied]) -> Iterator[str]:
     """Return the orders of the policy, one for each member."""
     said = {"hold_others": "hold", "land_others": "land", "return_others": "return"}.get(case.policy)
-    told = [(member, order) for each in ordered for member, order in each.orders.items()]
-    for member, order in told:
+    reported = [(member, order) for order_set in ordered for member, order in order_set.orders.items()]
+    for member, order in reported:
         if order != said:
             yield f"{member}: {case.policy} ordered {order}"
-    for member, count in Counter(member for member, _ in told).items():
+    for member, count in Counter(member for member, _ in reported).items():
         if count > 1:
             yield f"{member}: {case.policy} was ordered {count} times"
 
@@ -128,7 +131,7 @@ async def _give(
     case: FleetCase,
     cases: dict[str, Case],
     vehicles: dict[str, Simulated],
-    airs: dict[str, Air],
+    paths: dict[str, DisturbedLink],
     fleet: Fleet,
 ) -> dict[str, Flown]:
     loop = asyncio.get_running_loop()
@@ -136,15 +139,15 @@ async def _give(
     place = next(iter(cases.values())).row.place
     others = case.of_others
     if others:
-        await fly_by_another_station(vehicles[others], airs[others])
+        await fly_by_another_station(vehicles[others], paths[others])
     own = [name for name in vehicles if name != others]
     await asyncio.gather(*(go_to_place(place, vehicles[name], programs[name]) for name in own))
     given_at = loop.time()
     acted = {}
-    for name, each in cases.items():
-        airs[name].disturbances = each.disturbances
-        airs[name].begin()
-        acted[name] = somebody_acts(each, vehicles[name])
+    for name, member_case in cases.items():
+        paths[name].disturbances = member_case.disturbances
+        paths[name].begin()
+        acted[name] = another_party_acts(member_case, vehicles[name])
     errors: dict[str, BaseException] = {}
     with anyio.CancelScope(deadline=given_at + (case.cancel_at or 1e6)) as scope:
         try:
@@ -155,24 +158,24 @@ async def _give(
     if scope.cancelled_caught:
         errors.update(dict.fromkeys(fleet.members, asyncio.CancelledError()))
     ended_at = loop.time()
-    told = {name: (each.mode_name or "", each.is_armed) for name, each in programs.items()}
+    reported = {name: (program.mode_name or "", program.is_armed) for name, program in programs.items()}
     await anyio.sleep(WATCH_S)
     return {
         name: Flown(
             cases[name],
             vehicles[name],
-            Judged(list(airs[name].sent), airs[name].heartbeats),
+            Judged(list(paths[name].sent), paths[name].heartbeats),
             given_at,
             ended_at,
             errors.get(f"{name}/1") or _not_compared(acted[name]),
-            told[name],
+            reported[name],
             acted[name],
         )
         for name in vehicles
     }
 
 
-async def fly_by_another_station(vehicle: Simulated, air: Air) -> None:
+async def fly_by_another_station(vehicle: Simulated, path: DisturbedLink) -> None:
     """Arm, take off and fly manually by another station; this program has given no order."""
     station, seconds = FrameEncoder(200, 190), 40.0  # it boots, and gets its position
     is_px4 = isinstance(vehicle, SimulatedPx4)
@@ -182,7 +185,7 @@ async def fly_by_another_station(vehicle: Simulated, air: Air) -> None:
     steps = [(ARM, (1.0,), 1.5), (MavCmd.NAV_TAKEOFF, (0.0,) * 6 + (height_m,), 12.0)]
     for command, params, then_s in steps if is_px4 else [(SET_MODE, (1.0, CopterMode.GUIDED), 1.5), *steps]:
         await anyio.sleep(seconds)
-        air.link.write(station.encode(command_long(vehicle.system_id, 1, command, params)))
+        path.link.write(station.encode(command_long(vehicle.system_id, 1, command, params)))
         seconds = then_s
     await anyio.sleep(seconds)
     take_over(vehicle)
@@ -192,7 +195,7 @@ async def fly_by_another_station(vehicle: Simulated, air: Air) -> None:
 
 def _not_compared(acted: list[tuple[float, str]]) -> BaseException | None:
     """Return members that are not compared: another party may have taken one over before the others were done."""
-    return AerokitError("somebody else has acted") if acted else None
+    return AerokitError("another party has acted") if acted else None
 
 
 @dataclass

@@ -1,4 +1,4 @@
-"""One flight of the order table: a vehicle, an order, bad disturbances, and another party that acts."""
+"""One flight of the order table: a vehicle, an order, disturbances, and another party that acts."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
 
 import anyio
-from order_air import Air, Seen, Sky
-from order_airs import over_two
+from disturbed_hub import through_hub
+from disturbed_link import DisturbedLink, DisturbedPath, RecordedTraffic
+from disturbed_link_pair import over_two
 from order_cases import Case
-from order_hub import through_hub
 from order_table import upload
 
 import aerokit
@@ -38,11 +38,11 @@ class Flown:
 
     case: Case
     vehicle: Simulated
-    air: Seen
+    traffic: RecordedTraffic
     given_at: float
     ended_at: float
     error: BaseException | None
-    told_at_end: tuple[str, bool]
+    state_at_end: tuple[str, bool]
     """Mode and armed as the program knew them when the call ended."""
     acted: list[tuple[float, str]]
     """Time at which another party acted, on the program's clock, and the mode of the vehicle then."""
@@ -115,7 +115,7 @@ def run_the_battery_down(vehicle: Simulated) -> None:
 
 
 def _act(case: Case, vehicle: Simulated) -> None:
-    """Another station disarms what stands on the ground, or changes its mode; a pilot takes what flies."""
+    """Another station disarms a landed vehicle or changes its mode; a pilot takes over a flying one."""
     if case.row.place == "ground":
         if case.by_switch:
             turn_switch(vehicle)
@@ -127,7 +127,7 @@ def _act(case: Case, vehicle: Simulated) -> None:
         take_over(vehicle)
 
 
-def somebody_acts(case: Case, vehicle: Simulated) -> list[tuple[float, str]]:
+def another_party_acts(case: Case, vehicle: Simulated) -> list[tuple[float, str]]:
     """Run the events of the case, and record them in :attr:`Flown.acted`."""
     loop = asyncio.get_running_loop()
     acted: list[tuple[float, str]] = []
@@ -163,14 +163,14 @@ def set_up(case: Case) -> Simulated:
 async def _fly(case: Case) -> Flown:
     vehicle = set_up(case)
     async with (
-        _under(case, vehicle) as (sky, source),
+        _under(case, vehicle) as (path, source),
         aerokit.connect(source, rates=RATES) as program,
     ):
-        return await _give(case, vehicle, sky, program)
+        return await _give(case, vehicle, path, program)
 
 
 @asynccontextmanager
-async def _under(case: Case, vehicle: Simulated) -> AsyncIterator[tuple[Sky, Link | aerokit.Connection]]:
+async def _under(case: Case, vehicle: Simulated) -> AsyncIterator[tuple[DisturbedPath, Link | aerokit.Connection]]:
     """Return the links between program and vehicle."""
     if case.hub is not None:
         async with through_hub(vehicle, case.hub) as through:
@@ -180,17 +180,17 @@ async def _under(case: Case, vehicle: Simulated) -> AsyncIterator[tuple[Sky, Lin
             yield over
     else:
         async with simulated_link(vehicle) as link:
-            air = Air(link)
-            yield air, air
+            path = DisturbedLink(link)
+            yield path, path
 
 
-async def _give(case: Case, vehicle: Simulated, air: Sky, program: aerokit.Vehicle) -> Flown:
+async def _give(case: Case, vehicle: Simulated, path: DisturbedPath, program: aerokit.Vehicle) -> Flown:
     loop = asyncio.get_running_loop()
     await go_to_place(case.row.place, vehicle, program)
-    air.disturbances = case.disturbances
-    air.begin()
+    path.disturbances = case.disturbances
+    path.begin()
     given_at = loop.time()
-    acted = somebody_acts(case, vehicle)
+    acted = another_party_acts(case, vehicle)
     error: BaseException | None = None
     with anyio.CancelScope(deadline=given_at + (case.cancel_at or 1e6)) as scope:
         try:
@@ -200,6 +200,6 @@ async def _give(case: Case, vehicle: Simulated, air: Sky, program: aerokit.Vehic
     if scope.cancelled_caught:
         error = asyncio.CancelledError()
     ended_at = loop.time()
-    told = (program.mode_name or "", program.is_armed)
+    reported = (program.mode_name or "", program.is_armed)
     await anyio.sleep(WATCH_ARMING_S if case.row.name == "arm" else WATCH_S)
-    return Flown(case, vehicle, air, given_at, ended_at, error, told, acted)
+    return Flown(case, vehicle, path, given_at, ended_at, error, reported, acted)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Iterator
 
-from order_air import Seen, TrafficEntry
+from disturbed_link import RecordedTraffic, TrafficEntry
 from order_flights import WATCH_S, Flown, mode_of
 from order_table import ARM, REPOSITION, SET_MODE
 
@@ -28,7 +28,7 @@ ENDS_FLIGHT = ("disarm", "land", "return_to_launch")
 MODE_MAX_AGE_S = 2.6
 SETPOINTS = (SetPositionTargetLocalNed, SetPositionTargetGlobalInt, SetAttitudeTarget)
 OUTAGE_RECOVERY_S = 4.0
-"""Seconds after an outage until the vehicle's state is known and it is told to hold."""
+"""Seconds after an outage until the vehicle's state is known and the hold command is sent."""
 PX4_LOITER = 4 << 16 | 3 << 24
 COPTER_AUTO, COPTER_GUIDED, COPTER_BRAKE = 3, 4, 17
 INITIAL_SEND_S = 0.01
@@ -39,37 +39,37 @@ def faults(flown: Flown) -> list[str]:
     """Every rule that was broken, in words."""
     return [
         *_sent_again(flown),
-        *_sent_blind(flown),
-        *_taken_back(flown),
-        *_untrue(flown),
+        *_sent_into_silence(flown),
+        *_sent_after_takeover(flown),
+        *_false_success(flown),
         *_armed_late(flown),
-        *_left_flying(flown),
+        *_abandoned_flight_not_held(flown),
         *_sent_afterwards(flown),
-        *_endless(flown),
+        *_took_too_long(flown),
     ]
 
 
 def _orders(flown: Flown) -> Iterator[TrafficEntry]:
-    return orders_in(flown.air)
+    return orders_in(flown.traffic)
 
 
-def orders_in(air: Seen) -> Iterator[TrafficEntry]:
+def orders_in(traffic: RecordedTraffic) -> Iterator[TrafficEntry]:
     """Return the sent messages that change something."""
-    for each in air.sent:
-        command = getattr(each.message, "command", None)
-        is_command = isinstance(each.message, (CommandLong, CommandInt)) and command not in QUESTIONS
-        if is_command or isinstance(each.message, SetMode):
-            yield each
+    for message in traffic.sent:
+        command = getattr(message.message, "command", None)
+        is_command = isinstance(message.message, (CommandLong, CommandInt)) and command not in QUESTIONS
+        if is_command or isinstance(message.message, SetMode):
+            yield message
 
 
 State = tuple[int, bool, bool]
 """Mode, armed, and whether a failsafe is active."""
 
 
-def _told(flown: Flown, since: int, until: int) -> list[State]:
+def _states_between(flown: Flown, since: int, until: int) -> list[State]:
     """Return the states that HEARTBEAT reported between two recorded messages."""
-    told = [_state(each) for each in flown.air.heartbeats if since < each.number < until]
-    return [(mode, armed, False) for mode, armed, _ in told] if _ends_flight(flown) else told
+    reported = [_state(heartbeat) for heartbeat in flown.traffic.heartbeats if since < heartbeat.number < until]
+    return [(mode, armed, False) for mode, armed, _ in reported] if _ends_flight(flown) else reported
 
 
 def _ends_flight(flown: Flown) -> bool:
@@ -78,8 +78,8 @@ def _ends_flight(flown: Flown) -> bool:
     return flown.case.row.name in ENDS_FLIGHT or (bool(modes) and set(modes) <= {"LAND", "RTL"})
 
 
-def _state(heard: TrafficEntry) -> State:
-    beat = heard.message
+def _state(entry: TrafficEntry) -> State:
+    beat = entry.message
     assert isinstance(beat, Heartbeat)
     return beat.custom_mode, is_armed(beat.base_mode), beat.system_status in FAILSAFE_STATES
 
@@ -96,32 +96,32 @@ def _sent_again(flown: Flown) -> Iterator[str]:
     """
     first: dict[object, int] = {}
     last: dict[object, int] = {}
-    for each in _orders(flown):
-        key = _key(each.message)
+    for order in _orders(flown):
+        key = _key(order.message)
         if key in first:
-            before = _told(flown, -1, first[key])[-1:]
-            since = _told(flown, first[key], each.number)
-            if not _told(flown, last[key], each.number):
-                yield f"{_s(flown, each)} was sent again without a HEARTBEAT since"
-            elif any(told != before[0] and not _may_be_told(flown, each.message, told) for told in since):
-                yield f"{_s(flown, each)} was sent again although HEARTBEAT had told a change"
-        first.setdefault(key, each.number)
-        last[key] = each.number
+            before = _states_between(flown, -1, first[key])[-1:]
+            since = _states_between(flown, first[key], order.number)
+            if not _states_between(flown, last[key], order.number):
+                yield f"{_text_of(flown, order)} was sent again without a HEARTBEAT since"
+            elif any(state != before[0] and not _may_report_effect(flown, order.message, state) for state in since):
+                yield f"{_text_of(flown, order)} was sent again although HEARTBEAT had reported a change"
+        first.setdefault(key, order.number)
+        last[key] = order.number
 
 
-def _may_be_told(flown: Flown, message: Message, told: State) -> bool:
+def _may_report_effect(flown: Flown, message: Message, state: State) -> bool:
     """Return True if the effect may already be reported. An abandoned order may take effect late, and is held again
     then; a PX4 stopped by DO_REPOSITION may be in its hold mode all the time, which is not the effect.
     """
     if not isinstance(message, CommandLong):
         return False
     if message.command == REPOSITION:
-        return told == (PX4_LOITER, True, False)
+        return state == (PX4_LOITER, True, False)
     is_hold = message.command == SET_MODE and message.param2 == COPTER_BRAKE
     return (
         is_hold
         and flown.case.row.holds
-        and told
+        and state
         in {
             (COPTER_GUIDED, True, False),
             (COPTER_AUTO, True, False),
@@ -129,56 +129,56 @@ def _may_be_told(flown: Flown, message: Message, told: State) -> bool:
     )
 
 
-def _sent_blind(flown: Flown) -> Iterator[str]:
-    """The rest of an order is not sent into a silence."""
-    for each in _orders(flown):
+def _sent_into_silence(flown: Flown) -> Iterator[str]:
+    """The rest of an order is not sent while the vehicle is silent."""
+    for order in _orders(flown):
         given = (flown.given_at, *flown.fresh_at)
-        is_late = not any(0 <= each.at - at <= INITIAL_SEND_S for at in given)
-        if is_late and not any(each.at - MODE_MAX_AGE_S <= told.at <= each.at for told in flown.air.heartbeats):
-            yield f"{_s(flown, each)} was sent blind"
+        is_late = not any(0 <= order.at - at <= INITIAL_SEND_S for at in given)
+        if is_late and not any(order.at - MODE_MAX_AGE_S <= entry.at <= order.at for entry in flown.traffic.heartbeats):
+            yield f"{_text_of(flown, order)} was sent into a silence"
 
 
-def _taken_back(flown: Flown) -> Iterator[str]:
-    """After another party's mode was reported, nothing that steers is sent."""
-    taken = _taken(flown)
-    if taken is None or not flown.case.row.steers:
+def _sent_after_takeover(flown: Flown) -> Iterator[str]:
+    """After another party's mode was reported, no steering message is sent."""
+    takeover = _takeover_heartbeat(flown)
+    if takeover is None or not flown.case.row.steers:
         return
-    for each in flown.air.sent:
-        command = getattr(each.message, "command", None)
-        steers = command in CHANGED_BY_COMMAND.keys() - {ARM} or isinstance(each.message, (SetMode, *SETPOINTS))
-        if steers and each.number > taken.number:
-            yield f"{_s(flown, each)} was sent after somebody else's mode: {_s(flown, taken)}"
+    for message in flown.traffic.sent:
+        command = getattr(message.message, "command", None)
+        steers = command in CHANGED_BY_COMMAND.keys() - {ARM} or isinstance(message.message, (SetMode, *SETPOINTS))
+        if steers and message.number > takeover.number:
+            yield f"{_text_of(flown, message)} was sent after a takeover: {_text_of(flown, takeover)}"
 
 
-def _taken(flown: Flown) -> TrafficEntry | None:
-    """Return the HEARTBEAT by which the program could know about a takeover or a failsafe."""
+def _takeover_heartbeat(flown: Flown) -> TrafficEntry | None:
+    """Return the HEARTBEAT that reported a takeover or a failsafe to the program."""
     own = set(flown.case.row.modes[flown.case.autopilot == "px4"])
-    told = flown.air.heartbeats
-    assert isinstance(told[0].message, Heartbeat)
-    autopilot = autopilot_for(told[0].message)
+    reported = flown.traffic.heartbeats
+    assert isinstance(reported[0].message, Heartbeat)
+    autopilot = autopilot_for(reported[0].message)
     allowed: set[str] = set()
     had_failsafe = False
-    for each in told:
-        assert isinstance(each.message, Heartbeat)
-        name = autopilot.mode_of(each.message).name
-        has_failsafe = each.message.system_status in FAILSAFE_STATES
+    for event in reported:
+        assert isinstance(event.message, Heartbeat)
+        name = autopilot.mode_of(event.message).name
+        has_failsafe = event.message.system_status in FAILSAFE_STATES
         is_new, had_failsafe = has_failsafe and not had_failsafe, has_failsafe
-        if each.at < flown.given_at:
+        if event.at < flown.given_at:
             allowed = {name}
         elif is_new and not _ends_flight(flown):
-            return each
+            return event
         elif name in own:
             allowed = set()
         elif name not in allowed:
-            return each
+            return event
     return None
 
 
-def _untrue(flown: Flown) -> Iterator[str]:
+def _false_success(flown: Flown) -> Iterator[str]:
     """A successful call was true when it returned."""
     if flown.error is not None:
         return
-    mode, armed = flown.told_at_end
+    mode, armed = flown.state_at_end
     row, own = flown.case.row, flown.case.row.modes[flown.case.autopilot == "px4"]
     if row.name in ("set_mode", "hold") and mode not in own:
         yield f"{row.name} returned in {mode}"
@@ -191,48 +191,57 @@ def _untrue(flown: Flown) -> Iterator[str]:
 
 
 def _armed_late(flown: Flown) -> Iterator[str]:
-    """An abandoned arm command leaves nothing armed that it is known to have armed."""
+    """An abandoned arm command does not leave the vehicle armed if the program could notice."""
     if flown.case.row.name != "arm" or flown.error is None or not flown.is_armed_at_end:
         return
     disturbances, until = flown.case.disturbances, flown.given_at + ARM_HEARTBEAT_DELAY_S
     is_answered = not disturbances.lost_acks and disturbances.outage is None and not (flown.case.two or flown.case.hub)
-    is_told = any(_state(each)[1] for each in flown.air.heartbeats if flown.given_at < each.at <= until)
-    if is_answered or (is_told and not flown.acted):
+    is_reported_armed = any(
+        _state(heartbeat)[1] for heartbeat in flown.traffic.heartbeats if flown.given_at < heartbeat.at <= until
+    )
+    if is_answered or (is_reported_armed and not flown.acted):
         yield f"arm ended with {flown.error!r} and the vehicle is armed"
 
 
-def _left_flying(flown: Flown) -> Iterator[str]:
+def _abandoned_flight_not_held(flown: Flown) -> Iterator[str]:
     """An abandoned flight without a takeover holds, also if it was silent then."""
-    row, given_up = flown.case.row, isinstance(flown.error, (asyncio.CancelledError, OperationTimeout))
-    is_heard = flown.given_at + flown.case.quiet_until < flown.ended_at + WATCH_S - OUTAGE_RECOVERY_S
-    if row.holds and given_up and is_heard and _taken(flown) is None and not flown.acted and flown.is_armed_at_end:
+    row, is_abandoned = flown.case.row, isinstance(flown.error, (asyncio.CancelledError, OperationTimeout))
+    was_reachable = flown.given_at + flown.case.quiet_until < flown.ended_at + WATCH_S - OUTAGE_RECOVERY_S
+    if (
+        row.holds
+        and is_abandoned
+        and was_reachable
+        and _takeover_heartbeat(flown) is None
+        and not flown.acted
+        and flown.is_armed_at_end
+    ):
         wanted = "LOITER" if flown.case.autopilot == "px4" else "BRAKE"
         was_ordered = row.place != "armed" or flown.vehicle.altitude_m > 1.0
         if was_ordered and mode_of(flown.vehicle) != wanted and _is_reached(flown):
-            yield f"it was given up ({flown.error!r}) and is in {mode_of(flown.vehicle)}"
+            yield f"it was abandoned ({flown.error!r}) and is in {mode_of(flown.vehicle)}"
 
 
 def _sent_afterwards(flown: Flown) -> Iterator[str]:
     """An abandoned transfer or setting sends nothing more."""
     if flown.case.row.steers or flown.case.row.ends_later or flown.case.row.name == "arm":
         return
-    for each in flown.air.sent:
-        is_lasting = each.message.NAME in ("PARAM_SET", "MISSION_COUNT", "MISSION_ITEM_INT", "MISSION_ITEM")
-        if each.at > flown.ended_at and (is_lasting or each in list(_orders(flown))):
-            yield f"{_s(flown, each)} was sent after the call had ended"
+    for message in flown.traffic.sent:
+        is_lasting = message.message.NAME in ("PARAM_SET", "MISSION_COUNT", "MISSION_ITEM_INT", "MISSION_ITEM")
+        if message.at > flown.ended_at and (is_lasting or message in list(_orders(flown))):
+            yield f"{_text_of(flown, message)} was sent after the call had ended"
 
 
 def _is_reached(flown: Flown) -> bool:
-    """Return True if the vehicle received any of it."""
-    return any(not each.is_lost for each in _orders(flown))
+    """Return True if the vehicle received any message of the order."""
+    return any(not order.is_lost for order in _orders(flown))
 
 
-def _endless(flown: Flown) -> Iterator[str]:
+def _took_too_long(flown: Flown) -> Iterator[str]:
     if flown.ended_at - flown.given_at > 62.0:
         yield f"it took {flown.ended_at - flown.given_at:.0f} s"
 
 
-def _s(flown: Flown, each: TrafficEntry) -> str:
-    message = each.message.to_dict()
+def _text_of(flown: Flown, entry: TrafficEntry) -> str:
+    message = entry.message.to_dict()
     what = " ".join(f"{key}={value:g}" for key, value in message.items() if isinstance(value, (int, float)) and value)
-    return f"{each.at - flown.given_at:.2f} s: {each.message.NAME} {what}"
+    return f"{entry.at - flown.given_at:.2f} s: {entry.message.NAME} {what}"

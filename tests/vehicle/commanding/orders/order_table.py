@@ -24,7 +24,7 @@ async def _fly_setpoints(vehicle: aerokit.Vehicle) -> None:
 async def upload(vehicle: aerokit.Vehicle) -> None:
     here = vehicle.position.value
     places = [here.offset(north_m=20.0 * number) for number in range(1, 4)]
-    items = [missions.waypoint(each.latitude_deg, each.longitude_deg, altitude_relative_m=20) for each in places]
+    items = [missions.waypoint(place.latitude_deg, place.longitude_deg, altitude_relative_m=20) for place in places]
     mission = missions.Mission(items)
     await vehicle.mission.upload(mission, method="items")
 

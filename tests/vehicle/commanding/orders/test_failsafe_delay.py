@@ -20,7 +20,7 @@ async def _in_the_delay(flight: Flight | Px4Flight) -> None:
     """Return a flight whose battery is low, and HEARTBEAT has reported it."""
     run_the_battery_down(flight.px4 if isinstance(flight, Px4Flight) else flight.copter)
     await flight.vehicle.system_status.wait_until(lambda state: state == MavState.CRITICAL, timeout=3)
-    flight.wire.forget()
+    flight.wire.clear()
 
 
 async def test_go_to_cancelled_before_failsafe_action_keeps_failsafe() -> None:

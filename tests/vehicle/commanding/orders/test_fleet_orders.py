@@ -13,12 +13,12 @@ from test_orders import IS_SESSION, SEEDS
 from aerokit.fleets.policy import PolicyName
 
 EVERY = [(action, policy) for action in ACTIONS for policy in POLICIES]
-FLOWN, SEEDS_EACH = (EVERY, SEEDS) if IS_SESSION else (sampled([pytest.param(*each) for each in EVERY[::2]], 4), 1)
+FLOWN, SEEDS_EACH = (EVERY, SEEDS) if IS_SESSION else (sampled([pytest.param(*case) for case in EVERY[::2]], 4), 1)
 """Few of them in the tests, all of them in the session."""
 
 
 @pytest.mark.parametrize("seed", range(SEEDS_EACH))
 @pytest.mark.parametrize(("action", "policy"), FLOWN)
 def test_order_table_no_rule_is_broken(action: str, policy: PolicyName, seed: int) -> None:
-    """Neither the action nor the policy sends anything twice, blindly or against a pilot; reported results are true."""
+    """Neither the action nor the policy repeats a command, sends into a silence or overrides a pilot."""
     assert faults_of(case := random_fleet_case(action, policy, seed)) == [], case

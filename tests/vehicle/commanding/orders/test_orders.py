@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 from call_table import Row
+from disturbed_link import Disturbances, Silence
+from disturbed_link_pair import TwoLinks
 from exhaustive import sampled
-from order_air import Disturbances, Silence
-from order_airs import TwoLinks
 from order_cases import RIGHT_AFTER_S, Case, random_case, random_case_over_two
 from order_flights import Flown, fly, mode_of
 from order_judge import faults
@@ -28,13 +28,15 @@ BY_NAME = {row.name: row for row in ROWS}
 BOTH = ("ardupilot", "px4")
 
 
-ALL_ROWS = [pytest.param(row, each, id=f"{row.name}-{row.command}-{each}") for row in ROWS for each in row.on]
+ALL_ROWS = [
+    pytest.param(row, autopilot, id=f"{row.name}-{row.command}-{autopilot}") for row in ROWS for autopilot in row.on
+]
 IS_SESSION = "AEROKIT_ORDER_SEEDS" in os.environ
 DEFAULT_ROWS = [
-    pytest.param(row, each, id=f"{row.name}-{row.command}-{each}", marks=marks)
+    pytest.param(row, autopilot, id=f"{row.name}-{row.command}-{autopilot}", marks=marks)
     for place, row in enumerate(ROWS)
-    for each in row.on
-    for marks in [() if each == row.on[place % len(row.on)] else pytest.mark.exhaustive]
+    for autopilot in row.on
+    for marks in [() if autopilot == row.on[place % len(row.on)] else pytest.mark.exhaustive]
 ]
 """Each row on one autopilot by default, on either in turn."""
 OVER_TWO, SEEDS_OVER_TWO = (ALL_ROWS, SEEDS) if IS_SESSION else (sampled(ALL_ROWS[::6], 4), 1)
@@ -62,7 +64,7 @@ def test_orders_are_all_documented() -> None:
         assert re.search(rf"^\| [^|]*`{re.escape(row.name.split()[0])}", text, re.MULTILINE), row.name
 
 
-# --------------------------------------------------------- the faults that were found, one by one
+# ------------------------------------------------------------------------------------ regressions
 
 
 @pytest.mark.parametrize("autopilot", BOTH)
@@ -70,7 +72,7 @@ def test_takeover_during_lost_ack_keeps_vehicle(autopilot: str) -> None:
     disturbances = Disturbances(command=REPOSITION, lost_acks=1)
     flown = fly(Case(BY_NAME["go_to"], autopilot, disturbances, pilot_at=0.3))
     assert isinstance(flown.error, OperationRejected)
-    assert len([each for each in flown.air.sent if getattr(each.message, "command", 0) == REPOSITION]) == 1
+    assert len([message for message in flown.traffic.sent if getattr(message.message, "command", 0) == REPOSITION]) == 1
     assert mode_of(flown.vehicle) == flown.acted[0][1]
 
 
@@ -78,14 +80,14 @@ def test_takeover_during_lost_ack_keeps_vehicle(autopilot: str) -> None:
 def test_ensure_mode_recently_reported_sends_nothing(name: str) -> None:
     """The ack is lost, HEARTBEAT reports the mode, then the pilot takes over before the retry."""
     flown = fly(Case(BY_NAME[name], "ardupilot", Disturbances(command=SET_MODE, lost_acks=9), pilot_at=0.4))
-    assert len([each for each in flown.air.sent if getattr(each.message, "command", 0) == SET_MODE]) == 1
+    assert len([message for message in flown.traffic.sent if getattr(message.message, "command", 0) == SET_MODE]) == 1
     assert mode_of(flown.vehicle) == "ALT_HOLD"
 
 
 @pytest.mark.parametrize("autopilot", BOTH)
 def test_arm_is_not_repeated_against_other_station(autopilot: str) -> None:
     flown = fly(Case(BY_NAME["arm"], autopilot, Disturbances(command=ARM, lost_acks=9), pilot_at=1.3))
-    assert len([each for each in flown.air.sent if getattr(each.message, "command", 0) == ARM]) == 1
+    assert len([message for message in flown.traffic.sent if getattr(message.message, "command", 0) == ARM]) == 1
     assert not flown.is_armed_at_end
 
 
@@ -153,7 +155,7 @@ def test_takeover_to_previous_mode_keeps_vehicle() -> None:
 
 def sent(flown: Flown, command: int) -> int:
     """Return how many times this command was sent, over either link."""
-    return len([each for each in flown.air.sent if getattr(each.message, "command", 0) == command])
+    return len([message for message in flown.traffic.sent if getattr(message.message, "command", 0) == command])
 
 
 def test_ack_over_other_link_is_accepted() -> None:
@@ -179,9 +181,9 @@ def test_takeover_with_ack_lost_on_both_links_keeps_vehicle(autopilot: str) -> N
 def test_order_lost_on_link_is_repeated_on_next_after_heartbeat() -> None:
     flown = fly(Case(BY_NAME["land"], "ardupilot", Disturbances(), two=TwoLinks(Silence(0.0))))
     assert flown.error is None
-    first, again = [each for each in flown.air.sent if getattr(each.message, "command", 0) == SET_MODE]
+    first, again = [message for message in flown.traffic.sent if getattr(message.message, "command", 0) == SET_MODE]
     assert [first.is_lost, again.is_lost] == [True, False]
-    assert any(first.number < each.number < again.number for each in flown.air.heartbeats)
+    assert any(first.number < heartbeat.number < again.number for heartbeat in flown.traffic.heartbeats)
 
 
 def test_reboot_command_is_not_repeated_over_next_link() -> None:

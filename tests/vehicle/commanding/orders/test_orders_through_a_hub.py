@@ -21,6 +21,6 @@ ROWS, SEEDS_EACH = (ALL_ROWS, SEEDS) if IS_SESSION else (sampled(ALL_ROWS[::3], 
 @pytest.mark.parametrize("seed", range(SEEDS_EACH))
 @pytest.mark.parametrize(("row", "autopilot"), ROWS)
 def test_order_table_no_rule_is_broken(row: Row, autopilot: str, seed: int) -> None:
-    """Nothing is executed twice, late or without an order, and the result of the call is true."""
+    """No command is executed twice, late or without an order, and the result of the call is true."""
     flown = fly(case := random_case_through_hub(row, autopilot, seed))
     assert [*faults(flown), *hub_faults(flown)] == [], case

@@ -1,4 +1,4 @@
-"""A program that is stopped in flight, while the failsafe for a lost ground station acts: it keeps the vehicle."""
+"""A program that is stopped in flight while the ground station failsafe acts: the failsafe stays in control."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ async def main(address, what):
         except (errors.AerokitError, asyncio.TimeoutError) as caught:
             error = type(caught).__name__
         await asyncio.sleep(2.5)
-        print(json.dumps([error, [each for each in sent if each in (176, 192)], max(ages), vehicle.mode_name]))
+        print(json.dumps([error, [command for command in sent if command in (176, 192)], max(ages), vehicle.mode_name]))
 
 asyncio.run(main(*sys.argv[1:]))
 """
@@ -64,22 +64,22 @@ def fly(scheme: str, what: str) -> tuple[str, list[int], float, str, str]:
                 os.kill(program.pid, signal.SIGSTOP)
                 time.sleep(PAUSE_S)
                 os.kill(program.pid, signal.SIGCONT)
-                error, sent, oldest_s, told = json.loads(program.stdout.readline())
+                error, sent, oldest_s, reported = json.loads(program.stdout.readline())
             finally:
                 program.kill()
-        return error, sent, oldest_s, told, copter.mode.name
+        return error, sent, oldest_s, reported, copter.mode.name
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="processes are stopped by signals")
 @pytest.mark.exhaustive  # twenty seconds of real time
 @pytest.mark.parametrize("cases", [CASES[:1], CASES[1:]], ids=["one", "others"])
 def test_blocked_program_keeps_failsafe(cases: list[tuple[str, str]]) -> None:
-    """All of them at once, since they wait for the failsafe most of the time."""
+    """Run all of them concurrently, because they mostly wait for the failsafe."""
     with ThreadPoolExecutor(len(cases)) as pool:
         flown = dict(zip(cases, pool.map(lambda case: fly(*case), cases), strict=True))
-    for (scheme, what), (error, sent, oldest_s, told, mode) in flown.items():
+    for (scheme, what), (error, sent, oldest_s, reported, mode) in flown.items():
         where = f"{what} over {scheme}: {flown[scheme, what]}"
         assert error is not None, where
         assert len(sent) == (what != "stream"), where  # Sent before the pause.
         assert oldest_s > PAUSE_S - 1.5, where  # HEARTBEATs that waited are called as old as they are
-        assert told == mode == RTL, where
+        assert reported == mode == RTL, where

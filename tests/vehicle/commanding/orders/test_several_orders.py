@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import anyio
 import pytest
+from disturbed_link import Disturbances, DisturbedLink, TrafficEntry
 from exhaustive import sampled
-from order_air import Air, Disturbances, TrafficEntry
 from order_flights import RATES, Simulated, mode_of, take_over
 
 import aerokit
@@ -29,7 +29,7 @@ COMMANDS = (176, 192, 400, 20)
 
 
 def kind_of(message: Message) -> Hashable:
-    """Return the subject of a message; None: it neither steers nor arms."""
+    """Return the subject of a message; None if it neither steers nor arms."""
     if isinstance(message, SetPositionTargetLocalNed):
         return "set-point"
     if isinstance(message, CommandInt):
@@ -75,7 +75,7 @@ CHOICES = (
 
 
 @dataclass
-class Given:
+class GivenOrder:
     """An order, and how much the program had sent before it."""
 
     choice: Choice
@@ -86,23 +86,25 @@ class Given:
 async def _fly(seed: int, is_px4: bool) -> None:
     dice = random.Random(f"{seed} {is_px4}")
     simulated: Simulated = SimulatedPx4(boot_time_s=1.0) if is_px4 else SimulatedCopter(boot_time_s=0.0)
-    given: list[Given] = []
+    given: list[GivenOrder] = []
     async with simulated_link(simulated) as link:
-        air = Air(link)
-        async with aerokit.connect(air, rates=RATES) as vehicle:
+        path = DisturbedLink(link)
+        async with aerokit.connect(path, rates=RATES) as vehicle:
             await _climb(simulated, vehicle)
-            air.disturbances = _weather(dice)
-            air.begin()
+            path.disturbances = _disturbances(dice)
+            path.begin()
             taken_at = dice.choice((None, dice.uniform(0.1, 5.0)))
             if taken_at is not None:
                 asyncio.get_running_loop().call_later(taken_at, take_over, simulated)
-            await _give_some(dice, vehicle, air, given)
+            await _give_orders(dice, vehicle, path, given)
             await anyio.sleep(15.0)
     pilots = {2} if not is_px4 else {3 << 16}
-    told = next((each for each in air.heartbeats if getattr(each.message, "custom_mode", 0) in pilots), None)
-    story = f"seed {seed}: {[(round(each.at - air.began_at, 2), each.choice.name) for each in given]}"
-    for place, crossing in enumerate(air.sent):
-        _judge(crossing, [each for each in given if each.sent <= place], told, is_px4, story)
+    takeover = next(
+        (heartbeat for heartbeat in path.heartbeats if getattr(heartbeat.message, "custom_mode", 0) in pilots), None
+    )
+    story = f"seed {seed}: {[(round(order.at - path.began_at, 2), order.choice.name) for order in given]}"
+    for place, crossing in enumerate(path.sent):
+        _judge(crossing, [order for order in given if order.sent <= place], takeover, is_px4, story)
 
 
 async def _climb(simulated: Simulated, vehicle: aerokit.Vehicle) -> None:
@@ -116,7 +118,7 @@ async def _climb(simulated: Simulated, vehicle: aerokit.Vehicle) -> None:
     assert mode_of(simulated) in ("GUIDED", "LOITER")
 
 
-def _weather(dice: random.Random) -> Disturbances:
+def _disturbances(dice: random.Random) -> Disturbances:
     disturbances = Disturbances(
         command=dice.choice(COMMANDS),
         lost_acks=dice.choice((0, 1, 9)),
@@ -129,9 +131,11 @@ def _weather(dice: random.Random) -> Disturbances:
     return disturbances
 
 
-async def _give_some(dice: random.Random, vehicle: aerokit.Vehicle, air: Air, given: list[Given]) -> None:
+async def _give_orders(
+    dice: random.Random, vehicle: aerokit.Vehicle, path: DisturbedLink, given: list[GivenOrder]
+) -> None:
     async def give(choice: Choice) -> None:
-        given.append(Given(choice, len(air.sent), asyncio.get_running_loop().time()))
+        given.append(GivenOrder(choice, len(path.sent), asyncio.get_running_loop().time()))
         with suppress(AerokitError):
             await choice.give(vehicle)
 
@@ -147,26 +151,28 @@ async def _give_some(dice: random.Random, vehicle: aerokit.Vehicle, air: Air, gi
     await asyncio.gather(*tasks, return_exceptions=True)
 
 
-def _judge(sent: TrafficEntry, given: list[Given], told: TrafficEntry | None, is_px4: bool, story: str) -> None:
+def _judge(
+    sent: TrafficEntry, given: list[GivenOrder], takeover: TrafficEntry | None, is_px4: bool, story: str
+) -> None:
     kind = kind_of(sent.message)
     if kind is None:
         return
     about = f"{kind} at {sent.at:.2f}; {story}"
     if kind in ((400, 0), (400, 1)):
-        newest = [each for each in given if each.choice.name in ("arm", "disarm")][-1]
+        newest = [order for order in given if order.choice.name in ("arm", "disarm")][-1]
         is_old = newest.choice.name == "disarm" and newest.at < sent.at
         assert kind == (400, 0) or not is_old, f"armed after disarm(): {about}"
         return
-    steering = [each for each in given if each.choice.sends[is_px4]]
+    steering = [order for order in given if order.choice.sends[is_px4]]
     newest = steering[-1]
-    eager = [each for each in steering if each.at == newest.at]
-    allowed = HOLD[is_px4].union(*(each.choice.sends[is_px4] for each in eager))
-    assert kind in allowed, f"an order that was overruled: {about}"
-    is_against_the_pilot = told is not None and newest.at < told.at and sent.number > told.number
-    own = [each.at for each in given if each.choice.name == "command"]
-    if told is not None and own and told.at - own[-1] < MODE_GRACE_S:
+    eager = [order for order in steering if order.at == newest.at]
+    allowed = HOLD[is_px4].union(*(order.choice.sends[is_px4] for order in eager))
+    assert kind in allowed, f"a superseded order: {about}"
+    is_against_the_pilot = takeover is not None and newest.at < takeover.at and sent.number > takeover.number
+    own = [order.at for order in given if order.choice.name == "command"]
+    if takeover is not None and own and takeover.at - own[-1] < MODE_GRACE_S:
         return  # Any mode counts as its effect, see docs/reliability.md.
-    assert kind == "set-point" or not is_against_the_pilot, f"after the pilot was told: {about}"
+    assert kind == "set-point" or not is_against_the_pilot, f"after the pilot had taken over: {about}"
 
 
 @pytest.mark.parametrize("is_px4", [False, True], ids=["ardupilot", "px4"])

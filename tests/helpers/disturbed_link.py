@@ -23,8 +23,8 @@ from aerokit.transport.link import Link, Peer, Receiver
 class Disturbances:
     """Disturbances, in seconds since the order was given.
 
-    The first ``lost_acks`` answers to ``command`` are lost, and its first ``lost_commands`` sendings. During ``outage``
-    (from, until) everything is lost; what is sent during ``stall`` arrives at its end, in order.
+    The first ``lost_commands`` transmissions of ``command`` and its first ``lost_acks`` answers are lost. During
+    ``outage`` (from, until) all messages are lost. Messages sent during ``stall`` arrive at its end, in order.
     """
 
     command: int = 0
@@ -51,8 +51,8 @@ class TrafficEntry:
     """Time of arrival at the other end, unless it is lost."""
 
 
-class Seen(Protocol):
-    """The traffic, as seen from the program's end, for the judge."""
+class RecordedTraffic(Protocol):
+    """Recorded traffic at the program's end, as the judge reads it."""
 
     @property
     def sent(self) -> list[TrafficEntry]:
@@ -65,8 +65,8 @@ class Seen(Protocol):
         ...
 
 
-class Sky(Seen, Protocol):
-    """Everything between a program and a vehicle."""
+class DisturbedPath(RecordedTraffic, Protocol):
+    """A path between a program and a vehicle, with disturbances."""
 
     @property
     def disturbances(self) -> Disturbances:
@@ -77,7 +77,7 @@ class Sky(Seen, Protocol):
     def disturbances(self, disturbances: Disturbances) -> None: ...
 
     def begin(self) -> None:
-        """Start the disturbances, as the order is given."""
+        """Start the disturbances; call it when the order is given."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class TrafficLog:
 
     def __init__(self) -> None:
         self.sent: list[TrafficEntry] = []
-        self.heard: list[TrafficEntry] = []
+        self.received: list[TrafficEntry] = []
         self._numbers = itertools.count()
 
     def cross(self, into: list[TrafficEntry], message: Message, is_lost: bool = False) -> TrafficEntry:
@@ -105,16 +105,16 @@ class TrafficLog:
     def begin(self) -> None:
         """Drop all but the last HEARTBEAT."""
         self.sent.clear()
-        self.heard[:] = self.heartbeats[-1:]
+        self.received[:] = self.heartbeats[-1:]
 
     @property
     def heartbeats(self) -> list[TrafficEntry]:
         """State messages of the vehicle that the program received."""
-        return [each for each in self.heard if _is_autopilots(each.message) and each.is_believed]
+        return [message for message in self.received if _is_autopilots(message.message) and message.is_believed]
 
 
 @dataclass
-class Air(Link):
+class DisturbedLink(Link):
     """The program's end of a link with :class:`Disturbances`, which starts with :meth:`begin`."""
 
     link: Link
@@ -131,7 +131,7 @@ class Air(Link):
         self._receiver: Receiver | None = None
 
     def begin(self) -> None:
-        """Start the disturbances, as the order is given."""
+        """Start the disturbances; call it when the order is given."""
         self.began_at = _now()
         self.traffic_log.begin()
 
@@ -181,16 +181,16 @@ class Air(Link):
             self._receiver.link_lost(error)  # type: ignore[arg-type]
 
     def link_stalled(self, unsent_bytes: int) -> None:
-        """It never does."""
+        """Ignore it: the inner link never stalls."""
 
     def link_drained(self) -> None:
-        """It always does."""
+        """Ignore it: the inner link never stalls."""
 
     def _note_sent(self, frame: Frame, crossing: TrafficEntry) -> None:
         crossing.raw, crossing.arrives_at = frame.raw, crossing.at + self._delay()
 
     def _arrive(self, raw: bytes, message: Message) -> None:
-        self.traffic_log.cross(self.traffic_log.heard, message).raw = raw
+        self.traffic_log.cross(self.traffic_log.received, message).raw = raw
         if self._receiver is not None:
             self._receiver.bytes_received(raw, None)
 

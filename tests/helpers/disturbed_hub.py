@@ -8,8 +8,8 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass, field
 from typing import Literal
 
-from order_air import Air, Disturbances, Silence, TrafficEntry, TrafficLog
-from order_airs import Airs, TwoLinks, joined, unused_airs
+from disturbed_link import Disturbances, DisturbedLink, Silence, TrafficEntry, TrafficLog
+from disturbed_link_pair import DisturbedLinkPair, TwoLinks, joined, unopened_paths
 from stream_splitter import Splitter
 
 import aerokit
@@ -48,13 +48,13 @@ class ThroughHub:
     @property
     def quiet_until(self) -> float:
         """Time at which the vehicle can be received, and reached, again."""
-        ends = [each[1] for each in (self.jam, self.away) if each is not None]
+        ends = [pair[1] for pair in (self.jam, self.away) if pair is not None]
         dumb = min(self.silence.end_s, self.silence.begin_s + ROUTE_TIMEOUT_S + 1.0)
         return max([0.0, *ends, dumb if "twice" in self.ways else 0.0])
 
 
 @dataclass
-class HubsEnd(Air):
+class HubSideLink(DisturbedLink):
     """The hub's end of a link."""
 
     jam: tuple[float, float] | None = None
@@ -65,7 +65,7 @@ class HubsEnd(Air):
         super().begin()
         if self.away is not None:
             loop, (begin, end) = asyncio.get_running_loop(), self.away
-            loop.call_later(begin, self._attachment.link_interrupted, LinkLost("it was pulled out"))
+            loop.call_later(begin, self._attachment.link_interrupted, LinkLost("the cable was pulled out"))
             loop.call_later(end, self._attachment.link_restored, end - begin)
 
     @property
@@ -89,46 +89,46 @@ class HubsEnd(Air):
             super()._arrive(raw, message)
 
 
-class HubSky:
-    """Like :class:`order_air.Sky`, for what the program sends and receives.
+class DisturbedHubPath:
+    """A disturbed path through a hub; ``sent`` and ``heartbeats`` are the program's.
 
     ``at_vehicle`` is the traffic between hub and vehicle, over any endpoint.
     """
 
-    def __init__(self, near: Air | Airs, through: ThroughHub) -> None:
+    def __init__(self, near: DisturbedLink | DisturbedLinkPair, through: ThroughHub) -> None:
         self.near, self._through = near, through
         self.at_vehicle = TrafficLog()
-        self.vehicles_ends: list[HubsEnd] = []
-        self.programs_ends: list[HubsEnd] = []
-        self._weather = Disturbances()
+        self.vehicles_ends: list[HubSideLink] = []
+        self.programs_ends: list[HubSideLink] = []
+        self._disturbances = Disturbances()
 
     @property
     def disturbances(self) -> Disturbances:
-        return self._weather
+        return self._disturbances
 
     @disturbances.setter
     def disturbances(self, disturbances: Disturbances) -> None:
-        self._weather = disturbances
+        self._disturbances = disturbances
         if self._through.side == "program":
             self.near.disturbances = disturbances
             return
-        for each in self.vehicles_ends:
-            each.disturbances = disturbances
+        for vehicle_end in self.vehicles_ends:
+            vehicle_end.disturbances = disturbances
 
     def begin(self) -> None:
-        """Start the disturbances, as the order is given."""
+        """Start the disturbances; call it when the order is given."""
         ends = self.vehicles_ends if self._through.side == "vehicle" else self.programs_ends
         ends[0].jam, ends[0].away = self._through.jam, self._through.away
         if self._through.ways == "vehicle twice":
             self.vehicles_ends[0].silence = self._through.silence
-        for each in (self.near, *self.vehicles_ends, *self.programs_ends):
-            each.begin()
+        for end in (self.near, *self.vehicles_ends, *self.programs_ends):
+            end.begin()
 
     def end(self) -> None:
-        """Messages of the program that never reached the vehicle."""
-        arrived = {each.raw for each in self.at_vehicle.sent if not each.is_lost}
-        for each in self.sent:
-            each.is_lost |= each.raw not in arrived
+        """Mark the program's messages that never reached the vehicle as lost."""
+        arrived = {message.raw for message in self.at_vehicle.sent if not message.is_lost}
+        for message in self.sent:
+            message.is_lost |= message.raw not in arrived
 
     @property
     def sent(self) -> list[TrafficEntry]:
@@ -142,40 +142,42 @@ class HubSky:
 @asynccontextmanager
 async def through_hub(
     vehicle: SimulatedVehicle, through: ThroughHub
-) -> AsyncIterator[tuple[HubSky, Link | aerokit.Connection]]:
+) -> AsyncIterator[tuple[DisturbedHubPath, Link | aerokit.Connection]]:
     """The links of a vehicle, and a record of their traffic."""
     async with AsyncExitStack() as stack:
         near, fars = await _programs_side(stack, through)
-        sky = HubSky(near, through)
-        sky.programs_ends = [HubsEnd(each) for each in fars]
-        sky.vehicles_ends = await _vehicles_side(stack, vehicle, through, sky.at_vehicle)
-        ends = {"vehicle": sky.vehicles_ends, "program": sky.programs_ends}
+        path = DisturbedHubPath(near, through)
+        path.programs_ends = [HubSideLink(far_end) for far_end in fars]
+        path.vehicles_ends = await _vehicles_side(stack, vehicle, through, path.at_vehicle)
+        ends = {"vehicle": path.vehicles_ends, "program": path.programs_ends}
         named = [
-            Endpoint(each, name=f"{name} {number}")
+            Endpoint(end, name=f"{name} {number}")
             for name, those in ends.items()
-            for number, each in enumerate(those, 1)
+            for number, end in enumerate(those, 1)
         ]
         await stack.enter_async_context(Hub(named))
-        yield sky, near if isinstance(near, Air) else await stack.enter_async_context(joined(near))
-        sky.end()
+        yield path, near if isinstance(near, DisturbedLink) else await stack.enter_async_context(joined(near))
+        path.end()
 
 
-async def _programs_side(stack: AsyncExitStack, through: ThroughHub) -> tuple[Air | Airs, list[Link]]:
+async def _programs_side(
+    stack: AsyncExitStack, through: ThroughHub
+) -> tuple[DisturbedLink | DisturbedLinkPair, list[Link]]:
     """The ends of the program and the hub."""
     pairs = [memory_link_pair() for _ in range(1 if through.ways in ("one", "vehicle twice") else 2)]
     fars: list[Link] = [far for _, far in pairs]
     if through.ways == "program copied":
         splitter = Splitter([near for near, _ in pairs])
         await splitter.open(stack)
-        return Air(splitter.port), fars
+        return DisturbedLink(splitter.port), fars
     if through.ways == "program twice":
-        return unused_airs([near for near, _ in pairs], TwoLinks(through.silence)), fars
-    return Air(pairs[0][0]), fars
+        return unopened_paths([near for near, _ in pairs], TwoLinks(through.silence)), fars
+    return DisturbedLink(pairs[0][0]), fars
 
 
 async def _vehicles_side(
     stack: AsyncExitStack, vehicle: SimulatedVehicle, through: ThroughHub, traffic_log: TrafficLog
-) -> list[HubsEnd]:
+) -> list[HubSideLink]:
     """The hub's ends."""
     pairs = [memory_link_pair() for _ in range(2 if through.ways == "vehicle twice" else 1)]
     ports: list[Link] = [far for _, far in pairs]
@@ -184,4 +186,4 @@ async def _vehicles_side(
         await splitter.open(stack)
         ports = [splitter.port]
     await stack.enter_async_context(SimulatorServer(vehicle, ports))
-    return [HubsEnd(near, traffic_log=traffic_log) for near, _ in pairs]
+    return [HubSideLink(near, traffic_log=traffic_log) for near, _ in pairs]

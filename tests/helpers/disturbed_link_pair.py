@@ -7,7 +7,7 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
 from functools import partial
 
-from order_air import Air, Disturbances, Silence, TrafficEntry, TrafficLog
+from disturbed_link import Disturbances, DisturbedLink, Silence, TrafficEntry, TrafficLog
 from stream_splitter import Splitter
 
 import aerokit
@@ -25,59 +25,61 @@ class TwoLinks:
     is_copied: bool = False
 
 
-class Airs:
-    """Like :class:`order_air.Air` for two links with the same disturbances."""
+class DisturbedLinkPair:
+    """Like :class:`disturbed_link.DisturbedLink` for two links with the same disturbances."""
 
-    def __init__(self, airs: list[Air], two: TwoLinks) -> None:
-        self.airs, self._two = airs, two
-        self._diary = airs[0].traffic_log
+    def __init__(self, paths: list[DisturbedLink], two: TwoLinks) -> None:
+        self.paths, self._two = paths, two
+        self._log = paths[0].traffic_log
         self.connection: aerokit.Connection | None = None
 
     @property
     def disturbances(self) -> Disturbances:
-        return self.airs[0].disturbances
+        return self.paths[0].disturbances
 
     @disturbances.setter
     def disturbances(self, disturbances: Disturbances) -> None:
-        for air in self.airs:
-            air.disturbances = disturbances
+        for path in self.paths:
+            path.disturbances = disturbances
 
     def begin(self) -> None:
-        """Start the disturbances, as the order is given and the selected link fails."""
+        """Start the disturbances; call it when the order is given. The selected link fails."""
         assert self.connection is not None
         assert self.connection.links is not None
-        (used,) = [index for index, each in enumerate(self.connection.links.value) if each.used_for]
-        self.airs[used].silence = self._two.silence
-        for air in self.airs:
-            air.begin()
+        (used,) = [index for index, link in enumerate(self.connection.links.value) if link.used_for]
+        self.paths[used].silence = self._two.silence
+        for path in self.paths:
+            path.begin()
 
     @property
     def sent(self) -> list[TrafficEntry]:
-        return self._diary.sent
+        return self._log.sent
 
     @property
     def heartbeats(self) -> list[TrafficEntry]:
-        return self._diary.heartbeats
+        return self._log.heartbeats
 
     def believe(self, heartbeat: Heartbeat) -> None:
-        """Record that the program accepted the last message."""
-        self._diary.heard[-1].is_believed = True
+        """Record that the program accepted the last received message."""
+        self._log.received[-1].is_believed = True
 
 
 class _SelectedLinkLog(TrafficLog):
-    """The connection reports which of the links it selects."""
+    """Traffic log that accepts a message only after the connection confirms it (`believe`)."""
 
     def cross(self, into: list[TrafficEntry], *about: object, **more: object) -> TrafficEntry:
         crossing = super().cross(into, *about, **more)  # type: ignore[arg-type]
-        crossing.is_believed = into is not self.heard
+        crossing.is_believed = into is not self.received
         return crossing
 
 
 @asynccontextmanager
-async def over_two(vehicle: SimulatedVehicle, two: TwoLinks) -> AsyncIterator[tuple[Airs, aerokit.Connection]]:
+async def over_two(
+    vehicle: SimulatedVehicle, two: TwoLinks
+) -> AsyncIterator[tuple[DisturbedLinkPair, aerokit.Connection]]:
     """A connection over two links, and a record of their traffic."""
     pairs = [memory_link_pair() for _ in range(2)]
-    airs = unused_airs([near for near, _ in pairs], two)
+    paths = unopened_paths([near for near, _ in pairs], two)
     async with AsyncExitStack() as stack:
         ports: list[Link] = [far for _, far in pairs]
         if two.is_copied:
@@ -85,23 +87,23 @@ async def over_two(vehicle: SimulatedVehicle, two: TwoLinks) -> AsyncIterator[tu
             await splitter.open(stack)
             ports = [splitter.port]
         await stack.enter_async_context(SimulatorServer(vehicle, ports))
-        yield airs, await stack.enter_async_context(joined(airs))
+        yield paths, await stack.enter_async_context(joined(paths))
 
 
 @asynccontextmanager
-async def joined(airs: Airs) -> AsyncIterator[aerokit.Connection]:
+async def joined(paths: DisturbedLinkPair) -> AsyncIterator[aerokit.Connection]:
     """Open a connection over both links."""
-    together = MultiLink([partial(_itself, air) for air in airs.airs])
+    together = MultiLink([partial(_itself, path) for path in paths.paths])
     async with open_connection(together) as connection:
-        airs.connection = connection
-        connection.bus.attach(Heartbeat, airs.believe)
+        paths.connection = connection
+        connection.bus.attach(Heartbeat, paths.believe)
         yield connection
 
 
-def unused_airs(near: Sequence[Link], two: TwoLinks) -> Airs:
+def unopened_paths(near: Sequence[Link], two: TwoLinks) -> DisturbedLinkPair:
     """Create the disturbed links, not opened."""
     traffic_log = _SelectedLinkLog()
-    return Airs([Air(each, traffic_log=traffic_log) for each in near], two)
+    return DisturbedLinkPair([DisturbedLink(end, traffic_log=traffic_log) for end in near], two)
 
 
 def _itself(link: Link) -> Link:
