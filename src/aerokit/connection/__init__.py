@@ -1,1 +1,1 @@
-"""One MAVLink node: connections, cells and routes on the event loop."""
+"""This program as a MAVLink node: connections, state cells and routes."""

@@ -229,7 +229,7 @@ def copy_exception(error: ErrorT) -> ErrorT:
 
 
 class EndSignal:
-    """One-shot signal that something has ended with an error; calls back the registered functions."""
+    """One-shot end signal: stores the error and calls the registered callbacks with it."""
 
     def __init__(self) -> None:
         self.error: Exception | None = None
@@ -277,8 +277,8 @@ Overflow = Literal["drop_oldest", "drop_newest", "error"]
 class Subscription(Generic[ItemT]):
     """Asynchronous iterator over received items, for one reader. Active inside its ``with`` block.
 
-    The default, ``capacity=1`` with ``drop_oldest``, always yields the latest item; ``missed`` counts the dropped ones.
-    When the connection ends, queued items can still be read; after that, reading raises the connection's error.
+    The default, ``capacity=1`` with ``drop_oldest``, always yields the latest item; ``missed`` counts the dropped
+    ones. When the connection ends, queued items can still be read; after that, reading raises the connection's error.
     """
 
     def __init__(

@@ -72,8 +72,8 @@ class Connection:
     """One MAVLink node (system id, component id) on one link.
 
     Received bytes enter through ``bytes_received``, are checked by one framer per remote peer, and go to ``bus``.
-    ``send`` writes a message to the peer behind which its target was last received; :class:`Routes` decides which peer
-    that is, and when it may change (``may_move``). Everything runs on the event loop's thread.
+    ``send`` writes a message to the peer behind which its target was last received; :class:`Routes` decides which
+    peer that is, and when it may change (``may_move``). Everything runs on the event loop's thread.
     """
 
     def __init__(
@@ -202,7 +202,7 @@ class Connection:
 
     @property
     def unsent_bytes(self) -> int:
-        """Bytes sent but still on this machine, as far as the link can tell; they may still be transmitted.
+        """Number of written bytes that have not left this machine, if the link can measure it.
 
         A value that stays above 0 means that the link does not drain (TCP without a network, a serial port with flow
         control asserted): :class:`LinkStalled`. Always 0 for UDP.
@@ -212,8 +212,8 @@ class Connection:
     def discard_unsent(self) -> None:
         """Discard data that was sent but has not left this program, e.g. an outdated command.
 
-        This applies to all waiting data, for all targets. Data in the system's TCP buffer cannot be discarded and stays
-        in :attr:`unsent_bytes`.
+        This applies to all waiting data, for all targets. Data in the system's TCP buffer cannot be discarded and
+        stays in :attr:`unsent_bytes`.
         """
         self.link.discard_unsent()
 
@@ -268,7 +268,8 @@ class Connection:
     async def vehicles(self) -> AsyncGenerator[VehicleFound, None]:
         """Yield each autopilot once, those already received first, until the connection ends.
 
-        ``async for found in connection.vehicles(): async with aerokit.connect(connection, system_id=found.system_id)…``
+        ``async for found in connection.vehicles(): async with aerokit.connect(connection,
+        system_id=found.system_id)…``
 
         Raises:
             ConnectionClosed, LinkLost: the connection ended.
@@ -296,7 +297,8 @@ class Connection:
         return self._observers.add(callback)
 
     def observe_sent_frames(self, callback: Callable[[bytes], object]) -> Detach:
-        """Call ``callback(raw)`` with every frame that :meth:`send` writes, signature included; not with `write_raw`.
+        """Call ``callback(raw)`` with every frame that :meth:`send` writes, signature included. Frames of `write_raw`
+        are excluded.
 
         The callback must return quickly; its exceptions are logged.
         """

@@ -33,8 +33,8 @@ SETUP_SIGNING = (256).to_bytes(3, "little")
 class Recording:
     """A ``.tlog`` file of one connection. An existing file is replaced when the first frame is received.
 
-    A connection that receives nothing therefore keeps an older recording. Frames are written unchanged, signatures
-    included; SETUP_SIGNING is left out because it contains the key.
+    If no frame arrives, an existing file stays. Frames are written unchanged, signatures included; SETUP_SIGNING is
+    left out because it contains the key.
 
     ``now`` is the current time on the clock of :meth:`write`. Time stamps are the system time at the start, advanced
     by that clock: setting the system clock in flight, as a companion computer does when it gets a network, makes no

@@ -40,10 +40,10 @@ def suspended_s() -> float:
 class LoopWatch:
     """Detects pauses of the event loop by a timer that fires late.
 
-    Data that is read after a pause may have waited since the loop last ran, so that is taken as its receive time until
-    all waiting data has been read. Pauses shorter than ``CHECK_INTERVAL_S + LATE_THRESHOLD_S`` are not detected; ages
-    may be too small by that. ``on_blocked`` gets the length of pauses above ``BLOCKED_THRESHOLD_S``, ``on_slept`` the
-    time that the computer was suspended.
+    After a pause, data gets the time at which the loop last ran as its receive time, because it may have waited since
+    then. This ends when all waiting data is read. Pauses shorter than ``CHECK_INTERVAL_S + LATE_THRESHOLD_S`` are not
+    detected; ages may be too small by that. ``on_blocked`` gets the length of pauses above ``BLOCKED_THRESHOLD_S``,
+    ``on_slept`` the time that the computer was suspended.
     """
 
     def __init__(

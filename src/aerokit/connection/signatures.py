@@ -52,7 +52,8 @@ class SignatureGate:
 
     @contextmanager
     def key_handover(self, signing: Signing | None, system_id: int, component_id: int) -> Iterator[asyncio.Event]:
-        """Inside the block, switch to ``signing`` as soon as frames of the component show that it has switched.
+        """For the duration of the block, watch the component's frames and switch to ``signing`` when they show that
+        it uses the new key.
 
         The yielded event is set then; until then, frames are signed and verified as before. One frame signed with the
         new key is enough. A removed key is shown by at least `MIN_UNSIGNED_FRAMES` unsigned frames over

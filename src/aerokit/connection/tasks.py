@@ -20,9 +20,9 @@ class BackgroundTasks:
     """Tasks that end with an ``async with`` block. Their exceptions go to ``on_error``, not to the block.
 
     This is not a task group, because the program's block would then run inside its cancel scope. Cancelling the
-    program's task, ``asyncio.timeout`` and ``asyncio.TaskGroup`` interact with such a scope differently in each version
-    of Python and anyio; some swallow or exchange exceptions. A cancelled scope of the program does not reach these
-    tasks either: heartbeats continue while a shielded program lands its vehicle.
+    program's task, ``asyncio.timeout`` and ``asyncio.TaskGroup`` interact with such a scope differently in each
+    version of Python and anyio; some swallow or exchange exceptions. A cancelled scope of the program does not reach
+    these tasks either: heartbeats continue while a shielded program lands its vehicle.
     """
 
     def __init__(self, on_error: Callable[[Exception], None]) -> None:
@@ -67,7 +67,7 @@ class BackgroundTasks:
 
 
 async def run_shielded(work: Coroutine[Any, Any, None]) -> None:
-    """Await ``work`` to its end, even if the caller is cancelled, by any means and repeatedly.
+    """Await ``work`` to its end, even if the caller is cancelled (by asyncio or anyio, once or repeatedly).
 
     anyio's shield stops anyio's cancel scopes, but not ``task.cancel()`` or ``asyncio.timeout``. The work must be
     bounded in time. A cancellation is raised afterwards, with an exception of the work as its cause.
@@ -88,8 +88,8 @@ async def run_shielded(work: Coroutine[Any, Any, None]) -> None:
 class Cancellation:
     """Cancel scope that can be cancelled before it is entered, and from callbacks of the loop. Enter it once.
 
-    If sniffio is installed (a dependency of trio, openai and others), anyio detects the running library in tasks only:
-    creating an ``anyio.CancelScope`` in a callback raises.
+    If sniffio is installed (a dependency of trio, openai and others), anyio detects the running library in tasks
+    only: creating an ``anyio.CancelScope`` in a callback raises.
     """
 
     def __init__(self) -> None:
@@ -125,8 +125,8 @@ Alarm = Callable[[], None]
 class Deadlines:
     """Calls each alarm at its time, unless it is cancelled before.
 
-    Most deadlines of requests are cancelled soon, when the answer arrives. One timer serves all of them, because a loop
-    timer for each would cost more than sending the request. It is not moved when a deadline is cancelled.
+    Most deadlines of requests are cancelled soon, when the answer arrives. One timer serves all of them, because a
+    loop timer for each would cost more than sending the request. Cancelling a deadline does not reschedule the timer.
     """
 
     def __init__(self) -> None:

@@ -41,7 +41,7 @@ class FleetAction:
     Args:
         context: of the fleet.
         name: appears in results, events and errors.
-        members: those that are unavailable are skipped.
+        members: members to run it on; unavailable ones are skipped.
         execute: called with each available member.
         timeout: seconds for each member; None: no limit.
         stagger_s: delay in seconds between the starts of consecutive members.

@@ -27,7 +27,7 @@ POLL_INTERVAL_S = 0.25
 
 @checks_arguments
 class Actions(SelectionBase):
-    """Arming, take-off, landing, modes; and any other action with ``do``."""
+    """Arming, take-off, landing and modes of several members; ``do`` runs any other action."""
 
     async def do(
         self,
@@ -238,8 +238,8 @@ def fragments(data: bytes, sequence: int) -> list[GpsRtcmData]:
     """Return one RTCM message as GPS_RTCM_DATA messages.
 
     Flags: bit 0 is set for a fragment, bits 1 and 2 are the fragment number, bits 3 to 7 the sequence number. The
-    receiver takes a message as complete after four fragments or after one that is not full. An empty fragment therefore
-    follows a full last one.
+    receiver takes a message as complete after four fragments or after one that is not full. An empty fragment
+    therefore follows a full last one.
 
     Raises:
         InvalidArgument: the message is empty, or longer than four fragments (720 bytes).

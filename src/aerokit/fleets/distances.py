@@ -40,7 +40,7 @@ def position_of(member: Member, max_age_s: float = POSITION_MAX_AGE_S) -> Positi
 def altitude_amsl(member: Member, target: Position) -> float:
     """Return the altitude above sea level of a target for this member, in metres.
 
-    A target without an altitude has the member's own.
+    If the target has no altitude, the member's present altitude is used.
 
     Raises:
         ValueUnknownError, StaleValueError: the position of the member or of its home is unknown.

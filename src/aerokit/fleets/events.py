@@ -97,7 +97,7 @@ class PolicyCompleted(FleetEvent):
 
 
 class FollowingStopped(FleetEvent):
-    """Following the leader, ``member``, ended before its block did.
+    """Following the leader ``member`` ended, but its block is still running.
 
     ``orders`` and ``skipped`` are as in :class:`PolicyApplied`.
     """

@@ -42,7 +42,10 @@ class PathPoint(Snapshot):
 
 
 class Path(Snapshot):
-    """Path of one vehicle: straight lines between timed points; before the first and after the last it rests."""
+    """Path of one vehicle: straight lines between timed points.
+
+    The vehicle rests before the first and after the last point.
+    """
 
     name: str
     points: Sequence[PathPoint]
@@ -141,8 +144,8 @@ def _lower_bound(one: tuple[PathPoint, PathPoint], other: tuple[PathPoint, PathP
 def _closest(one: tuple[PathPoint, PathPoint], other: tuple[PathPoint, PathPoint], slack_s: float) -> Approach | None:
     """Return the closest approach of two legs; None if no two of their times are within the slack.
 
-    With s and t from 0 to 1 along the legs, the squared distance is a convex function of both. The time condition cuts
-    a strip out of the unit square, so the minimum is inside it or on the border of the remaining polygon.
+    With s and t from 0 to 1 along the legs, the squared distance is a convex function of both. The time condition
+    cuts a strip out of the unit square, so the minimum is inside it or on the border of the remaining polygon.
     """
     a, b = one[0].place, other[0].place
     along = [one[1].place[i] - a[i] for i in range(3)]

@@ -27,7 +27,10 @@ PolicyOrder = Literal["hold", "land", "return"]
 
 
 class MemberFailure(Snapshot):
-    """Failure of ``member`` (of ``group``) in ``action``; ``others`` are the members that the policy can order."""
+    """Failure of ``member`` (of ``group``) in ``action``.
+
+    ``others``: the members that the policy may send orders to.
+    """
 
     member: str
     group: str

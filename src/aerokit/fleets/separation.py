@@ -26,7 +26,7 @@ DELAY_STEP_S = 1.0
 
 
 class Route(Snapshot):
-    """A straight path: metres north, east and up of a common origin."""
+    """A straight path between two points in metres north, east and up of a common origin."""
 
     name: str
     start: LocalPoint
@@ -90,8 +90,8 @@ def separate_by_altitude(
 ) -> Deconfliction:
     """Separate conflicting routes by altitude.
 
-    All climb, then cross, then descend. No vehicle begins the next phase before all have finished the previous one, so
-    only movements of the same phase have to be separated.
+    All climb, then cross, then descend. No vehicle begins the next phase before all have finished the previous one,
+    so only movements of the same phase have to be separated.
 
     Args:
         routes: of the moving vehicles.

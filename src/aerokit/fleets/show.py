@@ -55,7 +55,7 @@ class Show(Snapshot):
 
         Args:
             min_distance_m: metres.
-            slack_s: how early or late one vehicle may be relative to another, in seconds.
+            slack_s: maximum time offset between two vehicles in seconds.
         """
         return find_conflicts(list(self.tracks.values()), min_distance_m, slack_s=slack_s)
 

@@ -38,8 +38,8 @@ ORDER_MAX_AGE_S = 1.0
 class Filters:
     """Messages that go out of an endpoint: those that match ``only`` (all if empty) and not ``block``.
 
-    Patterns are as in ``"GPS_*"``. ``rates`` maps patterns to the maximum rate per sender in Hz; the first matching
-    pattern applies. `ANSWERS` are limited only by their exact name.
+    Patterns may contain wildcards: ``"GPS_*"``. ``rates`` maps patterns to the maximum rate per sender in Hz; the
+    first matching pattern applies. `ANSWERS` are limited only by their exact name.
 
     Raises:
         InvalidArgument: a pattern matches no message of the dialect, or a rate is not above 0 and at most 1000.

@@ -20,12 +20,14 @@ class Endpoint(Snapshot):
     """One link of a hub, with its filters.
 
     Raises:
-        InvalidArgument: a field is wrong. The hub checks message names when the endpoint is added.
+        InvalidArgument: a field is invalid; the text names it. The hub checks message names when the endpoint is
+            added.
     """
 
     address: str | Link
     """A connection string such as ``"tcpin:0.0.0.0:5760"``, or an unopened link, which is not reopened when it is
-    lost."""
+    lost.
+    """
     name: str = ""
     """Name of the endpoint; empty: its address."""
     only: tuple[str, ...] = ()
@@ -38,7 +40,8 @@ class Endpoint(Snapshot):
     """True to forward nothing that is received here, not even heartbeats."""
     signing: Signing | None = None
     """Key that signs frames sent here; frames received without its signature are refused. Frames inside the hub are
-    not signed."""
+    not signed.
+    """
     peers: PeerFilter | None = None
     """IP addresses and networks to accept, for udpin, udpbcast and tcpin; None: all."""
     baud: int = 57600

@@ -54,7 +54,7 @@ def delay(duration_s: float) -> MissionItem:
 
 
 def delay_until(hour: int, minute: int = 0, second: int = 0) -> MissionItem:
-    """Hold the position until that time of day in UTC (ArduPilot).
+    """Hold the position until a time of day (UTC, ArduPilot).
 
     https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_DELAY
     """
@@ -180,7 +180,8 @@ def enable_fence(enable: bool = True) -> MissionItem:
 
 
 def set_camera_trigger_distance(distance_m: float, *, trigger_now: bool = False) -> MissionItem:
-    """Take a photo every ``distance_m`` metres from here on; 0 stops. With ``trigger_now`` take the first one at once.
+    """Take a photo every ``distance_m`` metres from here on; 0 stops. With ``trigger_now`` take the first one at
+    once.
 
     https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_CAM_TRIGG_DIST
     """

@@ -2,12 +2,11 @@
 
 The tables follow the conversions in the firmware (ArduPilot 4.7 AP_Mission, PX4 1.17 mavlink_mission), verified on
 vehicles. A string has one letter for each of the seven numbers of an item; numbers without a letter are lost and read
-back as 0:
-``f`` unchanged, ``u`` ``b`` unsigned integer of 16 or 8 bits, ``s`` ``i`` signed integer of 16 or 8 bits, ``c`` integer
-up to 255, larger ones clipped, ``U`` 16 bits that wrap around, ``?`` whether it is above 0, ``g`` the sign, ``r``
-radius in whole metres with its sign, ``R`` the same in 8 bits, in tens of metres above 255, ``n`` turns in 8 bits,
-fractions below 1 in 1/256, ``k`` whole centimetres, ``h`` 16-bit float, ``2`` always 2, ``y`` heading, normalised to 0
-to 360.
+back as 0: ``f`` unchanged, ``u`` ``b`` unsigned integer of 16 or 8 bits, ``s`` ``i`` signed integer of 16 or 8 bits,
+``c`` integer up to 255, larger ones clipped, ``U`` 16 bits that wrap around, ``?`` whether it is above 0, ``g`` the
+sign, ``r`` radius in whole metres with its sign, ``R`` the same in 8 bits, in tens of metres above 255, ``n`` turns
+in 8 bits, fractions below 1 in 1/256, ``k`` whole centimetres, ``h`` 16-bit float, ``2`` always 2, ``y`` heading,
+normalised to 0 to 360.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ FIELDS = ("param1", "param2", "param3", "param4", "x", "y", "z")
 
 
 class ItemStorage(Enum):
-    """The conversions that items have gone through before they are compared."""
+    """Storage of the items to compare: each one loses different precision."""
 
     WIRE = "wire"
     """Only MISSION_ITEM_INT: 32-bit floats, equivalent frames."""

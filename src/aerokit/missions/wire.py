@@ -110,7 +110,10 @@ def in_degrees(item: MissionItem) -> tuple[float, float]:
 
 
 def from_degrees(value: float, command: int, frame: int) -> int | float:
-    """Convert one coordinate back; the inverse of :func:`in_degrees`. Fractions remain only if it is not a position."""
+    """Convert one coordinate back; the inverse of :func:`in_degrees`.
+
+    Positions are rounded to integers; other values keep their fraction.
+    """
     if math.isnan(value):
         return DEFAULT_XY
     scale = xy_scale(command, frame)
@@ -149,9 +152,9 @@ def shift_jumps(items: Iterable[MissionItem], by: int) -> tuple[MissionItem, ...
 def convert_from_ardupilot(items: Iterable[MissionItem], here: tuple[float, float] | None) -> Iterator[MissionItem]:
     """Convert the items of a mission made for ArduPilot for another autopilot.
 
-    ArduPilot accepts commands without a place in any frame, PX4 only in MAV_FRAME_MISSION. ArduPilot understands 0°, 0°
-    as the current position: it becomes the destination of the previous item, and for the first item ``here`` (latitude
-    and longitude in degrees, None if unknown).
+    ArduPilot accepts commands without a place in any frame, PX4 only in MAV_FRAME_MISSION. ArduPilot understands 0°,
+    0° as the current position: it becomes the destination of the previous item, and for the first item ``here``
+    (latitude and longitude in degrees, None if unknown).
     """
     place = None if here is None else (round(here[0] * 1e7), round(here[1] * 1e7))
     for item in items:
@@ -200,12 +203,12 @@ def pack_items(
     target_system: int = 0,
     target_component: int = 0,
 ) -> bytes:
-    """Encode items, counted as the vehicle counts them, as a packed plan.
+    """Encode items (with the vehicle's numbering) as a packed plan.
 
-    A whole plan has ``first`` 0 and no options. ArduPilot accepts :data:`NO_CLEAR` for missions only: items from index
-    ``first`` on are replaced or appended, others are kept. Jump targets must then be below the number of items in the
-    file (4.7). ArduPilot processes the file when it is closed, and clears the old mission first, so that a file refused
-    half-way leaves half a mission.
+    A whole plan has ``first`` 0 and no options. ArduPilot accepts :data:`NO_CLEAR` for missions only: items from
+    index ``first`` on are replaced or appended, others are kept. Jump targets must then be below the number of items
+    in the file (4.7). ArduPilot processes the file when it is closed, and clears the old mission first, so that a
+    file refused half-way leaves half a mission.
     """
     if len(items) + first > MAX_ITEMS:
         raise InvalidArgument(f"{len(items) + first} items are too many: at most {MAX_ITEMS} are possible")

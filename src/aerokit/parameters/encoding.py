@@ -1,8 +1,9 @@
 """Encoding of parameter values in the 32-bit float of PARAM_VALUE and PARAM_SET.
 
 ArduPilot casts: 5 becomes 5.0, so an INT32 beyond 2**24 loses its last bits. PX4 copies the bytes of the integer
-(MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE). The bytes of some integers, such as -5,000,000, are signalling NaNs, in
-which a Python float changes one bit. :func:`parameter_of`, :func:`set_message` and :func:`value_message` preserve it.
+(MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE). The bytes of some integers, such as -5,000,000, are signalling NaNs,
+in which a Python float changes one bit. :func:`parameter_of`, :func:`set_message` and :func:`value_message` preserve
+it.
 
 https://mavlink.io/en/services/parameter.html#parameter-encoding
 """
@@ -97,7 +98,7 @@ def set_message(
 
 
 def value_message(parameter: Parameter, count: int, bytewise: bool) -> ParamValue:
-    """Create the PARAM_VALUE that a vehicle with ``count`` parameters sends."""
+    """Create the PARAM_VALUE for a parameter of a vehicle with ``count`` parameters."""
     bits = to_bits(parameter.value, parameter.type, bytewise)
     index = UNKNOWN_INDEX if parameter.index is None else parameter.index
     message = ParamValue(parameter.name, _FLOAT.unpack(bits)[0], int(parameter.type), count, index)
@@ -152,7 +153,8 @@ _DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 
 def number_text(value: float) -> str:
-    """Format with the fewest digits: ``0.1`` for the 32-bit float nearest to 0.1, ``3`` for 3.0; all digits of an int.
+    """Format with the fewest digits: ``0.1`` for the 32-bit float nearest to 0.1, ``3`` for 3.0; all digits of an
+    int.
 
     Raises:
         OverflowError: the number exceeds a 32-bit float.

@@ -1,8 +1,8 @@
 """``param.pck``: all parameters in one compact file, read and written by MAVFTP.
 
 Vehicles serve it at ``@PARAM/param.pck``: ArduPilot since 4.1, PX4 since August 2026 (PR 28435). ``?withdefaults=1``
-requests defaults, ``?start=50&count=10`` a part. Use a single block size for the whole file, because padding depends on
-it: no value crosses a block boundary. Downloaded and uploaded files have different headers, see
+requests defaults, ``?start=50&count=10`` a part. Use a single block size for the whole file, because padding depends
+on it: no value crosses a block boundary. Downloaded and uploaded files have different headers, see
 :func:`pack_parameters`.
 
 https://mavlink.io/en/services/parameter_ftp.html
@@ -94,8 +94,8 @@ def pack_parameters(parameters: Mapping[str, Parameter] | Iterable[Parameter]) -
     back what you wrote.
 
     Raises:
-        InvalidArgument: a name or value does not fit (INT32 is the widest type), or the file exceeds 65,535 bytes, the
-            maximum in its header.
+        InvalidArgument: a name or value does not fit (INT32 is the widest type), or the file exceeds 65,535 bytes,
+            the maximum in its header.
     """
     rows = list(_rows(parameters))
     body = bytearray()
@@ -119,7 +119,8 @@ def pack_for_download(
     block_size: int = 239,
     whole_defaults: bool = True,
 ) -> bytes:
-    """Encode the file that a vehicle with these parameters serves, for reads with that block size. Unchecked.
+    """Encode ``@PARAM/param.pck`` for these parameters. ``block_size``: data bytes per read. Values are not
+    validated.
 
     ``count`` 0 means all from ``start`` on. PX4 keeps a value and its default in one block; ArduPilot, and
     ``whole_defaults=False``, only the default. InvalidArgument if ``start`` is beyond the list.
@@ -247,9 +248,9 @@ def px4_hash(table: ParameterTable, volatile: Container[str] = ()) -> int:
     """Compute the ``_HASH_CHECK`` that PX4 would report for this table.
 
     CRC-32 without inversions over the name and the four value bytes of each parameter, sorted by name. PX4 ignores
-    volatile parameters, which it changes itself; pass their names as ``volatile``
-    (:attr:`ParameterMetadata.volatile <aerokit.parameters.ParameterMetadata>`). Without them the result differs, so a
-    cache should store the vehicle's own hash with the table.
+    volatile parameters, which it changes itself; pass their names as ``volatile`` (:attr:`ParameterMetadata.volatile
+    <aerokit.parameters.ParameterMetadata>`). Without them the result differs, so a cache should store the vehicle's
+    own hash with the table.
     """
     counted = (table[name] for name in sorted(table) if name not in volatile)
     data = b"".join(p.name.encode() + to_bits(p.value, p.type, bytewise=True) for p in counted)

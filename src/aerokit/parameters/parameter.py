@@ -45,7 +45,10 @@ class ParameterType(IntEnum):
 
     @classmethod
     def from_wire(cls, number: int) -> ParameterType:
-        """Return the type of a message, or REAL32, in which all values are sent, if the number is unknown."""
+        """Return the type with this MAV_PARAM_TYPE number.
+
+        REAL32 for unknown numbers, because every value is sent as a float.
+        """
         return cls(number) if 1 <= number <= 10 else cls.REAL32
 
     @property
@@ -77,8 +80,8 @@ class Parameter(Snapshot):
     """One parameter of a vehicle, as last reported.
 
     ``value`` is an ``int`` for integer types, else a ``float`` with 32-bit precision. ``default`` is None if unknown
-    (only MAVFTP reports it); ``index`` is the index in the vehicle's list, or None if not reported. Nothing is checked:
-    a vehicle may report NaN.
+    (only MAVFTP reports it); ``index`` is the index in the vehicle's list, or None if not reported. Nothing is
+    checked: a vehicle may report NaN.
     """
 
     name: str
@@ -182,8 +185,8 @@ _STRUCTS = {
 class Setting(Snapshot):
     """One setting of a component, as last reported.
 
-    ``type`` is a MAV_PARAM_EXT_TYPE. For the custom type, ``value`` is a ``str`` if its bytes are text, else ``bytes``.
-    ``index`` is the index in the component's list, or None if not reported.
+    ``type`` is a MAV_PARAM_EXT_TYPE. For the custom type, ``value`` is a ``str`` if its bytes are text, else
+    ``bytes``. ``index`` is the index in the component's list, or None if not reported.
     """
 
     name: str

@@ -266,8 +266,8 @@ class Changes(ChangesTwin[T]):
 class Subscription(SubscriptionTwin[ItemT]):
     """Asynchronous iterator over received items, for one reader. Active inside its ``with`` block.
 
-    The default, ``capacity=1`` with ``drop_oldest``, always yields the latest item; ``missed`` counts the dropped ones.
-    When the connection ends, queued items can still be read; after that, reading raises the connection's error.
+    The default, ``capacity=1`` with ``drop_oldest``, always yields the latest item; ``missed`` counts the dropped
+    ones. When the connection ends, queued items can still be read; after that, reading raises the connection's error.
     """
 
     @property
@@ -298,8 +298,8 @@ class Connection(ConnectionTwin):
     """One MAVLink node (system id, component id) on one link.
 
     Received bytes enter through ``bytes_received``, are checked by one framer per remote peer, and go to ``bus``.
-    ``send`` writes a message to the peer behind which its target was last received; :class:`Routes` decides which peer
-    that is, and when it may change (``may_move``). Everything runs on the event loop's thread.
+    ``send`` writes a message to the peer behind which its target was last received; :class:`Routes` decides which
+    peer that is, and when it may change (``may_move``). Everything runs on the event loop's thread.
     """
 
     @cached_property
@@ -336,7 +336,7 @@ class Connection(ConnectionTwin):
 
     @property
     def unsent_bytes(self) -> int:
-        """Bytes sent but still on this machine, as far as the link can tell; they may still be transmitted.
+        """Number of written bytes that have not left this machine, if the link can measure it.
 
         A value that stays above 0 means that the link does not drain (TCP without a network, a serial port with flow
         control asserted): :class:`LinkStalled`. Always 0 for UDP.
@@ -346,8 +346,8 @@ class Connection(ConnectionTwin):
     def discard_unsent(self) -> None:
         """Discard data that was sent but has not left this program, e.g. an outdated command.
 
-        This applies to all waiting data, for all targets. Data in the system's TCP buffer cannot be discarded and stays
-        in :attr:`unsent_bytes`.
+        This applies to all waiting data, for all targets. Data in the system's TCP buffer cannot be discarded and
+        stays in :attr:`unsent_bytes`.
         """
         self._loop.call(self.aio.discard_unsent)
 
@@ -638,8 +638,8 @@ class Gimbal(TwinOf["AsyncGimbal"]):
 
     @cached_property
     def attitude(self) -> StateCell[GimbalAttitude]:
-        """Attitude (GIMBAL_DEVICE_ATTITUDE_STATUS of any component of the vehicle, MOUNT_ORIENTATION, MOUNT_STATUS). It
-        is requested from the autopilot while your program watches this cell; reading it requests nothing.
+        """Attitude (GIMBAL_DEVICE_ATTITUDE_STATUS of any component of the vehicle, MOUNT_ORIENTATION, MOUNT_STATUS).
+        It is requested from the autopilot while your program watches this cell; reading it requests nothing.
         """
         return StateCell(self._loop, self.aio.attitude)
 
@@ -716,7 +716,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         self._loop.run(self.aio.look_at_system, system_id, wait=wait, tolerance_deg=tolerance_deg, timeout=timeout)
 
     def stop_looking(self) -> None:
-        """End :meth:`look_at` (MAV_CMD_DO_SET_ROI_NONE). The manager decides where the gimbal turns then.
+        """End :meth:`look_at` (MAV_CMD_DO_SET_ROI_NONE). Afterwards the gimbal manager chooses the direction.
 
         Raises:
             CommandRejected: the manager refused.
@@ -978,7 +978,7 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
         self._loop.run(self.aio.set_mode, mode, timeout=timeout, component_id=component_id)
 
     def wait_confirmed(self, timeout: float) -> None:
-        """Wait until HEARTBEAT reports the order's effect, or that it was in effect before.
+        """Wait until HEARTBEAT reports the order's effect; returns at once if it was in effect already.
 
         Raises:
             CommandRejected: the vehicle accepted first and refused then, as PX4 may do.
@@ -1040,9 +1040,9 @@ class Files(TwinOf["AsyncFiles"]):
     ) -> None:
         """Copy a file to this computer. It is written to ``<to>.part`` and renamed when it is complete.
 
-        With ``resume``, the ``<to>.part`` of an interrupted download is kept if the vehicle's file is not shorter, and
-        the result is verified by CRC-32 if the vehicle can compute it; if it differs, the whole file is read again.
-        Files whose names begin with ``@`` are always read completely.
+        With ``resume``, the ``<to>.part`` of an interrupted download is kept if the vehicle's file is not shorter,
+        and the result is verified by CRC-32 if the vehicle can compute it; if it differs, the whole file is read
+        again. Files whose names begin with ``@`` are always read completely.
 
         Raises:
             RemoteProtocolError: as for :meth:`read`.
@@ -1073,7 +1073,8 @@ class Files(TwinOf["AsyncFiles"]):
         return self._loop.run(self.aio.list, path, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
     def crc32(self, path: str, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None) -> int:
-        """Return the CRC-32 of a file as computed by the vehicle: polynomial 0x04C11DB7, nothing inverted.
+        """Return the CRC-32 of a file as computed by the vehicle: polynomial 0x04C11DB7, initial value 0, no final
+        XOR.
 
         That is ``zlib.crc32(data, 0xFFFFFFFF) ^ 0xFFFFFFFF``.
 
@@ -1094,8 +1095,8 @@ class Files(TwinOf["AsyncFiles"]):
     ) -> None:
         """Write a file. An existing file is replaced; its content is lost with the first message.
 
-        ``verify`` compares the CRC-32 afterwards, if the vehicle can compute it. It cannot for files whose names begin
-        with ``@``: the vehicle evaluates them when they are closed, and does not report the result.
+        ``verify`` compares the CRC-32 afterwards, if the vehicle can compute it. It cannot for files whose names
+        begin with ``@``: the vehicle evaluates them when they are closed, and does not report the result.
 
         Raises:
             VerificationFailed: the vehicle acknowledged everything, but the file has other content.
@@ -1381,9 +1382,9 @@ class Parameters(TwinOf["AsyncParameters"]):
             method: ``"ftp"`` reads one small file with the defaults (``@PARAM/param.pck``), ``"list"`` requests one
                 message for each parameter; ``"auto"`` uses the file if there is one.
             refresh: download again, even if the parameters are known or cached.
-            cache: keep the list on disk, and use it while the vehicle's parameter hash is unchanged: the second connect
-                takes one request. True means the user's cache directory, or pass one. Only PX4 has a hash; it does not
-                cover parameters that PX4 changes by itself, so they may be outdated. Off by default.
+            cache: keep the list on disk, and use it while the vehicle's parameter hash is unchanged: the second
+                connect takes one request. True means the user's cache directory, or pass one. Only PX4 has a hash; it
+                does not cover parameters that PX4 changes by itself, so they may be outdated. Off by default.
             idle_timeout_s: fail after this many seconds without progress.
             timeout: seconds in total.
             on_progress: called with the number of parameters, or bytes of the file, so far and in total.
@@ -1488,8 +1489,9 @@ class Parameters(TwinOf["AsyncParameters"]):
 
         ``method="ftp"`` writes one file (``@PARAM/param.pck``) and reads the values back, ``"set"`` sets them one by
         one, ``"auto"`` uses the file if the vehicle supports it and there are many changes. Results are as for
-        :meth:`set_many`; parameters that the vehicle does not have end as ``"failed"`` with ParameterRejected, and the
-        others are set. If a parameter is given under two names, the vehicle's own counts, and the other has no result.
+        :meth:`set_many`; parameters that the vehicle does not have end as ``"failed"`` with ParameterRejected, and
+        the others are set. If two names mean the same parameter, the vehicle's current name counts, and the other one
+        gets no result.
 
         Raises:
             InvalidArgument, FileFormatError: a name, a value or the file is invalid. Nothing was set.
@@ -1513,9 +1515,9 @@ class Parameters(TwinOf["AsyncParameters"]):
         """Set values for the duration of an ``async with`` block and restore the previous ones at its end.
 
         They are also restored if the block raises or is cancelled, which takes up to ``idle_timeout_s`` seconds. If a
-        value cannot be set, the others are restored and its error is raised. Blocks may be nested and may overlap, for
-        the same parameter as well: it is restored to the value from before the first of them when the last one ends. A
-        value that another station has changed meanwhile stays, and a warning of logger "aerokit" names it.
+        value cannot be set, the others are restored and its error is raised. Blocks may be nested and may overlap,
+        for the same parameter as well: it is restored to the value from before the first of them when the last one
+        ends. A value that another station has changed meanwhile stays, and a warning of logger "aerokit" names it.
 
         Raises:
             RollbackFailed: values could not be restored; ``not_restored`` has them.
@@ -1526,10 +1528,11 @@ class Parameters(TwinOf["AsyncParameters"]):
         )
 
     def transaction(self, *, idle_timeout_s: float = IDLE_TIMEOUT_S) -> Transaction:
-        """Write several parameters, all or none: ``async with vehicle.parameters.transaction() as t: await t.set(…)``.
+        """Write several parameters, all or none: ``async with vehicle.parameters.transaction() as t: await
+        t.set(…)``.
 
-        Each write is verified. If the block raises or is cancelled, or a write fails, the previous values are restored;
-        see :class:`Transaction`.
+        Each write is verified. If the block raises or is cancelled, or a write fails, the previous values are
+        restored; see :class:`Transaction`.
         """
         return Transaction(self._loop, self._loop.call(self.aio.transaction, idle_timeout_s=idle_timeout_s))
 
@@ -1602,14 +1605,15 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
                 nothing if it is equal, and only the items that differ if the vehicle supports that.
             verify: read the plan back and compare, or compare PX4's checksum where that is faster. Files are always
                 read back.
-            max_distance_m: refuse a plan with a position farther than this from the vehicle, if its position is known.
+            max_distance_m: refuse a plan with a position farther than this from the vehicle, if its position is
+                known.
             idle_timeout_s: fail after this many seconds without progress.
             timeout: seconds in total.
             on_progress: called with the progress in items, or in bytes of a file.
 
         See https://mavlink.io/en/services/mission.html. PX4 keeps the old items until it has all of the new ones.
-        ArduPilot overwrites missions and rally points one by one (a fence at the end), so that after a failure it holds
-        a mixture of both: the error says so.
+        ArduPilot overwrites missions and rally points one by one (a fence at the end), After a failure it may hold
+        old and new items; the error then says so. ("holds" is also a flight mode.)
 
         Raises:
             InvalidArgument: the plan is invalid, or has a position that is too far away. Nothing was sent.
@@ -1789,14 +1793,15 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
                 nothing if it is equal, and only the items that differ if the vehicle supports that.
             verify: read the plan back and compare, or compare PX4's checksum where that is faster. Files are always
                 read back.
-            max_distance_m: refuse a plan with a position farther than this from the vehicle, if its position is known.
+            max_distance_m: refuse a plan with a position farther than this from the vehicle, if its position is
+                known.
             idle_timeout_s: fail after this many seconds without progress.
             timeout: seconds in total.
             on_progress: called with the progress in items, or in bytes of a file.
 
         See https://mavlink.io/en/services/mission.html. PX4 keeps the old items until it has all of the new ones.
-        ArduPilot overwrites missions and rally points one by one (a fence at the end), so that after a failure it holds
-        a mixture of both: the error says so.
+        ArduPilot overwrites missions and rally points one by one (a fence at the end), After a failure it may hold
+        old and new items; the error then says so. ("holds" is also a flight mode.)
 
         Raises:
             InvalidArgument: the plan is invalid, or has a position that is too far away. Nothing was sent.
@@ -1896,14 +1901,15 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
                 nothing if it is equal, and only the items that differ if the vehicle supports that.
             verify: read the plan back and compare, or compare PX4's checksum where that is faster. Files are always
                 read back.
-            max_distance_m: refuse a plan with a position farther than this from the vehicle, if its position is known.
+            max_distance_m: refuse a plan with a position farther than this from the vehicle, if its position is
+                known.
             idle_timeout_s: fail after this many seconds without progress.
             timeout: seconds in total.
             on_progress: called with the progress in items, or in bytes of a file.
 
         See https://mavlink.io/en/services/mission.html. PX4 keeps the old items until it has all of the new ones.
-        ArduPilot overwrites missions and rally points one by one (a fence at the end), so that after a failure it holds
-        a mixture of both: the error says so.
+        ArduPilot overwrites missions and rally points one by one (a fence at the end), After a failure it may hold
+        old and new items; the error then says so. ("holds" is also a flight mode.)
 
         Raises:
             InvalidArgument: the plan is invalid, or has a position that is too far away. Nothing was sent.
@@ -1969,7 +1975,7 @@ class CameraBlock(BlockTwin["AsyncCameraBlock"]):
     """An operation of a camera for the duration of an ``async with`` block.
 
     The command to stop is sent at once when the block exits, also under cancellation, and retried until it is
-    acknowledged. It is also sent when the block of the vehicle exits first. It does not undo a newer order.
+    acknowledged. If the vehicle's block exits first, the command is sent then. It does not undo a newer order.
     """
 
 
@@ -1982,7 +1988,7 @@ class PhotoInterval(PhotoIntervalTwin):
 
     @property
     def missed(self) -> int:
-        """Number of pictures that were taken, but whose captures are not available."""
+        """Number of photos whose captures could not be received."""
         return self.aio.missed
 
 
@@ -2353,10 +2359,10 @@ class Camera(TwinOf["AsyncCamera"]):
     def take_photo(self, *, timeout: float = 10.0) -> Capture:
         """Take one photo; returns when the camera has reported it.
 
-        Sends MAV_CMD_IMAGE_START_CAPTURE (https://mavlink.io/en/services/camera.html), or MAV_CMD_DO_DIGICAM_CONTROL to
-        PX4's trigger and to cameras that do not support the former. The order is sent again only if the camera then
-        reports that it is not taking a picture and has taken none. A lost CAMERA_IMAGE_CAPTURED is requested. If you
-        cancel the call, the camera may still take the picture.
+        Sends MAV_CMD_IMAGE_START_CAPTURE (https://mavlink.io/en/services/camera.html), or MAV_CMD_DO_DIGICAM_CONTROL
+        to PX4's trigger and to cameras that do not support the former. The order is sent again only if the camera
+        then reports that it is not taking a picture and has taken none. A lost CAMERA_IMAGE_CAPTURED is requested. If
+        you cancel the call, the camera may still take the picture.
 
         Args:
             timeout: seconds to wait for the report.
@@ -2393,8 +2399,8 @@ class Camera(TwinOf["AsyncCamera"]):
     def load_captures(self, *, timeout: float = 600.0) -> list[Capture]:
         """Return all captures in the camera's log, including earlier ones, after requesting the missing ones.
 
-        At most the newest 20,000; of a camera attached to the autopilot only the newest one. Stops after three
-        successive captures that the camera does not send.
+        The newest 20,000 at most. For a camera attached to the autopilot, only the newest capture is available. Stops
+        after three successive captures that the camera does not send.
 
         Args:
             timeout: seconds to wait for all of them; :meth:`captures` has those that arrived in time.
@@ -2421,9 +2427,9 @@ class Settings(TwinOf["AsyncSettings"]):
     Every PARAM_EXT_VALUE and PARAM_EXT_ACK of the component updates the table, also after changes by other stations,
     and is published as :class:`aerokit.events.SettingChanged`. A reboot of the vehicle clears the table.
 
-    A camera definition file explains the settings: :meth:`fetch_definition` reads it from the camera, :meth:`load` from
-    a local file. From then on you can use the names of options, and values that are out of range or excluded by other
-    settings are refused before anything is sent. Without it, values are sent unchanged.
+    A camera definition file explains the settings: :meth:`fetch_definition` reads it from the camera, :meth:`load`
+    from a local file. From then on you can use the names of options, and values that are out of range or excluded by
+    other settings are refused before anything is sent. Without it, values are sent unchanged.
 
     All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
     total; then OperationTimeout), if they send anything. You can cancel any call.
@@ -3022,7 +3028,7 @@ class Vehicle(VehicleTwin):
         modes: tuple[Mode, ...] = (),
         armed: bool | None = None,
     ) -> AbstractContextManager[PostedOrder]:
-        """Open an order that need not be waited for: mode, arming and take-off can be sent one after another.
+        """Open an order without waiting for its effect, so that mode, arming and take-off can be sent in one go.
 
         Within the block its commands are sent again right after a HEARTBEAT until they are acknowledged or their
         effect is reported. They are not sent again after a newer order about the same subject, after a mode that
@@ -3730,7 +3736,7 @@ def connect(
         record: a ``.tlog`` file that receives all traffic in both directions; an existing file is replaced.
         reconnect: reopen a lost link until it is back, instead of ending the connection.
         peers: accept datagrams and connections only from these IP addresses and networks: ``"10.0.0.7"``,
-            ``["10.0.0.0/24"]``. For links that anybody can send to: udpin, udpbcast, tcpin. None: accept all.
+            ``["10.0.0.0/24"]``. For links with an open port: udpin, udpbcast, tcpin. None: accept all.
         may_move: accept a silent vehicle from a new IP address even if its sequence numbers and time since boot do
             not continue (it rebooted and has a new address). Otherwise that address is refused
             (``RouteChangeRefused``), because it may belong to another sender.

@@ -96,7 +96,7 @@ async def connect(
         record: a ``.tlog`` file that receives all traffic in both directions; an existing file is replaced.
         reconnect: reopen a lost link until it is back, instead of ending the connection.
         peers: accept datagrams and connections only from these IP addresses and networks: ``"10.0.0.7"``,
-            ``["10.0.0.0/24"]``. For links that anybody can send to: udpin, udpbcast, tcpin. None: accept all.
+            ``["10.0.0.0/24"]``. For links with an open port: udpin, udpbcast, tcpin. None: accept all.
         may_move: accept a silent vehicle from a new IP address even if its sequence numbers and time since boot do
             not continue (it rebooted and has a new address). Otherwise that address is refused
             (``RouteChangeRefused``), because it may belong to another sender.

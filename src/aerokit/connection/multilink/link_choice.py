@@ -167,9 +167,9 @@ MAX_SWITCH_DELAY_S = 10.0
 class LinkChoice:
     """The links to one system, and the one in use.
 
-    Systems with an autopilot need proof (``needs_proof``): frames of a second link are accepted, and commands sent over
-    it, only after it is proven to lead to the same vehicle, by its clock or by carrying the same frames. A different
-    hardware id disproves it, whatever its clock.
+    Systems with an autopilot need proof (``needs_proof``): frames of a second link are accepted, and commands sent
+    over it, only after it is proven to lead to the same vehicle, by its clock or by carrying the same frames. A
+    different hardware id disproves it, even if the clock matches.
     """
 
     def __init__(self, *, needs_proof: bool) -> None:

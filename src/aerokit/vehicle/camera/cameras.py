@@ -72,10 +72,10 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
     async def take_photo(self, *, timeout: float = 10.0) -> Capture:
         """Take one photo; returns when the camera has reported it.
 
-        Sends MAV_CMD_IMAGE_START_CAPTURE (https://mavlink.io/en/services/camera.html), or MAV_CMD_DO_DIGICAM_CONTROL to
-        PX4's trigger and to cameras that do not support the former. The order is sent again only if the camera then
-        reports that it is not taking a picture and has taken none. A lost CAMERA_IMAGE_CAPTURED is requested. If you
-        cancel the call, the camera may still take the picture.
+        Sends MAV_CMD_IMAGE_START_CAPTURE (https://mavlink.io/en/services/camera.html), or MAV_CMD_DO_DIGICAM_CONTROL
+        to PX4's trigger and to cameras that do not support the former. The order is sent again only if the camera
+        then reports that it is not taking a picture and has taken none. A lost CAMERA_IMAGE_CAPTURED is requested. If
+        you cancel the call, the camera may still take the picture.
 
         Args:
             timeout: seconds to wait for the report.
@@ -115,8 +115,8 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
     async def load_captures(self, *, timeout: float = 600.0) -> list[Capture]:
         """Return all captures in the camera's log, including earlier ones, after requesting the missing ones.
 
-        At most the newest 20,000; of a camera attached to the autopilot only the newest one. Stops after three
-        successive captures that the camera does not send.
+        The newest 20,000 at most. For a camera attached to the autopilot, only the newest capture is available. Stops
+        after three successive captures that the camera does not send.
 
         Args:
             timeout: seconds to wait for all of them; :meth:`captures` has those that arrived in time.

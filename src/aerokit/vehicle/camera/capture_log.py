@@ -106,7 +106,7 @@ class CaptureLog:
         return index in self._by_index
 
     async def fetch(self, index: int) -> Capture | None:
-        """Request a missed capture; None if the camera no longer has it, or does not answer."""
+        """Request a missed capture. Returns None if the camera has deleted it or does not answer."""
         if not self.has(index) and self._link.is_trigger:
             return None
         self._requested.add(index)

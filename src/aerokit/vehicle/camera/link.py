@@ -293,7 +293,7 @@ class ActiveOperation:
         return error is not None
 
     def discard(self) -> None:
-        """Forget the operation without stopping it."""
+        """Mark the operation as ended without sending its stop command."""
         self._is_over = True
         if self._finish in self._link.on_finish:
             self._link.on_finish.remove(self._finish)
@@ -317,7 +317,7 @@ class CameraBlock:
     """An operation of a camera for the duration of an ``async with`` block.
 
     The command to stop is sent at once when the block exits, also under cancellation, and retried until it is
-    acknowledged. It is also sent when the block of the vehicle exits first. It does not undo a newer order.
+    acknowledged. If the vehicle's block exits first, the command is sent then. It does not undo a newer order.
     """
 
     def __init__(

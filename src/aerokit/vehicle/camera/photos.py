@@ -189,7 +189,7 @@ class PhotoInterval:
 
     @property
     def missed(self) -> int:
-        """Number of pictures that were taken, but whose captures are not available."""
+        """Number of photos whose captures could not be received."""
         return self._missed
 
     async def __aenter__(self) -> Self:

@@ -172,10 +172,9 @@ class CommandArbiter:
     def post(
         self, subjects: Sequence[Subject], *, modes: Collection[Mode] = (), armed: bool | None = None
     ) -> Iterator[Order]:
-        """Create an order that later ones may follow before it is acknowledged, valid for the duration of the block.
-
-        A newer order about the first of its subjects ends it. It ends posted orders about any of them, and the order
-        of an action if it steers.
+        """Create a posted order, valid for the duration of the block. Its main subject is the first one: a newer
+        order about it ends this order. The new order ends earlier posted orders about any of its subjects and, if it
+        steers, the action in progress.
         """
         is_steering = "arm" not in subjects[:1]
         if is_steering:

@@ -69,8 +69,8 @@ class Health:
         return list(await self.arming_reasons(self._session.connection.now()))
 
     async def arming_reasons(self, since: float) -> tuple[str, ...]:
-        """Return status texts about arming since then, requested again if there are none, then failing bits and
-        flags.
+        """Return the reasons against arming: status texts received since ``since`` (pre-arm checks are run if there
+        are none), then failing sensors and flags.
         """
         with self._session.streaming("sensors", "estimator"):
             await self._session.wait_for_status_texts()

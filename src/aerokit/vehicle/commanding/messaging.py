@@ -132,7 +132,7 @@ MessageT = TypeVar("MessageT", bound=Message)
 
 @checks_arguments
 class MessagingActions(VehicleBase):
-    """Commands, messages, subscriptions, and information about the vehicle besides its cells."""
+    """Commands, messages, subscriptions, and information about the vehicle that is not in a cell."""
 
     # ---------------------------------------------------------------------------- commands
 
@@ -256,7 +256,7 @@ class MessagingActions(VehicleBase):
     def posted(
         self, *subjects: Subject, modes: tuple[Mode, ...] = (), armed: bool | None = None
     ) -> Iterator[PostedOrder]:
-        """Open an order that need not be waited for: mode, arming and take-off can be sent one after another.
+        """Open an order without waiting for its effect, so that mode, arming and take-off can be sent in one go.
 
         Within the block its commands are sent again right after a HEARTBEAT until they are acknowledged or their
         effect is reported. They are not sent again after a newer order about the same subject, after a mode that

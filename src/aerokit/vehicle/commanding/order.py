@@ -300,7 +300,7 @@ class SentCommand:
 
     @property
     def end(self) -> str:
-        """The reason why it must not be sent again, as a clause; empty while it may."""
+        """Reason why the command is not sent again, as a clause for error texts; empty while it may be sent again."""
         if self.is_confirmed:
             return "its effect was reported"
         return self.order.end or (SUPERSEDED if self._is_overruled else "") or self.order.unexplained

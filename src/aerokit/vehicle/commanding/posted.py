@@ -138,7 +138,7 @@ class PostedOrder:
         return False
 
     async def wait_confirmed(self, timeout: float) -> None:
-        """Wait until HEARTBEAT reports the order's effect, or that it was in effect before.
+        """Wait until HEARTBEAT reports the order's effect; returns at once if it was in effect already.
 
         Raises:
             CommandRejected: the vehicle accepted first and refused then, as PX4 may do.

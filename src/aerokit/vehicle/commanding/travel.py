@@ -350,7 +350,7 @@ LOCATION = MavCmd.DO_SET_ROI_LOCATION
 
 @checks_arguments
 class LookActions(VehicleBase):
-    """Pointing nose or gimbal at a place; the newer of two orders counts."""
+    """Pointing the nose or the gimbal at a place. A new order replaces the previous one."""
 
     async def look_at(self, target: Position) -> None:
         """Point nose or gimbal at a place, until :meth:`stop_looking`; without an altitude, at the vehicle's own.

@@ -1,4 +1,4 @@
-"""``component.settings``: parameters by the extended parameter protocol, explained by a camera definition file.
+"""``component.settings``: with names, options and rules from a camera definition file.
 
 https://mavlink.io/en/services/parameter_ext.html, https://mavlink.io/en/services/camera_def.html
 """
@@ -43,9 +43,9 @@ class Settings:
     Every PARAM_EXT_VALUE and PARAM_EXT_ACK of the component updates the table, also after changes by other stations,
     and is published as :class:`aerokit.events.SettingChanged`. A reboot of the vehicle clears the table.
 
-    A camera definition file explains the settings: :meth:`fetch_definition` reads it from the camera, :meth:`load` from
-    a local file. From then on you can use the names of options, and values that are out of range or excluded by other
-    settings are refused before anything is sent. Without it, values are sent unchanged.
+    A camera definition file explains the settings: :meth:`fetch_definition` reads it from the camera, :meth:`load`
+    from a local file. From then on you can use the names of options, and values that are out of range or excluded by
+    other settings are refused before anything is sent. Without it, values are sent unchanged.
 
     All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
     total; then OperationTimeout), if they send anything. You can cancel any call.

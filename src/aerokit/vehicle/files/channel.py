@@ -67,7 +67,7 @@ class FileChannel:
     ) -> AsyncIterator[None]:
         """Wait for the previous operations, and for sessions that are still being closed.
 
-        FileTimeout after ``timeout`` seconds has the ranges that ``missing()`` returns.
+        After ``timeout`` seconds raises FileTimeout, with the ranges returned by ``missing()``.
         """
         try:
             with anyio.fail_after(timeout):

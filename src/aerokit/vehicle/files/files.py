@@ -97,9 +97,9 @@ class Files:
     ) -> None:
         """Copy a file to this computer. It is written to ``<to>.part`` and renamed when it is complete.
 
-        With ``resume``, the ``<to>.part`` of an interrupted download is kept if the vehicle's file is not shorter, and
-        the result is verified by CRC-32 if the vehicle can compute it; if it differs, the whole file is read again.
-        Files whose names begin with ``@`` are always read completely.
+        With ``resume``, the ``<to>.part`` of an interrupted download is kept if the vehicle's file is not shorter,
+        and the result is verified by CRC-32 if the vehicle can compute it; if it differs, the whole file is read
+        again. Files whose names begin with ``@`` are always read completely.
 
         Raises:
             RemoteProtocolError: as for :meth:`read`.
@@ -142,7 +142,8 @@ class Files:
         return tuple(entries.values())
 
     async def crc32(self, path: str, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None) -> int:
-        """Return the CRC-32 of a file as computed by the vehicle: polynomial 0x04C11DB7, nothing inverted.
+        """Return the CRC-32 of a file as computed by the vehicle: polynomial 0x04C11DB7, initial value 0, no final
+        XOR.
 
         That is ``zlib.crc32(data, 0xFFFFFFFF) ^ 0xFFFFFFFF``.
 
@@ -164,8 +165,8 @@ class Files:
     ) -> None:
         """Write a file. An existing file is replaced; its content is lost with the first message.
 
-        ``verify`` compares the CRC-32 afterwards, if the vehicle can compute it. It cannot for files whose names begin
-        with ``@``: the vehicle evaluates them when they are closed, and does not report the result.
+        ``verify`` compares the CRC-32 afterwards, if the vehicle can compute it. It cannot for files whose names
+        begin with ``@``: the vehicle evaluates them when they are closed, and does not report the result.
 
         Raises:
             VerificationFailed: the vehicle acknowledged everything, but the file has other content.

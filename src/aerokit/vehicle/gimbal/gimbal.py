@@ -164,7 +164,7 @@ class RoiMixin(GimbalMixin):
                 await wait_until_there(orders, order, what, aim, since=since, timeout=timeout)
 
     async def stop_looking(self) -> None:
-        """End :meth:`look_at` (MAV_CMD_DO_SET_ROI_NONE). The manager decides where the gimbal turns then.
+        """End :meth:`look_at` (MAV_CMD_DO_SET_ROI_NONE). Afterwards the gimbal manager chooses the direction.
 
         Raises:
             CommandRejected: the manager refused.

@@ -202,7 +202,7 @@ class GimbalOrders:
         )
 
     async def wait_for(self, found: Callable[[], object], kind: type[Message], within_s: float) -> None:
-        """Wait until ``found()`` is not None, checked at each message of a type, for ``within_s`` seconds at most."""
+        """Wait up to ``within_s`` seconds until ``found()`` is not None; it is called at each ``kind`` message."""
         done = asyncio.Event()
 
         def check(_: Message) -> None:
@@ -292,8 +292,9 @@ class GimbalMixin:
         self._context, self._session = context, context.session
         shown = self._orders.public_device
         self.attitude: StateCell[GimbalAttitude] = shown.attitude
-        """Attitude (GIMBAL_DEVICE_ATTITUDE_STATUS of any component of the vehicle, MOUNT_ORIENTATION, MOUNT_STATUS). It
-        is requested from the autopilot while your program watches this cell; reading it requests nothing."""
+        """Attitude (GIMBAL_DEVICE_ATTITUDE_STATUS of any component of the vehicle, MOUNT_ORIENTATION, MOUNT_STATUS).
+        It is requested from the autopilot while your program watches this cell; reading it requests nothing.
+        """
         self.controllers: StateCell[GimbalControllers] = shown.controllers
         """Stations in control, as reported by the manager (GIMBAL_MANAGER_STATUS)."""
 

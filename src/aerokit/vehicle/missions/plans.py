@@ -30,7 +30,7 @@ PlanMethod = Literal["auto", "ftp", "items"]
 class VehiclePlan(ReadOnly, Generic[PlanT]):
     """A mission, a fence or rally points on a vehicle.
 
-    There is one transfer at a time with each vehicle; others wait. You can cancel any call; the vehicle is informed.
+    Transfers with one vehicle run one at a time. You can cancel any call; the vehicle is informed.
     """
 
     def __init__(self, context: PlanContext) -> None:
@@ -57,14 +57,15 @@ class VehiclePlan(ReadOnly, Generic[PlanT]):
                 nothing if it is equal, and only the items that differ if the vehicle supports that.
             verify: read the plan back and compare, or compare PX4's checksum where that is faster. Files are always
                 read back.
-            max_distance_m: refuse a plan with a position farther than this from the vehicle, if its position is known.
+            max_distance_m: refuse a plan with a position farther than this from the vehicle, if its position is
+                known.
             idle_timeout_s: fail after this many seconds without progress.
             timeout: seconds in total.
             on_progress: called with the progress in items, or in bytes of a file.
 
         See https://mavlink.io/en/services/mission.html. PX4 keeps the old items until it has all of the new ones.
-        ArduPilot overwrites missions and rally points one by one (a fence at the end), so that after a failure it holds
-        a mixture of both: the error says so.
+        ArduPilot overwrites missions and rally points one by one (a fence at the end), After a failure it may hold
+        old and new items; the error then says so. ("holds" is also a flight mode.)
 
         Raises:
             InvalidArgument: the plan is invalid, or has a position that is too far away. Nothing was sent.

@@ -116,9 +116,9 @@ class Parameters(ReadOnly):
             method: ``"ftp"`` reads one small file with the defaults (``@PARAM/param.pck``), ``"list"`` requests one
                 message for each parameter; ``"auto"`` uses the file if there is one.
             refresh: download again, even if the parameters are known or cached.
-            cache: keep the list on disk, and use it while the vehicle's parameter hash is unchanged: the second connect
-                takes one request. True means the user's cache directory, or pass one. Only PX4 has a hash; it does not
-                cover parameters that PX4 changes by itself, so they may be outdated. Off by default.
+            cache: keep the list on disk, and use it while the vehicle's parameter hash is unchanged: the second
+                connect takes one request. True means the user's cache directory, or pass one. Only PX4 has a hash; it
+                does not cover parameters that PX4 changes by itself, so they may be outdated. Off by default.
             idle_timeout_s: fail after this many seconds without progress.
             timeout: seconds in total.
             on_progress: called with the number of parameters, or bytes of the file, so far and in total.
@@ -219,8 +219,9 @@ class Parameters(ReadOnly):
 
         ``method="ftp"`` writes one file (``@PARAM/param.pck``) and reads the values back, ``"set"`` sets them one by
         one, ``"auto"`` uses the file if the vehicle supports it and there are many changes. Results are as for
-        :meth:`set_many`; parameters that the vehicle does not have end as ``"failed"`` with ParameterRejected, and the
-        others are set. If a parameter is given under two names, the vehicle's own counts, and the other has no result.
+        :meth:`set_many`; parameters that the vehicle does not have end as ``"failed"`` with ParameterRejected, and
+        the others are set. If two names mean the same parameter, the vehicle's current name counts, and the other one
+        gets no result.
 
         Raises:
             InvalidArgument, FileFormatError: a name, a value or the file is invalid. Nothing was set.
@@ -243,9 +244,9 @@ class Parameters(ReadOnly):
         """Set values for the duration of an ``async with`` block and restore the previous ones at its end.
 
         They are also restored if the block raises or is cancelled, which takes up to ``idle_timeout_s`` seconds. If a
-        value cannot be set, the others are restored and its error is raised. Blocks may be nested and may overlap, for
-        the same parameter as well: it is restored to the value from before the first of them when the last one ends. A
-        value that another station has changed meanwhile stays, and a warning of logger "aerokit" names it.
+        value cannot be set, the others are restored and its error is raised. Blocks may be nested and may overlap,
+        for the same parameter as well: it is restored to the value from before the first of them when the last one
+        ends. A value that another station has changed meanwhile stays, and a warning of logger "aerokit" names it.
 
         Raises:
             RollbackFailed: values could not be restored; ``not_restored`` has them.
@@ -253,10 +254,11 @@ class Parameters(ReadOnly):
         return TemporaryParameters(self._registry, self._access, self._writing, values, idle_timeout_s)
 
     def transaction(self, *, idle_timeout_s: float = IDLE_TIMEOUT_S) -> Transaction:
-        """Write several parameters, all or none: ``async with vehicle.parameters.transaction() as t: await t.set(…)``.
+        """Write several parameters, all or none: ``async with vehicle.parameters.transaction() as t: await
+        t.set(…)``.
 
-        Each write is verified. If the block raises or is cancelled, or a write fails, the previous values are restored;
-        see :class:`Transaction`.
+        Each write is verified. If the block raises or is cancelled, or a write fails, the previous values are
+        restored; see :class:`Transaction`.
         """
         return Transaction(self._registry, self._access, self._writing, self._needs_reboot, idle_timeout_s)
 

@@ -35,8 +35,8 @@ class CommandSender:
     """The command protocol with one vehicle (https://mavlink.io/en/services/command.html).
 
     COMMAND_ACK carries no request id, so equal commands to one component are serialized; different commands never
-    wait for each other. A command of an order that has ended is aborted in favour of a newer one, and is not sent if
-    it ended while waiting. Acks of cancelled and unconfirmed commands are not mistaken for the ack of the next one.
+    wait for each other. If an order ends, its command in progress is aborted, and its waiting command is not sent.
+    Acks of cancelled and unconfirmed commands are not mistaken for the ack of the next one.
     """
 
     def __init__(

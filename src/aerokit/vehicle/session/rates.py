@@ -126,7 +126,7 @@ class MessageRates:
     def request(self, message_type: type[Message], hz: float, *, is_optional: bool = False) -> Detach:
         """Request ``message_type`` at ``hz`` (above 0, at most 1000) or faster until the returned function is called.
 
-        An optional message may never arrive (a missing sensor) without an event.
+        For an optional message (e.g. of a sensor that may be missing) no StreamUnavailable event is published.
         """
         check_rate(message_type, hz)
         stream = self._streams.get(message_type.ID)

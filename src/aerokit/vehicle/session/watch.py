@@ -96,8 +96,8 @@ class VehicleWatch:
     def silent_for_s(self) -> float:
         """Seconds since a heartbeat was processed.
 
-        :attr:`last_heartbeat_at` may be older if the event loop was blocked: a pause of this program is no silence of
-        the vehicle.
+        :attr:`last_heartbeat_at` may be older if the event loop was blocked: a pause of this program does not count
+        as silence.
         """
         return self._connection.now() - self._heartbeat_read_at
 

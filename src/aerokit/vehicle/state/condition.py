@@ -72,7 +72,7 @@ class SensorHealth(Snapshot):
 
     @property
     def blocks_arming(self) -> tuple[str, ...]:
-        """The failing sensors, or none if the pre-arm checks pass nevertheless."""
+        """The failing sensors that block arming; empty if the pre-arm checks pass."""
         return () if self.prearm_checks_pass else self.failing
 
 

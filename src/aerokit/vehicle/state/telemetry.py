@@ -92,7 +92,7 @@ class Telemetry(States):
             handler(message)
 
     def expire(self, now: float) -> None:
-        """Pass on status texts whose end has not arrived; call it about once a second."""
+        """Deliver status texts whose last chunk is missing. Call it about once a second."""
         self._publish_texts(self._texts.expire(now), self._source("Statustext"))
 
     def forget(self) -> None:
