@@ -475,3 +475,9 @@ def test_flight_termination_stops_motors() -> None:
     assert client.command(MavCmd.DO_FLIGHTTERMINATION, 0) == MavResult.FAILED
     assert client.command(MavCmd.DO_FLIGHTTERMINATION, 1) == MavResult.ACCEPTED
     assert not copter.is_armed
+
+
+def test_misspelled_fault_raises() -> None:
+    copter = SimulatedCopter()
+    with pytest.raises(AttributeError, match="no fault 'gps_lots'; faults: gps_lost"):
+        copter.faults.gps_lots = True  # type: ignore[attr-defined]

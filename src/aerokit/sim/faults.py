@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavResult
 from aerokit.mavlink.message import Message
@@ -70,6 +71,14 @@ class Faults:
     read_only_parameters: set[str] = field(default_factory=set)
     mute_parameters: set[str] = field(default_factory=set)
     commands: dict[int, CommandFault] = field(default_factory=dict)
+
+    if not TYPE_CHECKING:  # A type checker knows the names already.
+
+        def __setattr__(self, name: str, value: object) -> None:
+            # A misspelled fault would otherwise be accepted and change nothing.
+            if name not in self.__dataclass_fields__:
+                raise AttributeError(f"there is no fault {name!r}; faults: {', '.join(self.__dataclass_fields__)}")
+            super().__setattr__(name, value)
 
     def refuse(
         self,

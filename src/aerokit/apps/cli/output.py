@@ -137,7 +137,7 @@ def import_extra(module: str, extra: str) -> Any:
         return import_module(module)
     except ModuleNotFoundError as error:
         raise NotInstalled(
-            f"{error.name} is required, but not installed: pip install 'aerokit-mavlink[{extra}]'"
+            f"{error.name} is required, but not installed: {sys.executable} -m pip install 'aerokit-mavlink[{extra}]'"
         ) from None
 
 
