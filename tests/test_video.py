@@ -146,7 +146,7 @@ async def test_missing_video_stream_cannot_be_opened() -> None:
 
 @pytest.mark.exhaustive
 async def test_video_opening_can_be_cancelled(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("aerokit.video.ENDS_WITHIN_S", 0.1)
+    monkeypatch.setattr("aerokit.video.JOIN_TIMEOUT_S", 0.1)
     with anyio.move_on_after(0.2) as scope:
         async with open_video(f"udp://127.0.0.1:{free_port()}", timeout=3.0):
             pass

@@ -325,9 +325,8 @@ def test_offline_browser_draws_all_charts(page: Page, chromium: str, tmp_path: P
     target.write_text(page.html, encoding="utf-8")
     dumped = browse(chromium, target, "--dump-dom")
     assert dumped.count('class="main-svg"') >= len(page.charts)
-    assert set(re.findall('data-title="([^"]*)"', dumped)) == {
-        *("Download plot as a PNG", "Pan", "Reset axes", "Zoom"),  # and none that uploads the chart
-    }
+    titles = {title.lower() for title in re.findall('data-title="([^"]*)"', dumped)}  # older Plotly writes "png"
+    assert titles == {"download plot as a png", "pan", "reset axes", "zoom"}, "no button uploads the chart"
     assert len(re.findall(r'class="chart[^"]* js-plotly-plot"', dumped)) == len(page.charts)
 
 
