@@ -24,6 +24,8 @@ from aerokit.sim.ardupilot.copter_auto import CopterAuto
 from aerokit.sim.ardupilot.copter_failsafes import CopterArming, CopterFailsafes, CopterFence
 from aerokit.sim.ardupilot.copter_guided import CopterGuided, CopterSetpoints
 from aerokit.sim.ardupilot.copter_modes import CopterHost, CopterModeBase
+from aerokit.sim.ardupilot.failsafes import ArduPilotArming, ArduPilotFailsafes
+from aerokit.sim.ardupilot.fence import ArduPilotFence
 from aerokit.sim.ardupilot.host import ArduPilotMode, ConditionTimer, variant
 from aerokit.sim.ardupilot.kinds import Kind
 from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND, Builders
@@ -173,9 +175,9 @@ class SimulatedCopter(CopterHost):
     CAPABILITIES: ClassVar[int] = 0xFBEF
     BUILDERS: ClassVar[Builders] = BUILDERS_OF_KIND["copter"]
     MODES: ClassVar[tuple[Callable[[Any], ArduPilotMode], ...]] = _MODES
-    ARMING: ClassVar[type[CopterArming]] = CopterArming
-    FAILSAFES: ClassVar[type[CopterFailsafes]] = CopterFailsafes
-    FENCE: ClassVar[type[CopterFence]] = CopterFence
+    ARMING: ClassVar[type[ArduPilotArming[Any]]] = CopterArming
+    FAILSAFES: ClassVar[type[ArduPilotFailsafes[Any]]] = CopterFailsafes
+    FENCE: ClassVar[type[ArduPilotFence[Any]]] = CopterFence
 
     def make_commands(self) -> dict[int, CommandHandler]:
         return {

@@ -18,7 +18,8 @@ from aerokit.mavlink.enums import (
 )
 from aerokit.sim.ardupilot import plane_modes as modes
 from aerokit.sim.ardupilot.commands import common_commands
-from aerokit.sim.ardupilot.failsafes import ArduPilotArming
+from aerokit.sim.ardupilot.failsafes import ArduPilotArming, ArduPilotFailsafes
+from aerokit.sim.ardupilot.fence import ArduPilotFence
 from aerokit.sim.ardupilot.host import ArduPilotMode, ArduPilotMotors, variant
 from aerokit.sim.ardupilot.kinds import Kind
 from aerokit.sim.ardupilot.plane_auto import PlaneAuto, PlaneGuided, PlaneSetpoints, guided_commands
@@ -114,10 +115,10 @@ class SimulatedPlane(PlaneHost):
     CAPABILITIES: ClassVar[int] = 0xF36F
     BUILDERS: ClassVar[Builders] = BUILDERS_OF_KIND["plane"]
     MODES: ClassVar[tuple[Callable[[Any], ArduPilotMode], ...]] = _MODES
-    ARMING: ClassVar[type[PlaneArming]] = PlaneArming
-    FAILSAFES: ClassVar[type[PlaneFailsafes]] = PlaneFailsafes
-    FENCE: ClassVar[type[PlaneFence]] = PlaneFence
-    MOTORS: ClassVar[type[PlaneEngine]] = PlaneEngine
+    ARMING: ClassVar[type[ArduPilotArming[Any]]] = PlaneArming
+    FAILSAFES: ClassVar[type[ArduPilotFailsafes[Any]]] = PlaneFailsafes
+    FENCE: ClassVar[type[ArduPilotFence[Any]]] = PlaneFence
+    MOTORS: ClassVar[type[ArduPilotMotors]] = PlaneEngine
 
     fence: PlaneFence  # pyright: ignore[reportIncompatibleVariableOverride]
     failsafes: PlaneFailsafes  # pyright: ignore[reportIncompatibleVariableOverride]

@@ -21,7 +21,7 @@ from aerokit.sim.ardupilot.failsafes import ArduPilotArming, ArduPilotFailsafes,
 from aerokit.sim.ardupilot.fence import REPORT_ONLY, ArduPilotFence
 from aerokit.sim.ardupilot.host import ArduPilotMode, ArduPilotMotors, ConditionTimer
 from aerokit.sim.ardupilot.kinds import Kind
-from aerokit.sim.ardupilot.radio import RoverJoystick
+from aerokit.sim.ardupilot.radio import ArduPilotJoystick, RoverJoystick
 from aerokit.sim.ardupilot.rover_modes import ROVER_MODES, RoverGuided, RoverHost
 from aerokit.sim.ardupilot.rover_sub_base import GuidedSetpoints, GuidedTarget
 from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND, Builders
@@ -231,7 +231,7 @@ class RoverFence(ArduPilotFence[RoverHost]):
 class RoverSetpoints(GuidedSetpoints):
     """Accepts a heading or turn rate without a velocity; thrust is a share of the waypoint speed."""
 
-    vehicle: RoverHost
+    vehicle: RoverHost  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def refuse_acceleration(self, message: PositionTarget) -> None:
         self.vehicle.info(f"Ignoring {message.NAME}; set ACC_IGNORE in mask")
@@ -291,11 +291,11 @@ class SimulatedRover(RoverHost):
     CAPABILITIES: ClassVar[int] = 0xF1EF
     BUILDERS: ClassVar[Builders] = BUILDERS_OF_KIND["rover"]
     MODES: ClassVar[tuple[Callable[[Any], ArduPilotMode], ...]] = ROVER_MODES
-    ARMING: ClassVar[type[RoverArming]] = RoverArming
-    FAILSAFES: ClassVar[type[RoverFailsafes]] = RoverFailsafes
-    FENCE: ClassVar[type[RoverFence]] = RoverFence
-    MOTORS: ClassVar[type[RoverMotors]] = RoverMotors
-    JOYSTICK: ClassVar[type[RoverJoystick]] = RoverJoystick
+    ARMING: ClassVar[type[ArduPilotArming[Any]]] = RoverArming
+    FAILSAFES: ClassVar[type[ArduPilotFailsafes[Any]]] = RoverFailsafes
+    FENCE: ClassVar[type[ArduPilotFence[Any]]] = RoverFence
+    MOTORS: ClassVar[type[ArduPilotMotors]] = RoverMotors
+    JOYSTICK: ClassVar[type[ArduPilotJoystick]] = RoverJoystick
 
     def make_motion(self, wind: SimulatedWind | None) -> GroundMotion:
         """Create the motion model with the present limits; wind is reported but has no effect."""

@@ -140,7 +140,7 @@ class RoverAuto(RoverSubAuto):
     number: int = RoverMode.AUTO
     name = "AUTO"
 
-    vehicle: RoverHost
+    vehicle: RoverHost  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def default_speed(self) -> float:
         return self.vehicle.waypoint_speed

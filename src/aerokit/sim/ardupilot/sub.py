@@ -23,7 +23,7 @@ from aerokit.sim.ardupilot.commands import relative_heading
 from aerokit.sim.ardupilot.failsafes import ArduPilotArming, ArduPilotFailsafes
 from aerokit.sim.ardupilot.host import ArduPilotMode, ArduPilotMotors
 from aerokit.sim.ardupilot.kinds import Kind
-from aerokit.sim.ardupilot.radio import SubJoystick
+from aerokit.sim.ardupilot.radio import ArduPilotJoystick, SubJoystick
 from aerokit.sim.ardupilot.requests import DISPLAY_VALUES
 from aerokit.sim.ardupilot.rover_sub_base import GuidedSetpoints, GuidedTarget
 from aerokit.sim.ardupilot.sub_modes import SUB_MODES, SubAuto, SubGuided, SubHost
@@ -253,10 +253,10 @@ class SimulatedSub(SubHost):
     CAPABILITIES: ClassVar[int] = 0xF9E7
     BUILDERS: ClassVar[Builders] = BUILDERS_OF_KIND["sub"]
     MODES: ClassVar[tuple[Callable[[Any], ArduPilotMode], ...]] = SUB_MODES
-    ARMING: ClassVar[type[SubArming]] = SubArming
-    FAILSAFES: ClassVar[type[SubFailsafes]] = SubFailsafes
-    MOTORS: ClassVar[type[SubMotors]] = SubMotors
-    JOYSTICK: ClassVar[type[SubJoystick]] = SubJoystick
+    ARMING: ClassVar[type[ArduPilotArming[Any]]] = SubArming
+    FAILSAFES: ClassVar[type[ArduPilotFailsafes[Any]]] = SubFailsafes
+    MOTORS: ClassVar[type[ArduPilotMotors]] = SubMotors
+    JOYSTICK: ClassVar[type[ArduPilotJoystick]] = SubJoystick
 
     def make_motion(self, wind: SimulatedWind | None) -> UnderwaterMotion:
         """Create the motion model. SIM_BUOYANCY 1 lifts with 0.1 m/s; wind has no effect."""

@@ -119,7 +119,7 @@ class SubAuto(RoverSubAuto):
     number: int = SubMode.AUTO
     name = "AUTO"
 
-    vehicle: SubHost
+    vehicle: SubHost  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def default_speed(self) -> float:
         return self.vehicle.parameters["WPNAV_SPEED"] / 100.0

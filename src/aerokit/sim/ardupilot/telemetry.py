@@ -378,7 +378,7 @@ BUILDERS_OF_KIND: dict[Kind, Builders] = {
     "rover": {
         **_without(m.Wind.ID, m.TerrainReport.ID, m.TerrainRequest.ID, m.EscTelemetry1To4.ID, *_COPTER_TARGETS),
         m.ServoOutputRaw.ID: _rover_outputs,
-        m.RcChannelsScaled.ID: lambda rover: m.RcChannelsScaled(rover.time_boot_ms, *(0,) * 9, 255),
+        m.RcChannelsScaled.ID: lambda rover: m.RcChannelsScaled(rover.time_boot_ms, 0, 0, 0, 0, 0, 0, 0, 0, 0, 255),
         m.VfrHud.ID: _rover_hud,
         m.ExtendedSysState.ID: lambda _: m.ExtendedSysState(0, 0),
     },

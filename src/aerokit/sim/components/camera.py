@@ -291,7 +291,7 @@ class SimulatedCamera(CameraBody):
     def listen(self) -> None:
         """Serve files by MAVFTP and settings by PARAM_EXT."""
         serve_files(self, self.files)
-        self.parameters: CameraParameters = CameraParameters(self)
+        self.parameters: ExtendedParameters = CameraParameters(self)
 
     def commands(self) -> dict[int, CommandHandler]:
         return camera_commands(self)
