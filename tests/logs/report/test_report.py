@@ -320,6 +320,7 @@ def browse(chromium: str, target: Path, *options: str) -> str:
     ).stdout
 
 
+@pytest.mark.exhaustive
 def test_offline_browser_draws_all_charts(page: Page, chromium: str, tmp_path: Path) -> None:
     target = tmp_path / "page.html"
     target.write_text(page.html, encoding="utf-8")
@@ -341,6 +342,7 @@ setTimeout(function () {
 """
 
 
+@pytest.mark.exhaustive
 def test_timelines_zoom_together_in_browser(page: Page, chromium: str, tmp_path: Path) -> None:
     target = tmp_path / "page.html"
     html = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", page.html)
@@ -354,6 +356,7 @@ def test_timelines_zoom_together_in_browser(page: Page, chromium: str, tmp_path:
     assert set(ranges.values()) == {"20,30"}
 
 
+@pytest.mark.exhaustive
 def test_printed_report_has_few_pages(chromium: str, tmp_path: Path) -> None:
     """Also for a long log, because content that cannot be read on paper is not printed."""
     flight = read_flight(RECORDINGS / "ardupilot-copter.tlog")

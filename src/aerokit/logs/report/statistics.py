@@ -42,7 +42,7 @@ class FlightStatistics(Snapshot):
     end_distance_m: float | None
     """Distance from home at the end."""
     start_voltage_v: float | None
-    """Of the first battery, like the following."""
+    """First battery, as the following ones."""
     end_voltage_v: float | None
     min_voltage_v: float | None
     start_remaining_percent: float | None
