@@ -81,9 +81,9 @@ def integer(low: int, high: int, what: str) -> Callable[[str], int]:
     return parse
 
 
-count = integer(1, 250, "a number of vehicles")
-port = integer(0, 65535, "a port number")
-system_id = integer(1, 255, "a system id")
+count: Callable[[str], int] = integer(1, 250, "a number of vehicles")
+port: Callable[[str], int] = integer(0, 65535, "a port number")
+system_id: Callable[[str], int] = integer(1, 255, "a system id")
 
 
 def wind(text: str) -> tuple[float, ...]:

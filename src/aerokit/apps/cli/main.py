@@ -141,7 +141,7 @@ COMMANDS = (
 )
 
 
-GROUPS = {
+GROUPS: dict[str, tuple[str, ...]] = {
     "without a vehicle": ("sim", "demo", "doctor", "report", "convert", "completion"),
     "watch vehicles": ("status", "monitor", "serve", "events", "record"),
     "fly": ("fly", "mission", RUN),
