@@ -40,6 +40,7 @@ CLIENT_TIMEOUT_S = 30.0
 
 _MIN_BEACON_INTERVAL_S = 0.02
 _RIVAL_TIMEOUT_S = 2.5 * BEACON_INTERVAL_S
+_RIVAL_QUERY_TIMEOUT_S = 1.0
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
@@ -131,7 +132,7 @@ class ZenohListen(NetworkLink):
 
         self._zenoh = zenoh
         self._declared = [session.declare_subscriber(self._keys.beacon, on_beacon)]
-        self._has_others = any(True for _ in session.liveliness().get(self._keys.alive(), timeout=1.0))
+        self._has_others = any(True for _ in session.liveliness().get(self._keys.alive(), timeout=_RIVAL_QUERY_TIMEOUT_S))
 
     def _serve(self, queue: LoopQueue[Callable[[], object]]) -> None:
         zenoh, session, keys = self._zenoh, self._session, self._keys
