@@ -173,7 +173,7 @@ class Actions(SelectionBase):
                 while not condition(member):
                     vehicle.connection.raise_if_ended()
                     if vehicle.connection.now() >= deadline:
-                        missing = [each.name for each in self if each.is_available and not condition(each)]
+                        missing = [member.name for member in self if member.is_available and not condition(member)]
                         raise OperationTimeout(
                             f"{description}: not reached within {timeout:g} s by {', '.join(missing)}"
                         )

@@ -102,7 +102,7 @@ class Formation(Snapshot):
 
     def min_distance_m(self) -> float:
         """Return the smallest distance between any two places, including the leader's."""
-        places = [(each.north_m, each.east_m, each.up_m) for each in (Offset(), *self.offsets.values())]
+        places = [(offset.north_m, offset.east_m, offset.up_m) for offset in (Offset(), *self.offsets.values())]
         pairs = (math.dist(one, other) for number, one in enumerate(places) for other in places[:number])
         return min(pairs, default=math.inf)
 
@@ -173,7 +173,7 @@ class Following:
 
     def error_m(self, name: str) -> float:
         """Return the distance of a follower from its place in metres; infinite if unknown."""
-        member = next((each for each in self._followers if each.name == name), None)
+        member = next((follower for follower in self._followers if follower.name == name), None)
         try:
             return math.inf if member is None else math.hypot(*self._to_go(member))
         except (ValueUnknownError, OperationRejected):

@@ -169,7 +169,7 @@ def track_deviation(path: Path, samples: Sequence[tuple[float, LocalPoint]]) -> 
             moved += sum(v * v for v in velocity)
     if not errors:
         return TrackDeviation(math.nan, math.nan, None, 0)
-    rms = math.sqrt(sum(each * each for each in errors) / len(errors))
+    rms = math.sqrt(sum(error * error for error in errors) / len(errors))
     return TrackDeviation(max(errors), rms, along / moved if moved else None, len(errors))
 
 
@@ -349,8 +349,8 @@ class Shows(Travel):
             result = await self._run("show", fly, names=names)
         samples = {name: recorder.samples for name, recorder in recorders.items()}
         tracks = {name: track_deviation(path, samples[name]) for name, path in show.tracks.items()}
-        lags = [each.lag_s for each in tracks.values() if each.lag_s is not None]
-        offsets = {name: each for name, each in clocks.items() if isinstance(each, ClockOffset)}
+        lags = [track.lag_s for track in tracks.values() if track.lag_s is not None]
+        offsets = {name: offset for name, offset in clocks.items() if isinstance(offset, ClockOffset)}
         spread_s = max(lags) - min(lags) if lags else None
         relative_m = max_relative_error(show.tracks, samples, show.duration_s)
         return ShowReport(result, tracks, offsets, spread_s, relative_m)
