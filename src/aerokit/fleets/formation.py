@@ -41,7 +41,7 @@ __all__ = ["Following", "Formation", "Formations", "Offset", "follow_velocity"]
 
 LEADER_MAX_AGE_S = 1.5
 
-# Speed per metre of distance to the own place, in 1/s.
+# Speed per metre of distance to the member's place, in 1/s.
 FOLLOW_GAIN = 0.6
 
 
@@ -185,10 +185,10 @@ class Following:
         return self._reason
 
     def raise_if_stopped(self) -> None:
-        """Raise if following has stopped early. For loops in the block.
+        """Raise if following has stopped early. Call it in the loops of the block.
 
         Raises:
-            SetpointStreamStopped: it has stopped; the text has the reason.
+            SetpointStreamStopped: following has stopped; the text has the reason.
         """
         if self._reason:
             self._was_raised = True
@@ -224,8 +224,8 @@ class Following:
                 # Wait for the cancellation by `_stop_if_leader_lost`: leaving the stream then makes the vehicle hold.
                 await asyncio.Event().wait()
         finally:
-            # Soon rather than at the end of the action: the policy may still land the others. Not now: the action has
-            # yet to record the failure.
+            # Deferred, because the action has yet to record the failure, but not until the end of the action: the
+            # policy may still land the others.
             asyncio.get_running_loop().call_soon(self._stop_if_no_followers)
 
     def _stop_if_no_followers(self) -> None:

@@ -1,4 +1,4 @@
-"""Failure policies: what the other members do when one fails. Without IO."""
+"""Failure policies: orders to the other members when one member fails. Without IO."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class PolicyRules:
         self._policy, self._of_groups = policy, dict(of_groups)
 
     def decide(self, failure: MemberFailure) -> dict[str, PolicyOrder]:
-        """Return the order for each of the others; members that are missing in it continue.
+        """Return the order for each of the others; members without an order continue.
 
         Raises:
             InvalidArgument: the policy function returned something else, or a name that is not among the others.

@@ -49,7 +49,7 @@ class Deconfliction(Snapshot):
 
     - ``"clear"``: no conflicts;
     - ``"layers"``: all climb to ``heights_m``, cross there, and descend after all have crossed;
-    - ``"corridors"``: each starts after ``delays_s``;
+    - ``"corridors"``: each vehicle starts after its delay in ``delays_s``;
     - ``"refused"``: the conflicts cannot be resolved.
 
     ``conflicts`` are those of the original paths. Heights are metres above sea level.
@@ -67,7 +67,7 @@ def find_conflicts(paths: Sequence[Path], min_distance_m: float, *, slack_s: flo
     """Return all pairs of paths that come closer than ``min_distance_m``.
 
     Args:
-        paths: of the vehicles.
+        paths: paths of the vehicles.
         min_distance_m: metres.
         slack_s: how early or late one vehicle may be relative to another, in seconds; infinite: ignore times.
     """
@@ -94,8 +94,8 @@ def separate_by_altitude(
     so only movements of the same phase have to be separated.
 
     Args:
-        routes: of the moving vehicles.
-        stationary: positions of the others, on the ground or in the air.
+        routes: routes of the moving vehicles.
+        stationary: positions of the other vehicles, on the ground or in the air.
         min_distance_m: minimum distance in metres, also between layers.
         max_altitude_m: highest layer in metres above sea level.
     """
@@ -138,8 +138,8 @@ def separate_by_time(
     """Separate conflicting routes by time.
 
     Args:
-        routes: of the moving vehicles.
-        stationary: positions of the others.
+        routes: routes of the moving vehicles.
+        stationary: positions of the other vehicles.
         min_distance_m: minimum distance in metres.
         speed_m_s: ground speed of all moving vehicles.
         slack_s: how early or late one vehicle may be relative to another, in seconds.

@@ -67,7 +67,7 @@ class Show(Snapshot):
         """
         missing = [name for name in self.tracks if name not in names]
         if missing or len(set(names.values())) < len(self.tracks):
-            raise InvalidArgument(f"names: {missing or 'one member for two tracks'}: each track needs its own member")
+            raise InvalidArgument(f"names: {f'no member for {missing}' if missing else 'one member for two tracks'}")
         return type(self)({names[name]: track.replace(name=names[name]) for name, track in self.tracks.items()})
 
     @classmethod
@@ -158,7 +158,7 @@ class Show(Snapshot):
     def _check(self) -> None:
         object.__setattr__(self, "tracks", dict(self.tracks))
         if not self.tracks:
-            raise InvalidArgument("tracks: a show needs at least one")
+            raise InvalidArgument("tracks is empty: a show needs at least one track")
         for name, track in self.tracks.items():
             if not isinstance(track, Path) or track.begins_at_s < 0:
                 raise InvalidArgument(f"tracks: {name!r} needs a Path that begins at 0 s or later")

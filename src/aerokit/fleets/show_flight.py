@@ -48,7 +48,7 @@ __all__ = [
 # Correction speed per metre of deviation from the track, in 1/s.
 TRACK_GAIN = 0.8
 
-# Speed limit while catching up: this factor of the track's speed, plus this many m/s.
+# Speed limit while catching up: the track's speed times this factor, plus this many m/s.
 CATCH_UP_FACTOR, CATCH_UP_M_S = 1.5, 1.0
 
 CONFLICT_SLACK_S = 0.5
@@ -140,7 +140,7 @@ class TrackDeviation(Snapshot):
 
 
 class ShowReport(Snapshot):
-    """Result of a show. Times are of the vehicles' own clocks, converted with ``clocks``.
+    """Result of a show. Times are from the vehicles' own clocks, converted with ``clocks``.
 
     ``lag_spread_s`` is the difference between the largest and the smallest lag. ``max_relative_error_m`` is the largest
     error of the vector between any two members. Both are None if unknown.
@@ -154,7 +154,7 @@ class ShowReport(Snapshot):
 
 
 def track_deviation(path: Path, samples: Sequence[tuple[float, LocalPoint]]) -> TrackDeviation:
-    """Compare positions, given with seconds of the show, with a path.
+    """Compare a path with measured positions, each with its time in seconds of the show.
 
     The lag is the time shift of the path that fits the samples best (least squares along the track).
     """

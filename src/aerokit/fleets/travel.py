@@ -1,4 +1,4 @@
-"""``Travel`` and ``Missions``: flying members to targets and missions on paths that are compared before."""
+"""``Travel`` and ``Missions``: flights to targets and missions, on paths that are compared before the flight."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ class Travel(SelectionBase):
         A fleet with a ``min_distance_m`` compares the paths first, and separates crossing paths by altitude.
 
         Args:
-            targets: member's name → target; other members stay where they are. Or a function that returns a member's
-                target.
+            targets: member's name → target, where other members stay where they are; or a function that returns a
+                member's target.
             speed_m_s: ground speed; None: unchanged.
             max_distance_m: reject targets farther than this from the vehicle.
             timeout: seconds for each member and leg; None: no limit.

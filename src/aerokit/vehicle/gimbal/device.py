@@ -74,7 +74,7 @@ class GimbalInformation(Snapshot):
 
     @property
     def has_neutral(self) -> bool:
-        """True if it has a neutral position."""
+        """True if the gimbal has a neutral position."""
         return self.can(Can.HAS_NEUTRAL)
 
     @property

@@ -247,7 +247,7 @@ class Gimbal(ReadOnly, PointingMixin, RoiMixin):
         valid_for_s: float = 1.0,
         max_lag_s: float = 0.5,
     ) -> GimbalRates:
-        """Turn it at rates for the duration of an ``async with`` block that feeds them; see :class:`GimbalRates`.
+        """Turn the gimbal at rates during an ``async with`` block that feeds them; see :class:`GimbalRates`.
 
         Args:
             pitch_deg_s: the first rate in degrees per second, −720 to 720; positive is up.

@@ -211,7 +211,7 @@ class PointingMixin(GimbalMixin):
         tolerance_deg: float = 3.0,
         timeout: float = 10.0,
     ) -> None:
-        """Point it at angles; returns when it reports that it points there.
+        """Point the gimbal at angles; returns when it reports these angles.
 
         Args:
             pitch_deg: from the horizon, −360 to 360: 0 is level, −90 straight down.

@@ -136,7 +136,7 @@ class Parameters(ReadOnly):
     async def get(
         self, name: str, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None
     ) -> int | float:
-        """Request one value; for arguments and errors see :meth:`read`."""
+        """Request one value from the vehicle; for arguments and errors see :meth:`read`."""
         return (await self.read(name, idle_timeout_s=idle_timeout_s, timeout=timeout)).value
 
     async def read(
