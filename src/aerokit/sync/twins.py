@@ -386,9 +386,9 @@ class SetpointStream(StreamTwin[SetpointT]):
     """Sends the latest set-point at a fixed rate while the ``async with`` block supplies set-points.
 
     Entering the block changes to the set-point mode (GUIDED, OFFBOARD) with the initial set-point. Leaving it in any
-    way tells the vehicle to hold. If the stream stops by itself, ``set`` and leaving the block raise
-    :class:`SetpointStreamStopped`; a vehicle that does not move for twelve seconds although it should stops it as
-    well. If it stopped because a pilot or a failsafe changed the mode, nothing more is sent to the vehicle.
+    way makes the vehicle hold. The stream stops by itself for the reasons above, and if the vehicle should move but
+    stays in place for twelve seconds; then ``set`` and leaving the block raise :class:`SetpointStreamStopped`. After a
+    pilot or a failsafe has changed the mode, nothing more is sent to the vehicle.
     """
 
     @property
@@ -419,8 +419,8 @@ class Guided(TwinOf["AsyncGuided"]):
 
     Every stream takes ``rate_hz`` (transmission rate of the latest set-point, 2 to 100), ``valid_for_s`` (how long a
     set-point may be resent without a new one) and ``max_lag_s`` (how late the event loop may be). NotSupported is
-    raised for a kind that this type of vehicle does not obey. Rates and seconds are in real time: a simulation at ten
-    times the speed needs ten times the rate.
+    raised for a kind that this type of vehicle does not support. Rates and seconds are in real time: a simulation at
+    ten times the speed needs ten times the rate.
     """
 
     def velocity(
@@ -915,7 +915,7 @@ class Gimbals(GimbalsTwin["Gimbal"]):
 
 
 class PostedOrder(TwinOf["AsyncPostedOrder"]):
-    """An order that need not be waited for; created by :meth:`aerokit.Vehicle.posted`."""
+    """An order whose effect need not be awaited; created by :meth:`aerokit.Vehicle.posted`."""
 
     @property
     def end(self) -> str:
@@ -2780,7 +2780,7 @@ class Vehicle(VehicleTwin):
 
     @cached_property
     def local_position(self) -> StateCell[LocalPosition]:
-        """Metres and m/s north, east, down of the estimator's origin (LOCAL_POSITION_NED)."""
+        """Position in metres and velocity in m/s, north, east, down from the local origin (LOCAL_POSITION_NED)."""
         return StateCell(self._loop, self.aio.local_position)
 
     @cached_property
@@ -2800,7 +2800,7 @@ class Vehicle(VehicleTwin):
 
     @cached_property
     def throttle_percent(self) -> StateCell[float]:
-        """Throttle, 0 to 100 (VFR_HUD)."""
+        """Throttle in percent (VFR_HUD)."""
         return StateCell(self._loop, self.aio.throttle_percent)
 
     @cached_property
@@ -2939,7 +2939,7 @@ class Vehicle(VehicleTwin):
 
         Args:
             command: the number, or a member of ``enums.MavCmd``.
-            params: param1 to param7; missing ones are 0, NaN where the command allows it.
+            params: param1 to param7; missing ones are 0, or NaN where the command allows it.
             component_id: the target component instead of the autopilot; 0: all components, and the autopilot's ack
                 counts.
             retries: how often it is sent again without an ack, from 0; ``confirmation`` increments each time. A
@@ -2985,8 +2985,8 @@ class Vehicle(VehicleTwin):
         """Send any MAV_CMD as COMMAND_INT: param1 to param4, ``x``, ``y``, ``z`` in ``frame`` (MAV_FRAME).
 
         ``x`` and ``y`` are latitude and longitude in 1e-7 degrees, or 1e-4 m in local frames; ``z`` is in metres.
-        With ``or_long``, firmware that does not support it as COMMAND_INT gets a COMMAND_LONG with degrees, in frame
-        0 only. All else as for :meth:`command`.
+        With ``or_long``, firmware that does not support the command as COMMAND_INT gets a COMMAND_LONG with degrees;
+        this requires frame 0. All else as for :meth:`command`.
         """
         return self._loop.run(
             self.aio.command_int,
@@ -3007,8 +3007,8 @@ class Vehicle(VehicleTwin):
     def send(self, message: Message) -> None:
         """Send one message unchanged, once; never blocks. The caller sets its ``target_system``.
 
-        A steering command (as by :meth:`command`) and SET_MODE are newer orders and end those of actions. A set-point
-        supersedes what was :meth:`posted` about motion. Messages to another system do neither.
+        A steering command and SET_MODE are orders and end the action in progress, as with :meth:`command`. A set-point
+        supersedes :meth:`posted` orders about motion. Messages to another system do neither.
 
         Raises:
             InvalidArgument: a field is out of range; nothing was sent.
@@ -3031,9 +3031,9 @@ class Vehicle(VehicleTwin):
         """Open an order without waiting for its effect, so that mode, arming and take-off can be sent in one go.
 
         Within the block its commands are sent again right after a HEARTBEAT until they are acknowledged or their
-        effect is reported. They are not sent again after a newer order about the same subject, after a mode that
-        neither this order nor one of the last ten seconds explains, or, for orders about motion, after disarming. An
-        abandoned order does not make the vehicle hold, and late arming is not monitored; use the actions for that.
+        effect is reported. Retries end with a newer order about the same subject, with a mode that neither this order
+        nor an order of the last ten seconds explains and, for orders about motion, with disarming. An abandoned order
+        does not make the vehicle hold, and late arming is not monitored; use the actions for that.
 
         Args:
             subjects: ``"mode"``, ``"motion"`` or ``"arm"``; the first one is what the order is about, and it also
@@ -3076,10 +3076,10 @@ class Vehicle(VehicleTwin):
     def streams(self, rate_hz: float) -> AbstractContextManager[None]:
         """Request all streams of the vehicle at ``rate_hz`` for the duration of the ``with`` block.
 
-        For recordings, ground stations, and firmware without rates of single messages. ArduPilot is asked by
+        For recordings, ground stations, and firmware without rates of single messages. ArduPilot receives
         REQUEST_DATA_STREAM (whole Hz, at least 1), again after a reboot or a silence and while nothing arrives; it
-        continues to stream afterwards. Other autopilots stream by themselves; missing common states are requested as
-        by :meth:`rate`.
+        continues to stream after the block. Other autopilots stream by themselves; missing common states are requested
+        as by :meth:`rate`.
 
         Raises:
             InvalidArgument: the rate is not above 0 and at most 1000. Nothing was sent.
@@ -3171,7 +3171,7 @@ class Vehicle(VehicleTwin):
     def hold(self) -> None:
         """Stop and stay (a fixed wing circles); returns when HEARTBEAT reports the autopilot's mode for that.
 
-        Copter BRAKE, Plane LOITER, Rover HOLD (a boat LOITER), Sub POSHOLD; PX4 LOITER where it comes to a stop.
+        The mode is BRAKE on Copter, LOITER on Plane and boats, HOLD on Rover, POSHOLD on Sub and LOITER on PX4.
 
         Raises:
             NotSupported: this vehicle has no mode for it. Nothing was sent.
@@ -3241,15 +3241,15 @@ class Vehicle(VehicleTwin):
         """Arm the motors and wait until HEARTBEAT reports armed: **propellers may start to turn**.
 
         If the present mode does not allow arming (RTL or LAND after a flight, OFFBOARD), the mode is changed first.
-        The command is sent once, because a HEARTBEAT that reports disarmed may mean that a pilot has disarmed since.
-        After a cancellation, or an error other than a refusal, the command may still be executed. The vehicle is
-        therefore monitored for 15 seconds and disarmed if this command arms it (it accepts the command, or is armed
-        at the next HEARTBEAT and there was no takeover), as long as the connection is open. Logger "aerokit" warns
-        about the outcome, and about an arming that cannot be attributed to this command, which is left alone.
+        The command is sent once: a HEARTBEAT that reports disarmed may mean that a pilot has disarmed the vehicle.
+        After a cancellation, or an error other than a refusal, the command may still be executed. aerokit therefore
+        monitors the vehicle for 15 seconds, as long as the connection is open. It disarms the vehicle if this command
+        arms it: the vehicle accepts the command, or reports armed in the next HEARTBEAT without a takeover. An arming
+        that cannot be attributed to this command is left alone. Logger "aerokit" warns about the outcome.
 
         Args:
-            mode: the mode to arm in; None: the present mode, or one that ``take_off`` starts in if that does not
-                allow it.
+            mode: the mode to arm in. None: the present mode, or one that ``take_off`` starts in if the present mode
+                does not allow arming.
             force: skip the vehicle's own arming checks. Dangerous.
             timeout: seconds for HEARTBEAT to report armed after the command was accepted.
             max_silence_s: raise when no heartbeat was received for this long; None: wait until ``timeout``.
@@ -3258,7 +3258,8 @@ class Vehicle(VehicleTwin):
             InvalidArgument: there is no such mode, or it does not allow arming. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has its pre-arm texts, failing sensors and missing
                 estimates. Where the vehicle can run its checks on request, they are run again for this.
-            CommandTimeout: there was no acknowledgement, and it did not arm; the text says whether it may still arm.
+            CommandTimeout: there was no acknowledgement, and the vehicle did not arm; the text says whether it may
+                still arm.
             OperationRejected: it is armed already in a mode other than ``mode`` (nothing was sent), or another party
                 disarmed it or changed its mode meanwhile.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
@@ -3289,23 +3290,23 @@ class Vehicle(VehicleTwin):
         self._loop.run(self.aio.disarm, force=force, timeout=timeout, max_silence_s=max_silence_s)
 
     def reboot(self, *, force: bool = False, timeout: float = 60.0) -> None:
-        """Reboot the autopilot and wait until it is back: its time since boot has restarted.
+        """Reboot the autopilot and wait until its time since boot has restarted.
 
         Args:
             force: reboot while armed as well: **a flying vehicle falls**.
-            timeout: seconds until it is back.
+            timeout: seconds until the vehicle has restarted.
 
         Raises:
             OperationRejected: it is armed, or not known to be disarmed. Nothing was sent.
             CommandRejected: it refused.
             CommandTimeout: there was no acknowledgement, and it did not reboot.
             LinkLost: the link went down with the vehicle (USB, TCP); connect again.
-            OperationTimeout: it did not come back.
+            OperationTimeout: it did not restart in time.
         """
         self._loop.run(self.aio.reboot, force=force, timeout=timeout)
 
     def look_at(self, target: Position) -> None:
-        """Point nose or gimbal at a place, until :meth:`stop_looking`; without an altitude, at the vehicle's own.
+        """Point nose or gimbal at a place until :meth:`stop_looking`; without an altitude, at the vehicle's altitude.
 
         Sends MAV_CMD_DO_SET_ROI_LOCATION (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_ROI_LOCATION), or
         MAV_CMD_DO_SET_ROI to old firmware.
@@ -3341,9 +3342,9 @@ class Vehicle(VehicleTwin):
     ) -> None:
         """Fly to a place and return on arrival.
 
-        After a cancellation, a time-out or a silence the vehicle is told to hold where it is, unless another order
-        was given meanwhile or another party changed the mode. A silent vehicle is told to hold when it is received
-        again, if it is still on its way then. Sends MAV_CMD_DO_REPOSITION
+        After a cancellation, a time-out or a silence, aerokit orders the vehicle to hold where it is, unless another
+        order was given meanwhile or another party changed the mode. After a silence it waits for the next heartbeat,
+        and orders the hold if the vehicle is still on its way. Sends MAV_CMD_DO_REPOSITION
         (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_REPOSITION), or SET_POSITION_TARGET_GLOBAL_INT to a
         vehicle that does not support it.
 
@@ -3401,8 +3402,8 @@ class Vehicle(VehicleTwin):
     ) -> None:
         """Turn on the spot and return when the vehicle has this heading.
 
-        ArduPilot: MAV_CMD_CONDITION_YAW in GUIDED, which is set first. PX4 has no such command and stops to turn:
-        MAV_CMD_DO_REPOSITION.
+        ArduPilot: changes to GUIDED and sends MAV_CMD_CONDITION_YAW. PX4 has no such command: the vehicle stops and
+            turns by MAV_CMD_DO_REPOSITION.
 
         Args:
             heading_deg: −360 to 360, clockwise from north; with ``relative`` an angle to turn by, negative to the
@@ -3465,12 +3466,12 @@ class Vehicle(VehicleTwin):
     ) -> None:
         """Take off and climb to ``altitude_m`` above home; returns at that altitude.
 
-        The vehicle must be armed. Its mode is changed if the autopilot needs that. After a cancellation or a time-out
-        the vehicle is told to hold where it is.
+        The vehicle must be armed. Its mode is changed if the autopilot needs that. After a cancellation or a time-out,
+        aerokit orders the vehicle to hold where it is.
 
         Args:
             altitude_m: metres above home, above 0, at most 10,000.
-            timeout: seconds until it is there.
+            timeout: seconds until the vehicle is at that altitude.
             max_silence_s: raise when no heartbeat was received for this long; None: wait until ``timeout``.
 
         Raises:
@@ -3515,7 +3516,7 @@ class Vehicle(VehicleTwin):
     def components(self) -> StateCell[tuple[ComponentStatus, ...]]:
         """The components seen on board: autopilot, cameras, gimbals, companion computers, receivers and others.
 
-        Cameras and gimbals without a component id of their own appear after their first message.
+        Cameras and gimbals without their own component id appear after their first message.
         """
         return self._part("components", StateCell)
 
@@ -3531,9 +3532,9 @@ class Vehicle(VehicleTwin):
 
     @property
     def camera(self) -> Camera:
-        """The first camera found. One with a component id of its own comes before those behind the autopilot.
+        """The first camera found. A camera with its own component id takes precedence over those behind the autopilot.
 
-        Its calls wait briefly until a camera is found; ``camera_at`` returns any other one.
+        Its calls wait briefly until a camera is found. ``camera_at`` returns any other camera.
         """
         return self._part("camera", Camera)
 
@@ -3606,13 +3607,13 @@ class Vehicle(VehicleTwin):
         """Install a signing key on the vehicle and sign all traffic with it from then on; None removes the key.
 
         **The key is sent unencrypted**: do this over a cable or a private link. Returns when the vehicle's frames
-        are signed with the key (None: when they are no longer signed). Until then the previous setting remains
-        active. Every other vehicle on this connection needs the key too, or ``signing.allow_unsigned``. After a
+        active. Every other vehicle on this connection needs the key too, or ``signing.allow_unsigned``. The vehicle may
+        accept the key even if the call is cancelled. See docs/signing.md.
         cancellation the vehicle may have accepted the key nevertheless. See docs/signing.md.
 
         Args:
             signing: the key, as for ``connect(signing=…)``.
-            timeout: seconds until the vehicle must use it.
+            timeout: seconds until the vehicle must use the key.
 
         Raises:
             NotSupported: this program or the vehicle uses MAVLink 1, which has no signatures. Nothing was sent.
@@ -3720,25 +3721,25 @@ def connect(
     Args:
         address: ``"udpin:0.0.0.0:14550"``, ``"tcp:127.0.0.1:5760"``, ``"/dev/ttyACM0,57600"``, a ``.tlog`` file …; a
             link; several of these that lead to the same vehicle (docs/how-to/several-links.md); or an open
-            connection, to use several vehicles on one link: the arguments after ``rates`` then belong to the call
-            that opened it.
+                connection, to use several vehicles on one link. For an open connection, pass the arguments after
+                ``rates`` to ``open_connection`` instead.
         system_id: the vehicle's MAVLink system id, 1–255; None takes the first autopilot found.
         timeout: seconds to wait for its first heartbeat, above 0.
         rates: message class → Hz (above 0, at most 1000), requested instead of the default rates; ``{}`` requests
             nothing.
         source_system: our own system id.
-        source_component: our own component id, 0–255. 0 is not a valid component id; some old programs send it.
+        source_component: our own component id, 0–255. 0 is not a valid component id, but some old programs use it.
         baud: baud rate of a serial link whose address has none.
         dialect: the message definitions to use.
         mavlink_version: version of the frames we send, 1 or 2.
         signing: signs everything we send, and rejects frames that are not signed with its key (docs/signing.md).
             None: no signatures.
         record: a ``.tlog`` file that receives all traffic in both directions; an existing file is replaced.
-        reconnect: reopen a lost link until it is back, instead of ending the connection.
+        reconnect: reopen a lost link, with as many attempts as it needs, instead of ending the connection.
         peers: accept datagrams and connections only from these IP addresses and networks: ``"10.0.0.7"``,
             ``["10.0.0.0/24"]``. For links with an open port: udpin, udpbcast, tcpin. None: accept all.
         may_move: accept a silent vehicle from a new IP address even if its sequence numbers and time since boot do
-            not continue (it rebooted and has a new address). Otherwise that address is refused
+            not continue, as after a reboot with a new address. By default such an address is refused
             (``RouteChangeRefused``), because it may belong to another sender.
         heartbeat: contents and condition of our own HEARTBEAT. None: no heartbeat is sent, and the vehicle sees no
             ground station: PX4 then sends no status texts, and a ``udpout:`` link stays silent.

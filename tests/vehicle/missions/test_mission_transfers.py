@@ -178,7 +178,7 @@ async def test_rejected_upload_names_item_and_remains(opened: Any, method: Any) 
             await flight.vehicle.mission.upload(bad, method=method)
         assert (caught.value.item, caught.value.result) == (17, Result.UNSUPPORTED)
         keeps = opened is open_px4
-        assert ("still holds its previous items" in str(caught.value)) == keeps
+        assert ("still has its previous items" in str(caught.value)) == keeps
         assert holds(flight, long_mission(30)) == keeps
         await flight.vehicle.mission.upload(long_mission(30))  # it was not recorded as uploaded
         assert holds(flight, long_mission(30))
@@ -189,7 +189,7 @@ async def test_rejected_partial_upload() -> None:
         await flight.vehicle.mission.upload(long_mission(30))
         items = list(long_mission(30))
         items[7] = UNKNOWN
-        with pytest.raises(MissionRejected, match=r"item 7.*still holds its previous items") as caught:
+        with pytest.raises(MissionRejected, match=r"item 7.*still has its previous items") as caught:
             await flight.vehicle.mission.upload(Mission(items))
         assert caught.value.item == 7
         assert holds(flight, long_mission(30))
