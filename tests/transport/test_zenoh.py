@@ -169,7 +169,7 @@ async def test_orders_held_back_by_broken_connection_are_refused() -> None:
             line.release()
             await eventually(lambda: vehicle.late_datagrams >= written - 1)
             assert recorder.data == before  # not one of them
-            await eventually(lambda: ("COMMAND_LONG", "it came too late", None) in client_recorder.refused)
+            await eventually(lambda: ("COMMAND_LONG", "it arrived too late", None) in client_recorder.refused)
             assert set(client_recorder.answers) == {()}
 
             def goes_through() -> bool:
