@@ -177,7 +177,7 @@ async def test_orders_held_back_by_broken_connection_are_refused() -> None:
             await asyncio.sleep(0.5)  # until the youngest of them is too old: its stamp is one period older than it
             line.release()
             await eventually(lambda: vehicle.late_datagrams >= late + written - 1)
-            await eventually(lambda: ("COMMAND_LONG", "it came too late", None) in client_recorder.refused)
+            await eventually(lambda: ("COMMAND_LONG", "it arrived too late", None) in client_recorder.refused)
             assert set(client_recorder.answers) == {()}
             recorder.pieces = [piece for piece in recorder.pieces if piece != (fresh, "ground")]
             assert recorder.pieces == []  # not one of them

@@ -172,7 +172,7 @@ def test_setpoint_notices_are_limited_and_counted() -> None:
 def test_late_orders_are_refused_without_answer() -> None:
     client = ClientFilter("one", ControlLease())
     (notice,) = client.refuse_late(send(ARM) + send(HEARTBEAT), 0.0)
-    assert (notice.message, notice.reason, notice.answer) == ("COMMAND_LONG", "it came too late", b"")
+    assert (notice.message, notice.reason, notice.answer) == ("COMMAND_LONG", "it arrived too late", b"")
     assert client.refused == 2
 
 

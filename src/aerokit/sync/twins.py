@@ -161,8 +161,8 @@ class StateCell(CellTwin[T]):
     """The latest value of one telemetry item: read it, check its age, wait for it, iterate over its changes.
 
     Reading never sends anything. ``clock`` returns seconds (event loop time); ``waits_for`` names the source messages
-    in error texts. A cell belongs to one event loop and its thread. Other threads may read it (values are never torn,
-    and ages never too small), but must not wait or write.
+    in error texts. A cell belongs to one event loop and its thread. Other threads may read it (they never get a
+    half-written value or an age that is too small), but must not wait or write.
     """
 
     @property
@@ -253,8 +253,8 @@ class StateCell(CellTwin[T]):
 class Changes(ChangesTwin[T]):
     """Endless asynchronous iterator over the values of a cell.
 
-    Raises the error that the cell was closed with. Until the iterator is garbage-collected, every received message of
-    the cell is decoded.
+    Iteration raises the error with which the cell was closed. While the iterator exists, every received message of the
+    cell is decoded.
     """
 
     @property
@@ -290,7 +290,7 @@ class Subscription(SubscriptionTwin[ItemT]):
         return self._loop.call(self.aio.get_nowait)
 
     def close(self, error: Exception | None = None) -> None:
-        """Stop taking items. A waiting reader gets ``error``, or the end of the iteration if there is none."""
+        """Stop taking items. A waiting reader raises ``error``; without an error, its iteration ends."""
         self._loop.call(self.aio.close, error)
 
 
@@ -298,8 +298,8 @@ class Connection(ConnectionTwin):
     """One MAVLink node (system id, component id) on one link.
 
     Received bytes enter through ``bytes_received``, are checked by one framer per remote peer, and go to ``bus``.
-    ``send`` writes a message to the peer behind which its target was last received; :class:`Routes` decides which
-    peer that is, and when it may change (``may_move``). Everything runs on the event loop's thread.
+    ``send`` writes a message to the peer from which its target was last received; :class:`Routes` stores that peer
+    and decides when it may change (``may_move``). Everything runs on the event loop's thread.
     """
 
     @cached_property
@@ -319,9 +319,9 @@ class Connection(ConnectionTwin):
     def send(self, message: Message, *, to: int | None = None) -> None:
         """Number, frame and write a message. Never blocks.
 
-        It goes to the peer behind which its ``target_component`` of system ``to`` (None: its ``target_system``) was
-        last received; if it names no component, to every peer with components of that system; if its target is
-        broadcast or unknown, to every peer.
+        A message for one component goes to the peer from which that component was last received. A message for a
+        whole system goes to every peer with components of that system, and a message for all or for an unknown target
+        goes to every peer. ``to`` is the system id of the target; None: the message's ``target_system``.
 
         Raises:
             InvalidArgument: a field is out of range; nothing was sent.
@@ -339,7 +339,7 @@ class Connection(ConnectionTwin):
         """Number of written bytes that have not left this machine, if the link can measure it.
 
         A value that stays above 0 means that the link does not drain (TCP without a network, a serial port with flow
-        control asserted): :class:`LinkStalled`. Always 0 for UDP.
+        control asserted); see :class:`LinkStalled`. Always 0 for UDP.
         """
         return self._loop.call(lambda: self.aio.unsent_bytes)
 
