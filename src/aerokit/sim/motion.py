@@ -32,8 +32,8 @@ class GlobalPoint(NamedTuple):
 class LocalFrame:
     """Conversion between global positions and metres north, east and down of an origin.
 
-  Accurate within a few kilometres, like the autopilots' own local frames.
-  """
+    Accurate within a few kilometres, like the autopilots' own local frames.
+    """
 
     __slots__ = ("_east_scale", "origin")
 

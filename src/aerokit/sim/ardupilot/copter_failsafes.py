@@ -273,8 +273,8 @@ _FENCE_ACTIONS: dict[int, tuple[int, ...]] = {
 class CopterFence(ArduPilotFence[CopterHost]):
     """Fence. FENCE_ACTION: report only (0), RTL (1), LAND (2), SMART_RTL (3, 5), BRAKE (4).
 
-  It changes to LAND instead if the mode is refused, or more than 100 m outside the fence.
-  """
+    It changes to LAND instead if the mode is refused, or more than 100 m outside the fence.
+    """
 
     PERIOD_S: ClassVar[float] = 0.1
     CHECKS_DISARMED: ClassVar[bool] = True

@@ -193,8 +193,8 @@ _STABILIZE_CLIMB_M_S = 6.0
 class CopterPilotedMode(CopterModeBase):
     """Base of the piloted modes: sticks control the attitude, the altitude is held.
 
-  Stick positions come from RC_CHANNELS_OVERRIDE, or from the test (``copter.rc``).
-  """
+    Stick positions come from RC_CHANNELS_OVERRIDE, or from the test (``copter.rc``).
+    """
 
     takes_off: bool = True
     """True if the mode supports take-off by command."""

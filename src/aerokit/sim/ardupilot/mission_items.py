@@ -143,8 +143,8 @@ def _kept_place(item: MissionItem) -> tuple[float, float, float, int] | int:
 def _kept_turns(item: MissionItem) -> tuple[float, float, float, float]:
     """Return params 1 to 4 of NAV_LOITER_TURNS. Turns and radius have one byte each.
 
-  Less than one turn is stored in 256ths, a radius above 255 m in tens of metres.
-  """
+    Less than one turn is stored in 256ths, a radius above 255 m in tens of metres.
+    """
     turns, radius = item.param1, abs(item.param3)
     is_part = 0 < turns < 1
     count = int(min(255.0, turns * 256 if is_part else turns)) & 0xFF

@@ -179,8 +179,8 @@ class ArduPilotMissionServer:
     def _is_current(self, item: MissionItem, mission_type: int) -> bool:
         """Return True if the firmware marks the item as current.
 
-  The firmware compares the item's command, instead of its index, with the index of the current item.
-  """
+        The firmware compares the item's command, instead of its index, with the index of the current item.
+        """
         return mission_type == MavMissionType.MISSION and item.command == self._vehicle.mission.nav_index
 
     def _on_count(self, count: m.MissionCount, channel: Channel) -> None:
