@@ -37,7 +37,7 @@ class StoredCommand(NamedTuple):
     name: str
     """Name in status texts; empty if a mission cannot contain the command."""
     parameters: str
-    """Storage types of params 1 to 4, and of x, y, z unless they are a position; see `_CONVERSIONS`. Empty: unsupported."""
+    """Storage types of params 1 to 4, and of x, y, z without a position; see `_CONVERSIONS`. Empty: unsupported."""
     has_place: bool
     """True if ``x``, ``y`` and ``z`` are a position."""
 
