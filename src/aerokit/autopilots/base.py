@@ -385,4 +385,6 @@ class Autopilot:
         """Return False if this autopilot is known not to send the message."""
         return message.NAME not in self.unsupported_messages
 
+    unsupported_commands: frozenset[int] = frozenset()
+    """MAV_CMDs without a handler in the firmware. Actions that need one raise NotSupported before anything is sent."""
     unsupported_messages: frozenset[str] = frozenset()
