@@ -393,7 +393,7 @@ class SetpointStream(StreamTwin[SetpointT]):
 
     @property
     def is_running(self) -> bool:
-        """True while set-points are being sent."""
+        """True while values are being sent."""
         return self.aio.is_running
 
     def set(self, setpoint: SetpointT) -> None:

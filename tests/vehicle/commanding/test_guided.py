@@ -394,7 +394,7 @@ async def test_setpoint_stream_outside_block_or_reused_raises(flying: Flight) ->
 
 BAD: list[Callable[[Any], object]] = [
     lambda guided: guided.velocity(rate_hz=1.0),
-    lambda guided: guided.velocity(rate_hz=101.0),
+    lambda guided: guided.velocity(rate_hz=401.0),
     lambda guided: guided.velocity(rate_hz=math.nan),
     lambda guided: guided.velocity(valid_for_s=0.0),
     lambda guided: guided.velocity(valid_for_s=math.inf),
