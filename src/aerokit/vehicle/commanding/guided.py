@@ -15,11 +15,14 @@ from aerokit._internal.arguments import check_kind, checks_arguments
 from aerokit.errors import NotSupported
 from aerokit.vehicle.commanding.setpoints import (
     AccelerationSetpoint,
+    ActuatorSetpoint,
+    AttitudeRateSetpoint,
     AttitudeSetpoint,
     BodyVelocitySetpoint,
     LocalPositionSetpoint,
     PositionSetpoint,
     SetpointEncoder,
+    TrajectorySetpoint,
     VelocitySetpoint,
     wants_motion,
 )
@@ -45,7 +48,7 @@ INITIAL_REPEATS, REPEAT_INTERVAL_S = 3, 5.0
 class Guided:
     """Opens set-point streams: ``async with vehicle.guided.velocity() as stream: stream.set(...)``.
 
-    Every stream takes ``rate_hz`` (transmission rate of the latest set-point, 2 to 100), ``valid_for_s`` (how long a
+    Every stream takes ``rate_hz`` (transmission rate of the latest set-point, 2 to 400), ``valid_for_s`` (how long a
     set-point may be resent without a new one) and ``max_lag_s`` (how late the event loop may be). NotSupported is
     raised for a kind that this type of vehicle does not obey. Rates and seconds are in real time: a simulation at ten
     times the speed needs ten times the rate.
@@ -120,6 +123,57 @@ class Guided:
     ) -> SetpointStream[AttitudeSetpoint]:
         """Stream attitudes with thrust (SET_ATTITUDE_TARGET)."""
         return self._stream("attitude", self._encode.attitude, initial, rate_hz, valid_for_s, max_lag_s)
+
+    def attitude_rate(
+        self,
+        initial: AttitudeRateSetpoint = AttitudeRateSetpoint(),
+        *,
+        rate_hz: float = 100.0,
+        valid_for_s: float = 0.1,
+        max_lag_s: float = 0.1,
+    ) -> SetpointStream[AttitudeRateSetpoint]:
+        """Stream body rates with thrust (SET_ATTITUDE_TARGET without an attitude).
+
+        ArduCopter and PX4 obey them. Nothing levels the vehicle: without a new set-point it is told to hold after
+        ``valid_for_s``, and turns on until it does.
+        """
+        return self._stream("attitude rate", self._encode.attitude_rate, initial, rate_hz, valid_for_s, max_lag_s)
+
+    def trajectory(
+        self,
+        initial: TrajectorySetpoint,
+        *,
+        rate_hz: float = 50.0,
+        valid_for_s: float = 0.5,
+        max_lag_s: float = 0.5,
+    ) -> SetpointStream[TrajectorySetpoint]:
+        """Stream local positions with velocity and acceleration feed-forward (SET_POSITION_TARGET_LOCAL_NED)."""
+        return self._stream("trajectory", self._encode.trajectory, initial, rate_hz, valid_for_s, max_lag_s)
+
+    def actuators(
+        self,
+        initial: ActuatorSetpoint,
+        *,
+        rate_hz: float = 100.0,
+        valid_for_s: float = 0.1,
+        max_lag_s: float = 0.1,
+    ) -> SetpointStream[ActuatorSetpoint]:
+        """Stream actuator controls (SET_ACTUATOR_CONTROL_TARGET).
+
+        PX4 obeys them up to version 1.13; newer ones, and ArduPilot, ignore the message.
+
+        Raises:
+            NotSupported: this firmware does not obey them, or its version is not known yet. Nothing was sent.
+        """
+        session = self._context.session
+        until, version = session.autopilot.actuators_until, session.telemetry.version.latest
+        if until is None or version is None or version.number[:2] >= until:
+            known = "of unknown version" if version is None else str(version.firmware)
+            raise NotSupported(
+                f"{session.autopilot.firmware} {known} does not obey SET_ACTUATOR_CONTROL_TARGET; only PX4 before 1.14"
+                " does. Use vehicle.guided.attitude_rate()"
+            )
+        return SetpointStream(self._context, self._encode.actuators, initial, rate_hz, valid_for_s, max_lag_s)
 
     def _stream(
         self, kind: str, encode: Callable[[SetpointT], Message], initial: SetpointT, *limits: float
