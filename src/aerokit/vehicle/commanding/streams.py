@@ -140,15 +140,15 @@ class ValueStream(Generic[ValueT]):
         return None
 
     def _stop(self, reason: str, *, hold: bool = True) -> None:
-        """Stop the stream from inside; tell the vehicle to hold unless there was a takeover."""
+        """Stop the stream from inside; order the vehicle to hold unless there was a takeover."""
         self._end()
         is_confirmed = hold and self._hold()
         self._stopped = SetpointStreamStopped(
-            f"the {self._NAME} has stopped: {reason}" + ("; the vehicle was told to hold" if is_confirmed else "")
+            f"the {self._NAME} has stopped: {reason}" + ("; a hold was ordered" if is_confirmed else "")
         )
 
     def _hold(self) -> bool:
-        """Tell the vehicle to hold, without waiting; return True if it was sent."""
+        """Order the vehicle to hold, without waiting; return True if it was sent."""
         return False
 
     def _end(self) -> None:
@@ -170,9 +170,9 @@ class ValueStream(Generic[ValueT]):
 class SteeringStream(ValueStream[ValueT]):
     """Flies the vehicle in the mode for its values while its ``async with`` block supplies them.
 
-    Entering the block changes to the mode. Leaving it in any way tells the vehicle to hold. If the stream stops by
+    Entering the block changes to the mode. Leaving it in any way orders the vehicle to hold. If the stream stops by
     itself, supplying a value and leaving the block raise :class:`SetpointStreamStopped`. If it stopped because a pilot
-    or a failsafe changed the mode, the vehicle is not told to hold.
+    or a failsafe changed the mode, no hold is ordered.
     """
 
     _order: Order | None = None
