@@ -47,10 +47,13 @@ if TYPE_CHECKING:
     from aerokit.mavlink.signing import SigningKey as SigningKey
     from aerokit.position import Position as Position
     from aerokit.vehicle.commanding.setpoints import AccelerationSetpoint as AccelerationSetpoint
+    from aerokit.vehicle.commanding.setpoints import ActuatorSetpoint as ActuatorSetpoint
+    from aerokit.vehicle.commanding.setpoints import AttitudeRateSetpoint as AttitudeRateSetpoint
     from aerokit.vehicle.commanding.setpoints import AttitudeSetpoint as AttitudeSetpoint
     from aerokit.vehicle.commanding.setpoints import BodyVelocitySetpoint as BodyVelocitySetpoint
     from aerokit.vehicle.commanding.setpoints import LocalPositionSetpoint as LocalPositionSetpoint
     from aerokit.vehicle.commanding.setpoints import PositionSetpoint as PositionSetpoint
+    from aerokit.vehicle.commanding.setpoints import TrajectorySetpoint as TrajectorySetpoint
     from aerokit.vehicle.commanding.setpoints import VelocitySetpoint as VelocitySetpoint
     from aerokit.vehicle.connect import connect as connect
     from aerokit.vehicle.vehicle import Vehicle as Vehicle
@@ -89,10 +92,13 @@ __getattr__, __dir__, __all__ = lazy_exports(
         "aerokit.position": ("Position",),
         "aerokit.vehicle.commanding.setpoints": (
             "AccelerationSetpoint",
+            "ActuatorSetpoint",
+            "AttitudeRateSetpoint",
             "AttitudeSetpoint",
             "BodyVelocitySetpoint",
             "LocalPositionSetpoint",
             "PositionSetpoint",
+            "TrajectorySetpoint",
             "VelocitySetpoint",
         ),
         "aerokit.vehicle.connect": ("connect",),

@@ -227,7 +227,7 @@ class ArduCopter(ArduPilot):
         "take_off": "GUIDED",
         "mission": "AUTO",
     }
-    setpoints: SetpointRules = SetpointRules(body_yaw_is_relative=True)
+    setpoints: SetpointRules = SetpointRules(body_yaw_is_relative=True, attitude_rate=True, trajectory=True)
     reposition: Reposition | None = Reposition(relative_altitude=True, yaw=False, speed=False)
     condition_yaw = True
     lands_after_return = True

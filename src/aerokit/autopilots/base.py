@@ -75,6 +75,7 @@ class SetpointRules(Snapshot):
     - ``stream_before_mode``: the stream must be running before the mode is requested.
     - ``body_yaw_is_relative``: in MAV_FRAME_BODY_NED, yaw is relative to the current heading instead of north.
     - ``position_restarts_path``: each position set-point, even a repeated one, restarts the path from a standstill.
+    - ``trajectory``: positions with velocity and acceleration.
     """
 
     local_position: bool = True
@@ -85,11 +86,14 @@ class SetpointRules(Snapshot):
     stream_before_mode: bool = False
     body_yaw_is_relative: bool = False
     position_restarts_path: bool = False
+    attitude_rate: bool = False
+    trajectory: bool = False
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the supported kinds."""
         kinds = ("local_position", "global_position", "velocity", "acceleration", "attitude")
+        kinds = (*kinds, "attitude_rate", "trajectory")
         return tuple(kind.replace("_", " ") for kind in kinds if getattr(self, kind))
 
 
@@ -157,6 +161,8 @@ class Autopilot:
     purposes: ClassVar[Mapping[str, str]] = {}
     """Maps purposes to names of modes."""
     setpoints: SetpointRules = SetpointRules(*[False] * 5)
+    actuators_until: tuple[int, int] | None = None
+    """First version (major, minor) without SET_ACTUATOR_CONTROL_TARGET; None if no version supports it."""
     reposition: Reposition | None = None
     """Behaviour of MAV_CMD_DO_REPOSITION; None if it is not known to work."""
     home_is_item_0 = False

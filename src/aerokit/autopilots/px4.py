@@ -93,7 +93,8 @@ class Px4(Autopilot):
     modes_are_numbered = False
     # The MAVLink module acknowledges with ACCEPTED at once, then the commander with the result.
     acks_per_command: ClassVar[Mapping[int, int]] = {MavCmd.DO_SET_MODE: 2}
-    setpoints: SetpointRules = SetpointRules(stream_before_mode=True)
+    setpoints: SetpointRules = SetpointRules(stream_before_mode=True, attitude_rate=True, trajectory=True)
+    actuators_until = (1, 14)  # removed on 2023-03-06: MavlinkReceiver.cpp, commit 27658354
     reposition: Reposition | None = Reposition(relative_altitude=False, yaw=True, speed=True)
     gimbals: GimbalRules = GimbalRules(*[False] * 6)
     log_suffix = ".ulg"

@@ -35,7 +35,12 @@ from aerokit.sync.blocks import (
 )
 from aerokit.vehicle.camera.controls import FORMAT_TIMEOUT_S
 from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M, MAX_SILENCE_S
-from aerokit.vehicle.commanding.setpoints import AccelerationSetpoint, BodyVelocitySetpoint, VelocitySetpoint
+from aerokit.vehicle.commanding.setpoints import (
+    AccelerationSetpoint,
+    AttitudeRateSetpoint,
+    BodyVelocitySetpoint,
+    VelocitySetpoint,
+)
 from aerokit.vehicle.connect import connect as connect_async
 from aerokit.vehicle.files.logs import ERASE_PATIENCE_S
 
@@ -88,7 +93,13 @@ if TYPE_CHECKING:
     from aerokit.vehicle.commanding.guided import Guided as AsyncGuided
     from aerokit.vehicle.commanding.order import Subject
     from aerokit.vehicle.commanding.posted import PostedOrder as AsyncPostedOrder
-    from aerokit.vehicle.commanding.setpoints import AttitudeSetpoint, LocalPositionSetpoint, PositionSetpoint
+    from aerokit.vehicle.commanding.setpoints import (
+        ActuatorSetpoint,
+        AttitudeSetpoint,
+        LocalPositionSetpoint,
+        PositionSetpoint,
+        TrajectorySetpoint,
+    )
     from aerokit.vehicle.components.component import Component as AsyncComponent
     from aerokit.vehicle.components.component import ComponentInformation, ComponentStatus, MetadataKind
     from aerokit.vehicle.components.settings import Settings as AsyncSettings
@@ -393,7 +404,7 @@ class SetpointStream(StreamTwin[SetpointT]):
 
     @property
     def is_running(self) -> bool:
-        """True while set-points are being sent."""
+        """True while values are being sent."""
         return self.aio.is_running
 
     def set(self, setpoint: SetpointT) -> None:
@@ -417,7 +428,7 @@ class SetpointStream(StreamTwin[SetpointT]):
 class Guided(TwinOf["AsyncGuided"]):
     """Opens set-point streams: ``async with vehicle.guided.velocity() as stream: stream.set(...)``.
 
-    Every stream takes ``rate_hz`` (transmission rate of the latest set-point, 2 to 100), ``valid_for_s`` (how long a
+    Every stream takes ``rate_hz`` (transmission rate of the latest set-point, 2 to 400), ``valid_for_s`` (how long a
     set-point may be resent without a new one) and ``max_lag_s`` (how late the event loop may be). NotSupported is
     raised for a kind that this type of vehicle does not support. Rates and seconds are in real time: a simulation at
     ten times the speed needs ten times the rate.
@@ -523,6 +534,70 @@ class Guided(TwinOf["AsyncGuided"]):
         return SetpointStream(
             self._loop,
             self._loop.call(self.aio.attitude, initial, rate_hz=rate_hz, valid_for_s=valid_for_s, max_lag_s=max_lag_s),
+        )
+
+    def attitude_rate(
+        self,
+        initial: AttitudeRateSetpoint = AttitudeRateSetpoint(),
+        *,
+        rate_hz: float = 100.0,
+        valid_for_s: float = 0.1,
+        max_lag_s: float = 0.1,
+    ) -> SetpointStream[AttitudeRateSetpoint]:
+        """Stream body rates with thrust (SET_ATTITUDE_TARGET without an attitude).
+
+        ArduCopter and PX4 obey them. Nothing levels the vehicle: without a new set-point it is told to hold after
+        ``valid_for_s``, and turns on until it does.
+        """
+        return SetpointStream(
+            self._loop,
+            self._loop.call(
+                self.aio.attitude_rate,
+                initial,
+                rate_hz=rate_hz,
+                valid_for_s=valid_for_s,
+                max_lag_s=max_lag_s,
+            ),
+        )
+
+    def trajectory(
+        self,
+        initial: TrajectorySetpoint,
+        *,
+        rate_hz: float = 50.0,
+        valid_for_s: float = 0.5,
+        max_lag_s: float = 0.5,
+    ) -> SetpointStream[TrajectorySetpoint]:
+        """Stream local positions with velocity and acceleration feed-forward (SET_POSITION_TARGET_LOCAL_NED)."""
+        return SetpointStream(
+            self._loop,
+            self._loop.call(
+                self.aio.trajectory,
+                initial,
+                rate_hz=rate_hz,
+                valid_for_s=valid_for_s,
+                max_lag_s=max_lag_s,
+            ),
+        )
+
+    def actuators(
+        self,
+        initial: ActuatorSetpoint,
+        *,
+        rate_hz: float = 100.0,
+        valid_for_s: float = 0.1,
+        max_lag_s: float = 0.1,
+    ) -> SetpointStream[ActuatorSetpoint]:
+        """Stream actuator controls (SET_ACTUATOR_CONTROL_TARGET).
+
+        PX4 obeys them up to version 1.13; newer ones, and ArduPilot, ignore the message.
+
+        Raises:
+            NotSupported: this firmware does not obey them, or its version is not known yet. Nothing was sent.
+        """
+        return SetpointStream(
+            self._loop,
+            self._loop.call(self.aio.actuators, initial, rate_hz=rate_hz, valid_for_s=valid_for_s, max_lag_s=max_lag_s),
         )
 
 

@@ -6,6 +6,7 @@ https://docs.px4.io/main/en/flight_modes/offboard.html
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 from aerokit.mavlink.enums import AttitudeTargetTypemask, MavFrame, MavSeverity
 from aerokit.mavlink.messages import SetAttitudeTarget, SetPositionTargetGlobalInt, SetPositionTargetLocalNed
@@ -22,6 +23,11 @@ _GLOBAL_FRAMES = (MavFrame.GLOBAL_INT, MavFrame.GLOBAL_RELATIVE_ALT_INT, MavFram
 _CLIMB_AT_FULL_THRUST_M_S = 5.0
 
 
+def _three(parts: Iterable[float]) -> Ned:
+    first, second, third = parts
+    return (first, second, third)
+
+
 class Px4Offboard:
     """The latest set-point. It is stored in every mode, and followed in OFFBOARD."""
 
@@ -31,6 +37,8 @@ class Px4Offboard:
         self._position, self._velocity, self._acceleration = _NAN3, _NAN3, _NAN3
         self._yaw = self._yaw_rate = math.nan
         self._attitude: tuple[float, float, float] | None = None
+        self._body_rates: tuple[float, float, float] | None = None
+        self._flown_at = 0.0
         self._thrust = 0.0
         vehicle.on(SetPositionTargetLocalNed, self._on_local)
         vehicle.on(SetPositionTargetGlobalInt, self._on_global)
@@ -94,10 +102,13 @@ class Px4Offboard:
         return True
 
     def _on_attitude(self, target: SetAttitudeTarget, _: Channel) -> None:
+        motion = self._vehicle.motion
         if target.type_mask & AttitudeTargetTypemask.ATTITUDE_IGNORE:
-            self._attitude = (0.0, 0.0, self._vehicle.motion.yaw)
+            if self._attitude is None or self._body_rates is None:
+                self._attitude = (motion.roll, motion.pitch, motion.yaw)
+            self._body_rates = (target.body_roll_rate, target.body_pitch_rate, target.body_yaw_rate)
         elif all(math.isfinite(part) for part in target.q):
-            self._attitude = euler_from_quaternion(*target.q)
+            self._attitude, self._body_rates = euler_from_quaternion(*target.q), None
         if math.isfinite(target.thrust):
             self._thrust = target.thrust
         self.updated_at = self._vehicle.now
@@ -117,7 +128,11 @@ class Px4Offboard:
 
     def fly(self) -> None:
         motion = self._vehicle.motion
+        elapsed, self._flown_at = min(0.1, self._vehicle.now - self._flown_at), self._vehicle.now
         if self._attitude is not None:
+            if self._body_rates is not None:
+                turned = zip(self._attitude, self._body_rates, strict=True)
+                self._attitude = _three(angle + rate * elapsed for angle, rate in turned)
             roll, pitch, yaw = self._attitude
             climb = (max(0.0, min(1.0, self._thrust)) - 0.5) * 2.0 * _CLIMB_AT_FULL_THRUST_M_S
             motion.seek_attitude(roll, pitch, -climb)
