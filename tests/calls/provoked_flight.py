@@ -191,6 +191,7 @@ def _actions() -> Table:
         ("Vehicle.take_off", "OperationTimeout"): P(_method("take_off", 50, timeout=2), armed),
         ("Vehicle.take_off", "ValueUnknownError"): P(_method("take_off", 5), armed, _clear_state("home"), on="px4"),
     }
+    rows |= _maneuvers()
     for name, do, repeated in (
         ("Vehicle.set_mode", _method("set_mode", "LOITER"), mode),
         ("Vehicle.hold", _method("hold"), mode),
@@ -213,6 +214,41 @@ def _actions() -> Table:
         rows[f"Vehicle.{name}", "OperationTimeout"] = P(_method(name, timeout=1), airborne)
     rows["Vehicle.go_to", "HeartbeatTimeout"] = later(_go, stops_sending)
     rows["Vehicle.go_to", "OperationTimeout"] = P(lambda s: _go(s, timeout=1), airborne)
+    return rows
+
+
+def _has_no_such_parameter(stage: Stage) -> None:
+    autopilot: Any = stage.vehicle.autopilot
+    autopilot.return_altitude_parameters = lambda **_: (("NOSUCH_ALT", 1.0),)
+
+
+def _rover(stage: Stage) -> None:
+    """A vehicle type that neither climbs nor has an airspeed."""
+    autopilot: Any = stage.vehicle.autopilot
+    autopilot.speed_types = frozenset()
+    autopilot.return_altitude_parameters = lambda **_: ()
+
+
+def _maneuvers() -> Table:
+    end, off = Cmd.DO_FLIGHTTERMINATION, Cmd.PREFLIGHT_REBOOT_SHUTDOWN
+    terminate = _method("terminate", intent="terminate flight", timeout=2)
+    patient = _method("terminate", intent="terminate flight", timeout=30)
+    shut_down = _method("shutdown", intent="shut down", timeout=2)
+    rows: Table = {
+        ("Vehicle.terminate", "HeartbeatTimeout"): later(patient, stops_sending, 0.3, before=accepted(end)),
+        ("Vehicle.terminate", "OperationTimeout"): P(terminate, airborne, accepted(end)),
+        ("Vehicle.shutdown", "NotSupported"): P(shut_down, grounded),
+        ("Vehicle.shutdown", "OperationRejected"): P(shut_down, armed, on="px4"),
+        ("Vehicle.shutdown", "OperationTimeout"): P(shut_down, grounded, accepted(off), on="px4"),
+        ("Vehicle.set_airspeed", "NotSupported"): P(_method("set_airspeed", 15), before=_rover, alone=True),
+        ("Vehicle.set_climb_speed", "NotSupported"): P(_method("set_climb_speed", 1), on="px4"),
+        ("Vehicle.set_return_altitude", "InvalidArgument"): P(_method("set_return_altitude", 0)),
+    }
+    for name, args in (("return_altitude", ()), ("set_return_altitude", (20.0,))):
+        call, do = f"Vehicle.{name}", _method(name, *args)
+        rows[call, "NotSupported"] = P(do, before=_rover, alone=True)
+        rows[call, "ParameterRejected"] = P(do, before=_has_no_such_parameter, on="px4", alone=True)
+        rows[call, "ParameterTimeout"] = P(do, before=stops_sending, alone=True)
     return rows
 
 

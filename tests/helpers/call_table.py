@@ -28,7 +28,7 @@ from aerokit import (
     messages,
 )
 from aerokit.mavlink.encoder import FrameEncoder
-from aerokit.mavlink.enums import MavCmd
+from aerokit.mavlink.enums import MavCmd, SpeedType
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.vehicle.components.settings import Settings
 
@@ -104,6 +104,7 @@ def _action(
     *,
     wrong: Give | None = None,
     on: tuple[str, ...] = BOTH,
+    after: Callable[[Stage], object] = _nothing,
     **order: Any,
 ) -> dict[str, Call]:
     """Create the row of an action that sends this command, for all tests of calls and for the table of orders."""
@@ -111,6 +112,7 @@ def _action(
         lambda stage: give(stage.vehicle),
         place,
         on,
+        after=after,
         command=command,
         wrong=None if wrong is None else lambda stage: wrong(stage.vehicle),
         order=Row(name, give, command, PLACES[place], on=on, **order),
@@ -307,6 +309,25 @@ def _pass_checks(stage: Stage) -> None:
     stage.simulated.faults.prearm_failures.clear()
 
 
+def _set_airspeed(vehicle: aerokit.Vehicle) -> Awaitable[object]:
+    """The copter accepts an airspeed and changes its ground speed; only a plane has this call."""
+    autopilot: Any = vehicle.autopilot
+    autopilot.speed_types |= {SpeedType.AIRSPEED}
+    return vehicle.set_airspeed(15)
+
+
+def _undo_termination(stage: Stage) -> None:
+    """A terminated PX4 flies again only after a restart, which would take long."""
+    if isinstance(stage.simulated, SimulatedPx4):
+        stage.simulated.arming.disarm("the test", force=True)
+        stage.simulated.arming.is_terminated = stage.simulated.is_in_failsafe = False
+
+
+def _switch_on(stage: Stage) -> None:
+    if stage.simulated.now > 0 and not stage.simulated._is_on:
+        stage.simulated.power_on()
+
+
 CALLS: dict[str, Call] = {
     "connect": Call(_connect),
     "open_connection": Call(_open_connection),
@@ -340,6 +361,25 @@ CALLS: dict[str, Call] = {
         wrong=lambda v: v.set_speed(-1),
         steers=False,
     ),
+    **_action(
+        "set_airspeed",
+        _set_airspeed,
+        MavCmd.DO_CHANGE_SPEED,
+        wrong=lambda v: v.set_airspeed(0),
+        on=COPTER,
+        steers=False,
+    ),
+    **_action(
+        "set_climb_speed",
+        lambda v: v.set_climb_speed(1.5),
+        MavCmd.DO_CHANGE_SPEED,
+        wrong=lambda v: v.set_climb_speed(-1),
+        on=COPTER,
+        steers=False,
+    ),
+    **_action("set_descent_speed", lambda v: v.set_descent_speed(1.5), MavCmd.DO_CHANGE_SPEED, on=COPTER, steers=False),
+    "Vehicle.return_altitude": Call(lambda s: s.vehicle.return_altitude()),
+    "Vehicle.set_return_altitude": Call(lambda s: s.vehicle.set_return_altitude(s.other_value() + 20)),
     "Vehicle.set_heading": Call(lambda s: s.vehicle.set_heading(60, relative=True), airborne),
     **_action(
         "set_home",
@@ -350,6 +390,25 @@ CALLS: dict[str, Call] = {
     ),
     **_action("look_at", lambda v: v.look_at(north(v, 50.0)), MavCmd.DO_SET_ROI_LOCATION, steers=False),
     **_action("stop_looking", lambda v: v.stop_looking(), MavCmd.DO_SET_ROI_NONE, steers=False),
+    **_action(
+        "terminate",
+        lambda v: v.terminate(intent="terminate flight"),
+        MavCmd.DO_FLIGHTTERMINATION,
+        armed,
+        wrong=lambda v: v.terminate(intent="land"),  # type: ignore[arg-type]
+        modes=((), ("TERMINATION",)),
+        after=_undo_termination,
+    ),
+    **_action(
+        "shutdown",
+        lambda v: v.shutdown(intent="shut down"),
+        MavCmd.PREFLIGHT_REBOOT_SHUTDOWN,
+        grounded,
+        wrong=lambda v: v.shutdown(intent="sleep"),  # type: ignore[arg-type]
+        on=PX4,
+        steers=False,
+        after=_switch_on,
+    ),
     **_action("reboot", lambda v: v.reboot(timeout=20), MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, grounded, steers=False),
     "Vehicle.setup_signing": Call(_sign, grounded, after=_no_key),
     "Vehicle.command": Call(lambda s: s.vehicle.command(MavCmd.REQUEST_MESSAGE, messages.AutopilotVersion.ID)),

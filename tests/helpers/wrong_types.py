@@ -108,6 +108,8 @@ for _literal in (
     "LogMethod",
     "Overflow",
     "Subject",
+    "TerminationIntent",
+    "ShutdownIntent",
 ):
     WRONG[_literal] = (*STRANGE, *NUMBER, "quick")
 

@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, ClassVar
 
-from aerokit.autopilots.base import Autopilot, GimbalRules, Purpose, Reposition, SetpointRules, TakeOff
+from aerokit.autopilots.base import VTOLS, Autopilot, GimbalRules, Purpose, Reposition, SetpointRules, TakeOff
 from aerokit.autopilots.modes import ModeTable
 from aerokit.autopilots.telemetry import ARDUPILOT_GROUPS, ATTITUDE_AND_HEIGHT, POS_HORIZ_ABS, bit_names
-from aerokit.mavlink.enums import EkfStatusFlags, MavCmd, MavLandedState, MavState, MavType
+from aerokit.mavlink.enums import EkfStatusFlags, MavCmd, MavLandedState, MavState, MavType, SpeedType
 
 if TYPE_CHECKING:
     from aerokit.mavlink.messages import Heartbeat
@@ -141,16 +141,6 @@ TRACKER = ModeTable({0: "MANUAL", 1: "STOP", 2: "SCAN", 3: "SERVOTEST", 4: "GUID
 
 EKF_PROBLEMS: Mapping[int, str] = {1024: "initialisation", 32768: "GPS without glitches"}
 
-VTOLS = (
-    MavType.VTOL_TAILSITTER_DUOROTOR,
-    MavType.VTOL_TAILSITTER_QUADROTOR,
-    MavType.VTOL_TILTROTOR,
-    MavType.VTOL_FIXEDROTOR,
-    MavType.VTOL_TAILSITTER,
-    MavType.VTOL_TILTWING,
-    MavType.VTOL_RESERVED5,
-)
-
 COPTERS = (
     MavType.QUADROTOR,
     MavType.COAXIAL,
@@ -229,6 +219,8 @@ class ArduCopter(ArduPilot):
     }
     setpoints: SetpointRules = SetpointRules(body_yaw_is_relative=True, attitude_rate=True, trajectory=True)
     reposition: Reposition | None = Reposition(relative_altitude=True, yaw=False, speed=False)
+    # An airspeed changes the ground speed (GCS_MAVLink_Copter.cpp, handle_MAV_CMD_DO_CHANGE_SPEED).
+    speed_types: frozenset[int] = frozenset((SpeedType.GROUNDSPEED, SpeedType.CLIMB_SPEED, SpeedType.DESCENT_SPEED))
     condition_yaw = True
     lands_after_return = True
     arming_mode: ClassVar[str | None] = "GUIDED"
@@ -258,6 +250,9 @@ class ArduCopter(ArduPilot):
         # STANDBY is reported on the ground only, ACTIVE in the air only. A failsafe (CRITICAL) hides both.
         return _landed_state(heartbeat)
 
+    def return_altitude_parameters(self, *, is_vtol: bool) -> tuple[tuple[str, float], ...]:
+        return (("RTL_ALT_M", 1.0), ("RTL_ALT", 100.0))
+
 
 class ArduPlane(ArduPilot):
     """ArduPlane: planes, and VTOL planes, which ArduPilot calls QuadPlanes."""
@@ -277,6 +272,7 @@ class ArduPlane(ArduPilot):
         local_position=False, global_position=False, velocity=False, acceleration=False
     )
     reposition: Reposition | None = Reposition(relative_altitude=True, yaw=False, speed=False)
+    speed_types: frozenset[int] = frozenset((SpeedType.AIRSPEED, SpeedType.GROUNDSPEED))
     arrival_radius_m: float = 90.0  # it circles at WP_LOITER_RAD, 60 m by default
     arming_mode: ClassVar[str | None] = "FBWA"  # manual throttle; a plane armed in TAKEOFF starts to move
     unarmable_modes: frozenset[str] = frozenset(("AUTOLAND", "INITIALISING", "QLAND", "QRTL", "RTL"))
@@ -295,6 +291,11 @@ class ArduPlane(ArduPilot):
 
     def landed_state_of(self, heartbeat: Heartbeat) -> int | None:
         return _landed_state(heartbeat)
+
+    def return_altitude_parameters(self, *, is_vtol: bool) -> tuple[tuple[str, float], ...]:
+        if self._can_hover(is_vtol):
+            return (("Q_RTL_ALT", 1.0),)  # It returns in QRTL.
+        return (("RTL_ALTITUDE", 1.0), ("ALT_HOLD_RTL", 100.0))
 
     def _can_hover(self, is_vtol: bool) -> bool:
         return is_vtol or self.vehicle_type in VTOLS

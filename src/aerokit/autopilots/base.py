@@ -19,7 +19,7 @@ from aerokit.autopilots.telemetry import (
     version_text,
 )
 from aerokit.mavlink import messages
-from aerokit.mavlink.enums import MavCmd, MavProtocolCapability
+from aerokit.mavlink.enums import MavCmd, MavProtocolCapability, MavType, SpeedType
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -53,7 +53,19 @@ PURPOSES_OF_COMMANDS: Mapping[int, tuple[Purpose, ...]] = {
 NAMES_OF_COMMANDS: Mapping[int, tuple[str, ...]] = {
     MavCmd.NAV_LOITER_UNLIM: ("LOITER",),
     MavCmd.DO_ORBIT: ("ORBIT", "CIRCLE"),
+    MavCmd.DO_FLIGHTTERMINATION: ("TERMINATION",),
 }
+
+
+VTOLS = (
+    MavType.VTOL_TAILSITTER_DUOROTOR,
+    MavType.VTOL_TAILSITTER_QUADROTOR,
+    MavType.VTOL_TILTROTOR,
+    MavType.VTOL_FIXEDROTOR,
+    MavType.VTOL_TAILSITTER,
+    MavType.VTOL_TILTWING,
+    MavType.VTOL_RESERVED5,
+)
 
 
 class TakeOff(Snapshot):
@@ -175,6 +187,10 @@ class Autopilot:
     """True if MAV_CMD_RUN_PREARM_CHECKS (401) repeats the failing checks as status texts."""
     calibrates_compasses_by_command = False
     """True if MAV_CMD_DO_START_MAG_CAL (42424) calibrates compasses; otherwise PREFLIGHT_CALIBRATION does."""
+    speed_types: frozenset[int] = frozenset((SpeedType.GROUNDSPEED,))
+    """SPEED_TYPEs of MAV_CMD_DO_CHANGE_SPEED (178) that change this speed, and no other."""
+    can_shut_down = False
+    """True if MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN (246) can switch the autopilot off."""
     condition_yaw = False
     """True if MAV_CMD_CONDITION_YAW (115) turns the vehicle in its set-point mode."""
     reposition_purpose: Purpose = "setpoint"
@@ -309,6 +325,12 @@ class Autopilot:
     ) -> TakeOff | None:
         """Return the take-off procedure for this altitude above home; None if the vehicle cannot take off."""
         return None
+
+    def return_altitude_parameters(self, *, is_vtol: bool) -> tuple[tuple[str, float], ...]:
+        """Return the names of the parameter with the altitude of a return, newest first, and the number of its units in
+        a metre; empty if there is none.
+        """
+        return ()
 
     def take_off_needs_home(self) -> bool:
         """Return True if :meth:`take_off` needs the altitude of home above mean sea level."""

@@ -7,6 +7,7 @@ from typing import ClassVar
 
 from aerokit.autopilots.base import (
     NAN,
+    VTOLS,
     Autopilot,
     GimbalRules,
     ModeOrder,
@@ -19,7 +20,7 @@ from aerokit.autopilots.base import (
 from aerokit.autopilots.modes import CUSTOM_MODE_ENABLED, NO_MODES, Mode, ModeTable
 from aerokit.autopilots.telemetry import ATTITUDE_AND_HEIGHT, POS_HORIZ_ABS, PREARM_CHECK, SENSORS, bit_names
 from aerokit.errors import InvalidArgument
-from aerokit.mavlink.enums import EstimatorStatusFlags, MavCmd, MavType
+from aerokit.mavlink.enums import EstimatorStatusFlags, MavCmd, MavType, SpeedType
 
 MAIN_POSCTL, MAIN_AUTO, SUB_MISSION = 3, 4, 4
 _E, _C = EstimatorStatusFlags, MavCmd
@@ -117,6 +118,7 @@ class Px4(Autopilot):
         "take_off": "TAKEOFF",
         "mission": "MISSION",
     }
+    can_shut_down = True
     mission_storage = "px4"
     mission_upload_window = 6
     reports_mission_checksum = True
@@ -138,6 +140,10 @@ class Px4(Autopilot):
         super().__init__(vehicle_type)
         self.is_surface_vehicle: bool = vehicle_type in (MavType.GROUND_ROVER, MavType.SURFACE_BOAT)
         self.lands_after_return: bool = not self._cannot_fly and vehicle_type != MavType.FIXED_WING
+        if vehicle_type == MavType.FIXED_WING or vehicle_type in VTOLS:
+            # Only the fixed-wing controller has an airspeed. PX4 takes every other type for the cruise speed
+            # (navigator_main.cpp), also that of a climb.
+            self.speed_types: frozenset[int] = frozenset((SpeedType.AIRSPEED, SpeedType.GROUNDSPEED))
         if vehicle_type == MavType.FIXED_WING:
             self.arrival_radius_m: float = 120.0  # it circles with NAV_LOITER_RAD, 80 m by default
 
@@ -187,6 +193,9 @@ class Px4(Autopilot):
             raise InvalidArgument("take-off on PX4 needs the altitude of home: NAV_TAKEOFF is above mean sea level")
         params = (NAN, 0, 0, NAN, NAN, NAN, home_altitude_amsl_m + altitude_relative_m)
         return TakeOff(None, MavCmd.NAV_TAKEOFF, params, self.modes.find("LOITER"))
+
+    def return_altitude_parameters(self, *, is_vtol: bool) -> tuple[tuple[str, float], ...]:
+        return () if self._cannot_fly else (("RTL_RETURN_ALT", 1.0),)
 
     def take_off_needs_home(self) -> bool:
         """True, because the altitude of NAV_TAKEOFF is above mean sea level."""

@@ -100,6 +100,7 @@ if TYPE_CHECKING:
         PositionSetpoint,
         TrajectorySetpoint,
     )
+    from aerokit.vehicle.commanding.termination import ShutdownIntent, TerminationIntent
     from aerokit.vehicle.components.component import Component as AsyncComponent
     from aerokit.vehicle.components.component import ComponentInformation, ComponentStatus, MetadataKind
     from aerokit.vehicle.components.settings import Settings as AsyncSettings
@@ -3228,6 +3229,47 @@ class Vehicle(VehicleTwin):
         """Return the status texts (STATUSTEXT) received since this time of the loop's clock, oldest first."""
         return self._loop.call(self.aio.texts_since, at)
 
+    def terminate(self, *, intent: TerminationIntent, timeout: float = 10.0) -> None:
+        """Terminate the flight (MAV_CMD_DO_FLIGHTTERMINATION): **the motors stop, and the vehicle falls**.
+
+        Returns when HEARTBEAT reports disarmed, PX4's mode TERMINATION, or MAV_STATE_FLIGHT_TERMINATION. The command is
+        sent at once, also to a silent vehicle, and only once: it is neither repeated nor sent later. A cancelled call
+        may have terminated the flight. PX4 releases its parachute if it has one, and needs a restart afterwards.
+        ArduPlane and Rover refuse it unless AFS_ENABLE is 1 and AFS_TERM_ACTION is 42.
+
+        Args:
+            intent: must be ``"terminate flight"``.
+            timeout: seconds for HEARTBEAT to report the termination after the command was accepted.
+
+        Raises:
+            InvalidArgument: the intent is another one. Nothing was sent.
+            CommandRejected: the vehicle refused; ``reasons`` has its status texts. PX4 refuses while it is disarmed.
+            CommandTimeout: there was no acknowledgement; the flight may have been terminated nevertheless.
+            HeartbeatTimeout: the vehicle was silent for ten seconds after its acknowledgement.
+            OperationTimeout: it accepted the command, and HEARTBEAT does not report the termination.
+        """
+        self._loop.run(self.aio.terminate, intent=intent, timeout=timeout)
+
+    def shutdown(self, *, intent: ShutdownIntent, timeout: float = 15.0) -> None:
+        """Switch the autopilot off (MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN) and wait until its HEARTBEATs end.
+
+        HEARTBEAT counts as ended after 3.5 s, or when the link goes down after the acknowledgement. The command is sent
+        only once. Only a person at the vehicle can switch it on again. A cancelled call may have switched it off.
+
+        Args:
+            intent: must be ``"shut down"``.
+            timeout: seconds until it is silent.
+
+        Raises:
+            InvalidArgument: the intent is another one. Nothing was sent.
+            NotSupported: this firmware cannot be switched off (ArduPilot). Nothing was sent.
+            OperationRejected: it is armed, or not known to be disarmed. Nothing was sent.
+            CommandRejected: it refused; PX4 does on boards that cannot switch their power off.
+            CommandTimeout: there was no acknowledgement; it may have switched off nevertheless.
+            OperationTimeout: it accepted the command and still sends HEARTBEATs.
+        """
+        self._loop.run(self.aio.shutdown, intent=intent, timeout=timeout)
+
     def set_mode(self, mode: str | int, *, timeout: float = 6.0) -> None:
         """Change the flight mode and wait until HEARTBEAT reports it.
 
@@ -3314,6 +3356,7 @@ class Vehicle(VehicleTwin):
         *,
         mode: str | int | None = None,
         force: bool = False,
+        reason: str = "",
         timeout: float = 10.0,
         max_silence_s: float | None = MAX_SILENCE_S,
     ) -> None:
@@ -3330,11 +3373,15 @@ class Vehicle(VehicleTwin):
             mode: the mode to arm in. None: the present mode, or one that ``take_off`` starts in if the present mode
                 does not allow arming.
             force: skip the vehicle's own arming checks. Dangerous.
+            reason: why your program arms, at most 50 bytes. Logger "aerokit" reports it at INFO, and a STATUSTEXT takes
+                it to the vehicle right before the command, where ArduPilot writes it into its flight log. PX4 logs only
+                texts that have the vehicle's own system id.
             timeout: seconds for HEARTBEAT to report armed after the command was accepted.
             max_silence_s: raise when no heartbeat was received for this long; None: wait until ``timeout``.
 
         Raises:
-            InvalidArgument: there is no such mode, or it does not allow arming. Nothing was sent.
+            InvalidArgument: there is no such mode, it does not allow arming, or the reason is too long. Nothing was
+                sent.
             CommandRejected: the vehicle refused; ``reasons`` has its pre-arm texts, failing sensors and missing
                 estimates. Where the vehicle can run its checks on request, they are run again for this.
             CommandTimeout: there was no acknowledgement, and the vehicle did not arm; the text says whether it may
@@ -3344,7 +3391,14 @@ class Vehicle(VehicleTwin):
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: it accepted the command and did not arm.
         """
-        self._loop.run(self.aio.arm, mode=mode, force=force, timeout=timeout, max_silence_s=max_silence_s)
+        self._loop.run(
+            self.aio.arm,
+            mode=mode,
+            force=force,
+            reason=reason,
+            timeout=timeout,
+            max_silence_s=max_silence_s,
+        )
 
     def disarm(
         self,
@@ -3407,6 +3461,43 @@ class Vehicle(VehicleTwin):
             OperationRejected: the mode changed, or a newer order was given, before the acknowledgement.
         """
         self._loop.run(self.aio.stop_looking)
+
+    def set_airspeed(self, airspeed_m_s: float) -> None:
+        """Change the airspeed of a fixed wing in m/s, above 0 (MAV_CMD_DO_CHANGE_SPEED, SPEED_TYPE_AIRSPEED).
+
+        Returns at the acknowledgement, because no message reports the setting; VFR_HUD has what the
+        vehicle measures.
+        ArduPlane applies it in GUIDED and AUTO, within AIRSPEED_MIN and AIRSPEED_MAX, and refuses it otherwise. PX4
+        applies it in modes that navigate, and accepts it always.
+
+        Raises:
+            InvalidArgument: out of range. Nothing was sent.
+            NotSupported: this vehicle has no wings: use ``set_speed``. Nothing was sent.
+            CommandRejected: the vehicle refused.
+            CommandTimeout: there was no acknowledgement.
+        """
+        self._loop.run(self.aio.set_airspeed, airspeed_m_s)
+
+    def set_climb_speed(self, climb_m_s: float) -> None:
+        """Change the speed of climbs in m/s, above 0 (MAV_CMD_DO_CHANGE_SPEED, SPEED_TYPE_CLIMB_SPEED).
+
+        Returns at the acknowledgement, because no message reports the setting. ArduCopter applies it in GUIDED, AUTO
+        and RTL until the mode changes, and refuses it otherwise. PX4 would take it for the cruise speed.
+
+        Raises:
+            InvalidArgument: out of range. Nothing was sent.
+            NotSupported: this firmware has no such command. Nothing was sent.
+            CommandRejected: the vehicle refused.
+            CommandTimeout: there was no acknowledgement.
+        """
+        self._loop.run(self.aio.set_climb_speed, climb_m_s)
+
+    def set_descent_speed(self, descent_m_s: float) -> None:
+        """Change the speed of descents in m/s, above 0 (MAV_CMD_DO_CHANGE_SPEED, SPEED_TYPE_DESCENT_SPEED).
+
+        All else as for :meth:`set_climb_speed`.
+        """
+        self._loop.run(self.aio.set_descent_speed, descent_m_s)
 
     def go_to(
         self,
@@ -3681,6 +3772,37 @@ class Vehicle(VehicleTwin):
     def rally(self) -> RallyControl:
         """The vehicle's rally points."""
         return self._part("rally", RallyControl)
+
+    def return_altitude(self) -> float:
+        """Return the altitude above home, in metres, at which the vehicle returns to launch.
+
+        Reads RTL_ALT_M (ArduCopter 4.7; before: RTL_ALT, in centimetres), RTL_ALTITUDE (ArduPlane; ALT_HOLD_RTL before
+        4.5), Q_RTL_ALT (ArduPilot's VTOL planes, which return in QRTL) or RTL_RETURN_ALT (PX4). ArduPlane reports −1 if
+        it keeps the present altitude, ArduCopter 0.
+
+        Raises:
+            NotSupported: this type of vehicle does not climb for a return. Nothing was sent.
+            ParameterRejected: the vehicle has no such parameter.
+            ParameterTimeout: there was no answer.
+        """
+        return self._loop.run(self.aio.return_altitude)
+
+    def set_return_altitude(self, altitude_m: float) -> None:
+        """Set the altitude of returns to launch; returns when the vehicle has confirmed the value.
+
+        Writes the parameter that :meth:`return_altitude` reads, so the value survives a reboot. A vehicle that is
+        higher than that does not descend for its return.
+
+        Args:
+            altitude_m: metres above home, above 0, at most 3,000. Q_RTL_ALT holds whole metres only.
+
+        Raises:
+            InvalidArgument: the altitude is out of range, or has a fraction that the parameter cannot hold.
+            NotSupported: this type of vehicle does not climb for a return. Nothing was sent.
+            ParameterRejected: the vehicle has no such parameter, or keeps the previous value.
+            ParameterTimeout: not confirmed, but it may have been set.
+        """
+        self._loop.run(self.aio.set_return_altitude, altitude_m)
 
     def setup_signing(self, signing: Signing | None, *, timeout: float = 5.0) -> None:
         """Install a signing key on the vehicle and sign all traffic with it from then on; None removes the key.

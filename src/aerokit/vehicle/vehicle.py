@@ -10,7 +10,9 @@ from aerokit._internal.async_block import ReadOnly
 from aerokit.mavlink.messages import ParamValue
 from aerokit.vehicle.commanding.arming import ArmingActions
 from aerokit.vehicle.commanding.flight import FlightActions, ModeActions
+from aerokit.vehicle.commanding.maneuvers import SpeedActions
 from aerokit.vehicle.commanding.messaging import MessagingActions
+from aerokit.vehicle.commanding.termination import TerminationActions
 from aerokit.vehicle.commanding.travel import LookActions, TravelActions
 from aerokit.vehicle.missions.context import PlanContext
 from aerokit.vehicle.state.field import MESSAGE_IDS
@@ -41,7 +43,17 @@ PICTURE_MESSAGE_IDS = tuple(MESSAGE_IDS[name] for name in ("CameraImageCaptured"
 
 
 @checks_arguments
-class Vehicle(ReadOnly, FlightActions, TravelActions, LookActions, ArmingActions, ModeActions, MessagingActions):
+class Vehicle(
+    ReadOnly,
+    FlightActions,
+    TravelActions,
+    SpeedActions,
+    LookActions,
+    ArmingActions,
+    ModeActions,
+    TerminationActions,
+    MessagingActions,
+):
     """One remote vehicle. Coroutines send commands to it; properties only read. Every call can be cancelled.
 
     Create it with :func:`aerokit.connect`. State is held in cells (``vehicle.position.value``, ``.age``,
@@ -181,6 +193,41 @@ class Vehicle(ReadOnly, FlightActions, TravelActions, LookActions, ArmingActions
         from aerokit.vehicle.missions.plans import RallyControl
 
         return RallyControl(self._plans)
+
+    async def return_altitude(self) -> float:
+        """Return the altitude above home, in metres, at which the vehicle returns to launch.
+
+        Reads RTL_ALT_M (ArduCopter 4.7; before: RTL_ALT, in centimetres), RTL_ALTITUDE (ArduPlane; ALT_HOLD_RTL before
+        4.5), Q_RTL_ALT (ArduPilot's VTOL planes, which return in QRTL) or RTL_RETURN_ALT (PX4). ArduPlane reports −1 if
+        it keeps the present altitude, ArduCopter 0.
+
+        Raises:
+            NotSupported: this type of vehicle does not climb for a return. Nothing was sent.
+            ParameterRejected: the vehicle has no such parameter.
+            ParameterTimeout: there was no answer.
+        """
+        from aerokit.vehicle.parameters.return_altitude import read_return_altitude
+
+        return await read_return_altitude(self.parameters, self.autopilot, self.telemetry)
+
+    async def set_return_altitude(self, altitude_m: float) -> None:
+        """Set the altitude of returns to launch; returns when the vehicle has confirmed the value.
+
+        Writes the parameter that :meth:`return_altitude` reads, so the value survives a reboot. A vehicle that is
+        higher than that does not descend for its return.
+
+        Args:
+            altitude_m: metres above home, above 0, at most 3,000. Q_RTL_ALT holds whole metres only.
+
+        Raises:
+            InvalidArgument: the altitude is out of range, or has a fraction that the parameter cannot hold.
+            NotSupported: this type of vehicle does not climb for a return. Nothing was sent.
+            ParameterRejected: the vehicle has no such parameter, or keeps the previous value.
+            ParameterTimeout: not confirmed, but it may have been set.
+        """
+        from aerokit.vehicle.parameters.return_altitude import write_return_altitude
+
+        await write_return_altitude(self.parameters, self.autopilot, self.telemetry, altitude_m)
 
     def __repr__(self) -> str:
         return f"<Vehicle {self.system_id}/{self.component_id} {self.autopilot.firmware}, {self.describe_link()}>"

@@ -224,6 +224,11 @@ class Px4Vehicle(Px4Host):
         self._next_text_id = 0
         self.reboot(_REBOOT_SILENCE_S)
 
+    def shut_down(self) -> None:
+        """Switch off until `power_on`."""
+        self._reset()
+        self.reboot(math.inf)
+
     def send_text(self, severity: int, text: str) -> None:
         """Queue a text with an id, and mostly a final tab; it follows the answer that is being sent."""
         self.call_later(0.0, partial(self.events.send_for, text))

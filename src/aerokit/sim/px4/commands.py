@@ -278,9 +278,9 @@ class _Flight:
     def reboot(self, command: ReceivedCommand) -> int:
         if command.param1 == 0.0:
             return MavResult.ACCEPTED
-        if self._px4.is_armed or command.param1 != 1.0:
+        if self._px4.is_armed or command.param1 not in (1.0, 2.0):
             return MavResult.DENIED
-        self._px4.call_later(0.2, self._px4.restart)
+        self._px4.call_later(0.2, self._px4.restart if command.param1 == 1.0 else self._px4.shut_down)
         return MavResult.ACCEPTED
 
 
