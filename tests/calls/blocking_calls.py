@@ -37,6 +37,7 @@ CLASSES: tuple[type, ...] = (
     twins.Component,
     twins.Settings,
     twins.Gimbals,
+    twins.FollowStream,
     twins.GimbalControl,
     twins.GimbalRates,
     twins.Camera,
@@ -203,7 +204,15 @@ def _streams(stage: Any) -> None:
         pass
 
 
+def _follow(stage: Any) -> None:
+    place = stage.vehicle.position.value
+    with stage.vehicle.follow(lambda: place, bearing_deg=180) as following:
+        following.fly(0.5)
+
+
 WRITTEN: dict[str, Do] = {
+    "Vehicle.follow": _follow,
+    "FollowStream.fly": _follow,
     "Gimbal.control": _in_control(lambda _: None),
     "GimbalControl.raise_if_taken": _in_control(lambda block: block.raise_if_taken()),
     "GimbalControl.until_lost": _until_lost,

@@ -225,8 +225,40 @@ def _has_no_such_parameter(stage: Stage) -> None:
 def _rover(stage: Stage) -> None:
     """A vehicle type that neither climbs nor has an airspeed."""
     autopilot: Any = stage.vehicle.autopilot
-    autopilot.speed_types = frozenset()
+    autopilot.speed_types, autopilot.circles_by = frozenset(), None
     autopilot.return_altitude_parameters = lambda **_: ()
+
+
+def _orbit(stage: Stage, **options: Any) -> Any:
+    return stage.vehicle.orbit(stage.target(), radius_m=8, **options)
+
+
+def _figure_eight(stage: Stage, **options: Any) -> Any:
+    return stage.vehicle.figure_eight(stage.target(), major_radius_m=16, minor_radius_m=8, **options)
+
+
+def _loiter(stage: Stage, **options: Any) -> Any:
+    return stage.vehicle.loiter(stage.home, **options)
+
+
+def _following(stage: Stage, target: Position | None = None, **options: Any) -> Any:
+    return stage.vehicle.follow(lambda: target, **options)
+
+
+async def _follow(stage: Stage, *target: Position | None, **options: Any) -> None:
+    place = target[0] if target else stage.home
+    async with _following(stage, place, **options) as following:
+        await following.fly(20)
+
+
+async def _vtol_in_the_air(stage: Stage) -> None:
+    await airborne(stage)
+    stage.simulated.vtol_state = 3  # type: ignore[union-attr]
+    await stage.vehicle.vtol_state.wait_until(lambda state: state == 3, timeout=5)
+
+
+def _px4_pilot(stage: Stage) -> None:
+    stage.simulated.switch_to((3, 0))  # type: ignore[union-attr]
 
 
 def _maneuvers() -> Table:
@@ -244,6 +276,41 @@ def _maneuvers() -> Table:
         ("Vehicle.set_climb_speed", "NotSupported"): P(_method("set_climb_speed", 1), on="px4"),
         ("Vehicle.set_return_altitude", "InvalidArgument"): P(_method("set_return_altitude", 0)),
     }
+    orbit, eight = Cmd.DO_ORBIT, Cmd.DO_SET_MODE
+    for name, do, command, on in (
+        ("Vehicle.orbit", _orbit, orbit, "px4"),
+        ("Vehicle.figure_eight", _figure_eight, eight, "ardupilot"),
+        ("Vehicle.loiter", _loiter, Cmd.DO_REPOSITION, "ardupilot"),
+    ):
+        rows[name, "CommandRejected"] = P(do, airborne, refused(command), on=on)
+        rows[name, "CommandTimeout"] = P(do, airborne, ignored(command), on=on)
+        rows[name, "OperationRejected"] = P(do, grounded)
+        rows[name, "ValueUnknownError"] = P(do, airborne, _clear_state("position"), alone=True)
+        rows[name, "HeartbeatTimeout"] = later(do, stops_sending, 3.0)
+        rows[name, "OperationTimeout"] = P(lambda s, do=do: do(s, timeout=1.5), airborne)  # type: ignore[misc]
+    rows["Vehicle.figure_eight", "CommandTimeout"] = P(_figure_eight, airborne, ignored(eight))
+    rows["Vehicle.orbit", "NotSupported"] = P(_orbit, airborne, _rover, alone=True)
+    rows["Vehicle.figure_eight", "NotSupported"] = P(_figure_eight, airborne, _obeys_nothing, alone=True)
+    rows["Vehicle.loiter", "NotSupported"] = P(lambda s: _loiter(s, radius_m=50), airborne)
+    rows["Vehicle.follow", "InvalidArgument"] = P(_now(lambda s: _following(s, distance_m=-1)))
+    rows["Vehicle.follow", "NotSupported"] = P(_now(_following), before=_obeys_nothing, alone=True)
+    rows["FollowStream", "OperationRejected"] = P(_follow, grounded)
+    rows["FollowStream", "OperationTimeout"] = P(lambda s: _follow(s, None), airborne)
+    rows["FollowStream", "InvalidArgument"] = P(lambda s: _follow(s, s.home, height_m=5), airborne)
+    rows["FollowStream", "SetpointStreamStopped"] = later(_follow, pilot, 2.0)
+    rows["FollowStream.fly", "SetpointStreamStopped"] = later(_follow, pilot, 2.0)
+    transition = Cmd.DO_VTOL_TRANSITION
+    to_wings = _method("transition_to", "fixed_wing", timeout=30)
+    rows["Vehicle.transition_to", "NotSupported"] = P(to_wings, airborne)
+    for error, trouble in (("CommandRejected", refused(transition)), ("CommandTimeout", ignored(transition))):
+        rows["Vehicle.transition_to", error] = P(to_wings, _vtol_in_the_air, trouble, on="px4", alone=True)
+    in_transition: dict[str, Any] = {"place": _vtol_in_the_air, "on": "px4", "alone": True}
+    in_transition["before"] = accepted(transition)
+    rows["Vehicle.transition_to", "OperationTimeout"] = P(
+        _method("transition_to", "fixed_wing", timeout=2), **in_transition
+    )
+    rows["Vehicle.transition_to", "HeartbeatTimeout"] = later(to_wings, stops_sending, 1.0, **in_transition)
+    rows["Vehicle.transition_to", "OperationRejected"] = later(to_wings, _px4_pilot, 1.0, **in_transition)
     for name, args in (("return_altitude", ()), ("set_return_altitude", (20.0,))):
         call, do = f"Vehicle.{name}", _method(name, *args)
         rows[call, "NotSupported"] = P(do, before=_rover, alone=True)

@@ -14,6 +14,7 @@ from aerokit.connection.connection import Connection
 from aerokit.vehicle.camera.cameras import Camera
 from aerokit.vehicle.camera.link import CameraBlock
 from aerokit.vehicle.camera.photos import PhotoInterval
+from aerokit.vehicle.commanding.follow import FollowStream
 from aerokit.vehicle.commanding.guided import Guided, SetpointStream
 from aerokit.vehicle.commanding.posted import PostedOrder
 from aerokit.vehicle.components.component import Component
@@ -34,6 +35,7 @@ CLASSES: tuple[type, ...] = (
     aerokit.Vehicle,
     Guided,
     SetpointStream,
+    FollowStream,
     Gimbal,
     Component,
     Gimbals,

@@ -27,8 +27,9 @@ from aerokit import (
     VelocitySetpoint,
     messages,
 )
+from aerokit.connection.cells import Source
 from aerokit.mavlink.encoder import FrameEncoder
-from aerokit.mavlink.enums import MavCmd, SpeedType
+from aerokit.mavlink.enums import MavCmd, MavVtolState, SpeedType
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.vehicle.components.settings import Settings
 
@@ -316,6 +317,31 @@ def _set_airspeed(vehicle: aerokit.Vehicle) -> Awaitable[object]:
     return vehicle.set_airspeed(15)
 
 
+async def _follow(stage: Stage) -> None:
+    target = stage.target()
+    async with stage.vehicle.follow(lambda: target, distance_m=5) as following:
+        await following.fly(1.0)
+
+
+def _make_vtol(stage: Stage) -> None:
+    stage.simulated.vtol_state = int(MavVtolState.MC)  # type: ignore[union-attr]
+
+
+def _unmake_vtol(stage: Stage) -> None:
+    stage.simulated.vtol_state = 0  # type: ignore[union-attr]
+
+
+async def _become_plane(stage: Stage) -> None:
+    await stage.vehicle.vtol_state.wait_until(lambda state: state == MavVtolState.MC, timeout=5)
+    await stage.vehicle.transition_to("fixed_wing")
+
+
+async def _transition(vehicle: aerokit.Vehicle) -> None:
+    """The vehicle of the order table is no VTOL, and does not answer."""
+    vehicle.telemetry.vtol_state.set(int(MavVtolState.MC), Source(1, 1, "the test"))
+    await vehicle.transition_to("fixed_wing")
+
+
 def _undo_termination(stage: Stage) -> None:
     """A terminated PX4 flies again only after a restart, which would take long."""
     if isinstance(stage.simulated, SimulatedPx4):
@@ -390,6 +416,34 @@ CALLS: dict[str, Call] = {
     ),
     **_action("look_at", lambda v: v.look_at(north(v, 50.0)), MavCmd.DO_SET_ROI_LOCATION, steers=False),
     **_action("stop_looking", lambda v: v.stop_looking(), MavCmd.DO_SET_ROI_NONE, steers=False),
+    "Vehicle.orbit": Call(
+        lambda s: s.vehicle.orbit(s.target(), radius_m=8, speed_m_s=4, turns=0.25),
+        airborne,
+        wrong=lambda s: s.vehicle.orbit(s.target(), radius_m=0),
+    ),
+    "Vehicle.figure_eight": Call(
+        lambda s: s.vehicle.figure_eight(s.target(), major_radius_m=16, minor_radius_m=8, speed_m_s=4, rounds=0.5),
+        airborne,
+        wrong=lambda s: s.vehicle.figure_eight(s.target(), major_radius_m=16, minor_radius_m=9),
+    ),
+    "Vehicle.loiter": Call(
+        lambda s: s.vehicle.loiter(s.target(), duration_s=2),
+        airborne,
+        command=MavCmd.DO_REPOSITION,
+        wrong=lambda s: s.vehicle.loiter(turns=1),
+    ),
+    "Vehicle.follow": Call(_follow, airborne),
+    "FollowStream.fly": Call(_follow, airborne),
+    "Vehicle.transition_to": Call(
+        _become_plane,
+        airborne,
+        on=PX4,
+        before=_make_vtol,
+        after=_unmake_vtol,
+        command=MavCmd.DO_VTOL_TRANSITION,
+        wrong=lambda s: s.vehicle.transition_to("tailsitter"),  # type: ignore[arg-type]
+        order=Row("transition_to", _transition, MavCmd.DO_VTOL_TRANSITION, steers=False, on=PX4),
+    ),
     **_action(
         "terminate",
         lambda v: v.terminate(intent="terminate flight"),

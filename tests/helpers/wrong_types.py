@@ -96,6 +96,7 @@ WRONG: dict[str, tuple[object, ...]] = {
 WRONG["type[ItemT]"] = WRONG["type[MessageT]"] = WRONG["type[Message]"]
 for _setpoint in ("Velocity", "BodyVelocity", "Acceleration", "LocalPosition", "Position", "Attitude"):
     WRONG[f"{_setpoint}Setpoint"] = (*NOTHING, *STRANGE, *TEXT, *NUMBER, PLACE)
+WRONG["FollowTarget"] = (*NOTHING, 1j, *TEXT, *NUMBER, PLACE)
 WRONG["CacheChoice"] = (*NOTHING, *STRANGE, *NUMBER)
 WRONG["Capture"] = (*NOTHING, *STRANGE, *TEXT, *NUMBER)
 for _literal in (
@@ -108,6 +109,8 @@ for _literal in (
     "LogMethod",
     "Overflow",
     "Subject",
+    "Facing",
+    "FlightState",
     "TerminationIntent",
     "ShutdownIntent",
 ):

@@ -7,7 +7,7 @@ Modes are from ``enum class Number`` in each vehicle's mode.h. Their names are t
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from aerokit.autopilots.base import VTOLS, Autopilot, GimbalRules, Purpose, Reposition, SetpointRules, TakeOff
 from aerokit.autopilots.modes import ModeTable
@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 _C = MavCmd
 NOT_ON_ARDUPILOT = frozenset((_C.DO_SET_ACTUATOR, _C.ACTUATOR_TEST, _C.INJECT_FAILURE, _C.ILLUMINATOR_ON_OFF))
 NOT_ON_PLANE = NOT_ON_ARDUPILOT | {_C.DO_WINCH}
-NOT_ON_GROUND_OR_WATER = NOT_ON_PLANE | {_C.DO_PARACHUTE}
+NOT_ON_COPTER = NOT_ON_ARDUPILOT | {_C.DO_VTOL_TRANSITION}
+NOT_ON_GROUND_OR_WATER = NOT_ON_PLANE | NOT_ON_COPTER | {_C.DO_PARACHUTE}
 
 COPTER = ModeTable(
     {
@@ -208,6 +209,7 @@ class ArduCopter(ArduPilot):
     """ArduCopter: multicopters and helicopters."""
 
     firmware = "ArduCopter"
+    unsupported_commands: frozenset[int] = NOT_ON_COPTER
     modes: ModeTable = COPTER
     purposes: ClassVar[Mapping[str, str]] = {
         "hold": "BRAKE",  # LOITER follows the throttle stick, which is down or absent while a program flies
@@ -223,6 +225,8 @@ class ArduCopter(ArduPilot):
     speed_types: frozenset[int] = frozenset((SpeedType.GROUNDSPEED, SpeedType.CLIMB_SPEED, SpeedType.DESCENT_SPEED))
     condition_yaw = True
     lands_after_return = True
+    # There is no DO_ORBIT, and CIRCLE follows the throttle stick (mode_circle.cpp).
+    circles_by: Literal["orbit", "reposition", "setpoints"] | None = "setpoints"
     arming_mode: ClassVar[str | None] = "GUIDED"
     unarmable_modes: frozenset[str] = frozenset(
         (
@@ -274,6 +278,7 @@ class ArduPlane(ArduPilot):
     reposition: Reposition | None = Reposition(relative_altitude=True, yaw=False, speed=False)
     speed_types: frozenset[int] = frozenset((SpeedType.AIRSPEED, SpeedType.GROUNDSPEED))
     arrival_radius_m: float = 90.0  # it circles at WP_LOITER_RAD, 60 m by default
+    circles_by: Literal["orbit", "reposition", "setpoints"] | None = "reposition"
     arming_mode: ClassVar[str | None] = "FBWA"  # manual throttle; a plane armed in TAKEOFF starts to move
     unarmable_modes: frozenset[str] = frozenset(("AUTOLAND", "INITIALISING", "QLAND", "QRTL", "RTL"))
 

@@ -189,6 +189,10 @@ class Autopilot:
     """True if MAV_CMD_DO_START_MAG_CAL (42424) calibrates compasses; otherwise PREFLIGHT_CALIBRATION does."""
     speed_types: frozenset[int] = frozenset((SpeedType.GROUNDSPEED,))
     """SPEED_TYPEs of MAV_CMD_DO_CHANGE_SPEED (178) that change this speed, and no other."""
+    circles_by: Literal["orbit", "reposition", "setpoints"] | None = None
+    """Way to circle a place: MAV_CMD_DO_ORBIT (34), DO_REPOSITION (192) with a radius, or set-points; None: there is
+    none.
+    """
     can_shut_down = False
     """True if MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN (246) can switch the autopilot off."""
     condition_yaw = False

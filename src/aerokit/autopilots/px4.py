@@ -139,6 +139,7 @@ class Px4(Autopilot):
     def __init__(self, vehicle_type: int) -> None:
         super().__init__(vehicle_type)
         self.is_surface_vehicle: bool = vehicle_type in (MavType.GROUND_ROVER, MavType.SURFACE_BOAT)
+        self.circles_by = None if self._cannot_fly else "orbit"
         self.lands_after_return: bool = not self._cannot_fly and vehicle_type != MavType.FIXED_WING
         if vehicle_type == MavType.FIXED_WING or vehicle_type in VTOLS:
             # Only the fixed-wing controller has an airspeed. PX4 takes every other type for the cruise speed

@@ -90,9 +90,13 @@ if TYPE_CHECKING:
         TrackingStatus,
     )
     from aerokit.vehicle.camera.videos import SourceName
+    from aerokit.vehicle.commanding.follow import FollowStream as AsyncFollowStream
+    from aerokit.vehicle.commanding.follow import FollowTarget
     from aerokit.vehicle.commanding.guided import Guided as AsyncGuided
+    from aerokit.vehicle.commanding.maneuvers import FlightState
     from aerokit.vehicle.commanding.order import Subject
     from aerokit.vehicle.commanding.posted import PostedOrder as AsyncPostedOrder
+    from aerokit.vehicle.commanding.rounds import Facing
     from aerokit.vehicle.commanding.setpoints import (
         ActuatorSetpoint,
         AttitudeSetpoint,
@@ -141,6 +145,7 @@ __all__ = [
     "Connection",
     "FenceControl",
     "Files",
+    "FollowStream",
     "Gimbal",
     "GimbalControl",
     "GimbalRates",
@@ -600,6 +605,45 @@ class Guided(TwinOf["AsyncGuided"]):
             self._loop,
             self._loop.call(self.aio.actuators, initial, rate_hz=rate_hz, valid_for_s=valid_for_s, max_lag_s=max_lag_s),
         )
+
+
+class FollowStream(BlockTwin["AsyncFollowStream"]):
+    """Follows a target while its ``async with`` block runs; opened by :meth:`aerokit.Vehicle.follow`.
+
+    Entering the block waits for the first position of the target, and changes the mode: to GUIDED on ArduPilot, to
+    OFFBOARD on PX4. Leaving it in any way makes the vehicle hold. It stops by itself, and the vehicle holds, when no
+    new position of the target arrives for ``valid_for_s``, when the target's positions end or raise, when it is farther
+    away than ``max_distance_m``, and for the reasons of set-point streams. After a pilot or a failsafe has changed the
+    mode, nothing more is sent. ``fly`` and leaving the block then raise :class:`SetpointStreamStopped`.
+
+    Entering raises:
+        OperationRejected: the vehicle is not flying. Nothing was sent.
+        OperationTimeout: no position of the target was known within ``valid_for_s``. Nothing was sent.
+        InvalidArgument: a height is wanted, and the target has no altitude. Nothing was sent.
+    """
+
+    @property
+    def is_running(self) -> bool:
+        """True while values are being sent."""
+        return self.aio.is_running
+
+    @property
+    def target(self) -> Position | None:
+        """The latest position of the target; None before the first one."""
+        return self._loop.call(lambda: self.aio.target)
+
+    @property
+    def distance_m(self) -> float:
+        """Distance to the target along the ground in metres; infinite while it is unknown."""
+        return self._loop.call(lambda: self.aio.distance_m)
+
+    def fly(self, duration_s: float | None = None) -> None:
+        """Follow for ``duration_s`` seconds; None: until it stops by itself.
+
+        Raises:
+            SetpointStreamStopped: it has stopped; the text has the reason.
+        """
+        self._loop.run(self.aio.fly, duration_s)
 
 
 class GimbalControl(BlockTwin["AsyncGimbalControl"]):
@@ -3498,6 +3542,224 @@ class Vehicle(VehicleTwin):
         All else as for :meth:`set_climb_speed`.
         """
         self._loop.run(self.aio.set_descent_speed, descent_m_s)
+
+    def orbit(
+        self,
+        center: Position,
+        *,
+        radius_m: float,
+        speed_m_s: float = 2.0,
+        turns: float | None = 1.0,
+        clockwise: bool = True,
+        facing: Facing = "center",
+        max_distance_m: float = MAX_DISTANCE_M,
+        timeout: float | None = None,
+        max_silence_s: float | None = MAX_SILENCE_S,
+    ) -> None:
+        """Fly around a place; returns when the reported positions have gone around it ``turns`` times.
+
+        Then a multicopter holds, and a fixed wing goes on circling. After a cancellation or a time-out, aerokit orders
+        the vehicle to hold.
+
+        PX4 flies the circle itself (MAV_CMD_DO_ORBIT). ArduCopter has no such command, and its mode CIRCLE follows the
+        throttle stick, so aerokit streams set-points with velocity and acceleration in GUIDED; if your program dies,
+        the vehicle stops. ArduPlane circles a place in GUIDED (MAV_CMD_DO_REPOSITION).
+
+        Args:
+            center: the middle of the circle; its altitude is that of the circle, without one the vehicle's own.
+            radius_m: above 0, at most 10,000. PX4's multicopters refuse more than MC_ORBIT_RAD_MAX.
+            speed_m_s: ground speed, above 0, at most 50. A fixed wing ignores it.
+            turns: number of turns, above 0, at most 1000; None: until the call is cancelled, or another order is given.
+            clockwise: direction, as seen from above.
+            facing: direction of the nose: to the center, ahead, as at the beginning, or left to the autopilot. A fixed
+                wing ignores it.
+            max_distance_m: a center farther away than this many metres is refused.
+            timeout: seconds; None: no limit while heartbeats arrive, the mode stays and the vehicle moves.
+            max_silence_s: raise when no heartbeat was received for this long; None: no limit.
+
+        Raises:
+            InvalidArgument: an argument is out of range. Nothing was sent.
+            NotSupported: this type of vehicle has no way to do it. Nothing was sent.
+            ValueUnknownError: position or home is needed here and not known.
+            OperationRejected: it is not flying, or the mode changed or it disarmed on the way.
+            CommandRejected: the vehicle refused.
+            CommandTimeout: there was no acknowledgement.
+            HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
+            OperationTimeout: it was not done in time, or does not move.
+        """
+        self._loop.run(
+            self.aio.orbit,
+            center,
+            radius_m=radius_m,
+            speed_m_s=speed_m_s,
+            turns=turns,
+            clockwise=clockwise,
+            facing=facing,
+            max_distance_m=max_distance_m,
+            timeout=timeout,
+            max_silence_s=max_silence_s,
+        )
+
+    def figure_eight(
+        self,
+        center: Position,
+        *,
+        major_radius_m: float,
+        minor_radius_m: float,
+        axis_deg: float = 0.0,
+        speed_m_s: float = 2.0,
+        rounds: float | None = 1.0,
+        clockwise: bool = True,
+        max_distance_m: float = MAX_DISTANCE_M,
+        timeout: float | None = None,
+        max_silence_s: float | None = MAX_SILENCE_S,
+    ) -> None:
+        """Fly an eight around a place; returns when the reported positions were ``rounds`` times in both lobes.
+
+        PX4's fixed wings fly it themselves (MAV_CMD_DO_FIGURE_EIGHT: two circles and straight lines between them, and
+        on until another order). For ArduCopter and PX4's multicopters aerokit streams the set-points of a lemniscate;
+        they hold at its center. All else as for :meth:`orbit`.
+
+        Args:
+            center: where the lines cross; its altitude is that of the figure, without one the vehicle's own.
+            major_radius_m: half the length of the figure, above 0, at most 10,000.
+            minor_radius_m: half its width, above 0, at most the half of ``major_radius_m``.
+            axis_deg: direction of its long axis, 0–360 clockwise from north; the first lobe is there.
+            speed_m_s: ground speed, above 0, at most 50. A fixed wing ignores it.
+            rounds: number of figures, a multiple of a half, above 0, at most 1000; None: until the call is cancelled.
+            clockwise: direction in the first lobe, as seen from above.
+            max_distance_m: a center farther away than this many metres is refused.
+            timeout: seconds; None: no limit while heartbeats arrive, the mode stays and the vehicle moves.
+            max_silence_s: raise when no heartbeat was received for this long; None: no limit.
+        """
+        self._loop.run(
+            self.aio.figure_eight,
+            center,
+            major_radius_m=major_radius_m,
+            minor_radius_m=minor_radius_m,
+            axis_deg=axis_deg,
+            speed_m_s=speed_m_s,
+            rounds=rounds,
+            clockwise=clockwise,
+            max_distance_m=max_distance_m,
+            timeout=timeout,
+            max_silence_s=max_silence_s,
+        )
+
+    def loiter(
+        self,
+        target: Position | None = None,
+        *,
+        radius_m: float | None = None,
+        clockwise: bool = True,
+        turns: float | None = None,
+        duration_s: float | None = None,
+        max_distance_m: float = MAX_DISTANCE_M,
+        timeout: float | None = None,
+        max_silence_s: float | None = MAX_SILENCE_S,
+    ) -> None:
+        """Go to a place and stay: a fixed wing circles there, a multicopter hovers.
+
+        Returns when it is there, or after ``turns`` or ``duration_s`` more. The vehicle stays until another order.
+        After a cancellation or a time-out, aerokit orders it to hold where it is. Sends MAV_CMD_DO_REPOSITION
+        (ArduPilot in GUIDED, PX4 in LOITER), or MAV_CMD_DO_ORBIT for the radius of a PX4 fixed wing.
+
+        Args:
+            target: the place, as for ``go_to``; None: where the vehicle is.
+            radius_m: radius of the circle of a fixed wing, above 0, at most 10,000; None: its own (WP_LOITER_RAD,
+                NAV_LOITER_RAD).
+            clockwise: direction of the circle, as seen from above; only with ``radius_m``.
+            turns: return after this many turns, above 0, at most 1000; only with ``radius_m``.
+            duration_s: return this many seconds after the arrival.
+            max_distance_m: a place farther away than this many metres is refused.
+            timeout: seconds in total; None: no limit while heartbeats arrive, the mode stays and the vehicle moves.
+            max_silence_s: raise when no heartbeat was received for this long; None: no limit.
+
+        All else as for :meth:`orbit`. NotSupported is raised for a radius if the vehicle hovers, InvalidArgument for
+        ``turns`` without one.
+        """
+        self._loop.run(
+            self.aio.loiter,
+            target,
+            radius_m=radius_m,
+            clockwise=clockwise,
+            turns=turns,
+            duration_s=duration_s,
+            max_distance_m=max_distance_m,
+            timeout=timeout,
+            max_silence_s=max_silence_s,
+        )
+
+    def follow(
+        self,
+        target: FollowTarget,
+        *,
+        distance_m: float = 10.0,
+        bearing_deg: float | None = None,
+        from_course: bool = False,
+        height_m: float | None = None,
+        face_target: bool = True,
+        valid_for_s: float = 3.0,
+        max_distance_m: float = 1000.0,
+    ) -> FollowStream:
+        """Follow a moving target: ``async with vehicle.follow(leader) as following: await following.fly(60)``.
+
+        aerokit computes the place beside the target and streams it with the target's velocity, at 10 Hz
+        (SET_POSITION_TARGET_GLOBAL_INT). The modes FOLLOW of ArduCopter and FOLLOWME of PX4 are not used: they need
+        parameters that stay, and differ in what they keep.
+
+        Args:
+            target: another vehicle, of this connection or of any other; an asynchronous iterable of positions; or a
+                function that returns the latest position, or None, called on the event loop ten times a second. The
+                velocity of positions is computed from two of them.
+            distance_m: distance along the ground to keep, 0 to 1000.
+            bearing_deg: direction from the target in which to stay, 0–360 clockwise from north; None: where the vehicle
+                is when it begins.
+            from_course: count ``bearing_deg`` from the direction in which the target moves: 180 is behind it.
+            height_m: height above the target, −1000 to 1000; None: the vehicle keeps its own altitude.
+            face_target: turn the nose to the target.
+            valid_for_s: without a new position of the target for this long, the vehicle holds.
+            max_distance_m: if the target is farther away than this many metres, the vehicle holds.
+
+        Raises:
+            InvalidArgument: an argument is out of range.
+            NotSupported: this type of vehicle takes no position set-points (ArduPlane).
+        """
+        return FollowStream(
+            self._loop,
+            self._loop.call(
+                self.aio.follow,
+                target,
+                distance_m=distance_m,
+                bearing_deg=bearing_deg,
+                from_course=from_course,
+                height_m=height_m,
+                face_target=face_target,
+                valid_for_s=valid_for_s,
+                max_distance_m=max_distance_m,
+            ),
+        )
+
+    def transition_to(self, state: FlightState, *, timeout: float = 60.0) -> None:
+        """Change a VTOL between hovering and flying on its wings (MAV_CMD_DO_VTOL_TRANSITION).
+
+        Returns when EXTENDED_SYS_STATE reports the state; at once if it is reported already. ArduPilot does it only in
+        AUTO. After a cancellation the vehicle goes on with its transition.
+
+        Args:
+            state: ``"fixed_wing"`` or ``"multicopter"``.
+            timeout: seconds until it is in that state.
+
+        Raises:
+            InvalidArgument: there is no such state. Nothing was sent.
+            NotSupported: it is no VTOL. Nothing was sent.
+            OperationRejected: the mode changed or it disarmed meanwhile.
+            CommandRejected: the vehicle refused; ``reasons`` has its status texts.
+            CommandTimeout: there was no acknowledgement.
+            HeartbeatTimeout: the vehicle was silent for ten seconds.
+            OperationTimeout: it did not reach the state in time.
+        """
+        self._loop.run(self.aio.transition_to, state, timeout=timeout)
 
     def go_to(
         self,

@@ -10,8 +10,9 @@ from aerokit._internal.async_block import ReadOnly
 from aerokit.mavlink.messages import ParamValue
 from aerokit.vehicle.commanding.arming import ArmingActions
 from aerokit.vehicle.commanding.flight import FlightActions, ModeActions
-from aerokit.vehicle.commanding.maneuvers import SpeedActions
+from aerokit.vehicle.commanding.maneuvers import ManeuverActions
 from aerokit.vehicle.commanding.messaging import MessagingActions
+from aerokit.vehicle.commanding.speeds import SpeedActions
 from aerokit.vehicle.commanding.termination import TerminationActions
 from aerokit.vehicle.commanding.travel import LookActions, TravelActions
 from aerokit.vehicle.missions.context import PlanContext
@@ -47,6 +48,7 @@ class Vehicle(
     ReadOnly,
     FlightActions,
     TravelActions,
+    ManeuverActions,
     SpeedActions,
     LookActions,
     ArmingActions,

@@ -148,6 +148,8 @@ class Px4Vehicle(Px4Host):
         self.throttle: float = 0.0
         self.home_is_set_by_hand = False
         self.mode_after_landing: Px4Mode = modes.HOLD
+        self.vtol_state: int = 0
+        """MAV_VTOL_STATE that is reported; assign it to simulate a VTOL, whose motion stays that of this vehicle."""
         self._touched_at = math.nan
         self._landed_at = math.nan
         self._has_flown = False

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavCmd, MavFrame, MavModeFlag, MavResult, MavSeverity
+from aerokit.mavlink.enums import MavCmd, MavFrame, MavModeFlag, MavResult, MavSeverity, MavType, MavVtolState
 from aerokit.sim.commands import CommandHandler, CommandProgress, ReceivedCommand, whole
 from aerokit.sim.px4 import modes
 from aerokit.sim.px4.base import Px4Vehicle
@@ -25,10 +25,11 @@ _UNANSWERED = (
     _C.NAV_DELAY, _C.DO_DIGICAM_CONTROL, _C.DO_MOUNT_CONFIGURE, _C.DO_MOUNT_CONTROL, _C.DO_SET_CAM_TRIGG_DIST,
     _C.DO_SET_CAM_TRIGG_INTERVAL, _C.PREFLIGHT_UAVCAN, _C.REQUEST_CAMERA_INFORMATION, _C.SET_CAMERA_MODE,
     _C.SET_CAMERA_ZOOM, _C.SET_CAMERA_FOCUS, _C.DO_GIMBAL_MANAGER_PITCHYAW, _C.DO_GIMBAL_MANAGER_CONFIGURE,
-    _C.DO_TRIGGER_CONTROL, _C.DO_VTOL_TRANSITION, _C.DO_WINCH,
+    _C.DO_TRIGGER_CONTROL, _C.DO_WINCH,
 )  # fmt: skip
 
 _GRIP_DURATION_S = 1.3
+_TRANSITION_S, _NO_TRANSITION = 4.0, frozenset({modes.TAKEOFF, modes.LAND, modes.RTL, modes.ORBIT})
 _UNKNOWN_PROGRESS = 255
 _STORAGE_ACTIONS = range(5)
 _ACTUATORS, _FIRST_OUTPUT_FUNCTION = (range(1, 13), range(33, 41)), 1000
@@ -85,6 +86,7 @@ def px4_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
         MavCmd.NAV_LAND: flight.land,
         MavCmd.NAV_LAND_LOCAL: flight.land_precisely,
         MavCmd.DO_ORBIT: flight.orbit,
+        MavCmd.DO_VTOL_TRANSITION: flight.transition,
         MavCmd.DO_CHANGE_ALTITUDE: flight.change_altitude,
         MavCmd.DO_FLIGHTTERMINATION: flight.terminate,
         MavCmd.NAV_RETURN_TO_LAUNCH: flight.return_to_launch,
@@ -234,10 +236,27 @@ class _Flight:
         north, east, down = self._destination(command)
         radius = command.param1 if math.isfinite(command.param1) else orbit.radius_m
         speed = abs(command.param2) if math.isfinite(command.param2) else orbit.speed_m_s
+        if px4.VEHICLE_TYPE == MavType.FIXED_WING:
+            px4.flight.target, result = (north, east, down), self._change(modes.HOLD)
+            px4.flight.radius_m = radius
+            return result
         if not orbit.plan(radius, speed, (north, east), down):
             px4.send_text(MavSeverity.CRITICAL, "Orbit radius limit exceeded")
             return MavResult.ACCEPTED
         return self._change(modes.ORBIT)
+
+    def transition(self, command: ReceivedCommand) -> int | None:
+        """Report a transition, then the state of param 1. Not answered by a vehicle that is no VTOL."""
+        px4, wanted = self._px4, whole(command.param1)
+        if not px4.vtol_state:
+            return None
+        if wanted not in (MavVtolState.MC, MavVtolState.FW) or px4.mode in _NO_TRANSITION:
+            return MavResult.TEMPORARILY_REJECTED
+        is_forward = wanted == MavVtolState.FW
+        if px4.vtol_state != wanted:
+            px4.vtol_state = MavVtolState.TRANSITION_TO_FW if is_forward else MavVtolState.TRANSITION_TO_MC
+            px4.call_later(_TRANSITION_S, lambda: setattr(px4, "vtol_state", wanted))
+        return MavResult.ACCEPTED
 
     def change_altitude(self, command: ReceivedCommand) -> int:
         """Change the altitude to param 1 (AMSL)."""

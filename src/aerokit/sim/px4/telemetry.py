@@ -99,7 +99,7 @@ def _extended_sys_state(px4: Px4Vehicle) -> m.ExtendedSysState:
         state = MavLandedState.TAKEOFF
     elif px4.mode == modes.LAND:
         state = MavLandedState.LANDING
-    return m.ExtendedSysState(0, state)
+    return m.ExtendedSysState(px4.vtol_state, state)
 
 
 def _battery_status(px4: Px4Vehicle) -> m.BatteryStatus:

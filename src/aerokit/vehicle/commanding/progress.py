@@ -161,7 +161,7 @@ class VehiclePosition:
         if here is None:
             return math.inf
         along = geo.distance_m(here.latitude_deg, here.longitude_deg, target.latitude_deg, target.longitude_deg)
-        return math.hypot(along, self._altitude_difference(here, target))
+        return math.hypot(along, self.height_above(here, target))
 
     def check_reach(self, name: str, places: Iterable[Position], max_distance_m: float) -> None:
         """Raise InvalidArgument for a place farther away than the limit; accept all while the position is unknown."""
@@ -188,7 +188,8 @@ class VehiclePosition:
         return self.distance_to(target)
 
     @staticmethod
-    def _altitude_difference(here: Position, target: Position) -> float:
+    def height_above(here: Position, target: Position) -> float:
+        """Return how much higher the first place is; 0 if that is not known."""
         for mine, its in (
             (here.altitude_relative_m, target.altitude_relative_m),
             (here.altitude_amsl_m, target.altitude_amsl_m),

@@ -21,6 +21,12 @@ async def _fly_setpoints(vehicle: aerokit.Vehicle) -> None:
         await stream.fly(aerokit.VelocitySetpoint(north_m_s=1.0), 6.0)
 
 
+async def _follow(vehicle: aerokit.Vehicle) -> None:
+    target = north(vehicle, 12.0)
+    async with vehicle.follow(lambda: target, distance_m=4) as following:
+        await following.fly(6.0)
+
+
 async def upload(vehicle: aerokit.Vehicle) -> None:
     here = vehicle.position.value
     places = [here.offset(north_m=20.0 * number) for number in range(1, 4)]
@@ -91,6 +97,37 @@ ROWS = (
         modes=(("GUIDED", "BRAKE"), ("LOITER", "OFFBOARD")),
         holds=True,
     ),
+    Row(
+        "orbit",
+        lambda v: v.orbit(north(v, 12.0), radius_m=6, speed_m_s=3, timeout=30),
+        SET_MODE,
+        modes=(("GUIDED", "BRAKE"), ()),
+        holds=True,
+        on=("ardupilot",),
+    ),
+    Row(
+        "orbit",
+        lambda v: v.orbit(north(v, 12.0), radius_m=6, speed_m_s=3, timeout=30),
+        int(MavCmd.DO_ORBIT),
+        modes=((), ("ORBIT", "LOITER")),
+        holds=True,
+        on=("px4",),
+    ),
+    Row(
+        "figure_eight",
+        lambda v: v.figure_eight(north(v, 12.0), major_radius_m=8, minor_radius_m=4, speed_m_s=3, timeout=30),
+        SET_MODE,
+        modes=(("GUIDED", "BRAKE"), ("OFFBOARD", "LOITER")),
+        holds=True,
+    ),
+    Row(
+        "loiter",
+        lambda v: v.loiter(north(v, 12.0), duration_s=2, timeout=30),
+        REPOSITION,
+        modes=(("GUIDED", "BRAKE"), ("LOITER",)),
+        holds=True,
+    ),
+    Row("follow", _follow, SET_MODE, modes=(("GUIDED", "BRAKE"), ("OFFBOARD", "LOITER")), holds=True),
     Row(
         "take_off",
         lambda v: v.take_off(6.0, timeout=30),
