@@ -50,6 +50,7 @@ GROUPS: dict[str, tuple[Page, ...]] = {
                       "aerokit.vehicle.state.equipment"), search_boost=1.5),
         Page("guided", "vehicle.guided and vehicle.posted", "Set-point streams, and orders without waiting",
              holders=("aerokit.vehicle.commanding.guided", "aerokit.vehicle.commanding.setpoints",
+                      "aerokit.vehicle.commanding.follow",
                       "aerokit.vehicle.commanding.posted"), search_boost=2),
         Page("plans", "vehicle.mission, .fence and .rally", "Missions, fences and rally points on board",
              holders=("aerokit.vehicle.missions.mission", "aerokit.vehicle.missions.plans"), search_boost=2),

@@ -147,6 +147,7 @@ def turns_around(center: aerokit.Position, places: list[aerokit.Position]) -> fl
     return sum(math.remainder(after - before, 360.0) for before, after in pairwise(bearings)) / 360
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("clockwise", [True, False])
 @BOTH
 async def test_orbit_flies_its_turns_then_holds(kind: Callable[..., Kind], clockwise: bool) -> None:
@@ -159,6 +160,7 @@ async def test_orbit_flies_its_turns_then_holds(kind: Callable[..., Kind], clock
         assert vehicle.mode_name in ("BRAKE", "LOITER")
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("facing", ["center", "ahead", "initial"])
 async def test_orbit_of_copter_faces_as_ordered(facing: Any) -> None:
     async with hovering(SimulatedCopter(boot_time_s=0.0)) as (vehicle, wire):
@@ -184,6 +186,7 @@ async def test_orbit_px4_radius_too_large_reports_its_reason() -> None:
         assert "Orbit radius limit exceeded" in caught.value.reasons
 
 
+@pytest.mark.sampled(2)
 @BOTH
 async def test_figure_eight_reaches_both_lobes_and_its_center(kind: Callable[..., Kind]) -> None:
     async with hovering(kind(boot_time_s=0.0)) as (vehicle, _):
@@ -207,6 +210,7 @@ async def test_pilot_during_set_point_orbit_keeps_the_vehicle() -> None:
         assert flight.wire.setpoints() == []
 
 
+@pytest.mark.sampled(2)
 @BOTH
 async def test_loiter_returns_after_its_time_at_the_place(kind: Callable[..., Kind]) -> None:
     async with hovering(kind(boot_time_s=0.0)) as (vehicle, _):
@@ -218,6 +222,7 @@ async def test_loiter_returns_after_its_time_at_the_place(kind: Callable[..., Ki
         assert now() - began == pytest.approx(7, abs=0.6)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("kind", [SimulatedPlane, SimulatedPx4Plane])
 async def test_loiter_of_plane_circles_with_its_radius(kind: Callable[..., SimulatedVehicle]) -> None:
     async with simulated_link(kind(boot_time_s=0.0)) as link, aerokit.connect(link) as vehicle:
@@ -231,6 +236,7 @@ async def test_loiter_of_plane_circles_with_its_radius(kind: Callable[..., Simul
         assert turns_around(center, [p for p in places if center.distance_to(p) < 130]) < -0.9
 
 
+@pytest.mark.sampled(2)
 @BOTH
 async def test_follow_stays_behind_a_moving_leader(kind: Callable[..., Kind]) -> None:
     leader_end = SimulatedCopter(boot_time_s=0.0, system_id=7)
@@ -307,3 +313,14 @@ async def test_transition_of_copter_is_not_supported() -> None:
         with pytest.raises(NotSupported, match="is no VTOL"):
             await flight.vehicle.transition_to("fixed_wing")
         assert flight.wire.commands(MavCmd.DO_VTOL_TRANSITION) == []
+
+
+async def test_takeover_before_the_first_position_of_the_target_keeps_the_vehicle() -> None:
+    async with in_the_air() as flight:
+        asyncio.get_running_loop().call_later(1, flight.pilot_takes_over)
+        places = iter([None] * 20)
+        with pytest.raises(OperationRejected, match="LOITER"):
+            async with flight.vehicle.follow(lambda: next(places, flight.vehicle.position.value)):
+                pass
+        await anyio.sleep(3)
+        assert flight.wire.mode_orders() == []

@@ -198,10 +198,12 @@ class FollowStream(SteeringStream[TargetState]):
         position = self._context.vehicle_position
         if not self._session.telemetry.is_armed or position.is_on_ground():
             raise OperationRejected("follow: the vehicle is not flying: call take_off() first; nothing was sent")
+        mode = self._wanted_mode()
         self._start_reading()
         try:
-            self._value = await self._first_state()
-            self._choose_place(self._value.position)
+            with self._context.flight_cleanup.preparing(mode):
+                self._value = await self._first_state()
+                self._choose_place(self._value.position)
             return await super().__aenter__()
         except BaseException:
             self._stop_reading()

@@ -146,7 +146,9 @@ class RoundFlight:
         """Stream the set-points of a path; leaving the stream makes the vehicle hold."""
         try:
             with self._session.streaming("position", "local_position"), anyio.move_on_after(self._timeout) as scope:
-                flight = await self._path_flight(path, speed_m_s, facing)
+                mode = self._context.sender.mode_for(self._what, "setpoint")
+                with self._context.flight_cleanup.preparing(mode):
+                    flight = await self._path_flight(path, speed_m_s, facing)
                 await self._stream(flight)
         except SetpointStreamStopped as error:
             kind = HeartbeatTimeout if self._session.watch.is_silent else OperationRejected
