@@ -204,15 +204,16 @@ def _streams(stage: Any) -> None:
         pass
 
 
-def _follow(stage: Any) -> None:
+def _follow_target(stage: Any) -> None:
     place = stage.vehicle.position.value
     with stage.vehicle.follow(lambda: place, bearing_deg=180) as following:
         following.fly(0.5)
 
 
 WRITTEN: dict[str, Do] = {
-    "Vehicle.follow": _follow,
-    "FollowStream.fly": _follow,
+    "Vehicle.transition_to": lambda s: s.vehicle.transition_to("fixed_wing"),
+    "Vehicle.follow": _follow_target,
+    "FollowStream.fly": _follow_target,
     "Gimbal.control": _in_control(lambda _: None),
     "GimbalControl.raise_if_taken": _in_control(lambda block: block.raise_if_taken()),
     "GimbalControl.until_lost": _until_lost,

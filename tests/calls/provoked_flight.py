@@ -277,17 +277,17 @@ def _maneuvers() -> Table:
         ("Vehicle.set_return_altitude", "InvalidArgument"): P(_method("set_return_altitude", 0)),
     }
     orbit, eight = Cmd.DO_ORBIT, Cmd.DO_SET_MODE
-    for name, do, command, on in (
+    for name, give, command, on in (
         ("Vehicle.orbit", _orbit, orbit, "px4"),
         ("Vehicle.figure_eight", _figure_eight, eight, "ardupilot"),
         ("Vehicle.loiter", _loiter, Cmd.DO_REPOSITION, "ardupilot"),
     ):
-        rows[name, "CommandRejected"] = P(do, airborne, refused(command), on=on)
-        rows[name, "CommandTimeout"] = P(do, airborne, ignored(command), on=on)
-        rows[name, "OperationRejected"] = P(do, grounded)
-        rows[name, "ValueUnknownError"] = P(do, airborne, _clear_state("position"), alone=True)
-        rows[name, "HeartbeatTimeout"] = later(do, stops_sending, 3.0)
-        rows[name, "OperationTimeout"] = P(lambda s, do=do: do(s, timeout=1.5), airborne)  # type: ignore[misc]
+        rows[name, "CommandRejected"] = P(give, airborne, refused(command), on=on)
+        rows[name, "CommandTimeout"] = P(give, airborne, ignored(command), on=on)
+        rows[name, "OperationRejected"] = P(give, grounded)
+        rows[name, "ValueUnknownError"] = P(give, airborne, _clear_state("position"), alone=True)
+        rows[name, "HeartbeatTimeout"] = later(give, stops_sending, 3.0)
+        rows[name, "OperationTimeout"] = P(lambda s, give=give: give(s, timeout=1.5), airborne)  # type: ignore[misc]
     rows["Vehicle.figure_eight", "CommandTimeout"] = P(_figure_eight, airborne, ignored(eight))
     rows["Vehicle.orbit", "NotSupported"] = P(_orbit, airborne, _rover, alone=True)
     rows["Vehicle.figure_eight", "NotSupported"] = P(_figure_eight, airborne, _obeys_nothing, alone=True)

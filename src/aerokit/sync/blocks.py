@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.camera.capture import Capture
     from aerokit.vehicle.camera.link import CameraBlock
     from aerokit.vehicle.camera.photos import PhotoInterval
+    from aerokit.vehicle.commanding.follow import FollowStream
     from aerokit.vehicle.commanding.guided import SetpointStream
     from aerokit.vehicle.gimbal.control import GimbalControl
     from aerokit.vehicle.gimbal.gimbal import Gimbals  # noqa: F401
@@ -80,7 +81,7 @@ EnteredT = TypeVar("EnteredT")
 
 BlockT = TypeVar(
     "BlockT",
-    bound="CameraBlock | Following | GimbalControl | GimbalRates | PhotoInterval | SetpointStream[Any]",
+    bound="CameraBlock | Following | FollowStream | GimbalControl | GimbalRates | PhotoInterval | SetpointStream[Any]",
 )
 
 ShieldedT = TypeVar("ShieldedT", bound="TemporaryParameters | Transaction")

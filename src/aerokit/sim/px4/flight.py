@@ -96,6 +96,7 @@ class Px4Flight:
         self.destination: Ned = (0.0, 0.0, 0.0)  # Landing point of RTL: home or a rally point.
         self.heading: float | None = None
         self.speed_m_s: float = 0.0
+        self.radius_m: float = 0.0  # Radius of the circle of a plane.
         self.lifts_off: bool = False  # True if the mode requests to leave the ground.
         self.by_hand: Px4ManualFlight = Px4ManualFlight(vehicle)
         self.orbit: Px4Orbit = Px4Orbit(vehicle)

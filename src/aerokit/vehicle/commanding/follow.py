@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.vehicle.commanding.context import VehicleContext
 
+__all__ = ["FollowStream"]
+
 
 @runtime_checkable
 class HasTelemetry(Protocol):

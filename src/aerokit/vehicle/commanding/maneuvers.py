@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Literal
 from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit.errors import InvalidArgument, NotSupported
 from aerokit.mavlink.enums import MavCmd, MavDoRepositionFlags, MavType, MavVtolState, OrbitYawBehaviour
+from aerokit.vehicle.commanding.closed_paths import Circle, Eight, LobeCounter, TurnCounter
 from aerokit.vehicle.commanding.context import VehicleBase
 from aerokit.vehicle.commanding.follow import FollowPlace, FollowStream, FollowTarget
-from aerokit.vehicle.commanding.paths import Circle, Eight, LobeCounter, TurnCounter
 from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M, MAX_SILENCE_S, await_progress
 from aerokit.vehicle.commanding.rounds import Facing, RoundFlight
 
@@ -97,7 +97,7 @@ class ManeuverActions(VehicleBase):
             return
         command, params, mode = self._circling("orbit", radius_m, speed_m_s, facing, clockwise=clockwise)
         flight.check_place(max_distance_m)
-        await flight.by_command(command, params, mode, is_held=not self._is_on_wings)
+        await flight.by_command(command, params, mode, is_held=not self._is_on_wings, circle_m=radius_m)
 
     async def figure_eight(
         self,
@@ -200,14 +200,16 @@ class ManeuverActions(VehicleBase):
         if radius_m is None:
             counter = None
             flags = MavDoRepositionFlags.CHANGE_MODE
-            command, params = int(MavCmd.DO_REPOSITION), (-1.0, float(flags), 0.0, math.nan)
+            params: tuple[float, ...] = (-1.0, float(flags), 0.0, math.nan)
+            command = int(MavCmd.DO_REPOSITION)
             mode = self._sender.mode_for("loiter", self.autopilot.reposition_purpose)
         else:
             counter = _turn_counter(radius_m, clockwise=clockwise)
             command, params, mode = self._circling("loiter", radius_m, math.nan, "free", clockwise=clockwise)
         flight = RoundFlight(self._context, "loiter", center, counter, turns or 0.0, timeout, max_silence_s)
         flight.check_place(max_distance_m)
-        await flight.by_command(command, params, mode, is_held=False, stay_s=duration_s or 0.0)
+        stay_s, circle_m = duration_s or 0.0, radius_m or 0.0
+        await flight.by_command(command, params, mode, is_held=False, stay_s=stay_s, circle_m=circle_m)
 
     def follow(
         self,
@@ -242,8 +244,10 @@ class ManeuverActions(VehicleBase):
 
         Raises:
             InvalidArgument: an argument is out of range.
-            NotSupported: this type of vehicle takes no position set-points (ArduPlane).
+            NotSupported: this type of vehicle takes no position set-points, or it flies on its wings.
         """
+        if self._is_on_wings:
+            raise NotSupported("follow: the vehicle flies on its wings, and cannot fly as slowly as its target")
         place = FollowPlace(distance_m, bearing_deg, from_course, height_m, face_target)
         return FollowStream(self._context, target, place, valid_for_s, max_distance_m)
 
@@ -252,7 +256,8 @@ class ManeuverActions(VehicleBase):
     ) -> tuple[int, tuple[float, ...], Mode]:
         """Return the command that circles a place, its first four parameters, and its mode."""
         if self.autopilot.circles_by == "orbit":
-            params = (radius_m if clockwise else -radius_m, speed_m_s, float(YAW_BEHAVIOURS[facing]), 0.0)
+            radius = radius_m if clockwise else -radius_m
+            params: tuple[float, ...] = (radius, speed_m_s, float(YAW_BEHAVIOURS[facing]), 0.0)
             orbit = self.autopilot.modes.find("ORBIT")
             mode = self._sender.mode_for(what, "hold") if self._is_on_wings else orbit
             return MavCmd.DO_ORBIT, params, mode

@@ -146,11 +146,26 @@ MAX_DISTANCE_M = 100_000.0
 """
 
 
+CIRCLE_MARGIN = 1.3
+"""Part of its radius within which a vehicle flies a circle."""
+
+
 class VehiclePosition:
     """Distances and altitudes from the vehicle's reported position."""
 
     def __init__(self, session: VehicleSession) -> None:
         self._telemetry, self._autopilot = session.telemetry, session.autopilot
+        self._circle_m = 0.0
+        session.telemetry.mode.observe(lambda *_: self.note_circle(0.0))
+
+    def note_circle(self, radius_m: float) -> None:
+        """Record the radius that was ordered: ArduPlane keeps it for the next place, until it leaves GUIDED."""
+        self._circle_m = radius_m
+
+    @property
+    def arrival_radius_m(self) -> float:
+        """Distance in metres at which the vehicle counts as arrived; includes the circle that it was ordered to fly."""
+        return max(self._autopilot.arrival_radius_m, CIRCLE_MARGIN * self._circle_m)
 
     def distance_to(self, target: Position) -> float:
         """Return the distance to ``target`` in metres, three-dimensional if ``target`` has an altitude.

@@ -10,8 +10,8 @@ import anyio
 from aerokit._internal import geo
 from aerokit.errors import HeartbeatTimeout, OperationRejected, OperationTimeout, SetpointStreamStopped
 from aerokit.mavlink.enums import MavFrame
+from aerokit.vehicle.commanding.closed_paths import PathFlight
 from aerokit.vehicle.commanding.guided import Guided
-from aerokit.vehicle.commanding.paths import PathFlight
 from aerokit.vehicle.commanding.progress import POSITION_MAX_AGE_S, StallDetector, await_progress
 
 if TYPE_CHECKING:
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 
     from aerokit.autopilots import Mode
     from aerokit.position import Position
+    from aerokit.vehicle.commanding.closed_paths import ClosedPath, LobeCounter, TurnCounter, Vector
     from aerokit.vehicle.commanding.context import VehicleContext
     from aerokit.vehicle.commanding.guided import SetpointStream
     from aerokit.vehicle.commanding.order import Order
-    from aerokit.vehicle.commanding.paths import LobeCounter, Path, TurnCounter, Vector
     from aerokit.vehicle.commanding.setpoints import TrajectorySetpoint
 
 Facing = Literal["center", "ahead", "initial", "free"]
@@ -78,9 +78,19 @@ class RoundFlight:
     # ------------------------------------------------------------------- by a command of the firmware
 
     async def by_command(
-        self, command: int, params: tuple[float, ...], mode: Mode, *, is_held: bool, stay_s: float = 0.0
+        self,
+        command: int,
+        params: tuple[float, ...],
+        mode: Mode,
+        *,
+        is_held: bool,
+        stay_s: float = 0.0,
+        circle_m: float = 0.0,
     ) -> None:
-        """Send the command and wait until the rounds are flown and ``stay_s`` seconds have passed; then hold."""
+        """Send the command and wait until the rounds are flown and ``stay_s`` seconds have passed.
+
+        Then hold if ``is_held``, or go on with a circle of this radius.
+        """
         context, cleanup = self._context, self._context.flight_cleanup
         hold = context.sender.mode_for(self._what, "hold")
         order = context.arbiter.order(mode, hold)
@@ -93,6 +103,8 @@ class RoundFlight:
                 await self._await_rounds(order, mode, stay_s)
             if is_held:
                 await cleanup.stop_in(hold, order)
+            elif circle_m:
+                context.vehicle_position.note_circle(circle_m)
         # The vehicle may have received the command.
         except (anyio.get_cancelled_exc_class(), OperationTimeout):
             cleanup.hold_in_background(order)
@@ -119,10 +131,10 @@ class RoundFlight:
 
     @property
     def _is_there(self) -> bool:
-        position, near_m = self._context.vehicle_position, self._session.autopilot.arrival_radius_m
+        position = self._context.vehicle_position
         if self._counter is not None:
             return self._counter.is_there
-        return position.remaining_distance(self._center) <= near_m
+        return position.remaining_distance(self._center) <= position.arrival_radius_m
 
     def _count(self) -> float:
         here = self._telemetry.position.latest
@@ -142,7 +154,7 @@ class RoundFlight:
 
     # ------------------------------------------------------------------------------ by set-points
 
-    async def by_setpoints(self, path: Path, speed_m_s: float, facing: Facing) -> None:
+    async def by_setpoints(self, path: ClosedPath, speed_m_s: float, facing: Facing) -> None:
         """Stream the set-points of a path; leaving the stream makes the vehicle hold."""
         try:
             with self._session.streaming("position", "local_position"), anyio.move_on_after(self._timeout) as scope:
@@ -156,7 +168,7 @@ class RoundFlight:
         if scope.cancelled_caught:
             raise OperationTimeout(f"{self._what}: not done within {self._timeout:g} s; {self._describe()}")
 
-    async def _path_flight(self, path: Path, speed_m_s: float, facing: Facing) -> PathFlight:
+    async def _path_flight(self, path: ClosedPath, speed_m_s: float, facing: Facing) -> PathFlight:
         """Convert the center to the vehicle's local frame, by its present position in both."""
         local, since = self._telemetry.local_position, self._session.connection.now()
         place = await local.wait_until(lambda _: local.updated_at >= since, timeout=FRAME_TIMEOUT_S)

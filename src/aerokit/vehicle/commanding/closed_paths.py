@@ -19,7 +19,7 @@ Vector = tuple[float, float]
 """Metres north and east."""
 
 
-class Path:
+class ClosedPath:
     """A closed curve around a centre. ``at(phase)`` has its place and its first two derivatives; a round is 2π."""
 
     first_phase: float = 0.0
@@ -28,7 +28,7 @@ class Path:
         raise NotImplementedError
 
 
-class Circle(Path):
+class Circle(ClosedPath):
     """A circle; the phase is the bearing from its centre in radians."""
 
     def __init__(self, radius_m: float, *, clockwise: bool, first_phase: float) -> None:
@@ -40,7 +40,7 @@ class Circle(Path):
         return (north, east), (-self._way * east, self._way * north), (-north, -east)
 
 
-class Eight(Path):
+class Eight(ClosedPath):
     """A lemniscate along an axis; it begins and ends at its centre."""
 
     def __init__(self, major_m: float, minor_m: float, axis_deg: float, *, clockwise: bool) -> None:
@@ -68,7 +68,7 @@ class PathFlight:
 
     def __init__(
         self,
-        path: Path,
+        path: ClosedPath,
         rounds: float,
         speed_m_s: float,
         start: tuple[float, float, float],
