@@ -299,6 +299,10 @@ def _maneuvers() -> Table:
     rows["FollowStream", "InvalidArgument"] = P(lambda s: _follow(s, s.home, height_m=5), airborne)
     rows["FollowStream", "SetpointStreamStopped"] = later(_follow, pilot, 2.0)
     rows["FollowStream.fly", "SetpointStreamStopped"] = later(_follow, pilot, 2.0)
+    tune = _method("autotune")
+    rows["Vehicle.autotune", "NotSupported"] = P(tune, airborne)
+    rows["Vehicle.autotune", "OperationTimeout"] = P(_method("autotune", timeout=2), airborne, on="px4")
+    rows["Vehicle.autotune", "OperationRejected"] = later(tune, _px4_pilot, 2.5, on="px4", alone=True)
     transition = Cmd.DO_VTOL_TRANSITION
     to_wings = _method("transition_to", "fixed_wing", timeout=30)
     rows["Vehicle.transition_to", "NotSupported"] = P(to_wings, airborne)

@@ -222,7 +222,7 @@ class ArduCopter(ArduPilot):
     setpoints: SetpointRules = SetpointRules(body_yaw_is_relative=True, attitude_rate=True, trajectory=True)
     reposition: Reposition | None = Reposition(relative_altitude=True, yaw=False, speed=False)
     # An airspeed changes the ground speed (GCS_MAVLink_Copter.cpp, handle_MAV_CMD_DO_CHANGE_SPEED).
-    speed_types: frozenset[int] = frozenset((SpeedType.GROUNDSPEED, SpeedType.CLIMB_SPEED, SpeedType.DESCENT_SPEED))
+    speed_types: frozenset[int] = frozenset((SpeedType.GROUNDSPEED, SpeedType.CLIMB_SPEED))
     condition_yaw = True
     lands_after_return = True
     # There is no DO_ORBIT, and CIRCLE follows the throttle stick (mode_circle.cpp).

@@ -193,6 +193,8 @@ class Autopilot:
     """Way to circle a place: MAV_CMD_DO_ORBIT (34), DO_REPOSITION (192) with a radius, or set-points; None: there is
     none.
     """
+    tunes_by_command = False
+    """True if MAV_CMD_DO_AUTOTUNE_ENABLE (212) tunes the controllers without a pilot, and reports its progress."""
     can_shut_down = False
     """True if MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN (246) can switch the autopilot off."""
     condition_yaw = False

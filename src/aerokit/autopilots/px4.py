@@ -118,7 +118,7 @@ class Px4(Autopilot):
         "take_off": "TAKEOFF",
         "mission": "MISSION",
     }
-    can_shut_down = True
+    can_shut_down = tunes_by_command = True
     mission_storage = "px4"
     mission_upload_window = 6
     reports_mission_checksum = True

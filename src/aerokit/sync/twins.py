@@ -3273,6 +3273,26 @@ class Vehicle(VehicleTwin):
         """Return the status texts (STATUSTEXT) received since this time of the loop's clock, oldest first."""
         return self._loop.call(self.aio.texts_since, at)
 
+    def autotune(self, *, timeout: float = 120.0, on_progress: OnProgress | None = None) -> None:
+        """Let PX4 tune its controllers (MAV_CMD_DO_AUTOTUNE_ENABLE): **the vehicle shakes about each axis**.
+
+        Call it while the vehicle hovers, or circles on its wings. Returns when PX4 has finished: with MC_AT_APPLY 1 it
+        saves the new gains when it is disarmed. PX4 aborts if the mode changes or the sticks are moved. After a
+        cancellation it goes on tuning; change the mode to stop it.
+
+        Args:
+            timeout: seconds for all axes; PX4 needs about forty.
+            on_progress: called with each new percentage.
+
+        Raises:
+            NotSupported: this firmware tunes by a pilot's sticks, in its mode AUTOTUNE. Nothing was sent.
+            OperationRejected: the mode changed, or another party disarmed the vehicle.
+            CommandRejected: PX4 has no such module, or the tuning failed.
+            CommandTimeout: an answer is missing; PX4 may go on tuning.
+            OperationTimeout: it was not done in time; PX4 may go on tuning.
+        """
+        self._loop.run(self.aio.autotune, timeout=timeout, on_progress=on_progress)
+
     def terminate(self, *, intent: TerminationIntent, timeout: float = 10.0) -> None:
         """Terminate the flight (MAV_CMD_DO_FLIGHTTERMINATION): **the motors stop, and the vehicle falls**.
 
@@ -3536,13 +3556,6 @@ class Vehicle(VehicleTwin):
         """
         self._loop.run(self.aio.set_climb_speed, climb_m_s)
 
-    def set_descent_speed(self, descent_m_s: float) -> None:
-        """Change the speed of descents in m/s, above 0 (MAV_CMD_DO_CHANGE_SPEED, SPEED_TYPE_DESCENT_SPEED).
-
-        All else as for :meth:`set_climb_speed`.
-        """
-        self._loop.run(self.aio.set_descent_speed, descent_m_s)
-
     def orbit(
         self,
         center: Position,
@@ -3723,7 +3736,7 @@ class Vehicle(VehicleTwin):
 
         Raises:
             InvalidArgument: an argument is out of range.
-            NotSupported: this type of vehicle takes no position set-points (ArduPlane).
+            NotSupported: this type of vehicle takes no position set-points, or it flies on its wings.
         """
         return FollowStream(
             self._loop,

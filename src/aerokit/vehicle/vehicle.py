@@ -15,6 +15,7 @@ from aerokit.vehicle.commanding.messaging import MessagingActions
 from aerokit.vehicle.commanding.speeds import SpeedActions
 from aerokit.vehicle.commanding.termination import TerminationActions
 from aerokit.vehicle.commanding.travel import LookActions, TravelActions
+from aerokit.vehicle.commanding.tuning import TuningActions
 from aerokit.vehicle.missions.context import PlanContext
 from aerokit.vehicle.state.field import MESSAGE_IDS
 
@@ -54,6 +55,7 @@ class Vehicle(
     ArmingActions,
     ModeActions,
     TerminationActions,
+    TuningActions,
     MessagingActions,
 ):
     """One remote vehicle. Coroutines send commands to it; properties only read. Every call can be cancelled.

@@ -16,7 +16,14 @@ from flight_harness import Wire, in_the_air, now, open_flight
 
 import aerokit
 from aerokit import messages as m
-from aerokit.errors import CommandRejected, InvalidArgument, NotSupported, OperationRejected, SetpointStreamStopped
+from aerokit.errors import (
+    CommandRejected,
+    CommandTimeout,
+    InvalidArgument,
+    NotSupported,
+    OperationRejected,
+    SetpointStreamStopped,
+)
 from aerokit.mavlink.enums import MavCmd, MavVtolState
 from aerokit.sim import (
     SimulatedCopter,
@@ -36,8 +43,7 @@ SPEED = MavCmd.DO_CHANGE_SPEED
 async def test_set_climb_speed_changes_the_copter() -> None:
     async with in_the_air() as flight:
         await flight.vehicle.set_climb_speed(1.25)
-        await flight.vehicle.set_descent_speed(0.75)
-        assert (flight.copter.guided.climb, flight.copter.guided.descent) == (1.25, 0.75)
+        assert flight.copter.guided.climb == 1.25
 
 
 async def test_set_airspeed_of_plane_outside_guided_is_refused() -> None:
@@ -331,3 +337,30 @@ async def test_takeover_before_first_target_position_keeps_vehicle() -> None:
                 pass
         await anyio.sleep(3)
         assert flight.wire.mode_orders() == []
+
+
+async def test_autotune_reports_its_progress() -> None:
+    simulated = SimulatedPx4(boot_time_s=0.0)
+    async with hovering(simulated) as (vehicle, _):
+        seen: list[int] = []
+        await vehicle.autotune(on_progress=seen.append)
+        assert seen == [0, 20, 40, 60, 80, 95]
+
+
+async def test_autotune_is_not_asked_again_after_a_lost_answer() -> None:
+    """PX4 takes the question for another start, once it has finished."""
+    simulated = SimulatedPx4(boot_time_s=0.0)
+    async with hovering(simulated) as (vehicle, wire):
+        asyncio.get_running_loop().call_later(3.5, simulated.faults.ignore, MavCmd.DO_AUTOTUNE_ENABLE)
+        with pytest.raises(CommandTimeout, match="may go on tuning"):
+            await vehicle.autotune()
+        sent = len(wire.commands(MavCmd.DO_AUTOTUNE_ENABLE))
+        await anyio.sleep(10)
+        assert len(wire.commands(MavCmd.DO_AUTOTUNE_ENABLE)) == sent <= 5
+
+
+async def test_autotune_of_copter_is_not_supported() -> None:
+    async with in_the_air() as flight:
+        with pytest.raises(NotSupported, match="pilot's sticks"):
+            await flight.vehicle.autotune()
+        assert flight.wire.commands(MavCmd.DO_AUTOTUNE_ENABLE) == []

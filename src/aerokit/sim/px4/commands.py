@@ -29,6 +29,7 @@ _UNANSWERED = (
 )  # fmt: skip
 
 _GRIP_DURATION_S = 1.3
+_TUNING_STEP_S, _TUNING_PROGRESS = 2.0, (0, 20, 40, 60, 80, 95)
 _TRANSITION_S, _NO_TRANSITION = 4.0, frozenset({modes.TAKEOFF, modes.LAND, modes.RTL, modes.ORBIT})
 _UNKNOWN_PROGRESS = 255
 _STORAGE_ACTIONS = range(5)
@@ -87,6 +88,7 @@ def px4_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
         MavCmd.NAV_LAND_LOCAL: flight.land_precisely,
         MavCmd.DO_ORBIT: flight.orbit,
         MavCmd.DO_VTOL_TRANSITION: flight.transition,
+        MavCmd.DO_AUTOTUNE_ENABLE: flight.tune,
         MavCmd.DO_CHANGE_ALTITUDE: flight.change_altitude,
         MavCmd.DO_FLIGHTTERMINATION: flight.terminate,
         MavCmd.NAV_RETURN_TO_LAUNCH: flight.return_to_launch,
@@ -134,6 +136,7 @@ def _change(px4: Px4Vehicle, mode: Px4Mode) -> int:
 class _Flight:
     def __init__(self, px4: Px4Vehicle) -> None:
         self._px4 = px4
+        self._tuning_since = math.nan
 
     def arm_or_disarm(self, command: ReceivedCommand) -> int | None:
         force = command.param2 == _FORCE_MAGIC
@@ -244,6 +247,21 @@ class _Flight:
             px4.send_text(MavSeverity.CRITICAL, "Orbit radius limit exceeded")
             return MavResult.ACCEPTED
         return self._change(modes.ORBIT)
+
+    def tune(self, command: ReceivedCommand) -> int | None:
+        """Start tuning, or report its progress. It then waits for disarming, as with MC_AT_APPLY 1."""
+        px4 = self._px4
+        if command.param1 != 1.0 or command.param2 != 0.0:
+            return MavResult.DENIED
+        if not px4.is_armed:
+            self._tuning_since = math.nan
+        elif math.isnan(self._tuning_since):
+            self._tuning_since = px4.now
+        steps = (px4.now - self._tuning_since) / _TUNING_STEP_S
+        progress = 0 if math.isnan(steps) else _TUNING_PROGRESS[min(int(steps), len(_TUNING_PROGRESS) - 1)]
+        answer = m.CommandAck(command.command, MavResult.IN_PROGRESS, progress, 0, *command.sender)
+        px4.send(answer, command.channel)
+        return None
 
     def transition(self, command: ReceivedCommand) -> int | None:
         """Report a transition, then the state of param 1. Not answered by a vehicle that is no VTOL."""

@@ -159,9 +159,9 @@ class RoundFlight:
         try:
             with self._session.streaming("position", "local_position"), anyio.move_on_after(self._timeout) as scope:
                 mode = self._context.sender.mode_for(self._what, "setpoint")
-                with self._context.flight_cleanup.preparing(mode):
+                with self._context.flight_cleanup.preparing(mode) as order:
                     flight = await self._path_flight(path, speed_m_s, facing)
-                await self._stream(flight)
+                await self._stream(flight, order)
         except SetpointStreamStopped as error:
             kind = HeartbeatTimeout if self._session.watch.is_silent else OperationRejected
             raise kind(f"{self._what}: {error}") from error
@@ -191,9 +191,10 @@ class RoundFlight:
 
         return heading
 
-    async def _stream(self, flight: PathFlight) -> None:
-        guided = Guided(self._context)
-        async with guided.trajectory(flight.advance(0.0), rate_hz=SETPOINT_RATE_HZ) as stream:
+    async def _stream(self, flight: PathFlight, order: Order) -> None:
+        stream = Guided(self._context).trajectory(flight.advance(0.0), rate_hz=SETPOINT_RATE_HZ)
+        stream.prepared_order = order
+        async with stream:
             while not flight.is_complete:
                 await self._next(stream, flight.advance(SETPOINT_INTERVAL_S))
                 if flight.is_on_path:

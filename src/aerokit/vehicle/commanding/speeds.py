@@ -1,4 +1,4 @@
-"""Airspeed, climb speed and descent speed."""
+"""Airspeed and climb speed."""
 
 from __future__ import annotations
 
@@ -18,12 +18,11 @@ def _speed(name: str, argument: str, kind: SpeedType) -> SimpleOrder:
 
 SET_AIRSPEED = _speed("set_airspeed", "airspeed_m_s", SpeedType.AIRSPEED)
 SET_CLIMB_SPEED = _speed("set_climb_speed", "climb_m_s", SpeedType.CLIMB_SPEED)
-SET_DESCENT_SPEED = _speed("set_descent_speed", "descent_m_s", SpeedType.DESCENT_SPEED)
 
 
 @checks_arguments
 class SpeedActions(VehicleBase):
-    """Airspeed, and vertical speeds. ``set_speed`` changes the ground speed."""
+    """Airspeed and climb speed. ``set_speed`` changes the ground speed."""
 
     async def set_airspeed(self, airspeed_m_s: float) -> None:
         """Change the airspeed of a fixed wing in m/s, above 0 (MAV_CMD_DO_CHANGE_SPEED, SPEED_TYPE_AIRSPEED).
@@ -54,13 +53,6 @@ class SpeedActions(VehicleBase):
             CommandTimeout: there was no acknowledgement.
         """
         await self._set_speed(SET_CLIMB_SPEED, climb_m_s)
-
-    async def set_descent_speed(self, descent_m_s: float) -> None:
-        """Change the speed of descents in m/s, above 0 (MAV_CMD_DO_CHANGE_SPEED, SPEED_TYPE_DESCENT_SPEED).
-
-        All else as for :meth:`set_climb_speed`.
-        """
-        await self._set_speed(SET_DESCENT_SPEED, descent_m_s)
 
     async def _set_speed(self, order: SimpleOrder, speed_m_s: float) -> None:
         kind, *_ = order.wire_params(speed_m_s)
