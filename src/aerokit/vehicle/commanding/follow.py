@@ -43,7 +43,7 @@ class HasTelemetry(Protocol):
 FollowTarget = HasTelemetry | AsyncIterable[Position] | Callable[[], Position | None]
 """A vehicle, an asynchronous iterable of positions, or a function that returns the latest position or None."""
 
-RATE_HZ, MAX_LAG_S = 10.0, 0.5
+RATE_HZ, MAX_LAG_S = 10.0, 1.0
 MAX_DISTANCE_M = 1000.0
 MIN_COURSE_SPEED_M_S = 0.5
 """Ground speed from which a movement has a direction."""

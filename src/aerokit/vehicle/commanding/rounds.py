@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 Facing = Literal["center", "ahead", "initial", "free"]
 
-SETPOINT_INTERVAL_S, SETPOINT_RATE_HZ = 0.1, 20.0
+SETPOINT_INTERVAL_S, SETPOINT_RATE_HZ, VALID_FOR_S = 0.1, 20.0, 1.0
 LAG_ROUNDS = 0.02
 """Part of a round by which a vehicle at the end of its path may have been counted too little."""
 END_TIMEOUT_S = 15.0
@@ -192,7 +192,8 @@ class RoundFlight:
         return heading
 
     async def _stream(self, flight: PathFlight, order: Order) -> None:
-        stream = Guided(self._context).trajectory(flight.advance(0.0), rate_hz=SETPOINT_RATE_HZ)
+        first, limits = flight.advance(0.0), {"valid_for_s": VALID_FOR_S, "max_lag_s": VALID_FOR_S}
+        stream = Guided(self._context).trajectory(first, rate_hz=SETPOINT_RATE_HZ, **limits)
         stream.prepared_order = order
         async with stream:
             while not flight.is_complete:
