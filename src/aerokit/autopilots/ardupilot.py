@@ -192,6 +192,8 @@ class ArduPilot(Autopilot):
     # ATTITUDE_QUATERNION is sent on request, and so not listed.
     unsupported_messages: frozenset[str] = frozenset(("ESTIMATOR_STATUS", "WIND_COV", "ALTITUDE", "CURRENT_MODE"))
     unsupported_commands: frozenset[int] = NOT_ON_ARDUPILOT
+    reports_gripper_by_text = True
+    winch_actions: frozenset[int] = frozenset((0, 1, 2))
 
     def missing_estimates(self, flags: int) -> tuple[str, ...]:
         return (

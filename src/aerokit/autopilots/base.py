@@ -387,4 +387,8 @@ class Autopilot:
 
     unsupported_commands: frozenset[int] = frozenset()
     """MAV_CMDs without a handler in the firmware. Actions that need one raise NotSupported before anything is sent."""
+    reports_gripper_by_text = False
+    """True if a gripper is acknowledged at once and its end reported by status text; otherwise the ack comes then."""
+    winch_actions: frozenset[int] = frozenset(range(10))
+    """WINCH_ACTIONS that MAV_CMD_DO_WINCH (42600) supports."""
     unsupported_messages: frozenset[str] = frozenset()

@@ -17,7 +17,8 @@ has the command is in `aerokit.autopilots`. A method that gives the order names 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+import asyncio
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from aerokit._internal.arguments import check_range
 from aerokit._internal.formatting import short_repr
@@ -34,6 +35,8 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.vehicle.commanding.context import VehicleContext
     from aerokit.vehicle.commanding.order import Order, Topic
+
+MessageT = TypeVar("MessageT", bound="Message")
 
 EFFECT_TIMEOUT_S = 5.0
 """Seconds after the acknowledgement until a message must report the effect."""
@@ -206,3 +209,33 @@ class SimpleOrder(Snapshot):
         except CommandTimeout:
             pass
         return True
+
+
+async def receive_once(
+    context: VehicleContext, message_type: type[MessageT], component_id: int | None = None, *, timeout: float = 1.0
+) -> MessageT | None:
+    """Request one message and return it; None if the vehicle refuses or does not send it within ``timeout`` seconds."""
+    session = context.session
+    target = session.component_id if component_id is None else component_id
+    received: list[MessageT] = []
+    arrived = asyncio.Event()
+
+    def on_message(message: Message) -> None:
+        frame = message.received_frame
+        if isinstance(message, message_type) and (frame is None or frame.component_id == target):
+            received[:] = [message]
+            arrived.set()
+
+    detach = session.connection.bus.attach(message_type, on_message, system_id=session.system_id)
+    timer = asyncio.get_running_loop().call_later(2 * timeout, arrived.set)
+    try:
+        await session.commands.send_long(
+            MavCmd.REQUEST_MESSAGE, message_type.ID, component_id=target, attempts=1, attempt_timeout=timeout
+        )
+        await arrived.wait()
+    except (CommandRejected, CommandTimeout):
+        pass
+    finally:
+        timer.cancel()
+        detach()
+    return received[0] if received else None

@@ -44,6 +44,7 @@ class MessageSource(Generic[T]):
         fallback: used only while no better message has reported the state recently.
         alternative: some autopilots send this message alternative of the first one.
         instance_field: the field that distinguishes several instances, each of which counts.
+        watched_hz: the rate to request while the program waits for the state or follows it, instead of ``hz``.
     """
 
     def __init__(
@@ -56,6 +57,7 @@ class MessageSource(Generic[T]):
         fallback: bool = False,
         alternative: bool = False,
         instance_field: str | None = None,
+        watched_hz: float | None = None,
     ) -> None:
         if message not in MESSAGE_IDS:
             raise ValueError(f"{message} is no message class")
@@ -66,6 +68,7 @@ class MessageSource(Generic[T]):
         self.fallback: bool = fallback
         self.alternative: bool = alternative
         self.instance_field: str | None = instance_field
+        self.watched_hz: float | None = watched_hz
 
 
 class _HasCells(Protocol):

@@ -12,14 +12,15 @@ from aerokit.vehicle.state import states
 from aerokit.vehicle.state.field import message_type
 
 if TYPE_CHECKING:
-    from aerokit.vehicle.state.field import StateField
+    from aerokit.vehicle.state.field import MessageSource, StateField
 
 HEAD = """# What a vehicle tells
 
 Each is a cell of the vehicle: `vehicle.position.value`, `.latest`, `.age`, `.source`, `.fresh(within=1)`,
 `await vehicle.position.wait_until(…)`, `async for … in vehicle.position.changes()`. Values are in SI units and
 degrees; their classes are in [vehicle/state](../src/aerokit/vehicle/state). The messages are named with the best
-source first, and with the rate at which the vehicle is asked for them unless `connect(rates=…)` says otherwise.
+source first, and with the rate at which the vehicle is asked for them unless `connect(rates=…)` says otherwise. "While
+watched" means while your program waits for the state or follows its changes; reading it requests nothing.
 
 | State | Type | What it is | Messages |
 |---|---|---|---|
@@ -50,10 +51,14 @@ def rendered() -> str:
 
 
 def _row(name: str, kind: str, text: str, told: StateField[Any]) -> str:
-    sources = ", ".join(
-        f"{message_type(each.message).NAME}{f' at {each.hz:g} Hz' if each.hz else ''}" for each in told.sources
-    )
+    sources = ", ".join(f"{message_type(each.message).NAME}{_rate(each)}" for each in told.sources)
     return f"| `{name}` | `{kind}` | {text.partition(' (')[0].rstrip('.')} | {sources} |\n"
+
+
+def _rate(source: MessageSource[Any]) -> str:
+    if source.watched_hz:
+        return f" at {source.watched_hz:g} Hz while watched"
+    return f" at {source.hz:g} Hz" if source.hz else ""
 
 
 if __name__ == "__main__":

@@ -1,0 +1,345 @@
+"""``Actuators``: servos, relays, actuators, landing gear, lights, the motor test and the parachute."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Literal
+
+import anyio
+
+from aerokit._internal.arguments import check_range, checks_arguments
+from aerokit._internal.async_block import ReadOnly
+from aerokit.errors import CommandRejected, InvalidArgument, OperationRejected
+from aerokit.mavlink.enums import MavCmd, MotorTestThrottleType, ParachuteAction
+from aerokit.vehicle.commanding.progress import await_progress
+from aerokit.vehicle.commanding.simple_orders import Argument, Effect, SimpleOrder
+from aerokit.vehicle.devices.text_effect import watch_texts
+
+if TYPE_CHECKING:
+    from aerokit.mavlink.messages import IlluminatorStatus, RelayStatus, ServoOutputRaw
+    from aerokit.vehicle.commanding.context import VehicleContext
+
+SpinIntent = Literal["spin motor"]
+ReleaseIntent = Literal["release parachute"]
+
+MAX_MOTOR_TEST_S = 3.0
+"""PX4 ends a test after 3 s at the latest (Commander.cpp, handleCommandActuatorTest)."""
+TEST_END_TIMEOUT_S = 4.0
+PARACHUTE_TIMEOUT_S = 3.0
+ACTUATORS = 6
+ALL_GEARS = -1
+ILLUMINATOR = 243
+OUTPUTS_PER_MESSAGE = 16
+
+
+def _has_pulse(message: ServoOutputRaw, number: float, pulse_us: float) -> bool:
+    port, index = divmod(int(number) - 1, OUTPUTS_PER_MESSAGE)
+    return message.port == port and getattr(message, f"servo{index + 1}_raw") == int(pulse_us)
+
+
+def _is_switched(message: RelayStatus, number: float, on: float) -> bool:
+    return bool(message.on >> int(number) & 1) == bool(on)
+
+
+def _is_lit(message: IlluminatorStatus, on: float) -> bool:
+    return bool(message.enable) == bool(on)
+
+
+SERVO = Argument("number", 1, 32, whole=True)
+RELAY = Argument("number", 0, 15, whole=True)
+PULSE = Argument("pulse_us", 500, 2500, whole=True)
+COUNT = Argument("count", 1, 1000, whole=True)
+PERIOD = Argument("period_s", 0, 60, above=True)
+ON = Argument("on", 0, 1)
+MOTOR = Argument("number", 1, 12, whole=True)
+DURATION = Argument("duration_s", 0, MAX_MOTOR_TEST_S, above=True)
+SET_SERVO = SimpleOrder("set_servo", MavCmd.DO_SET_SERVO, (SERVO, PULSE), Effect("ServoOutputRaw", _has_pulse))
+REPEAT_SERVO = SimpleOrder("repeat_servo", MavCmd.DO_REPEAT_SERVO, (SERVO, PULSE, COUNT, PERIOD))
+SET_RELAY = SimpleOrder("set_relay", MavCmd.DO_SET_RELAY, (RELAY, ON), Effect("RelayStatus", _is_switched))
+REPEAT_RELAY = SimpleOrder("repeat_relay", MavCmd.DO_REPEAT_RELAY, (RELAY, COUNT, PERIOD))
+LANDING_GEAR = SimpleOrder("landing_gear", MavCmd.AIRFRAME_CONFIGURATION, (ALL_GEARS, Argument("up", 0, 1)))
+LIGHTS = SimpleOrder("set_lights", MavCmd.ILLUMINATOR_ON_OFF, (ON,), Effect("IlluminatorStatus", _is_lit))
+PARACHUTE = SimpleOrder("parachute", MavCmd.DO_PARACHUTE, (Argument("action", 0, 2),))
+PERCENT = MotorTestThrottleType.THROTTLE_PERCENT
+TEST_BY_SEQUENCE = SimpleOrder(
+    "test_motor", MavCmd.DO_MOTOR_TEST, (MOTOR, PERCENT, Argument("throttle_percent", 0, 100), DURATION, 1)
+)
+TEST_BY_FUNCTION = SimpleOrder(
+    "test_motor",
+    MavCmd.ACTUATOR_TEST,
+    (Argument("throttle_percent", 0, 100, scale=0.01), DURATION, 0, 0, MOTOR),
+)
+
+
+@checks_arguments
+class Actuators(ReadOnly):
+    """Outputs of the vehicle besides its flight controls: ``vehicle.actuators``.
+
+    ArduPilot has servos, relays, landing gear and a parachute; PX4 has actuators. An order that the firmware does not
+    have raises NotSupported before anything is sent. After a cancellation the vehicle may have executed the order.
+    """
+
+    def __init__(self, context: VehicleContext) -> None:
+        self._context = context
+
+    async def set_servo(self, number: int, pulse_us: int) -> None:
+        """Set the pulse width of a servo output, and return when SERVO_OUTPUT_RAW reports it (MAV_CMD_DO_SET_SERVO).
+
+        ArduPilot only. The output must have no function, or follow a stick (SERVOn_FUNCTION 0, 1, 51 to 66).
+
+        Args:
+            number: output, 1 to 32.
+            pulse_us: pulse width in microseconds, 500 to 2500.
+
+        Raises:
+            InvalidArgument: a value is out of range. Nothing was sent.
+            NotSupported: PX4. Nothing was sent.
+            CommandRejected: the output has another function.
+            CommandTimeout: there was no acknowledgement.
+            OperationRejected: a newer order for this output was given.
+            OperationTimeout: SERVO_OUTPUT_RAW reports another pulse width.
+        """
+        await SET_SERVO.send(self._context, number, pulse_us, topic=("servo", number))
+
+    async def repeat_servo(self, number: int, pulse_us: int, *, count: int, period_s: float) -> None:
+        """Move a servo ``count`` times to a pulse width and back to its trim (MAV_CMD_DO_REPEAT_SERVO).
+
+        Returns when ArduPilot has acknowledged and begins; no message reports the end. It has one cycle at a time: the
+        next order of this kind replaces it. Never repeated, because each copy starts a new cycle. ArduPilot only.
+
+        Args:
+            number: output, 1 to 32, as for :meth:`set_servo`.
+            pulse_us: pulse width in microseconds, 500 to 2500.
+            count: number of cycles, 1 to 1000.
+            period_s: seconds from one pulse to the next, above 0, at most 60.
+
+        Raises:
+            InvalidArgument: a value is out of range. Nothing was sent.
+            NotSupported: PX4. Nothing was sent.
+            CommandRejected: the output has another function.
+            CommandTimeout: there was no acknowledgement.
+        """
+        await REPEAT_SERVO.send(self._context, number, pulse_us, count, period_s, topic=("servo", number))
+
+    async def set_relay(self, number: int, on: bool) -> None:
+        """Switch a relay, and return when RELAY_STATUS reports it (MAV_CMD_DO_SET_RELAY).
+
+        Firmware without RELAY_STATUS (before ArduPilot 4.5) only acknowledges. ArduPilot only.
+
+        Args:
+            number: relay from 0 (RELAY1_PIN) to 15.
+            on: the new state.
+
+        Raises:
+            InvalidArgument: the number is out of range. Nothing was sent.
+            NotSupported: PX4. Nothing was sent.
+            CommandRejected: the relay is not configured.
+            CommandTimeout: there was no acknowledgement.
+            OperationRejected: a newer order for this relay was given.
+            OperationTimeout: RELAY_STATUS reports the other state.
+        """
+        await SET_RELAY.send(self._context, number, on, topic=("relay", number))
+
+    async def repeat_relay(self, number: int, *, count: int, period_s: float) -> None:
+        """Switch a relay over and back ``count`` times (MAV_CMD_DO_REPEAT_RELAY).
+
+        Returns when ArduPilot has acknowledged and begins. Never repeated, as :meth:`repeat_servo`. ArduPilot only.
+
+        Args:
+            number: relay from 0 to 15.
+            count: number of cycles, 1 to 1000.
+            period_s: seconds of one cycle, above 0, at most 60.
+
+        Raises:
+            InvalidArgument: a value is out of range. Nothing was sent.
+            NotSupported: PX4. Nothing was sent.
+            CommandRejected: the relay is not configured.
+            CommandTimeout: there was no acknowledgement.
+        """
+        await REPEAT_RELAY.send(self._context, number, count, period_s, topic=("relay", number))
+
+    async def set_actuator(self, number: int, value: float) -> None:
+        """Set one actuator (MAV_CMD_DO_SET_ACTUATOR); as :meth:`set_actuators`.
+
+        Args:
+            number: actuator set, 1 to 6.
+            value: −1 to 1.
+
+        Raises:
+            InvalidArgument: a value is out of range. Nothing was sent.
+            NotSupported: ArduPilot, which has :meth:`set_servo`. Nothing was sent.
+            CommandRejected: the vehicle refused.
+            CommandTimeout: there was no acknowledgement.
+        """
+        check_range("number", number, 1, ACTUATORS)
+        await self.set_actuators(*(value if index == number else None for index in range(1, ACTUATORS + 1)))
+
+    async def set_actuators(self, *values: float | None) -> None:
+        """Set actuators by number: the first value is for "Peripheral via Actuator Set 1" (MAV_CMD_DO_SET_ACTUATOR).
+
+        Returns when PX4 has acknowledged, because no message reports the values. It acknowledges also if no output has
+        this function (PWM_MAIN_FUNCn 301 to 306). PX4 only.
+
+        Args:
+            values: up to six values, −1 to 1; None leaves an actuator as it is.
+
+        Raises:
+            InvalidArgument: none or more than six values, or one is out of range. Nothing was sent.
+            NotSupported: ArduPilot, which has :meth:`set_servo`. Nothing was sent.
+            CommandRejected: the vehicle refused.
+            CommandTimeout: there was no acknowledgement.
+        """
+        if not 1 <= len(values) <= ACTUATORS or all(value is None for value in values):
+            raise InvalidArgument(f"values = {values!r} is not allowed: one to {ACTUATORS} values, not all None")
+        for value in values:
+            if value is not None:
+                check_range("values", value, -1, 1)
+        params = [math.nan if value is None else float(value) for value in values]
+        order = SimpleOrder(
+            "set_actuators", MavCmd.DO_SET_ACTUATOR, (*params, *(math.nan,) * (ACTUATORS - len(params)), 0)
+        )
+        await order.send(self._context, topic="actuators")
+
+    async def raise_landing_gear(self) -> None:
+        """Retract the landing gear (MAV_CMD_AIRFRAME_CONFIGURATION); returns at the acknowledgement. ArduPilot only.
+
+        ArduPilot reports the gear by no message, and accepts the order also while it stands on it.
+
+        Raises:
+            NotSupported: PX4. Nothing was sent.
+            OperationRejected: the vehicle is on the ground, or not known to fly. Nothing was sent.
+            CommandRejected: there is no landing gear (LGR_ENABLE).
+            CommandTimeout: there was no acknowledgement.
+        """
+        LANDING_GEAR.check_supported(self._context)
+        if self._context.vehicle_position.is_on_ground() or self._context.session.telemetry.is_confirmed_disarmed:
+            raise OperationRejected("raise_landing_gear: the vehicle is on the ground; nothing was sent")
+        await LANDING_GEAR.send(self._context, 1, topic="landing gear")
+
+    async def lower_landing_gear(self) -> None:
+        """Deploy the landing gear (MAV_CMD_AIRFRAME_CONFIGURATION); returns at the acknowledgement. ArduPilot only.
+
+        Raises:
+            NotSupported: PX4. Nothing was sent.
+            CommandRejected: there is no landing gear (LGR_ENABLE).
+            CommandTimeout: there was no acknowledgement.
+        """
+        await LANDING_GEAR.send(self._context, 0, topic="landing gear")
+
+    async def set_lights(self, on: bool, *, component_id: int = ILLUMINATOR) -> None:
+        """Switch an illuminator, and return when ILLUMINATOR_STATUS reports it (MAV_CMD_ILLUMINATOR_ON_OFF).
+
+        For lights that are a MAVLink component. ArduPilot and PX4 do not have the command; lights on an output of
+        ArduPilot are servos or relays.
+
+        Args:
+            on: the new state.
+            component_id: the light, 1 to 255; MAV_COMP_ID_ILLUMINATOR is 243.
+
+        Raises:
+            InvalidArgument: the id is out of range. Nothing was sent.
+            NotSupported: the id is that of an autopilot without the command. Nothing was sent.
+            CommandRejected: it refused.
+            CommandTimeout: there was no acknowledgement.
+            OperationRejected: a newer order for this light was given.
+            OperationTimeout: ILLUMINATOR_STATUS reports the other state.
+        """
+        check_range("component_id", component_id, 1, 255)
+        if component_id == self._context.session.component_id:
+            LIGHTS.check_supported(self._context)
+        await LIGHTS.send(self._context, on, topic=("lights", component_id), component_id=component_id)
+
+    async def test_motor(self, number: int, *, throttle_percent: float, duration_s: float, intent: SpinIntent) -> None:
+        """Spin one motor of a disarmed vehicle, and return when it has stopped; remove the propellers.
+
+        Sent once: a copy would spin it again. If the call is cancelled or fails, the motor is told to stop at once; it
+        stops by itself after ``duration_s`` if that is lost. ArduCopter reports "armed" while it tests, and the call
+        returns when it reports "disarmed". PX4 acknowledges only, so the call returns after ``duration_s``.
+
+        ArduPilot: MAV_CMD_DO_MOTOR_TEST. PX4: MAV_CMD_ACTUATOR_TEST, if COM_MOT_TEST_EN is 1.
+
+        Args:
+            number: 1 to 12. ArduPilot counts clockwise from the front right, PX4 by output function (Motor 1).
+            throttle_percent: 0 to 100.
+            duration_s: seconds, above 0, at most 3.
+            intent: must be ``"spin motor"``, so that no other call can be mistaken for it.
+
+        Raises:
+            InvalidArgument: a value is out of range, or the intent is missing. Nothing was sent.
+            OperationRejected: the vehicle is armed, or not known to be disarmed: nothing was sent. Or a newer order
+                for its motors was given.
+            CommandRejected: it refused (not landed, safety switch, COM_MOT_TEST_EN).
+            CommandTimeout: there was no acknowledgement; the motor may have turned.
+            OperationTimeout: the vehicle still reports armed four seconds after the end.
+        """
+        session, arbiter = self._context.session, self._context.arbiter
+        by_sequence = MavCmd.DO_MOTOR_TEST not in session.autopilot.unsupported_commands
+        row = TEST_BY_SEQUENCE if by_sequence else TEST_BY_FUNCTION
+        values = (number, throttle_percent, duration_s)
+        values = values if by_sequence else (throttle_percent, duration_s, number)
+        row.wire_params(*values)
+        if not session.telemetry.is_confirmed_disarmed or not arbiter.is_known:
+            state = "armed" if session.telemetry.is_armed else "not known to be disarmed"
+            raise OperationRejected(f"test_motor: the vehicle is {state}; nothing was sent")
+        order = arbiter.of_device("motor test")
+        try:
+            await row.send(self._context, *values, of=order)
+            await anyio.sleep(duration_s)
+            ended_at = session.connection.now()
+            await await_progress(
+                session,
+                "test_motor",
+                is_done=lambda: not session.telemetry.is_armed and session.telemetry.armed.updated_at > ended_at,
+                trouble=lambda: None if order.is_newest else "another motor test was started",
+                describe=lambda: "the vehicle still reports armed",
+                timeout=TEST_END_TIMEOUT_S,
+            )
+        except CommandRejected:
+            raise
+        except BaseException:
+            if order.is_newest and arbiter.is_known and session.connection.is_open:
+                # Throttle 0 for 0 s ends a test on ArduPilot; NaN for 0 s releases the output on PX4.
+                stop = (number, PERCENT, 0, 0, 1) if by_sequence else (math.nan, 0, 0, 0, number)
+                session.commands.send_unconfirmed(row.command, *stop)
+            raise
+
+    async def release_parachute(self, *, intent: ReleaseIntent) -> None:
+        """Release the parachute and stop the motors; return when ArduPilot reports that it was released.
+
+        MAV_CMD_DO_PARACHUTE. ArduPilot accepts the command also where it then refuses to release: on the ground, below
+        CHUTE_ALT_MIN, or if the parachute is disabled. ArduCopter and ArduPlane only. **The vehicle falls.**
+
+        Args:
+            intent: must be ``"release parachute"``, so that no other call can be mistaken for it.
+
+        Raises:
+            InvalidArgument: the intent is missing. Nothing was sent.
+            NotSupported: PX4, Rover and Sub. Nothing was sent.
+            OperationRejected: the vehicle refused after the acknowledgement; ``reasons`` has its status texts.
+            CommandRejected: there is no parachute.
+            CommandTimeout: there was no acknowledgement.
+            OperationTimeout: no status text reported the release.
+        """
+        with watch_texts(self._context, "release_parachute") as texts:
+            await PARACHUTE.send(self._context, ParachuteAction.RELEASE, topic="parachute")
+            await texts.wait(
+                lambda text: text.startswith("Parachute: Released"),
+                refused=lambda text: text.startswith("Parachute: "),
+                timeout=PARACHUTE_TIMEOUT_S,
+            )
+
+    async def enable_parachute(self, enabled: bool = True) -> None:
+        """Allow or forbid the release of the parachute until the next reboot; returns at the acknowledgement.
+
+        MAV_CMD_DO_PARACHUTE. ArduCopter and ArduPlane only.
+
+        Args:
+            enabled: False forbids it, also for failsafes.
+
+        Raises:
+            NotSupported: PX4, Rover and Sub. Nothing was sent.
+            CommandRejected: there is no parachute.
+            CommandTimeout: there was no acknowledgement.
+        """
+        action = ParachuteAction.ENABLE if enabled else ParachuteAction.DISABLE
+        await PARACHUTE.send(self._context, action, topic="parachute")
