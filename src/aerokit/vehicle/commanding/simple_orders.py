@@ -17,13 +17,13 @@ has the command is in `aerokit.autopilots`. A method that gives the order names 
 
 from __future__ import annotations
 
-import asyncio
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from aerokit._internal.arguments import check_range
 from aerokit._internal.formatting import short_repr
 from aerokit._internal.values import Snapshot
-from aerokit.errors import CommandRejected, CommandTimeout, InvalidArgument, NotSupported
+from aerokit.errors import CommandRejected, CommandTimeout, InvalidArgument, NotSupported, OperationTimeout
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd
 from aerokit.vehicle.commanding.order import SUPERSEDED
@@ -206,7 +206,7 @@ class SimpleOrder(Snapshot):
             )
         except CommandRejected:
             return False
-        except CommandTimeout:
+        except CommandTimeout:  # It may have the message nevertheless.
             pass
         return True
 
@@ -217,25 +217,15 @@ async def receive_once(
     """Request one message and return it; None if the vehicle refuses or does not send it within ``timeout`` seconds."""
     session = context.session
     target = session.component_id if component_id is None else component_id
-    received: list[MessageT] = []
-    arrived = asyncio.Event()
-
-    def on_message(message: Message) -> None:
-        frame = message.received_frame
-        if isinstance(message, message_type) and (frame is None or frame.component_id == target):
-            received[:] = [message]
-            arrived.set()
-
-    detach = session.connection.bus.attach(message_type, on_message, system_id=session.system_id)
-    timer = asyncio.get_running_loop().call_later(2 * timeout, arrived.set)
-    try:
+    with (
+        session.connection.subscribe(message_type, system_id=session.system_id, capacity=8) as messages,
+        suppress(CommandRejected, CommandTimeout, OperationTimeout),
+    ):
         await session.commands.send_long(
             MavCmd.REQUEST_MESSAGE, message_type.ID, component_id=target, attempts=1, attempt_timeout=timeout
         )
-        await arrived.wait()
-    except (CommandRejected, CommandTimeout):
-        pass
-    finally:
-        timer.cancel()
-        detach()
-    return received[0] if received else None
+        while True:
+            message = await messages.get(timeout)
+            if message.received_frame is None or message.received_frame.component_id == target:
+                return message
+    return None

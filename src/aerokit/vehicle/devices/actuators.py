@@ -13,11 +13,12 @@ from aerokit.errors import CommandRejected, InvalidArgument, OperationRejected
 from aerokit.mavlink.enums import MavCmd, MotorTestThrottleType, ParachuteAction
 from aerokit.vehicle.commanding.progress import await_progress
 from aerokit.vehicle.commanding.simple_orders import Argument, Effect, SimpleOrder
-from aerokit.vehicle.devices.text_effect import watch_texts
+from aerokit.vehicle.devices.text_effect import await_text, collected_texts
 
 if TYPE_CHECKING:
     from aerokit.mavlink.messages import IlluminatorStatus, RelayStatus, ServoOutputRaw
     from aerokit.vehicle.commanding.context import VehicleContext
+    from aerokit.vehicle.commanding.order import Order
 
 SpinIntent = Literal["spin motor"]
 ReleaseIntent = Literal["release parachute"]
@@ -75,8 +76,8 @@ TEST_BY_FUNCTION = SimpleOrder(
 class Actuators(ReadOnly):
     """Outputs of the vehicle besides its flight controls: ``vehicle.actuators``.
 
-    ArduPilot has servos, relays, landing gear and a parachute; PX4 has actuators. An order that the firmware does not
-    have raises NotSupported before anything is sent. After a cancellation the vehicle may have executed the order.
+    ArduPilot has servos, relays, landing gear and a parachute; PX4 has actuators. After a cancellation the vehicle may
+    have executed the order.
     """
 
     def __init__(self, context: VehicleContext) -> None:
@@ -114,10 +115,7 @@ class Actuators(ReadOnly):
             period_s: seconds from one pulse to the next, above 0, at most 60.
 
         Raises:
-            InvalidArgument: a value is out of range. Nothing was sent.
-            NotSupported: PX4. Nothing was sent.
-            CommandRejected: the output has another function.
-            CommandTimeout: there was no acknowledgement.
+            InvalidArgument, NotSupported, CommandRejected, CommandTimeout: as for ``set_servo``.
         """
         await REPEAT_SERVO.send(self._context, number, pulse_us, count, period_s, topic=("servo", number))
 
@@ -151,10 +149,7 @@ class Actuators(ReadOnly):
             period_s: seconds of one cycle, above 0, at most 60.
 
         Raises:
-            InvalidArgument: a value is out of range. Nothing was sent.
-            NotSupported: PX4. Nothing was sent.
-            CommandRejected: the relay is not configured.
-            CommandTimeout: there was no acknowledgement.
+            InvalidArgument, NotSupported, CommandRejected, CommandTimeout: as for ``set_relay``.
         """
         await REPEAT_RELAY.send(self._context, number, count, period_s, topic=("relay", number))
 
@@ -166,10 +161,7 @@ class Actuators(ReadOnly):
             value: −1 to 1.
 
         Raises:
-            InvalidArgument: a value is out of range. Nothing was sent.
-            NotSupported: ArduPilot, which has :meth:`set_servo`. Nothing was sent.
-            CommandRejected: the vehicle refused.
-            CommandTimeout: there was no acknowledgement.
+            InvalidArgument, NotSupported, CommandRejected, CommandTimeout: as for ``set_actuators``.
         """
         check_range("number", number, 1, ACTUATORS)
         await self.set_actuators(*(value if index == number else None for index in range(1, ACTUATORS + 1)))
@@ -220,9 +212,7 @@ class Actuators(ReadOnly):
         """Deploy the landing gear (MAV_CMD_AIRFRAME_CONFIGURATION); returns at the acknowledgement. ArduPilot only.
 
         Raises:
-            NotSupported: PX4. Nothing was sent.
-            CommandRejected: there is no landing gear (LGR_ENABLE).
-            CommandTimeout: there was no acknowledgement.
+            NotSupported, CommandRejected, CommandTimeout: as for ``raise_landing_gear``.
         """
         await LANDING_GEAR.send(self._context, 0, topic="landing gear")
 
@@ -252,9 +242,9 @@ class Actuators(ReadOnly):
     async def test_motor(self, number: int, *, throttle_percent: float, duration_s: float, intent: SpinIntent) -> None:
         """Spin one motor of a disarmed vehicle, and return when it has stopped; remove the propellers.
 
-        Sent once: a copy would spin it again. If the call is cancelled or fails, the motor is told to stop at once; it
-        stops by itself after ``duration_s`` if that is lost. ArduCopter reports "armed" while it tests, and the call
-        returns when it reports "disarmed". PX4 acknowledges only, so the call returns after ``duration_s``.
+        Sent once: a copy would spin it again. If the call is cancelled or fails, aerokit orders the motor to stop at
+        once; without that, it stops after ``duration_s``. ArduCopter reports armed during the test, and the call
+        returns when it reports disarmed. PX4 acknowledges only, so the call returns after ``duration_s``.
 
         ArduPilot: MAV_CMD_DO_MOTOR_TEST. PX4: MAV_CMD_ACTUATOR_TEST, if COM_MOT_TEST_EN is 1.
 
@@ -272,12 +262,13 @@ class Actuators(ReadOnly):
             CommandTimeout: there was no acknowledgement; the motor may have turned.
             OperationTimeout: the vehicle still reports armed four seconds after the end.
         """
-        session, arbiter = self._context.session, self._context.arbiter
-        by_sequence = MavCmd.DO_MOTOR_TEST not in session.autopilot.unsupported_commands
+        by_sequence = MavCmd.DO_MOTOR_TEST not in self._context.session.autopilot.unsupported_commands
         row = TEST_BY_SEQUENCE if by_sequence else TEST_BY_FUNCTION
-        values = (number, throttle_percent, duration_s)
-        values = values if by_sequence else (throttle_percent, duration_s, number)
+        values: tuple[float, ...] = (number, throttle_percent, duration_s)
+        if not by_sequence:
+            values = (throttle_percent, duration_s, number)
         row.wire_params(*values)
+        session, arbiter = self._context.session, self._context.arbiter
         if not session.telemetry.is_confirmed_disarmed or not arbiter.is_known:
             state = "armed" if session.telemetry.is_armed else "not known to be disarmed"
             raise OperationRejected(f"test_motor: the vehicle is {state}; nothing was sent")
@@ -285,15 +276,7 @@ class Actuators(ReadOnly):
         try:
             await row.send(self._context, *values, of=order)
             await anyio.sleep(duration_s)
-            ended_at = session.connection.now()
-            await await_progress(
-                session,
-                "test_motor",
-                is_done=lambda: not session.telemetry.is_armed and session.telemetry.armed.updated_at > ended_at,
-                trouble=lambda: None if order.is_newest else "another motor test was started",
-                describe=lambda: "the vehicle still reports armed",
-                timeout=TEST_END_TIMEOUT_S,
-            )
+            await self._await_test_end(order)
         except CommandRejected:
             raise
         except BaseException:
@@ -302,6 +285,18 @@ class Actuators(ReadOnly):
                 stop = (number, PERCENT, 0, 0, 1) if by_sequence else (math.nan, 0, 0, 0, number)
                 session.commands.send_unconfirmed(row.command, *stop)
             raise
+
+    async def _await_test_end(self, order: Order) -> None:
+        session = self._context.session
+        armed, ended_at = session.telemetry.armed, session.connection.now()
+        await await_progress(
+            session,
+            "test_motor",
+            is_done=lambda: armed.latest is False and armed.updated_at > ended_at,
+            trouble=lambda: None if order.is_newest else "another motor test was started",
+            describe=lambda: "the vehicle still reports armed",
+            timeout=TEST_END_TIMEOUT_S,
+        )
 
     async def release_parachute(self, *, intent: ReleaseIntent) -> None:
         """Release the parachute and stop the motors; return when ArduPilot reports that it was released.
@@ -320,11 +315,16 @@ class Actuators(ReadOnly):
             CommandTimeout: there was no acknowledgement.
             OperationTimeout: no status text reported the release.
         """
-        with watch_texts(self._context, "release_parachute") as texts:
-            await PARACHUTE.send(self._context, ParachuteAction.RELEASE, topic="parachute")
-            await texts.wait(
-                lambda text: text.startswith("Parachute: Released"),
-                refused=lambda text: text.startswith("Parachute: "),
+        order = self._context.arbiter.of_device("parachute")
+        with collected_texts(self._context) as texts:
+            await PARACHUTE.send(self._context, ParachuteAction.RELEASE, of=order)
+            await await_text(
+                self._context,
+                "release_parachute",
+                texts,
+                lambda text, _: text.startswith("Parachute: Released"),
+                is_refusal=lambda text: text.startswith("Parachute: "),
+                order=order,
                 timeout=PARACHUTE_TIMEOUT_S,
             )
 
@@ -337,9 +337,7 @@ class Actuators(ReadOnly):
             enabled: False forbids it, also for failsafes.
 
         Raises:
-            NotSupported: PX4, Rover and Sub. Nothing was sent.
-            CommandRejected: there is no parachute.
-            CommandTimeout: there was no acknowledgement.
+            NotSupported, CommandRejected, CommandTimeout: as for ``release_parachute``.
         """
         action = ParachuteAction.ENABLE if enabled else ParachuteAction.DISABLE
         await PARACHUTE.send(self._context, action, topic="parachute")

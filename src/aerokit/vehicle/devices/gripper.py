@@ -8,7 +8,7 @@ from aerokit._internal.arguments import checks_arguments
 from aerokit._internal.async_block import ReadOnly
 from aerokit.mavlink.enums import GripperActions, MavCmd
 from aerokit.vehicle.commanding.simple_orders import Argument, SimpleOrder
-from aerokit.vehicle.devices.text_effect import watch_texts
+from aerokit.vehicle.devices.text_effect import await_text, collected_texts
 
 if TYPE_CHECKING:
     from aerokit.vehicle.commanding.context import VehicleContext
@@ -28,7 +28,7 @@ class Gripper(ReadOnly):
 
     PX4 acknowledges when the gripper has moved (PD_GRIPPER_EN). ArduPilot acknowledges at once and reports the end by
     status text (GRIP_ENABLE); an electro-permanent gripper reports only its beginning, and the call returns three
-    seconds later. After a cancellation the gripper may have moved.
+    seconds later. Orders are sent once. After a cancellation the gripper may have moved.
     """
 
     def __init__(self, context: VehicleContext, number: int) -> None:
@@ -46,26 +46,20 @@ class Gripper(ReadOnly):
         await self._move(GripperActions.GRAB)
 
     async def release(self) -> None:
-        """Open the gripper, and return when it has opened.
-
-        Raises:
-            CommandRejected: there is no gripper, or it refused.
-            CommandTimeout: there was no acknowledgement.
-            OperationRejected: a newer order for this gripper was given.
-            OperationTimeout: the end was not reported within ten seconds.
-        """
+        """Open the gripper, and return when it has opened. Raises as :meth:`grab`."""
         await self._move(GripperActions.RELEASE)
 
     async def _move(self, action: GripperActions) -> None:
-        context = self._context
+        context, name = self._context, f"gripper {action.name.lower()}"
         order = context.arbiter.of_device(("gripper", self._number))
-        with watch_texts(context, f"gripper {action.name.lower()}") as texts:
+        with collected_texts(context) as texts:
             await DO_GRIPPER.send(context, self._number, action, of=order)
             if context.session.autopilot.reports_gripper_by_text:
-                await texts.wait(
-                    lambda text: text == ENDS[action],
-                    begun=lambda text: text == BEGINS[action],
-                    begun_for_s=EPM_WAIT_S,
+                await await_text(
+                    context,
+                    name,
+                    texts,
+                    lambda text, after_s: text == ENDS[action] or (text == BEGINS[action] and after_s >= EPM_WAIT_S),
                     order=order,
                     timeout=GRIP_TIMEOUT_S,
                 )

@@ -1,4 +1,4 @@
-"""``SignalActions``: tunes, status texts of the program, failure injection, grippers and winches of a vehicle."""
+"""``DeviceActions``: tunes, status texts of the program, failure injection, grippers and winches of a vehicle."""
 
 from __future__ import annotations
 
@@ -20,54 +20,17 @@ if TYPE_CHECKING:
     from aerokit.vehicle.devices.shell import Shell
     from aerokit.vehicle.devices.winch import Winch
 
+# fmt: off
 FailingUnit = Literal[
-    "gyro",
-    "accelerometer",
-    "compass",
-    "barometer",
-    "gps",
-    "optical_flow",
-    "visual_odometry",
-    "distance_sensor",
-    "air_speed",
-    "battery",
-    "motor",
-    "servo",
-    "avoidance",
-    "rc_signal",
-    "mavlink_signal",
+    "gyro", "accel", "mag", "baro", "gps", "optical_flow", "vio", "distance_sensor", "airspeed", "battery", "motor",
+    "servo", "avoidance", "rc_signal", "mavlink_signal",
 ]
 FailureKind = Literal["ok", "off", "stuck", "garbage", "wrong", "slow", "delayed", "intermittent"]
 Severity = Literal["emergency", "alert", "critical", "error", "warning", "notice", "info", "debug"]
-
-_U, _T = FailureUnit, FailureType
-UNITS: dict[str, FailureUnit] = {
-    "gyro": _U.SENSOR_GYRO,
-    "accelerometer": _U.SENSOR_ACCEL,
-    "compass": _U.SENSOR_MAG,
-    "barometer": _U.SENSOR_BARO,
-    "gps": _U.SENSOR_GPS,
-    "optical_flow": _U.SENSOR_OPTICAL_FLOW,
-    "visual_odometry": _U.SENSOR_VIO,
-    "distance_sensor": _U.SENSOR_DISTANCE_SENSOR,
-    "air_speed": _U.SENSOR_AIRSPEED,
-    "battery": _U.SYSTEM_BATTERY,
-    "motor": _U.SYSTEM_MOTOR,
-    "servo": _U.SYSTEM_SERVO,
-    "avoidance": _U.SYSTEM_AVOIDANCE,
-    "rc_signal": _U.SYSTEM_RC_SIGNAL,
-    "mavlink_signal": _U.SYSTEM_MAVLINK_SIGNAL,
-}
-KINDS: dict[str, FailureType] = {
-    "ok": _T.OK,
-    "off": _T.OFF,
-    "stuck": _T.STUCK,
-    "garbage": _T.GARBAGE,
-    "wrong": _T.WRONG,
-    "slow": _T.SLOW,
-    "delayed": _T.DELAYED,
-    "intermittent": _T.INTERMITTENT,
-}
+# fmt: on
+FailureIntent = Literal["inject failure"]
+# FAILURE_UNIT_SENSOR_GYRO is "gyro".
+UNITS: dict[str, FailureUnit] = {unit.name.partition("_")[2].lower(): unit for unit in FailureUnit}
 INJECT_FAILURE = SimpleOrder(
     "inject_failure",
     MavCmd.INJECT_FAILURE,
@@ -80,7 +43,7 @@ CHUNK, MAX_TEXT_BYTES = 50, 1000
 
 
 @checks_arguments
-class SignalActions(VehicleBase):
+class DeviceActions(VehicleBase):
     """Devices and signals of a vehicle besides its flight."""
 
     @cached_property
@@ -123,11 +86,7 @@ class SignalActions(VehicleBase):
         return Winch(self._context, number, component_id)
 
     def shell(self) -> Shell:
-        """Open PX4's system shell for the duration of an ``async with`` block (SERIAL_CONTROL).
-
-        Raises:
-            NotSupported: ArduPilot, which has no shell.
-        """
+        """Open PX4's system shell for the duration of an ``async with`` block (SERIAL_CONTROL)."""
         from aerokit.vehicle.devices.shell import Shell
 
         return Shell(self._session)
@@ -177,26 +136,28 @@ class SignalActions(VehicleBase):
 
     _text_id = 0
 
-    async def inject_failure(self, unit: FailingUnit, kind: FailureKind, *, instance: int = 0) -> None:
-        """Make a simulated or real part fail, to test how the vehicle reacts (MAV_CMD_INJECT_FAILURE).
+    async def inject_failure(
+        self, unit: FailingUnit, kind: FailureKind, *, instance: int = 0, intent: FailureIntent
+    ) -> None:
+        """Make a part of the vehicle fail, to test how the vehicle reacts (MAV_CMD_INJECT_FAILURE).
 
         PX4 only, if SYS_FAILURE_EN is 1. Returns when PX4 has acknowledged; it reports the failure by status texts and
-        by the health of its sensors. **The vehicle may crash.** ``kind="ok"`` ends the failure.
+        by the health of its sensors. **The vehicle may crash.** ``kind="ok"`` ends the failure. Sent once.
 
         Args:
-            unit: the part that fails.
-            kind: how it fails.
-            instance: number of the part from 1; 0 for all.
+            unit: the part that fails, as FAILURE_UNIT.
+            kind: how it fails, as FAILURE_TYPE.
+            instance: number of the part from 1 to 16; 0 for all.
+            intent: must be ``"inject failure"``, so that no other call can be mistaken for it.
 
         Raises:
-            InvalidArgument: an unknown unit or kind, or an instance that is not 0 to 16. Nothing was sent.
+            InvalidArgument: an argument is not allowed, or the intent is missing. Nothing was sent.
             NotSupported: ArduPilot, whose simulation has SIM_ parameters instead. Nothing was sent.
             CommandRejected: SYS_FAILURE_EN is 0, or PX4 cannot let this part fail in this way.
-            CommandTimeout: there was no acknowledgement.
+            CommandTimeout: there was no acknowledgement. PX4 sends none for a part that nothing there can let fail; the
+                part may have failed nevertheless.
         """
-        await INJECT_FAILURE.send(
-            self._context, UNITS[unit], KINDS[kind], instance, topic=("failure", unit, instance)
-        )
+        await INJECT_FAILURE.send(self._context, UNITS[unit], FailureType[kind.upper()], instance)
 
 
 def _chunks(text: str) -> list[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from aerokit.vehicle.commanding.order import SUPERSEDED
 from aerokit.vehicle.commanding.progress import await_progress
 
 if TYPE_CHECKING:
@@ -12,67 +13,50 @@ if TYPE_CHECKING:
 
     from aerokit.vehicle.commanding.context import VehicleContext
     from aerokit.vehicle.commanding.order import Order
-    from aerokit.vehicle.state.condition import StatusText
 
 
-class TextWatch:
-    """Status texts received since an order was given; see :func:`watch_texts`."""
+async def await_text(
+    context: VehicleContext,
+    name: str,
+    texts: list[str],
+    is_done: Callable[[str, float], bool],
+    *,
+    is_refusal: Callable[[str], bool] = lambda _: False,
+    order: Order,
+    timeout: float,
+) -> None:
+    """Wait for a status text that reports the effect: ``is_done(text, seconds since the call)``.
 
-    def __init__(self, context: VehicleContext, name: str) -> None:
-        self._context, self._name = context, name
-        self.texts: list[str] = []
+    Raises:
+        OperationRejected: a refusal was received, or the order was superseded.
+        HeartbeatTimeout: the vehicle was silent for ten seconds.
+        OperationTimeout: there was no such text in time.
+    """
+    now = context.session.connection.now
+    started = now()
 
-    def on_text(self, _: StatusText | None, text: StatusText) -> None:
-        self.texts.append(text.text)
+    def trouble() -> str | None:
+        if not order.is_newest:
+            return SUPERSEDED
+        return next((f"the vehicle reports {text!r}" for text in texts if is_refusal(text)), None)
 
-    async def wait(
-        self,
-        is_done: Callable[[str], bool],
-        *,
-        refused: Callable[[str], bool] = lambda _: False,
-        begun: Callable[[str], bool] = lambda _: False,
-        begun_for_s: float = 0.0,
-        order: Order | None = None,
-        timeout: float,
-    ) -> None:
-        """Wait for a text that reports the effect.
-
-        A text for which ``begun`` is true will do if ``begun_for_s`` seconds have passed since.
-
-        Raises:
-            OperationRejected: a text for which ``refused`` is true was received, or the order was superseded.
-            HeartbeatTimeout: the vehicle was silent for ten seconds.
-            OperationTimeout: there was no such text in time.
-        """
-        session = self._context.session
-        started = session.connection.now()
-
-        def done() -> bool:
-            if any(map(is_done, self.texts)):
-                return True
-            return any(map(begun, self.texts)) and session.connection.now() - started >= begun_for_s
-
-        def trouble() -> str | None:
-            if order is not None and not order.is_newest:
-                return "another order was given"
-            return next((f"the vehicle reports {text!r}" for text in self.texts if refused(text)), None)
-
-        await await_progress(
-            session,
-            self._name,
-            is_done=done,
-            trouble=trouble,
-            describe=lambda: "no status text reported it",
-            timeout=timeout,
-        )
+    await await_progress(
+        context.session,
+        name,
+        is_done=lambda: any(is_done(text, now() - started) for text in texts),
+        trouble=trouble,
+        describe=lambda: "no status text reported it",
+        timeout=timeout,
+    )
 
 
 @contextmanager
-def watch_texts(context: VehicleContext, name: str) -> Iterator[TextWatch]:
+def collected_texts(context: VehicleContext) -> Iterator[list[str]]:
     """Collect the status texts of the vehicle for the duration of the block, which sends the order."""
-    watch = TextWatch(context, name)
-    detach = context.session.telemetry.status_text.observe(watch.on_text, every_arrival=True)
+    texts: list[str] = []
+    cell = context.session.telemetry.status_text
+    detach = cell.observe(lambda _, text: texts.append(text.text), every_arrival=True)
     try:
-        yield watch
+        yield texts
     finally:
         detach()

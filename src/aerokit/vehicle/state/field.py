@@ -116,7 +116,10 @@ class StateField(Generic[T]):
 
     def waits_for(self, autopilot: Autopilot) -> str:
         """Return the messages that report the state, for error texts."""
-        return self._waits_for or " or ".join(kind.NAME for kind in self.requested_from(autopilot))
+        if self._waits_for:
+            return self._waits_for
+        sent = [kind.NAME for kind in self.requested_from(autopilot)]
+        return " or ".join(sent) or f"message with it, which {autopilot.firmware} does not send,"
 
 
 U8, U16 = 0xFF, 0xFFFF

@@ -9,32 +9,27 @@ from aerokit._internal.values import Snapshot
 from aerokit.mavlink.enums import AdsbAltitudeType, AdsbEmitterType, AdsbFlags, MavFrame, MavWinchStatusFlag
 from aerokit.position import Position
 from aerokit.vehicle.state.field import I16, Context, finite, member, unless
+from aerokit.vehicle.state.movement import place
 
 if TYPE_CHECKING:
     from aerokit.mavlink import messages
 
-MG_M_S2, MGAUSS_UT, GAUSS_UT, HPA_PA = 9.80665e-3, 0.1, 100.0, 100.0
+MG_M_S2, MGAUSS_UT, HPA_PA, RAD_DEG = 9.80665e-3, 0.1, 100.0, math.degrees(1)
 NO_TERRAIN_M = -1000.0
 MAX_AIRCRAFT = 64
 _F = AdsbFlags
 
 
 class Imu(Snapshot):
-    """One inertial sensor in body axes: x forward, y right, z down.
+    """One inertial sensor, in body axes: x forward, y right, z down.
 
     Accelerations in m/s², rates in degrees per second, magnetic field in microtesla (1 gauss is 100 µT). Pressures in
     Pa and metres, None if the message has none.
     """
 
-    acceleration_x_m_s2: float
-    acceleration_y_m_s2: float
-    acceleration_z_m_s2: float
-    rate_x_deg_s: float
-    rate_y_deg_s: float
-    rate_z_deg_s: float
-    field_x_ut: float
-    field_y_ut: float
-    field_z_ut: float
+    acceleration_m_s2: tuple[float, float, float]
+    rate_deg_s: tuple[float, float, float]
+    field_ut: tuple[float, float, float]
     temperature_c: float | None = None
     pressure_pa: float | None = None
     differential_pressure_pa: float | None = None
@@ -53,23 +48,17 @@ class RawImu(Snapshot):
 class Odometry(Snapshot):
     """Pose in ``frame`` and velocity in ``child_frame`` (MAV_FRAME), as the estimator reports them.
 
-    Metres, m/s and degrees per second; ``quaternion`` is w, x, y, z. A covariance is the upper right triangle of a
-    6×6 matrix, row by row (x, y, z, roll, pitch, yaw), None if unknown. ``quality_percent`` is None if not reported,
-    −1 if the odometry has failed.
+    Metres, m/s and degrees per second along x, y, z; ``quaternion`` is w, x, y, z. A covariance is the upper right
+    triangle of a 6×6 matrix, row by row (x, y, z, roll, pitch, yaw), None if unknown. ``quality_percent`` is None if
+    not reported, −1 if the odometry has failed.
     """
 
     frame: int
     child_frame: int
-    x_m: float
-    y_m: float
-    z_m: float
+    position_m: tuple[float, float, float]
     quaternion: tuple[float, float, float, float]
-    x_m_s: float
-    y_m_s: float
-    z_m_s: float
-    roll_rate_deg_s: float
-    pitch_rate_deg_s: float
-    yaw_rate_deg_s: float
+    velocity_m_s: tuple[float, float, float]
+    rate_deg_s: tuple[float, float, float]
     pose_covariance: tuple[float, ...] | None = None
     velocity_covariance: tuple[float, ...] | None = None
     quality_percent: int | None = None
@@ -145,30 +134,30 @@ class WinchStatus(Snapshot):
         return bool(self.flags & MavWinchStatusFlag.HEALTHY)
 
 
-def _deg_s(*rates_rad_s: float) -> tuple[float, ...]:
-    return tuple(map(math.degrees, rates_rad_s))
+def _scaled(factor: float, x: float, y: float, z: float) -> tuple[float, float, float]:
+    return (x * factor, y * factor, z * factor)
 
 
-def highres_imu(message: messages.HighresImu) -> Imu:
+def highres_imu(message: messages.HighresImu, context: Context) -> Imu:
     """Decode HIGHRES_IMU."""
     return Imu(
-        *(message.xacc, message.yacc, message.zacc),
-        *_deg_s(message.xgyro, message.ygyro, message.zgyro),
-        *(field * GAUSS_UT for field in (message.xmag, message.ymag, message.zmag)),
-        temperature_c=finite(message.temperature),
-        pressure_pa=message.abs_pressure * HPA_PA,
-        differential_pressure_pa=message.diff_pressure * HPA_PA,
-        pressure_altitude_m=finite(message.pressure_alt),
+        (message.xacc, message.yacc, message.zacc),
+        _scaled(RAD_DEG, message.xgyro, message.ygyro, message.zgyro),
+        _scaled(context.autopilot.highres_imu_field_ut, message.xmag, message.ymag, message.zmag),
+        finite(message.temperature),
+        message.abs_pressure * HPA_PA,
+        message.diff_pressure * HPA_PA,
+        finite(message.pressure_alt),
     )
 
 
 def scaled_imu(message: messages.ScaledImu) -> Imu:
     """Decode SCALED_IMU: thousandths of g, rad/s and gauss."""
     return Imu(
-        *(axis * MG_M_S2 for axis in (message.xacc, message.yacc, message.zacc)),
-        *_deg_s(*(axis / 1000 for axis in (message.xgyro, message.ygyro, message.zgyro))),
-        *(axis * MGAUSS_UT for axis in (message.xmag, message.ymag, message.zmag)),
-        temperature_c=_centidegrees(message.temperature),
+        _scaled(MG_M_S2, message.xacc, message.yacc, message.zacc),
+        _scaled(RAD_DEG / 1000, message.xgyro, message.ygyro, message.zgyro),
+        _scaled(MGAUSS_UT, message.xmag, message.ymag, message.zmag),
+        _centidegrees(message.temperature),
     )
 
 
@@ -188,13 +177,14 @@ def _centidegrees(value: int) -> float | None:
 
 def odometry(message: messages.Odometry) -> Odometry:
     """Decode ODOMETRY."""
+    w, x, y, z = message.q
     return Odometry(
         member(MavFrame, message.frame_id),
         member(MavFrame, message.child_frame_id),
-        *(message.x, message.y, message.z),
-        tuple(message.q),
-        *(message.vx, message.vy, message.vz),
-        *_deg_s(message.rollspeed, message.pitchspeed, message.yawspeed),
+        (message.x, message.y, message.z),
+        (w, x, y, z),
+        (message.vx, message.vy, message.vz),
+        _scaled(RAD_DEG, message.rollspeed, message.pitchspeed, message.yawspeed),
         _covariance(message.pose_covariance),
         _covariance(message.velocity_covariance),
         message.quality or None,
@@ -215,17 +205,19 @@ def air_pressure(message: messages.ScaledPressure) -> AirPressure:
     )
 
 
-def ground_truth(message: messages.HilStateQuaternion) -> Position:
-    """Decode the position in HIL_STATE_QUATERNION, the truth of PX4's simulation."""
-    return Position(message.lat * 1e-7, message.lon * 1e-7, altitude_amsl_m=message.alt / 1000)
+def ground_truth(message: messages.HilStateQuaternion) -> Position | None:
+    """Return the position in HIL_STATE_QUATERNION, the truth of PX4's simulation; None if it is not a place."""
+    where = place(message.lat, message.lon)
+    return where and Position(*where, message.alt / 1000)
 
 
-def simulation_state(message: messages.SimState) -> Position:
-    """Decode the position in SIM_STATE, the truth of ArduPilot's simulation."""
-    latitude, longitude = message.lat_int * 1e-7, message.lon_int * 1e-7
-    if not (message.lat_int or message.lon_int):
-        latitude, longitude = message.lat, message.lon
-    return Position(latitude, longitude, altitude_amsl_m=message.alt)
+def simulation_state(message: messages.SimState) -> Position | None:
+    """Return the position in SIM_STATE, the truth of ArduPilot's simulation; None if it is not a place."""
+    latitude, longitude = message.lat_int, message.lon_int
+    if not (latitude or longitude) and abs(message.lat) <= 90 and abs(message.lon) <= 180:
+        latitude, longitude = round(message.lat * 1e7), round(message.lon * 1e7)
+    where, altitude = place(latitude, longitude), finite(message.alt)
+    return None if where is None or altitude is None else Position(*where, altitude)
 
 
 def altitude(message: messages.Altitude) -> Altitude:
@@ -273,7 +265,11 @@ def aircraft(message: messages.AdsbVehicle, context: Context) -> tuple[Aircraft,
 def winch(message: messages.WinchStatus) -> WinchStatus:
     """Decode WINCH_STATUS."""
     return WinchStatus(
-        *map(finite, (message.line_length, message.speed, message.tension, message.voltage, message.current)),
+        finite(message.line_length),
+        finite(message.speed),
+        finite(message.tension),
+        finite(message.voltage),
+        finite(message.current),
         unless(message.temperature, I16),
         message.status,
     )

@@ -205,7 +205,9 @@ class States:
     status_text: StateField[StatusText] = StateField(MessageSource("Statustext", None), eager=True)
     """The last status text (STATUSTEXT, chunks joined)."""
 
-    imu: StateField[Imu] = StateField(MessageSource("HighresImu", measurements.highres_imu, watched_hz=10.0))
+    imu: StateField[Imu] = StateField(
+        MessageSource("HighresImu", measurements.highres_imu, needs_context=True, watched_hz=10.0)
+    )
     """Accelerations, turn rates, magnetic field, pressures and temperature in SI units (HIGHRES_IMU)."""
 
     scaled_imu: StateField[Imu] = StateField(MessageSource("ScaledImu", measurements.scaled_imu, watched_hz=10.0))
