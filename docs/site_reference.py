@@ -305,7 +305,7 @@ def _annotated(item: Any) -> set[str]:
 
 @functools.cache
 def _class_sources(path: str) -> dict[str, str]:
-    """Return the source text of each class of a file by its qualified name; `inspect` parses the file for each class."""
+    """Return the source of each class of a file by qualified name: `inspect` would parse the file for each class."""
     text = Path(path).read_text(encoding="utf-8")
     lines, found = text.splitlines(keepends=True), dict[str, str]()
 
