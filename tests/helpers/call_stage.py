@@ -148,9 +148,10 @@ async def grounded(stage: Stage) -> None:
     """Disarmed and ready, on the ground, in a mode that can be armed."""
     vehicle = stage.vehicle
     await anywhere(stage)
-    if vehicle.is_armed:
-        with anyio.fail_after(60):
+    with anyio.fail_after(60):
+        if vehicle.is_armed:
             await vehicle.disarm(force=True)
+        if not stage.simulated.motion.is_on_ground:
             while not stage.simulated.motion.is_on_ground:  # noqa: ASYNC110
                 await anyio.sleep(0.1)
             await vehicle.landed_state.wait_until(lambda state: state == 1)

@@ -39,6 +39,7 @@ from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M, MAX_SILENCE_S
 from aerokit.vehicle.commanding.setpoints import AccelerationSetpoint, BodyVelocitySetpoint, VelocitySetpoint
 from aerokit.vehicle.connect import connect as connect_async
 from aerokit.vehicle.devices.actuators import ILLUMINATOR
+from aerokit.vehicle.devices.winch import ACTION_TIMEOUT_S
 from aerokit.vehicle.files.logs import ERASE_PATIENCE_S
 
 if TYPE_CHECKING:
@@ -1445,20 +1446,21 @@ class Actuators(TwinOf["AsyncActuators"]):
         self._loop.run(self.aio.set_actuators, *values)
 
     def raise_landing_gear(self) -> None:
-        """Retract the landing gear (MAV_CMD_AIRFRAME_CONFIGURATION); returns at the acknowledgement. ArduPilot only.
+        """Retract the landing gear (MAV_CMD_AIRFRAME_CONFIGURATION); returns at the acknowledgement.
 
-        ArduPilot reports the gear by no message, and accepts the order also while it stands on it.
+        ArduCopter and ArduPlane only. They report the gear by no message, and accept the order also if there is no
+        landing gear (LGR_ENABLE), or while they stand on it.
 
         Raises:
-            NotSupported: PX4. Nothing was sent.
-            OperationRejected: the vehicle is on the ground, or not known to fly. Nothing was sent.
-            CommandRejected: there is no landing gear (LGR_ENABLE).
+            NotSupported: PX4, Rover and Sub. Nothing was sent.
+            OperationRejected: the vehicle is disarmed, or on the ground. Nothing was sent.
+            CommandRejected: the vehicle refused.
             CommandTimeout: there was no acknowledgement.
         """
         self._loop.run(self.aio.raise_landing_gear)
 
     def lower_landing_gear(self) -> None:
-        """Deploy the landing gear (MAV_CMD_AIRFRAME_CONFIGURATION); returns at the acknowledgement. ArduPilot only.
+        """Deploy the landing gear (MAV_CMD_AIRFRAME_CONFIGURATION); returns at the acknowledgement.
 
         Raises:
             NotSupported, CommandRejected, CommandTimeout: as for ``raise_landing_gear``.
@@ -1495,13 +1497,13 @@ class Actuators(TwinOf["AsyncActuators"]):
         ArduPilot: MAV_CMD_DO_MOTOR_TEST. PX4: MAV_CMD_ACTUATOR_TEST, if COM_MOT_TEST_EN is 1.
 
         Args:
-            number: 1 to 12. ArduPilot counts clockwise from the front right, PX4 by output function (Motor 1).
+            number: 1 to 12. ArduCopter counts clockwise from the front, PX4 by output function (Motor 1).
             throttle_percent: 0 to 100.
             duration_s: seconds, above 0, at most 3.
             intent: must be ``"spin motor"``, so that no other call can be mistaken for it.
 
         Raises:
-            InvalidArgument: a value is out of range, or the intent is missing. Nothing was sent.
+            InvalidArgument: a value is out of range, or the intent is another one. Nothing was sent.
             OperationRejected: the vehicle is armed, or not known to be disarmed: nothing was sent. Or a newer order
                 for its motors was given.
             CommandRejected: it refused (not landed, safety switch, COM_MOT_TEST_EN).
@@ -1526,10 +1528,10 @@ class Actuators(TwinOf["AsyncActuators"]):
             intent: must be ``"release parachute"``, so that no other call can be mistaken for it.
 
         Raises:
-            InvalidArgument: the intent is missing. Nothing was sent.
+            InvalidArgument: the intent is another one. Nothing was sent.
             NotSupported: PX4, Rover and Sub. Nothing was sent.
             OperationRejected: the vehicle refused after the acknowledgement; ``reasons`` has its status texts.
-            CommandRejected: there is no parachute.
+            CommandRejected: the vehicle refused.
             CommandTimeout: there was no acknowledgement.
             OperationTimeout: no status text reported the release.
         """
@@ -1597,7 +1599,7 @@ class Winch(TwinOf["AsyncWinch"]):
         """
         self._loop.run(self.aio.relax)
 
-    def pay_out(self, length_m: float, *, rate_m_s: float = 0.5, timeout: float = 120.0) -> None:
+    def pay_out(self, length_m: float, *, rate_m_s: float = 0.5, timeout: float = ACTION_TIMEOUT_S) -> None:
         """Pay out a length of line, and return when WINCH_STATUS reports it within 0.1 m.
 
         Without WINCH_STATUS it returns at the acknowledgement. Sent once, because a copy would pay out more.
@@ -1613,6 +1615,7 @@ class Winch(TwinOf["AsyncWinch"]):
             CommandRejected: there is no winch (WINCH_TYPE).
             CommandTimeout: there was no acknowledgement; the winch may run.
             OperationRejected: a newer order for this winch was given.
+            HeartbeatTimeout: the vehicle was silent for ten seconds.
             OperationTimeout: the length was not reported in time.
         """
         self._loop.run(self.aio.pay_out, length_m, rate_m_s=rate_m_s, timeout=timeout)
@@ -1652,7 +1655,7 @@ class Winch(TwinOf["AsyncWinch"]):
         """Hold the line by the motor, without the brake; returns at the acknowledgement. Raises as :meth:`deliver`."""
         self._loop.run(self.aio.hold)
 
-    def retract(self, *, timeout: float = 120.0) -> None:
+    def retract(self, *, timeout: float = ACTION_TIMEOUT_S) -> None:
         """Wind up all line, and return when WINCH_STATUS reports it fully retracted.
 
         Args:
@@ -1663,6 +1666,7 @@ class Winch(TwinOf["AsyncWinch"]):
             CommandRejected: the winch refused.
             CommandTimeout: there was no acknowledgement; the winch may run.
             OperationRejected: a newer order for this winch was given.
+            HeartbeatTimeout: the vehicle was silent for ten seconds.
             OperationTimeout: the end was not reported in time.
         """
         self._loop.run(self.aio.retract, timeout=timeout)
@@ -1701,7 +1705,6 @@ class Shell(BlockTwin["AsyncShell"]):
 
         Raises:
             InvalidArgument: it is too long or has a line break, or the block is not open. Nothing was sent.
-            ConnectionClosed, LinkLost: the connection has ended.
         """
         self._loop.call(self.aio.write, line)
 
@@ -1714,7 +1717,6 @@ class Shell(BlockTwin["AsyncShell"]):
         Raises:
             InvalidArgument: the timeout is out of range, or the block is not open.
             OperationTimeout: there was no output in time.
-            ConnectionClosed, LinkLost: the connection has ended.
         """
         return self._loop.run(self.aio.read, timeout=timeout)
 
@@ -1730,7 +1732,6 @@ class Shell(BlockTwin["AsyncShell"]):
         Raises:
             InvalidArgument: as for :meth:`write`.
             OperationTimeout: there was no prompt in time; the text has the output so far.
-            ConnectionClosed, LinkLost: the connection has ended.
         """
         return self._loop.run(self.aio.run, command, timeout=timeout)
 
@@ -3472,7 +3473,6 @@ class Vehicle(VehicleTwin):
 
         Raises:
             InvalidArgument: it is empty, too long, or has other characters. Nothing was sent.
-            ConnectionClosed, LinkLost: the connection has ended.
         """
         self._loop.call(self.aio.play_tune, tune)
 
@@ -3488,7 +3488,6 @@ class Vehicle(VehicleTwin):
 
         Raises:
             InvalidArgument: the text is empty or too long, or the severity is unknown. Nothing was sent.
-            ConnectionClosed, LinkLost: the connection has ended.
         """
         self._loop.call(self.aio.send_status_text, text, severity=severity)
 
@@ -3505,10 +3504,11 @@ class Vehicle(VehicleTwin):
             intent: must be ``"inject failure"``, so that no other call can be mistaken for it.
 
         Raises:
-            InvalidArgument: an argument is not allowed, or the intent is missing. Nothing was sent.
+            InvalidArgument: an argument is not allowed. Nothing was sent.
             NotSupported: ArduPilot, whose simulation has SIM_ parameters instead. Nothing was sent.
             CommandRejected: SYS_FAILURE_EN is 0, or PX4 cannot let this part fail in this way.
-            CommandTimeout: there was no acknowledgement; the part may have failed.
+            CommandTimeout: there was no acknowledgement. PX4 sends none for a part that nothing there can let fail; the
+                part may have failed nevertheless.
         """
         self._loop.run(self.aio.inject_failure, unit, kind, instance=instance, intent=intent)
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavResult, SerialControlDev, SerialControlFlag
-from aerokit.sim.commands import ReceivedCommand, whole
+from aerokit.sim.commands import ReceivedCommand
 from aerokit.sim.vehicle import sender_of
 
 if TYPE_CHECKING:

@@ -136,7 +136,7 @@ class SimpleOrder(Snapshot):
 
         Raises:
             InvalidArgument: a value is out of range. Nothing was sent.
-            NotSupported: the firmware does not have the command. Nothing was sent.
+            NotSupported: the command is for the autopilot, which does not have it. Nothing was sent.
             CommandRejected: the vehicle refused.
             CommandTimeout: there was no acknowledgement.
             OperationRejected: a newer order for the same device was given.
@@ -144,7 +144,8 @@ class SimpleOrder(Snapshot):
             OperationTimeout: the effect was not reported in time.
         """
         params = self.wire_params(*values)
-        self.check_supported(context)
+        if component_id in (None, context.session.component_id):
+            self.check_supported(context)
         if topic is not None and of is None:
             of = context.arbiter.of_device(topic)
         with context.arbiter.auxiliary_order(of) as order:

@@ -193,23 +193,24 @@ class Actuators(ReadOnly):
         await order.send(self._context, topic="actuators")
 
     async def raise_landing_gear(self) -> None:
-        """Retract the landing gear (MAV_CMD_AIRFRAME_CONFIGURATION); returns at the acknowledgement. ArduPilot only.
+        """Retract the landing gear (MAV_CMD_AIRFRAME_CONFIGURATION); returns at the acknowledgement.
 
-        ArduPilot reports the gear by no message, and accepts the order also while it stands on it.
+        ArduCopter and ArduPlane only. They report the gear by no message, and accept the order also if there is no
+        landing gear (LGR_ENABLE), or while they stand on it.
 
         Raises:
-            NotSupported: PX4. Nothing was sent.
-            OperationRejected: the vehicle is on the ground, or not known to fly. Nothing was sent.
-            CommandRejected: there is no landing gear (LGR_ENABLE).
+            NotSupported: PX4, Rover and Sub. Nothing was sent.
+            OperationRejected: the vehicle is disarmed, or on the ground. Nothing was sent.
+            CommandRejected: the vehicle refused.
             CommandTimeout: there was no acknowledgement.
         """
         LANDING_GEAR.check_supported(self._context)
         if self._context.vehicle_position.is_on_ground() or self._context.session.telemetry.is_confirmed_disarmed:
-            raise OperationRejected("raise_landing_gear: the vehicle is on the ground; nothing was sent")
+            raise OperationRejected("raise_landing_gear: the vehicle is disarmed or on the ground; nothing was sent")
         await LANDING_GEAR.send(self._context, 1, topic="landing gear")
 
     async def lower_landing_gear(self) -> None:
-        """Deploy the landing gear (MAV_CMD_AIRFRAME_CONFIGURATION); returns at the acknowledgement. ArduPilot only.
+        """Deploy the landing gear (MAV_CMD_AIRFRAME_CONFIGURATION); returns at the acknowledgement.
 
         Raises:
             NotSupported, CommandRejected, CommandTimeout: as for ``raise_landing_gear``.
@@ -235,8 +236,6 @@ class Actuators(ReadOnly):
             OperationTimeout: ILLUMINATOR_STATUS reports the other state.
         """
         check_range("component_id", component_id, 1, 255)
-        if component_id == self._context.session.component_id:
-            LIGHTS.check_supported(self._context)
         await LIGHTS.send(self._context, on, topic=("lights", component_id), component_id=component_id)
 
     async def test_motor(self, number: int, *, throttle_percent: float, duration_s: float, intent: SpinIntent) -> None:
@@ -249,13 +248,13 @@ class Actuators(ReadOnly):
         ArduPilot: MAV_CMD_DO_MOTOR_TEST. PX4: MAV_CMD_ACTUATOR_TEST, if COM_MOT_TEST_EN is 1.
 
         Args:
-            number: 1 to 12. ArduPilot counts clockwise from the front right, PX4 by output function (Motor 1).
+            number: 1 to 12. ArduCopter counts clockwise from the front, PX4 by output function (Motor 1).
             throttle_percent: 0 to 100.
             duration_s: seconds, above 0, at most 3.
             intent: must be ``"spin motor"``, so that no other call can be mistaken for it.
 
         Raises:
-            InvalidArgument: a value is out of range, or the intent is missing. Nothing was sent.
+            InvalidArgument: a value is out of range, or the intent is another one. Nothing was sent.
             OperationRejected: the vehicle is armed, or not known to be disarmed: nothing was sent. Or a newer order
                 for its motors was given.
             CommandRejected: it refused (not landed, safety switch, COM_MOT_TEST_EN).
@@ -272,16 +271,19 @@ class Actuators(ReadOnly):
         if not session.telemetry.is_confirmed_disarmed or not arbiter.is_known:
             state = "armed" if session.telemetry.is_armed else "not known to be disarmed"
             raise OperationRejected(f"test_motor: the vehicle is {state}; nothing was sent")
-        order = arbiter.of_device("motor test")
+        order, spins_until = arbiter.of_device("motor test"), math.inf
         try:
             await row.send(self._context, *values, of=order)
+            spins_until = session.connection.now() + duration_s
             await anyio.sleep(duration_s)
             await self._await_test_end(order)
         except CommandRejected:
             raise
         except BaseException:
-            if order.is_newest and arbiter.is_known and session.connection.is_open:
-                # Throttle 0 for 0 s ends a test on ArduPilot; NaN for 0 s releases the output on PX4.
+            # After its end, the stop would be another test, which arms the motors.
+            is_spinning = session.connection.now() < spins_until
+            if is_spinning and order.is_newest and arbiter.is_known and session.connection.is_open:
+                # Throttle 0 for 0 s ends a test on ArduPilot; PX4 releases the output after 0 s.
                 stop = (number, PERCENT, 0, 0, 1) if by_sequence else (math.nan, 0, 0, 0, number)
                 session.commands.send_unconfirmed(row.command, *stop)
             raise
@@ -308,10 +310,10 @@ class Actuators(ReadOnly):
             intent: must be ``"release parachute"``, so that no other call can be mistaken for it.
 
         Raises:
-            InvalidArgument: the intent is missing. Nothing was sent.
+            InvalidArgument: the intent is another one. Nothing was sent.
             NotSupported: PX4, Rover and Sub. Nothing was sent.
             OperationRejected: the vehicle refused after the acknowledgement; ``reasons`` has its status texts.
-            CommandRejected: there is no parachute.
+            CommandRejected: the vehicle refused.
             CommandTimeout: there was no acknowledgement.
             OperationTimeout: no status text reported the release.
         """

@@ -78,7 +78,6 @@ class Shell(ReadOnly):
 
         Raises:
             InvalidArgument: it is too long or has a line break, or the block is not open. Nothing was sent.
-            ConnectionClosed, LinkLost: the connection has ended.
         """
         data = line.encode()
         if len(data) > MAX_LINE or "\n" in line or "\r" in line:
@@ -104,7 +103,6 @@ class Shell(ReadOnly):
         Raises:
             InvalidArgument: the timeout is out of range, or the block is not open.
             OperationTimeout: there was no output in time.
-            ConnectionClosed, LinkLost: the connection has ended.
         """
         if timeout is not None:
             check_range("timeout", timeout, 0, 1e6)
@@ -126,7 +124,6 @@ class Shell(ReadOnly):
         Raises:
             InvalidArgument: as for :meth:`write`.
             OperationTimeout: there was no prompt in time; the text has the output so far.
-            ConnectionClosed, LinkLost: the connection has ended.
         """
         check_range("timeout", timeout, 0, 1e6, above=True)
         while self._output.get_nowait() is not None:

@@ -102,7 +102,6 @@ class DeviceActions(VehicleBase):
 
         Raises:
             InvalidArgument: it is empty, too long, or has other characters. Nothing was sent.
-            ConnectionClosed, LinkLost: the connection has ended.
         """
         if not 1 <= len(tune) <= MAX_TUNE or not TUNE.fullmatch(tune):
             raise InvalidArgument(
@@ -123,7 +122,6 @@ class DeviceActions(VehicleBase):
 
         Raises:
             InvalidArgument: the text is empty or too long, or the severity is unknown. Nothing was sent.
-            ConnectionClosed, LinkLost: the connection has ended.
         """
         data = text.encode()
         if not 1 <= len(data) <= MAX_TEXT_BYTES:
@@ -151,7 +149,7 @@ class DeviceActions(VehicleBase):
             intent: must be ``"inject failure"``, so that no other call can be mistaken for it.
 
         Raises:
-            InvalidArgument: an argument is not allowed, or the intent is missing. Nothing was sent.
+            InvalidArgument: an argument is not allowed. Nothing was sent.
             NotSupported: ArduPilot, whose simulation has SIM_ parameters instead. Nothing was sent.
             CommandRejected: SYS_FAILURE_EN is 0, or PX4 cannot let this part fail in this way.
             CommandTimeout: there was no acknowledgement. PX4 sends none for a part that nothing there can let fail; the

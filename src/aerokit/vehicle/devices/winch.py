@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 _A, _F = WinchActions, MavWinchStatusFlag
 LENGTH_TOLERANCE_M = 0.1
 RATE_TOLERANCE_M_S = 0.05
+ACTION_TIMEOUT_S = 120.0
 MAX_LENGTH_M, MAX_RATE_M_S = 1000.0, 20.0
 PARAMS = (
     Argument("number", 1, 255, whole=True),
@@ -67,7 +68,7 @@ class Winch(ReadOnly):
         """
         await self._send(_A.RELAXED)
 
-    async def pay_out(self, length_m: float, *, rate_m_s: float = 0.5, timeout: float = 120.0) -> None:
+    async def pay_out(self, length_m: float, *, rate_m_s: float = 0.5, timeout: float = ACTION_TIMEOUT_S) -> None:
         """Pay out a length of line, and return when WINCH_STATUS reports it within 0.1 m.
 
         Without WINCH_STATUS it returns at the acknowledgement. Sent once, because a copy would pay out more.
@@ -83,6 +84,7 @@ class Winch(ReadOnly):
             CommandRejected: there is no winch (WINCH_TYPE).
             CommandTimeout: there was no acknowledgement; the winch may run.
             OperationRejected: a newer order for this winch was given.
+            HeartbeatTimeout: the vehicle was silent for ten seconds.
             OperationTimeout: the length was not reported in time.
         """
         check_range("length_m", length_m, -MAX_LENGTH_M, MAX_LENGTH_M)
@@ -135,7 +137,7 @@ class Winch(ReadOnly):
         """Hold the line by the motor, without the brake; returns at the acknowledgement. Raises as :meth:`deliver`."""
         await self._send(_A.HOLD)
 
-    async def retract(self, *, timeout: float = 120.0) -> None:
+    async def retract(self, *, timeout: float = ACTION_TIMEOUT_S) -> None:
         """Wind up all line, and return when WINCH_STATUS reports it fully retracted.
 
         Args:
@@ -146,6 +148,7 @@ class Winch(ReadOnly):
             CommandRejected: the winch refused.
             CommandTimeout: there was no acknowledgement; the winch may run.
             OperationRejected: a newer order for this winch was given.
+            HeartbeatTimeout: the vehicle was silent for ten seconds.
             OperationTimeout: the end was not reported in time.
         """
         await self._send_until_flag(_A.RETRACT, timeout=timeout)
@@ -162,7 +165,7 @@ class Winch(ReadOnly):
         """Run slowly until a payload is attached. Returns when WINCH_STATUS reports it. Raises as :meth:`retract`."""
         await self._send_until_flag(_A.LOAD_PAYLOAD)
 
-    async def _send_until_flag(self, action: WinchActions, *, timeout: float = 10.0) -> None:
+    async def _send_until_flag(self, action: WinchActions, *, timeout: float = ACTION_TIMEOUT_S) -> None:
         flag = ENDS[action]
         await self._send(action, is_done=lambda status: bool(status.status & flag), timeout=timeout)
 

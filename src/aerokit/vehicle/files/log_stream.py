@@ -151,7 +151,6 @@ class LogStream(ReadOnly):
         Raises:
             InvalidArgument: the block is not open.
             OperationTimeout: nothing was received for ``idle_timeout_s`` seconds.
-            ConnectionClosed, LinkLost: the connection has ended.
         """
         connection = self._context.session.connection
         while True:
