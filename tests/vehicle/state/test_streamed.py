@@ -38,6 +38,12 @@ ANYTHING: dict[str, Message] = {
     "PowerStatus": messages.PowerStatus(5012, 0, 1),
     "EkfStatusReport": messages.EkfStatusReport(831, 0.1, 0.1, 0.1, 0.1, 0.1),
     "EstimatorStatus": messages.EstimatorStatus(0, 831, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 1.0, 1.0),
+    "HilStateQuaternion": messages.HilStateQuaternion(
+        0, (1.0, 0.0, 0.0, 0.0), 0.0, 0.0, 0.0, 473977000, 85456000, 488000, *[0] * 8
+    ),
+    "SimState": messages.SimState(
+        **{field.name: 0.0 for field in messages.SimState.FIELDS} | {"lat_int": 473977000, "lon_int": 85456000}
+    ),
     "Vibration": messages.Vibration(0, 1.0, 1.0, 1.0, 0, 0, 0),
 }
 
