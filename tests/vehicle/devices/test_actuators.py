@@ -11,7 +11,6 @@ import pytest
 from device_calls import FITTED, components_of
 from flight_harness import Flight, Px4Flight, in_the_air, open_flight, open_px4
 
-from aerokit import messages as m
 from aerokit.errors import CommandTimeout, InvalidArgument, NotSupported, OperationRejected, OperationTimeout
 from aerokit.mavlink.enums import MavCmd as C
 from aerokit.sim import SimulatedCopter, SimulatedPx4
