@@ -151,9 +151,10 @@ async def grounded(stage: Stage) -> None:
     with anyio.fail_after(60):
         if vehicle.is_armed:
             await vehicle.disarm(force=True)
-        if not stage.simulated.motion.is_on_ground:
-            while not stage.simulated.motion.is_on_ground:  # noqa: ASYNC110
-                await anyio.sleep(0.1)
+        was_falling = not stage.simulated.motion.is_on_ground
+        while not stage.simulated.motion.is_on_ground:  # noqa: ASYNC110
+            await anyio.sleep(0.1)
+        if was_falling:
             await vehicle.landed_state.wait_until(lambda state: state == 1)
     with contextlib.suppress(AerokitError):  # an abandoned reboot command may be executed just now
         await vehicle.set_mode("LOITER" if stage.is_px4 else "GUIDED")

@@ -150,7 +150,7 @@ async def test_motor_test_on_px4_uses_output_function() -> None:
     async with on_px4() as flight:
         await flight.vehicle.actuators.test_motor(2, **SPIN)
         (sent,) = params(flight, C.ACTUATOR_TEST)
-        assert sent == (pytest.approx(0.05), 1.0, 0, 0, 2, 0, 0)
+        assert sent == pytest.approx((0.05, 1.0, 0, 0, 2, 0, 0))
 
 
 async def test_motor_test_of_armed_vehicle_sends_nothing() -> None:
@@ -181,6 +181,7 @@ async def test_motor_test_without_intent_sends_nothing() -> None:
 
 @pytest.mark.parametrize("simulated", ["copter", "px4"])
 async def test_cancelled_motor_test_stops_motor_at_once(simulated: str) -> None:
+    flight: Any
     async with on_px4() if simulated == "px4" else on_ground() as flight:
         with anyio.move_on_after(0.4):
             await flight.vehicle.actuators.test_motor(1, throttle_percent=5, duration_s=3, intent="spin motor")

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from aerokit.vehicle.commanding.context import VehicleContext
     from aerokit.vehicle.commanding.order import Order
 
+__all__ = ["Actuators"]
+
 SpinIntent = Literal["spin motor"]
 ReleaseIntent = Literal["release parachute"]
 

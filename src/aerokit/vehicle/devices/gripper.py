@@ -13,6 +13,8 @@ from aerokit.vehicle.devices.text_effect import await_text, collected_texts
 if TYPE_CHECKING:
     from aerokit.vehicle.commanding.context import VehicleContext
 
+__all__ = ["Gripper"]
+
 NUMBER = Argument("number", 1, 8, whole=True)
 DO_GRIPPER = SimpleOrder("gripper", MavCmd.DO_GRIPPER, (NUMBER, Argument("action", 0, 1)))
 GRIP_TIMEOUT_S = 10.0

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from aerokit.connection.bus import Subscription
     from aerokit.vehicle.session.session import VehicleSession
 
+__all__ = ["Shell"]
+
 PROMPTS = ("pxh> ", "nsh> ")
 """Prompts of PX4 in simulation and on NuttX, after each command."""
 DATA_BYTES, MAX_LINE, MAX_WAITING, OPEN_TIMEOUT_S = 70, 1000, 4096, 5.0

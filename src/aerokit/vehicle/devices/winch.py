@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from aerokit.vehicle.commanding.context import VehicleContext
     from aerokit.vehicle.state.measurements import WinchStatus
 
+__all__ = ["Winch"]
+
 _A, _F = WinchActions, MavWinchStatusFlag
 LENGTH_TOLERANCE_M = 0.1
 RATE_TOLERANCE_M_S = 0.05

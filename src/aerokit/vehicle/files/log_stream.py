@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from aerokit.connection.bus import Subscription
     from aerokit.vehicle.commanding.context import VehicleContext
 
+__all__ = ["LogStream"]
+
 START = SimpleOrder("logs.stream", MavCmd.LOGGING_START, (0,))
 STOP = SimpleOrder("logs.stream", MavCmd.LOGGING_STOP)
 MAGIC, HEADER_BYTES, NO_START = b"ULog\x01\x12\x35", 16, 255

@@ -14,6 +14,8 @@ from aerokit.vehicle.state.movement import place
 if TYPE_CHECKING:
     from aerokit.mavlink import messages
 
+__all__ = ["ActuatorControls", "AirPressure", "Aircraft", "Altitude", "Imu", "Odometry", "RawImu", "WinchStatus"]
+
 MG_M_S2, MGAUSS_UT, HPA_PA, RAD_DEG = 9.80665e-3, 0.1, 100.0, math.degrees(1)
 NO_TERRAIN_M = -1000.0
 MAX_AIRCRAFT = 64
