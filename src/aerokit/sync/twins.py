@@ -1357,11 +1357,11 @@ class Actuators(TwinOf["AsyncActuators"]):
 
         Raises:
             InvalidArgument: a value is out of range. Nothing was sent.
-            NotSupported: PX4. Nothing was sent.
-            CommandRejected: the output has another function.
+            NotSupported: the firmware does not have the command. Nothing was sent.
+            CommandRejected: the vehicle refused, for example because the output has another function.
             CommandTimeout: there was no acknowledgement.
             OperationRejected: a newer order for this output was given.
-            OperationTimeout: SERVO_OUTPUT_RAW reports another pulse width.
+            OperationTimeout: the vehicle reports another state.
         """
         self._loop.run(self.aio.set_servo, number, pulse_us)
 
@@ -1369,7 +1369,7 @@ class Actuators(TwinOf["AsyncActuators"]):
         """Move a servo ``count`` times to a pulse width and back to its trim (MAV_CMD_DO_REPEAT_SERVO).
 
         Returns when ArduPilot has acknowledged and begins; no message reports the end. It has one cycle at a time: the
-        next order of this kind replaces it. Never repeated, because each copy starts a new cycle. ArduPilot only.
+        next order of this kind replaces it. Never sent twice, because each copy starts a new cycle. ArduPilot only.
 
         Args:
             number: output, 1 to 32, as for :meth:`set_servo`.
@@ -1385,26 +1385,19 @@ class Actuators(TwinOf["AsyncActuators"]):
     def set_relay(self, number: int, on: bool) -> None:
         """Switch a relay, and return when RELAY_STATUS reports it (MAV_CMD_DO_SET_RELAY).
 
-        Firmware without RELAY_STATUS (before ArduPilot 4.5) only acknowledges. ArduPilot only.
+        Firmware without RELAY_STATUS (before ArduPilot 4.5) only acknowledges. ArduPilot only; it refuses a relay
+        without a pin. Raises as :meth:`set_servo`.
 
         Args:
             number: relay from 0 (RELAY1_PIN) to 15.
             on: the new state.
-
-        Raises:
-            InvalidArgument: the number is out of range. Nothing was sent.
-            NotSupported: PX4. Nothing was sent.
-            CommandRejected: the relay is not configured.
-            CommandTimeout: there was no acknowledgement.
-            OperationRejected: a newer order for this relay was given.
-            OperationTimeout: RELAY_STATUS reports the other state.
         """
         self._loop.run(self.aio.set_relay, number, on)
 
     def repeat_relay(self, number: int, *, count: int, period_s: float) -> None:
         """Switch a relay over and back ``count`` times (MAV_CMD_DO_REPEAT_RELAY).
 
-        Returns when ArduPilot has acknowledged and begins. Never repeated, as :meth:`repeat_servo`. ArduPilot only.
+        Returns when ArduPilot has acknowledged and begins. Never sent twice. ArduPilot only.
 
         Args:
             number: relay from 0 to 15.
@@ -1412,20 +1405,12 @@ class Actuators(TwinOf["AsyncActuators"]):
             period_s: seconds of one cycle, above 0, at most 60.
 
         Raises:
-            InvalidArgument, NotSupported, CommandRejected, CommandTimeout: as for ``set_relay``.
+            InvalidArgument, NotSupported, CommandRejected, CommandTimeout: as for ``set_servo``.
         """
         self._loop.run(self.aio.repeat_relay, number, count=count, period_s=period_s)
 
     def set_actuator(self, number: int, value: float) -> None:
-        """Set one actuator (MAV_CMD_DO_SET_ACTUATOR); as :meth:`set_actuators`.
-
-        Args:
-            number: actuator set, 1 to 6.
-            value: −1 to 1.
-
-        Raises:
-            InvalidArgument, NotSupported, CommandRejected, CommandTimeout: as for ``set_actuators``.
-        """
+        """Set one actuator (1 to 6) to a value from −1 to 1. Raises as :meth:`set_actuators`."""
         self._loop.run(self.aio.set_actuator, number, value)
 
     def set_actuators(self, *values: float | None) -> None:
@@ -1460,7 +1445,7 @@ class Actuators(TwinOf["AsyncActuators"]):
         self._loop.run(self.aio.raise_landing_gear)
 
     def lower_landing_gear(self) -> None:
-        """Deploy the landing gear (MAV_CMD_AIRFRAME_CONFIGURATION); returns at the acknowledgement.
+        """Deploy the landing gear; returns at the acknowledgement.
 
         Raises:
             NotSupported, CommandRejected, CommandTimeout: as for ``raise_landing_gear``.
@@ -1471,19 +1456,11 @@ class Actuators(TwinOf["AsyncActuators"]):
         """Switch an illuminator, and return when ILLUMINATOR_STATUS reports it (MAV_CMD_ILLUMINATOR_ON_OFF).
 
         For lights that are a MAVLink component. ArduPilot and PX4 do not have the command; lights on an output of
-        ArduPilot are servos or relays.
+        ArduPilot are servos or relays. Raises as :meth:`set_servo`.
 
         Args:
             on: the new state.
             component_id: the light, 1 to 255; MAV_COMP_ID_ILLUMINATOR is 243.
-
-        Raises:
-            InvalidArgument: the id is out of range. Nothing was sent.
-            NotSupported: the id is that of an autopilot without the command. Nothing was sent.
-            CommandRejected: it refused.
-            CommandTimeout: there was no acknowledgement.
-            OperationRejected: a newer order for this light was given.
-            OperationTimeout: ILLUMINATOR_STATUS reports the other state.
         """
         self._loop.run(self.aio.set_lights, on, component_id=component_id)
 
@@ -1628,12 +1605,8 @@ class Winch(TwinOf["AsyncWinch"]):
                 this call then times out.
 
         Raises:
-            InvalidArgument: out of range. Nothing was sent.
-            NotSupported: the autopilot has no such order. Nothing was sent.
-            CommandRejected: there is no winch (WINCH_TYPE).
-            CommandTimeout: there was no acknowledgement; the winch may run.
-            OperationRejected: a newer order for this winch was given.
-            OperationTimeout: WINCH_STATUS reports another speed.
+            InvalidArgument, NotSupported, CommandRejected, CommandTimeout, OperationRejected, OperationTimeout: as for
+                ``pay_out``.
         """
         self._loop.run(self.aio.set_rate, rate_m_s)
 
@@ -1642,17 +1615,14 @@ class Winch(TwinOf["AsyncWinch"]):
         self._loop.run(self.aio.lock)
 
     def deliver(self) -> None:
-        """Start the winch's own sequence that lowers, releases and retracts; returns at the acknowledgement.
+        """Start the winch's own delivery: lower, release, retract. Returns at the acknowledgement.
 
-        Raises:
-            NotSupported: the autopilot has no such order. Nothing was sent.
-            CommandRejected: the winch refused.
-            CommandTimeout: there was no acknowledgement; the winch may run.
+        Raises as :meth:`relax`.
         """
         self._loop.run(self.aio.deliver)
 
     def hold(self) -> None:
-        """Hold the line by the motor, without the brake; returns at the acknowledgement. Raises as :meth:`deliver`."""
+        """Hold the line by the motor, without the brake. Returns at the acknowledgement. Raises as :meth:`relax`."""
         self._loop.run(self.aio.hold)
 
     def retract(self, *, timeout: float = ACTION_TIMEOUT_S) -> None:

@@ -1,18 +1,8 @@
 """``SimpleOrder``: an order that is one command, declared as one table row.
 
 A row has the command, its parameters with units and ranges, and the message that reports its effect. Whether a firmware
-has the command is in `aerokit.autopilots`. A method that gives the order names the arguments and documents them::
-
-    SET_RELAY = SimpleOrder(
-        "set_relay",
-        MavCmd.DO_SET_RELAY,
-        (Argument("number", 0, 15, whole=True), Argument("on", 0, 1)),
-        Effect("RelayStatus", lambda status, number, on: bool(status.on >> int(number) & 1) == bool(on)),
-    )
-
-
-    async def set_relay(self, number: int, on: bool) -> None:
-        await SET_RELAY.send(self._context, number, on)
+has the command is in `aerokit.autopilots` (``unsupported_commands``), and whether it may be repeated in
+`aerokit.protocols.command`. A method that gives the order documents its arguments, as in ``devices/actuators.py``.
 """
 
 from __future__ import annotations

@@ -96,11 +96,11 @@ class Actuators(ReadOnly):
 
         Raises:
             InvalidArgument: a value is out of range. Nothing was sent.
-            NotSupported: PX4. Nothing was sent.
-            CommandRejected: the output has another function.
+            NotSupported: the firmware does not have the command. Nothing was sent.
+            CommandRejected: the vehicle refused, for example because the output has another function.
             CommandTimeout: there was no acknowledgement.
             OperationRejected: a newer order for this output was given.
-            OperationTimeout: SERVO_OUTPUT_RAW reports another pulse width.
+            OperationTimeout: the vehicle reports another state.
         """
         await SET_SERVO.send(self._context, number, pulse_us, topic=("servo", number))
 
@@ -108,7 +108,7 @@ class Actuators(ReadOnly):
         """Move a servo ``count`` times to a pulse width and back to its trim (MAV_CMD_DO_REPEAT_SERVO).
 
         Returns when ArduPilot has acknowledged and begins; no message reports the end. It has one cycle at a time: the
-        next order of this kind replaces it. Never repeated, because each copy starts a new cycle. ArduPilot only.
+        next order of this kind replaces it. Never sent twice, because each copy starts a new cycle. ArduPilot only.
 
         Args:
             number: output, 1 to 32, as for :meth:`set_servo`.
@@ -124,26 +124,19 @@ class Actuators(ReadOnly):
     async def set_relay(self, number: int, on: bool) -> None:
         """Switch a relay, and return when RELAY_STATUS reports it (MAV_CMD_DO_SET_RELAY).
 
-        Firmware without RELAY_STATUS (before ArduPilot 4.5) only acknowledges. ArduPilot only.
+        Firmware without RELAY_STATUS (before ArduPilot 4.5) only acknowledges. ArduPilot only; it refuses a relay
+        without a pin. Raises as :meth:`set_servo`.
 
         Args:
             number: relay from 0 (RELAY1_PIN) to 15.
             on: the new state.
-
-        Raises:
-            InvalidArgument: the number is out of range. Nothing was sent.
-            NotSupported: PX4. Nothing was sent.
-            CommandRejected: the relay is not configured.
-            CommandTimeout: there was no acknowledgement.
-            OperationRejected: a newer order for this relay was given.
-            OperationTimeout: RELAY_STATUS reports the other state.
         """
         await SET_RELAY.send(self._context, number, on, topic=("relay", number))
 
     async def repeat_relay(self, number: int, *, count: int, period_s: float) -> None:
         """Switch a relay over and back ``count`` times (MAV_CMD_DO_REPEAT_RELAY).
 
-        Returns when ArduPilot has acknowledged and begins. Never repeated, as :meth:`repeat_servo`. ArduPilot only.
+        Returns when ArduPilot has acknowledged and begins. Never sent twice. ArduPilot only.
 
         Args:
             number: relay from 0 to 15.
@@ -151,20 +144,12 @@ class Actuators(ReadOnly):
             period_s: seconds of one cycle, above 0, at most 60.
 
         Raises:
-            InvalidArgument, NotSupported, CommandRejected, CommandTimeout: as for ``set_relay``.
+            InvalidArgument, NotSupported, CommandRejected, CommandTimeout: as for ``set_servo``.
         """
         await REPEAT_RELAY.send(self._context, number, count, period_s, topic=("relay", number))
 
     async def set_actuator(self, number: int, value: float) -> None:
-        """Set one actuator (MAV_CMD_DO_SET_ACTUATOR); as :meth:`set_actuators`.
-
-        Args:
-            number: actuator set, 1 to 6.
-            value: −1 to 1.
-
-        Raises:
-            InvalidArgument, NotSupported, CommandRejected, CommandTimeout: as for ``set_actuators``.
-        """
+        """Set one actuator (1 to 6) to a value from −1 to 1. Raises as :meth:`set_actuators`."""
         check_range("number", number, 1, ACTUATORS)
         await self.set_actuators(*(value if index == number else None for index in range(1, ACTUATORS + 1)))
 
@@ -212,7 +197,7 @@ class Actuators(ReadOnly):
         await LANDING_GEAR.send(self._context, 1, topic="landing gear")
 
     async def lower_landing_gear(self) -> None:
-        """Deploy the landing gear (MAV_CMD_AIRFRAME_CONFIGURATION); returns at the acknowledgement.
+        """Deploy the landing gear; returns at the acknowledgement.
 
         Raises:
             NotSupported, CommandRejected, CommandTimeout: as for ``raise_landing_gear``.
@@ -223,19 +208,11 @@ class Actuators(ReadOnly):
         """Switch an illuminator, and return when ILLUMINATOR_STATUS reports it (MAV_CMD_ILLUMINATOR_ON_OFF).
 
         For lights that are a MAVLink component. ArduPilot and PX4 do not have the command; lights on an output of
-        ArduPilot are servos or relays.
+        ArduPilot are servos or relays. Raises as :meth:`set_servo`.
 
         Args:
             on: the new state.
             component_id: the light, 1 to 255; MAV_COMP_ID_ILLUMINATOR is 243.
-
-        Raises:
-            InvalidArgument: the id is out of range. Nothing was sent.
-            NotSupported: the id is that of an autopilot without the command. Nothing was sent.
-            CommandRejected: it refused.
-            CommandTimeout: there was no acknowledgement.
-            OperationRejected: a newer order for this light was given.
-            OperationTimeout: ILLUMINATOR_STATUS reports the other state.
         """
         check_range("component_id", component_id, 1, 255)
         await LIGHTS.send(self._context, on, topic=("lights", component_id), component_id=component_id)

@@ -110,12 +110,8 @@ class Winch(ReadOnly):
                 this call then times out.
 
         Raises:
-            InvalidArgument: out of range. Nothing was sent.
-            NotSupported: the autopilot has no such order. Nothing was sent.
-            CommandRejected: there is no winch (WINCH_TYPE).
-            CommandTimeout: there was no acknowledgement; the winch may run.
-            OperationRejected: a newer order for this winch was given.
-            OperationTimeout: WINCH_STATUS reports another speed.
+            InvalidArgument, NotSupported, CommandRejected, CommandTimeout, OperationRejected, OperationTimeout: as for
+                ``pay_out``.
         """
         await self._send(
             _A.RATE_CONTROL, 0, rate_m_s, lambda status: abs(status.speed - rate_m_s) <= RATE_TOLERANCE_M_S
@@ -126,17 +122,14 @@ class Winch(ReadOnly):
         await self._send_until_flag(_A.LOCK)
 
     async def deliver(self) -> None:
-        """Start the winch's own sequence that lowers, releases and retracts; returns at the acknowledgement.
+        """Start the winch's own delivery: lower, release, retract. Returns at the acknowledgement.
 
-        Raises:
-            NotSupported: the autopilot has no such order. Nothing was sent.
-            CommandRejected: the winch refused.
-            CommandTimeout: there was no acknowledgement; the winch may run.
+        Raises as :meth:`relax`.
         """
         await self._send(_A.DELIVER)
 
     async def hold(self) -> None:
-        """Hold the line by the motor, without the brake; returns at the acknowledgement. Raises as :meth:`deliver`."""
+        """Hold the line by the motor, without the brake. Returns at the acknowledgement. Raises as :meth:`relax`."""
         await self._send(_A.HOLD)
 
     async def retract(self, *, timeout: float = ACTION_TIMEOUT_S) -> None:
