@@ -67,7 +67,8 @@ class ArduPilotDevices:
     def _handle_chute(self, command: ReceivedCommand) -> int:
         vehicle = self._vehicle
         if command.param1 in (ParachuteAction.DISABLE, ParachuteAction.ENABLE):
-            vehicle.parameters["CHUTE_ENABLED"] = command.param1
+            if "CHUTE_ENABLED" in vehicle.parameters:
+                vehicle.parameters["CHUTE_ENABLED"] = command.param1
         elif command.param1 != ParachuteAction.RELEASE:
             return _R.FAILED
         elif self._is_set("CHUTE_ENABLED"):

@@ -136,13 +136,15 @@ class LogStream(ReadOnly):
     async def __aexit__(
         self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
     ) -> None:
+        is_stopped = False
         try:
             if exc is None:  # PX4 acknowledges when its last message was acknowledged (logger.cpp, stop_log_mavlink).
                 await STOP.send(self._context)
-                return
+                is_stopped = True
         finally:
             self._close()
-        self._context.session.transfers.command_in_background(MavCmd.LOGGING_STOP)
+            if not is_stopped:
+                self._context.session.transfers.command_in_background(MavCmd.LOGGING_STOP)
 
     def __aiter__(self) -> Self:
         return self

@@ -239,7 +239,7 @@ class States:
     """Control outputs before mixing, of PX4 before 1.14 (ACTUATOR_CONTROL_TARGET)."""
 
     transponder: StateField[tuple[Aircraft, ...]] = StateField(
-        MessageSource("AdsbVehicle", measurements.aircraft, needs_context=True, watched_hz=1.0), eager=True
+        MessageSource("AdsbVehicle", measurements.aircraft, needs_context=True, watched_hz=10.0), eager=True
     )
     """Other aircraft that an ADS-B receiver on board has reported, the latest last (ADSB_VEHICLE)."""
 
