@@ -118,8 +118,8 @@ class StateField(Generic[T]):
         """Return the messages that report the state, for error texts."""
         if self._waits_for:
             return self._waits_for
-        sent = [kind.NAME for kind in self.requested_from(autopilot)]
-        return " or ".join(sent) or f"message with it, which {autopilot.firmware} does not send,"
+        sent = " or ".join(kind.NAME for kind in self.requested_from(autopilot))
+        return sent or f"{message_type(self.sources[0].message).NAME}, which {autopilot.firmware} does not send,"
 
 
 U8, U16 = 0xFF, 0xFFFF
