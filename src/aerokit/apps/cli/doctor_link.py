@@ -119,7 +119,7 @@ def emit_finding(options: argparse.Namespace, finding: Finding) -> None:
 
 
 class LinkExamination:
-    """Collects everything a connection receives, and derives findings."""
+    """Collects all frames that a connection receives, and derives findings."""
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
