@@ -102,7 +102,7 @@ class VehicleText:
             (12, cell(vehicle.mode, _name)),
             (9, self._armed()),
             (9, cell(vehicle.position, lambda place: number(place.altitude_relative_m, 1, " m"))),
-            (6, cell(vehicle.batteries, lambda each: number(each[0].remaining_percent, 0, " %"))),
+            (6, cell(vehicle.batteries, lambda batteries: number(batteries[0].remaining_percent, 0, " %"))),
         ]
         if more:
             columns += [

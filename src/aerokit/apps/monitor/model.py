@@ -86,7 +86,7 @@ class MonitorModel:
                 known = dialect.get(number)
                 name = f"message {number}" if known is None else known.NAME
                 rates.append((name, (count - before[system, number]) / (until - since)))
-        return sorted(rates, key=lambda each: (-each[1], each[0]))
+        return sorted(rates, key=lambda rate: (-rate[1], rate[0]))
 
     def metres(self, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
         """Convert to metres north and east of ``reference``; the first position becomes the reference."""

@@ -197,9 +197,9 @@ class MissionControl(VehiclePlan["Mission"]):
 
         Raises:
             InvalidArgument: there is no such item. Nothing was sent.
-            OperationRejected: it is not armed, or its mode changed meanwhile.
+            OperationRejected: the vehicle is not armed, or its mode changed meanwhile.
             CommandRejected: the vehicle refused: it has no mission, no position, …; see ``reasons``.
-            OperationTimeout: it accepted but stayed in another mode.
+            OperationTimeout: the vehicle accepted the command but stayed in another mode.
             NotSupported: this type of vehicle has no mission mode.
         """
         self._check_item(item)
