@@ -115,6 +115,7 @@ def test_sim_option_serves_vehicle(
     assert f"a simulated copter is on tcp:127.0.0.1:{port}" in notified.err
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [

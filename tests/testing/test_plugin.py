@@ -57,6 +57,7 @@ def run(pytester: pytest.Pytester, source: str, *arguments: str) -> pytest.RunRe
     )
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("kind", ["copter", exhaustive("px4")])
 def test_flights_need_no_async_plugin(pytester: pytest.Pytester, kind: str) -> None:
     run(pytester, ASYNC.format(kind=kind), "-p", "no:anyio").assert_outcomes(passed=2)
