@@ -42,7 +42,7 @@ MIN_ATTEMPT_S = 1.0  # longer on slow links
 LAST_ATTEMPT_SHARE = 0.5
 ROUND_TRIPS = 3
 
-ROUNDING = 0.01  # ArduPilot adds it before it cuts off a fraction
+ROUNDING = 0.01  # ArduPilot adds this before it truncates a value to an integer
 
 
 class ParameterDownload:

@@ -76,8 +76,9 @@ class LinkStates:
             if link in choice.candidates
         }
         losses = [candidate.loss for candidate in candidates.values() if candidate.loss is not None]
-        answered = [candidate for candidate in candidates.values() if candidate.round_trip_s is not None]
-        round_trips = [candidate.round_trip_s for candidate in answered]
+        round_trips = [
+            candidate.round_trip_s for candidate in candidates.values() if candidate.round_trip_s is not None
+        ]
         return LinkStatus(
             self._link.names[link],
             self._states[link],

@@ -341,7 +341,7 @@ class MissionControl(VehiclePlan["Mission"]):
 
         transfers = self._context.transfers
         target = (transfers.system_id, transfers.component_id)
-        async with self._context.lock:  # PX4 ignores it during a transfer.
+        async with self._context.lock:  # PX4 ignores the command during a transfer.
             if order_status is not None:
                 self._vehicle_context.sender.raise_if_ended(order_status.order)
             await transfers.run(
