@@ -799,7 +799,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
             timeout: seconds to wait.
 
         Raises:
-            NotSupported: its manager accepts the order but does nothing (PX4). Nothing was sent.
+            NotSupported: the manager would accept the order but not execute it (PX4). Nothing was sent.
             CommandRejected: the manager refused.
             CommandTimeout: there was no answer.
             GimbalTaken: your program had control and lost it.
