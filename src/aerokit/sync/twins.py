@@ -95,11 +95,11 @@ if TYPE_CHECKING:
     from aerokit.vehicle.components.component import Component as AsyncComponent
     from aerokit.vehicle.components.component import ComponentInformation, ComponentStatus, MetadataKind
     from aerokit.vehicle.components.settings import Settings as AsyncSettings
+    from aerokit.vehicle.devices.actions import FailingUnit, FailureIntent, FailureKind, Severity
     from aerokit.vehicle.devices.actuators import Actuators as AsyncActuators
     from aerokit.vehicle.devices.actuators import ReleaseIntent, SpinIntent
     from aerokit.vehicle.devices.gripper import Gripper as AsyncGripper
     from aerokit.vehicle.devices.shell import Shell as AsyncShell
-    from aerokit.vehicle.devices.signals import FailingUnit, FailureIntent, FailureKind, Severity
     from aerokit.vehicle.devices.winch import Winch as AsyncWinch
     from aerokit.vehicle.files.files import FileEntry
     from aerokit.vehicle.files.files import Files as AsyncFiles

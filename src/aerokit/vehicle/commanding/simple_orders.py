@@ -98,7 +98,7 @@ class SimpleOrder(Snapshot):
             InvalidArgument: a value is out of range; the text names the argument.
         """
         rest = iter(values)
-        params = tuple(each.to_wire(next(rest)) if isinstance(each, Argument) else each for each in self.params)
+        params = tuple(param.to_wire(next(rest)) if isinstance(param, Argument) else param for param in self.params)
         if left := tuple(rest):
             raise TypeError(f"{self.name}: {len(left)} values too many")
         return params

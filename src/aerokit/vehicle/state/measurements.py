@@ -246,7 +246,7 @@ def aircraft(message: messages.AdsbVehicle, context: Context) -> tuple[Aircraft,
     def if_valid(flag: AdsbFlags, value: float) -> float | None:
         return value if message.flags & flag else None
 
-    others = [each for each in context.before or () if each.icao != message.ICAO_address]
+    others = [seen for seen in context.before or () if seen.icao != message.ICAO_address]
     reported = Aircraft(
         message.ICAO_address,
         message.callsign.strip() if message.flags & _F.VALID_CALLSIGN else "",
