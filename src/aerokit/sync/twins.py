@@ -3435,7 +3435,7 @@ class Vehicle(VehicleTwin):
     def play_tune(self, tune: str) -> None:
         """Play a tune on the vehicle's buzzer, such as ``"T200 L8 CEGO5C"`` (PLAY_TUNE); returns at once.
 
-        The message has no acknowledgement, and vehicles without a buzzer ignore it. PX4 plays 30 characters of it.
+        The message has no acknowledgement, and vehicles without a buzzer ignore it.
 
         Args:
             tune: notes in the format of QBASIC 1.1's PLAY statement, 1 to 230 characters: T tempo, L length, O octave,
