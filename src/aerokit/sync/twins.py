@@ -4165,10 +4165,9 @@ class Vehicle(VehicleTwin):
     def setup_signing(self, signing: Signing | None, *, timeout: float = 5.0) -> None:
         """Install a signing key on the vehicle and sign all traffic with it from then on; None removes the key.
 
-        **The key is sent unencrypted**: do this over a cable or a private link. Returns when the vehicle's frames
-        active. Every other vehicle on this connection needs the key too, or ``signing.allow_unsigned``. The vehicle may
-        accept the key even if the call is cancelled. See docs/signing.md.
-        cancellation the vehicle may have accepted the key nevertheless. See docs/signing.md.
+        **The key is sent unencrypted**: do this over a cable or a private link. Returns when the vehicle's frames are
+        signed with the key. Every other vehicle on this connection needs the key too, or ``signing.allow_unsigned``.
+        After a cancellation the vehicle may have accepted the key nevertheless. See docs/signing.md.
 
         Args:
             signing: the key, as for ``connect(signing=…)``.
