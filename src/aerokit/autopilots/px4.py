@@ -128,6 +128,7 @@ class Px4(Autopilot):
         ("EKF_STATUS_REPORT", "WIND", "RANGEFINDER", "AHRS", "AHRS2", "MEMINFO", "POWER_STATUS", "RAW_IMU")
     )
 
+    has_shell = True
     # DO_WINCH is passed on to the system, where no module handles it.
     unsupported_commands: frozenset[int] = frozenset(
         (

@@ -16,6 +16,7 @@ from aerokit.vehicle.commanding.speeds import SpeedActions
 from aerokit.vehicle.commanding.termination import TerminationActions
 from aerokit.vehicle.commanding.travel import LookActions, TravelActions
 from aerokit.vehicle.commanding.tuning import TuningActions
+from aerokit.vehicle.devices.actions import DeviceActions
 from aerokit.vehicle.missions.context import PlanContext
 from aerokit.vehicle.state.field import MESSAGE_IDS
 
@@ -57,6 +58,7 @@ class Vehicle(
     TerminationActions,
     TuningActions,
     MessagingActions,
+    DeviceActions,
 ):
     """One remote vehicle. Coroutines send commands to it; properties only read. Every call can be cancelled.
 
@@ -168,7 +170,7 @@ class Vehicle(
         """The vehicle's flight logs."""
         from aerokit.vehicle.files.logs import Logs
 
-        return Logs(self._session.transfers, self.files)
+        return Logs(self._session.transfers, self.files, self._context)
 
     @cached_property
     def parameters(self) -> Parameters:
@@ -239,10 +241,9 @@ class Vehicle(
     async def setup_signing(self, signing: Signing | None, *, timeout: float = 5.0) -> None:
         """Install a signing key on the vehicle and sign all traffic with it from then on; None removes the key.
 
-        **The key is sent unencrypted**: do this over a cable or a private link. Returns when the vehicle's frames
-        active. Every other vehicle on this connection needs the key too, or ``signing.allow_unsigned``. The vehicle may
-        accept the key even if the call is cancelled. See docs/signing.md.
-        cancellation the vehicle may have accepted the key nevertheless. See docs/signing.md.
+        **The key is sent unencrypted**: do this over a cable or a private link. Returns when the vehicle's frames are
+        signed with the key. Every other vehicle on this connection needs the key too, or ``signing.allow_unsigned``.
+        After a cancellation the vehicle may have accepted the key nevertheless. See docs/signing.md.
 
         Args:
             signing: the key, as for ``connect(signing=…)``.

@@ -1,28 +1,19 @@
 """``SimpleOrder``: an order that is one command, declared as one table row.
 
 A row has the command, its parameters with units and ranges, and the message that reports its effect. Whether a firmware
-has the command is in `aerokit.autopilots`. A method that gives the order names the arguments and documents them::
-
-    SET_RELAY = SimpleOrder(
-        "set_relay",
-        MavCmd.DO_SET_RELAY,
-        (Argument("number", 0, 15, whole=True), Argument("on", 0, 1)),
-        Effect("RelayStatus", lambda status, number, on: bool(status.on >> int(number) & 1) == bool(on)),
-    )
-
-
-    async def set_relay(self, number: int, on: bool) -> None:
-        await SET_RELAY.send(self._context, number, on)
+has the command is in `aerokit.autopilots` (``unsupported_commands``), and whether it may be repeated in
+`aerokit.protocols.command`. A method that gives the order documents its arguments, as in ``devices/actuators.py``.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from aerokit._internal.arguments import check_range
 from aerokit._internal.formatting import short_repr
 from aerokit._internal.values import Snapshot
-from aerokit.errors import CommandRejected, CommandTimeout, InvalidArgument, NotSupported
+from aerokit.errors import CommandRejected, CommandTimeout, InvalidArgument, NotSupported, OperationTimeout
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd
 from aerokit.vehicle.commanding.order import SUPERSEDED
@@ -34,6 +25,8 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.vehicle.commanding.context import VehicleContext
     from aerokit.vehicle.commanding.order import Order, Topic
+
+MessageT = TypeVar("MessageT", bound="Message")
 
 EFFECT_TIMEOUT_S = 5.0
 """Seconds after the acknowledgement until a message must report the effect."""
@@ -105,7 +98,7 @@ class SimpleOrder(Snapshot):
             InvalidArgument: a value is out of range; the text names the argument.
         """
         rest = iter(values)
-        params = tuple(each.to_wire(next(rest)) if isinstance(each, Argument) else each for each in self.params)
+        params = tuple(param.to_wire(next(rest)) if isinstance(param, Argument) else param for param in self.params)
         if left := tuple(rest):
             raise TypeError(f"{self.name}: {len(left)} values too many")
         return params
@@ -133,7 +126,7 @@ class SimpleOrder(Snapshot):
 
         Raises:
             InvalidArgument: a value is out of range. Nothing was sent.
-            NotSupported: the firmware does not have the command. Nothing was sent.
+            NotSupported: the command is for the autopilot, which does not have it. Nothing was sent.
             CommandRejected: the vehicle refused.
             CommandTimeout: there was no acknowledgement.
             OperationRejected: a newer order for the same device was given.
@@ -141,7 +134,8 @@ class SimpleOrder(Snapshot):
             OperationTimeout: the effect was not reported in time.
         """
         params = self.wire_params(*values)
-        self.check_supported(context)
+        if component_id in (None, context.session.component_id):
+            self.check_supported(context)
         if topic is not None and of is None:
             of = context.arbiter.of_device(topic)
         with context.arbiter.auxiliary_order(of) as order:
@@ -203,6 +197,26 @@ class SimpleOrder(Snapshot):
             )
         except CommandRejected:
             return False
-        except CommandTimeout:
+        except CommandTimeout:  # It may have the message nevertheless.
             pass
         return True
+
+
+async def receive_once(
+    context: VehicleContext, message_type: type[MessageT], component_id: int | None = None, *, timeout: float = 1.0
+) -> MessageT | None:
+    """Request one message and return it; None if the vehicle refuses or does not send it within ``timeout`` seconds."""
+    session = context.session
+    target = session.component_id if component_id is None else component_id
+    with (
+        session.connection.subscribe(message_type, system_id=session.system_id, capacity=8) as messages,
+        suppress(CommandRejected, CommandTimeout, OperationTimeout),
+    ):
+        await session.commands.send_long(
+            MavCmd.REQUEST_MESSAGE, message_type.ID, component_id=target, attempts=1, attempt_timeout=timeout
+        )
+        while True:
+            message = await messages.get(timeout)
+            if message.received_frame is None or message.received_frame.component_id == target:
+                return message
+    return None
