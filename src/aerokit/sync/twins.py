@@ -94,12 +94,11 @@ if TYPE_CHECKING:
     )
     from aerokit.vehicle.camera.videos import SourceName
     from aerokit.vehicle.commanding.follow import FollowStream as AsyncFollowStream
-    from aerokit.vehicle.commanding.follow import FollowTarget
+    from aerokit.vehicle.commanding.follow_target import FollowTarget
     from aerokit.vehicle.commanding.guided import Guided as AsyncGuided
-    from aerokit.vehicle.commanding.maneuvers import FlightState
+    from aerokit.vehicle.commanding.maneuvers import Facing, FlightState
     from aerokit.vehicle.commanding.order import Subject
     from aerokit.vehicle.commanding.posted import PostedOrder as AsyncPostedOrder
-    from aerokit.vehicle.commanding.rounds import Facing
     from aerokit.vehicle.commanding.setpoints import (
         ActuatorSetpoint,
         AttitudeSetpoint,

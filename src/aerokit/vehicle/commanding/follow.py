@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import AsyncIterable, Callable
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any
 
 import anyio
 
@@ -16,6 +16,7 @@ from aerokit.errors import InvalidArgument, NotSupported, OperationRejected, Ope
 from aerokit.mavlink.enums import MavFrame
 from aerokit.mavlink.messages import SetPositionTargetGlobalInt
 from aerokit.position import Position
+from aerokit.vehicle.commanding.follow_target import FollowTarget, HasTelemetry
 from aerokit.vehicle.commanding.progress import POSITION_MAX_AGE_S
 from aerokit.vehicle.commanding.setpoints import IGNORE_ACCELERATION, IGNORE_YAW, IGNORE_YAW_RATE
 from aerokit.vehicle.commanding.streams import SteeringStream
@@ -31,17 +32,6 @@ if TYPE_CHECKING:
 
 __all__ = ["FollowStream"]
 
-
-@runtime_checkable
-class HasTelemetry(Protocol):
-    """A vehicle, asynchronous or blocking."""
-
-    @property
-    def telemetry(self) -> Any: ...
-
-
-FollowTarget = HasTelemetry | AsyncIterable[Position] | Callable[[], Position | None]
-"""A vehicle, an asynchronous iterable of positions, or a function that returns the latest position or None."""
 
 RATE_HZ, MAX_LAG_S = 10.0, 1.0
 MAX_DISTANCE_M = 1000.0

@@ -8,16 +8,17 @@ from typing import TYPE_CHECKING, Literal
 from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit.errors import InvalidArgument, NotSupported
 from aerokit.mavlink.enums import MavCmd, MavDoRepositionFlags, MavType, MavVtolState, OrbitYawBehaviour
-from aerokit.vehicle.commanding.closed_paths import Circle, Eight, LobeCounter, TurnCounter
 from aerokit.vehicle.commanding.context import VehicleBase
-from aerokit.vehicle.commanding.follow import FollowPlace, FollowStream, FollowTarget
+from aerokit.vehicle.commanding.follow_target import FollowTarget
 from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M, MAX_SILENCE_S, await_progress
-from aerokit.vehicle.commanding.rounds import Facing, RoundFlight
 
 if TYPE_CHECKING:
     from aerokit.autopilots import Mode
     from aerokit.position import Position
+    from aerokit.vehicle.commanding.closed_paths import TurnCounter
+    from aerokit.vehicle.commanding.follow import FollowStream
 
+Facing = Literal["center", "ahead", "initial", "free"]
 FlightState = Literal["fixed_wing", "multicopter"]
 
 YAW_BEHAVIOURS: dict[str, OrbitYawBehaviour] = {
@@ -33,6 +34,8 @@ MIN_TOLERANCE_M, TOLERANCE_SHARE = 5.0, 0.3
 
 
 def _turn_counter(radius_m: float, *, clockwise: bool) -> TurnCounter:
+    from aerokit.vehicle.commanding.closed_paths import TurnCounter
+
     return TurnCounter(radius_m, max(MIN_TOLERANCE_M, TOLERANCE_SHARE * radius_m), clockwise=clockwise)
 
 
@@ -84,6 +87,9 @@ class ManeuverActions(VehicleBase):
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: it was not done in time, or does not move.
         """
+        from aerokit.vehicle.commanding.closed_paths import Circle
+        from aerokit.vehicle.commanding.rounds import RoundFlight
+
         check_range("radius_m", radius_m, 0, MAX_RADIUS_M, above=True)
         check_range("speed_m_s", speed_m_s, 0, MAX_SPEED_M_S, above=True)
         if turns is not None:
@@ -131,6 +137,9 @@ class ManeuverActions(VehicleBase):
             timeout: seconds; None: no limit while heartbeats arrive, the mode stays and the vehicle moves.
             max_silence_s: raise when no heartbeat was received for this long; None: no limit.
         """
+        from aerokit.vehicle.commanding.closed_paths import Eight, LobeCounter
+        from aerokit.vehicle.commanding.rounds import RoundFlight
+
         check_range("major_radius_m", major_radius_m, 0, MAX_RADIUS_M, above=True)
         check_range("minor_radius_m", minor_radius_m, 0, major_radius_m / 2, above=True)
         check_range("axis_deg", axis_deg, 0, 360)
@@ -186,6 +195,8 @@ class ManeuverActions(VehicleBase):
         All else as for :meth:`orbit`. NotSupported is raised for a radius if the vehicle hovers, InvalidArgument for
         ``turns`` without one.
         """
+        from aerokit.vehicle.commanding.rounds import RoundFlight
+
         if turns is not None:
             check_range("turns", turns, 0, MAX_ROUNDS, above=True)
         if radius_m is not None:
@@ -246,6 +257,8 @@ class ManeuverActions(VehicleBase):
             InvalidArgument: an argument is out of range.
             NotSupported: this type of vehicle takes no position set-points, or it flies on its wings.
         """
+        from aerokit.vehicle.commanding.follow import FollowPlace, FollowStream
+
         if self._is_on_wings:
             raise NotSupported("follow: the vehicle flies on its wings, and cannot fly as slowly as its target")
         place = FollowPlace(distance_m, bearing_deg, from_course, height_m, face_target)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import anyio
 
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from aerokit.vehicle.commanding.guided import SetpointStream
     from aerokit.vehicle.commanding.order import Order
     from aerokit.vehicle.commanding.setpoints import TrajectorySetpoint
-
-Facing = Literal["center", "ahead", "initial", "free"]
 
 SETPOINT_INTERVAL_S, SETPOINT_RATE_HZ, VALID_FOR_S = 0.1, 20.0, 1.0
 LAG_ROUNDS = 0.02
@@ -154,7 +152,7 @@ class RoundFlight:
 
     # ------------------------------------------------------------------------------ by set-points
 
-    async def by_setpoints(self, path: ClosedPath, speed_m_s: float, facing: Facing) -> None:
+    async def by_setpoints(self, path: ClosedPath, speed_m_s: float, facing: str) -> None:
         """Stream the set-points of a path; leaving the stream makes the vehicle hold."""
         try:
             with self._session.streaming("position", "local_position"), anyio.move_on_after(self._timeout) as scope:
@@ -168,7 +166,7 @@ class RoundFlight:
         if scope.cancelled_caught:
             raise OperationTimeout(f"{self._what}: not done within {self._timeout:g} s; {self._describe()}")
 
-    async def _path_flight(self, path: ClosedPath, speed_m_s: float, facing: Facing) -> PathFlight:
+    async def _path_flight(self, path: ClosedPath, speed_m_s: float, facing: str) -> PathFlight:
         """Convert the center to the vehicle's local frame, by its present position in both."""
         local, since = self._telemetry.local_position, self._session.connection.now()
         place = await local.wait_until(lambda _: local.updated_at >= since, timeout=FRAME_TIMEOUT_S)
@@ -179,7 +177,7 @@ class RoundFlight:
         heading = self._heading(facing)
         return PathFlight(path, self._rounds, speed_m_s, (north, east, -up), centre, heading)
 
-    def _heading(self, facing: Facing) -> Callable[[Vector, Vector], float | None]:
+    def _heading(self, facing: str) -> Callable[[Vector, Vector], float | None]:
         initial = self._telemetry.heading_deg.latest
 
         def heading(place: Vector, velocity: Vector) -> float | None:
