@@ -286,7 +286,7 @@ def _maneuvers() -> Table:
         rows[name, "CommandTimeout"] = P(give, airborne, ignored(command), on=on)
         rows[name, "OperationRejected"] = P(give, grounded)
         rows[name, "ValueUnknownError"] = P(give, airborne, _clear_state("position"), alone=True)
-        rows[name, "HeartbeatTimeout"] = later(give, stops_sending, 3.0)
+        rows[name, "HeartbeatTimeout"] = later(give, stops_sending, 3.0, alone=True)
         rows[name, "OperationTimeout"] = P(lambda s, give=give: give(s, timeout=1.5), airborne)  # type: ignore[misc]
     rows["Vehicle.figure_eight", "CommandTimeout"] = P(_figure_eight, airborne, ignored(eight))
     rows["Vehicle.orbit", "NotSupported"] = P(_orbit, airborne, _rover, alone=True)

@@ -64,6 +64,7 @@ WRONG: dict[str, tuple[object, ...]] = {
         {"HEARTBEAT": 1.0},
         {messages.Heartbeat: "1"},
     ),
+    "Callable[[int], object] | None": (*TEXT, *NUMBER, [print]),
     "Callable[[int | None], None] | None": (*TEXT, *NUMBER, [print]),
     "OnProgress | None": (*TEXT, *NUMBER, [print]),
     "Callable[[T], object]": (*NOTHING, *TEXT, *NUMBER, [print]),

@@ -225,6 +225,9 @@ class Px4(Autopilot):
                 return text[len(prefix) :].strip()
         return None
 
+    def is_refusal(self, text: str) -> bool:
+        return super().is_refusal(text) or "limit exceeded" in text.lower()  # "Orbit radius limit exceeded"
+
     def _purpose_name(self, purpose: Purpose, is_vtol: bool) -> str | None:
         if self._cannot_fly and purpose in ("take_off", "land"):
             return None

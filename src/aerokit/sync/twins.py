@@ -3827,7 +3827,7 @@ class Vehicle(VehicleTwin):
         """Return the status texts (STATUSTEXT) received since this time of the loop's clock, oldest first."""
         return self._loop.call(self.aio.texts_since, at)
 
-    def autotune(self, *, timeout: float = 120.0, on_progress: OnProgress | None = None) -> None:
+    def autotune(self, *, timeout: float = 120.0, on_progress: Callable[[int], object] | None = None) -> None:
         """Let PX4 tune its controllers (MAV_CMD_DO_AUTOTUNE_ENABLE): **the vehicle shakes about each axis**.
 
         Call it while the vehicle hovers, or circles on its wings. Returns when PX4 has finished: with MC_AT_APPLY 1 it

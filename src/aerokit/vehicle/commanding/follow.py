@@ -193,7 +193,7 @@ class FollowStream(SteeringStream[TargetState]):
         mode = self._wanted_mode()
         self._start_reading()
         try:
-            with self._context.flight_cleanup.preparing(mode) as self.prepared_order:
+            with self._context.flight_cleanup.preparing(mode) as self._prepared_order:
                 self._value = await self._first_state()
                 self._choose_place(self._value.position)
             return await super().__aenter__()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import anyio
@@ -10,12 +11,13 @@ import anyio
 from aerokit._internal import geo
 from aerokit.errors import HeartbeatTimeout, OperationRejected, OperationTimeout, SetpointStreamStopped
 from aerokit.mavlink.enums import MavFrame
+from aerokit.mavlink.messages import OrbitExecutionStatus
 from aerokit.vehicle.commanding.closed_paths import PathFlight
 from aerokit.vehicle.commanding.guided import Guided
 from aerokit.vehicle.commanding.progress import POSITION_MAX_AGE_S, StallDetector, await_progress
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from aerokit.autopilots import Mode
     from aerokit.position import Position
@@ -26,6 +28,8 @@ if TYPE_CHECKING:
     from aerokit.vehicle.commanding.setpoints import TrajectorySetpoint
 
 SETPOINT_INTERVAL_S, SETPOINT_RATE_HZ, VALID_FOR_S = 0.1, 20.0, 1.0
+RADIUS_ERROR_M, CIRCLE_REPORT_S = 0.5, 2.0
+"""Deviation that is another radius, and seconds in which PX4 may still report the previous circle."""
 LAG_ROUNDS = 0.02
 """Part of a round by which a vehicle at the end of its path may have been counted too little."""
 END_TIMEOUT_S = 15.0
@@ -52,6 +56,7 @@ class RoundFlight:
         self._rounds = math.inf if rounds is None else rounds
         self._timeout, self._max_silence_s = timeout, max_silence_s
         self._place: dict[str, Any] = {}
+        self._wrong_circle = ""
 
     def check_place(self, max_distance_m: float) -> None:
         """Raise if the vehicle cannot fly there; nothing is sent."""
@@ -97,7 +102,7 @@ class RoundFlight:
                 await context.sender.run_command(
                     order, self._session.commands.send_int, command, *params, modes=(mode,), **self._place
                 )
-            with cleanup.flying(order), self._session.streaming("position"):
+            with cleanup.flying(order), self._session.streaming("position"), self._watching_circle(circle_m):
                 await self._await_rounds(order, mode, stay_s)
             if is_held:
                 await cleanup.stop_in(hold, order)
@@ -107,15 +112,44 @@ class RoundFlight:
         except (anyio.get_cancelled_exc_class(), OperationTimeout):
             cleanup.hold_in_background(order)
             raise
+        except OperationRejected:
+            if self._wrong_circle:
+                cleanup.hold_in_background(order)
+            raise
+
+    @contextmanager
+    def _watching_circle(self, radius_m: float) -> Iterator[None]:
+        """Watch ORBIT_EXECUTION_STATUS: PX4 accepts a radius that it does not allow, and flies another one."""
+
+        def on_status(status: OrbitExecutionStatus) -> None:
+            if radius_m and abs(abs(status.radius) - radius_m) > RADIUS_ERROR_M:
+                self._wrong_circle = f"it flies a circle of {abs(status.radius):.1f} m instead of {radius_m:g} m"
+            else:
+                self._wrong_circle = ""
+
+        detach = self._session.connection.bus.attach(OrbitExecutionStatus, on_status, system_id=self._session.system_id)
+        try:
+            yield
+        finally:
+            detach()
 
     async def _await_rounds(self, order: Order, mode: Mode, stay_s: float) -> None:
         started = self._session.connection.now()
-        stall = StallDetector(self._session)
+        stall, stays = StallDetector(self._session), self._context.sender.stays_in(order, mode)
+        wrong_until = started + CIRCLE_REPORT_S
+
+        def trouble() -> str | None:
+            texts = self._session.texts_since(order.given_at)
+            refusal = next(filter(self._session.autopilot.is_refusal, texts), "")
+            self._wrong_circle = refusal or self._wrong_circle
+            is_late = self._session.connection.now() > wrong_until
+            return stays() or refusal or (self._wrong_circle if is_late else None) or None
+
         await await_progress(
             self._session,
             self._what,
             is_done=lambda: self._is_flown_since(started) and not order.end,
-            trouble=self._context.sender.stays_in(order, mode),
+            trouble=trouble,
             describe=self._describe,
             timeout=self._timeout,
             max_silence_s=self._max_silence_s,
@@ -192,7 +226,7 @@ class RoundFlight:
     async def _stream(self, flight: PathFlight, order: Order) -> None:
         first, limits = flight.advance(0.0), {"valid_for_s": VALID_FOR_S, "max_lag_s": VALID_FOR_S}
         stream = Guided(self._context).trajectory(first, rate_hz=SETPOINT_RATE_HZ, **limits)
-        stream.prepared_order = order
+        stream._prepared_order = order
         async with stream:
             while not flight.is_complete:
                 await self._next(stream, flight.advance(SETPOINT_INTERVAL_S))

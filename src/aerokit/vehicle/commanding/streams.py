@@ -175,7 +175,7 @@ class SteeringStream(ValueStream[ValueT]):
     or a failsafe changed the mode, no hold is ordered.
     """
 
-    prepared_order: Order | None = None
+    _prepared_order: Order | None = None
     """The order, if it was given before the block is entered; see `FlightCleanup.preparing`."""
     _order: Order | None = None
     _mode: Mode | None = None
@@ -206,7 +206,7 @@ class SteeringStream(ValueStream[ValueT]):
         except BaseException:
             self._end()
             raise
-        order = self._order = self.prepared_order or self._context.arbiter.order(mode)
+        order = self._order = self._prepared_order or self._context.arbiter.order(mode)
         order.may_move = order.may_move or self._session.telemetry.is_in(mode)
         try:
             await self._enter(mode, order)

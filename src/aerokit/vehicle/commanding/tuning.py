@@ -14,7 +14,7 @@ from aerokit.protocols.command import rejection
 from aerokit.vehicle.commanding.context import VehicleBase
 
 if TYPE_CHECKING:
-    from aerokit.protocols.exchange import OnProgress
+    from collections.abc import Callable
 
 POLL_INTERVAL_S, ANSWER_TIMEOUT_S = 1.0, 1.0
 """PX4 reports the result for two seconds; the command would start another tuning after that."""
@@ -26,7 +26,7 @@ TUNED_PERCENT = 95
 class TuningActions(VehicleBase):
     """Automatic tuning."""
 
-    async def autotune(self, *, timeout: float = 120.0, on_progress: OnProgress | None = None) -> None:
+    async def autotune(self, *, timeout: float = 120.0, on_progress: Callable[[int], object] | None = None) -> None:
         """Let PX4 tune its controllers (MAV_CMD_DO_AUTOTUNE_ENABLE): **the vehicle shakes about each axis**.
 
         Call it while the vehicle hovers, or circles on its wings. Returns when PX4 has finished: with MC_AT_APPLY 1 it
