@@ -144,7 +144,7 @@ def _actions() -> Table:
         ("Vehicle.setup_signing", "NotSupported"): P(_sign, grounded, _old, alone=True),
         ("Vehicle.setup_signing", "OperationRejected"): P(_sign, armed),
         ("Vehicle.setup_signing", "OperationTimeout"): P(_sign, grounded, stops_sending),
-        ("Vehicle.setup_signing", "BusyError"): P(_sign_twice, grounded, stops_sending),
+        ("Vehicle.setup_signing", "BusyError"): P(_sign_twice, grounded, stops_sending, alone=True),
         ("Vehicle.set_mode", "InvalidArgument"): P(_method("set_mode", "NONE")),
         ("Vehicle.set_heading", "InvalidArgument"): P(_method("set_heading", 999), airborne),
         ("Vehicle.set_home", "OperationTimeout"): P(
@@ -238,7 +238,7 @@ def _figure_eight(stage: Stage, **options: Any) -> Any:
 
 
 def _loiter(stage: Stage, **options: Any) -> Any:
-    return stage.vehicle.loiter(stage.home, **options)
+    return stage.vehicle.loiter(stage.target(), **options)
 
 
 def _following(stage: Stage, target: Position | None = None, **options: Any) -> Any:
@@ -291,7 +291,7 @@ def _maneuvers() -> Table:
     rows["Vehicle.figure_eight", "CommandTimeout"] = P(_figure_eight, airborne, ignored(eight))
     rows["Vehicle.orbit", "NotSupported"] = P(_orbit, airborne, _rover, alone=True)
     rows["Vehicle.figure_eight", "NotSupported"] = P(_figure_eight, airborne, _obeys_nothing, alone=True)
-    rows["Vehicle.loiter", "NotSupported"] = P(lambda s: _loiter(s, radius_m=50), airborne)
+    rows["Vehicle.loiter", "NotSupported"] = P(lambda s: _loiter(s, radius_m=50))
     rows["Vehicle.follow", "InvalidArgument"] = P(_now(lambda s: _following(s, distance_m=-1)))
     rows["Vehicle.follow", "NotSupported"] = P(_now(_following), before=_obeys_nothing, alone=True)
     rows["FollowStream", "OperationRejected"] = P(_follow, grounded)

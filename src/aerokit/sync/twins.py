@@ -4185,7 +4185,7 @@ class Vehicle(VehicleTwin):
 
         PX4's fixed wings fly it themselves (MAV_CMD_DO_FIGURE_EIGHT: two circles and straight lines between them, and
         on until another order). For ArduCopter and PX4's multicopters aerokit streams the set-points of a lemniscate;
-        they hold at its center. All else as for :meth:`orbit`.
+        they hold at its center. All else is as for :meth:`orbit`.
 
         Args:
             center: where the lines cross; its altitude is that of the figure, without one the vehicle's own.
@@ -4242,7 +4242,7 @@ class Vehicle(VehicleTwin):
             timeout: seconds in total; None: no limit while heartbeats arrive, the mode stays and the vehicle moves.
             max_silence_s: raise when no heartbeat was received for this long; None: no limit.
 
-        All else as for :meth:`orbit`. NotSupported is raised for a radius if the vehicle hovers, InvalidArgument for
+        All else is as for :meth:`orbit`. NotSupported is raised for a radius if the vehicle hovers, InvalidArgument for
         ``turns`` without one.
         """
         self._loop.run(
