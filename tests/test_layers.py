@@ -34,6 +34,7 @@ ROOMS = {
         {"session"},
         {"commanding"},
         {"gimbal"},
+        {"rtk"},
         {"files"},
         {"parameters", "missions"},
         {"components"},

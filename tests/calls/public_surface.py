@@ -27,6 +27,8 @@ from aerokit.vehicle.missions.mission import MissionControl
 from aerokit.vehicle.missions.plans import FenceControl, RallyControl
 from aerokit.vehicle.parameters.parameters import Parameters
 from aerokit.vehicle.parameters.transaction import TemporaryParameters, Transaction
+from aerokit.vehicle.rtk.ntrip import NtripClient
+from aerokit.vehicle.rtk.rtk import Rtk
 
 __all__ = ["CLASSES", "FUNCTIONS", "Member", "awaited", "members", "own_classes_in"]
 
@@ -50,6 +52,8 @@ CLASSES: tuple[type, ...] = (
     MissionControl,
     FenceControl,
     RallyControl,
+    Rtk,
+    NtripClient,
     Files,
     Logs,
     StateCell,

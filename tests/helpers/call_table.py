@@ -12,6 +12,7 @@ from camera_beside import camera_of, settings_of
 from camera_calls import AWAITED
 from component_calls import COMPONENTS_AWAITED
 from provoked import Do, Provocation, Table, ignored, refused
+from rtk_calls import RTK_AWAITED
 
 import aerokit
 from aerokit import (
@@ -365,6 +366,8 @@ CALLS: dict[str, Call] = {
     "SetpointStream.fly": Call(_fly, airborne),
     # ------------------------------------------------------------------------------------- Camera
     **{name: Call(do) for name, do in AWAITED.items()},
+    # ------------------------------------------------------------------------------- corrections
+    **{name: Call(do) for name, do in RTK_AWAITED.items()},
     # --------------------------------------------------------------------------------- components
     **{name: Call(do, before=_with_camera) for name, do in COMPONENTS_AWAITED.items()},
     # ------------------------------------------------------------------------------------- Gimbal

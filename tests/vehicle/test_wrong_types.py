@@ -31,6 +31,7 @@ OWNERS: dict[str, Callable[[aerokit.Vehicle], Any]] = {
     "camera": lambda vehicle: vehicle.camera,
     "files": lambda vehicle: vehicle.files,
     "logs": lambda vehicle: vehicle.logs,
+    "rtk": lambda vehicle: vehicle.rtk,
     "cell": lambda vehicle: vehicle.position,
     "subscription": lambda vehicle: vehicle.subscribe(m.Heartbeat),
     "connection": lambda vehicle: vehicle.connection,

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.gimbal.rates import GimbalRates
     from aerokit.vehicle.parameters.transaction import TemporaryParameters, Transaction
     from aerokit.vehicle.parameters.writing import ParameterWrite
+    from aerokit.vehicle.rtk.ntrip import NtripClient
     from aerokit.vehicle.vehicle import Vehicle
 
 
@@ -80,7 +81,7 @@ EnteredT = TypeVar("EnteredT")
 
 BlockT = TypeVar(
     "BlockT",
-    bound="CameraBlock | Following | GimbalControl | GimbalRates | PhotoInterval | SetpointStream[Any]",
+    bound="CameraBlock | Following | GimbalControl | GimbalRates | NtripClient | PhotoInterval | SetpointStream[Any]",
 )
 
 ShieldedT = TypeVar("ShieldedT", bound="TemporaryParameters | Transaction")

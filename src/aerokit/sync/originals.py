@@ -91,6 +91,8 @@ TWINS = (
     Twin("aerokit.vehicle.missions.mission.MissionControl"),
     Twin("aerokit.vehicle.missions.plans.FenceControl"),
     Twin("aerokit.vehicle.missions.plans.RallyControl"),
+    Twin("aerokit.vehicle.rtk.ntrip.NtripClient", "BlockTwin"),
+    Twin("aerokit.vehicle.rtk.rtk.Rtk"),
     Twin("aerokit.vehicle.camera.link.CameraBlock", "BlockTwin"),
     Twin("aerokit.vehicle.camera.photos.PhotoInterval", "PhotoIntervalTwin"),
     Twin("aerokit.vehicle.camera.cameras.Camera"),
@@ -101,7 +103,7 @@ TWINS = (
         "VehicleTwin",
         without=_names("telemetry"),
         direct=_names("distance_to describe_now"),
-        parts=_names("camera cameras components guided gimbal gimbals files logs parameters mission fence rally"),
+        parts=_names("camera cameras components guided gimbal gimbals files logs parameters mission fence rally rtk"),
     ),
     Twin("aerokit.fleets.formation.Following", "BlockTwin", direct=_names("error_m"), page="fleet_twins"),
     Twin(

@@ -108,6 +108,9 @@ if TYPE_CHECKING:
     from aerokit.vehicle.parameters.parameters import Parameters as AsyncParameters
     from aerokit.vehicle.parameters.parameters import ParameterSource
     from aerokit.vehicle.parameters.writing import ParameterWrite
+    from aerokit.vehicle.rtk.ntrip import NtripClient as AsyncNtripClient
+    from aerokit.vehicle.rtk.rtk import Corrections
+    from aerokit.vehicle.rtk.rtk import Rtk as AsyncRtk
     from aerokit.vehicle.state.condition import EstimatorHealth, MissionProgress, SensorHealth, StatusText, SystemTime
     from aerokit.vehicle.state.equipment import (
         Battery,
@@ -136,10 +139,12 @@ __all__ = [
     "Guided",
     "Logs",
     "MissionControl",
+    "NtripClient",
     "Parameters",
     "PhotoInterval",
     "PostedOrder",
     "RallyControl",
+    "Rtk",
     "SetpointStream",
     "Settings",
     "StateCell",
@@ -1973,6 +1978,87 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
         self._loop.run(self.aio.clear, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
 
+class NtripClient(BlockTwin["AsyncNtripClient"]):
+    """Fetches corrections from an NTRIP caster while its ``async with`` block runs, and sends them to the vehicle.
+
+    Entering returns when the caster has accepted the request. A connection that ends, or is silent for 30 s, is opened
+    again, after 1 to 30 s, as often as necessary; the logger ``aerokit`` reports it. Messages that GPS_RTCM_DATA cannot
+    carry (above 720 bytes) are left out. Leaving the block closes the connection.
+
+    Entering raises:
+        OperationRejected: the caster refused: user or password, or no such mount point (the text lists others).
+        LinkOpenError: the caster could not be reached.
+        OperationTimeout: the caster did not answer in time.
+        BusyError: the client was entered before.
+    """
+
+    @property
+    def is_connected(self) -> bool:
+        """True while the caster's connection is open."""
+        return self.aio.is_connected
+
+    @property
+    def problem(self) -> str:
+        """Why the caster is not connected now; empty while it is."""
+        return self.aio.problem
+
+    @property
+    def reconnects(self) -> int:
+        """How often the connection was opened again."""
+        return self.aio.reconnects
+
+    @property
+    def oversized(self) -> int:
+        """Number of messages that were left out because they have more than 720 bytes."""
+        return self.aio.oversized
+
+
+class Rtk(TwinOf["AsyncRtk"]):
+    """RTCM corrections for the vehicle's satellite receivers (GPS_RTCM_DATA).
+
+    ``vehicle.gps`` reports the effect: fix types 5 (RTK float) and 6 (RTK fixed).
+    """
+
+    @cached_property
+    def corrections(self) -> StateCell[Corrections]:
+        """Number, bytes and bandwidth of the corrections; its age is that of the last one."""
+        return StateCell(self._loop, self.aio.corrections)
+
+    def send(self, rtcm: bytes) -> None:
+        """Send RTCM 3 messages to the vehicle; never blocks.
+
+        Each message is split as GPS_RTCM_DATA requires. That message has no target, so it is sent once on each link,
+        even if several vehicles of the connection send the same message within 0.9 s. There is no acknowledgement:
+        ``vehicle.gps`` shows whether the receiver uses the corrections.
+
+        Args:
+            rtcm: one or more whole messages, each of 720 bytes at most.
+
+        Raises:
+            InvalidArgument: ``rtcm`` is empty, or a message is incomplete, damaged or longer. Nothing was sent.
+            ConnectionClosed, LinkLost: the connection has ended, or the block of this vehicle was left.
+        """
+        self._loop.call(self.aio.send, rtcm)
+
+    def ntrip(self, url: str, *, send_position: bool | None = None, timeout: float = 10.0) -> NtripClient:
+        """Fetch corrections from an NTRIP caster while the ``async with`` block runs, and send them to the vehicle.
+
+        Args:
+            url: ``"ntrip://user:password@host:2101/MOUNT"``; ``ntrips://`` for TLS. Characters such as ``@`` in the
+                password are written as ``%40``. The password appears in no log, error or repr.
+            send_position: send the vehicle's position to the caster (GGA, every 10 s), which a virtual reference
+                station needs. None: if the caster's source table asks for it.
+            timeout: seconds to wait for the caster's answer.
+
+        Raises:
+            InvalidArgument: the URL is invalid. Nothing was opened.
+        """
+        return NtripClient(
+            self._loop,
+            self._loop.call(self.aio.ntrip, url, send_position=send_position, timeout=timeout),
+        )
+
+
 class CameraBlock(BlockTwin["AsyncCameraBlock"]):
     """An operation of a camera for the duration of an ``async with`` block.
 
@@ -3606,6 +3692,11 @@ class Vehicle(VehicleTwin):
     def rally(self) -> RallyControl:
         """The vehicle's rally points."""
         return self._part("rally", RallyControl)
+
+    @property
+    def rtk(self) -> Rtk:
+        """RTCM corrections for the satellite receivers, from your program or from an NTRIP caster."""
+        return self._part("rtk", Rtk)
 
     def setup_signing(self, signing: Signing | None, *, timeout: float = 5.0) -> None:
         """Install a signing key on the vehicle and sign all traffic with it from then on; None removes the key.

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.missions.mission import MissionControl
     from aerokit.vehicle.missions.plans import FenceControl, RallyControl
     from aerokit.vehicle.parameters.parameters import Parameters
+    from aerokit.vehicle.rtk.rtk import Rtk
 
 __all__ = ["Vehicle", "overview"]
 
@@ -181,6 +182,13 @@ class Vehicle(ReadOnly, FlightActions, TravelActions, LookActions, ArmingActions
         from aerokit.vehicle.missions.plans import RallyControl
 
         return RallyControl(self._plans)
+
+    @cached_property
+    def rtk(self) -> Rtk:
+        """RTCM corrections for the satellite receivers, from your program or from an NTRIP caster."""
+        from aerokit.vehicle.rtk.rtk import Rtk
+
+        return Rtk(self._context)
 
     def __repr__(self) -> str:
         return f"<Vehicle {self.system_id}/{self.component_id} {self.autopilot.firmware}, {self.describe_link()}>"
