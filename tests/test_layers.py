@@ -37,6 +37,7 @@ ROOMS = {
         {"rtk"},
         {"files"},
         {"parameters", "missions"},
+        {"calibration"},
         {"components"},
         {"camera"},
         {"vehicle"},

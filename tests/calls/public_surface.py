@@ -11,6 +11,7 @@ import aerokit
 from aerokit.connection.bus import Subscription
 from aerokit.connection.cells import Changes, StateCell
 from aerokit.connection.connection import Connection
+from aerokit.vehicle.calibration.calibration import Calibration, Calibrations
 from aerokit.vehicle.camera.cameras import Camera
 from aerokit.vehicle.camera.link import CameraBlock
 from aerokit.vehicle.camera.photos import PhotoInterval
@@ -52,6 +53,8 @@ CLASSES: tuple[type, ...] = (
     MissionControl,
     FenceControl,
     RallyControl,
+    Calibrations,
+    Calibration,
     Rtk,
     NtripClient,
     Files,

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import anyio
+from calibration_calls import CALIBRATIONS_AWAITED
 from call_stage import DATA, Place, Stage, airborne, anywhere, armed, grounded, on_mission
 from camera_beside import camera_of, settings_of
 from camera_calls import AWAITED
@@ -366,6 +367,8 @@ CALLS: dict[str, Call] = {
     "SetpointStream.fly": Call(_fly, airborne),
     # ------------------------------------------------------------------------------------- Camera
     **{name: Call(do) for name, do in AWAITED.items()},
+    # ------------------------------------------------------------------------------- calibration
+    **{name: Call(do, grounded, on) for name, (do, on) in CALIBRATIONS_AWAITED.items()},
     # ------------------------------------------------------------------------------- corrections
     **{name: Call(do) for name, do in RTK_AWAITED.items()},
     # --------------------------------------------------------------------------------- components

@@ -159,7 +159,7 @@ def speed_of(copter: SimulatedCopter) -> float:
 
 def make_parts(vehicle: aerokit.Vehicle) -> None:
     """Create the parts that subscribe on first use and live as long as the vehicle, so that leak checks ignore them."""
-    for name in ("parameters", "gimbal", "mission", "rtk"):
+    for name in ("parameters", "gimbal", "mission", "rtk", "calibrate"):
         getattr(vehicle, name)
 
 

@@ -108,6 +108,7 @@ for _literal in (
     "LogMethod",
     "Overflow",
     "Subject",
+    "EscIntent",
 ):
     WRONG[_literal] = (*STRANGE, *NUMBER, "quick")
 

@@ -89,7 +89,8 @@ def test_incomplete_or_damaged_message_is_refused(data: bytes, reason: str) -> N
 def test_reader_finds_messages_in_any_pieces(sizes: list[int], noise: bytes, cuts: list[int]) -> None:
     noise = noise.replace(b"\xd3", b"")
     messages = [rtcm(size) for size in sizes]
-    stream, found, reader = noise.join([b"", *messages, b""]), [], RtcmReader()
+    stream, reader = noise.join([b"", *messages, b""]), RtcmReader()
+    found: list[bytes] = []
     while stream:
         size = cuts.pop() if cuts else len(stream)
         found += reader.feed(stream[:size])

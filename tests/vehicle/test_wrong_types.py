@@ -32,6 +32,7 @@ OWNERS: dict[str, Callable[[aerokit.Vehicle], Any]] = {
     "files": lambda vehicle: vehicle.files,
     "logs": lambda vehicle: vehicle.logs,
     "rtk": lambda vehicle: vehicle.rtk,
+    "calibrate": lambda vehicle: vehicle.calibrate,
     "cell": lambda vehicle: vehicle.position,
     "subscription": lambda vehicle: vehicle.subscribe(m.Heartbeat),
     "connection": lambda vehicle: vehicle.connection,

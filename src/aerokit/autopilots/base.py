@@ -385,4 +385,7 @@ class Autopilot:
         """Return False if this autopilot is known not to send the message."""
         return message.NAME not in self.unsupported_messages
 
+    calibration_protocol: str = ""
+    """How calibrations report: ``"acknowledgements"`` (ArduPilot), status ``"texts"`` (PX4), or ``""``: unknown."""
+
     unsupported_messages: frozenset[str] = frozenset()

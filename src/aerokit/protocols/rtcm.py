@@ -59,7 +59,8 @@ def rtcm_messages(data: bytes) -> list[bytes]:
     Raises:
         InvalidArgument: ``data`` is empty, a message is incomplete, damaged, or longer than 720 bytes.
     """
-    found, begin = [], 0
+    found: list[bytes] = []
+    begin = 0
     while begin < len(data) or not found:
         size = _frame_size(data, begin) if len(data) - begin > HEADER_SIZE else None
         where = f"rtcm (byte {begin} of {len(data)})"

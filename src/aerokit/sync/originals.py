@@ -88,6 +88,8 @@ TWINS = (
     Twin("aerokit.vehicle.parameters.transaction.TemporaryParameters", "TemporarilyTwin"),
     Twin("aerokit.vehicle.parameters.transaction.Transaction", "TransactionTwin"),
     Twin("aerokit.vehicle.parameters.parameters.Parameters", direct=_names("load_metadata known")),
+    Twin("aerokit.vehicle.calibration.calibration.Calibration", "CalibrationTwin"),
+    Twin("aerokit.vehicle.calibration.calibration.Calibrations"),
     Twin("aerokit.vehicle.missions.mission.MissionControl"),
     Twin("aerokit.vehicle.missions.plans.FenceControl"),
     Twin("aerokit.vehicle.missions.plans.RallyControl"),
@@ -103,7 +105,9 @@ TWINS = (
         "VehicleTwin",
         without=_names("telemetry"),
         direct=_names("distance_to describe_now"),
-        parts=_names("camera cameras components guided gimbal gimbals files logs parameters mission fence rally rtk"),
+        parts=_names(
+            "camera cameras components guided gimbal gimbals files logs parameters mission fence rally rtk calibrate"
+        ),
     ),
     Twin("aerokit.fleets.formation.Following", "BlockTwin", direct=_names("error_m"), page="fleet_twins"),
     Twin(

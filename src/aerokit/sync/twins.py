@@ -20,6 +20,7 @@ from aerokit.mavlink.enums import MavComponent
 from aerokit.protocols.exchange import IDLE_TIMEOUT_S
 from aerokit.sync.blocks import (
     BlockTwin,
+    CalibrationTwin,
     CellTwin,
     ChangesTwin,
     ConnectionTwin,
@@ -70,6 +71,8 @@ if TYPE_CHECKING:
     from aerokit.protocols.exchange import OnProgress
     from aerokit.transport.link import Link
     from aerokit.transport.sockets import PeerFilter
+    from aerokit.vehicle.calibration.calibration import Calibrations as AsyncCalibrations
+    from aerokit.vehicle.calibration.calibration import EscIntent
     from aerokit.vehicle.camera.cameras import Camera as AsyncCamera
     from aerokit.vehicle.camera.capture import Capture
     from aerokit.vehicle.camera.controls import AutoFocus
@@ -125,6 +128,8 @@ if TYPE_CHECKING:
     from aerokit.vehicle.state.movement import Attitude, Home, LocalPosition, Velocity, Wind
 
 __all__ = [
+    "Calibration",
+    "Calibrations",
     "Camera",
     "CameraBlock",
     "Changes",
@@ -1582,6 +1587,97 @@ class Parameters(TwinOf["AsyncParameters"]):
             timeout=timeout,
             on_progress=on_progress,
         )
+
+
+class Calibration(CalibrationTwin):
+    """The steps of a calibration: iterate with ``async for``. The last step has the ``result``.
+
+    The calibration starts with the first step. Leaving the loop, in any way, cancels it on the vehicle, as does the end
+    of the vehicle's block. ArduPilot cannot cancel ``accelerometer``; a warning says so. Calibrations that need no
+    person (gyroscope, level, barometer, airspeed on ArduPilot, and ``escs`` on PX4) end by themselves in seconds.
+
+    Iterating raises:
+        OperationRejected: the calibration failed, or was cancelled by another party, with the vehicle's texts as
+            reasons; or the vehicle is armed, or not known to be disarmed.
+        NotSupported: the vehicle has no such sensor or calibration. Nothing was sent.
+        CommandRejected: the vehicle refused to start.
+        CommandTimeout: the vehicle did not answer.
+        OperationTimeout: the vehicle reported nothing for two minutes, or its result was lost.
+        HeartbeatTimeout: the vehicle was silent for 10 s.
+        BusyError: another calibration of this vehicle is in progress. Nothing was sent.
+        ConnectionClosed, LinkLost: the connection has ended.
+    """
+
+    def cancel(self) -> None:
+        """Cancel the calibration; returns when the vehicle has confirmed it.
+
+        Does nothing if the calibration has not started or has ended.
+
+        Raises:
+            NotSupported: the vehicle cannot cancel it.
+            OperationTimeout: the vehicle did not confirm it.
+        """
+        self._loop.run(self.aio.cancel)
+
+
+class Calibrations(TwinOf["AsyncCalibrations"]):
+    """Calibrates the vehicle's sensors: ``async for step in vehicle.calibrate.compass(): …``.
+
+    Each method returns the steps. Print ``step.instruction``, show ``step.pose``; where ``step.needs_confirmation`` is
+    true, the calibration waits until the loop continues. See docs/how-to/calibration.md. Only one calibration runs at a
+    time, on a disarmed vehicle.
+    """
+
+    def compass(self) -> Calibration:
+        """Calibrate all compasses, while the vehicle is turned about all axes.
+
+        ArduPilot reports progress and fitness of each compass, and must reboot afterwards. PX4 wants up to six poses,
+        turned about the vertical in each.
+        """
+        return Calibration(self._loop, self._loop.call(self.aio.compass))
+
+    def accelerometer(self) -> Calibration:
+        """Calibrate the accelerometers in six poses.
+
+        ArduPilot waits for a confirmation in each pose, and must reboot afterwards. PX4 detects poses, in any order.
+        """
+        return Calibration(self._loop, self._loop.call(self.aio.accelerometer))
+
+    def gyroscope(self) -> Calibration:
+        """Calibrate the gyroscopes, while the vehicle stands still."""
+        return Calibration(self._loop, self._loop.call(self.aio.gyroscope))
+
+    def level(self) -> Calibration:
+        """Calibrate which attitude is level, while the vehicle stands level and still."""
+        return Calibration(self._loop, self._loop.call(self.aio.level))
+
+    def barometer(self) -> Calibration:
+        """Calibrate the barometer: ArduPilot by the present pressure, PX4 by the altitude of the GPS."""
+        return Calibration(self._loop, self._loop.call(self.aio.barometer))
+
+    def airspeed(self) -> Calibration:
+        """Calibrate the airspeed sensors: sheltered from wind first; on PX4, blow into the front afterwards."""
+        return Calibration(self._loop, self._loop.call(self.aio.airspeed))
+
+    def radio(self) -> Calibration:
+        """Calibrate the remote control: writes RCn_MIN, RCn_MAX and RCn_TRIM of each channel that was moved.
+
+        Both confirmations are needed: when all sticks and switches were at their ends, and when the sticks are centred.
+        """
+        return Calibration(self._loop, self._loop.call(self.aio.radio))
+
+    def escs(self, *, intent: EscIntent) -> Calibration:
+        """Calibrate the ESCs. **Remove the propellers**, because the motors get full throttle.
+
+        PX4 does it at once, while you connect the battery. ArduCopter does it at the next boot: the last step says so.
+
+        Args:
+            intent: ``"propellers are removed"``.
+
+        Raises:
+            InvalidArgument: the intent is another text. Nothing was sent.
+        """
+        return Calibration(self._loop, self._loop.call(self.aio.escs, intent=intent))
 
 
 class MissionControl(TwinOf["AsyncMissionControl"]):
@@ -3692,6 +3788,11 @@ class Vehicle(VehicleTwin):
     def rally(self) -> RallyControl:
         """The vehicle's rally points."""
         return self._part("rally", RallyControl)
+
+    @property
+    def calibrate(self) -> Calibrations:
+        """Calibrations of sensors, radio and ESCs, step by step."""
+        return self._part("calibrate", Calibrations)
 
     @property
     def rtk(self) -> Rtk:
