@@ -7,10 +7,12 @@ from collections.abc import Callable, Iterator
 from types import FunctionType
 from typing import Any
 
+from calibration_calls import CALIBRATIONS_BLOCKING
 from call_stage import Stage
 from call_table import CALLS, KEY
 from camera_calls import BLOCKING
 from component_calls import COMPONENTS_BLOCKING
+from rtk_calls import RTK_BLOCKING
 
 import aerokit.sync
 from aerokit import (
@@ -39,6 +41,10 @@ CLASSES: tuple[type, ...] = (
     twins.Gimbals,
     twins.GimbalControl,
     twins.GimbalRates,
+    twins.Calibrations,
+    twins.Calibration,
+    twins.Rtk,
+    twins.NtripClient,
     twins.Camera,
     twins.PostedOrder,
     twins.SetpointStream,
@@ -263,4 +269,4 @@ WRITTEN: dict[str, Do] = {
 def blocking_calls() -> dict[str, Do]:
     """Return the calls by name; coroutine functions of the other table have no twin."""
     shared = {name: call.do for name, call in CALLS.items() if not inspect.iscoroutinefunction(call.do)}
-    return {**shared, **WRITTEN, **BLOCKING, **COMPONENTS_BLOCKING}
+    return {**shared, **WRITTEN, **BLOCKING, **COMPONENTS_BLOCKING, **CALIBRATIONS_BLOCKING, **RTK_BLOCKING}

@@ -14,7 +14,7 @@ from aerokit.errors import NotSupported
 from aerokit.mavlink.enums import MavCmd
 from aerokit.vehicle.calibration.calibration import Calibration
 
-__all__ = ["CALIBRATIONS", "CALIBRATIONS_AWAITED"]
+__all__ = ["CALIBRATIONS", "CALIBRATIONS_AWAITED", "CALIBRATIONS_BLOCKING"]
 
 NAMES = ("compass", "accelerometer", "gyroscope", "level", "barometer")
 ESCS = "propellers are removed"
@@ -66,6 +66,33 @@ async def _refused_airspeed(stage: Stage) -> None:
         pass
 
 
+def _blocking(name: str) -> Callable[[Any], object]:
+    def run(stage: Any) -> None:
+        for _ in getattr(stage.vehicle.calibrate, name)():
+            break
+
+    return run
+
+
+def _blocking_escs(stage: Any) -> None:
+    for _ in stage.vehicle.calibrate.escs(intent=ESCS):
+        break
+
+
+def _blocking_cancel(stage: Any) -> None:
+    calibration = stage.vehicle.calibrate.compass()
+    next(calibration)
+    calibration.cancel()
+
+
+CALIBRATIONS_BLOCKING: dict[str, Callable[[Any], object]] = {
+    **{f"Calibrations.{name}": _blocking(name) for name in ("compass", "gyroscope", "level", "barometer", "radio")},
+    # ArduPilot cannot cancel the accelerometer calibration, and the copter has no airspeed sensor.
+    "Calibrations.accelerometer": lambda s: s.vehicle.calibrate.accelerometer(),
+    "Calibrations.airspeed": lambda s: s.vehicle.calibrate.airspeed(),
+    "Calibrations.escs": _blocking_escs,
+    "Calibration.cancel": _blocking_cancel,
+}
 CALIBRATIONS_AWAITED: dict[str, tuple[Do, tuple[str, ...]]] = {
     **{f"Calibrations.{name}": (_all_steps(name), ("ardupilot", "px4")) for name in NAMES},
     "Calibrations.airspeed": (_refused_airspeed, ("ardupilot",)),

@@ -14,7 +14,7 @@ from provoked import Do, Provocation, Table, lost
 
 from aerokit.vehicle.rtk import ntrip
 
-__all__ = ["RTK", "RTK_AWAITED", "memory_caster"]
+__all__ = ["RTK", "RTK_AWAITED", "RTK_BLOCKING", "memory_caster"]
 
 URL = "ntrip://someone:secret@caster/MOUNT"
 DATA = b"HTTP/1.1 200 OK\r\nContent-Type: gnss/data\r\n\r\n" + rtcm(25)
@@ -89,6 +89,10 @@ async def _wrong_url(stage: Stage) -> None:
 
 
 RTK_AWAITED: dict[str, Do] = {"Rtk.ntrip": _with(_fetch)}
+RTK_BLOCKING: dict[str, Callable[[Any], object]] = {
+    "Rtk.send": lambda s: s.vehicle.rtk.send(rtcm(25)),
+    "Rtk.ntrip": lambda s: s.vehicle.rtk.ntrip(URL),
+}
 RTK: Table = {
     ("Rtk.send", "InvalidArgument"): Provocation(_send_damaged),
     ("Rtk.send", "ConnectionClosed"): _send(lambda s: s.vehicle.connection.close()),
