@@ -87,7 +87,7 @@ def _after(run: CalibrationRun, step: CalibrationStep, report: CalibrationReport
         remaining, pose = report.poses, report.poses[0]
         instruction = "place the vehicle in one of the remaining poses and keep it still"
     elif report.kind == "detected":
-        pose = report.poses[0]
+        pose, instruction = report.poses[0], report.text
     elif report.kind == "side done":
         remaining = tuple(other for other in remaining if other not in report.poses)
         pose, instruction = remaining[0] if remaining else None, report.text
