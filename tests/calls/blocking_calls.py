@@ -41,7 +41,7 @@ CLASSES: tuple[type, ...] = (
     twins.Gimbals,
     twins.GimbalControl,
     twins.GimbalRates,
-    twins.Calibrations,
+    twins.CalibrationControl,
     twins.Calibration,
     twins.Rtk,
     twins.NtripClient,

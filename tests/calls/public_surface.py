@@ -11,7 +11,7 @@ import aerokit
 from aerokit.connection.bus import Subscription
 from aerokit.connection.cells import Changes, StateCell
 from aerokit.connection.connection import Connection
-from aerokit.vehicle.calibration.calibration import Calibration, Calibrations
+from aerokit.vehicle.calibration.calibration import Calibration, CalibrationControl
 from aerokit.vehicle.camera.cameras import Camera
 from aerokit.vehicle.camera.link import CameraBlock
 from aerokit.vehicle.camera.photos import PhotoInterval
@@ -53,7 +53,7 @@ CLASSES: tuple[type, ...] = (
     MissionControl,
     FenceControl,
     RallyControl,
-    Calibrations,
+    CalibrationControl,
     Calibration,
     Rtk,
     NtripClient,

@@ -1,4 +1,4 @@
-"""Calibrations, successful and failing ones."""
+"""CalibrationControl, successful and failing ones."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from provoked import Do, Provocation, Table, ignored, lost, refused, stops_sendi
 
 from aerokit.errors import NotSupported
 from aerokit.mavlink.enums import MavCmd
-from aerokit.vehicle.calibration.calibration import Calibration
+from aerokit.vehicle.calibration.calibration import Calibration, EscIntent
 
 __all__ = ["CALIBRATIONS", "CALIBRATIONS_AWAITED", "CALIBRATIONS_BLOCKING"]
 
 NAMES = ("compass", "accelerometer", "gyroscope", "level", "barometer")
-ESCS = "propellers are removed"
+ESCS: EscIntent = "propellers are removed"
 
 
 def _turn_quickly(stage: Stage) -> None:
@@ -86,18 +86,21 @@ def _blocking_cancel(stage: Any) -> None:
 
 
 CALIBRATIONS_BLOCKING: dict[str, Callable[[Any], object]] = {
-    **{f"Calibrations.{name}": _blocking(name) for name in ("compass", "gyroscope", "level", "barometer", "radio")},
+    **{
+        f"CalibrationControl.{name}": _blocking(name)
+        for name in ("compass", "gyroscope", "level", "barometer", "radio")
+    },
     # ArduPilot cannot cancel the accelerometer calibration, and the copter has no airspeed sensor.
-    "Calibrations.accelerometer": lambda s: s.vehicle.calibrate.accelerometer(),
-    "Calibrations.airspeed": lambda s: s.vehicle.calibrate.airspeed(),
-    "Calibrations.escs": _blocking_escs,
+    "CalibrationControl.accelerometer": lambda s: s.vehicle.calibrate.accelerometer(),
+    "CalibrationControl.airspeed": lambda s: s.vehicle.calibrate.airspeed(),
+    "CalibrationControl.escs": _blocking_escs,
     "Calibration.cancel": _blocking_cancel,
 }
 CALIBRATIONS_AWAITED: dict[str, tuple[Do, tuple[str, ...]]] = {
-    **{f"Calibrations.{name}": (_all_steps(name), ("ardupilot", "px4")) for name in NAMES},
-    "Calibrations.airspeed": (_refused_airspeed, ("ardupilot",)),
-    "Calibrations.radio": (_radio, ("ardupilot",)),
-    "Calibrations.escs": (_escs, ("ardupilot",)),
+    **{f"CalibrationControl.{name}": (_all_steps(name), ("ardupilot", "px4")) for name in NAMES},
+    "CalibrationControl.airspeed": (_refused_airspeed, ("ardupilot",)),
+    "CalibrationControl.radio": (_radio, ("ardupilot",)),
+    "CalibrationControl.escs": (_escs, ("ardupilot",)),
     "Calibration.cancel": (_cancel, ("ardupilot", "px4")),
 }
 
@@ -164,5 +167,5 @@ CALIBRATIONS: Table = {
     ("Calibration", "LinkLost"): _during(_lose, alone=True),
     ("Calibration.cancel", "NotSupported"): Provocation(_cancel_accelerometer, grounded, alone=True),
     ("Calibration.cancel", "OperationTimeout"): Provocation(_cancel_silent, grounded, alone=True),
-    ("Calibrations.escs", "InvalidArgument"): Provocation(_wrong_intent),
+    ("CalibrationControl.escs", "InvalidArgument"): Provocation(_wrong_intent),
 }

@@ -89,7 +89,7 @@ TWINS = (
     Twin("aerokit.vehicle.parameters.transaction.Transaction", "TransactionTwin"),
     Twin("aerokit.vehicle.parameters.parameters.Parameters", direct=_names("load_metadata known")),
     Twin("aerokit.vehicle.calibration.calibration.Calibration", "CalibrationTwin"),
-    Twin("aerokit.vehicle.calibration.calibration.Calibrations"),
+    Twin("aerokit.vehicle.calibration.calibration.CalibrationControl"),
     Twin("aerokit.vehicle.missions.mission.MissionControl"),
     Twin("aerokit.vehicle.missions.plans.FenceControl"),
     Twin("aerokit.vehicle.missions.plans.RallyControl"),

@@ -71,7 +71,7 @@ if TYPE_CHECKING:
     from aerokit.protocols.exchange import OnProgress
     from aerokit.transport.link import Link
     from aerokit.transport.sockets import PeerFilter
-    from aerokit.vehicle.calibration.calibration import Calibrations as AsyncCalibrations
+    from aerokit.vehicle.calibration.calibration import CalibrationControl as AsyncCalibrationControl
     from aerokit.vehicle.calibration.calibration import EscIntent
     from aerokit.vehicle.camera.cameras import Camera as AsyncCamera
     from aerokit.vehicle.camera.capture import Capture
@@ -129,7 +129,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Calibration",
-    "Calibrations",
+    "CalibrationControl",
     "Camera",
     "CameraBlock",
     "Changes",
@@ -1593,8 +1593,8 @@ class Calibration(CalibrationTwin):
     """The steps of a calibration: iterate with ``async for``. The last step has the ``result``.
 
     The calibration starts with the first step. Leaving the loop, in any way, cancels it on the vehicle, as does the end
-    of the vehicle's block. ArduPilot cannot cancel ``accelerometer``; a warning says so. Calibrations that need no
-    person (gyroscope, level, barometer, airspeed on ArduPilot, and ``escs`` on PX4) end by themselves in seconds.
+    of the vehicle's block. ArduPilot cannot cancel ``accelerometer``; a warning says so. Others that cannot be cancelled
+    (level, barometer, ArduPilot's gyroscope and airspeed, PX4's ESCs) end in seconds.
 
     Iterating raises:
         OperationRejected: the calibration failed, or was cancelled by another party, with the vehicle's texts as
@@ -1620,7 +1620,7 @@ class Calibration(CalibrationTwin):
         self._loop.run(self.aio.cancel)
 
 
-class Calibrations(TwinOf["AsyncCalibrations"]):
+class CalibrationControl(TwinOf["AsyncCalibrationControl"]):
     """Calibrates the vehicle's sensors: ``async for step in vehicle.calibrate.compass(): …``.
 
     Each method returns the steps. Print ``step.instruction``, show ``step.pose``; where ``step.needs_confirmation`` is
@@ -3790,9 +3790,9 @@ class Vehicle(VehicleTwin):
         return self._part("rally", RallyControl)
 
     @property
-    def calibrate(self) -> Calibrations:
-        """Calibrations of sensors, radio and ESCs, step by step."""
-        return self._part("calibrate", Calibrations)
+    def calibrate(self) -> CalibrationControl:
+        """CalibrationControl of sensors, radio and ESCs, step by step."""
+        return self._part("calibrate", CalibrationControl)
 
     @property
     def rtk(self) -> Rtk:

@@ -18,7 +18,7 @@ from aerokit.vehicle.state.field import MESSAGE_IDS
 if TYPE_CHECKING:
     from aerokit.connection.cells import StateCell
     from aerokit.mavlink.signing import Signing
-    from aerokit.vehicle.calibration.calibration import Calibrations
+    from aerokit.vehicle.calibration.calibration import CalibrationControl
     from aerokit.vehicle.camera.cameras import Camera, Cameras
     from aerokit.vehicle.commanding.context import VehicleContext
     from aerokit.vehicle.commanding.guided import Guided
@@ -185,11 +185,11 @@ class Vehicle(ReadOnly, FlightActions, TravelActions, LookActions, ArmingActions
         return RallyControl(self._plans)
 
     @cached_property
-    def calibrate(self) -> Calibrations:
-        """Calibrations of sensors, radio and ESCs, step by step."""
-        from aerokit.vehicle.calibration.calibration import Calibrations
+    def calibrate(self) -> CalibrationControl:
+        """CalibrationControl of sensors, radio and ESCs, step by step."""
+        from aerokit.vehicle.calibration.calibration import CalibrationControl
 
-        return Calibrations(self._context, lambda: self.parameters)
+        return CalibrationControl(self._context, lambda: self.parameters)
 
     @cached_property
     def rtk(self) -> Rtk:

@@ -15,7 +15,8 @@ from aerokit.apps.cli import calibrate
 from aerokit.apps.cli.calibrate import bar, lines_of
 from aerokit.sim import SimulatedCopter, SimulatedPx4, SimulatedVehicle, simulated_link
 from aerokit.testing import run_virtual
-from aerokit.vehicle.calibration.values import CalibrationStep, Pose
+from aerokit.vehicle.calibration.values import CalibrationPose as Pose
+from aerokit.vehicle.calibration.values import CalibrationStep
 
 
 def run(vehicle: SimulatedVehicle, *arguments: str, interrupt_after_s: float | None = None) -> int:

@@ -27,7 +27,8 @@ from aerokit.errors import (
 from aerokit.mavlink.enums import MavCmd, MavSeverity
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.vehicle.calibration.calibration import Calibration
-from aerokit.vehicle.calibration.values import CalibrationStep, Pose
+from aerokit.vehicle.calibration.values import CalibrationPose as Pose
+from aerokit.vehicle.calibration.values import CalibrationStep
 
 pytestmark = pytest.mark.anyio
 CALIBRATION = MavCmd.PREFLIGHT_CALIBRATION
@@ -100,9 +101,10 @@ async def test_failed_compass_raises_with_fitness(monkeypatch: pytest.MonkeyPatc
 
         def report() -> m.MagCalReport | None:
             found: m.MagCalReport | None = whole()
-            if found is not None:
-                found.cal_status, found.fitness = 5, 44.0
-            return found
+            if found is None:
+                return None
+            fields = {name: getattr(found, name) for name in found.__match_args__}
+            return m.MagCalReport(**{**fields, "cal_status": 5, "fitness": 44.0})
 
         monkeypatch.setattr(compasses, "report", report)
         with pytest.raises(OperationRejected, match=r"compass 0 failed \(fitness 44\.0 mgauss\)"):
@@ -119,7 +121,14 @@ async def test_ardupilot_accelerometer_confirms_each_pose_once() -> None:
             if step.needs_confirmation:
                 poses.append(step.pose)
                 await anyio.sleep(5)
-        assert poses == [Pose.LEVEL, Pose.LEFT, Pose.RIGHT, Pose.NOSE_DOWN, Pose.NOSE_UP, Pose.BACK]
+        assert poses == [
+            Pose.LEVEL,
+            Pose.LEFT,
+            Pose.RIGHT,
+            Pose.NOSE_DOWN,
+            Pose.NOSE_UP,
+            Pose.BACK,
+        ]
         assert [params[0] for params in orders(wire, MavCmd.ACCELCAL_VEHICLE_POS)] == [1, 2, 3, 4, 5, 6]
         assert step.result is not None
         assert step.result.reboot_due

@@ -6,9 +6,22 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aerokit.vehicle.calibration.values import SIDES, Pose, parse_report
+from aerokit.vehicle.calibration.values import SIDES, parse_report
+from aerokit.vehicle.calibration.values import CalibrationPose as Pose
 
-KINDS = {"started", "done", "failed", "cancelled", "progress", "pending", "detected", "side done", "already done"}
+WITH_POSES = ("pending", "detected", "side done", "side progress", "already done")
+KINDS = {"started", "done", "failed", "cancelled", "progress", *WITH_POSES}
+    "started",
+    "done",
+    "failed",
+    "cancelled",
+    "progress",
+    "pending",
+    "detected",
+    "side done",
+    "already done",
+    "side progress",
+}
 
 
 @pytest.mark.parametrize(
@@ -24,6 +37,7 @@ KINDS = {"started", "done", "failed", "cancelled", "progress", "pending", "detec
         ("[cal] front orientation detected", "detected", None, (Pose.NOSE_DOWN,)),
         ("[cal] down side done, rotate to a different side", "side done", None, (Pose.LEVEL,)),
         ("[cal] left side already completed", "already done", None, (Pose.LEFT,)),
+        ("[cal] up side calibration: progress <3>", "side progress", None, (Pose.BACK,)),
         ("[cal] Rotate vehicle", "text", None, ()),
     ],
 )
@@ -66,4 +80,4 @@ def test_any_text_is_parsed_without_error(text: str) -> None:
         if report is not None and report.kind in KINDS:
             assert received.startswith("[cal] ")
             assert report.progress is None or 0 <= report.progress <= 1
-            assert (report.kind in ("pending", "detected", "side done", "already done")) == bool(report.poses)
+            assert (report.kind in WITH_POSES) == bool(report.poses)

@@ -14,7 +14,7 @@ from aerokit.apps.cli.output import DONE, INTERRUPTED, emit
 from aerokit.apps.cli.terminal import CLEAR_LINE, on_interrupt, press_enter
 from aerokit.connection.opening import OBSERVER_SYSTEM_ID
 from aerokit.errors import NotSupported, OperationTimeout
-from aerokit.vehicle.calibration.values import Pose
+from aerokit.vehicle.calibration.values import CalibrationPose
 
 if TYPE_CHECKING:
     import argparse
@@ -29,8 +29,8 @@ _CANCEL_TIMEOUT_S = 20.0
 
 _GROUND = "    ~~~~~~~~~~~~~~~~~~~~~~~~~~~~"
 # A vehicle with its nose to the right, seen from its right side, or from behind where a side is down.
-PICTURES: dict[Pose, tuple[str, str]] = {
-    Pose.LEVEL: (
+PICTURES: dict[CalibrationPose, tuple[str, str]] = {
+    CalibrationPose.LEVEL: (
         "seen from the right side, upright",
         r"""
           ----+----     ----+----
@@ -39,7 +39,7 @@ PICTURES: dict[Pose, tuple[str, str]] = {
                   /     \
 """,
     ),
-    Pose.BACK: (
+    CalibrationPose.BACK: (
         "seen from the right side, upside down",
         r"""
                   \_____/
@@ -48,7 +48,7 @@ PICTURES: dict[Pose, tuple[str, str]] = {
           ----+----     ----+----
 """,
     ),
-    Pose.NOSE_DOWN: (
+    CalibrationPose.NOSE_DOWN: (
         "seen from the right side, nose to the ground",
         r"""
                  _       |
@@ -60,7 +60,7 @@ PICTURES: dict[Pose, tuple[str, str]] = {
                  V       |   nose
 """,
     ),
-    Pose.NOSE_UP: (
+    CalibrationPose.NOSE_UP: (
         "seen from the right side, nose to the sky",
         r"""
              |       A       nose
@@ -72,7 +72,7 @@ PICTURES: dict[Pose, tuple[str, str]] = {
              |               tail
 """,
     ),
-    Pose.LEFT: (
+    CalibrationPose.LEFT: (
         "seen from behind, on its left side",
         r"""
               |
@@ -83,7 +83,7 @@ PICTURES: dict[Pose, tuple[str, str]] = {
               +--'       left
 """,
     ),
-    Pose.RIGHT: (
+    CalibrationPose.RIGHT: (
         "seen from behind, on its right side",
         r"""
                          |
@@ -158,7 +158,7 @@ class Display:
 
     def __init__(self, options: argparse.Namespace) -> None:
         self._options = options
-        self._shown: tuple[Pose | None, str] | None = None
+        self._shown: tuple[CalibrationPose | None, str] | None = None
 
     def show(self, step: CalibrationStep) -> None:
         if step.result is not None:

@@ -1,4 +1,4 @@
-"""``Calibrations``: the calibrations of a vehicle, and ``Calibration``: the steps of one."""
+"""``CalibrationControl``: the calibrations of a vehicle, and ``Calibration``: the steps of one."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     Procedure = Callable[..., AsyncGenerator[CalibrationStep, None]]
 
-__all__ = ["Calibration", "Calibrations", "EscIntent"]
+__all__ = ["Calibration", "CalibrationControl", "EscIntent"]
 
 EscIntent = Literal["propellers are removed"]
 """Confirms that the motors may turn."""
@@ -32,8 +32,8 @@ class Calibration(AsyncIterator["CalibrationStep"]):
     """The steps of a calibration: iterate with ``async for``. The last step has the ``result``.
 
     The calibration starts with the first step. Leaving the loop, in any way, cancels it on the vehicle, as does the end
-    of the vehicle's block. ArduPilot cannot cancel ``accelerometer``; a warning says so. Calibrations that need no
-    person (gyroscope, level, barometer, airspeed on ArduPilot, and ``escs`` on PX4) end by themselves in seconds.
+    of the vehicle's block. ArduPilot cannot cancel ``accelerometer``; a warning says so. Others that cannot be cancelled
+    (level, barometer, ArduPilot's gyroscope and airspeed, PX4's ESCs) end in seconds.
 
     Iterating raises:
         OperationRejected: the calibration failed, or was cancelled by another party, with the vehicle's texts as
@@ -94,7 +94,7 @@ def _abandon(run: CalibrationRun, steps: AsyncGenerator[CalibrationStep, None]) 
 
 
 @checks_arguments
-class Calibrations:
+class CalibrationControl:
     """Calibrates the vehicle's sensors: ``async for step in vehicle.calibrate.compass(): …``.
 
     Each method returns the steps. Print ``step.instruction``, show ``step.pose``; where ``step.needs_confirmation`` is

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from aerokit.errors import NotSupported, OperationTimeout, ParameterRejected
 from aerokit.mavlink.enums import AccelcalVehiclePos, MagCalStatus, MavCmd, MavResult, MavState
 from aerokit.mavlink.messages import CommandLong, MagCalProgress, MagCalReport
-from aerokit.vehicle.calibration.values import CompassFit, Pose, parse_report
+from aerokit.vehicle.calibration.values import CalibrationPose, CompassFit, parse_report
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator
@@ -26,12 +26,12 @@ END_GRACE_S = 3.0
 # ArduPilot repeats its request every second; one that arrives sooner after a confirmation was sent before it.
 POSE_REPEAT_S = 2.0
 POSES = {
-    AccelcalVehiclePos.LEVEL: Pose.LEVEL,
-    AccelcalVehiclePos.LEFT: Pose.LEFT,
-    AccelcalVehiclePos.RIGHT: Pose.RIGHT,
-    AccelcalVehiclePos.NOSEDOWN: Pose.NOSE_DOWN,
-    AccelcalVehiclePos.NOSEUP: Pose.NOSE_UP,
-    AccelcalVehiclePos.BACK: Pose.BACK,
+    AccelcalVehiclePos.LEVEL: CalibrationPose.LEVEL,
+    AccelcalVehiclePos.LEFT: CalibrationPose.LEFT,
+    AccelcalVehiclePos.RIGHT: CalibrationPose.RIGHT,
+    AccelcalVehiclePos.NOSEDOWN: CalibrationPose.NOSE_DOWN,
+    AccelcalVehiclePos.NOSEUP: CalibrationPose.NOSE_UP,
+    AccelcalVehiclePos.BACK: CalibrationPose.BACK,
 }
 IS_NOT_CANCELLED = "ArduPilot cannot cancel it: it waits for the next pose, and cannot be armed, until it reboots"
 
@@ -231,6 +231,7 @@ async def ardupilot_accelerometer(run: CalibrationRun, *params: float) -> AsyncG
 
 
 MIN_CHANNELS, MIN_TRAVEL_US = 4, 300
+CHANNELS_TIMEOUT_S = 5.0
 # Ranges of RCn_MIN, RCn_MAX on both firmwares (RC_Channel.cpp, PX4 rc_params).
 LOWEST_US, MIDDLE_US, HIGHEST_US = 800, 1500, 2200
 ENDED_RC = (MavResult.UNSUPPORTED,)  # ArduPilot prevents arming while it calibrates, and answers UNSUPPORTED.
@@ -245,7 +246,7 @@ async def radio_by_channels(run: CalibrationRun, parameters: Parameters) -> Asyn
     with ExitStack() as ends:
         ends.enter_context(run.session.streaming("rc_channels"))
         seen = cell.updated_at
-        await run.wait(lambda: cell.updated_at > seen)
+        await run.wait(lambda: cell.updated_at > seen, CHANNELS_TIMEOUT_S, "no RC_CHANNELS: is there a receiver?")
         if not _pulses(cell.latest):
             raise run.failure("the receiver reports no channels: is the transmitter on? nothing was sent")
         await run.begin(CANCEL_ALL)

@@ -26,7 +26,7 @@ from aerokit.vehicle.commanding.progress import await_progress
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
 
-    from aerokit.vehicle.calibration.values import CompassFit, Pose
+    from aerokit.vehicle.calibration.values import CalibrationPose, CompassFit
     from aerokit.vehicle.commanding.context import VehicleContext
 
 logger: logging.Logger = logging.getLogger("aerokit")
@@ -196,15 +196,20 @@ class CalibrationRun:
 
     # --------------------------------------------------------------------------------------- steps
 
-    async def wait(self, is_ready: Callable[[], object]) -> None:
+    async def wait(
+        self,
+        is_ready: Callable[[], object],
+        timeout: float = REPORT_TIMEOUT_S,
+        missing: str = "the vehicle reported nothing about the calibration",
+    ) -> None:
         """Wait for the next report. Errors as for `await_progress`."""
         await await_progress(
             self.session,
             self.what,
             is_done=lambda: bool(is_ready()),
             trouble=self._trouble,
-            describe=lambda: "the vehicle reported nothing about the calibration",
-            timeout=REPORT_TIMEOUT_S,
+            describe=lambda: missing,
+            timeout=timeout,
         )
 
     def _trouble(self) -> str | None:
@@ -216,8 +221,8 @@ class CalibrationRun:
         self,
         progress: float | None,
         instruction: str,
-        pose: Pose | None = None,
-        remaining: tuple[Pose, ...] = (),
+        pose: CalibrationPose | None = None,
+        remaining: tuple[CalibrationPose, ...] = (),
         *,
         needs_confirmation: bool = False,
     ) -> CalibrationStep:

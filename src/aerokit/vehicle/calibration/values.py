@@ -7,10 +7,10 @@ from enum import Enum
 
 from aerokit._internal.values import Snapshot
 
-__all__ = ["CalibrationReport", "CalibrationResult", "CalibrationStep", "CompassFit", "Pose", "parse_report"]
+__all__ = ["CalibrationPose", "CalibrationReport", "CalibrationResult", "CalibrationStep", "CompassFit", "parse_report"]
 
 
-class Pose(Enum):
+class CalibrationPose(Enum):
     """How the vehicle has to be placed."""
 
     LEVEL = "level"
@@ -65,20 +65,20 @@ class CalibrationStep(Snapshot):
     sensor: str
     progress: float | None
     instruction: str
-    pose: Pose | None = None
-    remaining: tuple[Pose, ...] = ()
+    pose: CalibrationPose | None = None
+    remaining: tuple[CalibrationPose, ...] = ()
     needs_confirmation: bool = False
     result: CalibrationResult | None = None
 
 
 # PX4 names the side that points down, except "up" and "down": calibration_routines.cpp, detect_orientation_str.
 SIDES = {
-    "back": Pose.NOSE_UP,
-    "front": Pose.NOSE_DOWN,
-    "left": Pose.LEFT,
-    "right": Pose.RIGHT,
-    "up": Pose.BACK,
-    "down": Pose.LEVEL,
+    "back": CalibrationPose.NOSE_UP,
+    "front": CalibrationPose.NOSE_DOWN,
+    "left": CalibrationPose.LEFT,
+    "right": CalibrationPose.RIGHT,
+    "up": CalibrationPose.BACK,
+    "down": CalibrationPose.LEVEL,
 }
 _SIDE = "|".join(SIDES)
 # Formats of calibration_messages.h and calibration_routines.cpp.
@@ -91,8 +91,11 @@ _FORMATS = {
     "pending": re.compile(rf"pending:((?: (?:{_SIDE}))+)"),
     "detected": re.compile(rf"({_SIDE}) orientation detected"),
     "side done": re.compile(rf"({_SIDE}) side done, rotate to a different side"),
+    "side progress": re.compile(rf"({_SIDE}) side calibration: progress <\d{{1,3}}>"),
     "already done": re.compile(rf"({_SIDE}) side already completed"),
 }
+
+_WITH_POSES = ("pending", "detected", "side done", "side progress", "already done")
 
 
 class CalibrationReport(Snapshot):
@@ -101,7 +104,7 @@ class CalibrationReport(Snapshot):
     kind: str
     text: str
     progress: float | None = None
-    poses: tuple[Pose, ...] = ()
+    poses: tuple[CalibrationPose, ...] = ()
 
 
 def parse_report(status_text: str) -> CalibrationReport | None:
@@ -115,6 +118,6 @@ def parse_report(status_text: str) -> CalibrationReport | None:
         if kind == "progress":
             percent = int(match[1])
             return CalibrationReport(kind, text, progress=percent / 100) if percent <= 100 else None
-        poses = tuple(SIDES[word] for word in match[1].split() if word in SIDES) if "calibration" not in text else ()
+        poses = tuple(SIDES[word] for word in match[1].split() if word in SIDES) if kind in _WITH_POSES else ()
         return CalibrationReport(kind, text, poses=poses)
     return CalibrationReport("text", text)
