@@ -1593,7 +1593,7 @@ class Calibration(CalibrationTwin):
     """The steps of a calibration: iterate with ``async for``. The last step has the ``result``.
 
     The calibration starts with the first step. Leaving the loop, in any way, cancels it on the vehicle, as does the end
-    of the vehicle's block. ArduPilot cannot cancel ``accelerometer``; a warning says so. Others that cannot be cancelled
+    of the vehicle's block. ArduPilot cannot cancel ``accelerometer``; a warning says so. Others that no vehicle cancels
     (level, barometer, ArduPilot's gyroscope and airspeed, PX4's ESCs) end in seconds.
 
     Iterating raises:

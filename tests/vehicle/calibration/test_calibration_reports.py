@@ -11,17 +11,6 @@ from aerokit.vehicle.calibration.values import CalibrationPose as Pose
 
 WITH_POSES = ("pending", "detected", "side done", "side progress", "already done")
 KINDS = {"started", "done", "failed", "cancelled", "progress", *WITH_POSES}
-    "started",
-    "done",
-    "failed",
-    "cancelled",
-    "progress",
-    "pending",
-    "detected",
-    "side done",
-    "already done",
-    "side progress",
-}
 
 
 @pytest.mark.parametrize(
