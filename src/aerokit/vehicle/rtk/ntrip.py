@@ -63,9 +63,9 @@ class Caster:
         try:
             parts = urlsplit(url)
             host, port = parts.hostname, parts.port
-        except ValueError:
-            host = port = None
-        mount = unquote(parts.path[1:]) if host else ""
+        except ValueError:  # Its text may contain the password.
+            parts, host, port = urlsplit(""), None, None
+        mount = unquote(parts.path[1:])
         is_printable = mount.isascii() and mount.isprintable() and "/" not in mount and " " not in mount
         if not host or not mount or not is_printable or parts.scheme not in ("ntrip", "ntrips") or port == 0:
             raise InvalidArgument(
