@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
+from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
 import anyio
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 
     from aerokit.vehicle.calibration.values import CalibrationPose, CompassFit
     from aerokit.vehicle.commanding.context import VehicleContext
+    from aerokit.vehicle.commanding.order import SentCommand
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
@@ -54,6 +56,8 @@ class CalibrationRun:
         self._why_not_cancelled = ""
         self._started_at = math.inf
         self._cancelled_at: float | None = None
+        self._watch = ExitStack()
+        self._sent: SentCommand | None = None
         self._has_rebooted = self._is_abandoned = False
         self._ended = asyncio.Event()
 
@@ -112,6 +116,7 @@ class CalibrationRun:
         """Register that the calibration has ended on the vehicle."""
         if not self._ended.is_set():
             self._ended.set()
+            self._watch.close()
             if self.is_running:
                 self._runs.remove(self)
                 self.context.on_finish.remove(self.abandon)
@@ -137,7 +142,10 @@ class CalibrationRun:
         if self._cancel is None or self._has_rebooted or self.session.is_closed:
             self.finish()
             return
-        if self.session.connection.is_open and self.context.arbiter.is_known:
+        arbiter = self.context.arbiter
+        # Notices another party, after which the cancel is not repeated.
+        self._sent = self._watch.enter_context(arbiter.sending(self._watch.enter_context(arbiter.auxiliary_order())))
+        if self.session.connection.is_open and arbiter.is_known:
             self._send_cancel(self._cancel)
         self.session.background.start(self._confirm_cancel, "aerokit calibration")
 
@@ -163,21 +171,22 @@ class CalibrationRun:
         self.session.commands.send_unconfirmed(cancel[0], *cancel[1])
 
     async def _confirm_cancel(self) -> None:
+        """Send the cancel, if that was not possible before, and repeat it as docs/reliability.md says."""
         assert self._cancel is not None
         armed = self.session.telemetry.armed
         try:
             for _ in range(MAX_CANCEL_ATTEMPTS):
-                if not self.context.arbiter.is_known:
-                    now = self.session.connection.now()
-                    await armed.wait_until(lambda _: armed.updated_at > now)  # noqa: B023
-                    self._cancelled_at = None
-                if self._cancelled_at is None:
-                    self._send_cancel(self._cancel)
-                with anyio.move_on_after(CANCEL_INTERVAL_S):
-                    while not self._is_cancelled(self._cancel[0]):  # noqa: ASYNC110
-                        await anyio.sleep(CONFIRM_POLL_INTERVAL_S)
+                if self._cancelled_at is not None:
+                    with anyio.move_on_after(CANCEL_INTERVAL_S):
+                        while not self._is_cancelled(self._cancel[0]):  # noqa: ASYNC110
+                            await anyio.sleep(CONFIRM_POLL_INTERVAL_S)
+                        return
+                since = self.session.connection.now() if self._cancelled_at is None else self._cancelled_at
+                await armed.wait_until(lambda _: armed.updated_at > since)  # noqa: B023
+                if self._has_rebooted or (self._sent is not None and self._sent.end):
                     return
-                self._cancelled_at = None
+                if self.context.arbiter.is_known:
+                    self._send_cancel(self._cancel)
             logger.warning("%s: the vehicle did not confirm the cancellation", self.what)
         except (ConnectionClosed, LinkLost):
             pass
