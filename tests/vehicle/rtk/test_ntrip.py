@@ -12,6 +12,7 @@ from operator import xor
 import anyio
 import pytest
 from caster import CasterServer, open_caster, rtcm
+from exhaustive import exhaustive
 
 import aerokit
 from aerokit import messages as m
@@ -34,7 +35,8 @@ async def stage(**settings: object) -> AsyncIterator[tuple[CasterServer, aerokit
             yield caster, vehicle, copter
 
 
-@pytest.mark.parametrize(("version", "chunked"), [(1, False), (2, False), (2, True)])
+@pytest.mark.sampled(3)
+@pytest.mark.parametrize(("version", "chunked"), [(2, True), (2, False), (1, False)])
 async def test_corrections_reach_vehicle(version: int, chunked: bool) -> None:
     async with stage(version=version, chunked=chunked) as (caster, vehicle, _):
         async with vehicle.rtk.ntrip(caster.url()) as client:
@@ -46,7 +48,7 @@ async def test_corrections_reach_vehicle(version: int, chunked: bool) -> None:
         assert caster.sentences == []
 
 
-@pytest.mark.parametrize("version", [1, 2])
+@pytest.mark.parametrize("version", [2, exhaustive(1)])
 async def test_wrong_password_is_refused_without_showing_it(version: int, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.DEBUG)
     async with stage(version=version) as (caster, vehicle, _):
@@ -67,6 +69,7 @@ async def test_unknown_mount_is_refused_with_known_ones(version: int) -> None:
                 pass
 
 
+@pytest.mark.exhaustive
 async def test_source_table_lists_mounts_in_error() -> None:
     async with stage(version=1) as (caster, vehicle, _):
         with pytest.raises(OperationRejected, match="it has MOUNT, OTHER"):
@@ -130,6 +133,7 @@ async def test_silent_caster_is_connected_again(monkeypatch: pytest.MonkeyPatch)
         await vehicle.rtk.corrections.wait_until(lambda corrections: corrections.messages >= 4)
 
 
+@pytest.mark.exhaustive
 async def test_long_message_is_left_out() -> None:
     messages = [rtcm(900), b"noise between", rtcm(25)]
     async with stage(messages=messages) as (caster, vehicle, _), vehicle.rtk.ntrip(caster.url()) as client:
@@ -173,6 +177,7 @@ async def test_wrong_chunk_size_ends_connection_only(monkeypatch: pytest.MonkeyP
             await anyio.sleep(0.01)
 
 
+@pytest.mark.exhaustive
 async def test_caster_that_is_absent_raises_link_error() -> None:
     async with stage() as (caster, vehicle, _):
         url = caster.url().replace(str(caster.port), "1")
@@ -212,6 +217,7 @@ async def test_cancelled_client_leaves_nothing() -> None:
             await anyio.sleep(0.01)
 
 
+@pytest.mark.exhaustive
 async def test_client_outlived_by_vehicle_block_ends() -> None:
     async with stage() as (caster, vehicle, _), vehicle.rtk.ntrip(caster.url()) as client:
         await vehicle.rtk.corrections.wait_until(lambda corrections: corrections.messages == 2)
@@ -220,6 +226,7 @@ async def test_client_outlived_by_vehicle_block_ends() -> None:
             await anyio.sleep(0.01)
 
 
+@pytest.mark.exhaustive
 async def test_client_entered_twice_raises_busy_error() -> None:
     async with stage() as (caster, vehicle, _), vehicle.rtk.ntrip(caster.url()) as client:
         with pytest.raises(BusyError):
