@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 import gc
+import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from queue import Queue
 
+from caster import open_caster
 from served_copter import served
 
 import aerokit.sync
@@ -28,6 +34,39 @@ def test_break_cancels_on_vehicle() -> None:
         while copter.calibrations.is_compass_running and time.monotonic() < deadline:
             vehicle.mode.updates().__next__()  # the next HEARTBEAT
         assert not copter.calibrations.is_compass_running
+
+
+@contextmanager
+def caster_in_thread() -> Iterator[str]:
+    """Serve an NTRIP caster on a loop of its own; return the URL of its mount point."""
+    ready: Queue[str] = Queue()
+    loop, ended = asyncio.new_event_loop(), asyncio.Event()
+
+    async def serve() -> None:
+        async with open_caster() as caster:
+            ready.put(caster.url())
+            await ended.wait()
+
+    thread = threading.Thread(target=loop.run_until_complete, args=(serve(),))
+    thread.start()
+    try:
+        yield ready.get(timeout=20)
+    finally:
+        loop.call_soon_threadsafe(ended.set)
+        thread.join()
+        loop.close()
+
+
+def test_caster_feeds_vehicle_within_block() -> None:
+    with (
+        caster_in_thread() as url,
+        served([SimulatedCopter(boot_time_s=0.0)]) as address,
+        aerokit.sync.connect(address) as vehicle,
+    ):
+        with vehicle.rtk.ntrip(url) as client:
+            vehicle.rtk.corrections.wait_until(lambda corrections: corrections.messages == 2, timeout=20)
+            assert client.is_connected
+        assert not client.is_connected
 
 
 def test_corrections_reach_vehicle() -> None:

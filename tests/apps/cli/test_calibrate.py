@@ -98,5 +98,5 @@ def test_armed_vehicle_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_escs_without_confirmation_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(SimulatedCopter(boot_time_s=0.0), "escs") == 5
+    assert run(SimulatedCopter(boot_time_s=0.0), "escs") == 2
     assert "--propellers-removed" in capsys.readouterr().err

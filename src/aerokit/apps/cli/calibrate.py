@@ -13,7 +13,7 @@ from aerokit.apps.cli.connecting import add_link, connect_to, signing_of
 from aerokit.apps.cli.output import DONE, INTERRUPTED, emit
 from aerokit.apps.cli.terminal import CLEAR_LINE, on_interrupt, press_enter
 from aerokit.connection.opening import OBSERVER_SYSTEM_ID
-from aerokit.errors import NotSupported, OperationTimeout
+from aerokit.errors import InvalidArgument, NotSupported, OperationTimeout
 from aerokit.vehicle.calibration.values import CalibrationPose
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ _GROUND = "    ~~~~~~~~~~~~~~~~~~~~~~~~~~~~"
 # A vehicle with its nose to the right, seen from its right side, or from behind where a side is down.
 PICTURES: dict[CalibrationPose, tuple[str, str]] = {
     CalibrationPose.LEVEL: (
-        "seen from the right side, upright",
+        "seen from the right side",
         r"""
           ----+----     ----+----
               |   _______   |
@@ -40,7 +40,7 @@ PICTURES: dict[CalibrationPose, tuple[str, str]] = {
 """,
     ),
     CalibrationPose.BACK: (
-        "seen from the right side, upside down",
+        "seen from the right side",
         r"""
                   \_____/
               .--[_______]>-.   nose
@@ -49,7 +49,7 @@ PICTURES: dict[CalibrationPose, tuple[str, str]] = {
 """,
     ),
     CalibrationPose.NOSE_DOWN: (
-        "seen from the right side, nose to the ground",
+        "seen from the right side",
         r"""
                  _       |
                 | |------+   tail
@@ -61,7 +61,7 @@ PICTURES: dict[CalibrationPose, tuple[str, str]] = {
 """,
     ),
     CalibrationPose.NOSE_UP: (
-        "seen from the right side, nose to the sky",
+        "seen from the right side",
         r"""
              |       A       nose
              +------| |
@@ -73,7 +73,7 @@ PICTURES: dict[CalibrationPose, tuple[str, str]] = {
 """,
     ),
     CalibrationPose.LEFT: (
-        "seen from behind, on its left side",
+        "seen from behind",
         r"""
               |
               +--.       right
@@ -84,7 +84,7 @@ PICTURES: dict[CalibrationPose, tuple[str, str]] = {
 """,
     ),
     CalibrationPose.RIGHT: (
-        "seen from behind, on its right side",
+        "seen from behind",
         r"""
                          |
               left    .--+
@@ -109,7 +109,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 async def _run(options: argparse.Namespace) -> int:
     if options.sensor == "escs" and not options.propellers_removed:
-        raise NotSupported("escs: the motors get full throttle: remove the propellers and add --propellers-removed")
+        raise InvalidArgument("escs: the motors get full throttle: remove the propellers and add --propellers-removed")
     async with connect_to(
         options,
         options.address,

@@ -14,14 +14,11 @@ class CalibrationPose(Enum):
     """How the vehicle has to be placed."""
 
     LEVEL = "level"
-    LEFT = "left"
-    """On its left side."""
-    RIGHT = "right"
-    """On its right side."""
+    LEFT = "on its left side"
+    RIGHT = "on its right side"
     NOSE_DOWN = "nose down"
     NOSE_UP = "nose up"
-    BACK = "back"
-    """Upside down."""
+    BACK = "on its back"
 
 
 class CompassFit(Snapshot):
