@@ -158,7 +158,7 @@ class Display:
 
     def __init__(self, options: argparse.Namespace) -> None:
         self._options = options
-        self._shown: tuple[CalibrationPose | None, str] | None = None
+        self._shown: tuple[CalibrationPose | None, str] = (None, "")
 
     def show(self, step: CalibrationStep) -> None:
         if step.result is not None:
@@ -172,9 +172,11 @@ class Display:
             "remaining": step.remaining,
             "needs_confirmation": step.needs_confirmation,
         }
-        is_new = (step.pose, step.instruction) != self._shown
+        pose, instruction = self._shown
         self._shown = (step.pose, step.instruction)
-        emit(self._options, "calibration_step", record, "\n".join(lines_of(step)) if is_new else None)
+        lines = lines_of(step) if step.pose is not pose else [f"  {step.instruction[:76]}"]
+        is_new = self._shown != (pose, instruction)
+        emit(self._options, "calibration_step", record, "\n".join(lines) if is_new else None)
         if not self._options.json and step.progress is not None and sys.stdout.isatty():
             print(f"{CLEAR_LINE}{bar(step.progress)}", end="\r", flush=True)
 
