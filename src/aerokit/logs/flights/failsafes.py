@@ -74,7 +74,7 @@ KINDS = {
 """Kind of failsafe → title in reports."""
 
 _NO_EVIDENCE = re.compile(
-    r"clear|resolved|\boff$|prearm|pre-arm|preflight|^arm\b|arming|re-?gained|recovered|restored|compensation off"
+    r"clear|resolved|\boff$|prearm|pre-arm|preflight|^arm\b|(?<!dis)arming|re-?gained|recovered|restored|compensation off"
     r"|connection .*established|fence enabled|fence disabled",
     re.I,
 )
