@@ -48,11 +48,14 @@ class PlanFlight(SupervisedFlight):
     ) -> None:
         super().__init__(vehicle, report, interrupts, options.on_interrupt)
         self._plan, self._options, self._report = plan, options, report
+        self.has_sent: bool = False
+        """True once the upload has begun."""
 
     async def _fly(self) -> int:
         vehicle = self._vehicle
         self._print(f"found {vehicle.autopilot.firmware}, system {vehicle.system_id}")
         self._check_vehicle()
+        self.has_sent = True
         await upload_parts(vehicle, self._plan, self._options)
         confirmed_mission = await self._download_mission() if self._needs_confirmation else ()
         self._print("waiting until it is ready")
@@ -196,9 +199,11 @@ async def run_fly(options: argparse.Namespace) -> int:
     with on_interrupt(interrupts.interrupt):
         code = await interrupts.run(lambda: _connect_and_fly(options, plan, interrupts, flights))
     if code is None:
-        was_armed = any(flight.armed_by_us for flight in flights)
-        emit(options, "interrupted", {}, "interrupted" if was_armed else "interrupted; nothing was armed")
-        return INTERRUPTED
+        code = INTERRUPTED
+    if code == INTERRUPTED and not any(flight.armed_by_us for flight in flights):
+        has_sent = any(flight.has_sent for flight in flights)
+        sent = "the plan may be on the vehicle, nothing was armed" if has_sent else "nothing was sent"
+        emit(options, "interrupted", {}, f"interrupted; {sent}")
     return code
 
 
@@ -234,7 +239,8 @@ async def _connect_and_fly(
         async with report.running():
             flights.append(PlanFlight(vehicle, plan, report, interrupts, options))
             code = await flights[-1].fly()
-        report.print_summary(options.record)
+        if flights[-1].armed_by_us:
+            report.print_summary(options.record)
     return code
 
 

@@ -82,6 +82,24 @@ def _text(error: BaseException) -> str:
     return str(error) or type(error).__name__
 
 
+@contextmanager
+def plain_warnings() -> Iterator[None]:
+    """Within the block, print warnings of this library without the line of code that caused them."""
+    import warnings
+
+    original = warnings.showwarning
+
+    def show(message: Any, category: type[Warning], *arguments: Any, **options: Any) -> None:
+        if category.__module__.partition(".")[0] == "aerokit":
+            print(f"aerokit: {printable(str(message))}", file=sys.stderr)
+        else:
+            original(message, category, *arguments, **options)
+
+    with warnings.catch_warnings():
+        warnings.showwarning = show
+        yield
+
+
 DONE, FAILED, WRONG_ARGUMENTS, NO_VEHICLE, TIMED_OUT, REFUSED, UNREADABLE, NOT_INSTALLED = range(8)
 INTERRUPTED = 130
 # Of two names, by difflib: one wrong letter of four.

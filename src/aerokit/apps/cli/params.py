@@ -138,9 +138,13 @@ async def _read(vehicle: Vehicle, name: str, options: argparse.Namespace) -> Par
 def _hint(name: str, error: Exception, vehicle: Vehicle) -> str:
     """Suggest names of the simulated vehicles' parameters, or how to find one, unless the error does so already."""
     names = parameter_names(vehicle.autopilot.name)
-    if "did you mean" in str(error) or name.upper() in names:
+    is_lacking = "has no parameter" in str(error)  # the names are of all vehicle types
+    if "did you mean" in str(error) or (name.upper() in names and not is_lacking):
         return ""
-    return suggestion(name, names, 3) or "; `aerokit params list` shows all names"
+    return (
+        suggestion(name, [other for other in names if other != name.upper()], 3)
+        or "; `aerokit params list` shows all names"
+    )
 
 
 def _emit_parameters(options: argparse.Namespace, parameters: Iterable[Parameter]) -> None:

@@ -36,7 +36,11 @@ async def confirm(question: str) -> bool:
     """Ask a yes/no question. Return True for "y" or "yes"; anything else, including end of input, is no."""
     _discard_typed_input()
     print(f"{question} [y/N] ", end="", file=sys.stderr, flush=True)
-    answer = await _read_line()
+    try:
+        answer = await _read_line()
+    except asyncio.CancelledError:  # Ctrl-C: what follows begins on a new line
+        print(file=sys.stderr, flush=True)
+        raise
     return answer.strip().lower() in ("y", "yes")
 
 
