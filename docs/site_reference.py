@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 import enum as enum_kinds
+import functools
 import importlib
 import inspect
 import math
@@ -144,10 +146,10 @@ def navigation() -> list[Any]:
     return ["reference/index.md", *({group: pages} for group, pages in sections.items())]
 
 
-def reference_pages() -> Iterator[tuple[str, str]]:
+def reference_pages(listing: Listing | None = None) -> Iterator[tuple[str, str]]:
     """Yield path on the site and text of each page."""
     yield "reference/index.md", _index()
-    listing = Listing()
+    listing = listing or Listing()
     for page in REFERENCE_PAGES:
         yield f"reference/{page.name}.md", _page(page, listing)
     yield "reference/messages.md", _messages()
@@ -295,9 +297,26 @@ def _annotated(item: Any) -> set[str]:
         own = getattr(inspect.unwrap(member) if callable(member) else member, "__annotations__", None)
         annotations += own.values() if isinstance(own, dict) else ()
     if inspect.isclass(item):
-        with suppress(OSError):  # classes that are made at run time have no source
-            annotations += [" ".join(found) for found in ASSIGNED.findall(inspect.getsource(item))]
+        with suppress(OSError, TypeError):  # classes that are made at run time have no source
+            source = _class_sources(inspect.getsourcefile(item)).get(item.__qualname__, "")
+            annotations += [" ".join(found) for found in ASSIGNED.findall(source)]
     return {word for annotation in annotations for word in WORD.findall(str(annotation))}
+
+
+@functools.cache
+def _class_sources(path: str) -> dict[str, str]:
+    """Return the source of each class of a file by qualified name: `inspect` would parse the file for each class."""
+    text = Path(path).read_text(encoding="utf-8")
+    lines, found = text.splitlines(keepends=True), dict[str, str]()
+
+    def add(body: list[ast.stmt], prefix: str) -> None:
+        for node in body:
+            if isinstance(node, ast.ClassDef):
+                found[prefix + node.name] = "".join(lines[node.lineno - 1 : node.end_lineno])
+                add(node.body, f"{prefix}{node.name}.")
+
+    add(ast.parse(text).body, "")
+    return found
 
 
 # ------------------------------------------------------------------------------------ pages of mkdocstrings

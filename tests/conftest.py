@@ -53,6 +53,15 @@ def pytest_report_header() -> str:
 
 
 @pytest.fixture
+def any_delay(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Disable the age limits of zenoh links in this process: a busy machine may need longer for a datagram."""
+    from aerokit.transport.zenoh import connect, control_lease
+
+    for module, name in ((control_lease, "MAX_DELAY_S"), (control_lease, "LEASE_TIMEOUT_S"), (connect, "LOST_AFTER_S")):
+        monkeypatch.setattr(module, name, 3600.0)
+
+
+@pytest.fixture
 async def grounded(anyio_backend: object) -> AsyncIterator[Flight]:
     """A copter that is ready, disarmed and in STABILIZE."""
     async with open_flight() as flight:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import ast
 import functools
+from collections.abc import Iterable, Iterator
 from graphlib import TopologicalSorter
 from pathlib import Path
+from typing import Any
 
 from for_each import for_each
 
@@ -62,26 +64,38 @@ def package_of(path: Path) -> str:
 
 
 @functools.cache
-def tree_of(path: Path) -> ast.Module:
-    return ast.parse(path.read_text(encoding="utf-8"))
+def import_statements(path: Path) -> tuple[ast.Import | ast.ImportFrom, ...]:
+    """Return all import statements, at any depth. The tree is not kept: collecting garbage among all trees is slow."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    return tuple(node for node in statements(tree.body) if isinstance(node, (ast.Import, ast.ImportFrom)))
+
+
+def statements(body: Iterable[Any]) -> Iterator[ast.stmt]:
+    """Yield these statements and all within them."""
+    for node in body:
+        if isinstance(node, ast.stmt):
+            yield node
+        for field in ("body", "orelse", "finalbody", "handlers", "cases"):
+            if inner := getattr(node, field, None):
+                yield from statements(inner)
 
 
 @functools.cache
 def imports_of(path: Path) -> list[str]:
     """Return absolute names of all imports, type-checking imports included."""
     found: list[str] = []
-    for node in ast.walk(tree_of(path)):
+    for node in import_statements(path):
         if isinstance(node, ast.Import):
             found += [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            base = node.module or ""
-            if node.level:
-                parts = ("aerokit", *path.relative_to(SOURCE).parts)[: -node.level]
-                base = ".".join((*parts, *([base] if base else [])))
-            if base == "aerokit":
-                found += [f"aerokit.{alias.name}" for alias in node.names]
-            else:
-                found.append(base)
+            continue
+        base = node.module or ""
+        if node.level:
+            parts = ("aerokit", *path.relative_to(SOURCE).parts)[: -node.level]
+            base = ".".join((*parts, *([base] if base else [])))
+        if base == "aerokit":
+            found += [f"aerokit.{alias.name}" for alias in node.names]
+        else:
+            found.append(base)
     return found
 
 
@@ -143,7 +157,7 @@ def test_imports_have_no_cycles() -> None:
     graph: dict[str, set[str]] = {}
     for module, path in trees.items():
         graph[module] = set()
-        for node in ast.walk(tree_of(path)):
+        for node in import_statements(path):
             if isinstance(node, ast.ImportFrom) and node.module:
                 names = (f"{node.module}.{alias.name}" for alias in node.names)
                 graph[module] |= {name if name in trees else node.module for name in names}

@@ -42,8 +42,8 @@ def listing(site: dict[str, Any]) -> Any:
 
 
 @pytest.fixture(scope="module")
-def pages(site: dict[str, Any]) -> dict[str, str]:
-    return dict(site["reference_pages"]())
+def pages(site: dict[str, Any], listing: Any) -> dict[str, str]:
+    return dict(site["reference_pages"](listing))
 
 
 def test_every_object_is_listed_once(pages: dict[str, str]) -> None:

@@ -102,7 +102,7 @@ class ParameterTimeout(OperationTimeout):
 class MissionTimeout(OperationTimeout):
     """A mission transfer did not complete in time.
 
-    ``missing`` holds the indices of the items not transferred, counted as your program counts them (without home).
+    ``missing`` holds the indices of the items that were not transferred, counted from 0 without home.
     """
 
     def __init__(self, message: str, *, missing: tuple[int, ...] = ()) -> None:
@@ -179,7 +179,7 @@ class MissionRejected(OperationRejected):
 
 
 class VerificationFailed(OperationRejected):
-    """The vehicle confirmed a change but reads back different values. ``differences`` has one text for each."""
+    """The vehicle confirmed a change but reads back different values. ``differences`` lists them as texts."""
 
     def __init__(self, message: str, *, differences: tuple[str, ...]) -> None:
         super().__init__(message, reasons=differences)
@@ -207,7 +207,7 @@ class NotSupported(OperationRejected):
 class GimbalTaken(OperationRejected):
     """Another system took control of a gimbal.
 
-    ``system_id`` and ``component_id`` identify the one in control now; both are 0 if there is none.
+    ``system_id`` and ``component_id`` identify the system now in control; both are 0 if no system is in control.
     """
 
     def __init__(self, message: str, *, system_id: int, component_id: int) -> None:
@@ -248,7 +248,7 @@ class StaleValueError(ValueUnknownError):
 
 
 class SubscriptionOverflow(AerokitError):
-    """The program did not read a subscription with the policy ``error`` fast enough."""
+    """A subscription with the policy ``error`` overflowed, because the program did not read it fast enough."""
 
 
 class SetpointStreamStopped(AerokitError):

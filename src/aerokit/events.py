@@ -62,7 +62,8 @@ __all__ = [
 class Event(Snapshot):
     """Base class of all events.
 
-    ``at`` is the time in seconds on the event loop's clock; ``system_id`` is the vehicle, or 0 for the link as a whole.
+    ``at`` is the time in seconds on the event loop's clock. ``system_id`` identifies the vehicle; it is 0 for events
+    about the whole link.
     """
 
     at: float
@@ -110,8 +111,8 @@ class VehicleRebooted(Event):
 class DuplicateSender(Event):
     """A second sender uses a system and component id that is already in use. Its messages are ignored.
 
-    Either two vehicles have the same ids, or one vehicle is reachable over two paths. The second sender is another peer
-    of the link, or has its own sequence numbers behind the same peer. Published once for each such peer.
+    The second sender is recognised by its address on the link, or by a second series of sequence numbers from the
+    same address. Published once for each address.
     """
 
     component_id: int
@@ -126,9 +127,10 @@ class RouteChanged(Event):
 
 
 class RouteChangeRefused(Event):
-    """A silent component seems to have moved to ``peer``, but its sequence numbers do not continue. It is ignored.
+    """Frames of a silent component arrive from ``peer``, but are ignored: their sequence numbers do not continue.
 
-    It may be another vehicle, or this one after a reboot with a new IP address. ``may_move=True`` accepts it.
+    The sender may be another vehicle, or the same one with a new IP address after a reboot; ``may_move=True``
+    accepts both.
     """
 
     component_id: int
@@ -146,10 +148,10 @@ class FrameRefused(Event):
 
 
 class OrderRefused(Event):
-    """The program that serves the vehicle on the network refused to forward a message of ours (docs/network.md).
+    """The program that serves the vehicle on the network did not forward a message of this program (docs/network.md).
 
-    ``message`` is the name of the MAVLink message, ``reason`` a clause, ``lease_holder`` the client that controls the
-    vehicle if that is the reason. Published at most twice a second for each message name.
+    ``message`` is the name of the MAVLink message, and ``reason`` a clause that explains the refusal. ``lease_holder``
+    is the client that controls the vehicle, if that is the reason. Published at most twice a second for each name.
     """
 
     message: str
@@ -187,7 +189,7 @@ class MissionItemReached(Event):
 
 
 class MissionCurrentChanged(Event):
-    """The current mission item changed. None: the mission has not started, or there is none."""
+    """The current mission item changed; None before the mission has started, and without a mission."""
 
     before: int | None
     after: int | None
@@ -200,8 +202,8 @@ class MissionFinished(Event):
 class GimbalControlLost(Event):
     """Another system took control of a gimbal from a ``gimbal.control()`` block (GIMBAL_MANAGER_STATUS).
 
-    ``to_system_id`` and ``to_component_id`` identify the one in control now, 0 if there is none. ``is_primary`` tells
-    primary from secondary control.
+    ``to_system_id`` and ``to_component_id`` identify the system now in control; both are 0 if no system is in control.
+    ``is_primary`` is True for primary control, False for secondary control.
     """
 
     gimbal_device_id: int
@@ -253,11 +255,11 @@ class SettingChanged(Event):
 
 
 class ImageCaptured(Event):
-    """A camera reported a new image. ``camera.captures()`` has more about it.
+    """A camera reported a new image. ``camera.captures()`` returns its details.
 
     ``camera`` is 1 to 6 for cameras behind the autopilot, otherwise a component id. ``index`` counts from 0.
-    ``success`` is None if not reported. Published once ``vehicle.camera`` or ``vehicle.cameras`` was used, or a message
-    about images arrived.
+    ``success`` is None if not reported. Published only after the program has used ``vehicle.camera`` or
+    ``vehicle.cameras``, or after the vehicle has sent a message about images.
     """
 
     camera: int
@@ -300,7 +302,7 @@ class HeartbeatPaused(Event):
 
 
 class HeartbeatResumed(Event):
-    """The program is active again, so aerokit sends its own heartbeat again, after ``paused_s`` seconds."""
+    """aerokit sends its own heartbeat again after ``paused_s`` seconds, because the program is active again."""
 
     paused_s: float
 
@@ -320,8 +322,8 @@ class LinkRestored(Event):
 class LinkStalled(Event):
     """The link has not transmitted anything for a second. ``unsent_bytes`` are queued, so commands may arrive late.
 
-    aerokit drops what waits in its own queue for more than a second. It cannot drop what the operating system has
-    accepted (``connection.unsent_bytes``). :class:`LinkDrained`, or the end of the link, follows.
+    aerokit drops data that waited in its own queue for more than a second, but cannot drop data that the operating
+    system has accepted (``connection.unsent_bytes``). The next event is :class:`LinkDrained`, unless the link ends.
     """
 
     unsent_bytes: int
@@ -336,10 +338,10 @@ class LinkDrained(Event):
 class LinkSelected(Event):
     """The traffic to this system now uses ``link`` (its address), one of several links.
 
-    ``before`` is the previous link, None for the first one. ``reason`` is "first heard", "silent", "stalled", "lost"
-    (all of the previous link), "better", "cheaper" (the previous one is costly), or "another vehicle"
-    (AUTOPILOT_VERSION showed another vehicle behind the previous one). aerokit requests message rates again, because
-    autopilots keep them for each link.
+    ``before`` is the previous link, None for the first one. ``reason`` is "first heard" for the first link; "silent",
+    "stalled" or "lost" if the previous link was; "better", "cheaper" than a costly previous link; or "another vehicle"
+    if AUTOPILOT_VERSION showed another vehicle behind the previous link. aerokit requests message rates again, because
+    autopilots keep separate rates for each link.
     """
 
     link: str
@@ -389,9 +391,9 @@ class LinkState(enum.Enum):
     CONNECTED = "connected"
     """The vehicle sent a heartbeat, or the link delivered any frame, within the last 3.5 seconds."""
     SILENT = "silent"
-    """The link is open, but nothing arrived for longer than that."""
+    """The link is open, but no such frame arrived within the last 3.5 seconds."""
     LOST = "lost"
-    """The link failed or the connection was closed. With ``reconnect=True`` it may become CONNECTED again."""
+    """The link failed or the connection was closed. With ``reconnect=True`` the state may become CONNECTED again."""
 
 
 class LinkStatus(Snapshot):
@@ -402,12 +404,12 @@ class LinkStatus(Snapshot):
     state: LinkState
     """SILENT: no vehicle was received for a second or two. LOST: closed; aerokit reopens it if possible."""
     is_costly: bool
-    """True if it is used only when the others fail (``costly=1``)."""
+    """True if the link is used only when all others fail (``costly=1``)."""
     systems: tuple[int, ...]
-    """Ids of the systems received over it."""
+    """Ids of the systems received over this link."""
     used_for: tuple[int, ...]
-    """Ids of the systems whose traffic it carries."""
+    """Ids of the systems whose traffic uses this link."""
     loss_percent: float | None
-    """Frame loss of the last seconds, by sequence numbers, for the system with the highest loss; None: unknown yet."""
+    """Frame loss of the last seconds, by sequence numbers, for the system with the highest loss; None until known."""
     round_trip_s: float | None
     """Round-trip time (TIMESYNC) of the slowest system; None before the first answer."""

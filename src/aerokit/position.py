@@ -41,7 +41,7 @@ class Position(Snapshot):
         return geo.bearing_deg(self.latitude_deg, self.longitude_deg, other.latitude_deg, other.longitude_deg)
 
     def offset(self, *, north_m: float = 0.0, east_m: float = 0.0, up_m: float = 0.0) -> Self:
-        """Return the place that many metres north, east and above."""
+        """Return the position moved by these distances in metres; an unknown altitude stays unknown."""
         latitude, longitude = geo.offset(self.latitude_deg, self.longitude_deg, north_m, east_m)
         amsl_m, relative_m = _add(self.altitude_amsl_m, up_m), _add(self.altitude_relative_m, up_m)
         return type(self)(latitude, longitude, amsl_m, relative_m)

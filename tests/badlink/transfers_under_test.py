@@ -22,7 +22,7 @@ from aerokit.sim.parameters import stored
 from aerokit.vehicle.files.logs import LogMethod
 
 REAL32 = 9
-NO_ANSWER = ("no answer to", "was not answered", "did not say how many")
+NO_ANSWER = ("no answer to", "was not answered", "no MISSION_COUNT was received")
 HOLES = (ParameterTimeout, MissionTimeout, FileTimeout)
 
 

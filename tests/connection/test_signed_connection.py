@@ -142,7 +142,7 @@ async def test_px4_accepts_keys_by_usb_only() -> None:
     px4 = SimulatedPx4()
     px4.signing.may_change = lambda: False  # type: ignore[method-assign]
     async with connected(px4) as vehicle:
-        with pytest.raises(OperationTimeout, match="PX4 takes a key on its USB port only"):
+        with pytest.raises(OperationTimeout, match="PX4 accepts a signing key only on its USB port"):
             await vehicle.setup_signing(Signing(KEY))
 
 

@@ -148,7 +148,7 @@ def test_parameter_set_unchanged_value_is_confirmed(vehicle: dronekit.Vehicle, f
 @pytest.mark.parametrize(
     ("name", "value", "reason"),
     [
-        ("FOO", 50, "FOO to 50.000000: the vehicle made it 10"),
+        ("FOO", 50, "FOO to 50.000000: the vehicle set 10 instead"),
         ("NOPE", 1, "NOPE to 1.000000: the vehicle has no parameter NOPE"),
         ("A_NAME_OF_MANY_LETTERS", 1, "1 to 16 are possible"),
         ("THR_MIN", 40000, "-32768..32767"),

@@ -96,7 +96,7 @@ async def test_policy_orders_each_other_member_once(policy: str, mode: str) -> N
         assert list(result.failed) == ["north/1"]
         assert stage.modes_ordered("north/2") == stage.modes_ordered("north/3") == [mode]
         assert stage.modes_ordered("north/1") == []
-        assert f"the policy ordered it to {policy.partition('_')[0]}" in str(result.stopped["north/2"])
+        assert f"the policy ordered north/2 to {policy.partition('_')[0]}" in str(result.stopped["north/2"])
 
 
 async def test_policy_orders_members_that_have_finished() -> None:

@@ -36,7 +36,7 @@ async def test_signing_key_is_installed(choice: Choice) -> None:
     async with ready(choice) as vehicle:
         signing = Signing(KEY)
         if choice.vehicle != "sim" and not choice.kind.is_ardupilot:
-            with pytest.raises(OperationTimeout, match="PX4 takes a key on its USB port only"):
+            with pytest.raises(OperationTimeout, match="PX4 accepts a signing key only on its USB port"):
                 await vehicle.setup_signing(signing, timeout=choice.seconds(10))
             return
         await vehicle.setup_signing(signing, timeout=choice.seconds(10))

@@ -97,7 +97,7 @@ def test_order_without_heartbeat_is_sent_once() -> None:
     assert now == 3.0
     assert looked <= 50
     assert confirmations(machine) == [0]
-    assert "sent once within 3.0 s; not sent again: no HEARTBEAT received since" in text_of(machine)
+    assert "sent once within 3.0 s; not sent again: no HEARTBEAT received since then" in text_of(machine)
 
 
 def test_order_waits_for_last_sending() -> None:
@@ -132,7 +132,7 @@ def test_unrepeatable_order_is_sent_once(command: int) -> None:
         machine.expire(now)
     assert now == 4.0
     assert confirmations(machine) == [0]
-    assert text_of(machine).endswith(f"within 4.0 s; never sent again: a second one {what}")
+    assert text_of(machine).endswith(f"within 4.0 s; not sent again, because a repetition {what}")
 
 
 def test_unrepeatable_order_ends_with_its_effect() -> None:

@@ -146,7 +146,7 @@ def test_setting_list_without_settings_times_out() -> None:
 def test_setting_list_timeout_names_missing() -> None:
     channel = Channel(FakeCamera(table_of(6)))
     channel.is_lost = lambda message: isinstance(message, m.ParamExtValue) and message.param_index in (2, 4)
-    with pytest.raises(ParameterTimeout, match=r"2 of 6 settings did not come: .* missing 2, 4") as caught:
+    with pytest.raises(ParameterTimeout, match=r"2 of 6 settings were not received: .* missing 2, 4") as caught:
         channel.run(listing(idle_timeout_s=3.0))
     assert caught.value.missing == (2, 4)
 
@@ -215,7 +215,7 @@ def test_setting_read_of_unknown_name_is_rejected() -> None:
     channel = Channel(FakeCamera(table_of(4)))
     answers = channel.run(reads("NOPE", "CAM_001"))
     assert isinstance(answers["NOPE"], ParameterRejected)
-    assert "no setting NOPE: it answers others" in str(answers["NOPE"])
+    assert "no setting NOPE: it answers other requests" in str(answers["NOPE"])
     assert value(answers["CAM_001"]) == 0.5
     assert channel.now < 3.0
 

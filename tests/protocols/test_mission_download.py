@@ -192,7 +192,7 @@ def test_mission_clear_refused() -> None:
 def test_mission_clear_unanswered() -> None:
     result = run(MissionClear(1, 1), ArduPilotModel(HELD), Radio(loss=1.0))
     assert isinstance(result.error, MissionTimeout)
-    assert "may or may not" in str(result.error)
+    assert "the vehicle may have cleared it" in str(result.error)
 
 
 def test_set_current_item() -> None:

@@ -210,7 +210,7 @@ def test_mission_upload_timeout_names_unconfirmed(model: type[Store]) -> None:
 def test_mission_upload_without_answer_times_out() -> None:
     result = run(upload(NEW), ArduPilotModel(OLD), Radio(loss=1.0))
     assert isinstance(result.error, MissionTimeout)
-    assert "never requested" in str(result.error)
+    assert "no item was requested" in str(result.error)
     assert len(result.sent) < 14
 
 

@@ -150,7 +150,7 @@ def test_accepted(text: str, address: LinkAddress) -> None:
         ("COM3:fast", "the baud rate 'fast' is not a whole number"),
         ("serial:///dev/ttyACM0:0", "the baud rate is 0"),
         ("serial://", "the serial port is missing"),
-        ("serial://COM3?rtscts=perhaps", "neither yes"),
+        ("serial://COM3?rtscts=perhaps", r"must be 1 \(yes\)"),
         ("replay:", "the path of the recording is missing"),
         ("flight.tlog?speed=0", "is not a number above 0"),
         ("flight.tlog?speed=nan", "is not a number above 0"),

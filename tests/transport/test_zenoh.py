@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 from link_harness import Recorder, each_loop
-from zenoh_harness import RefusalRecorder, client, reconnecting, serving
+from zenoh_harness import RefusalRecorder, client, reconnecting, serving, until_open_error
 from zenoh_network import VEHICLE_SIDE, HoldingProxy, eventually, free_port, process, router
 
 from aerokit.errors import BusyError, ConnectionClosed, InvalidArgument, LinkOpenError
@@ -19,11 +19,11 @@ from aerokit.mavlink.messages import CommandLong, Heartbeat, ParamRequestList, S
 from aerokit.transport import create_link
 from aerokit.transport import link as needed
 from aerokit.transport.zenoh import listen as zenoh_listen
-from aerokit.transport.zenoh.keys import Stamp
+from aerokit.transport.zenoh.keys import Stamp, sent_at
 from aerokit.transport.zenoh.listen import CLIENT_TIMEOUT_S, MAX_CLIENTS, ZenohListen
 from aerokit.transport.zenoh.session import LoopQueue
 
-pytest.importorskip("zenoh")
+CongestionControl = pytest.importorskip("zenoh").CongestionControl
 pytestmark = pytest.mark.anyio
 
 ENCODER = FrameEncoder(255, 190)
@@ -42,6 +42,7 @@ def frame(message: Message = ARM) -> bytes:
 
 
 @each_loop
+@pytest.mark.usefixtures("any_delay")
 async def test_zenoh_bytes_pass_both_ways() -> None:
     port = free_port()
     async with serving(port) as (vehicle, recorder), client(port, "&client=ground") as (link, answered):
@@ -64,6 +65,7 @@ async def test_zenoh_bytes_pass_both_ways() -> None:
     assert recorder.losses == []
 
 
+@pytest.mark.usefixtures("any_delay")
 async def test_only_complete_frames_of_a_client_pass() -> None:
     port = free_port()
     async with serving(port) as (_, recorder), client(port) as (link, _client_recorder):
@@ -84,14 +86,11 @@ async def test_closed_vehicle_side_is_a_lost_link() -> None:
 
 async def test_unknown_name() -> None:
     port = free_port()
+    address = f"zenoh://north/alpha?connect=tcp/127.0.0.1:{port}"
     with router(port):
         async with serving(port, "beta", "connect"), serving(port, "gamma", "connect"):
-            with pytest.raises(LinkOpenError, match=r"no vehicle side named alpha .*available: beta, gamma"):
-                async with client(port, "&timeout=0.3"):
-                    pass
-        with pytest.raises(LinkOpenError, match="the fleet is empty"):
-            async with client(port, "&timeout=0.3"):
-                pass
+            await until_open_error(address, r"no vehicle side named alpha .*available: beta, gamma")
+        await until_open_error(address, "the fleet is empty")
 
 
 async def test_no_router() -> None:
@@ -111,11 +110,16 @@ async def test_port_in_use() -> None:
                 pass
 
 
-async def test_name_in_use() -> None:
+async def test_name_in_use(monkeypatch: pytest.MonkeyPatch) -> None:
     port = free_port()
     with router(port):
         async with serving(port, how="connect"):
-            with pytest.raises(LinkOpenError, match="another program serves this name"):
+            with (
+                monkeypatch.context() as patched,
+                pytest.raises(LinkOpenError, match="another program serves this name"),
+            ):
+                patched.setattr(zenoh_listen, "_RIVAL_QUERY_TIMEOUT_S", 100.0)
+                patched.setattr(zenoh_listen, "_RIVAL_TIMEOUT_S", 100.0)
                 async with serving(port, how="connect"):
                     pass
         async with serving(port, how="connect"):
@@ -153,29 +157,30 @@ async def test_without_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
 
 async def test_orders_held_back_by_broken_connection_are_refused() -> None:
     port = free_port()
+    fresh, held = frame(), frame(CommandLong(1, 1, 400, 0, 0, 0, 0, 0, 0, 0, 0))
     async with serving(port) as (vehicle, recorder), HoldingProxy(port) as line:  # noqa: SIM117 - the line's port
         async with client(line.port, "&client=ground") as (link, client_recorder):
-            link.write(before := frame())
-            await recorder.until_data(before)
+
+            def goes_through() -> bool:
+                link.write(fresh)
+                return recorder.data != b""
+
+            await eventually(goes_through)
             line.hold()
-            written = 0
-            while link.dropped_writes == 0:  # until no beacon has come for two seconds
+            written, dropped, late = 0, link.dropped_writes, vehicle.late_datagrams
+            while link.dropped_writes == dropped:  # until no beacon has come for two seconds
                 vehicle.write(b"telemetry")
-                link.write(frame())
+                link.write(held)
                 written += 1
                 await asyncio.sleep(0.02)
             assert line.held_bytes > 1000
             await asyncio.sleep(0.5)  # until the youngest of them is too old: its stamp is one period older than it
             line.release()
-            await eventually(lambda: vehicle.late_datagrams >= written - 1)
-            assert recorder.data == before  # not one of them
-            await eventually(lambda: ("COMMAND_LONG", "it came too late", None) in client_recorder.refused)
+            await eventually(lambda: vehicle.late_datagrams >= late + written - 1)
+            await eventually(lambda: ("COMMAND_LONG", "it arrived too late", None) in client_recorder.refused)
             assert set(client_recorder.answers) == {()}
-
-            def goes_through() -> bool:
-                link.write(frame())
-                return recorder.data != before
-
+            recorder.pieces = [piece for piece in recorder.pieces if piece != (fresh, "ground")]
+            assert recorder.pieces == []  # not one of them
             await eventually(goes_through)
             assert client_recorder.losses == []
 
@@ -185,8 +190,12 @@ async def test_killed_router_returns() -> None:
     port = free_port()
     with router(port) as first:
         async with serving(port, how="connect") as (vehicle, recorder), reconnecting(port) as (link, client_recorder):
-            link.write(frame())
-            await eventually(lambda: recorder.data != b"")
+
+            def passes() -> bool:
+                link.write(frame())
+                return recorder.data != b""
+
+            await eventually(passes)
             first.kill()
             first.wait()
             await eventually(lambda: client_recorder.interruptions == 1)
@@ -195,8 +204,14 @@ async def test_killed_router_returns() -> None:
             with router(port):
                 await eventually(lambda: client_recorder.restored == 1)
                 assert recorder.pieces == []
-                link.write(late := frame())
-                await recorder.until_data(late)
+                late = frame()
+
+                def arrives() -> bool:
+                    link.write(late)
+                    return recorder.data != b""
+
+                await eventually(arrives)
+                assert {piece for piece, _ in recorder.pieces} == {late}
                 assert len(vehicle.peers) == 1
 
 
@@ -217,10 +232,9 @@ async def test_killed_vehicle_side_is_replaced() -> None:
 async def test_late_client_finds_vehicle_side_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """The next beacon is disabled."""
     port = free_port()
+    monkeypatch.setattr(zenoh_listen, "BEACON_INTERVAL_S", 3600.0)
     with router(port):
         async with serving(port, how="connect") as (vehicle, _):
-            monkeypatch.setattr(zenoh_listen, "BEACON_INTERVAL_S", 3600.0)
-            await asyncio.sleep(1.0)  # longer does no harm: the last beacon has gone
             async with client(port):
                 pass
             await eventually(lambda: vehicle.peers == ())
@@ -229,6 +243,7 @@ async def test_late_client_finds_vehicle_side_at_once(monkeypatch: pytest.Monkey
 # ---------------------------------------------------------------------------- the control lease
 
 
+@pytest.mark.usefixtures("any_delay")
 async def test_two_programs_order_the_same_vehicle() -> None:
     port = free_port()
     with router(port):
@@ -266,6 +281,7 @@ async def test_two_programs_order_the_same_vehicle() -> None:
                 await eventually(lambda: client_recorder.refused[-1] == ("COMMAND_LONG", "three has control", "three"))
 
 
+@pytest.mark.usefixtures("any_delay")
 async def test_router_restricts_reading_and_ordering(tmp_path: Path) -> None:
     """The configuration of docs/network.md."""
     port = free_port()
@@ -288,7 +304,8 @@ async def test_router_restricts_reading_and_ordering(tmp_path: Path) -> None:
     with router(port, str(files["router"])):
         vehicle, received = create_link(f"zenohin://north/alpha?config={files['alpha']}"), Recorder()
         pilot, onlooker = (
-            create_link(f"zenoh://north/alpha?client={name}&config={files[name]}") for name in ("ground-1", "onlooker")
+            create_link(f"zenoh://north/alpha?client={name}&timeout=100&config={files[name]}")
+            for name in ("ground-1", "onlooker")
         )
         liar = create_link(f"zenohin://north/beta?config={files['ground-1']}")
         observed, client_recorder = RefusalRecorder(), RefusalRecorder()
@@ -303,8 +320,8 @@ async def test_router_restricts_reading_and_ordering(tmp_path: Path) -> None:
         pilot.write(order := frame())
         await received.until_data(order)
         assert received.peers == ["ground-1"]
-        with pytest.raises(LinkOpenError, match=r"no vehicle side named beta in the fleet north \(available: alpha\)"):
-            await create_link(f"zenoh://north/beta?timeout=0.3&config={files['onlooker']}").open(RefusalRecorder())
+        address = f"zenoh://north/beta?config={files['onlooker']}"
+        await until_open_error(address, r"no vehicle side named beta in the fleet north \(available: alpha\)")
         for link, _ in opened:
             link.close()
         for link, _ in opened:
@@ -320,6 +337,7 @@ def open_resources() -> tuple[int, int]:
 
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="Linux counts files")
+@pytest.mark.usefixtures("any_delay")
 async def test_closed_links_leave_nothing() -> None:
     async def once() -> None:
         port = free_port()
@@ -440,15 +458,26 @@ async def test_duplicated_datagram_reaches_vehicle_once(monkeypatch: pytest.Monk
     assert (link._freshness.duplicates, link.late_datagrams) == (3, 0)
 
 
+@pytest.mark.usefixtures("any_delay")
 async def test_payload_larger_than_datagram_is_ignored() -> None:
     """On either side, a publisher on the network cannot fill the memory or block the event loop."""
     port = free_port()
     async with serving(port) as (vehicle, recorder), client(port, "&client=ground") as (link, answered):
-        link.write(orders := frame(ParamRequestList(1, 1)))
-        await recorder.until_data(orders)
-        for far in (vehicle, link):
-            far.write(orders * 10_000, "ground" if far is vehicle else None)
-        link.write(orders)
-        vehicle.write(b"small", "ground")
-        await recorder.until_data(orders + orders)
-        await answered.until_data(b"small")
+        link.write(order := frame(ParamRequestList(1, 1)))
+        await recorder.until_data(order)
+        stamp, sent = link._tracker.stamp(link._now()), sent_at(vehicle._freshness.epoch, vehicle._now())
+        assert stamp is not None
+        for session, key, attachment in (
+            (link._session, link._keys.to_vehicle("ground"), stamp.encode()),
+            (vehicle._session, vehicle._keys.from_vehicle("ground"), sent),
+        ):  # blocks until it is sent; the small ones arrive after it
+            session.put(key, order * 10_000, attachment=attachment, congestion_control=CongestionControl.BLOCK)
+
+        def small_ones_arrive() -> bool:
+            link.write(order)
+            vehicle.write(b"small", "ground")  # dropped while the large one fills the queue
+            return len(recorder.pieces) > 1 and answered.pieces != []
+
+        await eventually(small_ones_arrive)
+        assert {piece for piece, _ in recorder.pieces} == {order}
+        assert {piece for piece, _ in answered.pieces} == {b"small"}

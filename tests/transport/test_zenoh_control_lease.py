@@ -37,7 +37,7 @@ from aerokit.transport.zenoh.control_lease import (
     is_read,
     refusals_in,
 )
-from aerokit.vehicle.commanding.order import CHANGED_BY_COMMAND, CHANGED_BY_MESSAGE, QUESTIONS
+from aerokit.vehicle.commanding.order import CHANGED_BY_COMMAND, CHANGED_BY_MESSAGE, REQUEST_COMMANDS
 
 LEASE_TIMEOUT_S = 5.0
 
@@ -96,7 +96,7 @@ def test_reads(read: Message) -> None:
 
 
 def test_reads_change_nothing() -> None:
-    assert QUESTIONS <= READ_COMMANDS  # what this library itself takes for questions
+    assert REQUEST_COMMANDS <= READ_COMMANDS  # what this library itself takes for questions
     assert not READ_COMMANDS & CHANGED_BY_COMMAND.keys()
     names = {row[0] for row in messages.INDEX.values()}
     assert names >= READ_MESSAGES
@@ -172,7 +172,7 @@ def test_setpoint_notices_are_limited_and_counted() -> None:
 def test_late_orders_are_refused_without_answer() -> None:
     client = ClientFilter("one", ControlLease())
     (notice,) = client.refuse_late(send(ARM) + send(HEARTBEAT), 0.0)
-    assert (notice.message, notice.reason, notice.answer) == ("COMMAND_LONG", "it came too late", b"")
+    assert (notice.message, notice.reason, notice.answer) == ("COMMAND_LONG", "it arrived too late", b"")
     assert client.refused == 2
 
 

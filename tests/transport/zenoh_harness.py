@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import AsyncIterator
 
+import pytest
 from link_harness import Recorder
 
+from aerokit.errors import LinkOpenError
 from aerokit.transport import ReconnectingLink, ZenohConnect, ZenohListen, create_link
 
-__all__ = ["RefusalRecorder", "client", "reconnecting", "serving"]
+__all__ = ["RefusalRecorder", "client", "reconnecting", "serving", "until_open_error"]
 
 
 class RefusalRecorder(Recorder):
@@ -52,7 +55,7 @@ async def client(
     port: int, more: str = "", *, name: str = "alpha"
 ) -> AsyncIterator[tuple[ZenohConnect, RefusalRecorder]]:
     """A client that connects to a port."""
-    link = create_link(f"zenoh://north/{name}?connect=tcp/127.0.0.1:{port}{more}")
+    link = create_link(f"zenoh://north/{name}?connect=tcp/127.0.0.1:{port}&timeout=100{more}")
     assert isinstance(link, ZenohConnect)
     answered = RefusalRecorder()
     await link.open(answered)
@@ -66,7 +69,7 @@ async def client(
 @contextlib.asynccontextmanager
 async def reconnecting(port: int) -> AsyncIterator[tuple[ReconnectingLink, RefusalRecorder]]:
     """The same, opened again when it is lost."""
-    address = f"zenoh://north/alpha?connect=tcp/127.0.0.1:{port}&timeout=1"
+    address = f"zenoh://north/alpha?connect=tcp/127.0.0.1:{port}&timeout=100"
     link, answered = ReconnectingLink(lambda: create_link(address), max_delay_s=0.4), RefusalRecorder()
     await link.open(answered)
     try:
@@ -74,3 +77,13 @@ async def reconnecting(port: int) -> AsyncIterator[tuple[ReconnectingLink, Refus
     finally:
         link.close()
         await link.wait_closed()
+
+
+async def until_open_error(address: str, pattern: str) -> None:
+    """Open an address with longer time-outs until the error text matches: the network may need long to answer."""
+    for timeout_s in (0.3, 3, 30):
+        with pytest.raises(LinkOpenError) as error:
+            await create_link(f"{address}&timeout={timeout_s}").open(RefusalRecorder())
+        if re.search(pattern, str(error.value)):
+            return
+    raise AssertionError(str(error.value))

@@ -180,9 +180,9 @@ def _generic_rule(name: str, inner: ast.expr, names: Mapping[str, Any]) -> Rule:
         return partial(_is_class, kinds), f"a class{' of ' if kinds else ''}{' or '.join(kinds)}"
     if name == "Mapping":
         (is_key, _), (is_value, description) = rules
-        return partial(_is_mapping, is_key, is_value), f"a mapping to {description} each"
+        return partial(_is_mapping, is_key, is_value), f"a mapping whose values are each {description}"
     if name in ("Iterable", "Sequence", "list", "tuple"):
-        return partial(_are_items, rules[0][0]), f"several, each {rules[0][1]}"
+        return partial(_are_items, rules[0][0]), f"an iterable whose items are each {rules[0][1]}"
     return partial(_has_class_name, name), with_article(name)
 
 
@@ -214,7 +214,7 @@ def _is_mapping(is_key: Check, is_value: Check, value: object) -> bool:
 
 
 def _are_items(is_item: Check, value: object) -> bool:
-    # A string is iterable, but never meant. An iterator is not checked, because that would exhaust it.
+    # A string is an iterable of characters, which no caller intends. Checking an iterator would exhaust it.
     if isinstance(value, (str, bytes, bytearray)) or not isinstance(value, Iterable):
         return False
     return not isinstance(value, (list, tuple, set, frozenset)) or all(map(is_item, value))

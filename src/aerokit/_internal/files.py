@@ -23,7 +23,7 @@ def write_atomically(path: str | os.PathLike[str], text: str) -> None:
     """Write a UTF-8 file with Unix line ends. If writing fails (OSError), the previous content is kept."""
     target = Path(path)
     part = target.with_name(target.name + ".part")
-    # A leftover of an earlier attempt, or a symbolic link that would redirect the writing.
+    # Remove the file of an earlier attempt, or a symbolic link that would redirect the writing.
     part.unlink(missing_ok=True)
     try:
         with part.open("x", encoding="utf-8", newline="\n") as file:
@@ -39,8 +39,8 @@ def read_bounded(path: str | os.PathLike[str]) -> bytes:
     """Read a file.
 
     Raises:
-        FileFormatError: it is larger than :data:`MAX_FILE_SIZE`.
-        OSError: it cannot be read.
+        FileFormatError: the file is larger than :data:`MAX_FILE_SIZE`.
+        OSError: the file cannot be read.
     """
     with open(path, "rb") as file:
         data = file.read(MAX_FILE_SIZE + 1)
@@ -58,7 +58,8 @@ def decompress(data: bytes, name: str) -> bytes:
     """Decompress ``.xz`` data. Other data is returned unchanged.
 
     Raises:
-        FileFormatError: the data is damaged or decompresses to more than :data:`MAX_FILE_SIZE`; begins with ``name``.
+        FileFormatError: the data is damaged or decompresses to more than :data:`MAX_FILE_SIZE`. The text begins with
+            ``name``.
     """
     if not data.startswith(_XZ_MAGIC):
         return data
@@ -80,8 +81,8 @@ def read_text(path: str | os.PathLike[str]) -> str:
     """Read a text file, with Unix line ends.
 
     Raises:
-        FileFormatError: it is not UTF-8, or too large.
-        OSError: it cannot be read.
+        FileFormatError: the file is not UTF-8, or too large.
+        OSError: the file cannot be read.
     """
     try:
         text = read_bounded(path).decode("utf-8-sig")
@@ -92,7 +93,7 @@ def read_text(path: str | os.PathLike[str]) -> str:
 
 
 class PartFile:
-    """A download in progress: ``<to>.part`` until ``finish``, always the beginning of the complete file.
+    """A download in progress: ``<to>.part`` always holds the beginning of the complete file, until :meth:`finish`.
 
     ``mark`` is inserted before ``.part``, so that a partial download of another file is not continued.
     """
@@ -109,10 +110,10 @@ class PartFile:
 
     @contextmanager
     def writing(self, start: int) -> Iterator[BinaryIO]:
-        """Open for writing from offset ``start`` on, truncating what follows. An empty file is removed on errors.
+        """Open the file for writing at offset ``start`` and truncate it there. An error removes an empty file.
 
         Raises:
-            OSError: it cannot be written.
+            OSError: the file cannot be written.
         """
         try:
             with self.path.open("r+b" if start else "wb") as disk:

@@ -81,7 +81,7 @@ def short_repr(value: object) -> str:
     """Return ``repr(value)``, at most 100 characters; the type's name if ``repr`` fails."""
     try:
         text = repr(value)
-    except Exception:  # an int of 5000 digits, or any class of a program
+    except Exception:  # repr fails for an int of 5000 digits, and may fail for classes of the program
         text = f"<{type(value).__name__}>"
     return text if len(text) <= _MAX_LENGTH else f"{text[: _MAX_LENGTH - 3]}..."
 

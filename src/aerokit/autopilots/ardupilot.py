@@ -271,7 +271,7 @@ class ArduPlane(ArduPilot):
     )
     reposition: Reposition | None = Reposition(relative_altitude=True, yaw=False, speed=False)
     arrival_radius_m: float = 90.0  # it circles at WP_LOITER_RAD, 60 m by default
-    arming_mode: ClassVar[str | None] = "FBWA"  # manual throttle; armed in TAKEOFF it would start
+    arming_mode: ClassVar[str | None] = "FBWA"  # manual throttle; a plane armed in TAKEOFF starts to move
     unarmable_modes: frozenset[str] = frozenset(("AUTOLAND", "INITIALISING", "QLAND", "QRTL", "RTL"))
 
     def _purpose_name(self, purpose: Purpose, is_vtol: bool) -> str | None:

@@ -33,7 +33,7 @@ _C_CAST = MavProtocolCapability.PARAM_ENCODE_C_CAST.value
 Purpose = Literal["hold", "land", "return", "setpoint", "take_off", "mission"]
 """Purpose for which a program uses a mode."""
 
-# MAV_CMD → purposes of the modes that it may lead to. Autopilots may use several for one.
+# Maps a MAV_CMD to the purposes of the modes that it may lead to. An autopilot may use several modes for one purpose.
 
 
 PURPOSES_OF_COMMANDS: Mapping[int, tuple[Purpose, ...]] = {
@@ -49,7 +49,7 @@ PURPOSES_OF_COMMANDS: Mapping[int, tuple[Purpose, ...]] = {
     MavCmd.OVERRIDE_GOTO: ("hold", "mission"),
     MavCmd.DO_ORBIT: ("setpoint", "hold"),
 }
-# MAV_CMD → names of further such modes, on autopilots that have them.
+# Maps a MAV_CMD to the names of further modes that it may lead to, on autopilots that have these modes.
 NAMES_OF_COMMANDS: Mapping[int, tuple[str, ...]] = {
     MavCmd.NAV_LOITER_UNLIM: ("LOITER",),
     MavCmd.DO_ORBIT: ("ORBIT", "CIRCLE"),
@@ -59,8 +59,8 @@ NAMES_OF_COMMANDS: Mapping[int, tuple[str, ...]] = {
 class TakeOff(Snapshot):
     """Take-off procedure of a vehicle.
 
-    Change to ``mode`` (None: stay), arm, then send ``command`` with ``params`` (None: arming in ``mode`` suffices).
-    ``mode_after`` is the mode in which the vehicle ends up by itself; None if it stays in ``mode``.
+    Change to ``mode`` (None: keep the current mode), arm, then send ``command`` with ``params`` (None: arming in
+    ``mode`` suffices). The vehicle then changes to ``mode_after`` by itself; None if it stays in ``mode``.
     """
 
     mode: Mode | None
@@ -153,16 +153,16 @@ class Autopilot:
     """Name of the firmware for this vehicle type, for example ``"ArduCopter"``."""
     modes: ModeTable = ModeTable({})
     modes_are_numbered = True
-    """True if users know modes by number, too."""
+    """True if users also refer to modes by number."""
     purposes: ClassVar[Mapping[str, str]] = {}
     """Maps purposes to names of modes."""
     setpoints: SetpointRules = SetpointRules(*[False] * 5)
     reposition: Reposition | None = None
-    """None if DO_REPOSITION is not known to work."""
+    """Behaviour of MAV_CMD_DO_REPOSITION; None if it is not known to work."""
     home_is_item_0 = False
     """True if item 0 of a mission is home."""
     acks_per_command: ClassVar[Mapping[int, int]] = {}
-    """Maps MAV_CMD to the number of COMMAND_ACKs for one sending, if it is not one."""
+    """Maps a MAV_CMD to the number of COMMAND_ACKs for each transmission, where it is not 1."""
     signing_key_restriction = ""
     """Restriction on the links on which SETUP_SIGNING is accepted, as a clause; empty if there is none."""
     runs_prearm_checks = False
@@ -176,13 +176,13 @@ class Autopilot:
     lands_after_return = False
     """True if the return mode ends with a landing."""
     arrival_radius_m: float = 2.0
-    """Default distance at which the vehicle has arrived at a place, including the radius in which it circles."""
+    """Distance in metres at which the vehicle counts as arrived by default; includes the radius of its circle."""
     mission_storage = "any"
-    """Conversions of mission items in its storage: a value of :class:`aerokit.missions.ItemStorage`."""
+    """Conversions that the autopilot applies to stored mission items: an :class:`aerokit.missions.ItemStorage`."""
     mission_upload_window = 1
-    """Number of mission items that may be sent before they are requested. The standard says 1."""
+    """Number of mission items that may be sent before they are requested. The standard allows 1."""
     mission_download_window = 1
-    """Number of mission items that may be requested at once, in any order. The standard says 1."""
+    """Number of mission items that may be requested at once, in any order. The standard allows 1."""
     writes_partial_missions = False
     """True if MISSION_WRITE_PARTIAL_LIST (38) works."""
     reports_mission_checksum = False
@@ -198,7 +198,7 @@ class Autopilot:
     repeats_item_reached = False
     """True if MISSION_ITEM_REACHED is sent repeatedly for one item."""
     accepts_ftp_session_ids = False
-    """True if a MAVFTP session has the number chosen by the client, rather than one chosen by the vehicle."""
+    """True if the client chooses the number of a MAVFTP session, False if the vehicle does."""
     has_upper_case_parameters = False
     """True if parameters are always reported in upper case."""
     log_suffix = ".log"
@@ -212,7 +212,7 @@ class Autopilot:
     silent_without_logs = False
     """True if LOG_REQUEST_LIST is not answered when there are no logs."""
     unknown_currents_ca: frozenset[int] = frozenset((-1,))
-    """Values of a battery current in 0.01 A that mean unknown. The standard says −1."""
+    """Values of a battery current in 0.01 A that mean unknown. The standard defines −1."""
     stream_groups: ClassVar[Mapping[int, int]] = {}
     """Maps message ids to MAV_DATA_STREAM, for firmware without MAV_CMD_SET_MESSAGE_INTERVAL."""
     gimbals: GimbalRules = GimbalRules()
@@ -229,7 +229,7 @@ class Autopilot:
     video_addresses_camera = False
     """True if the stream id of VIDEO_START_CAPTURE selects a camera."""
     arming_mode: ClassVar[str | None] = None
-    """Mode to arm in if the current one does not allow it. The vehicle does not start to move in it."""
+    """Mode in which to arm if the current mode does not allow arming. The vehicle stays at rest in it."""
 
     def __init__(self, vehicle_type: int) -> None:
         self.vehicle_type = vehicle_type
@@ -286,7 +286,7 @@ class Autopilot:
         return (self.mode(custom, base, extra),) if base & CUSTOM_MODE_ENABLED else ()
 
     def mode_to_arm_in(self) -> Mode | None:
-        """Return a mode in which a vehicle can be armed whose current mode does not allow it; None if unknown."""
+        """Return a mode in which to arm if the current mode does not allow arming; None if no such mode is known."""
         return None if self.arming_mode is None else self.modes.find(self.arming_mode)
 
     def learn_mode_name(self, custom_mode: int, name: str) -> str | None:
@@ -301,7 +301,7 @@ class Autopilot:
     def take_off(
         self, altitude_relative_m: float, home_altitude_amsl_m: float | None, *, is_vtol: bool
     ) -> TakeOff | None:
-        """Return how to take off to this altitude above home, or None if the vehicle cannot."""
+        """Return the take-off procedure for this altitude above home; None if the vehicle cannot take off."""
         return None
 
     def take_off_needs_home(self) -> bool:
@@ -328,7 +328,7 @@ class Autopilot:
         return bool(health & PREARM_CHECK) if present & enabled & PREARM_CHECK else None
 
     def missing_estimates(self, flags: int) -> tuple[str, ...]:
-        """Return the missing estimates for arming in a mode that needs a position; empty if none.
+        """Return the estimates that are missing for arming in a mode that needs a position; empty if none are.
 
         ``flags`` are those of EKF_STATUS_REPORT or ESTIMATOR_STATUS.
         """
@@ -371,8 +371,8 @@ class Autopilot:
 
     _bytewise_by_default = False
     parameter_interval_s: float | None = None
-    """Interval, in seconds, at which the vehicle can be made to serve parameters during a transfer, by
-    MAV_CMD_SET_MESSAGE_INTERVAL of PARAM_VALUE; None if it has no effect."""
+    """Shortest interval in seconds between PARAM_VALUEs that MAV_CMD_SET_MESSAGE_INTERVAL can set for a transfer; None
+    if the command has no effect."""
     has_parameter_hash = False
     """True if the parameter ``_HASH_CHECK`` is a checksum of all others."""
 

@@ -88,7 +88,7 @@ class Px4(Autopilot):
 
     name = "PX4"
     firmware = "PX4"
-    signing_key_restriction = "PX4 takes a key on its USB port only, and before 1.17 nowhere"
+    signing_key_restriction = "PX4 accepts a signing key only on its USB port, and before 1.17 on no port"
     modes = MODES
     modes_are_numbered = False
     # The MAVLink module acknowledges with ACCEPTED at once, then the commander with the result.
@@ -167,7 +167,7 @@ class Px4(Autopilot):
     def take_off(
         self, altitude_relative_m: float, home_altitude_amsl_m: float | None, *, is_vtol: bool
     ) -> TakeOff | None:
-        """NAV_TAKEOFF to the altitude above mean sea level, at the current position and heading; then LOITER.
+        """Return the procedure: NAV_TAKEOFF at the current position and heading to the altitude, then LOITER.
 
         Raises:
             InvalidArgument: the altitude of home is not given.

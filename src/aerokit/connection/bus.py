@@ -40,12 +40,12 @@ Sink = Callable[[Any], None]
 
 EventT = TypeVar("EventT", bound=Event)
 
-# MESSAGE, FRAME or BOTH, and the sink.
+# (kind, sink); the kind is MESSAGE, FRAME or BOTH, i.e. the arguments that the sink takes.
 _Entry = tuple[int, Callable[..., None]]
 
 MESSAGE, FRAME, BOTH = range(3)
 
-# True if any sink needs the decoded message, and all sinks.
+# (True if any of the sinks needs the decoded message, all sinks).
 _DeliveryPlan = tuple[bool, tuple[_Entry, ...]]
 
 EVERY_SYSTEM = 0
@@ -54,7 +54,7 @@ EVERY_SYSTEM = 0
 class Bus:
     """Delivers messages and events to the attached sinks, in the order in which they were attached.
 
-    ``wanted`` is the live set of message ids with a sink; a framer that holds it skips all other frames.
+    ``wanted`` has the message ids with a sink and is updated in place: a framer that uses it skips all other frames.
     """
 
     def __init__(self, dialect: Dialect = STANDARD) -> None:
@@ -84,15 +84,15 @@ class Bus:
         *,
         system_id: int = EVERY_SYSTEM,
     ) -> Detach:
-        """Like :meth:`attach_frames`; if another sink has the message decoded, ``sink`` gets it as second argument."""
+        """Like :meth:`attach_frames`, but pass the message as second argument if another sink needs it decoded."""
         return self._attach((system_id, message_type.ID), (BOTH, sink))
 
     def create_on_first(
         self, message_ids: Iterable[int], create: Callable[[], object], *, system_id: int = EVERY_SYSTEM
     ) -> Detach:
-        """Call ``create()`` once, when the first of these messages arrives; sinks that it attaches get that message.
+        """Call ``create()`` once, when the first of these messages arrives, and before the message is delivered.
 
-        The call happens before all sinks that are attached already.
+        Sinks that ``create()`` attaches get that first message too.
         """
 
         def first(frame: Frame) -> None:
@@ -159,7 +159,7 @@ class Bus:
         return once(lambda: self._detach(key, entry))
 
     def _plan(self, frame: Frame) -> _DeliveryPlan:
-        """Sinks for such a frame: those of its system first. Empty if the dialect cannot decode it."""
+        """Return the sinks of the frame's system, then those of every system; none if the message is unknown."""
         system_id, message_id = frame.system_id, frame.message_id
         sinks = self._sinks.get((system_id, message_id), ()) if system_id != EVERY_SYSTEM else ()
         sinks += self._sinks.get((EVERY_SYSTEM, message_id), ())
@@ -183,7 +183,7 @@ class Bus:
 
 
 def _drop(table: dict[Any, tuple[Any, ...]], key: object, sink: object) -> None:
-    """Remove one occurrence of the sink. Tuples are replaced, not changed: a delivery in progress keeps its own."""
+    """Remove one occurrence of the sink by a new tuple: a delivery in progress continues with the old one."""
     left = list(table[key])
     left.remove(sink)
     if left:
@@ -233,7 +233,7 @@ class EndSignal:
 
     def __init__(self) -> None:
         self.error: Exception | None = None
-        """The error that ended it; None while it is active."""
+        """The error passed to :meth:`notify`; None before that."""
         self._callbacks: list[EndCallback] = []
 
     def raise_if_ended(self) -> None:
@@ -255,13 +255,13 @@ class EndSignal:
         return detach
 
     def notify(self, error: Exception) -> None:
-        """Call all registered functions with this error."""
+        """Store the error and call all registered callbacks with it."""
         callbacks, self._callbacks = self._callbacks, []
         for callback in callbacks:
             try:
                 callback(error)
             except Exception:
-                logger.exception("a callback for the end of a connection raised an exception; the others are called")
+                logger.exception("a callback of on_end() raised an exception; the other callbacks are called")
 
 
 def _nothing() -> None:
@@ -306,7 +306,7 @@ class Subscription(Generic[ItemT]):
 
     def __enter__(self) -> Self:
         if self._closed or self._detach:
-            raise BusyError("a subscription is entered once; make a new one")
+            raise BusyError("a subscription can be entered only once; create a new one")
         self._detach = list(self._attach(self._push))
         return self
 
@@ -352,7 +352,7 @@ class Subscription(Generic[ItemT]):
         return self._queue.popleft() if self._queue else None
 
     def close(self, error: Exception | None = None) -> None:
-        """Stop taking items. A waiting reader gets ``error``, or the end of the iteration if there is none."""
+        """Stop taking items. A waiting reader raises ``error``; without an error, its iteration ends."""
         for detach in self._detach:
             detach()
         self._detach = []

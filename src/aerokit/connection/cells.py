@@ -49,8 +49,8 @@ class StateCell(Generic[T]):
     """The latest value of one telemetry item: read it, check its age, wait for it, iterate over its changes.
 
     Reading never sends anything. ``clock`` returns seconds (event loop time); ``waits_for`` names the source messages
-    in error texts. A cell belongs to one event loop and its thread. Other threads may read it (values are never torn,
-    and ages never too small), but must not wait or write.
+    in error texts. A cell belongs to one event loop and its thread. Other threads may read it (they never get a
+    half-written value or an age that is too small), but must not wait or write.
     """
 
     __slots__ = (
@@ -146,7 +146,7 @@ class StateCell(Generic[T]):
             StaleValueError: the value is older.
             ValueUnknownError: no value has been received.
         """
-        age = self.age  # read before the value: another thread then never gets an age that is too small
+        age = self.age  # read before the value, so that another thread never gets an age that is too small
         value = self.value
         if age > within:
             raise StaleValueError(
@@ -193,7 +193,7 @@ class StateCell(Generic[T]):
 
     @checked
     def observe(self, callback: Callable[[T | None, T], None], *, every_arrival: bool = False) -> Callable[[], None]:
-        """Call ``callback(previous, value)`` on every change; return a function that ends this.
+        """Call ``callback(previous, value)`` on every change; return a function that removes the callback.
 
         With ``every_arrival``, call it for every received value. The callback runs inside :meth:`set` and must return
         quickly; its exceptions are logged.
@@ -218,13 +218,13 @@ class StateCell(Generic[T]):
                 sink.receive(value)
 
     def _add_age(self, seconds: float) -> None:
-        """Make the value older, for time that the clock did not count (the computer slept)."""
+        """Add time that the clock did not count, because the computer slept, to the age of the value."""
         self._catch_up()
         self._updated_at -= seconds
 
     def forget(self) -> None:
         """Make the value unknown again, e.g. after a reboot. Waiters keep waiting."""
-        self._known = False  # `_latest` stays for a thread that has just seen `_known`
+        self._known = False  # `_latest` is kept, because another thread may just have read `_known` as True
         self._source = None
         self._updated_at = -math.inf
         for sink in tuple(self._sinks):
@@ -300,8 +300,8 @@ class StateCell(Generic[T]):
 class Changes(AsyncIterator[T]):
     """Endless asynchronous iterator over the values of a cell.
 
-    Raises the error that the cell was closed with. Until the iterator is garbage-collected, every received message of
-    the cell is decoded.
+    Iteration raises the error with which the cell was closed. While the iterator exists, every received message of the
+    cell is decoded.
     """
 
     def __init__(self, cell: StateCell[T], *, every_arrival: bool) -> None:

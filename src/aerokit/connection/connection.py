@@ -72,8 +72,8 @@ class Connection:
     """One MAVLink node (system id, component id) on one link.
 
     Received bytes enter through ``bytes_received``, are checked by one framer per remote peer, and go to ``bus``.
-    ``send`` writes a message to the peer behind which its target was last received; :class:`Routes` decides which
-    peer that is, and when it may change (``may_move``). Everything runs on the event loop's thread.
+    ``send`` writes a message to the peer from which its target was last received; :class:`Routes` stores that peer
+    and decides when it may change (``may_move``). Everything runs on the event loop's thread.
     """
 
     def __init__(
@@ -149,9 +149,9 @@ class Connection:
     def send(self, message: Message, *, to: int | None = None) -> None:
         """Number, frame and write a message. Never blocks.
 
-        It goes to the peer behind which its ``target_component`` of system ``to`` (None: its ``target_system``) was
-        last received; if it names no component, to every peer with components of that system; if its target is
-        broadcast or unknown, to every peer.
+        A message for one component goes to the peer from which that component was last received. A message for a
+        whole system goes to every peer with components of that system, and a message for all or for an unknown target
+        goes to every peer. ``to`` is the system id of the target; None: the message's ``target_system``.
 
         Raises:
             InvalidArgument: a field is out of range; nothing was sent.
@@ -183,9 +183,9 @@ class Connection:
         self._write(frame.raw, None if message_type is None else self.bus.dialect.decode(frame), None)
 
     def feed(self) -> None:
-        """Show that the program is running: our heartbeat continues for ``fed_within_s`` seconds (`OwnHeartbeat`).
+        """Keep our heartbeat going for another ``fed_within_s`` seconds (see `OwnHeartbeat`).
 
-        May be called from any thread.
+        Call it from any thread to show that the program is running.
         """
         if self._heartbeat is not None:
             self._heartbeat.activity.feed()
@@ -205,7 +205,7 @@ class Connection:
         """Number of written bytes that have not left this machine, if the link can measure it.
 
         A value that stays above 0 means that the link does not drain (TCP without a network, a serial port with flow
-        control asserted): :class:`LinkStalled`. Always 0 for UDP.
+        control asserted); see :class:`LinkStalled`. Always 0 for UDP.
         """
         return self.link.unsent_bytes
 
@@ -266,7 +266,7 @@ class Connection:
         return subscription
 
     async def vehicles(self) -> AsyncGenerator[VehicleFound, None]:
-        """Yield each autopilot once, those already received first, until the connection ends.
+        """Yield every autopilot on the link once, until the connection ends. Those already known come first.
 
         ``async for found in connection.vehicles(): async with aerokit.connect(connection,
         system_id=found.system_id)…``
@@ -290,17 +290,17 @@ class Connection:
     def observe_frames(self, callback: FrameObserver) -> Detach:
         """Call ``callback(frame, peer)`` with every received frame, after the subscribers of its message.
 
-        Frames of message ids outside the dialect are included, with unchecked checksums; refused frames of a second
-        peer under the ids of a known component are not. The callback must return quickly; its exceptions are logged.
+        Frames with message ids outside the dialect are included, and their checksums are not checked. Frames that are
+        refused because a second peer sends them under the ids of a known component are excluded. The callback must
+        return quickly; its exceptions are logged.
         Without observers, frames without subscribers are not even built.
         """
         return self._observers.add(callback)
 
     def observe_sent_frames(self, callback: Callable[[bytes], object]) -> Detach:
-        """Call ``callback(raw)`` with every frame that :meth:`send` writes, signature included. Frames of `write_raw`
-        are excluded.
+        """Call ``callback(raw)`` with every frame that :meth:`send` writes, signature included.
 
-        The callback must return quickly; its exceptions are logged.
+        Frames of :meth:`write_raw` are excluded. The callback must return quickly; its exceptions are logged.
         """
         return self._observers.add_sent(callback)
 
@@ -356,7 +356,7 @@ class Connection:
         return self._unix_epoch_s + self._clock()
 
     def describe_signature_problems(self, system_id: int = 0, component_id: int = 0) -> str:
-        """Describe for error texts which signatures block communication with this component (0: any); "" if none."""
+        """Explain, for error texts, why signatures block communication with this component (0: any); "" if none do."""
         return self._gate.describe(
             heartbeat
             for (system, component), heartbeat in self.heartbeats.items()

@@ -20,7 +20,7 @@ ResultT = TypeVar("ResultT")
 async def run_exchange(connection: Connection, system_id: int, exchange: Exchange[ResultT]) -> ResultT:
     """Run ``exchange`` with the vehicle ``system_id`` and return its result.
 
-    Cancellation ends it immediately. If the connection ends, its error is raised; so are errors in sending.
+    Cancellation ends the exchange immediately. Errors of sending, and the error that ends the connection, are raised.
     """
     run = ExchangeRun(connection, exchange)
     detachments = [
@@ -39,7 +39,7 @@ async def run_exchange(connection: Connection, system_id: int, exchange: Exchang
 class ExchangeRun(Generic[ResultT]):
     """Drives one exchange: sends its messages and calls it at its deadlines.
 
-    The owner passes in the messages of the target, and aborts it when the connection ends.
+    The owner calls :meth:`receive` with each message of the target, and :meth:`abort` when the connection ends.
     """
 
     def __init__(self, connection: Connection, exchange: Exchange[ResultT]) -> None:

@@ -27,13 +27,13 @@ if TYPE_CHECKING:
     from aerokit.transport.link import Link, Peer
 
 MAX_PEERS = 256
-"""Peers that are remembered after a valid frame."""
+"""Maximum number of peers that have sent a valid frame."""
 
 MAX_UNVERIFIED_PEERS = 32
-"""Peers without a valid frame yet that are tracked; another one replaces the oldest of them."""
+"""Maximum number of tracked peers without a valid frame. A new one replaces the oldest."""
 
 MAX_SENDERS = 2048
-"""(system id, component id) pairs of all peers together that have their own counters."""
+"""Maximum number of (system id, component id) pairs, over all peers, that have their own counters."""
 
 
 class PeerTable:
@@ -123,10 +123,10 @@ BLOCKING_CODE_HINT = (
 
 
 class FrameReceiver:
-    """Checks received frames: framing by one framer per peer, signature, and the sender's route.
+    """Checks the framing, signature and route of received frames, with one framer for each peer.
 
-    Accepted frames go to ``bus``, then to the observers. ``multilink`` equals ``routes`` if there are several links.
-    ``clock`` is the event loop's.
+    Accepted frames go to ``bus``, then to the observers. ``multilink`` is ``routes`` if there are several links,
+    otherwise None. ``clock`` is the clock of the event loop.
     """
 
     def __init__(
@@ -196,7 +196,7 @@ class FrameReceiver:
                 observers.notify_received(frame, peer)
 
     def arrived_at(self) -> float:
-        """Return the receive time of the current frame: now, or before a pause of the loop if it may have waited."""
+        """Return the receive time of the current frame: now, or earlier if it may have waited for a blocked loop."""
         return min(self._clock(), self._loop_watch.oldest_arrival)
 
     def statistics(self) -> Iterator[FramerStatistics]:
@@ -221,7 +221,7 @@ class FrameReceiver:
         self._bus.publish(LoopBlocked(self._clock(), 0, seconds))
 
     def _on_slept(self, seconds: float) -> None:
-        logger.warning("the computer slept for %.0f s: all values of vehicles are older by that time", seconds)
+        logger.warning("the computer slept for %.0f s: all values of vehicles are now older by this time", seconds)
         self._bus.publish(ComputerSlept(self._clock(), 0, seconds))
 
     def _update_framers(self) -> None:
@@ -247,7 +247,7 @@ class FrameReceiver:
         return self._routes.claims_route(frame, peer, framer.counters_of(frame), self._gate.has_checked(frame))
 
     def _is_stale(self, framer: Framer, frame: Frame) -> bool:
-        """Return True if an out-of-order frame is to be dropped: a second sender's, or an outdated heartbeat."""
+        """Return True if an out-of-order frame is to be dropped: sent by a second sender, or an outdated heartbeat."""
         is_foreign = frame in framer.foreign
         if not is_foreign and frame not in framer.late:
             return False

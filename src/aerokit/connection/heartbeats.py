@@ -1,4 +1,4 @@
-"""HEARTBEAT: the kind of its sender, our own one, and the state of a link or vehicle by the last reception."""
+"""HEARTBEAT: classification of senders, our own heartbeat, and the state of a link or vehicle."""
 
 from __future__ import annotations
 
@@ -72,16 +72,16 @@ def discovery_event(
 
 
 BLOCKING_MAX_IDLE_S = 60.0
-"""A blocking program that makes no call for this long pauses our heartbeat. Longer than usual sleeps in flight."""
+"""Seconds without a call after which a blocking program's heartbeat pauses; longer than usual sleeps in flight."""
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
 
 class OwnHeartbeat(Snapshot):
-    """The HEARTBEAT that aerokit sends at 1 Hz, and when it pauses (https://mavlink.io/en/services/heartbeat.html).
+    """Settings of the HEARTBEAT that aerokit sends at 1 Hz (https://mavlink.io/en/services/heartbeat.html).
 
-    A vehicle's ground station failsafe acts when heartbeats stop. They therefore pause when the program hangs:
-    ``fed_within_s`` seconds after its last call, or ``feed()``. None means 60 seconds in :mod:`aerokit.sync` and
+    A vehicle's ground station failsafe acts when heartbeats stop. Heartbeats therefore pause when the program hangs,
+    ``fed_within_s`` seconds after its last call or ``feed()``. None means 60 seconds in :mod:`aerokit.sync` and
     :mod:`aerokit.dronekit`, whose event loop has its own thread, and no limit in asyncio, where a blocked loop sends
     nothing anyway. Infinity means no limit. ``type`` is a MAV_TYPE: 6 for a ground station (GCS), 18 for a companion
     computer (ONBOARD_CONTROLLER).
@@ -126,7 +126,7 @@ class HeartbeatWatchdog:
         self._paused_at: float | None = None
 
     def require(self, activity: ActivityMonitor, fed_within_s: float) -> None:
-        """Watch this activity, with ``fed_within_s`` as limit unless the settings have one."""
+        """Watch this activity too. ``fed_within_s`` is the limit if the settings have none."""
         self.activity = activity
         self._limit_s = fed_within_s if self._limit_s is None else self._limit_s
 
@@ -144,8 +144,8 @@ class HeartbeatWatchdog:
             self._paused_at = now
             self._publish(HeartbeatPaused(now, 0, idle_s))
             logger.warning(
-                "the program has made no call for %.0f s: heartbeats are paused, so that the vehicle's ground station"
-                " failsafe can act (set the limit by connect(heartbeat=OwnHeartbeat(fed_within_s=…)))",
+                "the program has not called aerokit for %.0f s: heartbeats are paused, so that the vehicle's ground"
+                " station failsafe can act (set the limit by connect(heartbeat=OwnHeartbeat(fed_within_s=…)))",
                 idle_s,
             )
         return False

@@ -40,10 +40,10 @@ def suspended_s() -> float:
 class LoopWatch:
     """Detects pauses of the event loop by a timer that fires late.
 
-    After a pause, data gets the time at which the loop last ran as its receive time, because it may have waited since
-    then. This ends when all waiting data is read. Pauses shorter than ``CHECK_INTERVAL_S + LATE_THRESHOLD_S`` are not
-    detected; ages may be too small by that. ``on_blocked`` gets the length of pauses above ``BLOCKED_THRESHOLD_S``,
-    ``on_slept`` the time that the computer was suspended.
+    Data may have waited during a pause. Until all waiting data has been read, the time at which the loop last ran
+    before the pause is therefore the receive time of data. Pauses shorter than
+    ``CHECK_INTERVAL_S + LATE_THRESHOLD_S`` are not detected; ages may be too small by that. ``on_blocked`` gets the
+    length of pauses above ``BLOCKED_THRESHOLD_S``, ``on_slept`` the time that the computer was suspended.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class LoopWatch:
         self._on_blocked, self._on_slept = on_blocked, on_slept
         self._suspended, self._suspended_before = suspended, max(suspended() for _ in range(3))
         self.late_after: float = math.inf
-        """For data read later than this, :meth:`arrival` returns the receive time."""
+        """Loop time up to which data is received in time; for data read later, call :meth:`arrival`."""
         self._ran_at = self._due = self._loop.time()
         self._timer: asyncio.TimerHandle | None = None
         self._oldest: float | None = None  # set while data may have waited
@@ -74,11 +74,11 @@ class LoopWatch:
 
     @property
     def oldest_arrival(self) -> float:
-        """Earliest receive time of data that is read now; infinite while nothing can have waited."""
+        """Earliest possible receive time of data that is read now; infinite while no data can have waited."""
         return math.inf if self._oldest is None else self._oldest
 
     def arrival(self, now: float) -> float:
-        """Return the receive time of data that is read now: now, or the earliest possible one if it may have waited."""
+        """Return ``now``, or the earliest possible receive time if data that is read now may have waited."""
         # Data that is read in time postpones the timer: waking a sleeping process costs as much as a few messages.
         has_slept = self._has_slept()
         if self._oldest is None and not has_slept and now <= self._due + LATE_THRESHOLD_S:
@@ -140,7 +140,7 @@ IPYTHON_HINT = (
 
 
 def is_unintegrated_ipython() -> bool:
-    """Return True in IPython in a terminal without ``%gui asyncio``, which runs the loop only while a cell runs."""
+    """Return True in terminal IPython without ``%gui asyncio``, where the loop runs only while a cell runs."""
     module = sys.modules.get("IPython.terminal.interactiveshell")
     shell: Any = getattr(getattr(module, "TerminalInteractiveShell", None), "_instance", None)
     if shell is None or getattr(shell, "active_eventloop", None) == "asyncio":

@@ -176,7 +176,7 @@ def _check_distinct(addresses: Sequence[str | Link], targets: Sequence[Link | Li
 
 
 def _target_key(target: Link | LinkAddress) -> object:
-    """Identify what an address opens, regardless of its options; None if it opens something new each time."""
+    """Return a key of the port or socket that an address opens; None if it opens a new one each time."""
     if isinstance(target, Link):
         return id(target)
     is_new = (target.kind in ("udpin", "tcpin") and not target.port) or (target.kind == "pty" and not target.path)
@@ -197,7 +197,7 @@ MAX_LISTED_IDS = 5
 
 
 def explain_no_vehicle(connection: Connection, wanted_system: int | None) -> str:
-    """Explain, by what was received, why no vehicle was found on a link."""
+    """Return the reason why no vehicle was found on a link, derived from the received data."""
     return _Diagnosis(connection, wanted_system).text()
 
 
@@ -230,8 +230,8 @@ class _Diagnosis:
         if self._unknown and 2 * self._bad_bytes < self._bytes:
             numbers = ", ".join(map(str, sorted(self._unknown_messages)[:MAX_LISTED_IDS]))
             return (
-                f"{received}, with {self._unknown} frames of an unknown dialect (messages {numbers}) and none of this"
-                " one: pass dialect=Dialect.from_xml(...)"
+                f"{received}, with {self._unknown} frames of an unknown dialect (messages {numbers}) and no known"
+                " message: pass dialect=Dialect.from_xml(...)"
             )
         if self._bad_crcs * NOISE_BYTES > self._bytes:
             return f"{received}, with {self._bad_crcs} damaged frames and no valid one: noisy link, or another dialect?"

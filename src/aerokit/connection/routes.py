@@ -52,7 +52,7 @@ class RouteClaim:
         self.is_refusal_reported: bool = False
 
     def add(self, frame: Frame, evidence: tuple[int, bool | None, bool | None]) -> None:
-        """Add a frame, with the owner's expected count and whether sequence number and clock continue it."""
+        """Add a frame and its evidence, the result of ``Routes._evidence``."""
         expected, sequence_matches, clock_matches = evidence
         if expected != self._expected:
             self._expected = expected
@@ -69,7 +69,7 @@ class RouteClaim:
         return self._sequence_matches is not False and self._clock_matches is True
 
     def has_replaced(self, now: float, rate: float) -> bool:
-        """Return True if it continues the owner, silent for the time of three frames (``rate`` per second)."""
+        """Return True if the claim continues the owner's stream, and the owner missed three frames at this rate."""
         return (
             self.continues_owner and self._frames >= CLAIM_MIN_FRAMES and (now - self._since) * rate >= CLAIM_MIN_FRAMES
         )
@@ -94,10 +94,10 @@ PEER_TTL_S = 30.0
 """Time without heartbeats after which a peer may be evicted. A peer with a vehicle object is never evicted."""
 
 MAX_ROUTES = 1024
-"""Components with a route. Messages to other components go to every peer."""
+"""Maximum number of components with a route. Messages to other components go to every peer."""
 
 MAX_CLAIMS = 256
-"""Claims that are remembered. An evicted claim is reported again when it recurs."""
+"""Maximum number of remembered claims. An evicted claim is reported again when it recurs."""
 
 SWEEP_INTERVAL_S = 1.0
 
@@ -178,7 +178,7 @@ class Routes:
         return 0 < (route.sequence - frame.sequence) & 0xFF < 128
 
     def peers_of(self, system_id: int, component_id: int, message: Message | None = None) -> Collection[Peer]:
-        """Return the peers that receive a message for this component, or for its system if it is 0 or unknown.
+        """Return the peers of a component, or of its whole system if the component is 0 or unknown.
 
         Peers that send under the ids of another peer are excluded, because they would execute broadcasts.
         """
@@ -256,7 +256,7 @@ class Routes:
     def _evidence(
         self, route: _Route, frame: Frame, counters: SourceStatistics | None
     ) -> tuple[int, bool | None, bool | None]:
-        """Return the owner's expected count, and whether the frame's number and clock continue it (None: unknown)."""
+        """Return the owner's expected frame count, and if sequence number and clock match it (None: unknown)."""
         sequence_matches: bool | None = None
         silent_for = max(frame.received_at - route.heartbeat_at, 0.0)
         expected = 0

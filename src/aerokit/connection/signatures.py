@@ -52,12 +52,11 @@ class SignatureGate:
 
     @contextmanager
     def key_handover(self, signing: Signing | None, system_id: int, component_id: int) -> Iterator[asyncio.Event]:
-        """For the duration of the block, watch the component's frames and switch to ``signing`` when they show that
-        it uses the new key.
+        """Switch to ``signing`` when the component's frames, received during the block, show that it uses the new key.
 
-        The yielded event is set then; until then, frames are signed and verified as before. One frame signed with the
-        new key is enough. A removed key is shown by at least `MIN_UNSIGNED_FRAMES` unsigned frames over
-        `MIN_UNSIGNED_S` without a signed one, because any other sender could forge a few.
+        The yielded event is set at the switch; before it, the old key signs and verifies. One frame signed with the
+        new key is enough. If the key is removed, at least `MIN_UNSIGNED_FRAMES` unsigned frames over `MIN_UNSIGNED_S`
+        without a signed one are needed, because any sender could forge a few.
 
         Raises:
             BusyError: another handover is in progress.
@@ -79,7 +78,7 @@ class SignatureGate:
         self.is_open = self._encoder.signing is None and self._handover is None
 
     def admits(self, frame: Frame, *, may_hand_over: bool = True) -> bool:
-        """Return True if a frame is admitted. It switches no key if it comes from another peer (not may_hand_over)."""
+        """Return True if a frame is admitted. With ``may_hand_over=False`` (another peer's frame), keep the key."""
         handover = self._handover
         is_of_handover = handover is not None and may_hand_over and handover.concerns(frame)
         if handover is not None and is_of_handover and handover.is_shown_by(frame, self._unix_time()):
@@ -124,10 +123,10 @@ class SignatureGate:
         self._keep_error = error
 
     def describe(self, heartbeats: Iterable[Heartbeat]) -> str:
-        """Describe for error texts which signatures block communication with these senders; "" if none."""
+        """Explain, for error texts, why signatures block communication with these senders; "" if none do."""
         signing = self._encoder.signing
         if signing is not None:
-            refused = "; ".join(f"{n}: {why.value}" for why, n in signing.refused.items() if n)
+            refused = "; ".join(f"{count}: {reason.value}" for reason, count in signing.refused.items() if count)
             return f"frames were refused ({refused}) by {signing.key!r}" if refused else ""
         frames = (heartbeat.received_frame for heartbeat in heartbeats)
         is_signed = any(frame is not None and _has_key(frame) for frame in frames)

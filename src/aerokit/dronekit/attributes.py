@@ -46,7 +46,7 @@ LOCAL_FRAME = "location.local_frame"
 
 
 class Locations(HasObservers, LocationPrivates):
-    """The vehicle's location in global, global relative and local frames. Each frame can be listened to.
+    """The vehicle's location in global, global relative and local frames. Each frame can have listeners.
 
     Listeners get this object as their first argument. The three numbers of a location are from the same message.
     """
@@ -107,7 +107,7 @@ def _place_of(message: m.GlobalPositionInt) -> tuple[float | None, float | None]
 
 
 class VehicleAttributes(VehicleCore):
-    """State as DroneKit's attributes. Reading returns the latest value without waiting, on any thread.
+    """DroneKit's attributes of a vehicle. Reading one returns the latest value without waiting, on any thread.
 
     Each message is stored by a single assignment, so that values read together are from the same message.
     """
@@ -206,7 +206,7 @@ class VehicleAttributes(VehicleCore):
 
     @property
     def is_armable(self) -> bool:
-        """True if the vehicle has booted, has a GPS fix and a (predicted) position; on PX4: its checks pass.
+        """True if the vehicle has booted and has a GPS fix and a (predicted) position; on PX4, if its checks pass.
 
         Its own arming checks may still fail: :meth:`Vehicle.arm` reports the reasons.
         """

@@ -121,13 +121,13 @@ class ClassicConnection:
 
     def is_of_another_vehicle(self, system_id: int) -> bool:
         """Return True if this system has an autopilot and is not the connected vehicle."""
-        heard = self.connection.heartbeats
         return system_id != self.target_system and any(
-            source[0] == system_id and is_autopilot(heartbeat) for source, heartbeat in heard.items()
+            source[0] == system_id and is_autopilot(heartbeat)
+            for source, heartbeat in self.connection.heartbeats.items()
         )
 
     def match_mavlink_version(self, heartbeat: Message) -> None:
-        """Send the MAVLink version that the vehicle uses, because old firmware does not understand version 2."""
+        """Switch to the MAVLink version that the vehicle uses, because old firmware does not support version 2."""
         frame = heartbeat.received_frame
         if frame is not None:
             version = 2 if self.supports_mavlink_2 else frame.version
@@ -141,7 +141,7 @@ def _on_dropped(
     listener_thread: ListenerThread,
     at_close: list[Callable[[], object]],
 ) -> None:
-    """Runs on the loop, which ends afterwards, when the connection was garbage collected."""
+    """Clean up after a connection was garbage collected. Runs on the loop, which ends afterwards."""
     vehicle_logger.warning("the connection to %s was closed: the program dropped it without close()", address)
     atexit.unregister(at_exit)
     listener_thread.stop()
@@ -241,7 +241,7 @@ class BackgroundCalls:
 
 
 def _call_after_tasks(function: Callable[..., object], *args: Any) -> None:
-    # In the next turn of the loop, so that calls started before have sent their first messages.
+    # The next loop iteration is late enough for earlier calls to have sent their first messages.
     asyncio.get_running_loop().call_soon(function, *args)
 
 

@@ -139,7 +139,7 @@ class CommandSequence:
     def download(self) -> None:
         """Start reading the vehicle's mission; :meth:`wait_ready` waits for it.
 
-        The sequence does not change until then. Restarts a running download. Afterwards listeners of ``'commands'`` are
+        A running download is restarted. When it is complete, the sequence is replaced, listeners of ``'commands'`` are
         called, and ``vehicle.home_location`` is set if the mission has it. APIException: the link is down.
         """
         self._core.check_link()
@@ -301,7 +301,7 @@ class CommandSequence:
         """Wait for a running download; raise if it has failed."""
         self._wait_for_download()
         if (failure := self._core.ready.failure_of({"commands"})) is not None:
-            raise type(failure)(f"{failure}; download() again, or clear()") from failure.__cause__
+            raise type(failure)(f"{failure}; call download() again, or clear()") from failure.__cause__
 
     def _wait_for_download(self) -> None:
         # As in DroneKit, clear() and add() after download() apply to the downloaded mission.
@@ -311,7 +311,7 @@ class CommandSequence:
 
 
 class WaypointLoader:
-    """``vehicle._wploader`` for reading: commands with home as number 0."""
+    """Read-only ``vehicle._wploader``: commands with home as number 0."""
 
     def __init__(self, commands: CommandSequence) -> None:
         self._commands = commands

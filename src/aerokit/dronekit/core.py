@@ -1,4 +1,4 @@
-"""``Core``: the connection of a classic vehicle as its parts use it, and the messages received on it."""
+"""``Core``: the connection and the received messages that the parts of a classic vehicle share."""
 
 from __future__ import annotations
 
@@ -68,11 +68,11 @@ class Readiness:
             self._changed.notify_all()
 
     def failure_of(self, names: set[str]) -> APIException | None:
-        """Return why one of these attributes gets no value, or None."""
+        """Return the error because of which one of these attributes gets no value, or None."""
         return next(filter(None, map(self._failures.get, names)), None)
 
     def wait_for_change(self, wanted: set[str], at_most_s: float) -> None:
-        """Wait for a change, at most ``at_most_s`` and 0.2 seconds, if one of these attributes is missing."""
+        """If one of these attributes is missing, wait for a change: at most ``at_most_s``, and at most 0.2 s."""
         with self._changed:
             missing = wanted - self.names
             if missing and self.failure_of(missing) is None:
@@ -157,7 +157,7 @@ class Core:
         self.heartbeat_limit_s: float = 0.0
         """Silence after which orders raise, in seconds; 0: no limit."""
         self.aio_or_none: AsyncVehicle | None = None
-        """The asynchronous vehicle, once it is connected."""
+        """The asynchronous vehicle; None before it is connected."""
         self._tasks: BackgroundTasks | None = None
         self._latest: dict[type[Message], LatestMessage[Any]] = {}
         self.on_connected: list[Callable[[], None]] = []
@@ -229,7 +229,7 @@ class Core:
             aio.connection.bus.attach_lazily(message_type, weak_callback(latest.take), system_id=aio.system_id)
 
     def watch_link(self) -> None:
-        """Report the age of the last heartbeat to listeners, 20 times a second; log the begin and end of silence."""
+        """Report the age of the last heartbeat to listeners 20 times a second; log when silence begins and ends."""
         aio = self.aio
         if not aio.connection.is_open:
             return
@@ -278,7 +278,7 @@ class Core:
 
 
 def _feeding(read: property) -> property:
-    """Return a property that also records that the program is alive."""
+    """Return a property that also records that the program is running."""
     getter = read.fget
     assert getter is not None
 
@@ -320,7 +320,7 @@ class VehicleCore(HasObservers):
         """Wait until attributes have values; without names, or with True, for the usual five.
 
         Args:
-            types: names of attributes, your own too; ``wait_ready(True)`` is ``'parameters'``, ``'gps_0'``,
+            types: names of attributes, including your own; ``wait_ready(True)`` is ``'parameters'``, ``'gps_0'``,
                 ``'armed'``, ``'mode'`` and ``'attitude'``.
             timeout: seconds; None: no limit.
             raise_exception: raise when the time is over.

@@ -61,7 +61,7 @@ class FlightMethods(VehicleAttributes):
     def wait_for_mode(self, mode: VehicleMode | str | int, timeout: float | None = None) -> None:
         """Set the mode and wait until HEARTBEAT confirms it.
 
-        Raises TimeoutError after ``timeout`` seconds, or as soon as the vehicle rejects it.
+        Raises TimeoutError after ``timeout`` seconds, or as soon as the vehicle rejects the mode.
         """
         name, done = self._dk_set_mode(mode)
         self._dk_wait_for_order(done, lambda: self._flightmode == name, timeout, "failed to set flight mode")
@@ -72,8 +72,8 @@ class FlightMethods(VehicleAttributes):
     def armed(self) -> bool:
         """True if HEARTBEAT reports armed motors.
 
-        Setting it to another value than reported or just ordered sends the order: **propellers may start to turn**.
-        :meth:`arm` waits, and reports why arming is refused.
+        Setting a value that is neither reported nor already ordered sends an order: **propellers may start to turn**.
+        :meth:`arm` waits, and raises the reason if arming is refused.
         """
         return self._armed
 
@@ -269,7 +269,7 @@ class FlightMethods(VehicleAttributes):
         interval: float = 0.1,
         errmsg: str | None = None,
     ) -> None:
-        """Wait until ``condition()`` is true; called every ``interval`` seconds on the caller's thread.
+        """Wait until ``condition()`` is true. It is called every ``interval`` seconds on the caller's thread.
 
         Raises TimeoutError with the text ``errmsg`` after ``timeout`` seconds (None: no limit).
         """

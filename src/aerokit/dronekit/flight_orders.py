@@ -128,9 +128,9 @@ async def go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: 
 
 
 def reposition_modes(aio: AsyncVehicle) -> tuple[Mode, ...]:
-    """Return the modes in which a reposition command is allowed, if it changes the mode (PX4).
+    """Return the modes in which a reposition command may be sent. The command itself sets the first of them (PX4).
 
-    The first is the mode that the command sets. Empty if the mode stays, and the vehicle itself refuses in others.
+    Empty if the command does not change the mode: the vehicle then refuses it in wrong modes.
     """
     if not aio.autopilot.repositions_amsl:
         return ()
@@ -188,7 +188,7 @@ class CurrentCommand:
         return int(message.seq) + 1
 
     def choose(self, seq: int) -> None:
-        """Set the next command without waiting. InvalidArgument: it is not from 0 to 65,535."""
+        """Set the next command without waiting. InvalidArgument: ``seq`` is not from 0 to 65,535."""
         if not 0 <= operator.index(seq) <= MAX_SEQ:
             raise InvalidArgument(f"next = {seq!r} is not allowed: 0 to {MAX_SEQ}")
         self._core.order("commands.next", self._choose, operator.index(seq))
@@ -280,9 +280,9 @@ class Maintenance(VehicleCore):
         self._dk.send(PlayTune(self._dk.target_system, 0, text[:first], text[first:]))
 
     def reboot(self) -> None:
-        """Reboot the autopilot, which is then away for some seconds. It refuses while armed.
+        """Reboot the autopilot, which then does not answer for some seconds. It refuses while armed.
 
-        Sent once: without an answer a warning is logged, and the vehicle may have rebooted.
+        The command is sent once. Without an answer a warning is logged, and the vehicle may have rebooted.
         """
         shutdown = MavCmd.PREFLIGHT_REBOOT_SHUTDOWN
         self._dk.command("reboot", shutdown, 1, attempt_timeout=REBOOT_TIMEOUT_S)

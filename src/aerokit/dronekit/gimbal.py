@@ -38,17 +38,17 @@ class Gimbal(GimbalPrivates):
 
     @property
     def pitch(self) -> float | None:
-        """Degrees from the horizon: 0 is level, -90 straight down."""
+        """Pitch in degrees from the horizon: 0 is level, -90 straight down."""
         return self._attitude.pitch_deg
 
     @property
     def roll(self) -> float | None:
-        """Degrees from the horizon, positive to the right."""
+        """Roll in degrees from the horizon, positive to the right."""
         return self._attitude.roll_deg
 
     @property
     def yaw(self) -> float | None:
-        """Degrees clockwise from north, 0 to 360.
+        """Yaw in degrees clockwise from north, 0 to 360.
 
         With MOUNT_STATUS (ArduPilot before 4.3) the reference of the angle depends on the firmware.
         """
@@ -80,7 +80,7 @@ class Gimbal(GimbalPrivates):
         self._core.order("gimbal", gimbal.point, *angles[:2], roll_deg=angles[2], wait=False)
 
     def target_location(self, roi: LocationGlobalRelative | LocationGlobal) -> None:
-        """Point the camera at a location; a copter without a gimbal turns itself. A location of zeros ends this."""
+        """Point the camera at a location; a copter without a gimbal turns itself. Zeros end the order."""
         if not isinstance(roi, (LocationGlobal, LocationGlobalRelative)):
             raise InvalidArgument("Expecting roi to be LocationGlobal or LocationGlobalRelative.")
         is_location = any(checked_location(roi))

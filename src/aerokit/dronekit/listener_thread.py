@@ -20,7 +20,7 @@ JOIN_TIMEOUT_S = CALL_TIMEOUT_S = 2.0
 
 
 class ListenerThread:
-    """Calls functions in the order in which they were posted. Starts with the first of them; a daemon thread.
+    """Calls functions in the order in which they were posted, on a daemon thread that starts with the first call.
 
     Exceptions of the functions are logged.
     """
@@ -56,7 +56,7 @@ class ListenerThread:
         self.dropped += 1
 
     def call(self, function: Callable[..., object], *args: Any) -> None:
-        """Queue a call and wait until it was made; call directly on this thread, or if the thread has ended.
+        """Queue a call and wait for it; call directly if on this thread already, or if the thread has ended.
 
         Does not wait on threads of event loops and of other listeners, to avoid deadlocks. Waits at most two seconds
         elsewhere, because the caller may hold a lock that a callback needs.

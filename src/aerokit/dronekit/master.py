@@ -44,7 +44,7 @@ class Master:
         ours = connection.connection
         self.source_system: int = ours.source_system
         self.source_component: int = ours.source_component
-        """Own ids."""
+        """Own component id."""
         self.mav: MessageFactory = MessageFactory(self._send, ours.source_system, ours.source_component)
         """Creates and sends messages."""
         self.messages: Inbox = Inbox(connection)
@@ -57,7 +57,7 @@ class Master:
 
     @property
     def target_component(self) -> int:
-        """Component id of its autopilot, 0 until it is found."""
+        """Component id of the vehicle's autopilot, 0 until it is found."""
         return self._autopilot()[0]
 
     @property
@@ -66,7 +66,7 @@ class Master:
 
     @property
     def port(self) -> Master:
-        """Returns this object: programs call ``port.close()``. Not a socket or serial port."""
+        """This object itself, because programs call ``port.close()``. Not a socket or serial port."""
         return self
 
     @property
@@ -112,7 +112,7 @@ class Master:
     # -------------------------------------------------------------------------------- orders
 
     def arducopter_arm(self) -> None:
-        """Send the command to arm: **propellers may start to turn**."""
+        """Send the arming command: **propellers may start to turn**."""
         self._command(MavCmd.COMPONENT_ARM_DISARM, 1)
 
     def arducopter_disarm(self) -> None:
@@ -177,9 +177,9 @@ class Master:
     ) -> Any:
         """Return the next message of a type, of several or of any, that satisfies pymavlink's ``condition``.
 
-        Messages are kept from the first call on: the last 1,000 of at most five seconds. Returns None if there is none
-        and ``blocking`` is false, or after ``timeout`` seconds (None: no limit). APIException: the connection was
-        closed.
+        From the first call on, the last 1,000 messages of the last five seconds are kept. Without a match, returns None
+        at once if ``blocking`` is false, otherwise after ``timeout`` seconds (None: no limit). APIException: the
+        connection was closed.
         """
         names = {type} if isinstance(type, str) else None if type is None else set(type)
 

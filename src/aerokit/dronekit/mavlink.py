@@ -112,7 +112,7 @@ class MAVConnection(ClassicConnection):
     # ---------------------------------------------------------------------------- life cycle
 
     def start(self) -> None:
-        """Does nothing else than raise if the connection has ended: it receives since it was created."""
+        """Raise if the connection has ended. Reception starts when the connection is created."""
         self.connection.raise_if_ended()
 
     def reset(self) -> None:
@@ -134,7 +134,7 @@ class MAVConnection(ClassicConnection):
 
     @_accept_input.setter
     def _accept_input(self, value: bool) -> None:
-        """False discards received bytes, so that programs can test a silent link."""
+        """Discard received bytes if False, so that programs can test a silent link."""
         if value:
             vars(self.connection).pop("bytes_received", None)
         else:
@@ -204,7 +204,7 @@ def _open(
     overrides: OverrideRelease,
     heartbeat: OwnHeartbeat | None,
 ) -> OpenContext[Connection]:
-    """Open the link. Retried if refused, because a program may have just started a simulator."""
+    """Open the link. A refused connection is retried, because a program may have just started a simulator."""
     ids: dict[str, Any] = {"source_system": source_system, "source_component": source_component}
     try:
         _check_address(ip)
@@ -274,5 +274,5 @@ class MAVWriter:
         self.queue.put(pkt)
 
     def read(self) -> NoReturn:
-        """Raise RuntimeError: it is write only."""
+        """Raise RuntimeError, because the object is write only."""
         raise RuntimeError("a MAVWriter is write only")

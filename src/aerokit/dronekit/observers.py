@@ -79,7 +79,7 @@ class Listeners:
         return name in self.by_name or EVERY_NAME in self.by_name
 
     def notify(self, name: str, value: Any, cache: bool = False, *, waits: bool = False) -> None:
-        """Notify listeners of a value: with ``cache`` only of a change, otherwise it may be dropped under load.
+        """Notify listeners of a value: with ``cache`` only if it changed, without ``cache`` unless under high load.
 
         Returns immediately or, with ``waits``, after the listeners have run.
         """

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.parameters.writing import ResolvedParameter
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
-VERSION_TIMEOUT_S = 1.0  # for AUTOPILOT_VERSION, which says whether the list is available as a file
+VERSION_TIMEOUT_S = 1.0  # for AUTOPILOT_VERSION, which shows whether the list is available as a file
 READ_TIMEOUT_S = 30.0
 RETRY_DELAY_S = 1.0
 
@@ -48,7 +48,7 @@ ROUNDING = 0.01  # ArduPilot adds it before it cuts off a fraction
 class ParameterDownload:
     """Downloads the parameters once the vehicle is connected. A failure is logged once, as a warning.
 
-    It is repeated only while a program waits for parameters.
+    A failed download is repeated only while a program waits for parameters.
     """
 
     def __init__(self, core: Core, take_all: Callable[[ParameterTable], None]) -> None:
@@ -71,7 +71,7 @@ class ParameterDownload:
             self._core.handler.calls.post(self.begin)
 
     async def wait_for(self, name: str) -> None:
-        """Return when the parameter was received, alone or with the list, or certainly does not exist."""
+        """Wait until the parameter is received, alone or with the list, or is known not to exist."""
         if self.is_complete:
             await self._read(name)
             return
@@ -104,7 +104,7 @@ class ParameterDownload:
     async def _read(self, name: str) -> bool:
         """Request a parameter under all its names; return True if it was received or the vehicle reported it missing.
 
-        No answer is no evidence while the list is being sent.
+        While the list is being sent, a missing answer proves nothing.
         """
         from aerokit.parameters.renames import other_names
 
@@ -124,7 +124,7 @@ async def _download(
     fail: Callable[[AerokitError], None],
     end: Callable[[], None],
 ) -> None:
-    """Runs on the loop without a reference to the classic vehicle, which may be garbage collected."""
+    """Download all parameters on the loop, without a reference that keeps the classic vehicle alive."""
     try:
         take(await vehicle.parameters.download(method=await _method(vehicle)))
     except ConnectionClosed:
@@ -137,7 +137,7 @@ async def _download(
 
 
 async def _method(vehicle: AsyncVehicle) -> DownloadMethod:
-    """Wait shortly for AUTOPILOT_VERSION, which decides between list and file."""
+    """Wait briefly for AUTOPILOT_VERSION, which decides between list and file."""
     version = vehicle.telemetry.version
     with anyio.move_on_after(VERSION_TIMEOUT_S):
         await version.wait_until(lambda _: True)
@@ -193,7 +193,7 @@ async def set_parameter(aio: AsyncVehicle, name: str, value: float, retries: int
     except (InvalidArgument, ParameterRejected, ParameterTimeout) as error:
         return error
     if done.outcome == "clamped":
-        return ParameterRejected(f"the vehicle made it {done.value:g}", name=name)
+        return ParameterRejected(f"the vehicle set {done.value:g} instead", name=name)
     return None
 
 
@@ -216,8 +216,8 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
     """Name → value: ``vehicle.parameters['RTL_ALT']``, ``vehicle.parameters['RTL_ALT'] = 30``.
 
     Names are upper-cased, values are floats. The list is downloaded in the background after connecting, and stays valid
-    through reboots and lost links; changes that the vehicle reports are included. Reading a missing value requests that
-    one, and so rarely waits for the whole list; iterating does. :func:`len` returns the number received so far.
+    through reboots and lost links; changes that the vehicle reports are included. Reading a missing value requests only
+    that value; iterating waits for the whole list. :func:`len` returns the number received so far.
 
     Old and new names of parameters that ArduPilot renamed both work; values are converted, and a warning is logged.
     Listeners get ``(parameters, name, value)`` when a value is received first or has changed. Waiting raises
@@ -342,7 +342,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
 
     @property
     def _is_settled(self) -> bool:
-        """True if no unknown parameters can exist: the list is complete, and as long as the vehicle reports."""
+        """True if no unknown parameters can exist: the list is complete and has the reported length."""
         return self._reading.is_complete and self._count <= len(self._values)
 
     async def _wait_for(self, name: str) -> None:

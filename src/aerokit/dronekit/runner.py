@@ -134,7 +134,7 @@ def run_script(path: str | os.PathLike[str], arguments: Sequence[str] = ()) -> N
 
 
 def main(arguments: Sequence[str], prog: str = "python -m aerokit.dronekit") -> int:
-    """Run the program of a command line in place of this one. Its exceptions propagate.
+    """Run the program that a command line names, in this process. Its exceptions propagate.
 
     Args:
         arguments: ``program.py arguments…`` or ``-m module arguments…``.

@@ -95,7 +95,7 @@ class ServedVehicle:
 
 
 def serve_for_program(kind: str, home: tuple[float, float, float], speedup: float) -> ServedVehicle:
-    """Serve a vehicle on the usual addresses. A vehicle that the program starts itself replaces it.
+    """Serve a vehicle on the usual addresses, until the program starts a vehicle of its own.
 
     Raises:
         InvalidArgument: the kind is unknown.
@@ -139,11 +139,11 @@ class SITL:
         use_saved_data: bool = False,
         speedup: float | None = None,
     ) -> None:
-        """Start it. Supports SITL's arguments ``--home``, ``--speedup``, ``--model`` and ``-I``.
+        """Start the vehicle. Supports SITL's arguments ``--home``, ``--speedup``, ``--model`` and ``-I``.
 
         Raises:
-            ChildProcessError: it is running, and ``restart`` is not set.
-            LinkOpenError: its port is in use.
+            ChildProcessError: the vehicle is running, and ``restart`` is not set.
+            LinkOpenError: the port is in use.
         """
         global _for_program
         if self._served is not None and self._served.is_up:
@@ -164,7 +164,7 @@ class SITL:
         self._served = ServedVehicle(kind, addresses, home=home, speedup=speedup or options.speedup or 1.0)
 
     def poll(self) -> int | None:
-        """Return None while it runs, 0 otherwise."""
+        """Return None while the vehicle runs, 0 otherwise."""
         return None if self._served is not None and self._served.is_up else 0
 
     def stop(self) -> None:
@@ -172,7 +172,7 @@ class SITL:
             self._served.stop()
 
     def block_until_ready(self, verbose: bool = False) -> int | None:
-        """Return the result of :meth:`poll`: it is ready once :meth:`launch` has returned."""
+        """Return the result of :meth:`poll` at once, because a launched vehicle is ready."""
         return self.poll()
 
     def complete(self, verbose: bool = False) -> None:

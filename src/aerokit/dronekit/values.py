@@ -85,7 +85,7 @@ class GPSInfo(_Value):
     """GPS receiver: fields of GPS_RAW_INT.
 
     ``eph`` and ``epv`` are dilutions of precision times 100 (65535: unknown), ``fix_type`` is 0 or 1 without a fix,
-    2 for 2D, 3 for 3D and more for better ones, ``satellites_visible`` a number (255: unknown).
+    2 for 2D, 3 for 3D and higher for better fixes, ``satellites_visible`` a number (255: unknown).
     """
 
     _text = "GPSInfo:fix={0.fix_type},num_sat={0.satellites_visible}"

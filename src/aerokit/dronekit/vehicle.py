@@ -66,8 +66,8 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
     """A vehicle: attributes to read and to listen to, orders, parameters, missions.
 
     Created by :func:`connect`; ``connect(…, vehicle_class=…)`` creates a subclass, which passes its one argument on and
-    may add listeners and attributes. Can be used from any thread. Callbacks run in order on a thread of their own, and
-    may use it, too. A context manager; :meth:`close` closes the connection.
+    may add listeners and attributes. Can be used from any thread. Callbacks run in order on a separate thread, and may
+    use the vehicle too. A context manager; :meth:`close` closes the connection.
     """
 
     def __init__(self, handler: MAVConnection) -> None:
@@ -85,7 +85,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
 
     @property
     def channels(self) -> Channels:
-        """RC channels by number, and ``.overrides`` of them."""
+        """RC channels by number; ``.overrides`` overrides them."""
         return self._channels
 
     @property
@@ -113,7 +113,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
 
     @property
     def commands(self) -> CommandSequence:
-        """The mission: download, change, upload."""
+        """The vehicle's mission, to download, change and upload."""
         return self._commands
 
     @property
@@ -210,7 +210,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
                 raise APIException after a silence of this length (0 or less: never).
 
         Raises:
-            APIException: no vehicle was found in time; the text says what was received instead.
+            APIException: no vehicle was found in time; the text describes what was received instead.
         """
         with self._dk_initializing:
             if self._dk.aio_or_none is not None:
@@ -230,7 +230,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
                 raise APIException(str(error)) from None
 
     def close(self) -> None:
-        """Wait shortly for answers to recent orders, then close the link and end the threads.
+        """Wait up to two seconds for answers to recent orders, then close the link and end the threads.
 
         Idempotent; can be called from any thread, including callbacks. Releases overridden RC channels
         (``connect(release_overrides=)``) and sends nothing else: a vehicle in the air continues what it does. Waiting
@@ -252,7 +252,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         return not mode_name(self._dk.aio, mode_code).endswith(f" {mode_code}")
 
     def _dk_begin(self, aio: AsyncVehicle, tasks: BackgroundTasks) -> None:
-        """Start receiving, on the loop, in the same turn in which the vehicle was found. Weak references only."""
+        """Start receiving in the loop iteration in which the vehicle was found. Uses weak references only."""
         core = self._dk
         core.begin(aio, tasks)
         self._handler.vehicle, self._handler.note_sent = self, aio.note_sent
@@ -364,14 +364,14 @@ def connect(
         use_native: ignored.
         release_overrides: release RC channels that are still overridden when the connection ends. False leaves them, as
             DroneKit does, until the vehicle times out (ArduPilot: RC_OVERRIDE_TIME).
-        heartbeat: content of the own HEARTBEAT, and how long it is sent without a sign that the program is alive:
-            reading an attribute, an order, a wait, a called listener (60 seconds; :class:`aerokit.OwnHeartbeat`). None
+        heartbeat: content of our HEARTBEAT, and the time for which it continues after the program last read an
+            attribute, gave an order, waited, or returned from a listener (60 s; :class:`aerokit.OwnHeartbeat`). None
             sends none.
 
     Raises:
         OSError: the link cannot be opened (ConnectionRefusedError, socket.gaierror, serial.SerialException …).
         ValueError: an argument is wrong; for an invalid connection string also an OSError.
-        APIException: no vehicle was found in time; the text says what was received instead.
+        APIException: no vehicle was found in time; the text describes what was received instead.
         TimeoutError: ``wait_ready`` was not satisfied in time. On any error everything is closed.
     """
     from aerokit.dronekit.mavlink import MAVConnection

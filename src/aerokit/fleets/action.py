@@ -39,7 +39,7 @@ class FleetAction:
     """One run of an action.
 
     Args:
-        context: of the fleet.
+        context: context of the fleet.
         name: appears in results, events and errors.
         members: members to run it on; unavailable ones are skipped.
         execute: called with each available member.
@@ -222,14 +222,14 @@ class FleetAction:
                     partial(self._send_order, member, self._orders[member.name]),
                     f"aerokit policy {member.name}",
                 )
-        # Cancel running actions only after the policy's orders are given: the orders overrule them, so that the
-        # cancelled actions do not send a hold of their own.
+        # The policy's orders come first: they supersede those of the running actions, so that these send no hold when
+        # they are cancelled.
         asyncio.get_running_loop().call_soon(self._cancel, [member for member in available if member.name in orders])
         if not self._orders:
             self._publish_completed()
 
     def _set_stopped(self, member: Member, failed: Member, order: PolicyOrder | None) -> None:
-        ordered = f"; the policy ordered it to {order}" if order else ""
+        ordered = f"; the policy ordered {member.name} to {order}" if order else ""
         error = OperationRejected(f"{self.name}: stopped because {failed.name} failed{ordered}")
         self._stopped[member.name] = self._outcomes[member.name] = error
 
@@ -349,10 +349,10 @@ class FleetContext:
             action.on_member_unavailable(member)
 
 
-# Actions that a failure of one member does not stop for the others.
+# Actions that continue for the other members when one member fails.
 FLIGHT_ENDING_ACTIONS = ("hold", "land", "return_to_launch", "disarm", "mission.pause")
 
-# Actions after whose cancellation no member has to hold.
+# Actions that need no hold when they are cancelled.
 ACTIONS_ON_GROUND = ("arm", "wait_ready", "upload")
 
 

@@ -52,7 +52,7 @@ class Actions(SelectionBase):
         """
         if isinstance(action, str):
             for member in self:
-                _method(member, action)  # fail before any member has started
+                _method(member, action)  # an unknown name fails before any member has started
             name = method = action
 
             async def execute(member: Member) -> Any:
@@ -60,7 +60,7 @@ class Actions(SelectionBase):
 
         else:
             if arguments or options:
-                raise InvalidArgument("do: arguments and options are for an action given by name")
+                raise InvalidArgument("do: arguments and options are allowed only for an action given by name")
             execute, name = action, getattr(action, "__name__", "action")  # type: ignore[assignment]
         return await self._run(name, execute, timeout=timeout, stagger_s=stagger_s)
 
@@ -139,7 +139,7 @@ class Actions(SelectionBase):
         """Change the flight mode; see :meth:`aerokit.Vehicle.set_mode`.
 
         Args:
-            mode: name as in the autopilot's documentation, or its number.
+            mode: name as in the autopilot's documentation, or number.
             timeout: seconds for each member.
 
         Raises:
@@ -163,7 +163,7 @@ class Actions(SelectionBase):
             description: name of the barrier in errors.
 
         Raises:
-            FleetError: it did not become true for a member; this member has then failed, as in any action.
+            FleetError: the condition did not become true for a member, which counts as failed in this action.
         """
 
         async def until(member: Member) -> None:
@@ -173,7 +173,7 @@ class Actions(SelectionBase):
                 while not condition(member):
                     vehicle.connection.raise_if_ended()
                     if vehicle.connection.now() >= deadline:
-                        missing = [each.name for each in self if each.is_available and not condition(each)]
+                        missing = [member.name for member in self if member.is_available and not condition(member)]
                         raise OperationTimeout(
                             f"{description}: not reached within {timeout:g} s by {', '.join(missing)}"
                         )
@@ -195,7 +195,7 @@ class Actions(SelectionBase):
             timeout: seconds until all of them are there.
 
         Raises:
-            FleetError: a member did not get there.
+            FleetError: a member did not reach the altitude in time.
         """
 
         def is_at_altitude(member: Member) -> bool:

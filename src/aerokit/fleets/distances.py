@@ -29,7 +29,8 @@ def position_of(member: Member, max_age_s: float = POSITION_MAX_AGE_S) -> Positi
     """Return the position of a member.
 
     Raises:
-        ValueUnknownError, StaleValueError: it is unknown or older than ``max_age_s``; the text names the member.
+        ValueUnknownError, StaleValueError: the position is unknown or older than ``max_age_s``; the text names the
+            member.
     """
     try:
         return member.vehicle.position.fresh(max_age_s)
@@ -80,7 +81,7 @@ class LocalOrigin:
         """Return the current position of a member.
 
         Raises:
-            ValueUnknownError, StaleValueError: it is unknown.
+            ValueUnknownError, StaleValueError: the position is unknown.
         """
         here = position_of(member)
         return self.to_local(here, altitude_amsl(member, here))
@@ -89,7 +90,7 @@ class LocalOrigin:
 class DistanceMonitor:
     """Compares the positions of flying members four times a second.
 
-    A pair is reported once, and again after it has been well apart in between (``RESET_FACTOR``).
+    A pair is reported again only after its distance has exceeded the minimum by the factor ``RESET_FACTOR``.
     """
 
     def __init__(self, context: FleetContext, min_distance_m: float, *, holds: bool) -> None:

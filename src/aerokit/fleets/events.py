@@ -80,7 +80,8 @@ class MemberFailed(FleetEvent):
 class PolicyApplied(FleetEvent):
     """``member`` failed in ``action``, and the policy sends ``orders`` to others.
 
-    ``orders`` maps names to ``"hold"``, ``"land"`` or ``"return"``; ``skipped`` maps the rest to the reason.
+    ``orders`` maps names to ``"hold"``, ``"land"`` or ``"return"``; ``skipped`` maps members without an order to the
+    reason.
     """
 
     action: str

@@ -27,9 +27,9 @@ __all__ = ["Fleet", "Selection"]
 class Selection(Actions, Missions, Formations, Shows):
     """Some members of a fleet: ``fleet.group("alpha")``, ``fleet["north/*"]``.
 
-    Every action goes to all available members at once (not lost, taken over or released), and returns a
-    :class:`FleetResult` when each of them is done. If one fails, the fleet's policy decides what the others do, and the
-    action ends when they have done it. If the action is cancelled, all of them hold.
+    Every action runs on all available members at once: those that are not lost, taken over or released. It returns a
+    :class:`FleetResult` when all of them are done. If a member fails, the fleet's policy orders what the others do, and
+    the action ends when they have done it. If the action is cancelled, all of them hold.
     """
 
     def __getitem__(self, pattern: str) -> Selection:
@@ -90,7 +90,7 @@ class Fleet(Selection):
             self._context.members[member].reclaim()
 
     def release(self, name: str, reason: str = "released by the program") -> None:
-        """Exclude members from actions until :meth:`reclaim`. Sends nothing: they continue what they do.
+        """Exclude members from actions until :meth:`reclaim`. Sends nothing: they continue what they are doing.
 
         Args:
             name: a member's name or a pattern.

@@ -41,7 +41,7 @@ __all__ = ["Following", "Formation", "Formations", "Offset", "follow_velocity"]
 
 LEADER_MAX_AGE_S = 1.5
 
-# Speed per metre of distance to the own place, in 1/s.
+# Speed per metre of distance to the member's place, in 1/s.
 FOLLOW_GAIN = 0.6
 
 
@@ -102,7 +102,7 @@ class Formation(Snapshot):
 
     def min_distance_m(self) -> float:
         """Return the smallest distance between any two places, including the leader's."""
-        places = [(each.north_m, each.east_m, each.up_m) for each in (Offset(), *self.offsets.values())]
+        places = [(offset.north_m, offset.east_m, offset.up_m) for offset in (Offset(), *self.offsets.values())]
         pairs = (math.dist(one, other) for number, one in enumerate(places) for other in places[:number])
         return min(pairs, default=math.inf)
 
@@ -173,7 +173,7 @@ class Following:
 
     def error_m(self, name: str) -> float:
         """Return the distance of a follower from its place in metres; infinite if unknown."""
-        member = next((each for each in self._followers if each.name == name), None)
+        member = next((follower for follower in self._followers if follower.name == name), None)
         try:
             return math.inf if member is None else math.hypot(*self._to_go(member))
         except (ValueUnknownError, OperationRejected):
@@ -185,10 +185,10 @@ class Following:
         return self._reason
 
     def raise_if_stopped(self) -> None:
-        """Raise if following has stopped early. For loops in the block.
+        """Raise if following has stopped early. Call it in the loops of the block.
 
         Raises:
-            SetpointStreamStopped: it has stopped; the text has the reason.
+            SetpointStreamStopped: following has stopped; the text has the reason.
         """
         if self._reason:
             self._was_raised = True
@@ -224,8 +224,8 @@ class Following:
                 # Wait for the cancellation by `_stop_if_leader_lost`: leaving the stream then makes the vehicle hold.
                 await asyncio.Event().wait()
         finally:
-            # Soon rather than at the end of the action: the policy may still land the others. Not now: the action has
-            # yet to record the failure.
+            # Deferred, because the action has yet to record the failure, but not until the end of the action: the
+            # policy may still land the others.
             asyncio.get_running_loop().call_soon(self._stop_if_no_followers)
 
     def _stop_if_no_followers(self) -> None:

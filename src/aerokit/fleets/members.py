@@ -25,15 +25,15 @@ class MemberState(enum.Enum):
     """State of a member in its fleet."""
 
     ACTIVE = "active"
-    """It takes part in actions."""
+    """The member takes part in actions."""
     LOST = "lost"
-    """Its heartbeats stopped or its link closed. The fleet sends it no orders until it is back."""
+    """The member's heartbeats stopped or its link closed. The fleet sends it no orders until it is back."""
     TAKEN_OVER = "taken over"
-    """A pilot, a failsafe or another program controls it. The fleet sends it no orders until ``reclaim``."""
+    """A pilot, a failsafe or another program controls the member. The fleet sends it no orders until ``reclaim``."""
     FAILED = "failed"
-    """It failed in its last action. It takes part in the next one."""
+    """The member failed in its last action. It takes part in the next one."""
     RELEASED = "released"
-    """The program released it. The fleet sends it no orders until ``reclaim``."""
+    """The program released the member. The fleet sends it no orders until ``reclaim``."""
 
 
 class Member:
@@ -47,16 +47,16 @@ class Member:
         self.vehicle: Vehicle = vehicle
         """The vehicle object, for anything that the fleet does not do."""
         self.group: str = group
-        """The group that it is in, or an empty string."""
+        """The member's group, or an empty string."""
         self.role: str = role
-        """Its role, or an empty string."""
+        """The member's role, or an empty string."""
         self.state: MemberState = MemberState.ACTIVE
-        """Its state in the fleet."""
+        """The member's state in the fleet."""
         self.reason: str = ""
-        """The cause of its state; empty while it is ACTIVE."""
+        """The cause of the state; empty while it is ACTIVE."""
         self._lost_at = 0.0
         self._control_when_reclaimed: tuple[object, object] | None = None
-        # MAV_STATE when the program reclaimed it: this failsafe does not count as a takeover.
+        # MAV_STATE when the program reclaimed the member: this failsafe does not count as a takeover.
         self._ignored_failsafe: int | None = None
         self._detach: list[Detach] = []
         self._publish: Callable[[FleetEvent], None] = lambda _: None
@@ -64,7 +64,7 @@ class Member:
 
     @property
     def is_available(self) -> bool:
-        """True while the fleet can order it: it is neither lost, taken over nor released."""
+        """True while the fleet can send orders to the member: it is neither lost, taken over nor released."""
         return self.state in (MemberState.ACTIVE, MemberState.FAILED)
 
     @property
@@ -83,14 +83,15 @@ class Member:
     # ------------------------------------------------------------------- called by the fleet
 
     def start_monitoring(self, publish: Callable[[FleetEvent], None], on_unavailable: Callable[[Member], None]) -> None:
-        """Subscribe to the vehicle. ``on_unavailable`` is called when it is lost or taken over."""
+        """Subscribe to the vehicle. ``on_unavailable`` is called when the member is lost or taken over."""
         self._publish, self._on_unavailable = publish, on_unavailable
         vehicle, bus = self.vehicle, self.vehicle.connection.bus
         self._detach = [
             bus.attach_event(VehicleSilent, self._on_silent),
             bus.attach_event(VehicleRecovered, self._on_back),
             vehicle.mode.observe(self._refresh_soon),
-            # every_arrival: a HEARTBEAT without a change still has more to evaluate than the CURRENT_MODE before it.
+            # every_arrival: CURRENT_MODE may already have reported the mode, but the HEARTBEAT reports more than the
+            # mode.
             vehicle.armed.observe(self._refresh_soon, every_arrival=True),
             vehicle.connection.on_end(self._on_end),
         ]
@@ -113,7 +114,7 @@ class Member:
             self._on_unavailable(self)
 
     def record_failure(self, action: str, error: Exception) -> None:
-        """Set the state to FAILED, unless it is lost or taken over, and publish :class:`MemberFailed`."""
+        """Set the state to FAILED, unless the member is lost or taken over, and publish :class:`MemberFailed`."""
         self.refresh()
         if self.is_available:
             self._change(MemberState.FAILED, str(error))
@@ -125,7 +126,7 @@ class Member:
             self._change(MemberState.ACTIVE, "")
 
     def reclaim(self) -> None:
-        """Make it available again. The takeover or failsafe that is active now no longer counts."""
+        """Make the member available again. The takeover or failsafe that is active now no longer counts."""
         self._control_when_reclaimed = self._current_control()
         self._ignored_failsafe = self.vehicle.system_status.latest
         self.vehicle._arbiter.clear_failsafe()
@@ -161,7 +162,7 @@ class Member:
         return self.vehicle._arbiter.newest, self.vehicle.mode.latest
 
     def _refresh_soon(self, *_: object) -> None:
-        # Once the whole HEARTBEAT is read: a vehicle that landed disarms and changes its mode in the same one.
+        # Deferred until the whole HEARTBEAT is read: after a landing it reports disarming and a mode change together.
         asyncio.get_running_loop().call_soon(self.refresh)
 
     def _on_silent(self, event: VehicleSilent) -> None:

@@ -269,8 +269,8 @@ async def find_systems(
             if searched and count is None:
                 await anyio.sleep(DISCOVERY_S)
     finally:
-        for each in detach:
-            each()
+        for function in detach:
+            function()
     if not is_complete():
         reasons = "".join(
             f"\n  - network {name}: {explain_no_vehicle(networks[name], None)}" for name in searched if not found[name]

@@ -37,7 +37,7 @@ class PathPoint(Snapshot):
         return self.north_m, self.east_m, self.up_m
 
     def _check(self) -> None:
-        if not all(math.isfinite(each) for each in (self.t_s, *self.place)):
+        if not all(math.isfinite(value) for value in (self.t_s, *self.place)):
             raise InvalidArgument(f"{self!r} is not allowed: finite numbers")
 
 
@@ -128,7 +128,7 @@ def min_path_distance(one: Path, other: Path, *, slack_s: float = math.inf, belo
 
 def horizontal_distance(one: tuple[LocalPoint, LocalPoint], other: tuple[LocalPoint, LocalPoint]) -> float:
     """Return the distance in metres between two straight lines as seen from above, regardless of time."""
-    (a, b), (c, d) = [tuple(PathPoint(0.0, place[0], place[1], 0.0) for place in each) for each in (one, other)]
+    (a, b), (c, d) = [tuple(PathPoint(0.0, place[0], place[1], 0.0) for place in path) for path in (one, other)]
     found = _closest((a, b), (c, d), math.inf)
     assert found is not None
     return found.distance_m

@@ -1,4 +1,4 @@
-"""Failure policies: what the other members do when one fails. Without IO."""
+"""Failure policies: orders to the other members when one member fails. Without IO."""
 
 from __future__ import annotations
 
@@ -56,19 +56,19 @@ class PolicyRules:
     """The policy of a fleet and those of its groups. The group of the failed member selects the policy."""
 
     def __init__(self, policy: Policy, of_groups: Mapping[str, Policy]) -> None:
-        for name, each in (
+        for name, candidate in (
             ("on_error", policy),
             *((f"on_error_by_group[{group!r}]", of_groups[group]) for group in of_groups),
         ):
-            if not callable(each) and each not in get_args(PolicyName):
+            if not callable(candidate) and candidate not in get_args(PolicyName):
                 raise InvalidArgument(
-                    f"{name} = {short_repr(each)} is not allowed: one of"
+                    f"{name} = {short_repr(candidate)} is not allowed: one of"
                     f" {', '.join(get_args(PolicyName))}, or a function"
                 )
         self._policy, self._of_groups = policy, dict(of_groups)
 
     def decide(self, failure: MemberFailure) -> dict[str, PolicyOrder]:
-        """Return the order for each of the others; members that are missing in it continue.
+        """Return the order for each of the others; members without an order continue.
 
         Raises:
             InvalidArgument: the policy function returned something else, or a name that is not among the others.

@@ -49,7 +49,7 @@ class Deconfliction(Snapshot):
 
     - ``"clear"``: no conflicts;
     - ``"layers"``: all climb to ``heights_m``, cross there, and descend after all have crossed;
-    - ``"corridors"``: each starts after ``delays_s``;
+    - ``"corridors"``: each vehicle starts after its delay in ``delays_s``;
     - ``"refused"``: the conflicts cannot be resolved.
 
     ``conflicts`` are those of the original paths. Heights are metres above sea level.
@@ -67,7 +67,7 @@ def find_conflicts(paths: Sequence[Path], min_distance_m: float, *, slack_s: flo
     """Return all pairs of paths that come closer than ``min_distance_m``.
 
     Args:
-        paths: of the vehicles.
+        paths: paths of the vehicles.
         min_distance_m: metres.
         slack_s: how early or late one vehicle may be relative to another, in seconds; infinite: ignore times.
     """
@@ -94,8 +94,8 @@ def separate_by_altitude(
     so only movements of the same phase have to be separated.
 
     Args:
-        routes: of the moving vehicles.
-        stationary: positions of the others, on the ground or in the air.
+        routes: routes of the moving vehicles.
+        stationary: positions of the other vehicles, on the ground or in the air.
         min_distance_m: minimum distance in metres, also between layers.
         max_altitude_m: highest layer in metres above sea level.
     """
@@ -105,10 +105,14 @@ def separate_by_altitude(
     reason = _vertical_conflict(routes, stationary, min_distance_m)
     if reason:
         return Deconfliction("refused", reason, min_distance_m, conflicts)
-    base = max(max(each.start[2], each.target[2]) for each in routes)
+    base = max(max(route.start[2], route.target[2]) for route in routes)
     layers: dict[str, int] = {}
     for route in routes:
-        taken = {layers[each.name] for each in routes if each.name in layers and _cross(each, route, min_distance_m)}
+        taken = {
+            layers[earlier.name]
+            for earlier in routes
+            if earlier.name in layers and _cross(earlier, route, min_distance_m)
+        }
         layer = 0
         while layer in taken or _meets(route, stationary, base + layer * min_distance_m, min_distance_m):
             layer += 1
@@ -134,8 +138,8 @@ def separate_by_time(
     """Separate conflicting routes by time.
 
     Args:
-        routes: of the moving vehicles.
-        stationary: positions of the others.
+        routes: routes of the moving vehicles.
+        stationary: positions of the other vehicles.
         min_distance_m: minimum distance in metres.
         speed_m_s: ground speed of all moving vehicles.
         slack_s: how early or late one vehicle may be relative to another, in seconds.
@@ -149,13 +153,13 @@ def separate_by_time(
     for _ in routes:
         delays, blocked, blocker = _delays(order, rests, min_distance_m, speed_m_s, slack_s, max_delay_s)
         if blocked is None:
-            in_order = {each.name: delays[each.name] for each in routes}
+            in_order = {route.name: delays[route.name] for route in routes}
             reason = f"{_pairs(conflicts)} come too close; starts are delayed by up to {max(delays.values()):g} s"
             return Deconfliction("corridors", reason, min_distance_m, conflicts, {}, in_order)
         refusal = f"{blocked.name} would have to wait for {blocker} longer than {max_delay_s:g} s"
         order = [
             blocked,
-            *(each for each in order if each is not blocked),
+            *(route for route in order if route is not blocked),
         ]  # retry with the blocked one first
     return Deconfliction("refused", refusal, min_distance_m, conflicts)
 
@@ -164,7 +168,7 @@ def _conflicts(
     routes: Sequence[Route], stationary: Mapping[str, LocalPoint], min_distance_m: float
 ) -> tuple[Conflict, ...]:
     _check_distance(min_distance_m)
-    paths = [Path.straight(each.name, each.start, each.target, 1.0) for each in routes]
+    paths = [Path.straight(route.name, route.start, route.target, 1.0) for route in routes]
     moving = find_conflicts(paths, min_distance_m)
     rests = [Path(name, (PathPoint(0.0, *place),)) for name, place in stationary.items()]
     found = list(moving)
@@ -205,7 +209,7 @@ def _delays(
 def _vertical_conflict(routes: Sequence[Route], stationary: Mapping[str, LocalPoint], min_distance_m: float) -> str:
     """Return why the vehicles cannot climb and descend vertically; empty if they can."""
     for what in ("start", "target"):
-        ends = {each.name: getattr(each, what) for each in routes}
+        ends = {route.name: getattr(route, what) for route in routes}
         # A stationary vehicle well below an end point is not on the vertical path above it.
         for name, place in ends.items():
             near = {other: there for other, there in stationary.items() if there[2] > place[2] - min_distance_m}
@@ -236,7 +240,7 @@ def _first_near(path: Path, others: Sequence[Path], min_distance_m: float, slack
 
 
 def _pairs(conflicts: Sequence[Conflict]) -> str:
-    texts = [f"{each.name} and {each.other} ({each.distance_m:.1f} m)" for each in conflicts[:3]]
+    texts = [f"{conflict.name} and {conflict.other} ({conflict.distance_m:.1f} m)" for conflict in conflicts[:3]]
     more = len(conflicts) - len(texts)
     return ", ".join(texts) + (f" and {more} more pairs" if more else "")
 

@@ -43,7 +43,7 @@ class Show(Snapshot):
     @property
     def duration_s(self) -> float:
         """Seconds until the last trajectory ends."""
-        return max(each.ends_at_s for each in self.tracks.values())
+        return max(track.ends_at_s for track in self.tracks.values())
 
     def top_speed_m_s(self, name: str) -> float:
         """Return the speed of the fastest leg of one track, in m/s."""
@@ -67,7 +67,7 @@ class Show(Snapshot):
         """
         missing = [name for name in self.tracks if name not in names]
         if missing or len(set(names.values())) < len(self.tracks):
-            raise InvalidArgument(f"names: {missing or 'one member for two tracks'}: each track needs its own member")
+            raise InvalidArgument(f"names: {f'no member for {missing}' if missing else 'one member for two tracks'}")
         return type(self)({names[name]: track.replace(name=names[name]) for name, track in self.tracks.items()})
 
     @classmethod
@@ -80,7 +80,7 @@ class Show(Snapshot):
         parsed: dict[str, Path] = {}
         for name, points in tracks.items():
             try:
-                parsed[name] = Path(name, [PathPoint(*map(float, each)) for each in points])
+                parsed[name] = Path(name, [PathPoint(*map(float, row)) for row in points])
             except (TypeError, ValueError) as error:
                 raise InvalidArgument(f"track {name!r}: {error}") from None
         return cls(parsed)
@@ -107,7 +107,7 @@ class Show(Snapshot):
             InvalidArgument: the text is not in this format; the error names the line.
         """
         rows = csv.reader(io.StringIO(text))
-        if [each.strip() for each in next(rows, [])] != COLUMNS:
+        if [cell.strip() for cell in next(rows, [])] != COLUMNS:
             raise InvalidArgument(f"line 1 is not {','.join(COLUMNS)}")
         points: dict[str, list[PathPoint]] = {}
         for row in rows:
@@ -119,7 +119,7 @@ class Show(Snapshot):
                 points.setdefault(name, []).append(PathPoint(t_s, north_m, east_m, up_m))
             except ValueError as error:
                 raise InvalidArgument(f"line {rows.line_num}: {error}") from None
-        return cls({name: Path(name, each) for name, each in points.items()})
+        return cls({name: Path(name, path) for name, path in points.items()})
 
     @classmethod
     def from_json(cls, text: str) -> Self:
@@ -143,12 +143,12 @@ class Show(Snapshot):
         writer = csv.writer(out, lineterminator="\n")
         writer.writerow(COLUMNS)
         for name, track in self.tracks.items():
-            writer.writerows([name, each.t_s, *each.place] for each in track.points)
+            writer.writerows([name, point.t_s, *point.place] for point in track.points)
         return out.getvalue()
 
     def to_json(self) -> str:
         """Return the show as JSON text."""
-        tracks = {name: [[each.t_s, *each.place] for each in track.points] for name, track in self.tracks.items()}
+        tracks = {name: [[point.t_s, *point.place] for point in track.points] for name, track in self.tracks.items()}
         return json.dumps({"format": FORMAT, "version": VERSION, "tracks": tracks})
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -158,7 +158,7 @@ class Show(Snapshot):
     def _check(self) -> None:
         object.__setattr__(self, "tracks", dict(self.tracks))
         if not self.tracks:
-            raise InvalidArgument("tracks: a show needs at least one")
+            raise InvalidArgument("tracks is empty: a show needs at least one track")
         for name, track in self.tracks.items():
             if not isinstance(track, Path) or track.begins_at_s < 0:
                 raise InvalidArgument(f"tracks: {name!r} needs a Path that begins at 0 s or later")

@@ -48,7 +48,7 @@ __all__ = [
 # Correction speed per metre of deviation from the track, in 1/s.
 TRACK_GAIN = 0.8
 
-# Speed limit while catching up: this factor of the track's speed, plus this many m/s.
+# Speed limit while catching up: the track's speed times this factor, plus this many m/s.
 CATCH_UP_FACTOR, CATCH_UP_M_S = 1.5, 1.0
 
 CONFLICT_SLACK_S = 0.5
@@ -140,7 +140,7 @@ class TrackDeviation(Snapshot):
 
 
 class ShowReport(Snapshot):
-    """Result of a show. Times are of the vehicles' own clocks, converted with ``clocks``.
+    """Result of a show. Times are from the vehicles' own clocks, converted with ``clocks``.
 
     ``lag_spread_s`` is the difference between the largest and the smallest lag. ``max_relative_error_m`` is the largest
     error of the vector between any two members. Both are None if unknown.
@@ -154,7 +154,7 @@ class ShowReport(Snapshot):
 
 
 def track_deviation(path: Path, samples: Sequence[tuple[float, LocalPoint]]) -> TrackDeviation:
-    """Compare positions, given with seconds of the show, with a path.
+    """Compare a path with measured positions, each with its time in seconds of the show.
 
     The lag is the time shift of the path that fits the samples best (least squares along the track).
     """
@@ -169,7 +169,7 @@ def track_deviation(path: Path, samples: Sequence[tuple[float, LocalPoint]]) -> 
             moved += sum(v * v for v in velocity)
     if not errors:
         return TrackDeviation(math.nan, math.nan, None, 0)
-    rms = math.sqrt(sum(each * each for each in errors) / len(errors))
+    rms = math.sqrt(sum(error * error for error in errors) / len(errors))
     return TrackDeviation(max(errors), rms, along / moved if moved else None, len(errors))
 
 
@@ -349,8 +349,8 @@ class Shows(Travel):
             result = await self._run("show", fly, names=names)
         samples = {name: recorder.samples for name, recorder in recorders.items()}
         tracks = {name: track_deviation(path, samples[name]) for name, path in show.tracks.items()}
-        lags = [each.lag_s for each in tracks.values() if each.lag_s is not None]
-        offsets = {name: each for name, each in clocks.items() if isinstance(each, ClockOffset)}
+        lags = [track.lag_s for track in tracks.values() if track.lag_s is not None]
+        offsets = {name: offset for name, offset in clocks.items() if isinstance(offset, ClockOffset)}
         spread_s = max(lags) - min(lags) if lags else None
         relative_m = max_relative_error(show.tracks, samples, show.duration_s)
         return ShowReport(result, tracks, offsets, spread_s, relative_m)

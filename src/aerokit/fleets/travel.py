@@ -1,4 +1,4 @@
-"""``Travel`` and ``Missions``: flying members to targets and missions on paths that are compared before."""
+"""``Travel`` and ``Missions``: flights to targets and missions, on paths that are compared before the flight."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ class Travel(SelectionBase):
         A fleet with a ``min_distance_m`` compares the paths first, and separates crossing paths by altitude.
 
         Args:
-            targets: member's name → target; other members stay where they are. Or a function that returns a member's
-                target.
+            targets: member's name → target, where other members stay where they are; or a function that returns a
+                member's target.
             speed_m_s: ground speed; None: unchanged.
             max_distance_m: reject targets farther than this from the vehicle.
             timeout: seconds for each member and leg; None: no limit.
@@ -356,9 +356,11 @@ class Missions(SelectionBase):
         members = self._require_available(missions)
         first = next(iter(members.values()), None)
         origin = None if first is None else LocalOrigin(position_of(first, math.inf))
-        paths = [] if origin is None else [_path(origin, members[name], each) for name, each in missions.items()]
+        paths = [] if origin is None else [_path(origin, members[name], mission) for name, mission in missions.items()]
         conflicts = find_conflicts([path for path in paths if path is not None], min_m)
-        pairs = ", ".join(f"{each.name} and {each.other} ({each.distance_m:.1f} m)" for each in conflicts[:3])
+        pairs = ", ".join(
+            f"{conflict.name} and {conflict.other} ({conflict.distance_m:.1f} m)" for conflict in conflicts[:3]
+        )
         reason = f"{pairs} come too close" if conflicts else "no paths come too close"
         deconfliction = Deconfliction("refused" if conflicts else "clear", reason, min_m, conflicts)
         self._context.publish(PathsCompared(self._context.now(), 0, "", deconfliction))

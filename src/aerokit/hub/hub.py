@@ -88,7 +88,7 @@ class Hub:
         """Open all endpoints.
 
         Raises:
-            LinkOpenError: one of them, without ``retry_open``, could not be opened; all are closed again.
+            LinkOpenError: an endpoint without ``retry_open`` could not be opened; all are closed again.
             InvalidArgument: two endpoints have the same address and no names.
             BusyError: the hub was entered before.
         """
@@ -121,7 +121,7 @@ class Hub:
         """Open another endpoint, and return its name, address and counters.
 
         Raises:
-            LinkOpenError: it could not be opened and has no ``retry_open``.
+            LinkOpenError: the endpoint could not be opened and has no ``retry_open``.
             InvalidArgument: the address, the name or a message name is wrong; nothing was opened.
             BusyError: the given link is in use.
             ConnectionClosed: the hub or the given link is closed.
@@ -139,7 +139,7 @@ class Hub:
         self._raise_unless_open()
         attachment = self._attachments.pop(name, None)
         if attachment is None:
-            raise InvalidArgument(f"name = {name!r} is not allowed: {', '.join(self._attachments) or 'none'}")
+            raise InvalidArgument(f"no endpoint is named {name!r}; endpoints: {', '.join(self._attachments) or 'none'}")
         attachment.close()
         self._report(attachment, "removed", f"{name} was removed")
         await _closed([attachment])
@@ -147,9 +147,9 @@ class Hub:
     async def share(self, connection: Connection, *, name: str = "program") -> EndpointStatistics:
         """Add an open connection of this program as an endpoint.
 
-        The connection continues as before. Frames that it receives and sends go to the other endpoints; their frames to
-        its vehicles are sent over it, signed if it signs. Other stations need other ids than this program
-        (``source_system``, ``source_component``), because frames for these ids are for the program.
+        The connection continues as before. The other endpoints get every frame that it receives or sends. Their frames
+        for its vehicles are sent over the connection, signed if the connection signs. Other stations must not use this
+        program's ids (``source_system``, ``source_component``), because frames for these ids go to the program.
 
         Raises:
             InvalidArgument: an endpoint has this name already.
@@ -160,7 +160,7 @@ class Hub:
         return (await self._add(Endpoint(SharedLink(connection), name=name))).statistics()
 
     def on_event(self, listener: Callable[[HubEvent], object]) -> Callable[[], None]:
-        """Call ``listener(event)`` for every event; return a function that ends this.
+        """Call ``listener(event)`` for every event; return a function that removes the listener.
 
         The listener must return quickly; its exceptions are logged.
         """
@@ -175,7 +175,7 @@ class Hub:
     def record(self, path: str | os.PathLike[str]) -> None:
         """Record every forwarded frame once to a ``.tlog`` file. An existing file is replaced.
 
-        The recording has no signatures that an endpoint removes, and no SETUP_SIGNING, which contains a key. A full
+        Signatures that an endpoint removes are not recorded. Nor is SETUP_SIGNING, because it contains a key. A full
         disk ends the recording, not the hub.
 
         Raises:
@@ -276,7 +276,7 @@ class Hub:
         port.report(kind, text)
 
     def _on_port_error(self, port: Port, error: Exception) -> None:
-        port.report("internal_error", f"frames to be sent are lost: {error}")
+        port.report("internal_error", f"frames could not be sent and were dropped: {error}")
 
     def _on_background_error(self, error: Exception) -> None:
         logger.error("internal error of aerokit's hub; its endpoints continue", exc_info=error)
@@ -291,7 +291,7 @@ def _period(port: Port, message_id: int) -> float | None:
 
 
 async def _closed(attachments: list[Attachment]) -> None:
-    """Wait until their links are closed, at most `CLOSE_TIMEOUT_S`."""
+    """Wait until the links of these attachments are closed, for at most `CLOSE_TIMEOUT_S`."""
     with anyio.CancelScope(shield=True), anyio.move_on_after(CLOSE_TIMEOUT_S):
         for attachment in attachments:
             await attachment.wait_closed()

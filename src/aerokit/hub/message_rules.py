@@ -1,4 +1,4 @@
-"""Rules by message: filters of an endpoint, what may be dropped from a queue, and the target of a frame."""
+"""Rules that depend on the message: filters of an endpoint, handling in a queue, and the target of a frame."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ ANSWERS = frozenset(
 MAX_RATE_HZ = 1000.0
 
 ORDER_MAX_AGE_S = 1.0
-"""Age at which a queued command is dropped: a late command is worse than none."""
+"""Seconds after which a queued command is dropped, because a late command is worse than none."""
 
 
 class Filters:

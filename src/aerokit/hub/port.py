@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 MAX_QUEUED_FRAMES = 1024
 
 MAX_QUEUED_BYTES = 128 * 1024
-"""A few seconds of a mission or of parameters on a slow radio."""
+"""Maximum size of a queue: a few seconds of a mission or parameter transfer on a slow radio."""
 
 
 class QueuedFrame(NamedTuple):
@@ -129,7 +129,7 @@ class SigningGateway:
     def admitted(self, frame: Frame, unix_time: float) -> Frame | None:
         try:
             refusal = self.signing.check(frame, unix_time)
-        except Exception as error:  # of the program's allow_unsigned
+        except Exception as error:  # allow_unsigned is a function of the program
             self._refused(frame, f"allow_unsigned raised {error!r}")
             return None
         if refusal is not None:
@@ -154,10 +154,10 @@ class SigningGateway:
 
 
 MAX_JOINED_BYTES = 1200
-"""Frames sent together are joined up to this size, which is not fragmented as a datagram."""
+"""Frames sent together are joined up to this size, so that their datagram is not fragmented."""
 UNLIMITED = 1 << 62
 MAX_RATE_LIMITS = 4096
-"""(sender, message) pairs whose rate is tracked."""
+"""Maximum number of (sender, message) pairs whose rate is tracked."""
 
 
 class EndpointCounters:
@@ -243,7 +243,7 @@ class Port:
             return False
         if due is None and len(self._due) >= MAX_RATE_LIMITS:
             self._due.clear()
-        # The average rate is kept for irregular messages, without a burst after a pause.
+        # Irregular messages keep their average rate, but a pause must not be followed by a burst.
         self._due[key] = now + period_s if due is None else max(due, now - period_s) + period_s
         return True
 

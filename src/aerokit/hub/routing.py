@@ -37,7 +37,7 @@ _RADIOS = (109, 166)
 
 
 class ForwardingPlan(Generic[PortT]):
-    """Destinations of frames of one message from one sender at one port to one target."""
+    """Cached routing decision for all frames with the same message, sender, port and target."""
 
     __slots__ = ("key", "message_id", "outs", "rate_limited", "reason", "target")
 
@@ -60,8 +60,7 @@ class ForwardingPlan(Generic[PortT]):
         self.rate_limited: tuple[tuple[PortT, float], ...] = rate_limited
         """Ports that get at most one frame per interval, with the interval in seconds."""
         self.reason: str = reason
-        """Reason for dropping the frames: ``"duplicate"``, ``"loop"``, ``"no_route"``, ``"secret"``, ``"unknown"``; ""
-        if there is just no destination."""
+        """Reason for dropping the frames, a key of `EndpointStatistics.dropped`; "" if there is only no destination."""
 
 
 class RouterPort(Generic[PortT]):
@@ -81,16 +80,16 @@ class RouterPort(Generic[PortT]):
 
 
 class Router(Generic[PortT]):
-    """Learns at which ports senders are, and plans where frames go.
+    """Learns the ports at which each sender is received, and plans the destinations of frames.
 
     - A broadcast goes to all other ports. A broadcast command skips ports through which it would reach a vehicle twice.
-    - A message for one component or system goes to the ports at which it was received, and nowhere while it is unknown.
-      A message for an unknown component of a known system goes to the ports of the system.
-    - A vehicle that is received at several ports is reached by one of them, so that no command arrives twice: the
-      first one, until it has been silent for 3.5 s. A message for a system goes to its autopilot in this way, and to
-      its other components on ports without the autopilot. Ground stations that share ids all get it.
-    - A frame never goes back to its port, and is forwarded once: copies at other ports within two seconds are
-      dropped, as are later ones if they prove a loop. They do not change routes.
+    - A message for one component or system goes to the ports at which its target was received. It is dropped if the
+      target is unknown. A message for an unknown component of a known system goes to the ports of the system.
+    - A vehicle that is received at several ports is reached by the first one until that is silent for 3.5 s, so that
+      no command arrives twice. A message for a system goes to its autopilot in this way, and also to ports with only
+      other components of the system. Ground stations that share ids all get their messages.
+    - A frame never goes back to its port, and is forwarded once. Copies at other ports within two seconds are
+      dropped, and later copies if they prove a loop. Copies do not change routes.
     - SETUP_SIGNING, which contains a key, is not forwarded. Status messages of telemetry radios do not go to vehicles.
 
     At most `MAX_ROUTES` senders are remembered. A new one replaces one without heartbeats, or one that was silent for
@@ -115,8 +114,7 @@ class Router(Generic[PortT]):
         self.on_vehicle: Callable[[PortT], object] | None = None
         """Called when an autopilot is received at a port for the first time."""
         self.on_change: Callable[[HubEventKind, int, PortT, PortT | None], object] | None = None
-        """Called with ``"duplicate_sender"``, ``"route_changed"`` or ``"loop"``, the sender, the port, and its former
-        port (None if that was removed)."""
+        """Called with the kind of event, the sender, its port and its former port (None if that was removed)."""
 
     def add(self, port: PortT) -> RouterPort[PortT]:
         self._count += 1
@@ -148,7 +146,7 @@ class Router(Generic[PortT]):
         sender = self._senders.get(source)
         if sender is None:
             if message_id not in self._offsets and self._targets.is_unknown(message_id):
-                return self._unknown  # its checksum could not be checked: it may be noise
+                return self._unknown  # the frame may be noise, because its checksum could not be checked
             sender = self._add_sender(source, node, now)
         number, recent = node.number, self._recent
         if now >= recent.ends_at or len(recent.newer) >= MAX_RECENT_FRAMES:
@@ -219,8 +217,8 @@ class Router(Generic[PortT]):
     def _is_copy(self, before: tuple[int, int, float], number: int, now: float, is_late: bool) -> bool:
         """Return True if a frame is a copy of an earlier one, not the first frame of a restarted program.
 
-        A restarted program starts its sequence numbers again, and its first command may equal an earlier one; it must
-        not be lost. It comes from a new port, after the former port was removed, or from the same port after a while.
+        A restarted program starts its sequence numbers again. Its first command may equal an earlier one and must not
+        be lost. It arrives at a new port after the former port was removed, or at the same port after a while.
         """
         first, count, at = before
         if first == number:

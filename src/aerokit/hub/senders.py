@@ -22,11 +22,13 @@ DUPLICATE_WINDOW_S = 2.0
 """A frame with the same sender, number and checksum from another port within this time is a duplicate."""
 
 REPEAT_WINDOW_S = 0.5
-"""The same for a late frame from the same port."""
+"""A frame with an out-of-order number that was received at the same port within this time is a duplicate."""
 
 LOOP_WINDOW_S = 60.0
-"""Time for which a frame that returns over another port is recognised. It is below 256 s, in which the sequence numbers
-of a sender of heartbeats only repeat."""
+"""Time for which a frame that returns over another port is recognised.
+
+It is below 256 s, after which the sequence numbers of a component that sends only heartbeats repeat.
+"""
 
 MIN_LOOP_FRAMES = 8
 """Returning frames of one sender that prove a loop. Fewer may be equal by chance, if a vehicle has two radios."""
@@ -58,13 +60,13 @@ class Sender:
         self.system_id: int = source & 0xFF
         self.component_id: int = source >> 8
         self.number: int = number
-        """Number of the port by which it is reached, if one is enough."""
+        """Number of the port to which messages for this sender go, if one port is enough."""
         self.received_at: float = now
         """Time of the last frame at that port."""
         self.ports: dict[int, float] = {number: now}
-        """All ports at which it was received; times are of ports other than `number`."""
+        """Port number → time of the last frame there. For `number`, see :attr:`received_at` instead."""
         self.is_vehicle: bool = False
-        """True if its HEARTBEAT is not of a ground station: it is then reached by one port only."""
+        """True if its HEARTBEAT is not of a ground station. Messages then go to one port only."""
         self.is_autopilot: bool = False
         self.reported: set[int] = set()
         """Ports already known to lead to this autopilot."""
@@ -105,7 +107,7 @@ class Sender:
 
 
 class RecentFrames:
-    """Frames of the last one to two `LOOP_WINDOW_S`, in two generations, so that nothing is searched for expiry."""
+    """Recent frames in two generations of `LOOP_WINDOW_S` each. A whole generation expires, without a search."""
 
     __slots__ = ("ends_at", "newer", "older")
 
@@ -166,7 +168,7 @@ class IdentityGuard:
         if isinstance(event, RouteChanged):
             source = event.system_id, event.component_id
             self._reported_at.pop(source, None)
-            text = f"{source[0]}/{source[1]} is reached here now, no longer at {event.before}"
+            text = f"messages for {source[0]}/{source[1]} are sent here now, no longer to {event.before}"
             self._report("route_changed", self._current_peer, text)
         elif isinstance(event, DuplicateSender):
             source = event.system_id, event.component_id

@@ -24,7 +24,7 @@ logger: logging.Logger = logging.getLogger("aerokit")
 
 
 class SharedLink(Link):
-    """Link that exchanges the frames of a connection with a hub: received and sent ones, and those for its vehicles.
+    """Link between a hub and a connection: the hub gets all frames of the connection and sends frames to its vehicles.
 
     The connection stays open when this link is closed.
     """
@@ -89,13 +89,13 @@ class SharedLink(Link):
         """See `Link.wait_closed`."""
 
     def _check_ids(self, frame: Frame) -> None:
-        """Report another station with our ids: each would take the vehicle's answers to the other for its own."""
+        """Report another station with our ids, because both would process the vehicle's answers to the other."""
         ours = self._connection.source_system, self._connection.source_component
         if (frame.system_id, frame.component_id) == ours:
             self._is_duplicate_reported = True
             logger.warning(
-                "another station on the shared link has the same ids %d/%d as this program: each takes answers to the"
-                " other for its own; give this program other ids (source_system=, source_component=)",
+                "another station on the shared link uses this program's ids %d/%d, so that both process the answers to"
+                " the other; give this program other ids (source_system=, source_component=)",
                 *ours,
             )
             self._connection.bus.publish(DuplicateSender(self._connection.now(), *ours))
@@ -143,4 +143,4 @@ def _frames(data: bytes) -> Iterator[bytes]:
 
 
 def _ignore(frame: Frame, why: str) -> None:
-    """Do nothing, because the connection itself verifies received frames."""
+    """Do nothing, because the connection verifies received frames."""

@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.framer import Framer
 
-# Polling of full links: the interval is doubled while none of them accepts data.
+# Interval at which full links are polled. It is doubled while no link accepts data.
 MIN_POLL_INTERVAL_S = 0.01
 MAX_POLL_INTERVAL_S = 0.08
 
-# Larger bursts are written at once.
+# Frames are written after this many of a burst, before its end.
 MAX_BURST_FRAMES = 256
 
 

@@ -25,8 +25,9 @@ class Endpoint(Snapshot):
     """
 
     address: str | Link
-    """A connection string such as ``"tcpin:0.0.0.0:5760"``, or an unopened link, which is not reopened when it is
-    lost.
+    """A connection string such as ``"tcpin:0.0.0.0:5760"``, or an unopened link.
+
+    A lost link object is not reopened.
     """
     name: str = ""
     """Name of the endpoint; empty: its address."""
@@ -39,8 +40,9 @@ class Endpoint(Snapshot):
     read_only: bool = False
     """True to forward nothing that is received here, not even heartbeats."""
     signing: Signing | None = None
-    """Key that signs frames sent here; frames received without its signature are refused. Frames inside the hub are
-    not signed.
+    """Key that signs frames sent here; frames received without its signature are refused.
+
+    Frames inside the hub are not signed.
     """
     peers: PeerFilter | None = None
     """IP addresses and networks to accept, for udpin, udpbcast and tcpin; None: all."""
@@ -138,13 +140,13 @@ class HubEvent(Snapshot):
     """An event of one endpoint."""
 
     at_s: float
-    """Event loop time in seconds."""
+    """Event loop time of the event, in seconds."""
     endpoint: str
     """Name of the endpoint."""
     kind: HubEventKind
     """Kind of the event.
 
-    - ``opened``, ``lost``, ``restored``, ``removed``: of its link
+    - ``opened``, ``lost``, ``restored``, ``removed``: the link was opened, lost or reopened, or the endpoint removed
     - ``client_joined``, ``client_left``: a client of a server (``tcpin:``) has connected or disconnected
     - ``stalled``, ``drained``: written data does not leave, or leaves again
     - ``order_dropped``: a command waited too long, met a full queue, or its link was lost
@@ -156,4 +158,4 @@ class HubEvent(Snapshot):
     - ``internal_error``: an error inside aerokit
     """
     text: str
-    """Description."""
+    """Description of the event for people."""

@@ -44,7 +44,7 @@ def change_speed(
 
 
 def delay(duration_s: float) -> MissionItem:
-    """Hold the position for that many seconds, above 0.
+    """Hold the position for ``duration_s`` seconds, above 0.
 
     https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_DELAY
     """
@@ -68,7 +68,7 @@ def delay_until(hour: int, minute: int = 0, second: int = 0) -> MissionItem:
 
 
 def condition_delay(duration_s: float) -> MissionItem:
-    """Delay the following actions by that many seconds, while the vehicle flies on.
+    """Delay the following actions by ``duration_s`` seconds, while the vehicle flies on.
 
     https://mavlink.io/en/messages/common.html#MAV_CMD_CONDITION_DELAY
     """
@@ -76,7 +76,7 @@ def condition_delay(duration_s: float) -> MissionItem:
 
 
 def condition_distance(distance_m: float) -> MissionItem:
-    """Delay the following actions until the vehicle is within that many metres of the next waypoint.
+    """Delay the following actions until the vehicle is within ``distance_m`` metres of the next waypoint.
 
     https://mavlink.io/en/messages/common.html#MAV_CMD_CONDITION_DISTANCE
     """
@@ -180,8 +180,7 @@ def enable_fence(enable: bool = True) -> MissionItem:
 
 
 def set_camera_trigger_distance(distance_m: float, *, trigger_now: bool = False) -> MissionItem:
-    """Take a photo every ``distance_m`` metres from here on; 0 stops. With ``trigger_now`` take the first one at
-    once.
+    """Take a photo every ``distance_m`` metres from here on; 0 stops. ``trigger_now``: also take one at once.
 
     https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_CAM_TRIGG_DIST
     """

@@ -1,4 +1,4 @@
-"""Checks of items before a vehicle sees them: ranges, frames, NaN, jump targets, number of items."""
+"""Checks of items before they are sent: ranges, frames, NaN, jump targets, number of items."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def check_count(count: int, *, home_is_item_0: bool = False) -> None:
 
 
 def check_item(item: MissionItem, where: str = "item", mission_type: int = 0) -> None:
-    """Raise :class:`InvalidArgument`, which begins with ``where``, if MISSION_ITEM_INT cannot carry the item."""
+    """Raise :class:`InvalidArgument`, whose text begins with ``where``, if MISSION_ITEM_INT cannot carry the item."""
     if not isinstance(item, MissionItem):
         raise InvalidArgument(f"{where} = {item!r} is not a MissionItem")
     _check_integer(where, "command", item.command, 0xFFFF)

@@ -1,12 +1,14 @@
 """Comparison of items that tolerates what the protocol and the vehicle's storage change.
 
 The tables follow the conversions in the firmware (ArduPilot 4.7 AP_Mission, PX4 1.17 mavlink_mission), verified on
-vehicles. A string has one letter for each of the seven numbers of an item; numbers without a letter are lost and read
-back as 0: ``f`` unchanged, ``u`` ``b`` unsigned integer of 16 or 8 bits, ``s`` ``i`` signed integer of 16 or 8 bits,
-``c`` integer up to 255, larger ones clipped, ``U`` 16 bits that wrap around, ``?`` whether it is above 0, ``g`` the
-sign, ``r`` radius in whole metres with its sign, ``R`` the same in 8 bits, in tens of metres above 255, ``n`` turns
-in 8 bits, fractions below 1 in 1/256, ``k`` whole centimetres, ``h`` 16-bit float, ``2`` always 2, ``y`` heading,
-normalised to 0 to 360.
+vehicles. A string has one letter for each of the seven numbers of an item. Numbers without a letter, and those with
+``-``, are lost and read back as 0. The other letters are:
+
+- ``f`` unchanged; ``h`` 16-bit float; ``2`` always 2; ``?`` 1 if above 0, else 0; ``g`` 1 or -1, the sign;
+- ``u`` ``b`` unsigned integer of 16 or 8 bits; ``s`` ``i`` signed integer of 16 or 8 bits; ``U`` 16 bits that wrap;
+- ``c`` integer up to 255, larger ones clipped; ``n`` the same, but fractions below 1 in steps of 1/256;
+- ``r`` whole metres with sign; ``R`` the same in 8 bits, above 255 m in tens of metres; ``k`` whole centimetres;
+- ``y`` heading, normalised to 0 to 360.
 """
 
 from __future__ import annotations
@@ -35,7 +37,7 @@ FIELDS = ("param1", "param2", "param3", "param4", "x", "y", "z")
 
 
 class ItemStorage(Enum):
-    """Storage of the items to compare: each one loses different precision."""
+    """Storage whose loss of precision a comparison tolerates."""
 
     WIRE = "wire"
     """Only MISSION_ITEM_INT: 32-bit floats, equivalent frames."""
@@ -223,7 +225,7 @@ def changed_items(
 ) -> tuple[int, ...]:
     """Return the indices of the wanted items that ``found`` does not have at the same index.
 
-    These must be sent in a partial update. By default only what the protocol itself loses counts as unchanged.
+    These must be sent in a partial update. By default only changes made by the protocol itself are tolerated.
     """
     common = min(len(wanted), len(found))
     changed = [i for i in range(common) if item_differences(wanted[i], found[i], storage)]

@@ -28,7 +28,7 @@ FENCE_COMMANDS = frozenset(
 
 RALLY_COMMANDS = frozenset({MavCmd.NAV_RALLY_POINT})
 
-# Commands whose altitude needs a frame that says what it is relative to.
+# Commands whose altitude needs a frame that defines its reference.
 DESTINATIONS = frozenset(
     {
         MavCmd.NAV_WAYPOINT,
@@ -151,7 +151,7 @@ def canonical_frame(frame: int) -> int:
 
 
 def has_place(command: int) -> bool:
-    """Return True if x and y of this command are coordinates. Commands of other dialects count as such."""
+    """Return True if x and y of this command are coordinates; also for all commands of other dialects."""
     return command in PLACES or command not in _STANDARD_COMMANDS
 
 
@@ -181,7 +181,7 @@ class MissionItem(Snapshot):
     unscaled (fractions can only be sent as MISSION_ITEM). ``z`` is in metres, relative to what the frame says.
 
     Values are not checked on construction, because vehicles and files may contain anything; ``check`` of the whole plan
-    does. Items are equal if all fields are, and NaN equals NaN.
+    checks them. Items are equal if all fields are, and NaN equals NaN.
     https://mavlink.io/en/messages/common.html#MISSION_ITEM_INT
     """
 
@@ -251,7 +251,7 @@ def place_item(
 ) -> MissionItem:
     """Create an item at a place. ``altitudes`` are relative to home, to mean sea level and to terrain; one is given.
 
-    A Position supplies latitude, longitude, and the altitude if none is given. Without a place, unless it
+    A Position supplies latitude, longitude, and the altitude if none is given. If no place is given and none
     ``is_needed``, the item has 0°, 0°, which ArduPilot understands as the current position.
     """
     if isinstance(latitude_deg, Position):
@@ -324,7 +324,7 @@ def whole_number(name: str, value: object, low: int, high: int) -> float:
 
 
 def heading(name: str, value: float | None) -> float:
-    """Return the heading in degrees, or NaN, "not given" in the standard, for None."""
+    """Return the heading in degrees; for None return NaN, which means "not given" in the standard."""
     return math.nan if value is None else in_range(name, value, -360, 360)
 
 

@@ -280,8 +280,8 @@ class Plan(Snapshot):
 
     ``mission.home`` is the planned home position. ``firmware_type`` (MAV_AUTOPILOT) and ``vehicle_type`` (MAV_TYPE) are
     those it was planned for; ``cruise_speed_m_s`` (planes) and ``hover_speed_m_s`` (copters) are assumptions of the
-    planner. ``source`` is the text of the file it was read from: writing changes only what differs from it, so that
-    surveys and unknown fields are kept. It is ignored when plans are compared.
+    planner. ``source`` is the text of the file from which the plan was read. Writing changes only what differs from it,
+    so that surveys and unknown fields are kept. It is ignored when plans are compared.
     """
 
     mission: Mission = Mission()

@@ -65,9 +65,9 @@ def waypoint(
 ) -> MissionItem:
     """Fly to a place and hold there for ``hold_s`` seconds (0 to 65,535; whole seconds on ArduPilot, not on Plane).
 
-    ``acceptance_radius_m`` is the distance at which it counts as reached (0: the vehicle's setting; not ArduCopter).
-    ``pass_by_m`` is the distance at which a plane may pass it, negative on the other side. ArduPlane stores whole
-    metres up to 255 of both. https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_WAYPOINT
+    ``acceptance_radius_m`` is the distance at which the place counts as reached (0: the vehicle's setting; not
+    ArduCopter). ``pass_by_m`` is the distance at which a plane may pass the place, negative on the other side.
+    ArduPlane stores whole metres up to 255 of both. https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_WAYPOINT
     """
     return place_item(
         MavCmd.NAV_WAYPOINT,

@@ -166,6 +166,6 @@ def _item_row(item: MissionItem, index: int) -> str:
 
 
 def _text(value: float, digits: int) -> str:
-    """Format with that many decimal places, or as many as are needed to read the same number back."""
+    """Format with ``digits`` decimal places, or as many as are needed to read the same number back."""
     text = f"{value:.{digits}f}"
     return text if float(text) == value or math.isnan(value) else repr(float(value))

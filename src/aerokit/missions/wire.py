@@ -125,7 +125,7 @@ def from_degrees(value: float, command: int, frame: int) -> int | float:
 def with_home(items: Sequence[MissionItem], home: Position | None = None) -> tuple[MissionItem, ...]:
     """Add home as item 0, as ArduPilot counts items, and adjust jump targets. Unknown home is 0°, 0°.
 
-    ArduPilot ignores it and uses its own home.
+    ArduPilot ignores this item and uses its own home.
     """
     return (home_item(home), *shift_jumps(items, 1))
 
@@ -152,9 +152,9 @@ def shift_jumps(items: Iterable[MissionItem], by: int) -> tuple[MissionItem, ...
 def convert_from_ardupilot(items: Iterable[MissionItem], here: tuple[float, float] | None) -> Iterator[MissionItem]:
     """Convert the items of a mission made for ArduPilot for another autopilot.
 
-    ArduPilot accepts commands without a place in any frame, PX4 only in MAV_FRAME_MISSION. ArduPilot understands 0°,
-    0° as the current position: it becomes the destination of the previous item, and for the first item ``here``
-    (latitude and longitude in degrees, None if unknown).
+    ArduPilot accepts commands without a place in any frame, PX4 only in MAV_FRAME_MISSION. The place 0°, 0°, which
+    means the current position to ArduPilot, is replaced by the destination of the previous item; for the first item by
+    ``here`` (latitude and longitude in degrees, None if unknown).
     """
     place = None if here is None else (round(here[0] * 1e7), round(here[1] * 1e7))
     for item in items:

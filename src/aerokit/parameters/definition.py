@@ -208,8 +208,8 @@ def load_definition(path: str | os.PathLike[str]) -> CameraDefinition:
     If a setting is defined twice, the first definition counts. Invalid numbers and conditions are ignored.
 
     Raises:
-        FileFormatError: it is not a definition file, or has more than 1 MB (decompressed) or 20,000 elements.
-        OSError: it cannot be read.
+        FileFormatError: the file is no definition file, or has more than 1 MB (decompressed) or 20,000 elements.
+        OSError: the file cannot be read.
     """
     return parse_definition(read_bounded(path), os.fspath(path))
 
@@ -292,7 +292,7 @@ def _check_range(own: SettingDefinition, value: object) -> SettingValue:
 
 
 def _tests(condition: str) -> list[tuple[str, str, str, str]]:
-    """Parse into (setting, operator, value, "AND" or "OR" with the tests before); ValueError if it is malformed."""
+    """Parse into (setting, operator, value, AND or OR with the tests before); ValueError for a malformed condition."""
     tests = []
     joiner, words = "AND", list[str]()
     for word in (*condition.split(), "AND") if condition else ():

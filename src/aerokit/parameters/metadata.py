@@ -1,6 +1,6 @@
 """Parameter metadata: descriptions, units, ranges, names of values and bits.
 
-Vehicles send little of it. :func:`load_metadata` reads the files of both autopilots:
+Vehicles send little metadata. :func:`load_metadata` reads the files of both autopilots:
 
 - ArduPilot: ``apm.pdef.xml`` or ``apm.pdef.json`` from ``https://autotest.ardupilot.org/Parameters/ArduCopter/``
   (``ArduPlane``, ``Rover``, ``ArduSub``, ``AntennaTracker``, ``Blimp``); of each release from
@@ -134,8 +134,8 @@ def load_metadata(path: str | os.PathLike[str]) -> Metadata:
     If a parameter is defined several times, for different frame types, the first definition counts.
 
     Raises:
-        FileFormatError: it is not such a file, or has more than 16 MB (decompressed).
-        OSError: it cannot be read.
+        FileFormatError: the file is no metadata file, or has more than 16 MB (decompressed).
+        OSError: the file cannot be read.
     """
     return parse_metadata(read_bounded(path), os.fspath(path))
 

@@ -229,7 +229,7 @@ def _entry(name: bytes, last: bytes, code: int, *values: float) -> bytes:
 
 
 def _common_length(name: bytes, last: bytes) -> int:
-    # At least one character of its own is required.
+    # A name must have at least one character that it does not share with the previous one.
     common = 0
     for char, last_char in zip(name[:-1], last):  # noqa: B905 - the shorter one ends it
         if char != last_char:

@@ -24,7 +24,7 @@ _PLANE = ("Plane",)
 
 
 def _prefixed(prefix: str, new_prefix: str, pairs: str) -> str:
-    """``ACCEL>ACC`` → ``WPNAV_ACCEL>WP_ACC``."""
+    """Add prefixes to pairs: ``ACCEL>ACC`` becomes ``WPNAV_ACCEL>WP_ACC``."""
     halves = (pair.split(">") for pair in pairs.split())
     return " ".join(f"{prefix}{old}>{new_prefix}{new}" for old, new in halves)
 
@@ -124,7 +124,7 @@ _OLDER_COPTER, _OLDER_PLANE, _ROVER = ("Copter",), ("Plane",), ("Rover",)
 
 
 def _moved(old: str, new: str, names: str) -> str:
-    """``TYPE`` → ``RNGFND_TYPE>RNGFND1_TYPE``. Also takes pairs ``A>B``."""
+    """Make pairs from names: ``TYPE`` becomes ``RNGFND_TYPE>RNGFND1_TYPE``. Also accepts pairs ``A>B``."""
     halves = (name.partition(">") for name in names.split())
     return " ".join(f"{old}{before}>{new}{after or before}" for before, _, after in halves)
 

@@ -122,7 +122,7 @@ ParameterValues = Mapping[str, "int | float"] | Mapping[str, Parameter]
 
 
 class ParameterDifference(Snapshot):
-    """A parameter that differs. None on the side where it is missing."""
+    """A parameter that differs; a value is None where the parameter is missing."""
 
     name: str
     before: int | float | None

@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from aerokit.protocols.exchange import RoundTrip
 
-# Answers arrive in the order of their requests: one overtaken by this many later ones was lost.
+# Answers arrive in the order of their requests. A request is lost if this many later requests were answered before it.
 OVERTAKEN = 3
 
 # ArduPilot queues five requests, drops further ones, and processes them every 2 ms.
 BURST_SIZE = 4
 
-# Between requests beyond a burst.
+# Pause between requests beyond a burst.
 SPACING_S = 0.002
 
-# An answer within this fraction of the fastest round trip belongs to an earlier sending.
+# An answer faster than this fraction of the fastest round trip belongs to an earlier sending of the request.
 MIN_ROUND_TRIP_FRACTION = 0.5
 
 # Consecutive timeouts before requests back off, because radios lose single frames.
@@ -39,7 +39,7 @@ class AdaptiveWindow:
 
     @property
     def size(self) -> int:
-        """Requests that may be in flight."""
+        """Maximum number of requests in flight."""
         return int(self._size)
 
     def widen(self, size: float) -> None:
@@ -47,7 +47,7 @@ class AdaptiveWindow:
         self._size = max(self._size, min(size, self._max_size / 2))
 
     def on_answer(self, seconds: float | None) -> None:
-        """Record an answer ``seconds`` after its request; None if it is unclear which sending it answers."""
+        """Record an answer ``seconds`` after its request; None if it may answer any of several sendings."""
         self._loss -= self._loss / 16
         if seconds is None:
             return
@@ -75,7 +75,7 @@ class _Block:
 
 
 class BlockRequests:
-    """Requests for blocks, identified by their offsets, with an adaptive window of them in flight.
+    """Requests for blocks, keyed by offset. An adaptive window limits the number of requests in flight.
 
     The first ``burst_size`` requests are sent at once, further ones ``spacing_s`` seconds apart. A request is repeated
     when its answer is overdue (:class:`RoundTrip`), or when later requests were answered first.
@@ -97,7 +97,7 @@ class BlockRequests:
 
     @property
     def deadline(self) -> float | None:
-        """Time at which an answer is overdue or another request may be sent; None while none is in flight."""
+        """Time at which an answer is overdue or another request may be sent; None while no request is in flight."""
         overdue_at = min((self._due_at(block) for block in self._in_flight.values()), default=None)
         if self._is_held_back and overdue_at is not None:
             return min(overdue_at, self._free_at)
@@ -141,7 +141,7 @@ class BlockRequests:
             self._requeue_overtaken(block.number)
 
     def _answered_sending(self, block: _Block, now: float) -> float | None:
-        """Return the time of the sending that was answered, or None if unclear."""
+        """Return the time of the sending that was answered; None if several sendings are possible."""
         if block.attempts == 1:
             return block.sent_at
         fastest_s = self._round_trip.fastest_s or 0.0
@@ -202,7 +202,7 @@ WriteBytes = Callable[[bytes], object]
 class Reassembly:
     """Reassembles the blocks of one file, and passes them to ``write`` in order.
 
-    What was written is therefore always the beginning of the file. Blocks start at ``start`` plus a multiple of
+    The written data is therefore always the beginning of the file. Blocks start at ``start`` plus a multiple of
     ``block_size`` bytes; only the last one may be shorter.
     """
 
@@ -251,7 +251,7 @@ class Reassembly:
         return True
 
     def end_at(self, end: int) -> None:
-        """Set the size of the file. The smallest one counts."""
+        """Set the size of the file, unless a smaller size is known."""
         if self.end is not None and self.end <= end:
             return
         self.end = end
@@ -266,7 +266,7 @@ class Reassembly:
     def missing(self, size: int | None = None) -> tuple[tuple[int, int], ...]:
         """Return the missing ranges as (offset, size); ``size`` is the expected size of the file, if known.
 
-        A range of size 0 means from there to an unknown end.
+        A range of size 0 extends to the unknown end of the file.
         """
         ranges: list[tuple[int, int]] = []
         for offset in self.gaps:

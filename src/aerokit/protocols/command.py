@@ -33,11 +33,11 @@ MAX_ATTEMPTS = 4
 
 _ARM, _RELATIVE, _STEP = (0, 1.0), (3, 1.0), (0, 0.0)
 
-# MAV_CMD → what a repetition does, and the parameter (index, value) with which it does, None if always.
+# MAV_CMD → effect of a repetition, and the parameter (index, value) for which it has this effect; None: always.
 # docs/reliability.md has the same table.
 UNREPEATABLE_COMMANDS: Mapping[int, tuple[str, tuple[int, float] | None]] = {
     MavCmd.COMPONENT_ARM_DISARM: ("arms a vehicle that a pilot has disarmed since", _ARM),
-    MavCmd.CONDITION_YAW: ("turns on by the same angle", _RELATIVE),
+    MavCmd.CONDITION_YAW: ("turns by the same angle again", _RELATIVE),
     MavCmd.DO_REPEAT_RELAY: ("cycles the relay again", None),
     MavCmd.DO_REPEAT_SERVO: ("cycles the servo again", None),
     MavCmd.DO_DIGICAM_CONTROL: ("takes another picture, zooms another step", None),
@@ -66,7 +66,7 @@ UNREPEATABLE_COMMANDS: Mapping[int, tuple[str, tuple[int, float] | None]] = {
 
 
 def max_attempts(command: int, params: Sequence[float]) -> int:
-    """Return how often a command may be sent: once if a repetition would have an effect of its own."""
+    """Return how often a command may be sent: once if a repetition would have a further effect."""
     if command not in UNREPEATABLE_COMMANDS:
         return MAX_ATTEMPTS
     _, condition = UNREPEATABLE_COMMANDS[command]
@@ -79,7 +79,7 @@ FLOAT32_MAX = 3.4028234663852886e38
 
 ATTEMPT_TIMEOUT_S = 1.0
 
-# How often an order that waits for its next sending is checked for a new HEARTBEAT.
+# Interval at which an order that waits for its next sending is checked for a new HEARTBEAT.
 POLL_INTERVAL_S = 0.05
 
 # The earliest repetition, as a fraction of ``attempt_timeout``. Heartbeats come at 1 Hz, with some jitter.
@@ -87,11 +87,11 @@ MIN_RESEND_FRACTION = 0.75
 
 
 class OrderStatus(Protocol):
-    """State of an order since it was sent, which decides about repetitions."""
+    """State of a sent order. It decides whether the order is repeated."""
 
     @property
     def end(self) -> str:
-        """Why the order has ended, as a clause; empty while it may be sent again."""
+        """Reason why the order has ended, as a clause; empty while it may be sent again."""
         ...
 
     @property
@@ -151,8 +151,8 @@ class CommandExchange(Exchange[CommandAck]):
     ``on_progress``: 0–100, or None if the vehicle does not report a percentage. Acknowledgements to other ground
     stations, or from other components than the target, are ignored.
 
-    A request (no ``order_status``) is repeated every ``attempt_timeout`` seconds. An order is repeated only after a
-    HEARTBEAT that shows that it has neither taken effect nor ended, so it is never sent to a silent vehicle.
+    A request (no ``order_status``) is repeated every ``attempt_timeout`` seconds. An order is repeated only after a new
+    HEARTBEAT, and only until it takes effect or ends. It is therefore never sent to a silent vehicle.
 
     Args:
         message: the command.
@@ -267,7 +267,7 @@ class CommandExchange(Exchange[CommandAck]):
             self._fail(CommandTimeout(self._timeout_text(now)))
 
     def _expire_order(self, order_status: OrderStatus, now: float) -> None:
-        # Repeat the order if it has not ended, as soon as a HEARTBEAT shows that, and until the time is up.
+        # Until the time is up, each new HEARTBEAT repeats an order that has not ended.
         until = self._started + self._attempts * self._attempt_timeout
         if order_status.end:
             self._fail(CommandTimeout(f"{self._timeout_text(now)}; not sent again: {order_status.end}"))
@@ -283,10 +283,10 @@ class CommandExchange(Exchange[CommandAck]):
 
     def _why_not_repeated(self) -> str:
         if self._sent < self._attempts:
-            return "; not sent again: no HEARTBEAT received since"
+            return "; not sent again: no HEARTBEAT received since then"
         if self._attempts == 1 and max_attempts(self._message.command, _params_of(self._message)) == 1:
             effect, _ = UNREPEATABLE_COMMANDS[self._message.command]
-            return f"; never sent again: a second one {effect}"
+            return f"; not sent again, because a repetition {effect}"
         return ""
 
     def _send(self, now: float) -> None:

@@ -61,7 +61,7 @@ class Exchange(ABC, Generic[ResultT]):
     def link_changed(self, now: float) -> None:
         """Handle a switch to another link, and so to another port of the vehicle.
 
-        Most exchanges only retry what was not answered. One whose state the vehicle keeps for each port restarts.
+        Most exchanges only repeat unanswered requests. An exchange restarts if the vehicle keeps its state per port.
         """
         return
 
@@ -97,7 +97,7 @@ class Exchange(ABC, Generic[ResultT]):
 GAIN, DEVIATION_GAIN = 1 / 8, 1 / 4
 DEVIATIONS = 4.0
 
-# Added by the vehicle's main loop and the clock resolution, however regular the answers are.
+# Jitter of the vehicle's main loop and of the clock resolution, which even regular answers have.
 JITTER_S = 0.03
 
 BACKOFF = 1.5
@@ -169,7 +169,7 @@ class MessageStream:
 
     @property
     def due_at(self) -> float:
-        """Time at which the stream has ended, or failed to start, unless messages arrive."""
+        """Time at which the stream counts as ended, or as not started, if no further message arrives."""
         silence = self._round_trip.timeout_s(max(1, self.failures - 1))
         if self._received_at is not None and self._interval.smoothed_s is not None:
             silence += max(SILENT_MESSAGES * self._interval.smoothed_s, self._interval.timeout_s())
@@ -217,7 +217,7 @@ _MAX_RANGES = 10
 
 
 def format_ranges(numbers: Iterable[int]) -> str:
-    """Format numbers as ranges: ``3, 7–12``. Beyond ten ranges, only the count of the others follows."""
+    """Format numbers as ranges: ``3, 7–12``. After ten ranges, only the number of further ranges follows."""
     found: list[tuple[int, int]] = []
     for number in sorted(numbers):
         if found and number == found[-1][1] + 1:
@@ -292,8 +292,8 @@ class Transfer(Exchange[ResultT]):
 # No answer arrives in less than this fraction of the fastest round trip so far.
 MIN_ROUND_TRIP_FRACTION = 0.5
 
-# After more early answers than this, the vehicle has become faster. Without the limit, one that was slow at first would
-# be asked until the idle timeout.
+# After more early answers than this, the vehicle has become faster. Without the limit, a vehicle that was slow at first
+# would get requests until the idle timeout.
 MAX_EARLY_ANSWERS = 2
 
 

@@ -58,7 +58,7 @@ def setting_of(message: ParamExtValue | ParamExtAck) -> Setting:
 
 
 class SettingList(ValueList[dict[str, Setting], Setting]):
-    """Request the whole list once, and request missing indices, in a window, as soon as a gap is seen.
+    """Download of all settings: requests the list once, and missing indices, in a window, as soon as a gap appears.
 
     If the component reports another number of settings than before, values received before the change are requested
     again. A component without settings does not answer, so its transfer times out.
@@ -137,8 +137,8 @@ class SettingList(ValueList[dict[str, Setting], Setting]):
 class SettingReads(NamedReads[Setting]):
     """Read some settings by name. The result has one answer for each, in the order given.
 
-    Components do not answer requests for unknown names. So the setting of index 0 is requested together with overdue
-    names. If that one is answered repeatedly, and a name is not, the answer for the name is a ParameterRejected.
+    Components do not answer requests for unknown names. Overdue names are therefore requested together with the setting
+    of index 0. While index 0 is answered repeatedly and a name is not, the result for the name is a ParameterRejected.
     After ``idle_timeout_s`` seconds without progress, the missing answers become ParameterTimeout errors.
     """
 
@@ -251,7 +251,7 @@ class SettingWrite(Transfer[Setting]):
             self._measure(now)
             self._finish(reported)
         elif self._is_stale(now):
-            return  # it answers another station
+            return  # the answer is for another station
         elif result == ParamAck.IN_PROGRESS:
             self._progress_at = now
             self._is_writing = True

@@ -69,7 +69,7 @@ ERRNOS = {
     17: ("EEXIST", "the file or directory already exists"),
     19: ("ENODEV", "no such device"),
     20: ("ENOTDIR", "not a directory"),
-    21: ("EISDIR", "it is a directory"),
+    21: ("EISDIR", "the path is a directory"),
     22: ("EINVAL", "invalid argument"),
     23: ("ENFILE", "too many open files"),
     24: ("EMFILE", "too many open files"),
@@ -121,7 +121,7 @@ class FtpMessage(Snapshot):
 
     @classmethod
     def decode(cls, payload: bytes, *, cut: bool = True) -> Self:
-        """Decode a payload of any bytes. ``data`` is cut to ``size``, or with ``cut=False`` to 239 bytes."""
+        """Decode a payload, valid or not. ``data`` is cut to ``size``, or with ``cut=False`` to 239 bytes."""
         payload = payload.ljust(PAYLOAD_SIZE, b"\0")
         sequence, session, opcode, size, request_opcode, burst_complete, offset = HEADER.unpack_from(payload)
         data = payload[HEADER.size : HEADER.size + size if cut else PAYLOAD_SIZE]
@@ -159,16 +159,16 @@ def path_bytes(path: str) -> bytes:
     """Encode a path for a request.
 
     Raises:
-        InvalidArgument: it is empty, not encodable as UTF-8, has a NUL, or is longer than 238 bytes.
+        InvalidArgument: the path is empty, not encodable as UTF-8, contains NUL, or is longer than 238 bytes.
     """
     if not isinstance(path, str):
-        raise InvalidArgument(f"path = {path!r} is not allowed: text")
+        raise InvalidArgument(f"path = {path!r} is not allowed: a string")
     try:
         encoded = path.encode()
     except UnicodeEncodeError:
-        raise InvalidArgument(f"path = {path!r} is not allowed: text that UTF-8 can encode") from None
+        raise InvalidArgument(f"path = {path!r} is not allowed: a string that UTF-8 can encode") from None
     if not encoded or b"\0" in encoded:
-        raise InvalidArgument(f"path = {path!r} is not allowed: not empty, without NUL")
+        raise InvalidArgument(f"path = {path!r} is not allowed: a non-empty string without NUL")
     if len(encoded) > PATH_SIZE:
         raise InvalidArgument(
             f"path = {path!r} is not allowed: {len(encoded)} bytes, at most {PATH_SIZE} fit into a message"
@@ -193,7 +193,7 @@ SEQUENCES = 0x10000
 
 SESSIONS = 255
 
-# Before it answers, the vehicle reads the whole file, or saves what was written to it.
+# The vehicle reads or saves the whole file before it answers these requests.
 SLOW_REQUESTS = (MavFtpOpcode.CALCFILECRC, MavFtpOpcode.TERMINATESESSION)
 SLOW_ANSWER_S = 0.25
 
@@ -204,8 +204,8 @@ ATTEMPTS_BEFORE_BACKOFF = 3
 
 NEED_SESSION = (MavFtpOpcode.READFILE, MavFtpOpcode.WRITEFILE, MavFtpOpcode.BURSTREADFILE)
 
-# Answers to them while no file is open: INVALIDSESSION from PX4, FILENOTFOUND from ArduPilot, and FILEEXISTS from a PX4
-# that has answered FILEEXISTS once and then repeats it for any refusal until another operation fails with an errno.
+# Errors for NEED_SESSION requests while no file is open: INVALIDSESSION from PX4, FILENOTFOUND from ArduPilot.
+# A PX4 that has once answered FILEEXISTS repeats it for any refusal until another operation fails with an errno.
 NO_SESSION = (MavFtpErr.INVALIDSESSION, MavFtpErr.FILENOTFOUND, MavFtpErr.FILEEXISTS)
 
 
@@ -252,7 +252,7 @@ class FtpClient:
         return FileTransferProtocol(0, self.target_system, self.target_component, request.encode())
 
     def is_for_us(self, message: FileTransferProtocol) -> bool:
-        """Return True if the message is addressed to this client, or not addressed at all."""
+        """Return True if the message is addressed to this client or to all."""
         return message.target_system in (0, self.source_system) and message.target_component in (
             0,
             self.source_component,
@@ -269,7 +269,7 @@ class FtpExchange(Transfer[ResultT]):
         self._client, self._path = client, path
 
     def receive(self, message: Message, now: float) -> None:
-        """Process a message. Only replies of this server to this client count."""
+        """Process a message. All but replies of this server to this client are ignored."""
         if self.done or not isinstance(message, FileTransferProtocol):
             return
         if self._is_from_target(message) and self._client.is_for_us(message):
@@ -377,7 +377,7 @@ class FtpRequest(FtpExchange[FtpMessage]):
             self._end(reply)
 
     def _renumber(self, now: float) -> None:
-        # The server mistook it for its previous request, which had the same sequence number, and repeated that reply.
+        # The server took this request for its previous one, which had the same sequence number, and repeated its reply.
         if self._renumbered < MAX_RENUMBERED:
             self._renumbered += 1
             self._request = self._request.replace(sequence=self._client.next_sequence())
@@ -400,10 +400,10 @@ class FtpRequest(FtpExchange[FtpMessage]):
     def _was_done_before(self, reply: FtpMessage) -> bool:
         opcode, code = self._request.opcode, reply.error_code
         if opcode == MavFtpOpcode.TERMINATESESSION:
-            return True  # the session does not exist, or no longer
+            return True  # the session does not exist any more
         if self.attempts == 1:
             return False
-        # An earlier sending may have done it, and its answer was lost.
+        # An earlier sending may have removed it, and the answer was lost.
         if opcode in (MavFtpOpcode.REMOVEFILE, MavFtpOpcode.REMOVEDIRECTORY):
             return code == MavFtpErr.FILENOTFOUND
         return opcode == MavFtpOpcode.CREATEDIRECTORY and code == MavFtpErr.FILEEXISTS

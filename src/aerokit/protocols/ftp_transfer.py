@@ -168,7 +168,7 @@ class FtpDownload(FtpExchange[int]):
         self._add(reply.offset, reply.data, now)
 
     def _measure(self, burst: _Burst, number: int, now: float) -> None:
-        # A burst counts as progress even if its blocks are known from another burst, but not endlessly.
+        # Known blocks of a repeated burst count as progress too, but only for a limited number of bursts.
         if number > self._blocks_sent.get(burst.sequence, -1) and self._repeated_bursts <= MAX_REPEATED_BURSTS:
             self._blocks_sent[burst.sequence], self._progress_at = number, now
         last, previous_at, previous = self._last_block
@@ -290,7 +290,7 @@ class FtpDownload(FtpExchange[int]):
 
     @property
     def _burst_due_at(self) -> float:
-        """Time at which the burst has ended, or failed to start, unless blocks arrive."""
+        """Time at which the burst counts as ended, or as not started, if no further block arrives."""
         silence = self.round_trip.timeout_s(1 + self._failed_bursts)
         if self._interval.smoothed_s is None:
             if self._size is not None and self._size > SHORT_FILE:  # repeating a long burst is expensive

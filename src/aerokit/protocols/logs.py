@@ -5,7 +5,7 @@ Behaviour of vehicles (ArduPilot 4.7, PX4 1.17) that determines this design:
 - ArduPilot serves one request at a time and ignores others meanwhile, but answers requests for single blocks at once.
   PX4 serves the latest request and drops the previous one; over UDP it sends 256 kB at once, regardless of losses.
   So a long range is requested alone. Once it has ended, its gaps are requested: long ones as ranges, single blocks many
-  at a time with a short delay between them. Ranges become shorter if most of them is lost.
+  at a time with a short delay between them. Ranges become shorter if most of their blocks are lost.
 - ArduPilot does not answer while armed, and sends nothing if it has received no heartbeat for three seconds.
 - ArduPilot numbers logs from 1, PX4 from 0. PX4 lists all logs from the first one requested, and does not answer if it
   has none. After a boot it sends no data before it has listed its logs.
@@ -31,7 +31,7 @@ __all__ = ["LOG_BLOCK", "LogDownload", "LogList", "LogStop"]
 LOG_BLOCK = 90
 """Number of log bytes in one message."""
 
-# Between requests for single blocks: PX4 reads the latest one every 2 to 10 ms.
+# Pause between requests for single blocks, because PX4 reads only the latest request, every 2 to 10 ms.
 SPACING_S = 0.005
 
 # Sizes of ranges, in blocks.

@@ -229,7 +229,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
     # ------------------------------------------------------------------------------------ end
 
     def _end(self) -> None:
-        # Twice for PX4, which accepts no upload until it has received one of them, or 5 s have passed.
+        # PX4 accepts no upload until it has received an acknowledgement or 5 s have passed, so it gets two.
         self._outbox += [self._ack(MavMissionResult.ACCEPTED)] * (2 if self._window == 1 else 1)
         items = tuple(self._items[seq] for seq in self._indices)
         self._finish(DownloadResult(items, self._count or 0, self._opaque_id))
@@ -237,10 +237,11 @@ class MissionDownload(MissionExchange[DownloadResult]):
     def _time_out(self, now: float) -> None:
         self._outbox += self.cancellation()
         missing = [seq for seq in self._indices if seq not in self._items]
-        what = "it did not say how many there are" if self._count is None else f"missing: {format_ranges(missing)}"
+        details = "no MISSION_COUNT was received" if self._count is None else f"missing: {format_ranges(missing)}"
         self._fail(
             MissionTimeout(
-                f"{self.kind}: the vehicle fell silent during the download: {what} ({now - self._progress_at:.1f} s)",
+                f"{self.kind}: the vehicle fell silent during the download:"
+                f" {details} ({now - self._progress_at:.1f} s)",
                 missing=tuple(seq - self.offset for seq in missing if seq >= self.offset),
             )
         )

@@ -39,7 +39,7 @@ class UploadResult(Snapshot):
     """Result of an upload that was not refused.
 
     ``is_confirmed`` is True if the vehicle has confirmed it. Otherwise everything was sent, but the answers are
-    ambiguous, so read it back; ``item`` is then the first unconfirmed item. ``opaque_id`` identifies the plan on the
+    ambiguous, so read the plan back; ``item`` is then the first unconfirmed item. ``opaque_id`` identifies it on the
     vehicle, 0 if the vehicle sends none.
     """
 
@@ -105,12 +105,12 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     @property
     def may_have_changed_items(self) -> bool:
-        """True if a vehicle that overwrites items in place may have done so, unless it truncates the list first."""
+        """True if the vehicle may have overwritten items in place. A vehicle that truncates the list first has not."""
         return self.was_started and not (self._is_partial and self._sent == self._first + 1)
 
     @property
     def was_sent_completely(self) -> bool:
-        """True if the vehicle may have everything, regardless of its answers."""
+        """True if all items were sent, so that the vehicle may have them regardless of its answers."""
         return self.was_started and self._sent == self._end
 
     # --------------------------------------------------------------------------------- events
@@ -258,12 +258,10 @@ class MissionUpload(MissionExchange[UploadResult]):
     def _time_out(self, now: float) -> None:
         self._outbox += self.cancellation()
         missing = range(max(self._confirmed, self.offset), self._end)
-        what = (
-            f"items {format_ranges(missing)} were not confirmed" if self._is_accepted else "it never requested an item"
-        )
+        details = f"items {format_ranges(missing)} were not confirmed" if self._is_accepted else "no item was requested"
         self._fail(
             MissionTimeout(
-                f"{self.kind}: the vehicle fell silent during the upload: {what}"
+                f"{self.kind}: the vehicle fell silent during the upload: {details}"
                 f" ({self._attempt} attempts, {now - self._progress_at:.1f} s)",
                 missing=tuple(seq - self.offset for seq in missing),
             )
@@ -285,7 +283,7 @@ class MissionUpload(MissionExchange[UploadResult]):
     def _send_window(self, now: float, *, ahead: int = 0) -> None:
         """Repeat everything in flight and send ``ahead`` more items, because requests may have been lost."""
         if self._sent == self._end and self._sent - self._confirmed > 1:
-            # PX4 takes a repeated item for the last one, whether or not it is.
+            # PX4 takes any repeated item for the last item of the mission.
             self._was_tail_repeated = True
         upto = max(self._sent, min(self._sent + ahead, self._confirmed + self._window + 1, self._end))
         for seq in range(self._confirmed, upto):

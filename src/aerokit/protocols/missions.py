@@ -75,7 +75,7 @@ RESULTS: dict[int, str] = {
 class MissionExchange(Transfer[ResultT]):
     """A transfer with one component. Ignores messages to other systems and of other mission types.
 
-    Indices in errors are those of the program: ``offset`` lower than those on the wire.
+    Indices in errors are the program's, which are ``offset`` lower than those on the wire.
     """
 
     def __init__(
@@ -131,7 +131,7 @@ class MissionExchange(Transfer[ResultT]):
 
 
 class MissionClear(MissionExchange[None]):
-    """MISSION_CLEAR_ALL until it is acknowledged.
+    """Sends MISSION_CLEAR_ALL until it is acknowledged.
 
     ArduPilot refuses with ERROR while it flies the mission. PX4 does not answer while busy with a transfer.
     """
@@ -168,7 +168,7 @@ class MissionClear(MissionExchange[None]):
     def _timeout(self, now: float) -> MissionTimeout:
         return MissionTimeout(
             f"{self.kind}: no answer to MISSION_CLEAR_ALL, sent {self._attempt} times"
-            f" in {now - self._started_at:.1f} s; the vehicle may or may not have cleared it"
+            f" in {now - self._started_at:.1f} s; the vehicle may have cleared it"
         )
 
 
@@ -179,7 +179,7 @@ MISSION_CURRENT_INTERVAL_S = 1.0
 
 
 class SetCurrentItem(Transfer[None]):
-    """MISSION_SET_CURRENT until MISSION_CURRENT confirms it, because there is no acknowledgement.
+    """Sends MISSION_SET_CURRENT until MISSION_CURRENT confirms it, because there is no acknowledgement.
 
     ``reported`` is the item last reported by the vehicle. It also counts as confirmation if the vehicle moves from
     ``reported`` past the requested item.
@@ -236,7 +236,7 @@ class SetCurrentItem(Transfer[None]):
             self._send(now)
 
     def _has_passed(self, seq: int) -> bool:
-        """Return True if the vehicle went to our item and beyond, rather than on from where it was."""
+        """Return True if the vehicle has passed our item, rather than continued from the reported one."""
         last = self._reported
         return last is not None and (last <= self._seq < seq or self._seq < seq < last)
 

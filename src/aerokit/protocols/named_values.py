@@ -1,4 +1,4 @@
-"""Base classes of the parameter protocols: lists with gaps, requests by name, and when an answer counts.
+"""Base classes of the parameter protocols: lists with gaps, requests by name, and the rules for valid answers.
 
 See https://mavlink.io/en/services/parameter.html and https://mavlink.io/en/services/parameter_ext.html.
 """
@@ -27,7 +27,7 @@ ResultT = TypeVar("ResultT")
 PAUSES = 4
 # A list may take this long to start; requesting it again would restart it.
 MIN_START_TIMEOUT_S = 0.3
-# How often values that were received under another count are requested again.
+# Maximum number of times that values received under another count are requested again.
 MAX_REFRESHES = 3
 # The index in requests by name.
 BY_NAME = -1
@@ -41,7 +41,7 @@ ANSWERS_TO_SETTLE, ANSWERS_TO_SETTLE_UNCHANGED = 2, 8
 
 
 class ValueList(Transfer[ResultT], Generic[ResultT, ValueT]):
-    """Request a whole list once, and request missing indices, in a window, as soon as a gap is seen."""
+    """Download of a list: requests it once, and missing indices, in a window, as soon as a gap appears."""
 
     list_request_name: ClassVar[str]
     noun: ClassVar[str]
@@ -124,8 +124,8 @@ class ValueList(Transfer[ResultT], Generic[ResultT, ValueT]):
             return f"{self.list_request_name} was not answered, sent {self._attempts} times"
         missing = self._missing()
         return (
-            f"{len(missing)} of {self._count} {self.noun} did not come: nothing new for {self._idle_timeout_s:g} s,"
-            f" missing {format_ranges(missing)}"
+            f"{len(missing)} of {self._count} {self.noun} were not received: nothing new for"
+            f" {self._idle_timeout_s:g} s, missing {format_ranges(missing)}"
         )
 
 
@@ -238,7 +238,7 @@ class NamedReads(NamedRequests[ValueT]):
     def _reject_unknown(self, names: Iterable[str], now: float) -> None:
         for name in names:
             if self._loss_probability(self._window.attempts(name)) < MAX_LOSS_PROBABILITY:
-                text = f"{self.unknown_text} {name}: it answers others but not this one"
+                text = f"{self.unknown_text} {name}: it answers other requests, but not this one"
                 self._settle(name, ParameterRejected(text, name=name), now)
 
     def _loss_probability(self, attempts: int) -> float:

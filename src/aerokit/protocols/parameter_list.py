@@ -41,7 +41,7 @@ def merge_update(known: Parameter, reported: Parameter, bytewise: bool) -> Param
 # ArduPilot sends parts of the list ten times a second, or only once a second (MAV1_PARAMS).
 MAX_TICK_S = 1.1
 
-# With this few left, a gap is requested without waiting for the next tick, because it costs little.
+# When this few values are left, a gap is requested without waiting for the next tick, because it costs little.
 NEAR_END = 20
 
 # After this many values the stream has started, and the list is not requested again.
@@ -52,11 +52,12 @@ MAX_REFUSALS = 2
 
 
 class ParameterList(ValueList[ParameterTable, Parameter]):
-    """Request the whole list once, and request missing indices, in a window, as soon as a gap is seen.
+    """Download of all parameters: requests the list once, and missing indices, in a window, as soon as a gap appears.
 
     The vehicle reports the number of parameters. It may change during the transfer (ArduPilot reveals a group when it
-    is enabled, PX4 counts a parameter once it is used), and with it the indices after the change. If the names do not
-    add up, values received before the change are requested again. Values with index 65535 are not part of the list.
+    is enabled, PX4 counts a parameter once it is used), and with it the indices after the change. If a name then has
+    two indices or none, values received before the change are requested again. Values with index 65535 are not part of
+    the list.
 
     Raises from ``result()``:
         ParameterTimeout: no progress for ``idle_timeout_s`` seconds; ``missing`` has the missing indices.
@@ -142,7 +143,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
             self._count = min(self._count, index)
 
     def _note_count(self, count: int, is_streamed: bool) -> None:
-        # The count in ArduPilot's stream stays what it was at the beginning of the stream, so it is no change.
+        # ArduPilot's stream keeps the count from its beginning, so that only a changed streamed count is news.
         if count == (self._streamed_count if is_streamed else self._count):
             return
         if is_streamed:
@@ -183,7 +184,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
         self._is_streaming, self._quiet_at, self._needs_check = False, None, True
 
     def _quiet_s(self) -> float:
-        """Seconds without any message after which the stream has stopped. Answers to requests delay it."""
+        """Seconds without any message after which the stream has stopped. Answers to requests delay the stream."""
         seconds = max(self.round_trip.timeout_s(), PAUSES * self._pause_s)
         if self._streamed < STARTED:  # the only value may be the answer to the request by index
             return max(seconds, MIN_START_TIMEOUT_S)

@@ -40,7 +40,7 @@ ParameterAnswer = Parameter | ParameterRejected | ParameterTimeout
 ERRORS = {
     1: "the vehicle has no such parameter",
     2: "the vehicle does not accept this value",
-    3: "the vehicle does not permit it",
+    3: "the vehicle does not permit access",
     4: "the vehicle has no such component",
     5: "the parameter is read-only",
     6: "the vehicle has no parameters of this type",
@@ -101,12 +101,12 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
     """Read some parameters by name. The result has one answer for each.
 
     ArduPilot, and PX4 before 1.17, do not answer requests for unknown names. With ``probe=True``, overdue names are
-    requested together with the parameter of index 0. If that one is answered repeatedly, and a name is not, the answer
+    requested together with the parameter of index 0. While index 0 is answered repeatedly and a name is not, the result
     for the name is a ParameterRejected without a code.
 
-    ``alternatives`` maps names to other names of the same parameter: the vehicle has at most one of them, so the others
-    are rejected when it answers. ``possibly_stale`` maps names to old values that a delayed message may still have:
-    such a value is accepted only the second time.
+    ``alternatives`` maps names to other names of the same parameter. The vehicle has at most one of them, so an answer
+    for one name rejects the others. ``possibly_stale`` maps names to old values that a delayed message may still have.
+    Such a value is accepted only when it is received a second time.
     """
 
     unknown_text = "the vehicle has no parameter"

@@ -22,9 +22,9 @@ QUEUED_FACTOR, QUEUED_MARGIN_S = 1.5, 0.02
 FEW_LEFT, DUPLICATE_FROM_ATTEMPT = 5, 3
 # The last few are repeated after at most this time, or two round trips, because it costs little.
 FEW_LEFT_TIMEOUT_S = 0.5
-# A queue that delayed answers may be empty by then.
+# Maximum wait for an answer: a queue that delays answers may be empty after this time.
 MAX_TIMEOUT_S = 2.0
-# Answers arrive in the order of their requests: one overtaken by this many later ones was lost.
+# Answers arrive in the order of their requests. A request is lost if this many later requests were answered before it.
 OVERTAKEN = 3
 
 
@@ -64,7 +64,7 @@ class RequestWindow(Generic[KeyT]):
 
     @property
     def deadline(self) -> float | None:
-        """Time at which the next answer is overdue; None while none is in flight."""
+        """Time at which the next answer is overdue; None while no request is in flight."""
         return min((request.due_at for request in self._in_flight.values()), default=None)
 
     def attempts(self, key: KeyT) -> int:
@@ -133,7 +133,7 @@ class RequestWindow(Generic[KeyT]):
         return due
 
     def _on_silence(self, now: float) -> None:
-        # Nothing arrives, so these are no single losses: request less at a time, and less often.
+        # Nothing arrives at all, so the link may be down: send fewer requests at a time, and less often.
         self._limit = self._size
         if now >= self._silent_until:
             self._silences += 1

@@ -1,8 +1,8 @@
 """Simulated vehicles that speak MAVLink and fly, without hardware or firmware.
 
-`SimulatedCopter` and its siblings do no I/O: they take bytes and the time, and return bytes. `SimulatorServer`
-serves vehicles on links, `simulated_link` returns the client's end of a link in memory, `open_simulator` listens on
-addresses:
+The vehicle classes, such as `SimulatedCopter`, do no I/O: they take bytes and the time, and return bytes.
+`SimulatorServer` serves vehicles on links. `simulated_link` returns the client's end of a link in memory.
+`open_simulator` listens on addresses:
 
 ```python
 copter = SimulatedCopter(boot_time_s=1.0)

@@ -18,11 +18,10 @@ from aerokit.sim.vehicle import AttachableComponent, SimulatedVehicle
 
 
 class VehicleSigning:
-    """Message signing as ArduPilot and PX4 do it: SETUP_SIGNING is accepted while disarmed, every port signs and
-    checks.
+    """Message signing of ArduPilot and PX4: SETUP_SIGNING sets the key, then ports sign and check frames.
 
-    ``key`` and ``timestamp`` (10 µs since 2015) are the stored values. The time stamps of accepted frames are shared
-    by all ports until the vehicle is switched off.
+    ``key`` and ``timestamp`` (units of 10 µs since 2015) are the stored values. All ports share the time stamps of
+    accepted frames, until the vehicle is switched off.
     """
 
     AHEAD: ClassVar[int] = 0
@@ -33,9 +32,7 @@ class VehicleSigning:
         """The stored key; None turns signing off. Call `load` after assigning it."""
         self.timestamp: int = timestamp if key is not None else 0
         self.trusts_first_port = False
-        """True if the first port accepts unsigned frames, as ArduPilot's does by default. Call `load` after assigning
-        it.
-        """
+        """True if the first port accepts unsigned frames, ArduPilot's default. Call `load` after assigning it."""
         self._vehicle = vehicle
         self._streams: dict[tuple[int, int, int], int] = {}
         vehicle.on(SetupSigning, self._on_setup)
@@ -89,7 +86,7 @@ class VehicleSigning:
 
 
 class _Signing(Signing):
-    """Time stamps wrap around after 48 bits, as in the firmwares."""
+    """Message signing whose time stamps wrap around after 48 bits, as in the firmwares."""
 
     def sign(self, frame: bytes, now: float = 0.0) -> bytes:
         if self.timestamp > LAST_TIMESTAMP:
@@ -113,9 +110,9 @@ class SimulatedAutopilot(SimulatedVehicle):
     """MAV_PROTOCOL_CAPABILITY flags."""
 
     files: FileTree
-    """Files on its card and generated ones; they survive a reboot."""
+    """Files on the memory card and generated files; they survive a reboot."""
     signing: VehicleSigning
-    """Key of message signing; it survives a reboot."""
+    """Message signing; its key survives a reboot."""
 
     def __init__(
         self,
@@ -139,7 +136,7 @@ class SimulatedAutopilot(SimulatedVehicle):
         raise NotImplementedError
 
     def open_channel(self, *, version: int = 2) -> Channel:
-        """Open another port with stream rates of its own; ``version`` is its MAVLink version."""
+        """Open another port, which has its own stream rates; ``version`` is its MAVLink version."""
         channel = super().open_channel(version=version)
         if len(self.channels) > 1:  # The base class opens the first channel before `signing` exists.
             self.signing.start(channel)
@@ -166,12 +163,12 @@ class SimulatedAutopilot(SimulatedVehicle):
         self.on(m.Timesync, self._on_timesync)
 
     def serve_commands(self, handlers: Mapping[int, CommandHandler]) -> CommandServer:
-        """Answer these MAV_CMDs, except the unsupported ones."""
+        """Answer these MAV_CMDs, except those in ``unsupported_commands``."""
         supported = {number: handler for number, handler in handlers.items() if number not in self.unsupported_commands}
         return CommandServer(self, supported, self.refusal_of_command)
 
     def refusal_of_command(self, command: ReceivedCommand) -> int | None:
-        """Return the MAV_RESULT of a command that is refused before its number is looked at, or None."""
+        """Return the MAV_RESULT if the command is refused whatever its MAV_CMD, else None."""
         return None
 
     def _on_timesync(self, request: m.Timesync, channel: Channel) -> None:

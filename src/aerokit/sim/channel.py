@@ -20,9 +20,9 @@ _MAX_FLOAT32 = 3.4028234663852886e38
 
 
 def fitted(message: MessageT) -> MessageT:
-    """Return a copy of the message whose values fit: integers clamped, floats beyond the range infinite, texts cut.
+    """Return a copy of the message whose values fit their fields: integers clamped, large floats infinite, texts cut.
 
-    Values of a wrong type stay as they are, because they are bugs of the simulation.
+    Values of a wrong type are not changed, so that encoding them reveals the bug.
     """
     found = copy.copy(message)
     for field in found.FIELDS:
@@ -53,7 +53,7 @@ MAX_PEERS = 256
 
 
 class MessageReader:
-    """Decodes the bytes of any number of peers. ``wanted`` are message ids; None decodes all."""
+    """Decodes the bytes of several peers. ``wanted`` holds the message ids to decode; None decodes all."""
 
     def __init__(self, wanted: Container[int] | None) -> None:
         self._wanted = wanted
@@ -72,7 +72,7 @@ class MessageReader:
 
 
 class SharedMessageReader(MessageReader):
-    """Decodes once for several vehicles: the result is cached until `forget`."""
+    """Decodes the same bytes only once for several vehicles: caches the result until `forget`."""
 
     def __init__(self) -> None:
         super().__init__(None)
@@ -88,7 +88,7 @@ class SharedMessageReader(MessageReader):
 
 
 class Streams:
-    """Intervals by message id. A stream that is late skips messages; it never sends a burst."""
+    """Schedule of the streamed messages of a port. A late stream skips messages instead of sending a burst."""
 
     __slots__ = ("_heap", "_intervals", "_token", "next_due")
 
@@ -152,7 +152,7 @@ _DATAGRAM_SIZE = 1200
 
 
 class Channel:
-    """A port. As on a flight controller, stream rates belong to the port and apply to all its listeners."""
+    """A port of a vehicle. As on a flight controller, all clients of a port share its stream rates."""
 
     def __init__(self, system_id: int, component_id: int, wanted: Container[int], *, version: int = 2) -> None:
         self.version = version
@@ -169,7 +169,7 @@ class Channel:
         """Signs and checks frames; see `sign_with`."""
 
     def sign_with(self, signing: Signing | None) -> None:
-        """Sign and check with this from now on; None turns signing off."""
+        """Sign and check frames with ``signing`` from now on; None turns signing off."""
         self.signing = signing
         for encoder in self._encoders.values():
             encoder.signing = signing
@@ -198,7 +198,7 @@ class Channel:
             return encoder.encode(fitted(message))
 
     def write(self, data: bytes) -> None:
-        """Append a frame, or other bytes that belong together, to the outbox."""
+        """Append a frame, or bytes that must stay in one piece, to the outbox."""
         if data:
             self._outbox.append(data)
 
@@ -216,12 +216,12 @@ class Channel:
         return data
 
     def take_pieces(self) -> list[bytes]:
-        """Like `take_outbox`, in the pieces that were written."""
+        """Return and clear the outbox, one element for each `write`."""
         pieces, self._outbox = self._outbox, []
         return pieces
 
     def take_datagrams(self) -> list[bytes]:
-        """Like `take_outbox`, in pieces that fit into a datagram each."""
+        """Return and clear the outbox, divided into datagrams."""
         return datagrams(self.take_pieces())
 
     def reset(self) -> None:

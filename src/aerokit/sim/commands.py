@@ -26,9 +26,10 @@ from aerokit.sim.vehicle import MessageHost, sender_of
 
 @dataclass(frozen=True)
 class ReceivedCommand:
-    """A command from either message.
+    """A command received as COMMAND_LONG or COMMAND_INT.
 
-    ``x`` and ``y`` are params 5 and 6: as sent in COMMAND_LONG, degrees times 1e7 in COMMAND_INT.
+    ``x`` and ``y`` are params 5 and 6 as sent; positions are in degrees in COMMAND_LONG, in degrees times 1e7 in
+    COMMAND_INT.
     """
 
     command: int
@@ -62,7 +63,7 @@ class ReceivedCommand:
 
 @dataclass(frozen=True)
 class CommandProgress:
-    """Result of a command that takes time: IN_PROGRESS with these percentages, then ``result``."""
+    """Answer to a command that takes time: IN_PROGRESS with each percentage, then ``result``."""
 
     percents: tuple[int, ...]
     interval_s: float
@@ -77,9 +78,9 @@ CommandHandler = Callable[[ReceivedCommand], "int | CommandProgress | None"]
 class CommandServer:
     """Dispatches commands to handlers, applies `Faults` and sends COMMAND_ACK to the sender.
 
-    A handler returns a MAV_RESULT, a `CommandProgress`, or None if it answers itself; its messages precede the
-    acknowledgement. Other commands are UNSUPPORTED. ``refusal`` returns the MAV_RESULT of a command that is refused
-    before dispatch, or None.
+    A handler returns a MAV_RESULT, a `CommandProgress`, or None if it sends the acknowledgement. Messages that it
+    sends precede the acknowledgement. A command without a handler is UNSUPPORTED. ``refusal`` returns the MAV_RESULT
+    of a command to refuse before its handler is called, else None.
     """
 
     def __init__(
@@ -124,7 +125,7 @@ class CommandServer:
             self.answer(command, answer, fault)
 
     def answer(self, command: ReceivedCommand, result: int, fault: CommandFault | None = None) -> None:
-        """Send the acknowledgement, as the fault specifies."""
+        """Send the acknowledgement, modified by ``fault``."""
         fault = CommandFault() if fault is None else fault
         if fault.progress:
             without = CommandFault(acks=fault.acks, delay_s=fault.delay_s)
@@ -171,9 +172,7 @@ _ACCELERATION = (int(Mask.AX_IGNORE), int(Mask.AY_IGNORE), int(Mask.AZ_IGNORE))
 
 @dataclass(frozen=True)
 class Setpoint:
-    """A decoded set-point message; vectors are in the frame of the message. A vector counts if none of its axes is
-    ignored.
-    """
+    """A decoded set-point message; vectors are in the frame of the message."""
 
     mask: int
     velocity: Ned
@@ -233,5 +232,5 @@ def rotated(vector: Ned, yaw: float) -> Ned:
 
 
 def is_finite(*vectors: Ned | None) -> bool:
-    """Return True if all components are finite; None is skipped."""
+    """Return True if all components of all vectors are finite; None is skipped."""
     return all(math.isfinite(part) for vector in vectors if vector is not None for part in vector)

@@ -23,7 +23,7 @@ class CommandFault:
     ignore: bool = False
     """Neither execute nor acknowledge the command."""
     acks: int = 1
-    """Number of acknowledgements: 0 loses it, 2 repeats it."""
+    """Number of acknowledgements sent: 0 loses the acknowledgement, 2 repeats it."""
     delay_s: float = 0.0
     """Delay of the acknowledgement in seconds; the command is executed at once."""
     progress: tuple[int, ...] = ()
@@ -33,7 +33,7 @@ class CommandFault:
 
 @dataclass
 class Faults:
-    """Faults of a vehicle or component, all off at first. Changes apply from the next message or step on.
+    """Faults of a vehicle or component, initially all off. A change applies from the next message or step on.
 
     - ``gps_lost``: no GPS fix; the estimator drops its position after seven seconds
     - ``rc_lost``: the pilot's transmitter is off; the failsafes of the vehicle react
@@ -43,8 +43,8 @@ class Faults:
     - ``silent``: the radio fails in both directions; the vehicle continues to fly
     - ``prearm_failures``: additional reasons of the arming checks, such as "Compass not healthy"
     - ``drop_outgoing``, ``drop_incoming``: number of frames to lose next (counts down)
-    - ``loss``, ``loss_incoming``: share of outgoing and incoming frames lost at random, 0 to 1; determined by the
-      seed
+    - ``loss``, ``loss_incoming``: share of outgoing and incoming frames to lose, 0 to 1; chosen at random from the
+      vehicle's seed
     - ``lost_messages``: message id → number of outgoing messages to lose next; see ``lose``
     - ``motor_failed``: one motor stops; the vehicle cannot hold its altitude and descends
     - ``no_ftp``: FILE_TRANSFER_PROTOCOL is not answered and not in the capabilities
@@ -77,7 +77,7 @@ class Faults:
         def __setattr__(self, name: str, value: object) -> None:
             # A misspelled fault would otherwise be accepted and change nothing.
             if name not in self.__dataclass_fields__:
-                raise AttributeError(f"there is no fault {name!r}; faults: {', '.join(self.__dataclass_fields__)}")
+                raise AttributeError(f"Faults has no fault {name!r}; faults: {', '.join(self.__dataclass_fields__)}")
             super().__setattr__(name, value)
 
     def refuse(
@@ -100,7 +100,7 @@ class Faults:
         self.commands[command] = CommandFault(times, acks=0)
 
     def lose(self, message_type: type[Message], *, times: int = 1) -> None:
-        """Lose the next outgoing messages of this type."""
+        """Lose the next ``times`` outgoing messages of this type."""
         self.lost_messages[message_type.ID] = times
 
     def drops_outgoing(self, message: Message, rng: random.Random) -> bool:
@@ -123,11 +123,11 @@ class Faults:
         return self.loss_incoming > 0.0 and rng.random() < self.loss_incoming
 
     def repeat_ack(self, command: int, count: int = 2, *, times: int | None = None) -> None:
-        """Execute a MAV_CMD and acknowledge it several times."""
+        """Execute a MAV_CMD and acknowledge it ``count`` times."""
         self.commands[command] = CommandFault(times, acks=count)
 
     def delay_ack(self, command: int, seconds: float, *, times: int | None = None) -> None:
-        """Execute a MAV_CMD at once and acknowledge it later."""
+        """Execute a MAV_CMD at once and acknowledge it ``seconds`` later."""
         self.commands[command] = CommandFault(times, delay_s=seconds)
 
     def report_progress(
@@ -144,7 +144,7 @@ class Faults:
             self.commands.pop(command, None)
 
     def take(self, command: int) -> CommandFault | None:
-        """Return the fault that applies to this command now, and decrement its ``times``."""
+        """Return the fault to apply to this command now, or None; decrements its ``times``."""
         fault = self.commands.get(command)
         if fault is not None and fault.times is not None:
             fault.times -= 1

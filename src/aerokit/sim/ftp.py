@@ -40,12 +40,12 @@ class FileHandle(ABC):
     def write(self, offset: int, data: bytes) -> None:
         raise FileFault(EROFS)
 
-    def close(self) -> None:  # noqa: B027 - most have nothing to do then
+    def close(self) -> None:  # noqa: B027 - most subclasses need no cleanup
         """Close the file; an upload takes effect now."""
 
 
 class UploadedFile(FileHandle):
-    """A file that is written in pieces, in any order, and takes effect when it is closed."""
+    """A file that a client writes in blocks, in any order; it takes effect when it is closed."""
 
     def __init__(self) -> None:
         self.content: bytearray = bytearray()
@@ -64,26 +64,26 @@ class UploadedFile(FileHandle):
 
 
 class Mount(ABC):
-    """Generated files below one prefix such as ``@PARAM``."""
+    """Generated files whose paths begin with a common prefix such as ``@PARAM``."""
 
     is_listed = False
-    """True if it appears in the root and can be listed."""
+    """True if the mount appears in the root folder and its files can be listed."""
 
     @abstractmethod
     def size(self, path: str) -> int:
-        """Return the size that an open reports, which may be an estimate; FileFault if there is no such file."""
+        """Return the size reported on opening, perhaps an estimate; raises FileFault if there is no such file."""
 
     @abstractmethod
     def open(self, path: str, *, writing: bool) -> FileHandle:
-        """Open a file; FileFault on failure."""
+        """Open a file; raises FileFault on failure."""
 
     def entries(self) -> list[Entry]:
-        """Return the files; FileFault if it cannot be listed."""
+        """Return the files; raises FileFault if the mount cannot be listed."""
         raise FileFault(ENOENT)
 
 
 class TextMount(Mount):
-    """Read-only texts, such as ArduPilot's ``@SYS``. An open reports 100,000 bytes for each."""
+    """Read-only text files, such as ArduPilot's ``@SYS``. Opening a file reports a size of 100,000 bytes."""
 
     is_listed = True
     _PLACEHOLDER = 100_000
@@ -177,7 +177,7 @@ class FileTree:
         self._file(path).content.extend(data)
 
     def get(self, path: str) -> bytes:
-        """Return the content of a file; FileFault if there is none."""
+        """Return the content of a file; raises FileFault if it does not exist."""
         return bytes(self._file(path).content)
 
     def __contains__(self, path: str) -> bool:
@@ -203,7 +203,7 @@ class FileTree:
         return 4096 if isinstance(node, dict) else node.size
 
     def open(self, path: str, *, writing: bool = False, create: bool = False) -> FileHandle:
-        """Open a file; ``create`` creates or empties it."""
+        """Open a file; ``create`` creates a missing file and empties an existing one."""
         if (inside := self.mounted(path)) is not None:
             return inside[0].open(inside[1], writing=writing)
         if create:
@@ -250,7 +250,7 @@ class FileTree:
         folder[name] = node
 
     def claim(self, size: int) -> None:
-        """Reserve free bytes, or release them (negative); FileFault if there are not enough."""
+        """Reserve free bytes; a negative size releases them. Raises FileFault if there are not enough."""
         if self.free_bytes is None:
             return
         if size >= 0 and (size > self.free_bytes or self.free_bytes == 0):
@@ -269,7 +269,7 @@ class FileTree:
         return [(name, None if isinstance(node, dict) else node.size) for name, node in folder.items()]
 
     def make_folder(self, path: str) -> None:
-        """Create a folder in an existing one."""
+        """Create a folder; its parent folder must exist."""
         folder, name = self._parent(path)
         if name in folder:
             raise FileFault(EEXIST)
@@ -326,10 +326,10 @@ def _contains(folder: _Folder, other: _Folder) -> bool:
 
 
 class FtpPacket(FtpMessage):
-    """Payload of a FILE_TRANSFER_PROTOCOL message and its client. A request's ``data`` always has 239 bytes."""
+    """Payload of a FILE_TRANSFER_PROTOCOL message, and its client. ``data`` of a request always has 239 bytes."""
 
     client: tuple[int, int] = (0, 0)
-    """System and component id."""
+    """System and component id of the client."""
 
     @classmethod
     def parse(cls, message: FileTransferProtocol) -> FtpPacket:
@@ -359,13 +359,13 @@ class FtpPacket(FtpMessage):
         return self.acknowledge(data).replace(opcode=MavFtpOpcode.NAK)
 
     def refuse_errno(self, errno: int) -> FtpPacket:
-        """Return the NAK for an errno; EEXIST and ENOENT have error codes of their own."""
+        """Return the NAK for an errno; MAVFTP has separate error codes for EEXIST and ENOENT."""
         own = {EEXIST: MavFtpErr.FILEEXISTS, ENOENT: MavFtpErr.FILENOTFOUND}.get(errno)
         return self.refuse(MavFtpErr.FAILERRNO, errno) if own is None else self.refuse(own)
 
 
 class FtpServer:
-    """Receives requests; a subclass per autopilot answers them. `Faults.no_ftp` turns it off."""
+    """Receives MAVFTP requests; each autopilot's subclass answers them. `Faults.no_ftp` turns the server off."""
 
     def __init__(self, vehicle: MessageHost, files: FileTree) -> None:
         self.files = files
@@ -374,7 +374,7 @@ class FtpServer:
 
     @property
     def open_sessions(self) -> int:
-        """Number of sessions with an open file that have not timed out."""
+        """Number of sessions that have an open file and have not timed out."""
         raise NotImplementedError
 
     def restart(self) -> None:
@@ -394,12 +394,12 @@ def path_in(data: bytes) -> str:
 
 
 def crc32(data: bytes, start: int = 0) -> int:
-    """CRC32 as CalcFileCRC32 computes it: the usual polynomial without the inversions."""
+    """Return the checksum of CalcFileCRC32: CRC32 without the inversions before and after."""
     return zlib.crc32(data, start ^ 0xFFFFFFFF) ^ 0xFFFFFFFF
 
 
 def read_crc32(files: FileTree, path: str, block: int) -> int:
-    """Return the checksum of a file, read in blocks; FileFault if it cannot be read."""
+    """Return the checksum of a file, read in blocks; raises FileFault if it cannot be read."""
     file, checksum, offset = files.open(path), 0, 0
     while data := file.read(offset, block):
         checksum, offset = crc32(data, checksum), offset + len(data)

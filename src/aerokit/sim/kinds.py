@@ -31,9 +31,9 @@ def kind_names() -> tuple[str, ...]:
 
 
 def kind_class(name: str) -> type[SimulatedVehicle]:
-    """Return the class of a kind.
+    """Return the vehicle class of a kind name.
 
-    Raises InvalidArgument, with the list of kinds, if there is none of that name.
+    Raises InvalidArgument, with the list of kinds, for an unknown name.
     """
     if name not in _KINDS:
         raise InvalidArgument(
@@ -64,9 +64,9 @@ _INT8_MAX = 127.0
 def scale_timeouts(vehicles: Iterable[SimulatedVehicle], speedup: float, *, leave: Collection[str] = ()) -> None:
     """Multiply the timeouts in the vehicles' parameters by ``speedup``; ``leave`` names parameters to skip.
 
-    A client sends heartbeats and set-points by its own clock: at ten times the speed, five seconds of the vehicle
-    are half a second of the client. PX4's simulation scales COM_DL_LOSS_T in the same way. ArduPilot's DISARM_DELAY
-    is limited to 127 s by its type. Nothing changes for a ``speedup`` of 1 or less.
+    A client times its heartbeats and set-points by its own clock. At ten times the speed, five simulated seconds last
+    only half a second for the client. PX4's simulation scales COM_DL_LOSS_T in the same way. ArduPilot's DISARM_DELAY
+    is limited to 127 s by its type. A ``speedup`` of 1 or less changes nothing.
     """
     if speedup <= 1.0:
         return

@@ -28,16 +28,16 @@ _BLOCK = 90
 
 @dataclass(frozen=True)
 class SimulatedLog:
-    """A flight log. Its content is noise derived from size and time, the same in every run."""
+    """A flight log. Its content is pseudo-random, derived from ``seed``, or from size and time without a seed."""
 
     size: int
     time_utc: int = 1_790_000_000
     """Seconds since 1970."""
     seed: int | None = None
-    """Seed of the noise, instead of size and time."""
+    """Seed of the content; None derives it from size and time."""
 
     def make(self) -> bytes:
-        """Return the content; with the same seed, a longer log starts with it."""
+        """Return the content; of two logs with the same seed, the longer starts with the shorter."""
         words = -(-self.size // 4)
         return random.Random(self._noise).randbytes(4 * words)[: self.size]
 
@@ -51,7 +51,7 @@ class SimulatedLog:
 
 
 class LogServer:
-    """Sends log lists, and log content in blocks of 90 bytes: ``rate_hz`` messages a second, ``burst`` at a time.
+    """Sends lists and contents of logs, ``rate_hz`` messages a second in groups of ``burst``.
 
     Serves one transfer at a time. Subclasses implement what differs between autopilots.
     """
@@ -118,14 +118,14 @@ class LogServer:
         self._append_to_file(len(self.logs) - 1, self.logs[-1].make()[before.size :])
 
     def blocks(self, number: int, log_id: int, offset: int, count: int) -> list[Callable[[], Message]]:
-        """Return functions that create the LOG_DATA blocks of a range; a single empty block if there is no data."""
+        """Return functions that create the LOG_DATA blocks of a range, or one empty block for a range without data."""
         data = self.content(number)
         end = min(len(data), offset + count)
         starts = range(offset, end, _BLOCK) if offset < end else range(offset, offset + 1)
         return [lambda start=start: _block(data, log_id, start, end) for start in starts]  # type: ignore[misc]
 
     def transfer(self, messages: Sequence[Callable[[], Message]], channel: Channel) -> None:
-        """Send these messages, and abort the transfer before."""
+        """Abort the running transfer and send these messages."""
         self.restart()
         self._outgoing.extend(messages)
         self._channel = channel
@@ -141,9 +141,9 @@ class LogServer:
 
 
 class ArduPilotLogServer(LogServer):
-    """Log numbers start at 1. Requests during a transfer are ignored; data of an unknown log aborts it.
+    """ArduPilot's log server: log numbers start at 1, and requests are refused while armed.
 
-    Nothing is listed or sent while armed.
+    Requests during a transfer are ignored. A request for an unknown log aborts the transfer.
     """
 
     def __init__(
@@ -200,10 +200,10 @@ class ArduPilotLogServer(LogServer):
 
 
 class Px4LogServer(LogServer):
-    """Log numbers start at 0. Data is sent only after a list request, whose ``end`` is ignored.
+    """PX4's log server: log numbers start at 0, and data is sent only after a list request.
 
-    A new request replaces the transfer. The last block is not cut to the requested size. Without logs, a list
-    request is not answered.
+    The ``end`` of a list request is ignored. A new request replaces the transfer. The last block is not cut to the
+    requested size. Without logs, a list request is not answered.
     """
 
     _was_listed = False

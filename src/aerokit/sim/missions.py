@@ -1,6 +1,6 @@
 """Missions, fences and rally points of a simulated vehicle: conversions and the ``@MISSION`` files.
 
-The protocol itself differs so much between autopilots that each has a server of its own
+The servers of the mission protocol are separate, because the autopilots differ too much
 (`sim.ardupilot.mission_server`, `sim.px4.mission_server`). https://mavlink.io/en/services/mission.html
 """
 
@@ -38,7 +38,7 @@ class MissionStore(Protocol):
         ...
 
     def items(self, mission_type: int) -> list[MissionItem]:
-        """Return the items as a download has them, including ArduPilot's home (item 0)."""
+        """Return the items that a download sends, including ArduPilot's home (item 0)."""
         ...
 
     def replace(self, mission_type: int, items: Sequence[MissionItem], *, start: int = 0, clear: bool = True) -> int:
@@ -55,7 +55,7 @@ def float32(value: float) -> float:
 
 
 def item_from(message: AnyItem) -> MissionItem:
-    """Return the item of a MISSION_ITEM_INT, or of a MISSION_ITEM without scaling ``x`` and ``y``."""
+    """Convert a MISSION_ITEM_INT or MISSION_ITEM to an item; does not scale ``x`` and ``y``."""
     numbers = (
         message.param1,
         message.param2,
@@ -101,13 +101,13 @@ _FILES = {
     "fence.dat": MavMissionType.FENCE,
     "rally.dat": MavMissionType.RALLY,
 }
-# Fills gaps in an upload.
+# Zero bytes between the parts of an incomplete upload decode as this item.
 _EMPTY = MissionItem(0, 0, autocontinue=False)
 _PLACEHOLDER_SIZE = 1 << 20
 
 
 class MissionMount(Mount):
-    """Files mounted as ``@MISSION``. Accepts one upload at a time; an open reports one mebibyte."""
+    """Files mounted as ``@MISSION``. Accepts one upload at a time; opening a file reports a size of 1 MiB."""
 
     def __init__(self, store: MissionStore) -> None:
         self._store = store
@@ -137,7 +137,7 @@ class _Reader(FileHandle):
 
 
 class _Writer(UploadedFile):
-    """An upload that is incomplete or rejected has no effect and is not reported."""
+    """Upload of items. An incomplete or rejected upload has no effect and sends no status text."""
 
     def __init__(self, store: MissionStore, type_: int) -> None:
         super().__init__()

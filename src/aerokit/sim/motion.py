@@ -1,8 +1,8 @@
 """Local frame and motion of a simulated multicopter: a point mass that leans as its acceleration requires.
 
-Modelled: limits of speed, acceleration and turn rate; braking before a target as ArduPilot's and PX4's square-root
-controllers do; drag, which makes it lean into its airspeed; constant wind with gusts; ground. Not modelled:
-propeller dynamics, attitude control loops, ground effect, drift.
+Modelled: limits of speed, acceleration and turn rate; braking before a target, by the square-root controller of
+ArduPilot and PX4; drag, for which the copter leans forward in steady flight; constant wind with gusts; ground. Not
+modelled: propeller dynamics, attitude control loops, ground effect, drift.
 """
 
 from __future__ import annotations
@@ -30,7 +30,10 @@ class GlobalPoint(NamedTuple):
 
 
 class LocalFrame:
-    """Metres north, east and down of an origin; accurate within a few kilometres, like the autopilots' own frames."""
+    """Conversion between global positions and metres north, east and down of an origin.
+
+    Accurate within a few kilometres, like the autopilots' own local frames.
+    """
 
     __slots__ = ("_east_scale", "origin")
 
@@ -92,7 +95,7 @@ def euler_from_quaternion(w: float, x: float, y: float, z: float) -> tuple[float
 
 
 GRAVITY_M_S2 = 9.80665
-_DRAG_PER_S = 0.33  # Deceleration per airspeed: a 450 mm quadrotor leans 20 degrees at 10 m/s.
+_DRAG_PER_S = 0.33  # Deceleration divided by airspeed: a 450 mm quadrotor leans 20 degrees at 10 m/s.
 _VELOCITY_TIME_CONSTANT_S = 0.3
 _LEAN_TIME_CONSTANT_S = 0.15
 _TURN_GAIN_PER_S = 2.0
@@ -100,7 +103,7 @@ _TERMINAL_SPEED_M_S = 25.0
 
 
 def wrap_pi(angle: float) -> float:
-    """Return the angle between -pi and pi."""
+    """Return the equivalent angle between -pi and pi."""
     return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
@@ -112,7 +115,7 @@ def _clamp(value: float, limit: float) -> float:
 
 
 def approach_speed(distance: float, gain: float, deceleration: float) -> float:
-    """Return the speed at which to approach a point ``distance`` metres away and stop there without overshoot."""
+    """Return the highest speed at which a vehicle can still stop at a point ``distance`` metres away."""
     linear = deceleration / (gain * gain)
     if distance <= linear:
         return distance * gain
@@ -131,7 +134,7 @@ class MotionLimits:
 
 @dataclass
 class SimulatedWind:
-    """Wind in m/s, as the direction in which the air moves. ``gusts_m_s`` is the standard deviation of its changes."""
+    """Velocity of the air in m/s. ``gusts_m_s`` is the standard deviation of the gusts."""
 
     north_m_s: float = 0.0
     east_m_s: float = 0.0
@@ -182,7 +185,7 @@ class Motion:
 
     @property
     def place(self) -> Ned:
-        """Metres north, east and down."""
+        """Metres north, east and down of the origin."""
         return (self.north, self.east, self.down)
 
     def seek_velocity(self, north: float, east: float, down: float) -> None:
@@ -225,7 +228,7 @@ class Motion:
 
     @property
     def airspeed_m_s(self) -> float:
-        """Horizontal airspeed."""
+        """Horizontal speed through the air."""
         return math.hypot(
             self.velocity_north - self.wind.north_m_s - self._gust_north,
             self.velocity_east - self.wind.east_m_s - self._gust_east,
@@ -233,11 +236,11 @@ class Motion:
 
     @property
     def ground_speed_m_s(self) -> float:
-        """Horizontal ground speed."""
+        """Horizontal speed over the ground."""
         return math.hypot(self.velocity_north, self.velocity_east)
 
     def step(self, dt: float, *, powered: bool = True) -> None:
-        """Advance by ``dt`` seconds; unpowered, it falls."""
+        """Advance by ``dt`` seconds; an unpowered copter falls."""
         if self.wind.gusts_m_s > 0.0:
             self._update_gusts(dt)
         if powered:
@@ -251,7 +254,7 @@ class Motion:
         self._turn(dt, powered=powered)
 
     def settle(self) -> None:
-        """Stop, level, on the ground."""
+        """Rest level on the ground, without a target."""
         self.down = self.ground_down
         self.velocity_north = self.velocity_east = self.velocity_down = 0.0
         self.acceleration_north = self.acceleration_east = self.acceleration_down = 0.0

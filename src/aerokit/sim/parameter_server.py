@@ -18,9 +18,9 @@ from aerokit.sim.vehicle import SimulatedVehicle, sender_of
 
 
 class ParameterServer:
-    """Handles PARAM_REQUEST_LIST, PARAM_REQUEST_READ and PARAM_SET; subclasses implement what differs.
+    """Handles PARAM_REQUEST_LIST, PARAM_REQUEST_READ and PARAM_SET; each autopilot has a subclass.
 
-    Lists are sent per port, at ``list_rate_hz`` parameters a second in groups of ``burst``.
+    A list is sent only on the requesting port: ``list_rate_hz`` parameters a second, in groups of ``burst``.
     """
 
     burst = 5
@@ -106,12 +106,12 @@ _ROUNDING_OFFSET = 0.01
 class ArduPilotParameterServer(ParameterServer):
     """Parameter protocol of ArduPilot.
 
-    The development version of 4.7 does not answer an unknown name or a value that is not a number. With ``errors``
-    it sends PARAM_ERROR, as the released version does, and sends the confirmation of PARAM_SET to the sender's port
-    in addition to the broadcast.
+    Without ``errors`` it does not answer requests for an unknown name or a value that is not a number, like the
+    development version of 4.7. With ``errors`` it answers them by PARAM_ERROR, like the released version, and confirms
+    PARAM_SET on the sender's port in addition to the broadcast.
 
-    Read requests wait in a queue of 20, and one is served each millisecond; requests beyond that are lost. A list
-    begins with the banner.
+    A queue holds 20 read requests, of which one is served each millisecond; further requests are lost. The banner
+    texts precede a list.
     """
 
     def __init__(
@@ -189,16 +189,15 @@ def rounded(value: float, type_: int) -> float:
 
 
 _SECOND_ECHO_S = 0.02
-# Seen in the unused index field of PX4's PARAM_ERROR.
+# Observed value of the unused index field of PX4's PARAM_ERROR.
 _UNUSED_INDEX = 24400
 
 
 class Px4ParameterServer(ParameterServer):
-    """Parameter protocol of PX4; ``errors`` sends PARAM_ERROR as main does, v1.16 sends none.
+    """Parameter protocol of PX4; ``errors`` sends PARAM_ERROR, as PX4's main branch does and v1.16 does not.
 
-    Values are not checked: the four bytes are stored. PARAM_SET is confirmed on the sender's port, and a change is
-    broadcast shortly after. Setting _HASH_CHECK stops a list; a list request during a list restarts it without the
-    hash.
+    Values are stored unchecked. PARAM_SET is confirmed on the sender's port, and a change is broadcast shortly after.
+    Setting _HASH_CHECK stops a running list. A second list request restarts the list without the hash.
     """
 
     burst = 10

@@ -39,8 +39,8 @@ class SimParameter:
     is_volatile: bool = False
     """Excluded from PX4's hash, because the vehicle changes it."""
     switch: str | None = None
-    """Name of a parameter; while that is 0, ArduPilot leaves this one out of lists and counts, but answers reads by
-    name.
+    """Name of an enabling parameter. While it is 0, ArduPilot omits this parameter from lists and counts, but answers
+    reads by name.
     """
 
     def as_parameter(self, index: int | None = None) -> Parameter:
@@ -66,7 +66,7 @@ class SimParameters:
     def from_text(cls, text: str, *, used: Iterable[str] = (), count: int | None = None) -> SimParameters:
         """Parse lines of ``name,type,value[,default[,switch]]``; the switch ``v`` marks a volatile parameter.
 
-        ``count`` limits their number, in the order of the text; those in ``used`` are always included.
+        ``count`` limits the number of parameters, in the order of the text. Names in ``used`` are always included.
         """
         lines = text.split()
         if count is not None:
@@ -86,7 +86,7 @@ class SimParameters:
         return self[name] if name in self else default  # noqa: SIM401 - this is `get`
 
     def __setitem__(self, name: str, value: float) -> None:
-        """Raises KeyError for an unknown name."""
+        """Set a value; raises KeyError for an unknown name."""
         row = self.row(name)
         row.value = stored(value, row.type)
         if name in self._switched.values():
@@ -95,7 +95,7 @@ class SimParameters:
     def change(self, values: Mapping[str, float]) -> None:
         """Set several parameters.
 
-        Raises InvalidArgument, with similar names, for an unknown one.
+        Raises InvalidArgument, with similar names, for an unknown name.
         """
         for name, value in values.items():
             if name not in self:
@@ -114,7 +114,7 @@ class SimParameters:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Listed names, in the vehicle's order; the position is the index on the wire."""
+        """Names that a list contains, in the vehicle's order; the position is ``param_index``."""
         if self._names is None:
             off = {name for name, switch in self._switched.items() if not self[switch]}
             self._names = tuple(name for name in self._rows if name not in off)
@@ -122,7 +122,7 @@ class SimParameters:
         return self._names
 
     def index(self, name: str) -> int:
-        """Return the position in ``names``; KeyError if it is not listed."""
+        """Return the position in ``names``; raises KeyError for a name that is not listed."""
         _ = self.names
         return self._indices[name]
 
@@ -141,7 +141,7 @@ class SimParameters:
         return row
 
     def add(self, name: str, value: float, type: int = MavParamType.REAL32) -> None:  # noqa: A002
-        """Append a parameter, as when a feature is enabled at run time."""
+        """Append a parameter, like a firmware on which a feature is enabled at run time."""
         self._rows[name] = SimParameter(name, type, stored(value, type), stored(value, type))
         self._names = None
 
@@ -195,8 +195,9 @@ _GUESSED_ROW_SIZE = 12
 class ParameterPackMount(Mount):
     """Files mounted as ``@PARAM``.
 
-    ``apply(name, value)`` is called for each uploaded parameter. With ``block`` no value crosses a block of that
-    size and an open reports the exact size (PX4); without it, the first read sets the block size (ArduPilot).
+    ``apply(name, value)`` is called for each uploaded parameter. ``block`` is the size of the blocks over whose
+    boundaries no value extends. With it, opening the file reports the exact size (PX4). Without it, the first read
+    sets the block size (ArduPilot).
     """
 
     def __init__(
@@ -222,7 +223,7 @@ class ParameterPackMount(Mount):
 
 
 class _Reader(FileHandle):
-    """All reads must have the same size, so that blocks read at different times never split a value."""
+    """Download of parameters. All reads must have the same size, so that no value extends over two blocks."""
 
     def __init__(self, parameters: SimParameters, path: str, block: int | None) -> None:
         query = _query(path)
@@ -265,7 +266,7 @@ class _Reader(FileHandle):
 
 
 class _Writer(UploadedFile):
-    """Parameters are applied on close. An invalid file has no effect and is not reported."""
+    """Upload of parameters, applied on close. An invalid file has no effect and sends no status text."""
 
     def __init__(self, parameters: SimParameters, apply: Callable[[str, float], None]) -> None:
         super().__init__()
@@ -301,7 +302,7 @@ class _Writer(UploadedFile):
 
 
 def _query(path: str) -> dict[str, int]:
-    """Parse the query string; FileFault for another file name."""
+    """Parse the query string; raises FileFault for another file name."""
     name, _, query = path.partition("?")
     if name != _NAME:
         raise FileFault(ENOENT)

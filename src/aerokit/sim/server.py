@@ -17,32 +17,31 @@ from aerokit.sim.channel import Channel, SharedMessageReader, datagrams
 from aerokit.sim.vehicle import TICK_S, SimulatedVehicle
 from aerokit.transport import Link, MemoryLink, Peer, TcpListen, create_link, memory_link_pair
 
-# Shortest timer, in loop time, for many vehicles or faster than real time: several ticks then run at once.
+# Minimum timer delay in loop time, for many vehicles or above real time: several ticks then run in one callback.
 _MIN_WAIT_S = 0.001
 _BATCH_THRESHOLD = 10
-# Simulated seconds whose output is sent together, for more than `_BATCH_THRESHOLD` vehicles in real time.
+# Output of this many simulated seconds is sent together for more than `_BATCH_THRESHOLD` vehicles.
 _BATCH_INTERVAL_S = TICK_S
-# On virtual time, events this close together run in the same callback, as timers would.
+# On virtual time, events less than this apart run in the same callback.
 _INSTANT_S = 1e-8
 _EXTRA_TURNS = 1
-# Simulated seconds that are caught up after the loop was blocked; more is skipped unless in real time.
+# Simulated seconds that are caught up after the loop was blocked. Except in real time, the rest is skipped.
 _MAX_CATCH_UP_S = 0.5
 
 
 class SimulatorServer:
-    """Serves vehicles while its ``async with`` block runs. Every vehicle is on every link.
+    """Serves vehicles on links while its ``async with`` block runs. Leaving the block closes the links.
 
-    ``vehicles_on`` overrides that: for each link, the vehicles on it.
+    Every vehicle is on every link, unless ``vehicles_on`` lists the vehicles of each link.
 
-    It runs on the loop's clock with timers only, without tasks or threads. ``speedup`` 10 runs ten simulated seconds
-    per second. If the loop was blocked, time is caught up in real time; at other speeds all but half a simulated
-    second is skipped, so that a client that had no chance to send does not look silent. Leaving the block closes the
-    links.
+    The server uses timers of the event loop, without tasks or threads. ``speedup`` 10 simulates ten seconds per
+    second. After the loop was blocked, the server catches up in real time. At other speeds it skips all but half a
+    simulated second, so that vehicles do not detect a link loss while the client could not send.
 
-    An exception in a vehicle or a callback ends the block at once: the links are closed, the task that runs the
-    block is cancelled, and the block raises the exception.
+    An exception in a vehicle or a callback closes the links and cancels the task that runs the block; the block then
+    raises the exception.
 
-    Raises LinkOpenError if a link cannot be opened; the others are closed then.
+    Raises LinkOpenError if a link cannot be opened, after closing the others.
     """
 
     def __init__(
@@ -75,17 +74,17 @@ class SimulatorServer:
         self._timer: asyncio.TimerHandle | None = None
         self._timer_due = self._timer_at = 0.0
         self._exit = AsyncExitStack()
-        # The task that entered the block; that of a fixture may end before the block does.
+        # The task that entered the block. A test fixture's task may end before the block does.
         self._owner: asyncio.Task[Any] | None = None
         self._cancels_owner = False
         self.on_datagram: Callable[[float, bytes, bool], object] | None = None
-        """Called with every datagram in either direction: simulated time, bytes, and True if a vehicle sent it."""
+        """Called with simulated time, bytes and direction of every datagram; True if a vehicle sent the datagram."""
         self.failure: Exception | None = None
-        """Exception raised by a vehicle; the simulation has stopped since."""
+        """Exception of a vehicle that stopped the simulation; None while it runs."""
 
     @property
     def addresses(self) -> tuple[str, ...]:
-        """Addresses of its links, resolved once they are open."""
+        """Addresses of the links; once the links are open, with the actual ports."""
         return tuple(link.address for link in self._links)
 
     @property
@@ -97,7 +96,7 @@ class SimulatorServer:
 
     async def __aenter__(self) -> Self:
         if self._loop is not None:
-            raise BusyError("this SimulatorServer was started before; create a new one")
+            raise BusyError("this SimulatorServer was already started; create a new one")
         self._loop, self._owner = asyncio.get_running_loop(), asyncio.current_task()
         self._jump = getattr(self._loop, "jump", None)
         if self._jump is None and len(self.vehicles) > _BATCH_THRESHOLD:
@@ -129,7 +128,7 @@ class SimulatorServer:
         self._end(error)
 
     def _end(self, error: BaseException | None) -> None:
-        """Raise a vehicle's exception in place of the one that it caused."""
+        """Raise a vehicle's exception instead of the cancellation that it caused."""
         self._stop()
         owner, self._owner = self._owner, None
         if self._cancels_owner and owner is not None and owner is asyncio.current_task():
@@ -138,9 +137,9 @@ class SimulatorServer:
             raise self.failure from self.failure.__cause__
 
     def wake(self) -> None:
-        """Run everything that is due. Call it after changing a fault or value.
+        """Run all due events. Call it after changing a fault or value.
 
-        Raises the exception that a vehicle raises or has raised.
+        Raises the exception that a vehicle raises now or raised before.
         """
         if self.failure is not None:
             raise self.failure
@@ -163,7 +162,7 @@ class SimulatorServer:
             self._fail(error)
 
     def _fail(self, error: Exception) -> None:
-        """Close the links and cancel the owner, because nobody sees an exception raised in a loop callback."""
+        """Close the links and cancel the owner; asyncio only logs an exception that a callback raises."""
         self.failure = error
         self._stop()
         for link in self._links:
@@ -184,7 +183,7 @@ class SimulatorServer:
         self._schedule()
 
     def _run_ahead(self, now: float) -> None:
-        """Like `_run`; on virtual time also runs what follows until another callback or timer of the loop is due."""
+        """Run due events; on virtual time also later events, until another callback or timer of the loop is due."""
         self._step(now)
         while not self._flush():
             if (due := self._jump_ahead()) is None:
@@ -194,11 +193,11 @@ class SimulatorServer:
         loop = self._loop
         if self._jump is None or loop is None or self._loop_time(min(self._dues)) < loop.time() + _INSTANT_S:
             self._schedule()
-        else:  # The receivers of what was sent run first; they may not answer.
+        else:  # The receivers of the datagrams run first; they might not answer.
             loop.call_soon(self._continue_run, _EXTRA_TURNS)
 
     def _continue_run(self, turns: int) -> None:
-        """Replace a timer on virtual time, after ``turns`` more turns of the loop for receivers that were woken."""
+        """Continue `_run_ahead` after up to ``turns`` more iterations of the loop, in which woken receivers run."""
         loop = self._loop
         if loop is None:
             return
@@ -213,7 +212,7 @@ class SimulatorServer:
             self._fail(error)
 
     def _jump_ahead(self) -> float | None:
-        """On virtual time, advance the clock to the next event; return its time, or None if something else is first."""
+        """Advance a virtual clock to the next event and return its time; None if the loop has earlier work."""
         due = min(self._dues)
         if self._jump is None or due == math.inf or not self._jump(self._loop_time(due)):
             return None
@@ -273,7 +272,7 @@ class SimulatorServer:
         self._timer = loop.call_at(when, self._on_timer)
 
     def _skip_lateness(self) -> None:
-        """Shift the start time by the delay of the timer, except in real time."""
+        """Except in real time, skip the time by which the timer is late, beyond what is caught up."""
         if self._loop is None or self._timer is None or self._speedup == 1.0:
             return
         late = self._loop.time() - self._timer_at - _MAX_CATCH_UP_S / self._speedup
@@ -306,7 +305,7 @@ class _Port:
                 channel.reader = self.reader
 
     def take_datagrams(self, *, together: bool) -> list[bytes]:
-        """Return the datagrams to send. With ``together``, many vehicles share datagrams, as behind a router."""
+        """Return the datagrams to send. With ``together``, many vehicles share datagrams, as a router joins them."""
         active = [channel for channel in self.channels if channel.has_output]
         if together and len(self.channels) > _BATCH_THRESHOLD:
             return datagrams(piece for channel in active for piece in channel.take_pieces())
@@ -336,7 +335,7 @@ def _uncancel(task: asyncio.Task[Any]) -> None:
 
 
 def _channels(vehicles: Iterable[SimulatedVehicle], connected: set[int]) -> list[Channel]:
-    """Return a channel of each vehicle: its first channel on its first link, a new one on each other link."""
+    """Return one channel per vehicle: its first channel on its first link, a new channel on each further link."""
     channels = []
     for vehicle in vehicles:
         is_first = id(vehicle) not in connected
@@ -349,7 +348,7 @@ def _channels(vehicles: Iterable[SimulatedVehicle], connected: set[int]) -> list
 async def simulated_link(
     vehicles: SimulatedVehicle | Iterable[SimulatedVehicle], *, speedup: float = 1.0, latency_s: float = 0.0
 ) -> AsyncIterator[MemoryLink]:
-    """Simulate vehicles in memory; yields the client's end of the link, which the caller opens.
+    """Simulate vehicles in memory and yield the client's end of the link, which the caller opens.
 
     ``latency_s`` delays both directions, in seconds of the loop's clock.
     """
@@ -364,7 +363,7 @@ async def open_simulator(
 ) -> AsyncIterator[SimulatorServer]:
     """Serve vehicles on addresses ("tcpin:0.0.0.0:5760", "udpout:127.0.0.1:14550") for other programs.
 
-    Raises InvalidArgument for a wrong address, LinkOpenError for one that cannot be opened.
+    Raises InvalidArgument for an invalid address, LinkOpenError if an address cannot be opened.
     """
     links = [create_link(address) for address in addresses]
     async with SimulatorServer(vehicles, links, speedup=speedup) as server:

@@ -1,7 +1,7 @@
 """Base of all simulated vehicles: simulated time, channels, timers, status texts, faults.
 
-It uses no event loop. The caller passes the time, in simulated seconds that never decrease. Events run at their own
-times and in the same order for any step size, so that equal calls with an equal seed produce equal bytes.
+A vehicle uses no event loop. The caller passes the time, in simulated seconds that never decrease. Times and order
+of events do not depend on the step size: equal calls with an equal seed produce equal bytes.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Handler = Callable[[Any, Channel], None]
 
 
 class MessageHost(Protocol):
-    """A vehicle or component, as its protocol servers use it."""
+    """Interface of a vehicle or component that its protocol servers use."""
 
     faults: Faults
 
@@ -47,7 +47,7 @@ class MessageHost(Protocol):
 
 
 class VehicleJournal(Protocol):
-    """Records what a vehicle receives and reports, such as `aerokit.testing.Journal`. Times are simulated seconds."""
+    """Records received messages and sent texts, such as `aerokit.testing.Journal`. Times are simulated seconds."""
 
     def on_text_sent(self, time_s: float, severity: int, text: str) -> None: ...
 
@@ -55,7 +55,7 @@ class VehicleJournal(Protocol):
 
 
 class AttachableComponent(Protocol):
-    """A MAVLink component that can be added to a vehicle: `ExtraComponent`, or a device of `aerokit.sim.components`."""
+    """A MAVLink component that can be added to a vehicle, such as `ExtraComponent` or `SimulatedCamera`."""
 
     @property
     def component_id(self) -> int:
@@ -63,7 +63,7 @@ class AttachableComponent(Protocol):
         ...
 
     def join(self, vehicle: SimulatedVehicle) -> None:
-        """Called once by the vehicle it is added to."""
+        """Join a vehicle; the vehicle calls this once."""
         ...
 
 
@@ -92,7 +92,7 @@ class SimulatedVehicle:
     """Sans-I/O base of a vehicle; subclasses define its messages, streams and motion.
 
     `receive` and `step` take the time, `take_outbox` returns bytes, and `next_due` is the time of the next event.
-    They use the first channel; `open_channel` adds one for each further link.
+    The first link uses the first channel; call `open_channel` for each further link.
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class SimulatedVehicle:
             component.join(self)
 
     def open_channel(self, *, version: int = 2) -> Channel:
-        """Open another port with stream rates of its own; ``version`` is its MAVLink version."""
+        """Open another port, which has its own stream rates; ``version`` is its MAVLink version."""
         channel = Channel(self.system_id, self.component_id, self.handlers, version=version)
         self.channels.append(channel)
         if self._is_on:
@@ -132,7 +132,7 @@ class SimulatedVehicle:
         return channel
 
     def receive(self, data: bytes, now: float, peer: Hashable = None, channel: Channel | None = None) -> None:
-        """Process bytes of a peer; replies are put into the outbox."""
+        """Process bytes from a peer; replies are put into the outbox."""
         self.step(now)
         channel = self._channel if channel is None else channel
         if self.faults.frozen or self.faults.silent or not self._is_on:
@@ -165,7 +165,7 @@ class SimulatedVehicle:
         if not self._is_on and math.isnan(self.booted_at):
             return self.now
         if self.faults.frozen:
-            return self.now + TICK_S  # Nothing happens, but the time must be followed.
+            return self.now + TICK_S  # `step` must follow the time even while nothing happens.
         due = self._next_tick
         if self._timers and self._timers[0][0] < due:
             due = self._timers[0][0]
@@ -278,7 +278,7 @@ class SimulatedVehicle:
                         self.send(message, channel)
 
     def _skip_to(self, now: float) -> None:
-        """Delay everything that is due, as in a program that hung."""
+        """Advance the time and delay all events as much, like a program that hung."""
         late = now - self.now
         if late <= 0:
             return
@@ -304,7 +304,7 @@ class SimulatedVehicle:
         return system in (0, self.system_id) and component in (0, self.component_id)
 
     def send(self, message: Message, channel: Channel | None = None, sender: tuple[int, int] | None = None) -> None:
-        """Send on one channel, or on all if None; a frame that `Faults` drop leaves a gap in the sequence."""
+        """Send on one channel, or on all if None. A frame lost by `Faults` leaves a gap in the sequence numbers."""
         for port in self.channels if channel is None else (channel,):
             data = port.encode(message, sender)
             if not self.faults.drops_outgoing(message, self.rng):
@@ -327,7 +327,7 @@ class SimulatedVehicle:
         self.send_chunks(severity, text, self._text_id)
 
     def send_chunks(self, severity: int, text: str, text_id: int) -> None:
-        """Send STATUSTEXTs with a common id; a chunk that is not full ends the text."""
+        """Send STATUSTEXTs with a common id; the last chunk has fewer than 50 characters."""
         self._record_text(severity, text)
         chunks = [text[start : start + _TEXT_SIZE] for start in range(0, len(text) + 1, _TEXT_SIZE)]
         self.send_parts([Statustext(severity, chunk, text_id, number) for number, chunk in enumerate(chunks)])

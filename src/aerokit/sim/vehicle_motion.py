@@ -1,6 +1,6 @@
 """Motion of simulated planes, rovers, boats and submarines.
 
-A plane is a point mass that flies where its nose points, through moving air. Modelled: limits of airspeed, climb,
+A plane is a point mass that moves in the direction of its nose through moving air. Modelled: limits of airspeed, climb,
 sink, bank and load; turn radius from bank and speed; wind correction; take-off and landing roll. Not modelled: lift
 and drag, stalls, sideslip, propellers, uneven ground.
 """
@@ -40,9 +40,9 @@ class WingLimits:
 
 
 class FixedWing(Motion):
-    """Motion of a plane: `bank_and_climb`, `head`, `fly_to`, `circle` or `roll_out` set the target, ``step`` moves.
+    """Motion of a plane: `bank_and_climb`, `head`, `fly_to`, `circle` and `roll_out` set the target, ``step`` moves.
 
-    It starts at rest on the ground and rolls straight ahead until it is fast enough and a climb is requested.
+    The plane starts at rest on the ground. It lifts off at its minimum airspeed, if a climb is requested.
     """
 
     north: float
@@ -70,7 +70,7 @@ class FixedWing(Motion):
         self._wanted_climb = max(-self.wing.sink_m_s, min(self.wing.climb_m_s, climb))
 
     def head(self, course: float, airspeed: float, climb: float, *, turn_rate: float = 0.0) -> None:
-        """Fly a ground course (rad from north) with wind correction; ``turn_rate`` is the change of the course."""
+        """Fly a ground course (rad from north) with wind correction; ``turn_rate`` is its change in rad/s."""
         speed = max(self._speed, self.wing.airspeed_min_m_s)
         north, east = self._air_movement()
         across = -north * math.sin(course) + east * math.cos(course)
@@ -79,12 +79,12 @@ class FixedWing(Motion):
         self.bank_and_climb(airspeed, math.atan(speed * rate / GRAVITY_M_S2), climb)
 
     def fly_to(self, north: float, east: float, down: float, *, airspeed: float) -> None:
-        """Fly towards and over a point; a plane cannot stop there."""
+        """Fly towards a point and over it."""
         course = math.atan2(east - self.east, north - self.north)
         self.head(course, airspeed, self.climb_to(down))
 
     def circle(self, north: float, east: float, down: float, *, radius: float, airspeed: float) -> None:
-        """Circle a point with this radius in metres; negative is counter-clockwise."""
+        """Circle a point with this radius in metres; a negative radius is counter-clockwise."""
         size, way = max(1.0, abs(radius)), math.copysign(1.0, radius)
         distance = math.hypot(north - self.north, east - self.east)
         inward = math.atan2(east - self.east, north - self.north)
@@ -107,7 +107,7 @@ class FixedWing(Motion):
         return self.is_on_ground and self._speed < _STOPPED_M_S
 
     def step(self, dt: float, *, powered: bool = True) -> None:
-        """Advance by ``dt`` seconds; unpowered, it glides."""
+        """Advance by ``dt`` seconds; an unpowered plane glides."""
         if self.wind.gusts_m_s > 0.0:
             self._update_gusts(dt)
         was_on_ground = self.is_on_ground
@@ -216,7 +216,7 @@ class GroundLimits:
 
 
 class GroundMotion(Motion):
-    """Motion of a rover or boat: `drive`, `head`, `drive_to` or `stop` set the target, ``step`` moves."""
+    """Motion of a rover or boat: `drive`, `head`, `drive_to` and `stop` set the target, ``step`` moves."""
 
     north: float
     east: float
@@ -247,7 +247,7 @@ class GroundMotion(Motion):
         self._wanted_speed, self._rate, self._heading = speed, 0.0, heading
 
     def drive_to(self, north: float, east: float, *, speed: float, stops: bool = True, backwards: bool = False) -> None:
-        """Drive to a point at up to this speed (m/s); ``stops`` brakes to stop there."""
+        """Drive to a point at up to this speed (m/s); with ``stops`` the rover brakes and stops at the point."""
         north, east = north - self.north, east - self.east
         distance = math.hypot(north, east)
         if stops:
@@ -265,7 +265,7 @@ class GroundMotion(Motion):
         return 0.0
 
     def step(self, dt: float, *, powered: bool = True) -> None:
-        """Advance by ``dt`` seconds; unpowered, it rolls out."""
+        """Advance by ``dt`` seconds; an unpowered rover rolls to a stop."""
         rate = self._turn_rate()
         self._accelerate(self._curve_speed(rate) if powered else 0.0, dt)
         middle = self.yaw + 0.5 * rate * dt
@@ -313,10 +313,10 @@ _LIMITS = MotionLimits(
 
 
 class UnderwaterMotion(Motion):
-    """Motion of a submarine. ``down`` is the depth, ``bottom_down`` the bottom, ``ground_down`` the surface of the
-    water.
+    """Motion of a submarine. ``down`` is its depth.
 
-    ``buoyancy_m_s2`` is its upward acceleration without thrust.
+    ``bottom_down`` is the depth of the bottom, ``ground_down`` that of the water surface. ``buoyancy_m_s2`` is the
+    upward acceleration without thrust.
     """
 
     def __init__(self, rng: random.Random, *, bottom_down: float = 200.0, buoyancy_m_s2: float = 0.1) -> None:
@@ -335,13 +335,13 @@ class UnderwaterMotion(Motion):
 
     @property
     def is_still(self) -> bool:
-        """True if it floats motionless at the surface."""
+        """True if the submarine floats motionless at the surface."""
         speed = math.hypot(self.velocity_north, self.velocity_east, self.velocity_down)
         return self.is_at_surface and speed < 0.01
 
     @property
     def airspeed_m_s(self) -> float:
-        """Speed through the water, as the telemetry reports it."""
+        """Horizontal speed through the water, which telemetry reports as airspeed."""
         return math.hypot(self.velocity_north, self.velocity_east)
 
     def seek_velocity(self, north: float, east: float, down: float) -> None:
@@ -354,7 +354,7 @@ class UnderwaterMotion(Motion):
         self._is_floating = True
 
     def step(self, dt: float, *, powered: bool = True) -> None:
-        """Advance by ``dt`` seconds; unpowered, it drifts up."""
+        """Advance by ``dt`` seconds; an unpowered submarine rises."""
         lift = -self.buoyancy_m_s2 - _DRAG_PER_S * self.velocity_down
         if powered:
             north, east, down = self._commanded_acceleration()

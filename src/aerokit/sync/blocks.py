@@ -43,7 +43,7 @@ class BlockingContext:
     _opened_by: str  # name of the function
 
     def close(self) -> None:
-        """Close it. Idempotent."""
+        """Close the object. Idempotent."""
         raise NotImplementedError
 
     def __enter__(self) -> Self:
@@ -135,7 +135,7 @@ class CellTwin(TwinOf["StateCell[T]"], Generic[T]):
 
 
 class ChangesTwin(TwinOf["Changes[T]"], Generic[T]):
-    """Iterator over changes."""
+    """Blocking iterator over the values of a cell."""
 
     def __iter__(self) -> Self:
         return self
@@ -178,7 +178,7 @@ class SubscriptionTwin(TwinOf["Subscription[T]"], Generic[T]):
 
 
 class BlockTwin(TwinOf[BlockT]):
-    """Active while its ``with`` block runs."""
+    """Twin of an object that is active while its ``with`` block runs."""
 
     def __enter__(self) -> Self:
         self._loop.enter(self.aio)
@@ -189,7 +189,7 @@ class BlockTwin(TwinOf[BlockT]):
 
 
 class StreamTwin(BlockTwin["SetpointStream[T]"], Generic[T]):
-    """Sends set-points while its ``with`` block runs."""
+    """Twin of a stream that sends set-points while its ``with`` block runs."""
 
 
 class GimbalsTwin(TwinOf["Gimbals"], Generic[T]):
@@ -225,21 +225,21 @@ class PhotoIntervalTwin(BlockTwin["PhotoInterval"]):
 
 
 class ShieldedBlockTwin(TwinOf[ShieldedT]):
-    """Ctrl-C does not interrupt the exit of its ``with`` block."""
+    """Twin of a block whose exit Ctrl-C does not interrupt."""
 
     def __exit__(self, exc_type: Any, exc: Any, traceback: Any) -> None:
         self._loop.run_shielded(self.aio.__aexit__, exc_type, exc, traceback)
 
 
 class TemporarilyTwin(ShieldedBlockTwin["TemporaryParameters"]):
-    """Its ``with`` block yields the results of the writes; the exit restores the previous values."""
+    """Block that sets parameters and yields the results of the writes; its exit restores the previous values."""
 
     def __enter__(self) -> dict[str, ParameterWrite]:
         return self._loop.enter(self.aio)
 
 
 class TransactionTwin(ShieldedBlockTwin["Transaction"]):
-    """Rolled back if its ``with`` block raises."""
+    """Block of parameter changes that are undone if it raises."""
 
     def __enter__(self) -> Self:
         self._loop.enter(self.aio)
@@ -247,7 +247,7 @@ class TransactionTwin(ShieldedBlockTwin["Transaction"]):
 
 
 class ConnectionTwin(TwinOf["Connection"], BlockingContext):
-    """Context manager; also ends the loop thread that was started for it."""
+    """Connection as a context manager, which also ends the loop thread that was started for it."""
 
     _opened_by = "open_connection"
 
@@ -282,7 +282,7 @@ class ConnectionTwin(TwinOf["Connection"], BlockingContext):
 
 
 class VehicleTwin(TwinOf["Vehicle"], BlockingContext):
-    """Context manager; also closes the connection that was opened for it."""
+    """Vehicle as a context manager, which also closes the connection that was opened for it."""
 
     _opened_by = "connect"
 

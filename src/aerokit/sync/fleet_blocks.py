@@ -58,7 +58,7 @@ def _vehicle(loop: LoopThread, vehicle: Any) -> Vehicle:
 
 
 class FleetTwin(TwinOf["AsyncFleet"], BlockingContext):
-    """Context manager; also closes the connections that were opened for it."""
+    """Fleet as a context manager, which also closes the connections that were opened for it."""
 
     _opened_by = "fleet"
 

@@ -45,7 +45,7 @@ class LoopThread:
 
     def __init__(self) -> None:
         self.activity: ActivityMonitor = ActivityMonitor(time.monotonic)
-        """Evidence that the calling program is alive."""
+        """Record of the program's calls, which shows that it is running."""
         self._calls = _Calls()
         started: ThreadFuture[asyncio.AbstractEventLoop] = ThreadFuture()
         # An empty context: sniffio stores the running async library there, and the caller may use another one.
@@ -162,7 +162,7 @@ class LoopThread:
         return self.enter(_AsyncContext(context))
 
     def feed(self) -> None:
-        """Record that the program is alive, unless called on the loop's own thread."""
+        """Record that the program is running, unless called on the loop's own thread."""
         if not self.is_current:
             self.activity.feed()
 
@@ -209,7 +209,7 @@ class LoopThread:
         return threading.current_thread() is self._thread
 
     def wait_for(self, future: ThreadFuture[Any]) -> None:
-        """Wait until it is done; Ctrl-C interrupts on every system. Raises ConnectionClosed if the loop ends first."""
+        """Wait for a future; Ctrl-C interrupts on every system. Raises ConnectionClosed if the loop ends first."""
         while not future.wait(SIGNAL_CHECK_INTERVAL_S):
             if not self._thread.is_alive() and not future.is_done:
                 raise ConnectionClosed(CLOSED_DURING_CALL)

@@ -161,8 +161,8 @@ class StateCell(CellTwin[T]):
     """The latest value of one telemetry item: read it, check its age, wait for it, iterate over its changes.
 
     Reading never sends anything. ``clock`` returns seconds (event loop time); ``waits_for`` names the source messages
-    in error texts. A cell belongs to one event loop and its thread. Other threads may read it (values are never torn,
-    and ages never too small), but must not wait or write.
+    in error texts. A cell belongs to one event loop and its thread. Other threads may read it (they never get a
+    half-written value or an age that is too small), but must not wait or write.
     """
 
     @property
@@ -253,8 +253,8 @@ class StateCell(CellTwin[T]):
 class Changes(ChangesTwin[T]):
     """Endless asynchronous iterator over the values of a cell.
 
-    Raises the error that the cell was closed with. Until the iterator is garbage-collected, every received message of
-    the cell is decoded.
+    Iteration raises the error with which the cell was closed. While the iterator exists, every received message of the
+    cell is decoded.
     """
 
     @property
@@ -290,7 +290,7 @@ class Subscription(SubscriptionTwin[ItemT]):
         return self._loop.call(self.aio.get_nowait)
 
     def close(self, error: Exception | None = None) -> None:
-        """Stop taking items. A waiting reader gets ``error``, or the end of the iteration if there is none."""
+        """Stop taking items. A waiting reader raises ``error``; without an error, its iteration ends."""
         self._loop.call(self.aio.close, error)
 
 
@@ -298,8 +298,8 @@ class Connection(ConnectionTwin):
     """One MAVLink node (system id, component id) on one link.
 
     Received bytes enter through ``bytes_received``, are checked by one framer per remote peer, and go to ``bus``.
-    ``send`` writes a message to the peer behind which its target was last received; :class:`Routes` decides which
-    peer that is, and when it may change (``may_move``). Everything runs on the event loop's thread.
+    ``send`` writes a message to the peer from which its target was last received; :class:`Routes` stores that peer
+    and decides when it may change (``may_move``). Everything runs on the event loop's thread.
     """
 
     @cached_property
@@ -319,9 +319,9 @@ class Connection(ConnectionTwin):
     def send(self, message: Message, *, to: int | None = None) -> None:
         """Number, frame and write a message. Never blocks.
 
-        It goes to the peer behind which its ``target_component`` of system ``to`` (None: its ``target_system``) was
-        last received; if it names no component, to every peer with components of that system; if its target is
-        broadcast or unknown, to every peer.
+        A message for one component goes to the peer from which that component was last received. A message for a
+        whole system goes to every peer with components of that system, and a message for all or for an unknown target
+        goes to every peer. ``to`` is the system id of the target; None: the message's ``target_system``.
 
         Raises:
             InvalidArgument: a field is out of range; nothing was sent.
@@ -339,7 +339,7 @@ class Connection(ConnectionTwin):
         """Number of written bytes that have not left this machine, if the link can measure it.
 
         A value that stays above 0 means that the link does not drain (TCP without a network, a serial port with flow
-        control asserted): :class:`LinkStalled`. Always 0 for UDP.
+        control asserted); see :class:`LinkStalled`. Always 0 for UDP.
         """
         return self._loop.call(lambda: self.aio.unsent_bytes)
 
@@ -386,9 +386,9 @@ class SetpointStream(StreamTwin[SetpointT]):
     """Sends the latest set-point at a fixed rate while the ``async with`` block supplies set-points.
 
     Entering the block changes to the set-point mode (GUIDED, OFFBOARD) with the initial set-point. Leaving it in any
-    way tells the vehicle to hold. If the stream stops by itself, ``set`` and leaving the block raise
-    :class:`SetpointStreamStopped`; a vehicle that does not move for twelve seconds although it should stops it as
-    well. If it stopped because a pilot or a failsafe changed the mode, nothing more is sent to the vehicle.
+    way makes the vehicle hold. The stream stops by itself for the reasons above, and if the vehicle should move but
+    stays in place for twelve seconds; then ``set`` and leaving the block raise :class:`SetpointStreamStopped`. After a
+    pilot or a failsafe has changed the mode, nothing more is sent to the vehicle.
     """
 
     @property
@@ -419,8 +419,8 @@ class Guided(TwinOf["AsyncGuided"]):
 
     Every stream takes ``rate_hz`` (transmission rate of the latest set-point, 2 to 100), ``valid_for_s`` (how long a
     set-point may be resent without a new one) and ``max_lag_s`` (how late the event loop may be). NotSupported is
-    raised for a kind that this type of vehicle does not obey. Rates and seconds are in real time: a simulation at ten
-    times the speed needs ten times the rate.
+    raised for a kind that this type of vehicle does not support. Rates and seconds are in real time: a simulation at
+    ten times the speed needs ten times the rate.
     """
 
     def velocity(
@@ -531,9 +531,9 @@ class GimbalControl(BlockTwin["AsyncGimbalControl"]):
 
     Entering takes control from any other station and returns when the manager confirms it. Leaving releases it, without
     waiting if the block exits by an error or cancellation. When another station takes control, aerokit publishes
-    ``GimbalControlLost``; orders to the gimbal, including running ones, raise :class:`GimbalTaken`, and so does leaving
-    the block unless your program has seen the loss. Control is not released then. Another station that uses your own
-    system and component id cannot be detected.
+    ``GimbalControlLost``, and orders to the gimbal, including running ones, raise :class:`GimbalTaken`. Leaving the
+    block then raises it too, unless your program has already seen the loss, and releases nothing. Another station that
+    uses your own system and component id cannot be detected.
 
     Entering raises:
         NotSupported: the vehicle has no gimbal manager, or its manager has no secondary control.
@@ -631,8 +631,9 @@ class GimbalRates(BlockTwin["AsyncGimbalRates"]):
 class Gimbal(TwinOf["AsyncGimbal"]):
     """One gimbal, by the gimbal protocol v2 (https://mavlink.io/en/services/gimbal_v2.html), or an older mount.
 
-    ``vehicle.gimbal`` is the first one, ``vehicle.gimbals`` has all. An order returns when the gimbal reports that it
-    points there, and ends when another one is given. The gimbal keeps the direction while the vehicle moves. If the
+    ``vehicle.gimbal`` is the first one, ``vehicle.gimbals`` has all. An order returns when the gimbal reports the
+    ordered direction, and ends when another order is given. The gimbal keeps the direction while the vehicle moves. If
+    the
     manager requires control, an order outside a block of :meth:`control` claims it until :meth:`release`.
     """
 
@@ -661,14 +662,14 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         tolerance_deg: float = 5.0,
         timeout: float = 15.0,
     ) -> None:
-        """Keep it pointed at a position; returns when it points there.
+        """Keep the gimbal pointed at a position; returns when it points there.
 
-        Sends MAV_CMD_DO_SET_ROI_LOCATION. Without an altitude, it is taken to be at the vehicle's own. A copter whose
+        Sends MAV_CMD_DO_SET_ROI_LOCATION. A target without an altitude is at the vehicle's own altitude. A copter whose
         gimbal does not pan turns its nose.
 
         Args:
             target: the position.
-            wait: False: return when it was accepted.
+            wait: False: return when the manager has accepted the order.
             tolerance_deg: accepted deviation in each axis, above 0 to 45.
             timeout: seconds to wait.
 
@@ -693,13 +694,13 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         tolerance_deg: float = 5.0,
         timeout: float = 15.0,
     ) -> None:
-        """Keep it pointed at another vehicle (MAV_CMD_DO_SET_ROI_SYSID); returns when it points there.
+        """Keep the gimbal pointed at another vehicle (MAV_CMD_DO_SET_ROI_SYSID); returns when it points there.
 
         The gimbal's manager and this connection both need the position of the other vehicle (GLOBAL_POSITION_INT).
 
         Args:
             system_id: its MAVLink system id, 1 to 255.
-            wait: False: return when it was accepted.
+            wait: False: return when the manager has accepted the order.
             tolerance_deg: accepted deviation in each axis, above 0 to 45.
             timeout: seconds to wait.
 
@@ -736,15 +737,15 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         tolerance_deg: float = 3.0,
         timeout: float = 10.0,
     ) -> None:
-        """Point it at angles; returns when it reports that it points there.
+        """Point the gimbal at angles; returns when it reports these angles.
 
         Args:
             pitch_deg: from the horizon, −360 to 360: 0 is level, −90 straight down.
             yaw_deg: −360 to 360, clockwise from north (``frame="earth"``) or from the nose (``"vehicle"``).
             roll_deg: from the horizon, −360 to 360. Other values than 0 need the mount command, which turns the camera
                 with the vehicle: a yaw from north is right only at the time of the order.
-            frame: reference of the yaw, which it keeps afterwards.
-            wait: False: return when it was accepted.
+            frame: reference of the yaw, which the gimbal keeps afterwards.
+            wait: False: return when the manager has accepted the order.
             tolerance_deg: accepted deviation in each axis, above 0 to 45.
             timeout: seconds to wait.
 
@@ -774,10 +775,10 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         )
 
     def neutral(self, *, wait: bool = True, timeout: float = 10.0) -> None:
-        """Turn it to its neutral position, usually level and straight ahead; returns when it rests there.
+        """Turn the gimbal to its neutral position, usually level and straight ahead; returns when it rests there.
 
         Args:
-            wait: False: return when it was accepted.
+            wait: False: return when the manager has accepted the order.
             timeout: seconds to wait.
 
         Raises:
@@ -791,10 +792,10 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         self._loop.run(self.aio.neutral, wait=wait, timeout=timeout)
 
     def retract(self, *, wait: bool = True, timeout: float = 10.0) -> None:
-        """Retract it; returns when it rests there.
+        """Retract the gimbal; returns when it rests there.
 
         Args:
-            wait: False: return when it was accepted.
+            wait: False: return when the manager has accepted the order.
             timeout: seconds to wait.
 
         Raises:
@@ -809,7 +810,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         self._loop.run(self.aio.retract, wait=wait, timeout=timeout)
 
     def release(self) -> None:
-        """Return it to the pilot's sticks, and release control that was claimed outside of a control block.
+        """Return the gimbal to the pilot's sticks, and release control that was claimed outside of a control block.
 
         Raises:
             CommandRejected: the vehicle refused.
@@ -820,7 +821,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
     def information(self) -> GimbalInformation:
         """Request capabilities, limits and identity (GIMBAL_MANAGER_INFORMATION, GIMBAL_DEVICE_INFORMATION).
 
-        Afterwards, angles beyond its limits are refused before anything is sent.
+        Afterwards, angles beyond the gimbal's limits are refused before anything is sent.
 
         Raises:
             CommandRejected: there is no gimbal manager, or it does not support the messages.
@@ -846,7 +847,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         valid_for_s: float = 1.0,
         max_lag_s: float = 0.5,
     ) -> GimbalRates:
-        """Turn it at rates for the duration of an ``async with`` block that feeds them; see :class:`GimbalRates`.
+        """Turn the gimbal at rates during an ``async with`` block that feeds them; see :class:`GimbalRates`.
 
         Args:
             pitch_deg_s: the first rate in degrees per second, −720 to 720; positive is up.
@@ -915,7 +916,7 @@ class Gimbals(GimbalsTwin["Gimbal"]):
 
 
 class PostedOrder(TwinOf["AsyncPostedOrder"]):
-    """An order that need not be waited for; created by :meth:`aerokit.Vehicle.posted`."""
+    """An order whose effect need not be awaited; created by :meth:`aerokit.Vehicle.posted`."""
 
     @property
     def end(self) -> str:
@@ -1040,8 +1041,8 @@ class Files(TwinOf["AsyncFiles"]):
     ) -> None:
         """Copy a file to this computer. It is written to ``<to>.part`` and renamed when it is complete.
 
-        With ``resume``, the ``<to>.part`` of an interrupted download is kept if the vehicle's file is not shorter,
-        and the result is verified by CRC-32 if the vehicle can compute it; if it differs, the whole file is read
+        With ``resume``, the download continues the ``<to>.part`` of an interrupted one, unless the vehicle's file is
+        shorter. The result is verified by CRC-32 if the vehicle can compute it; if it differs, the whole file is read
         again. Files whose names begin with ``@`` are always read completely.
 
         Raises:
@@ -1191,9 +1192,9 @@ class Logs(TwinOf["AsyncLogs"]):
     All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
     total; None for no limit). You can cancel any call; the vehicle then stops sending.
 
-    ArduPilot answers the LOG_* messages only while disarmed, and ends its current log when one is read by them; by
-    MAVFTP its logs can also be read in flight. A log that is still being written is read up to its current end; if that
-    exceeds the size in its entry, logger "aerokit" reports it (INFO).
+    ArduPilot answers LOG_* messages only while disarmed, and reading a log by them ends its current log. By MAVFTP,
+    logs can also be read in flight. A log that is still being written is read up to its current end. If that exceeds
+    the size in the entry, logger "aerokit" reports it (INFO).
     """
 
     def list(self, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None) -> tuple[LogEntry, ...]:
@@ -1358,8 +1359,9 @@ class Parameters(TwinOf["AsyncParameters"]):
     def load_metadata(self, path: str | os.PathLike[str]) -> Metadata:
         """Read ArduPilot's ``apm.pdef.xml`` or ``apm.pdef.json``, or PX4's ``parameters.xml`` or ``parameters.json``.
 
-        Metadata is advice: a write outside the documented range is done, and its result has a ``note``; only values
-        that the type cannot represent are refused. It also lists changes that need a reboot. PX4's has the defaults.
+        Metadata does not restrict writes: a value outside the documented range is set, and its result has a ``note``.
+            Only values that the type cannot represent are refused. Metadata also identifies changes that need a reboot.
+            PX4's has the defaults.
 
         Raises:
             FileFormatError: the file is damaged, or of another kind.
@@ -1382,9 +1384,9 @@ class Parameters(TwinOf["AsyncParameters"]):
             method: ``"ftp"`` reads one small file with the defaults (``@PARAM/param.pck``), ``"list"`` requests one
                 message for each parameter; ``"auto"`` uses the file if there is one.
             refresh: download again, even if the parameters are known or cached.
-            cache: keep the list on disk, and use it while the vehicle's parameter hash is unchanged: the second
-                connect takes one request. True means the user's cache directory, or pass one. Only PX4 has a hash; it
-                does not cover parameters that PX4 changes by itself, so they may be outdated. Off by default.
+            cache: keep the list on disk, and use it while the vehicle's parameter hash is unchanged: the second connect
+                takes one request. True means the user's cache directory; or pass a path. Only PX4 has a hash; it does
+                not cover parameters that PX4 changes by itself, so they may be outdated. Off by default.
             idle_timeout_s: fail after this many seconds without progress.
             timeout: seconds in total.
             on_progress: called with the number of parameters, or bytes of the file, so far and in total.
@@ -1404,15 +1406,15 @@ class Parameters(TwinOf["AsyncParameters"]):
         )
 
     def get(self, name: str, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None) -> int | float:
-        """Request one value; for arguments and errors see :meth:`read`."""
+        """Request one value from the vehicle; for arguments and errors see :meth:`read`."""
         return self._loop.run(self.aio.get, name, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
     def read(self, name: str, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None) -> Parameter:
-        """Request one parameter from the vehicle; ``table[name]`` has the local copy.
+        """Request one parameter from the vehicle, bypassing the local copy in ``table``.
 
         Raises:
             InvalidArgument: the name is empty, or longer than 16 characters.
-            ParameterRejected: the vehicle has no such parameter: it answers so, or answers others but not this one.
+            ParameterRejected: the vehicle reports that it has no such parameter, or answers only requests for others.
             ParameterTimeout: there was no answer.
         """
         return self._loop.run(self.aio.read, name, idle_timeout_s=idle_timeout_s, timeout=timeout)
@@ -1429,7 +1431,7 @@ class Parameters(TwinOf["AsyncParameters"]):
 
         Returns:
             For each name the parameter, or the error that :meth:`get` would have raised. Its ``code`` is None if the
-            vehicle did not deny the parameter, but answered others and not this one.
+                vehicle did not report an error, but answered only requests for others.
 
         Raises:
             InvalidArgument: a name is empty, or longer than 16 characters. Nothing was sent.
@@ -1461,7 +1463,7 @@ class Parameters(TwinOf["AsyncParameters"]):
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> dict[str, ParameterWrite]:
-        """Set several parameters concurrently; return one result each: check its ``error``.
+        """Set several parameters concurrently; return a result for each of them: check its ``error``.
 
         Parameters that appear only when another one is set (ArduPilot's ``…_ENABLE``) are set after it.
 
@@ -1580,8 +1582,8 @@ class Parameters(TwinOf["AsyncParameters"]):
 class MissionControl(TwinOf["AsyncMissionControl"]):
     """The mission of a vehicle: ``await vehicle.mission.upload(mission)``, ``start()``, ``wait_finished()``.
 
-    Item numbers count from 0, and home is not an item, for all autopilots. Starting, pausing and resuming are
-    orders like taking off: the newest one wins.
+    Item numbers count from 0, and home is not an item, for all autopilots. Starting, pausing and resuming are orders:
+    each supersedes earlier orders to move, and ends with a later one.
     """
 
     def upload(
@@ -1612,14 +1614,14 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
             on_progress: called with the progress in items, or in bytes of a file.
 
         See https://mavlink.io/en/services/mission.html. PX4 keeps the old items until it has all of the new ones.
-        ArduPilot overwrites missions and rally points one by one (a fence at the end), After a failure it may hold
-        old and new items; the error then says so. ("holds" is also a flight mode.)
+        ArduPilot overwrites missions and rally points item by item, and a fence at the end. After a failure it may have
+        both old and new items; the error then states that.
 
         Raises:
             InvalidArgument: the plan is invalid, or has a position that is too far away. Nothing was sent.
             MissionRejected: the vehicle refused; see ``item``, ``result`` and ``reasons``.
-            MissionTimeout: it stopped answering; ``missing`` are the items it did not confirm.
-            VerificationFailed: it confirmed, but holds something else.
+            MissionTimeout: it stopped answering; ``missing`` has the items that it did not confirm.
+            VerificationFailed: it confirmed the plan, but has other items.
             NotSupported: ``"ftp"`` was requested, but it has none.
             FileError, FileTimeout: the same for a file, with ``"ftp"``.
             OperationTimeout: not done within ``timeout``.
@@ -1669,7 +1671,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
             InvalidArgument: an argument is invalid. Nothing was sent.
             MissionRejected: the vehicle refused.
             MissionTimeout: it stopped answering.
-            VerificationFailed: it confirmed, but still holds items.
+            VerificationFailed: it confirmed, but still has items.
             OperationTimeout: not done within ``timeout``.
         """
         self._loop.run(self.aio.clear, idle_timeout_s=idle_timeout_s, timeout=timeout)
@@ -1714,7 +1716,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         The vehicle must be armed: **it takes off** if the mission begins with a take-off. A copter on the ground needs
         a take-off item first. If you cancel the call, aerokit orders the vehicle to hold.
 
-        Sends MISSION_START to ArduPilot, which then takes off from the ground, and changes the mode of others.
+        Sends MISSION_START to ArduPilot, which then takes off from the ground. Other autopilots get a mode change.
 
         Raises:
             InvalidArgument: there is no such item. Nothing was sent.
@@ -1728,7 +1730,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
     def pause(self) -> None:
         """Hold and remember the current item; returns when HEARTBEAT reports the hold mode.
 
-        Raises OperationRejected if it is not flying its mission, else as :meth:`Vehicle.hold`.
+        Raises OperationRejected if the vehicle is not flying its mission, else as :meth:`Vehicle.hold`.
         """
         self._loop.run(self.aio.pause)
 
@@ -1740,7 +1742,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         self._loop.run(self.aio.resume, timeout=timeout)
 
     def wait_finished(self, *, timeout: float | None = None, max_silence_s: float | None = MAX_SILENCE_S) -> None:
-        """Wait until the mission has been flown to its end; for one that ends with landing, until it has landed.
+        """Wait until the mission has been flown to its end; if it ends with a landing, until the vehicle has landed.
 
         A :meth:`pause` by another task does not end the wait. Cancelling this call does not stop the vehicle.
 
@@ -1749,8 +1751,8 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
             max_silence_s: fail after this many seconds without a heartbeat; None for no limit.
 
         Raises:
-            OperationRejected: it no longer flies the mission: a pilot, a failsafe or another order changed the mode, or
-                it disarmed on the way. ``reasons`` has what the vehicle reported.
+            OperationRejected: the vehicle no longer flies the mission: a pilot, a failsafe or another order changed the
+                mode, or it disarmed on the way. ``reasons`` has what the vehicle reported.
             OperationTimeout: not finished in time.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
         """
@@ -1769,7 +1771,7 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
     """The fence of a vehicle: ``await vehicle.fence.upload(Fence(polygons=[...]))``.
 
     For ArduPilot, uploading does not enable the fence: use :meth:`enable`, or the parameter FENCE_ENABLE. PX4 always
-    obeys its fence; GF_ACTION defines its reaction.
+    enforces its fence; GF_ACTION defines its reaction.
     """
 
     def upload(
@@ -1800,14 +1802,14 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
             on_progress: called with the progress in items, or in bytes of a file.
 
         See https://mavlink.io/en/services/mission.html. PX4 keeps the old items until it has all of the new ones.
-        ArduPilot overwrites missions and rally points one by one (a fence at the end), After a failure it may hold
-        old and new items; the error then says so. ("holds" is also a flight mode.)
+        ArduPilot overwrites missions and rally points item by item, and a fence at the end. After a failure it may have
+        both old and new items; the error then states that.
 
         Raises:
             InvalidArgument: the plan is invalid, or has a position that is too far away. Nothing was sent.
             MissionRejected: the vehicle refused; see ``item``, ``result`` and ``reasons``.
-            MissionTimeout: it stopped answering; ``missing`` are the items it did not confirm.
-            VerificationFailed: it confirmed, but holds something else.
+            MissionTimeout: it stopped answering; ``missing`` has the items that it did not confirm.
+            VerificationFailed: it confirmed the plan, but has other items.
             NotSupported: ``"ftp"`` was requested, but it has none.
             FileError, FileTimeout: the same for a file, with ``"ftp"``.
             OperationTimeout: not done within ``timeout``.
@@ -1857,7 +1859,7 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
             InvalidArgument: an argument is invalid. Nothing was sent.
             MissionRejected: the vehicle refused.
             MissionTimeout: it stopped answering.
-            VerificationFailed: it confirmed, but still holds items.
+            VerificationFailed: it confirmed, but still has items.
             OperationTimeout: not done within ``timeout``.
         """
         self._loop.run(self.aio.clear, idle_timeout_s=idle_timeout_s, timeout=timeout)
@@ -1908,14 +1910,14 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
             on_progress: called with the progress in items, or in bytes of a file.
 
         See https://mavlink.io/en/services/mission.html. PX4 keeps the old items until it has all of the new ones.
-        ArduPilot overwrites missions and rally points one by one (a fence at the end), After a failure it may hold
-        old and new items; the error then says so. ("holds" is also a flight mode.)
+        ArduPilot overwrites missions and rally points item by item, and a fence at the end. After a failure it may have
+        both old and new items; the error then states that.
 
         Raises:
             InvalidArgument: the plan is invalid, or has a position that is too far away. Nothing was sent.
             MissionRejected: the vehicle refused; see ``item``, ``result`` and ``reasons``.
-            MissionTimeout: it stopped answering; ``missing`` are the items it did not confirm.
-            VerificationFailed: it confirmed, but holds something else.
+            MissionTimeout: it stopped answering; ``missing`` has the items that it did not confirm.
+            VerificationFailed: it confirmed the plan, but has other items.
             NotSupported: ``"ftp"`` was requested, but it has none.
             FileError, FileTimeout: the same for a file, with ``"ftp"``.
             OperationTimeout: not done within ``timeout``.
@@ -1965,7 +1967,7 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
             InvalidArgument: an argument is invalid. Nothing was sent.
             MissionRejected: the vehicle refused.
             MissionTimeout: it stopped answering.
-            VerificationFailed: it confirmed, but still holds items.
+            VerificationFailed: it confirmed, but still has items.
             OperationTimeout: not done within ``timeout``.
         """
         self._loop.run(self.aio.clear, idle_timeout_s=idle_timeout_s, timeout=timeout)
@@ -1995,9 +1997,10 @@ class PhotoInterval(PhotoIntervalTwin):
 class Camera(TwinOf["AsyncCamera"]):
     """One camera: photos, video, lens, tracking, storage, streams (https://mavlink.io/en/services/camera.html).
 
-    ``vehicle.camera`` is the first camera, ``vehicle.camera_at(number)`` any: one with its own component id (100 to
-    105), or one attached to the autopilot (1 to 6), e.g. ArduPilot's drivers and PX4's trigger. Calls outside its
-    reported capabilities are refused before anything is sent. Cells are polled only while your program uses them.
+    ``vehicle.camera`` is the first camera; ``vehicle.camera_at(number)`` is any camera: one with its own component id
+    (100 to 105), or one attached to the autopilot (1 to 6), e.g. ArduPilot's drivers and PX4's trigger. Calls outside
+    the camera's reported capabilities are refused before anything is sent. Cells are polled only while your program
+    uses them.
     """
 
     @cached_property
@@ -2348,7 +2351,7 @@ class Camera(TwinOf["AsyncCamera"]):
         return self.aio.number
 
     def wait_found(self, *, timeout: float = 10.0) -> CameraInformation:
-        """Wait until the camera is found and has identified itself; other calls do so by themselves.
+        """Wait until the camera is found and has identified itself; other calls wait for that by themselves.
 
         Raises:
             CommandRejected: the camera refused to identify itself.
@@ -2361,8 +2364,8 @@ class Camera(TwinOf["AsyncCamera"]):
 
         Sends MAV_CMD_IMAGE_START_CAPTURE (https://mavlink.io/en/services/camera.html), or MAV_CMD_DO_DIGICAM_CONTROL
         to PX4's trigger and to cameras that do not support the former. The order is sent again only if the camera
-        then reports that it is not taking a picture and has taken none. A lost CAMERA_IMAGE_CAPTURED is requested. If
-        you cancel the call, the camera may still take the picture.
+        reports afterwards that it has taken no picture and is taking none. A lost CAMERA_IMAGE_CAPTURED is requested.
+        If you cancel the call, the camera may still take the picture.
 
         Args:
             timeout: seconds to wait for the report.
@@ -2429,7 +2432,7 @@ class Settings(TwinOf["AsyncSettings"]):
 
     A camera definition file explains the settings: :meth:`fetch_definition` reads it from the camera, :meth:`load`
     from a local file. From then on you can use the names of options, and values that are out of range or excluded by
-    other settings are refused before anything is sent. Without it, values are sent unchanged.
+    other settings are refused before anything is sent. Without a definition, values are sent unchanged.
 
     All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
     total; then OperationTimeout), if they send anything. You can cancel any call.
@@ -2526,7 +2529,8 @@ class Settings(TwinOf["AsyncSettings"]):
         """Return all settings by name, in the component's order; immediately if they were downloaded before.
 
         Raises:
-            ParameterTimeout: the list is incomplete, or the component has none; ``table`` has what has arrived.
+            ParameterTimeout: the list is incomplete, or the component has none; ``table`` has the settings that
+                arrived.
         """
         return self._loop.run(
             self.aio.download,
@@ -2541,7 +2545,7 @@ class Settings(TwinOf["AsyncSettings"]):
         return self._loop.run(self.aio.get, name, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
     def read(self, name: str, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None) -> Setting:
-        """Request one setting from the component; ``table[name]`` has the local copy.
+        """Request one setting from the component, bypassing the local copy in ``table``.
 
         Raises:
             InvalidArgument: the name is empty, or longer than 16 characters.
@@ -2596,16 +2600,16 @@ class Component(TwinOf["AsyncComponent"]):
 
     @property
     def age(self) -> float:
-        """Seconds since its last HEARTBEAT; inf before the first."""
+        """Seconds since the last HEARTBEAT of the component; inf before the first."""
         return self.aio.age
 
     @property
     def is_silent(self) -> bool:
-        """True if its last HEARTBEAT is older than 3.5 seconds, or none was received."""
+        """True if the component's last HEARTBEAT is older than 3.5 seconds, or none was received."""
         return self.aio.is_silent
 
     def information(self, *, timeout: float = 3.0) -> ComponentInformation:
-        """Request its identity and capabilities (COMPONENT_INFORMATION_BASIC).
+        """Request identity and capabilities of the component (COMPONENT_INFORMATION_BASIC).
 
         Raises:
             CommandRejected: it does not support the message.
@@ -2614,10 +2618,10 @@ class Component(TwinOf["AsyncComponent"]):
         return self._loop.run(self.aio.information, timeout=timeout)
 
     def metadata(self, kind: MetadataKind = "general", *, timeout: float = 3.0) -> dict[str, Any]:
-        """Read one of its metadata files (COMPONENT_METADATA) by MAVFTP and return the JSON object.
+        """Read a metadata file of the component (COMPONENT_METADATA) by MAVFTP and return its JSON object.
 
         Args:
-            kind: ``"general"`` lists the others: ``"parameter"``, ``"commands"``, ``"peripherals"``, ``"events"``,
+            kind: ``"general"`` lists the other files: ``"parameter"``, ``"commands"``, ``"peripherals"``, ``"events"``,
                 ``"actuators"``. PX4 has general, parameter, events and actuators.
             timeout: seconds to wait for the address of the file.
 
@@ -2629,7 +2633,7 @@ class Component(TwinOf["AsyncComponent"]):
         return self._loop.run(self.aio.metadata, kind, timeout=timeout)
 
     def fetch(self, uri: str, *, idle_timeout_s: float = 10.0) -> bytes:
-        """Return the content of a file by the address that a component has reported, at most 16 MB.
+        """Return the content of a file, at most 16 MB, by an address that a component has reported.
 
         Args:
             uri: ``mftp://path`` is on this component, ``mftp://[;comp=1]path`` on another component of the vehicle;
@@ -2675,7 +2679,7 @@ class Component(TwinOf["AsyncComponent"]):
         Args:
             message_type: class of the message.
             params: param2 to param6, e.g. the number of a camera, stream or storage.
-            timeout: seconds to wait; it is requested up to three times.
+            timeout: seconds to wait; the message is requested up to three times.
             where: predicate to select one of several messages.
 
         Raises:
@@ -2701,7 +2705,7 @@ class Component(TwinOf["AsyncComponent"]):
         )
 
     def message(self, message_type: type[MessageT], *, rate_hz: float | None = None) -> StateCell[MessageT]:
-        """Return a cell with its latest message of a type; as :meth:`aerokit.Vehicle.message`."""
+        """Return a cell with the component's latest message of a type; as :meth:`aerokit.Vehicle.message`."""
         return StateCell(self._loop, self._loop.call(self.aio.message, message_type, rate_hz=rate_hz))
 
     def rate(self, message_type: type[Message], rate_hz: float) -> AbstractContextManager[None]:
@@ -2710,17 +2714,17 @@ class Component(TwinOf["AsyncComponent"]):
 
     @cached_property
     def files(self) -> Files:
-        """Its files, by MAVFTP."""
+        """The component's files, by MAVFTP."""
         return Files(self._loop, self._loop.call(lambda: self.aio.files))
 
     @cached_property
     def parameters(self) -> Parameters:
-        """Its parameters (PARAM_VALUE)."""
+        """The component's parameters (PARAM_VALUE)."""
         return Parameters(self._loop, self._loop.call(lambda: self.aio.parameters))
 
     @cached_property
     def settings(self) -> Settings:
-        """Its settings (PARAM_EXT), which may be texts; for cameras explained by the camera definition file."""
+        """The component's settings (PARAM_EXT). A camera definition file explains those of a camera."""
         return Settings(self._loop, self._loop.call(lambda: self.aio.settings))
 
 
@@ -2780,7 +2784,7 @@ class Vehicle(VehicleTwin):
 
     @cached_property
     def local_position(self) -> StateCell[LocalPosition]:
-        """Metres and m/s north, east, down of the estimator's origin (LOCAL_POSITION_NED)."""
+        """Position in metres and velocity in m/s, north, east, down from the local origin (LOCAL_POSITION_NED)."""
         return StateCell(self._loop, self.aio.local_position)
 
     @cached_property
@@ -2800,7 +2804,7 @@ class Vehicle(VehicleTwin):
 
     @cached_property
     def throttle_percent(self) -> StateCell[float]:
-        """Throttle, 0 to 100 (VFR_HUD)."""
+        """Throttle in percent (VFR_HUD)."""
         return StateCell(self._loop, self.aio.throttle_percent)
 
     @cached_property
@@ -2939,7 +2943,7 @@ class Vehicle(VehicleTwin):
 
         Args:
             command: the number, or a member of ``enums.MavCmd``.
-            params: param1 to param7; missing ones are 0, NaN where the command allows it.
+            params: param1 to param7; missing ones are 0, or NaN where the command allows it.
             component_id: the target component instead of the autopilot; 0: all components, and the autopilot's ack
                 counts.
             retries: how often it is sent again without an ack, from 0; ``confirmation`` increments each time. A
@@ -2985,8 +2989,8 @@ class Vehicle(VehicleTwin):
         """Send any MAV_CMD as COMMAND_INT: param1 to param4, ``x``, ``y``, ``z`` in ``frame`` (MAV_FRAME).
 
         ``x`` and ``y`` are latitude and longitude in 1e-7 degrees, or 1e-4 m in local frames; ``z`` is in metres.
-        With ``or_long``, firmware that does not support it as COMMAND_INT gets a COMMAND_LONG with degrees, in frame
-        0 only. All else as for :meth:`command`.
+        With ``or_long``, firmware that does not support the command as COMMAND_INT gets a COMMAND_LONG with degrees;
+        this requires frame 0. All else as for :meth:`command`.
         """
         return self._loop.run(
             self.aio.command_int,
@@ -3007,8 +3011,8 @@ class Vehicle(VehicleTwin):
     def send(self, message: Message) -> None:
         """Send one message unchanged, once; never blocks. The caller sets its ``target_system``.
 
-        A steering command (as by :meth:`command`) and SET_MODE are newer orders and end those of actions. A set-point
-        supersedes what was :meth:`posted` about motion. Messages to another system do neither.
+        A steering command and SET_MODE are orders and end the action in progress, as with :meth:`command`. A set-point
+        supersedes :meth:`posted` orders about motion. Messages to another system do neither.
 
         Raises:
             InvalidArgument: a field is out of range; nothing was sent.
@@ -3031,9 +3035,9 @@ class Vehicle(VehicleTwin):
         """Open an order without waiting for its effect, so that mode, arming and take-off can be sent in one go.
 
         Within the block its commands are sent again right after a HEARTBEAT until they are acknowledged or their
-        effect is reported. They are not sent again after a newer order about the same subject, after a mode that
-        neither this order nor one of the last ten seconds explains, or, for orders about motion, after disarming. An
-        abandoned order does not make the vehicle hold, and late arming is not monitored; use the actions for that.
+        effect is reported. Retries end with a newer order about the same subject, with a mode that neither this order
+        nor an order of the last ten seconds explains and, for orders about motion, with disarming. An abandoned order
+        does not make the vehicle hold, and late arming is not monitored; use the actions for that.
 
         Args:
             subjects: ``"mode"``, ``"motion"`` or ``"arm"``; the first one is what the order is about, and it also
@@ -3076,10 +3080,10 @@ class Vehicle(VehicleTwin):
     def streams(self, rate_hz: float) -> AbstractContextManager[None]:
         """Request all streams of the vehicle at ``rate_hz`` for the duration of the ``with`` block.
 
-        For recordings, ground stations, and firmware without rates of single messages. ArduPilot is asked by
+        For recordings, ground stations, and firmware without rates of single messages. ArduPilot receives
         REQUEST_DATA_STREAM (whole Hz, at least 1), again after a reboot or a silence and while nothing arrives; it
-        continues to stream afterwards. Other autopilots stream by themselves; missing common states are requested as
-        by :meth:`rate`.
+        continues to stream after the block. Other autopilots stream by themselves; missing common states are requested
+        as by :meth:`rate`.
 
         Raises:
             InvalidArgument: the rate is not above 0 and at most 1000. Nothing was sent.
@@ -3171,7 +3175,7 @@ class Vehicle(VehicleTwin):
     def hold(self) -> None:
         """Stop and stay (a fixed wing circles); returns when HEARTBEAT reports the autopilot's mode for that.
 
-        Copter BRAKE, Plane LOITER, Rover HOLD (a boat LOITER), Sub POSHOLD; PX4 LOITER where it comes to a stop.
+        The mode is BRAKE on Copter, LOITER on Plane and boats, HOLD on Rover, POSHOLD on Sub and LOITER on PX4.
 
         Raises:
             NotSupported: this vehicle has no mode for it. Nothing was sent.
@@ -3241,15 +3245,15 @@ class Vehicle(VehicleTwin):
         """Arm the motors and wait until HEARTBEAT reports armed: **propellers may start to turn**.
 
         If the present mode does not allow arming (RTL or LAND after a flight, OFFBOARD), the mode is changed first.
-        The command is sent once, because a HEARTBEAT that reports disarmed may mean that a pilot has disarmed since.
-        After a cancellation, or an error other than a refusal, the command may still be executed. The vehicle is
-        therefore monitored for 15 seconds and disarmed if this command arms it (it accepts the command, or is armed
-        at the next HEARTBEAT and there was no takeover), as long as the connection is open. Logger "aerokit" warns
-        about the outcome, and about an arming that cannot be attributed to this command, which is left alone.
+        The command is sent once: a HEARTBEAT that reports disarmed may mean that a pilot has disarmed the vehicle.
+        After a cancellation, or an error other than a refusal, the command may still be executed. aerokit therefore
+        monitors the vehicle for 15 seconds, as long as the connection is open. It disarms the vehicle if this command
+        arms it: the vehicle accepts the command, or reports armed in the next HEARTBEAT without a takeover. An arming
+        that cannot be attributed to this command is left alone. Logger "aerokit" warns about the outcome.
 
         Args:
-            mode: the mode to arm in; None: the present mode, or one that ``take_off`` starts in if that does not
-                allow it.
+            mode: the mode to arm in. None: the present mode, or one that ``take_off`` starts in if the present mode
+                does not allow arming.
             force: skip the vehicle's own arming checks. Dangerous.
             timeout: seconds for HEARTBEAT to report armed after the command was accepted.
             max_silence_s: raise when no heartbeat was received for this long; None: wait until ``timeout``.
@@ -3258,7 +3262,8 @@ class Vehicle(VehicleTwin):
             InvalidArgument: there is no such mode, or it does not allow arming. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has its pre-arm texts, failing sensors and missing
                 estimates. Where the vehicle can run its checks on request, they are run again for this.
-            CommandTimeout: there was no acknowledgement, and it did not arm; the text says whether it may still arm.
+            CommandTimeout: there was no acknowledgement, and the vehicle did not arm; the text says whether it may
+                still arm.
             OperationRejected: it is armed already in a mode other than ``mode`` (nothing was sent), or another party
                 disarmed it or changed its mode meanwhile.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
@@ -3289,23 +3294,23 @@ class Vehicle(VehicleTwin):
         self._loop.run(self.aio.disarm, force=force, timeout=timeout, max_silence_s=max_silence_s)
 
     def reboot(self, *, force: bool = False, timeout: float = 60.0) -> None:
-        """Reboot the autopilot and wait until it is back: its time since boot has restarted.
+        """Reboot the autopilot and wait until its time since boot has restarted.
 
         Args:
             force: reboot while armed as well: **a flying vehicle falls**.
-            timeout: seconds until it is back.
+            timeout: seconds until the vehicle has restarted.
 
         Raises:
             OperationRejected: it is armed, or not known to be disarmed. Nothing was sent.
             CommandRejected: it refused.
             CommandTimeout: there was no acknowledgement, and it did not reboot.
             LinkLost: the link went down with the vehicle (USB, TCP); connect again.
-            OperationTimeout: it did not come back.
+            OperationTimeout: it did not restart in time.
         """
         self._loop.run(self.aio.reboot, force=force, timeout=timeout)
 
     def look_at(self, target: Position) -> None:
-        """Point nose or gimbal at a place, until :meth:`stop_looking`; without an altitude, at the vehicle's own.
+        """Point nose or gimbal at a place until :meth:`stop_looking`; without an altitude, at the vehicle's altitude.
 
         Sends MAV_CMD_DO_SET_ROI_LOCATION (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_ROI_LOCATION), or
         MAV_CMD_DO_SET_ROI to old firmware.
@@ -3341,9 +3346,9 @@ class Vehicle(VehicleTwin):
     ) -> None:
         """Fly to a place and return on arrival.
 
-        After a cancellation, a time-out or a silence the vehicle is told to hold where it is, unless another order
-        was given meanwhile or another party changed the mode. A silent vehicle is told to hold when it is received
-        again, if it is still on its way then. Sends MAV_CMD_DO_REPOSITION
+        After a cancellation, a time-out or a silence, aerokit orders the vehicle to hold where it is, unless another
+        order was given meanwhile or another party changed the mode. After a silence it waits for the next heartbeat,
+        and orders the hold if the vehicle is still on its way. Sends MAV_CMD_DO_REPOSITION
         (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_REPOSITION), or SET_POSITION_TARGET_GLOBAL_INT to a
         vehicle that does not support it.
 
@@ -3401,8 +3406,8 @@ class Vehicle(VehicleTwin):
     ) -> None:
         """Turn on the spot and return when the vehicle has this heading.
 
-        ArduPilot: MAV_CMD_CONDITION_YAW in GUIDED, which is set first. PX4 has no such command and stops to turn:
-        MAV_CMD_DO_REPOSITION.
+        ArduPilot: changes to GUIDED and sends MAV_CMD_CONDITION_YAW. PX4 has no such command: the vehicle stops and
+            turns by MAV_CMD_DO_REPOSITION.
 
         Args:
             heading_deg: −360 to 360, clockwise from north; with ``relative`` an angle to turn by, negative to the
@@ -3465,12 +3470,12 @@ class Vehicle(VehicleTwin):
     ) -> None:
         """Take off and climb to ``altitude_m`` above home; returns at that altitude.
 
-        The vehicle must be armed. Its mode is changed if the autopilot needs that. After a cancellation or a time-out
-        the vehicle is told to hold where it is.
+        The vehicle must be armed. Its mode is changed if the autopilot needs that. After a cancellation or a time-out,
+        aerokit orders the vehicle to hold where it is.
 
         Args:
             altitude_m: metres above home, above 0, at most 10,000.
-            timeout: seconds until it is there.
+            timeout: seconds until the vehicle is at that altitude.
             max_silence_s: raise when no heartbeat was received for this long; None: wait until ``timeout``.
 
         Raises:
@@ -3515,7 +3520,7 @@ class Vehicle(VehicleTwin):
     def components(self) -> StateCell[tuple[ComponentStatus, ...]]:
         """The components seen on board: autopilot, cameras, gimbals, companion computers, receivers and others.
 
-        Cameras and gimbals without a component id of their own appear after their first message.
+        Cameras and gimbals without their own component id appear after their first message.
         """
         return self._part("components", StateCell)
 
@@ -3531,9 +3536,9 @@ class Vehicle(VehicleTwin):
 
     @property
     def camera(self) -> Camera:
-        """The first camera found. One with a component id of its own comes before those behind the autopilot.
+        """The first camera found. A camera with its own component id takes precedence over those behind the autopilot.
 
-        Its calls wait briefly until a camera is found; ``camera_at`` returns any other one.
+        Its calls wait briefly until a camera is found. ``camera_at`` returns any other camera.
         """
         return self._part("camera", Camera)
 
@@ -3606,13 +3611,13 @@ class Vehicle(VehicleTwin):
         """Install a signing key on the vehicle and sign all traffic with it from then on; None removes the key.
 
         **The key is sent unencrypted**: do this over a cable or a private link. Returns when the vehicle's frames
-        are signed with the key (None: when they are no longer signed). Until then the previous setting remains
-        active. Every other vehicle on this connection needs the key too, or ``signing.allow_unsigned``. After a
+        active. Every other vehicle on this connection needs the key too, or ``signing.allow_unsigned``. The vehicle may
+        accept the key even if the call is cancelled. See docs/signing.md.
         cancellation the vehicle may have accepted the key nevertheless. See docs/signing.md.
 
         Args:
             signing: the key, as for ``connect(signing=…)``.
-            timeout: seconds until the vehicle must use it.
+            timeout: seconds until the vehicle must use the key.
 
         Raises:
             NotSupported: this program or the vehicle uses MAVLink 1, which has no signatures. Nothing was sent.
@@ -3720,25 +3725,25 @@ def connect(
     Args:
         address: ``"udpin:0.0.0.0:14550"``, ``"tcp:127.0.0.1:5760"``, ``"/dev/ttyACM0,57600"``, a ``.tlog`` file …; a
             link; several of these that lead to the same vehicle (docs/how-to/several-links.md); or an open
-            connection, to use several vehicles on one link: the arguments after ``rates`` then belong to the call
-            that opened it.
+                connection, to use several vehicles on one link. For an open connection, pass the arguments after
+                ``rates`` to ``open_connection`` instead.
         system_id: the vehicle's MAVLink system id, 1–255; None takes the first autopilot found.
         timeout: seconds to wait for its first heartbeat, above 0.
         rates: message class → Hz (above 0, at most 1000), requested instead of the default rates; ``{}`` requests
             nothing.
         source_system: our own system id.
-        source_component: our own component id, 0–255. 0 is not a valid component id; some old programs send it.
+        source_component: our own component id, 0–255. 0 is not a valid component id, but some old programs use it.
         baud: baud rate of a serial link whose address has none.
         dialect: the message definitions to use.
         mavlink_version: version of the frames we send, 1 or 2.
         signing: signs everything we send, and rejects frames that are not signed with its key (docs/signing.md).
             None: no signatures.
         record: a ``.tlog`` file that receives all traffic in both directions; an existing file is replaced.
-        reconnect: reopen a lost link until it is back, instead of ending the connection.
+        reconnect: reopen a lost link, with as many attempts as it needs, instead of ending the connection.
         peers: accept datagrams and connections only from these IP addresses and networks: ``"10.0.0.7"``,
             ``["10.0.0.0/24"]``. For links with an open port: udpin, udpbcast, tcpin. None: accept all.
         may_move: accept a silent vehicle from a new IP address even if its sequence numbers and time since boot do
-            not continue (it rebooted and has a new address). Otherwise that address is refused
+            not continue, as after a reboot with a new address. By default such an address is refused
             (``RouteChangeRefused``), because it may belong to another sender.
         heartbeat: contents and condition of our own HEARTBEAT. None: no heartbeat is sent, and the vehicle sees no
             ground station: PX4 then sends no status texts, and a ``udpout:`` link stays silent.

@@ -41,10 +41,9 @@ class LinkAddress(Snapshot):
     baud: int | None = None
     """Bits per second; None if not given."""
     path: str = ""
-    """File of a recording; symbolic link of a pseudo-terminal, "" for none; "fleet/name" on a zenoh network."""
+    """Path of a recording or of a pseudo-terminal's symbolic link ("": none), or "fleet/name" on a zenoh network."""
     options: tuple[tuple[str, str], ...] = ()
-    """Options, sorted: ``rtscts`` ("1"), ``speed`` (a factor, or "inf"), ``timeout`` (seconds), ``costly`` ("1") and
-    those of zenoh."""
+    """(name, value) pairs sorted by name: ``rtscts``, ``costly`` ("1"), ``speed``, ``timeout`` (s), zenoh's."""
 
     def __str__(self) -> str:
         as_written = _quote_option if self.kind in _ZENOH_KINDS else str
@@ -130,7 +129,7 @@ _RECORDING = re.compile(r".*\.tlog(\?[^/\\]*)?", re.IGNORECASE | re.DOTALL)
 
 _DATAFLASH = re.compile(r".*\.(bin|log|px4log|ulg)", re.IGNORECASE | re.DOTALL)
 
-# A missing colon: ``udp//:14550``, ``tcp/127.0.0.1:5760``, ``127.0.0.1/14550``.
+# Addresses with a missing colon: ``udp//:14550``, ``tcp/127.0.0.1:5760``, ``127.0.0.1/14550``.
 _WITHOUT_COLON = re.compile(r"([^/\\:.~,][^/\\:]*)(//+|/(?=([^/\\]*:)?\d+$))")
 
 _COM_PORT = re.compile(r"com\d+([,:].*)?", re.IGNORECASE)
@@ -311,7 +310,7 @@ class _Parser:
             return value
         if key in ("rtscts", "costly"):
             if value not in _YES_AND_NO:
-                self.fail(f"{key}={value} is neither yes (1) nor no (0)")
+                self.fail(f"{key}={value} must be 1 (yes) or 0 (no)")
             return str(int(_YES_AND_NO[value]))
         try:
             number = float("inf" if value == "max" else value)

@@ -27,7 +27,7 @@ def create_link(address: str | LinkAddress, *, baud: int = 57600, peers: PeerFil
     where = address if isinstance(address, LinkAddress) else parse_address(address)
     if peers is not None and where.kind not in ("udpin", "udpbcast", "tcpin"):
         raise InvalidArgument(
-            f"peers = … is not allowed with {where}: only udpin, udpbcast and tcpin accept any sender"
+            f"peers = … is not allowed with {where}: only udpin, udpbcast and tcpin links filter senders"
         )
     if where.kind == "serial":
         from aerokit.transport.serial import SerialLink  # imported here because a program has few kinds

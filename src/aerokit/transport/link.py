@@ -57,13 +57,13 @@ class OrderRefusalListener(Receiver, Protocol):
 
 @runtime_checkable
 class PeerKeeper(Receiver, Protocol):
-    """A receiver that decides by `Link.keep_peer` which peers a link remembers, so that senders of noise are not.
+    """A receiver that decides by `Link.keep_peer` which peers a link remembers, so that it forgets senders of noise.
 
     A link that wraps another one forwards `Link.keep_peer`, `Link.forget_peer` and `Link.host_of`.
     """
 
     keeps_peers: bool
-    """If True, the link writes to kept peers only, and forgets none by itself."""
+    """If True, the link writes to kept peers only, and never forgets a kept peer by itself."""
 
 
 @runtime_checkable
@@ -71,7 +71,7 @@ class BurstListener(Receiver, Protocol):
     """A receiver that processes the data of one read burst together. Used by links with `Link.reports_bursts`."""
 
     def burst_ended(self) -> None:
-        """Handle the end of one or more ``bytes_received``; the next one comes in a later loop iteration."""
+        """Called after one or more ``bytes_received``, before the next one in a later loop iteration."""
 
 
 @runtime_checkable
@@ -101,7 +101,7 @@ class Link(ABC):
     """Name of the link, usually in a form that `create_link` accepts, with the actual port instead of 0."""
 
     dropped_writes: int = 0
-    """Number of dropped writes: buffer full, waited too long, no route, or no peer."""
+    """Number of writes dropped because of a full buffer, a long wait, a missing route or a missing peer."""
 
     is_multilink: bool = False
     """True for `MultiLink`, which joins several links to the same vehicles."""
@@ -139,7 +139,7 @@ class Link(ABC):
         return 0
 
     def unsent_bytes_to(self, peer: Peer) -> int:
-        """Return the same for one peer; for all peers if the link does not count them separately."""
+        """Return `unsent_bytes` of one peer, or of all peers if the link does not count them separately."""
         return self.unsent_bytes
 
     def discard_unsent(self) -> None:
@@ -247,7 +247,7 @@ class BaseLink(Link):
         self.dropped_writes += writes
 
     def _report_stalled(self, is_stalled: bool) -> None:
-        """Notify the receiver when the first transport of this link stalls, and when none is stalled again."""
+        """Notify the receiver when a first transport of this link stalls, and when the last one has recovered."""
         if is_stalled == (self._stalled_at is not None):
             return
         now, since = asyncio.get_running_loop().time(), self._stalled_at

@@ -46,7 +46,7 @@ class MultiLink(Link):
     """Several links to the same vehicles. A link that cannot be opened is retried while another one is open.
 
     Args:
-        factories: make each link; called again for each attempt to open all links.
+        factories: functions that create the links, called for the first and every later attempt to open them.
         costly: indices of links that are used only when the others fail.
         survives_loss: True to report an interruption instead of a loss while all links are lost.
     """
@@ -93,7 +93,7 @@ class MultiLink(Link):
 
     @property
     def dropped_writes(self) -> int:  # type: ignore[override]
-        """See `Link.dropped_writes`; of all links."""
+        """Sum of `Link.dropped_writes` over all links."""
         return self._dropped + sum(link.dropped_writes for link in self._links)
 
     @property
@@ -113,7 +113,7 @@ class MultiLink(Link):
         return self._is_available[link]
 
     async def open(self, receiver: Receiver) -> None:
-        """See `Link.open`. LinkOpenError if no link can be opened, with the reason of each."""
+        """See `Link.open`. Raises LinkOpenError with the reason of every link if no link can be opened."""
         if self._is_closed:
             raise ConnectionClosed(f"{self.address} was closed; make a new link to open it again")
         if self._was_opened:
@@ -223,7 +223,7 @@ class MultiLink(Link):
             if error is None:
                 return
             logger.debug("the link still cannot be opened: %s", error)
-            # Not after the first attempt: subscribers of the connection's events are not attached yet.
+            # The first failure is not reported, because no subscriber of the connection's events is attached yet.
             if not is_reported and isinstance(self._receiver, MemberLinkListener):
                 is_reported = True
                 self._receiver.member_link_open_failed(index, error)
@@ -252,7 +252,7 @@ class MultiLink(Link):
                 receiver.link_interrupted(error)
             return
         self._receiver = None
-        lost = LinkLost(f"all links are lost; the last one: {error}")
+        lost = LinkLost(f"all links are lost; the last error: {error}")
         lost.__cause__ = error
         receiver.link_lost(lost)
 

@@ -1,4 +1,4 @@
-"""``Outbox``: write buffer in front of a transport, limited in bytes and seconds, which can be discarded."""
+"""``Outbox``: write buffer in front of a transport. It is limited in bytes and seconds, and can be discarded."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable
 
 WRITE_TIMEOUT_S = 1.0
-"""Data that has waited for this long is dropped: a late command is worse than none."""
+"""Seconds after which waiting data is dropped, because a late command is worse than none."""
 
 STALLED_AFTER_S = 1.0
 """Time without progress after which a link counts as stalled."""
@@ -22,7 +22,7 @@ class Outbox:
     """Write buffer of one transport: forwards writes while the transport accepts them, and keeps them otherwise.
 
     At most ``limit`` bytes (or one larger write) are kept, for at most `WRITE_TIMEOUT_S`. While the transport is
-    stalled, nothing is forwarded, because the transport's own data cannot be discarded.
+    stalled, nothing is forwarded, because data in the transport cannot be discarded.
 
     Args:
         send: writes bytes to the transport.
@@ -86,7 +86,7 @@ class Outbox:
         self._flush()
 
     def discard(self) -> None:
-        """Drop the data that waits here. The transport keeps its own."""
+        """Drop the data in this buffer. Data in the transport is kept."""
         self._dropped(len(self._waiting))
         self._waiting.clear()
         self._waiting_bytes = 0
@@ -96,7 +96,7 @@ class Outbox:
         self._forwarded -= count
 
     def close(self) -> None:
-        """Forward the data that may still be sent. Only ``dropped`` is called afterwards."""
+        """Forward waiting data, or drop it if the transport is stalled. Only ``dropped`` is called afterwards."""
         if self._is_closed:
             return
         self._is_closed = True

@@ -69,7 +69,7 @@ class ReconnectingLink(Link):
 
     The first opening is not retried. ``link_lost`` is called only at the end of a recording, and if ``make_link``
     raises. Data written while the link is lost is dropped and counted in `dropped_writes`. Loss and recovery are logged
-    once each (WARNING, INFO); a server that accepts connections only to close them counts as lost.
+    once each (WARNING, INFO). A server that closes connections just after accepting them counts as lost.
 
     ``make_link`` is called at once and for each attempt, and must return a new link each time.
     """
@@ -98,7 +98,7 @@ class ReconnectingLink(Link):
 
     @property
     def dropped_writes(self) -> int:  # type: ignore[override]
-        """See `Link.dropped_writes`; of all links so far, and of the time between them."""
+        """See `Link.dropped_writes`; includes earlier links, and writes while the link was lost."""
         return self._dropped + self._link.dropped_writes
 
     @property

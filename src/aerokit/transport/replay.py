@@ -13,10 +13,10 @@ from aerokit.transport.address import LinkAddress
 from aerokit.transport.link import BaseLink, Peer
 
 MAX_FRAMES_PER_ITERATION = 64
-"""Frames delivered in one loop iteration, so that other tasks can run."""
+"""Maximum number of frames delivered in one loop iteration, so that other tasks can run."""
 
 MAX_GAP_S = 60.0
-"""Longer gaps in a recording are shortened to this: pauses between flights, or changes of the clock."""
+"""Seconds to which longer gaps in a recording are shortened, e.g. between flights or at changes of the clock."""
 
 
 class Replay(BaseLink):

@@ -1,6 +1,6 @@
 """Serial ports, by pyserial-asyncio, and pseudo-terminals.
 
-Only pyserial-asyncio's transport is used, and the calls of its port are replaced, because of these observed problems:
+Of pyserial-asyncio only the transport is used. The methods of its port are replaced because of these observed problems:
 
 * Closing calls ``tcdrain`` on the event loop: a port with flow control asserted blocks the program.
 * pyserial's ``write`` spins while the device accepts nothing; its ``read`` fails above file descriptor 1023.
@@ -116,7 +116,7 @@ class SerialLink(BaseLink):
                 self._device, self._baud, rtscts=self._rtscts, exclusive=True, timeout=0, write_timeout=0
             )
         except _TermiosError as error:
-            # pyserial does not convert this one, which occurs when the device vanishes during opening.
+            # pyserial does not convert this error, which occurs when the device vanishes during opening.
             raise serial.SerialException(*error.args) from error
 
     def _device_failed(self, error: OSError) -> None:
@@ -155,11 +155,11 @@ class SerialLink(BaseLink):
     def _close_port(self, transport: Any) -> None:
         unsent = self._waiting_to_be_sent(transport)
         with contextlib.suppress(RuntimeError):  # the loop is closed
-            transport.pause_reading()  # again: before its first loop iteration it had no effect
+            transport.pause_reading()  # a second call, because the first has no effect before the first loop iteration
             transport.flush()
         if unsent:
             with contextlib.suppress(Exception):
-                self._port.reset_output_buffer()  # otherwise close() waits for it, up to 30 s
+                self._port.reset_output_buffer()  # otherwise close() waits up to 30 s until the buffer is sent
         self._port.close()
         self._released.set()
 
@@ -181,12 +181,12 @@ class _SerialProtocol(asyncio.Protocol):
             with contextlib.suppress(RuntimeError):  # the loop is closed
                 self._link._loop.call_soon(self._link._outbox.resume)
 
-    def connection_lost(self, exc: Exception | None) -> None:  # only called where the port's calls are not replaced
+    def connection_lost(self, exc: Exception | None) -> None:  # only called for errors outside the replaced methods
         self._link._lose(f"the device failed: {exc}", exc)
 
 
 def _replace_calls(port: Any, on_failure: _OnFailure) -> None:
-    """Replace the calls of a port by ones that never block and report a lost device to ``on_failure``."""
+    """Replace the methods of a port by ones that never block and report a lost device to ``on_failure``."""
     port.flush = lambda: None
     if os.name == "posix":
         port.read = partial(_read, port.fileno(), on_failure)
@@ -274,7 +274,7 @@ class PtyLink(BaseLink):
         import tty
 
         self._loop = asyncio.get_running_loop()
-        # The other end stays open here: otherwise ours fails while no program has it open.
+        # Keep the other end open too, because our end fails while no process has the other end open.
         ours, theirs = self._ends = os.openpty()
         tty.setraw(theirs)
         os.set_blocking(ours, False)

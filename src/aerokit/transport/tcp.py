@@ -39,11 +39,11 @@ NOT_SENT_LOW_WATER = 1024
 ACCEPT_ITERATIONS = 5
 
 MAX_CLIENTS = 64
-"""Further clients are refused, or replace one that is not kept yet (`Link.keep_peer`)."""
+"""Maximum number of clients. A further client replaces one that is not kept (`Link.keep_peer`), or is refused."""
 
 
 class _TcpLink(BaseLink):
-    """Common base: connections that outlive the link by at most `LINGER_S`."""
+    """Common base of TCP links. Connections outlive a closed link by at most `LINGER_S`."""
 
     def __init__(self, scheme: str, host: str, port: int) -> None:
         super().__init__(f"{scheme}:{host_and_port(host, port)}")
@@ -53,7 +53,7 @@ class _TcpLink(BaseLink):
 
     @property
     def unsent_bytes(self) -> int:
-        """See `Link.unsent_bytes`; of all clients."""
+        """Sum of `Link.unsent_bytes` over all connections."""
         return sum(stream.unsent_bytes for stream in self._streams)
 
     def discard_unsent(self) -> None:
@@ -138,7 +138,7 @@ class TcpConnect(_TcpLink):
             self._stream = None  # the link was never open, so this is not a loss
             stream.close()
             sock.close()  # uvloop leaves the socket to the garbage collector
-            self._remove_stream(stream, None)  # and does not call the protocol
+            self._remove_stream(stream, None)  # uvloop does not call connection_lost
             raise
 
     def _on_connected(self, stream: _Stream) -> None:

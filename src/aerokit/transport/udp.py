@@ -27,10 +27,10 @@ from aerokit.transport.sockets import (
 )
 
 MAX_BURST_DATAGRAMS = 64
-"""Datagrams read in one loop iteration, so that other tasks can run."""
+"""Maximum number of datagrams read in one loop iteration, so that other tasks can run."""
 
 MAX_PEERS = 256
-"""Peers that a listening link remembers, unless its receiver is a `PeerKeeper`. The least recent one is replaced."""
+"""Maximum number of peers without a `PeerKeeper` as receiver. A new peer replaces the least recent one."""
 
 REMOTE_TIMEOUT_S = 3.5
 """Silence of the peer that answered a broadcast, after which its port or address may have changed."""
@@ -48,7 +48,7 @@ _TRANSIENT_ERRORS = (
 
 
 class _UdpLink(BaseLink):
-    """Common base: one socket, read in bursts."""
+    """Common base of UDP links: one socket, which is read in bursts."""
 
     def __init__(self, scheme: str, host: str, port: int) -> None:
         super().__init__(f"{scheme}:{host_and_port(host, port)}")
@@ -305,7 +305,7 @@ class _DatagramProtocol(asyncio.DatagramProtocol):
 
 
 def _source_address(remote: SocketAddress) -> Any:
-    """Return the source address of datagrams from there (0.0.0.0 is this machine). OSError without a route."""
+    """Return the source address of datagrams from ``remote`` (0.0.0.0: this host); raises OSError without a route."""
     with socket.socket(remote.family, socket.SOCK_DGRAM) as probe:
         probe.connect(remote.address)
         return probe.getpeername()

@@ -47,7 +47,7 @@ logger: logging.Logger = logging.getLogger("aerokit")
 # An older heartbeat does not prove that the vehicle is present now, so the search waits for the next one.
 HEARTBEAT_MAX_AGE_S = 2.0
 
-# This many heartbeats of one component, with none from component 1, make it the vehicle's autopilot.
+# A component other than 1 counts as the autopilot after this many heartbeats, if component 1 has sent none.
 MIN_LONE_HEARTBEATS = 3
 
 
@@ -80,25 +80,25 @@ async def connect(
     Args:
         address: ``"udpin:0.0.0.0:14550"``, ``"tcp:127.0.0.1:5760"``, ``"/dev/ttyACM0,57600"``, a ``.tlog`` file …; a
             link; several of these that lead to the same vehicle (docs/how-to/several-links.md); or an open
-            connection, to use several vehicles on one link: the arguments after ``rates`` then belong to the call
-            that opened it.
+                connection, to use several vehicles on one link. For an open connection, pass the arguments after
+                ``rates`` to ``open_connection`` instead.
         system_id: the vehicle's MAVLink system id, 1–255; None takes the first autopilot found.
         timeout: seconds to wait for its first heartbeat, above 0.
         rates: message class → Hz (above 0, at most 1000), requested instead of the default rates; ``{}`` requests
             nothing.
         source_system: our own system id.
-        source_component: our own component id, 0–255. 0 is not a valid component id; some old programs send it.
+        source_component: our own component id, 0–255. 0 is not a valid component id, but some old programs use it.
         baud: baud rate of a serial link whose address has none.
         dialect: the message definitions to use.
         mavlink_version: version of the frames we send, 1 or 2.
         signing: signs everything we send, and rejects frames that are not signed with its key (docs/signing.md).
             None: no signatures.
         record: a ``.tlog`` file that receives all traffic in both directions; an existing file is replaced.
-        reconnect: reopen a lost link until it is back, instead of ending the connection.
+        reconnect: reopen a lost link, with as many attempts as it needs, instead of ending the connection.
         peers: accept datagrams and connections only from these IP addresses and networks: ``"10.0.0.7"``,
             ``["10.0.0.0/24"]``. For links with an open port: udpin, udpbcast, tcpin. None: accept all.
         may_move: accept a silent vehicle from a new IP address even if its sequence numbers and time since boot do
-            not continue (it rebooted and has a new address). Otherwise that address is refused
+            not continue, as after a reboot with a new address. By default such an address is refused
             (``RouteChangeRefused``), because it may belong to another sender.
         heartbeat: contents and condition of our own HEARTBEAT. None: no heartbeat is sent, and the vehicle sees no
             ground station: PX4 then sends no status texts, and a ``udpout:`` link stays silent.
@@ -129,7 +129,7 @@ async def connect(
             )
         if peers is not None or may_move:
             raise InvalidArgument(
-                "peers and may_move are not allowed here: the connection is open; pass it to open_connection"
+                "peers and may_move are not allowed here: the connection is open; pass them to open_connection"
             )
         if share:
             raise InvalidArgument(
@@ -255,7 +255,7 @@ _Found = tuple[VehicleContext, Vehicle, Heartbeat]
 
 
 class _Search:
-    """Creates the vehicle inside the delivery of its heartbeat, so that no later message is missed.
+    """Creates the vehicle while its first heartbeat is being delivered, so that no later message is missed.
 
     A recording replayed at full speed delivers many frames in one iteration of the loop.
     """
@@ -276,7 +276,7 @@ class _Search:
             return
         try:
             if frame.system_id in self._connection.attached:
-                raise BusyError(f"system {frame.system_id} has a vehicle object on this connection already")
+                raise BusyError(f"system {frame.system_id} already has a vehicle object on this connection")
             context = VehicleContext(VehicleSession(self._connection, frame.system_id, frame.component_id, heartbeat))
             self._found = (context, Vehicle(context), heartbeat)
             self._connection.attached.add(frame.system_id)
@@ -328,16 +328,16 @@ async def vehicles_on(
     """Connect to every vehicle found on a connection, for the duration of the block.
 
     A vehicle that falls silent stays in the mapping: its cells have ages, and ``link_state`` reports the silence.
-    Vehicles that this program has connected to otherwise are left out.
+    Vehicles to which this program is connected already are left out.
 
     Args:
-        connection: of :func:`aerokit.open_connection`.
+        connection: the result of :func:`aerokit.open_connection`.
         rates: message class → Hz, requested from each vehicle, as by :func:`aerokit.connect`; ``{}`` requests
             nothing.
         on_found: called in the loop with each new vehicle.
 
     Returns:
-        System id → vehicle, in the order in which they were found; grows while the block lasts.
+        Mapping of system id to vehicle, in the order in which they were found; grows while the block lasts.
 
     Raises:
         ConnectionClosed, LinkLost: the connection has ended.
@@ -356,7 +356,7 @@ async def vehicles_on(
         except AerokitError as error:
             logger.info("system %d was not connected: %s", system_id, error)
 
-    async def look_out() -> None:
+    async def search() -> None:
         try:
             async for found in connection.vehicles():
                 if found.system_id not in vehicles:
@@ -365,7 +365,7 @@ async def vehicles_on(
             logger.info("the search for vehicles has ended: %s", error)
 
     tasks = BackgroundTasks(connection.fail)
-    tasks.start(look_out)
+    tasks.start(search)
     try:
         yield vehicles
     finally:

@@ -31,12 +31,12 @@ if TYPE_CHECKING:
 
 __all__ = ["Vehicle", "overview"]
 
-TELL_OF_GIMBALS = tuple(
+GIMBAL_MESSAGE_IDS = tuple(
     MESSAGE_IDS[name]
     for name in ("GimbalDeviceAttitudeStatus", "GimbalManagerStatus", "MountStatus", "MountOrientation")
 )
 
-TELL_OF_PICTURES = tuple(MESSAGE_IDS[name] for name in ("CameraImageCaptured", "CameraFeedback", "CameraTrigger"))
+PICTURE_MESSAGE_IDS = tuple(MESSAGE_IDS[name] for name in ("CameraImageCaptured", "CameraFeedback", "CameraTrigger"))
 """Message ids of camera triggers. Looked up by name, because only programs that use cameras need the classes."""
 
 
@@ -55,9 +55,9 @@ class Vehicle(ReadOnly, FlightActions, TravelActions, LookActions, ArmingActions
         self._plans = PlanContext(context, lambda: self.files)
         first = partial(self.connection.bus.create_on_first, system_id=self.system_id)
         context.session.at_close(
-            first(TELL_OF_GIMBALS, lambda: self.gimbal),
+            first(GIMBAL_MESSAGE_IDS, lambda: self.gimbal),
             first([ParamValue.ID], lambda: self.parameters),
-            first(TELL_OF_PICTURES, lambda: self._cameras),
+            first(PICTURE_MESSAGE_IDS, lambda: self._cameras),
         )
 
     # Sub-objects are imported and created on first use, or when the vehicle first sends a message that they
@@ -67,7 +67,7 @@ class Vehicle(ReadOnly, FlightActions, TravelActions, LookActions, ArmingActions
     def components(self) -> StateCell[tuple[ComponentStatus, ...]]:
         """The components seen on board: autopilot, cameras, gimbals, companion computers, receivers and others.
 
-        Cameras and gimbals without a component id of their own appear after their first message.
+        Cameras and gimbals without their own component id appear after their first message.
         """
         return self._components.cell
 
@@ -89,9 +89,9 @@ class Vehicle(ReadOnly, FlightActions, TravelActions, LookActions, ArmingActions
 
     @property
     def camera(self) -> Camera:
-        """The first camera found. One with a component id of its own comes before those behind the autopilot.
+        """The first camera found. A camera with its own component id takes precedence over those behind the autopilot.
 
-        Its calls wait briefly until a camera is found; ``camera_at`` returns any other one.
+        Its calls wait briefly until a camera is found. ``camera_at`` returns any other camera.
         """
         return self._cameras.first
 
@@ -189,13 +189,13 @@ class Vehicle(ReadOnly, FlightActions, TravelActions, LookActions, ArmingActions
         """Install a signing key on the vehicle and sign all traffic with it from then on; None removes the key.
 
         **The key is sent unencrypted**: do this over a cable or a private link. Returns when the vehicle's frames
-        are signed with the key (None: when they are no longer signed). Until then the previous setting remains
-        active. Every other vehicle on this connection needs the key too, or ``signing.allow_unsigned``. After a
+        active. Every other vehicle on this connection needs the key too, or ``signing.allow_unsigned``. The vehicle may
+        accept the key even if the call is cancelled. See docs/signing.md.
         cancellation the vehicle may have accepted the key nevertheless. See docs/signing.md.
 
         Args:
             signing: the key, as for ``connect(signing=…)``.
-            timeout: seconds until the vehicle must use it.
+            timeout: seconds until the vehicle must use the key.
 
         Raises:
             NotSupported: this program or the vehicle uses MAVLink 1, which has no signatures. Nothing was sent.

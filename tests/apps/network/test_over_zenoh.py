@@ -40,10 +40,11 @@ async def copter_at(port: int) -> AsyncIterator[SimulatedCopter]:
             yield copter
 
 
+@pytest.mark.usefixtures("any_delay")
 async def test_zenoh_link_supports_whole_api() -> None:
     port = free_port()
-    address = f"zenoh://north/alpha?connect=tcp/127.0.0.1:{port}&client=ground-1"
-    async with copter_at(port), aerokit.connect(address) as vehicle:
+    address = f"zenoh://north/alpha?connect=tcp/127.0.0.1:{port}&client=ground-1&timeout=100"
+    async with copter_at(port), aerokit.connect(address, timeout=100) as vehicle:
         await vehicle.wait_ready()
         parameters = await vehicle.parameters.download()
         assert len(parameters) > 100
@@ -70,13 +71,14 @@ async def test_zenoh_link_supports_whole_api() -> None:
         assert link.dropped_writes == 0
 
 
+@pytest.mark.usefixtures("any_delay")
 async def test_zenoh_client_without_control_is_refused() -> None:
     port = free_port()
-    address = f"zenoh://north/alpha?connect=tcp/127.0.0.1:{port}&client="
+    address = f"zenoh://north/alpha?connect=tcp/127.0.0.1:{port}&timeout=100&client="
     async with (
         copter_at(port),
-        aerokit.connect(address + "one") as one,
-        aerokit.connect(address + "two", source_system=254) as two,
+        aerokit.connect(address + "one", timeout=100) as one,
+        aerokit.connect(address + "two", source_system=254, timeout=100) as two,
     ):
         await one.wait_ready()
         await one.set_mode("GUIDED")
@@ -103,13 +105,14 @@ async def test_zenoh_reconnect_survives_partition() -> None:
         async with aerokit.connect(address, reconnect=True) as vehicle:
             await vehicle.wait_ready()
             line.hold()
-            await vehicle.link_state.wait_until(lambda state: state is not aerokit.LinkState.CONNECTED, timeout=10)
+            await vehicle.link_state.wait_until(lambda state: state is not aerokit.LinkState.CONNECTED, timeout=100)
             line.release()
-            await vehicle.link_state.wait_until(lambda state: state is aerokit.LinkState.CONNECTED, timeout=10)
+            await vehicle.link_state.wait_until(lambda state: state is aerokit.LinkState.CONNECTED, timeout=100)
             await vehicle.set_mode("GUIDED")
             await vehicle.arm()
 
 
+@pytest.mark.usefixtures("any_delay")
 async def test_zenoh_publishes_states() -> None:
     port = free_port()
     endpoint = f"tcp/127.0.0.1:{port}"
@@ -118,7 +121,10 @@ async def test_zenoh_publishes_states() -> None:
     def hear(sample: Any) -> None:
         received[str(sample.key_expr)] = json.loads(sample.payload.to_bytes())
 
-    async with copter_at(port), aerokit.connect(f"zenoh://north/alpha?connect={endpoint}") as vehicle:
+    async with (
+        copter_at(port),
+        aerokit.connect(f"zenoh://north/alpha?connect={endpoint}&timeout=100", timeout=100) as vehicle,
+    ):
         config = zenoh.Config()
         for key, value in (
             ("mode", "client"),
@@ -132,7 +138,10 @@ async def test_zenoh_publishes_states() -> None:
             await eventually(lambda: "aerokit/north/alpha/state/1/position" in received)
             position = received["aerokit/north/alpha/state/1/position"]
             assert position["value"]["latitude_deg"] == pytest.approx(vehicle.position.value.latitude_deg, abs=1e-4)
-            assert await discover("north", connect=[endpoint], wait=0.2) == ["alpha"]
+            for wait_s in (0.2, 2.0, 20.0):  # the router may need long to answer
+                if found := await discover("north", connect=[endpoint], wait=wait_s):
+                    break
+            assert found == ["alpha"]
         del subscriber
         other.close()
 

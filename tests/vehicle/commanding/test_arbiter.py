@@ -15,7 +15,7 @@ from aerokit.errors import CommandRejected, CommandTimeout
 from aerokit.mavlink.enums import MavCmd, MavState
 from aerokit.mavlink.messages import Heartbeat
 from aerokit.vehicle.commanding.arbiter import MODE_GRACE_S, MODE_MAX_AGE_S, CommandArbiter
-from aerokit.vehicle.commanding.order import CHANGED_BY_COMMAND, QUESTIONS, Order, SentCommand
+from aerokit.vehicle.commanding.order import CHANGED_BY_COMMAND, REQUEST_COMMANDS, Order, SentCommand
 from aerokit.vehicle.state.telemetry import Telemetry
 
 HEARTBEAT = Source(1, 1, "HEARTBEAT")
@@ -315,9 +315,9 @@ def test_commands_are_classified_as_orders_or_questions() -> None:
         *("DO_FLIGHTTERMINATION", "DO_ORBIT", "DO_PAUSE_CONTINUE", "OVERRIDE_GOTO", "MISSION_START"),
         "COMPONENT_ARM_DISARM",
     }
-    for number in QUESTIONS - {MavCmd.SET_MESSAGE_INTERVAL, MavCmd.RUN_PREARM_CHECKS}:
+    for number in REQUEST_COMMANDS - {MavCmd.SET_MESSAGE_INTERVAL, MavCmd.RUN_PREARM_CHECKS}:
         assert MavCmd(number).name.startswith(("REQUEST_", "GET_")), "a command that changes something is not a query"
-    assert len(QUESTIONS) == 11
+    assert len(REQUEST_COMMANDS) == 11
 
 
 def test_order_without_modes_stays_valid() -> None:

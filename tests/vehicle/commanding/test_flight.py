@@ -644,7 +644,7 @@ async def test_take_off_refused_in_air_says_so(flying: Flight) -> None:
     """The vehicle answers only FAILED; the landed state was unknown when the order was given."""
     flying.vehicle.telemetry.landed_state.forget()
     with pytest.raises(
-        CommandRejected, match=r"it is in the air, 10\.\d m above home and takes off from the ground only"
+        CommandRejected, match=r"it is in the air, 10\.\d m above home and can only take off from the ground"
     ):
         await flying.vehicle.take_off(20)
 
@@ -652,7 +652,7 @@ async def test_take_off_refused_in_air_says_so(flying: Flight) -> None:
 async def test_take_off_refused_height_shows_flight(flying: Flight, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(flight, "IN_THE_AIR", {})
     flying.vehicle.telemetry.landed_state.forget()
-    with pytest.raises(CommandRejected, match=r"it is probably in the air, 10\.\d m above home and takes off"):
+    with pytest.raises(CommandRejected, match=r"it is probably in the air, 10\.\d m above home and can only take off from the ground"):
         await flying.vehicle.take_off(20)
 
 

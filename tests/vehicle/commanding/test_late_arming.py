@@ -113,7 +113,7 @@ async def test_pilot_arming_after_mode_change_stays_armed(grounded: Flight, capl
     await anyio.sleep(ARM_WATCH_S)
     assert grounded.copter.is_armed
     assert ordered(grounded) == [1]
-    assert "not certain that this command armed it: it stays armed" in caplog.text
+    assert "it stays armed, because another party may have armed it" in caplog.text
 
 
 async def test_pilot_arming_later_by_sticks_stays_armed(grounded: Flight) -> None:

@@ -151,7 +151,7 @@ async def test_px4_refusal_after_acceptance_raises() -> None:
         started = now()
         with pytest.raises(
             OperationRejected,
-            match=r"set_mode\(OFFBOARD\): the vehicle accepted it first and refused it then",
+            match=r"set_mode\(OFFBOARD\): the vehicle accepted the command and then refused it",
         ):
             await flight.vehicle.set_mode("OFFBOARD")
         assert now() - started < 2.0
@@ -178,5 +178,5 @@ async def test_refusal_after_acceptance_raises(grounded: Flight, result: MavResu
             grounded.wire.deliver(FrameEncoder(1, 1).encode(again))
 
         tasks.start_soon(answer_again)
-        with pytest.raises(OperationRejected, match="the vehicle accepted it first and refused it then"):
+        with pytest.raises(OperationRejected, match="the vehicle accepted the command and then refused it"):
             await grounded.vehicle.set_mode("GUIDED")

@@ -76,7 +76,7 @@ async def test_refused_fence_keeps_the_old_one(opened: Any) -> None:
     async with opened() as flight:
         await flight.vehicle.fence.upload(FENCE)
         many = Fence([FencePolygon([place(i, i % 2) for i in range(70)])] * 200)
-        with pytest.raises(MissionRejected, match="the vehicle still holds its previous items"):
+        with pytest.raises(MissionRejected, match="the vehicle still has its previous items"):
             await flight.vehicle.fence.upload(many, method="items")
         assert FENCE.matches(await flight.vehicle.fence.download())
 

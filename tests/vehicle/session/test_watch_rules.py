@@ -19,7 +19,7 @@ from aerokit.mavlink.messages import Attitude, Heartbeat, SystemTime, Timesync
 from aerokit.vehicle.commanding.context import VehicleContext
 from aerokit.vehicle.commanding.progress import StallDetector
 from aerokit.vehicle.commanding.setpoints import (
-    FAR,
+    MAX_RESTING_RADII,
     SLOW_M_S,
     BodyVelocitySetpoint,
     LocalPositionSetpoint,
@@ -363,7 +363,7 @@ def test_stall_velocity_threshold(speed_m_s: float, wanted: bool) -> None:
     ("away_m", "wanted"), [(0.0, False), (3.0, False), (3.1, True), (1e7, True), (math.inf, False)]
 )
 def test_stall_global_position_requires_distance(away_m: float, wanted: bool) -> None:
-    session = SimpleNamespace(autopilot=SimpleNamespace(arrival_radius_m=3.0 / FAR))
+    session = SimpleNamespace(autopilot=SimpleNamespace(arrival_radius_m=3.0 / MAX_RESTING_RADII))
     where = SimpleNamespace(distance_to=lambda _: away_m)  # infinite while the position is unknown
     context = cast("VehicleContext", SimpleNamespace(session=session, vehicle_position=where))
     assert wants_motion(PositionSetpoint(HERE), context) is wanted
@@ -375,7 +375,7 @@ def test_stall_local_position_requires_distance(axis: int, off_m: float, wanted:
     """The distance along each axis counts."""
     here = LocalPosition(-5.0, 7.0, -10.0, 0.0, 0.0, 0.0)
     telemetry = SimpleNamespace(local_position=SimpleNamespace(latest=here))
-    session = SimpleNamespace(autopilot=SimpleNamespace(arrival_radius_m=3.0 / FAR), telemetry=telemetry)
+    session = SimpleNamespace(autopilot=SimpleNamespace(arrival_radius_m=3.0 / MAX_RESTING_RADII), telemetry=telemetry)
     place = [here.north_m, here.east_m, here.down_m]
     place[axis] += off_m
     context = cast("VehicleContext", SimpleNamespace(session=session))

@@ -19,7 +19,7 @@ MAX_REMEMBERED = 4096  # frames: 10 s at 400 frames per second
 # A copy within this time is always a duplicate.
 COPY_WINDOW_S = 3.0
 
-# A copy within this time is a duplicate if the first one was accepted: it comes over a link that became slow.
+# A later copy, within this time, is a duplicate only if the first copy was accepted. Slow links deliver such copies.
 LATE_COPY_WINDOW_S = 10.0
 
 # Sequence numbers repeat after 256 frames; after half of them, equal bytes are another frame.
@@ -107,7 +107,8 @@ ANSWERS = frozenset(
     )
 )  # fmt: skip
 
-# PX4 sends one over each port on which it received us. The second one would acknowledge the next command.
+# PX4 sends an acknowledgement over each port on which it received us. The second copy would be taken for the answer to
+# the next command.
 ACKNOWLEDGEMENTS = frozenset(message_type.ID for message_type in (m.CommandAck, m.MissionAck, m.ParamExtAck))
 
 
@@ -132,8 +133,8 @@ class _Stream:
 class MergedStreams:
     """Accepts each frame once, whichever copy arrives first.
 
-    If two links carry separate streams (each port of an autopilot has its own sequence numbers), only the link in use
-    is accepted, because frames of the other one may be older. ``choices`` has the links to each system.
+    If two links carry separate streams (each port of an autopilot has its own sequence numbers), only frames of the
+    link in use are accepted, because those of the other link may be older. ``choices`` has the links to each system.
     """
 
     def __init__(self, links: int, choices: Mapping[int, LinkChoice]) -> None:
@@ -209,7 +210,7 @@ def _is_accepted_from_unused(frame: Frame, candidate: Candidate | None, choice: 
 
 
 def _may_be_equal(frame: Frame, link: int, choice: LinkChoice) -> bool:
-    """Return True if two frames with equal bytes may be different ones: heartbeats of separate streams."""
+    """Return True if frames with equal bytes may be different frames, as heartbeats of separate streams are."""
     candidate = choice.used
     if candidate is None or candidate.link != link or frame.message_id != m.Heartbeat.ID:
         return False

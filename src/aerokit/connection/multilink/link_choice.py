@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 # Silence after which a link is not alive. Probes are answered twice a second.
 PROBED_TIMEOUT_S = 1.0
 
-# The same for a link without answers, or a costly one: two missing heartbeats.
+# Silence after which a link without answers, or a costly link, is not alive: two missing heartbeats.
 UNPROBED_TIMEOUT_S = 2.5
 
 # Consecutive matching clock samples that prove that a second link leads to the same vehicle.
@@ -24,7 +24,7 @@ MAX_TIMES_WITHOUT_HARDWARE = 3
 
 MAX_HARDWARE_REQUESTS = 20
 
-# Frames received both over a link and over the link in use that prove that they lead to the same vehicle.
+# Number of frames received over both a link and the link in use that proves that both lead to the same vehicle.
 MIN_COPIES = 3
 
 
@@ -42,17 +42,17 @@ class Candidate:
         self.loss: float | None = None
         """Share of frames lost over the last seconds, 0 to 1; None: unknown."""
         self.round_trip_s: float | None = None
-        """None before the first answer."""
+        """Smoothed round-trip time of the probes; None before the first answer."""
         self.is_proven: bool = False
         """True if the link is known to lead to the vehicle."""
         self.was_proven: bool = False
-        """True if it was proven before the vehicle rebooted, or before its clock was doubted."""
+        """True if :attr:`is_proven` was True before the vehicle rebooted, or before the link was doubted."""
         self.is_doubted: bool = False
         """True if another vehicle with the same system id seems to be behind the link."""
         self.hardware: HardwareId | None = None
         """Hardware id received over the link; None before that."""
         self.is_other_hardware: bool = False
-        """True if that is another vehicle's; neither clock nor copies can then prove the link."""
+        """True if :attr:`hardware` belongs to another vehicle: neither clock nor copies can then prove the link."""
         self._hardware_requests = self._times_since_request = 0
         self._clock_matches = self._clock_mismatches = self._copies = 0
         self._counted = (0, 0)
@@ -167,9 +167,9 @@ MAX_SWITCH_DELAY_S = 10.0
 class LinkChoice:
     """The links to one system, and the one in use.
 
-    Systems with an autopilot need proof (``needs_proof``): frames of a second link are accepted, and commands sent
-    over it, only after it is proven to lead to the same vehicle, by its clock or by carrying the same frames. A
-    different hardware id disproves it, even if the clock matches.
+    Systems with an autopilot need proof (``needs_proof``) that a second link leads to the same vehicle: a matching
+    clock, or the same frames. Before that, its frames are refused and no command is sent over it. A different hardware
+    id disproves it, even if the clock matches.
     """
 
     def __init__(self, *, needs_proof: bool) -> None:
@@ -204,7 +204,7 @@ class LinkChoice:
             self.candidates = {candidate.link: candidate}
 
     def record_answer(self, link: int, at: float, vehicle_s: float, round_trip_s: float, now: float) -> None:
-        """Record the vehicle's time ``vehicle_s``, received over a link; ``at`` is the time of that by our clock."""
+        """Record the vehicle's time ``vehicle_s``, received over a link; ``at`` is our time at that moment."""
         candidate = self.candidates[link]
         is_used_silent = self.used is not None and self.used.answered_at < candidate.answered_at
         candidate.record_round_trip(round_trip_s, now)
@@ -229,8 +229,8 @@ class LinkChoice:
     def record_hardware(self, link: int, hardware: HardwareId) -> None:
         """Record a hardware id received over a link.
 
-        Over the link in use it is the vehicle's, unless the vehicle's was received over another link before: then the
-        link in use leads to another vehicle.
+        An id received over the link in use becomes the vehicle's id. If it contradicts an id that was received over
+        another link before, the link in use leads to another vehicle.
         """
         candidate = self.candidates[link]
         if hardware.has_value or candidate.hardware is None:
@@ -279,18 +279,18 @@ class LinkChoice:
     def should_request_hardware(self, candidate: Candidate, *, is_attached: bool) -> bool:
         """Return True if the hardware id is to be requested over this link, and count the request.
 
-        A vehicle object (``is_attached``) itself requests it over the link in use.
+        Over the link in use, an attached vehicle object (``is_attached``) requests the id itself.
         """
         if candidate is not self.used:
             return not candidate.is_proven and candidate.request_hardware()
         return len(self.candidates) > 1 and not is_attached and candidate.request_hardware()
 
     def _is_same_by_hardware(self, candidate: Candidate, now: float) -> bool:
-        """Return True if the hardware id is proof enough: proven before the reboot, and the only link alive."""
+        """Return True if a matching hardware id suffices: the link was proven before, and no other link is alive."""
         is_same = (
             self.hardware is not None and candidate.hardware is not None and self.hardware.confirms(candidate.hardware)
         )
-        alive = [each for each in self.candidates.values() if each.is_alive(now)]
+        alive = [known for known in self.candidates.values() if known.is_alive(now)]
         return candidate.was_proven and is_same and alive == [candidate]
 
     def _awaits_hardware(self, candidate: Candidate) -> bool:

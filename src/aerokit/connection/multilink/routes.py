@@ -181,7 +181,7 @@ class MultiLinkRoutes:
         return []
 
     def peers_of(self, system_id: int, component_id: int, message: Message | None = None) -> Collection[Peer]:
-        """Return the peers to which a message for this component goes: over one link, the best one.
+        """Return the peers that get a message for this component, all of them on the best link.
 
         A broadcast goes once to each known system, as far as the links allow it, and to all links without a known
         system; heartbeats and time messages go everywhere.
@@ -287,7 +287,7 @@ class MultiLinkRoutes:
         return (LinkPeer(link, None),) if None in peers else peers
 
     def _one_per_system(self, now: float) -> Collection[Peer]:
-        """Return peers that reach every system. A system that other systems' peers reach gets no copy of its own."""
+        """Return peers that together reach every system. A system behind an already chosen peer adds no second peer."""
         peers: set[Peer] = set()
         links_with_systems: set[int] = set()
         options: list[list[Collection[Peer]]] = []

@@ -21,10 +21,10 @@ _LAST = AccelcalVehiclePos.BACK
 
 
 class AccelerometerCalibration:
-    """Six-position calibration. It broadcasts the wanted position as a COMMAND_LONG every second.
+    """Six-position calibration, which broadcasts the requested position as a COMMAND_LONG every second.
 
-    The client confirms each position with the same command. After the end the result is broadcast every second until
-    a reboot. With ``is_held_wrong`` the calibration fails.
+    The client confirms each position with the same command. The result is broadcast every second until a reboot.
+    Set ``is_held_wrong`` to let the calibration fail.
     """
 
     def __init__(self, vehicle: ArduPilotHost) -> None:
@@ -47,7 +47,7 @@ class AccelerometerCalibration:
         self._request(self._run, AccelcalVehiclePos.LEVEL)
 
     def confirm(self, command: ReceivedCommand) -> int:
-        """Execute MAV_CMD_ACCELCAL_VEHICLE_POS: the vehicle is in the requested position."""
+        """Execute MAV_CMD_ACCELCAL_VEHICLE_POS, which confirms that the vehicle is in the requested position."""
         if not self.is_waiting or command.param1 != self._requested:
             return MavResult.FAILED
         self._requested, run, position = None, self._run, whole(command.param1)
@@ -88,8 +88,8 @@ _FITNESS = 5.0
 class CompassCalibration:
     """Compass calibration: DO_START_MAG_CAL, DO_ACCEPT_MAG_CAL, DO_CANCEL_MAG_CAL and their reports.
 
-    ``turns_s``: seconds until the vehicle has been turned in all directions; with infinity, as in SITL, the progress
-    stays at 0 % until the calibration is cancelled. While it runs the vehicle cannot be armed.
+    ``turns_s``: seconds until the vehicle has been turned in all directions. With infinity, as in SITL, the progress
+    stays at 0 % until the calibration is cancelled. The vehicle cannot be armed while a calibration runs.
     """
 
     def __init__(self, vehicle: ArduPilotHost) -> None:
@@ -106,7 +106,7 @@ class CompassCalibration:
 
     @property
     def is_running(self) -> bool:
-        """True until 100 %; a calibration that waits to be accepted is not running."""
+        """True until the progress reaches 100 %; a calibration that waits for acceptance is not running."""
         return bool(self._mask) and self.percent < 100
 
     @property
@@ -126,7 +126,7 @@ class CompassCalibration:
         }
 
     def _start(self, command: ReceivedCommand) -> int:
-        """Start; param 1 is a mask of compasses, 0 for all, param 3 saves the result without acceptance."""
+        """Start; param 1 is a mask of compasses (0: all), param 3 is 1 to save the result without acceptance."""
         if self._vehicle.motors.is_armed:
             self._vehicle.send_text(MavSeverity.NOTICE, "Disarm to allow compass calibration")
             return MavResult.FAILED
@@ -181,9 +181,9 @@ _Accelerometers = PreflightCalibrationAccelerometer
 
 
 class Calibrations:
-    """Sensor calibrations. PREFLIGHT_CALIBRATION is acknowledged at its end, or with the first requested position.
+    """Sensor calibrations. PREFLIGHT_CALIBRATION is acknowledged when it ends or requests the first position.
 
-    ``compasses`` and ``accelerometers`` are the two for which the vehicle is turned by hand.
+    The calibrations ``compasses`` and ``accelerometers`` require that the vehicle is turned by hand.
     """
 
     def __init__(self, vehicle: ArduPilotHost) -> None:

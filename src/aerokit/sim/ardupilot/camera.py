@@ -16,10 +16,10 @@ _UNLIMITED = -1
 
 
 class ArduPilotCamera:
-    """Takes images at once, by time or by distance, and sends CAMERA_FEEDBACK for each on every link.
+    """Takes images on command, by time or by distance, and sends CAMERA_FEEDBACK for each image on every link.
 
-    It is part of the autopilot (component 1); like the firmware it sends neither CAMERA_IMAGE_CAPTURED nor
-    heartbeats. It is enabled while CAM1_TYPE is not 0.
+    The camera belongs to the autopilot component (1). Like the firmware, it sends neither CAMERA_IMAGE_CAPTURED nor
+    heartbeats. CAM1_TYPE 0 disables it.
     """
 
     image_count: int
@@ -35,7 +35,7 @@ class ArduPilotCamera:
         self._taken_where: tuple[float, float] | None = None
         self._ticks = False
         self.feedback: m.CameraFeedback = m.CameraFeedback(0, 0, 0, 0, 0, 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0)
-        """CAMERA_FEEDBACK of the latest image; zeros before the first."""
+        """CAMERA_FEEDBACK of the latest image; zeros before the first image."""
 
     @property
     def is_fitted(self) -> bool:
@@ -46,7 +46,7 @@ class ArduPilotCamera:
         return self._vehicle.parameters.get("CAM1_DURATION", _SHUTTER_S)
 
     def take(self) -> bool:
-        """Take an image; return False without a camera or while the shutter is open."""
+        """Take an image; return False if there is no camera or its shutter is still open."""
         if not self.is_fitted or self._vehicle.now - self._taken_at < self._shutter_s:
             return False
         motion = self._vehicle.motion
@@ -69,7 +69,7 @@ class ArduPilotCamera:
         self.remaining = 0
 
     def trigger_by_distance(self, metres: float) -> None:
-        """Take an image at this distance in metres; 0 stops."""
+        """Take an image each time the vehicle has moved this far in metres; 0 stops."""
         self.trigger_distance_m = metres
         self._taken_where = None
         self._watch()
@@ -98,7 +98,7 @@ class ArduPilotCamera:
             self.take()
 
     def run(self, item: MissionItem) -> None:
-        """Execute a mission command, if it is for cameras."""
+        """Execute a mission command; commands that do not concern cameras are ignored."""
         if item.command == MavCmd.DO_DIGICAM_CONTROL and item.x == 1:
             self.take()
         elif item.command == MavCmd.DO_SET_CAM_TRIGG_DIST:
@@ -143,7 +143,7 @@ class ArduPilotCamera:
         return MavResult.ACCEPTED
 
     def zoom(self, command: ReceivedCommand) -> int:
-        """Handle MAV_CMD_SET_CAMERA_ZOOM, continuous or in percent; it has no visible effect."""
+        """Handle MAV_CMD_SET_CAMERA_ZOOM, continuous or in percent; no message reports the zoom."""
         is_supported = self.is_fitted and command.param1 in (1.0, 2.0)
         return MavResult.ACCEPTED if is_supported else MavResult.UNSUPPORTED
 
@@ -154,8 +154,8 @@ class ArduPilotCamera:
             return MavResult.DENIED
         if not self.is_fitted:
             return MavResult.FAILED
-        by_itself = kind not in (SetFocusType.CONTINUOUS, SetFocusType.RANGE)
-        return MavResult.UNSUPPORTED if by_itself else MavResult.ACCEPTED
+        is_autofocus = kind not in (SetFocusType.CONTINUOUS, SetFocusType.RANGE)
+        return MavResult.UNSUPPORTED if is_autofocus else MavResult.ACCEPTED
 
     def _take_feedback(self) -> m.CameraFeedback:
         motion, nav = self._vehicle.motion, self._vehicle.navigation

@@ -1,6 +1,6 @@
 """Commands (MAV_CMD) that all simulated ArduPilots implement, with the conditions and results of the firmware.
 
-Results are those of a vehicle as the simulation starts it: without gripper, winch or lifting rotors.
+Results are those of a vehicle without gripper, winch and lifting rotors.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _FIXED_TEXTS: dict[tuple[int, Kind], tuple[tuple[int, str], ...]] = {
 
 
 def common_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
-    """Return the handler of each MAV_CMD. Each kind of vehicle adds and replaces some."""
+    """Return the handlers by MAV_CMD. Each kind of vehicle adds and replaces handlers."""
     common, requests = _CommonCommands(vehicle), vehicle.requests
     # Commands of absent devices.
     handlers: dict[int, CommandHandler] = {
@@ -131,7 +131,7 @@ class _CommonCommands:
         return _R.ACCEPTED
 
     def start_mission(self, command: ReceivedCommand) -> int:
-        """Start or resume the mission; on the ground this permits its take-off."""
+        """Start or resume the mission; if the vehicle is armed on the ground, this permits the take-off."""
         vehicle = self._vehicle
         if command.param1 or command.param2:
             return _R.DENIED
@@ -144,7 +144,7 @@ class _CommonCommands:
 
     def reposition(self, command: ReceivedCommand) -> int:
         vehicle, guided = self._vehicle, self._vehicle.guided
-        if command.is_long:  # ArduPilot defines no altitude frame for COMMAND_LONG here
+        if command.is_long:  # COMMAND_LONG does not specify the altitude frame that ArduPilot requires here.
             return _R.UNSUPPORTED
         if vehicle.mode is not guided and not whole(command.param2) & MavDoRepositionFlags.CHANGE_MODE:
             return _R.DENIED
@@ -179,7 +179,7 @@ class _CommonCommands:
             return _R.FAILED
         if command.param1 not in (1.0, 3.0):
             return _R.UNSUPPORTED
-        self._vehicle.call_later(0.1, self._vehicle.restart)  # after the acknowledgement
+        self._vehicle.call_later(0.1, self._vehicle.restart)  # The acknowledgement is sent first.
         return _R.ACCEPTED
 
     def send_banner(self, _: ReceivedCommand) -> int:
@@ -187,20 +187,20 @@ class _CommonCommands:
         return _R.ACCEPTED
 
     def reset_battery(self, command: ReceivedCommand) -> int:
-        """Set the charge of the first battery in percent, if the mask in param 1 contains it."""
+        """Set the charge of the first battery to param 2 (percent), if the mask in param 1 selects that battery."""
         if whole(command.param1) & 1:
             self._vehicle.battery.percent = max(0.0, min(100.0, command.param2))
         return _R.ACCEPTED
 
     def control_high_latency(self, command: ReceivedCommand) -> int:
-        """Refuse to start high latency, which no port supports; stopping it succeeds."""
+        """Refuse to start high-latency mode, which no port supports; accept to stop it."""
         if command.param1:
             return _R.FAILED
         self._vehicle.send_text(_NOTICE, "High Latency disabled")
         return _R.ACCEPTED
 
     def look_at(self, command: ReceivedCommand) -> int:
-        """Set the region of interest, with or without a gimbal; zeros or DO_SET_ROI_NONE end it."""
+        """Set the region of interest, with or without a gimbal; zeros or DO_SET_ROI_NONE clear it."""
         point = None
         if command.command != _C.DO_SET_ROI_NONE:
             point = self._vehicle.point(*command.place(), command.z, command.altitude_frame)
@@ -225,10 +225,10 @@ _FRAMES = frozenset(
 
 
 class HomeAndOrigin:
-    """DO_SET_HOME, GET_HOME_POSITION and SET_GPS_GLOBAL_ORIGIN.
+    """Handlers of DO_SET_HOME, GET_HOME_POSITION and SET_GPS_GLOBAL_ORIGIN.
 
-    The origin can be set once, before GPS sets it; positions are available without GPS then. Copter and Sub accept no
-    home before they have an origin; Plane and Rover do.
+    SET_GPS_GLOBAL_ORIGIN is accepted only once, and only before GPS has set the origin. Copter and Sub refuse a home
+    before they have an origin; Plane and Rover accept it.
     """
 
     def __init__(self, vehicle: ArduPilotVehicle) -> None:
@@ -270,7 +270,7 @@ class HomeAndOrigin:
         return _R.ACCEPTED
 
     def _on_origin(self, message: m.SetGpsGlobalOrigin, channel: Channel) -> None:
-        """Set the origin and send it to the requester. Invalid values and a second origin are ignored."""
+        """Set the origin and send it to the requester. Invalid values are ignored, as is a second request."""
         vehicle = self._vehicle
         place = (message.latitude, message.longitude)
         point = vehicle.point(*place, message.altitude / 1000.0, MavFrame.GLOBAL)
@@ -287,7 +287,7 @@ _PLAIN_MOUNT_MODES = frozenset(
 
 
 class GimbalCommands:
-    """DO_MOUNT_CONFIGURE, DO_MOUNT_CONTROL and the commands and messages of the gimbal manager."""
+    """Handlers of DO_MOUNT_CONFIGURE, DO_MOUNT_CONTROL, and the gimbal manager's commands and messages."""
 
     def __init__(self, vehicle: ArduPilotVehicle) -> None:
         self._vehicle = vehicle
@@ -301,7 +301,7 @@ class GimbalCommands:
         vehicle.on(m.GimbalManagerSetPitchyaw, self._on_pitch_and_yaw)
 
     def _gimbal(self, device_id: float = 0) -> ArduPilotGimbal | None:
-        """Return the gimbal if it is fitted and addressed, as device 1 or 0 (all)."""
+        """Return the gimbal if it is fitted and ``device_id`` selects it (1, or 0 for all)."""
         gimbal = self._vehicle.gimbal
         return gimbal if gimbal.is_fitted and whole(device_id) in (0, 1) else None
 

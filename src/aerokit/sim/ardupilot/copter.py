@@ -1,4 +1,4 @@
-"""`SimulatedCopter`: an ArduCopter 4.7 quadrotor without sockets, threads or a clock of its own."""
+"""`SimulatedCopter`: an ArduCopter 4.7 quadrotor that uses no sockets, threads or system clock."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ from aerokit.sim.commands import CommandHandler, ReceivedCommand, whole
 from aerokit.sim.motion import Ned
 
 _MAX_S = 600.0
-# Pause between two motors, as a share of the time for each.
+# Pause between two motors, as a share of the test time of one motor.
 _PAUSE_SHARE = 0.5
 _MIN_PWM, _MAX_PWM = 800, 2200
 
 
 class MotorTest:
-    """Motor test on the ground. HEARTBEAT reports the vehicle as armed meanwhile; it is disarmed afterwards."""
+    """Motor test on the ground. HEARTBEAT reports an armed vehicle during the test."""
 
     def __init__(self, copter: SimulatedCopter) -> None:
         self._copter = copter
@@ -47,7 +47,7 @@ class MotorTest:
         self._number = 0
 
     def command(self, command: ReceivedCommand) -> int:
-        """Start a test, or continue with other motors. A text reports the end."""
+        """Start a test, or replace the motors of the running test. A text reports the end."""
         if not self.is_running:
             reason = "" if self._copter.is_landed else "vehicle not landed"
             if not self._copter.is_initialised:
@@ -80,14 +80,14 @@ class MotorTest:
 
 
 class CopterHold(CopterModeBase):
-    """Holds its position."""
+    """Mode that holds the position."""
 
     def update(self, dt: float) -> None:
         self.vehicle.hold_position()
 
 
 class CopterThrow(CopterHold):
-    """Reports once after arming that it waits for the throw; in the air it holds its position."""
+    """THROW: reports once after arming that the copter waits for the throw; the throw itself is not simulated."""
 
     _reported_at = -math.inf
 
@@ -99,7 +99,7 @@ class CopterThrow(CopterHold):
 
 
 class CopterFollow(CopterHold):
-    """Needs FOLL_ENABLE. It holds its position, as the firmware does without a vehicle to follow."""
+    """FOLLOW: needs FOLL_ENABLE, and holds the position as the firmware does without a vehicle to follow."""
 
     def enter(self, *, force: bool) -> bool:
         if self.vehicle.parameters["FOLL_ENABLE"]:
@@ -135,7 +135,7 @@ _MODES: tuple[Callable[[Any], ArduPilotMode], ...] = (
     variant(modes.CopterStabilize, CopterMode.ACRO, "ACRO"),
     variant(modes.CopterStabilize, CopterMode.STABILIZE, "STABILIZE"),
     variant(modes.CopterPilotedMode, CopterMode.ALT_HOLD, "ALT_HOLD", needs_position=False),
-    # On the ground CIRCLE pulls towards its circle, so that the land detector never triggers.
+    # On the ground CIRCLE commands a movement to its circle, so that the land detector never triggers.
     variant(
         modes.CopterLoiter, CopterMode.CIRCLE, "CIRCLE", takes_off=False, can_arm=False, notices_landing=False
     ),
@@ -161,11 +161,11 @@ _MODES: tuple[Callable[[Any], ArduPilotMode], ...] = (
 
 
 class SimulatedCopter(CopterHost):
-    """Behaves as ArduCopter does where a client can observe it; flies with `Motion`.
+    """ArduCopter, as far as a client can observe it. `Motion` is the motion model.
 
     Takes the arguments of `ArduPilotVehicle`. It has 1,349 parameters; MNT1_TYPE 1 fits a gimbal with three axes.
 
-    Not simulated: slowing down before a fence, the terrain failsafe.
+    Not simulated: braking before a fence, the terrain failsafe.
     """
 
     KIND: ClassVar[Kind] = "copter"

@@ -1,8 +1,8 @@
 """AUTO of a simulated ArduCopter.
 
 Simulated: take-off, waypoints (splines as straight lines), loitering, circles, delays, landing, return to launch,
-conditions, speed, home, region of interest, jumps; servo, relay and camera commands. Skipped: payload place, guided by
-script or attitude, guided limits.
+conditions, speed, home, region of interest, jumps; servo, relay and camera commands. Skipped: NAV_PAYLOAD_PLACE,
+NAV_SCRIPT_TIME, NAV_ATTITUDE_TIME, DO_GUIDED_LIMITS.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _RAISED_THROTTLE = 1100
 
 
 class _Leg(Protocol):
-    """The present manoeuvre of a mission; `update` sets the motion targets for the next ``dt`` seconds."""
+    """Manoeuvre of a navigation command; `update` sets the motion targets for the next ``dt`` seconds."""
 
     def update(self, dt: float) -> None: ...
     @property
@@ -33,7 +33,7 @@ class _Leg(Protocol):
 
 
 class _FlyLeg:
-    """Straight to a place. With ``stops`` the place itself must be reached, else WPNAV_RADIUS around it."""
+    """Straight flight to a place. It is complete within WPNAV_RADIUS, with ``stops`` at the place itself."""
 
     def __init__(self, auto: CopterAuto, destination: Ned, *, stops: bool) -> None:
         self._copter, self._auto = auto.vehicle, auto
@@ -51,7 +51,7 @@ class _FlyLeg:
 
 
 class _CircleLeg:
-    """Circle that is approached at its edge; a negative radius turns anticlockwise."""
+    """Flight to the nearest point of a circle, then around it; a negative radius is anticlockwise."""
 
     def __init__(self, auto: CopterAuto, centre: Ned, *, turns: float, radius: float) -> None:
         self._copter, self._turns, self._centre = auto.vehicle, turns, centre
@@ -103,7 +103,7 @@ class _CircleLeg:
 
 
 class _ClimbLeg:
-    """Take-off. On the ground it waits for MISSION_START, a raised throttle or AUTO_OPTIONS."""
+    """Take-off, which waits on the ground for MISSION_START or a raised throttle unless AUTO_OPTIONS skips that."""
 
     def __init__(self, auto: CopterAuto, altitude_m: float) -> None:
         self._copter, self._auto = auto.vehicle, auto
@@ -159,7 +159,7 @@ _WITHOUT_EFFECT = (
 
 
 class CopterAuto(MissionMode):
-    """Flies the mission. `MissionRun` selects the commands, each navigation command becomes a leg."""
+    """AUTO: `MissionRun` selects the commands; the manoeuvre of each navigation command is a leg."""
 
     number: int = CopterMode.AUTO
     name = "AUTO"
@@ -170,7 +170,7 @@ class CopterAuto(MissionMode):
         super().__init__(copter)
         self.climb: float = 0.0
         self.descent: float = 0.0  # Limits in m/s.
-        # None holds the position.
+        # Without a leg, AUTO holds the position.
         self._leg: _Leg | None = None
         self._last_reached = 0
         self._reached_at = self._condition_from = self._delay_until = 0.0
@@ -223,10 +223,10 @@ class CopterAuto(MissionMode):
         return True
 
     def enter(self, *, force: bool) -> bool:
-        """Start. In the air this needs a mission, on the ground one that begins with a take-off."""
+        """Enter AUTO, which requires a mission; on the ground its first navigation command must be a take-off."""
         copter, run = self.vehicle, self.vehicle.mission
         if copter.mode is self:
-            return True  # armed in this mode
+            return True  # Arming in AUTO enters it again.
         if not run.is_present and not force:
             return False
         if copter.is_armed and copter.is_landed and not run.starts_with_take_off():
@@ -259,7 +259,7 @@ class CopterAuto(MissionMode):
             self.vehicle.yaw.update()
 
     def _has_changed(self) -> bool:
-        """Return True if an upload changed the next commands while the current one is the same."""
+        """Return True if an upload changed the next commands while the current index stayed the same."""
         run, commands = self.vehicle.mission, self.vehicle.missions.commands
         had_same_place = bool(self._upcoming) and self._upcoming[0][0] == run.nav_index
         if commands.version == self._version and had_same_place:
@@ -287,12 +287,12 @@ class CopterAuto(MissionMode):
         return True
 
     def _report_reached(self) -> None:
-        # Of several commands that complete at the same time the firmware reports the last.
+        # The firmware reports only the last of several commands that complete in the same tick.
         index, self._last_reached = self._last_reached, 0
         self.vehicle.send(MissionItemReached(index))
 
     def end_mission(self) -> None:
-        """Hold in the air, or disarm on the ground."""
+        """Hold the position in the air; disarm on the ground."""
         if self.vehicle.is_landed:
             self.vehicle.arming.disarm()
         else:
@@ -331,7 +331,7 @@ class CopterAuto(MissionMode):
         return True
 
     def _has_landed(self, index: int) -> bool:
-        """Disarm after landing. The mission continues only if a take-off follows and MIS_OPTIONS allows it."""
+        """Disarm after landing and return False; return True if MIS_OPTIONS lets a following take-off continue."""
         copter = self.vehicle
         if isinstance(self._leg, _FlyLeg):
             if self._leg.is_complete:
@@ -347,7 +347,7 @@ class CopterAuto(MissionMode):
         return False
 
     def _place(self, item: MissionItem) -> Ned:
-        """Return the place of an item; zeros in it keep the present value."""
+        """Return the place of an item; zero coordinates keep the vehicle's current ones."""
         leg = self._leg
         here: Ned = self.vehicle.motion.place
         if isinstance(leg, _FlyLeg) and leg.is_complete:
@@ -397,7 +397,7 @@ class CopterAuto(MissionMode):
         leg.enter(force=True)
 
     def _delay(self, item: MissionItem) -> None:
-        # A time of day is not simulated and counts as no delay.
+        # A delay until a time of day is not simulated; it counts as no delay.
         seconds = max(0.0, item.param1)
         self._delay_until = self.vehicle.now + seconds
         self.vehicle.info(f"Delaying {int(seconds)} sec")

@@ -16,16 +16,16 @@ _STICK_CENTRE, _STICK_LOW, _DEADZONE = 1500, 1050, 100
 
 
 class CopterArming(ArduPilotArming[CopterHost]):
-    """Needs a position only in modes that use it, and a throttle stick that is low or centred."""
+    """ArduCopter's arming checks: a position only in modes that use it, and a low or centred throttle stick."""
 
     ARMED_TEXT: ClassVar[str] = "Arming motors"
     DISARMED_TEXT: ClassVar[str] = "Disarming motors"
 
     def ahrs_reasons(self) -> Sequence[str]:
-        return ()  # checked after GPS, in `position_reasons`
+        return ()  # `position_reasons` checks the estimator after GPS.
 
     def position_reasons(self) -> Sequence[str]:
-        """Check GPS, the estimator, and what a forced arming requires."""
+        """Check GPS and the estimator, and run the mandatory checks."""
         if self.vehicle.mode.needs_position and (reasons := self.gps_reasons()):
             return reasons
         return super().ahrs_reasons() or self.mandatory_reasons()
@@ -68,13 +68,13 @@ _MODES: dict[int, tuple[int, ...]] = {
     _AUTO: (CopterMode.RTL, CopterMode.LAND),
     _BRAKE: (CopterMode.BRAKE, CopterMode.LAND),
 }
-# Text when the first mode of an action is refused.
+# Text that reports that the first mode of an action was refused.
 _FALLBACK_TEXTS = {
     _SMART_RTL: "SmartRTL Unavailable, Trying RTL Mode",
     _SMART_RTL_OR_LAND: "SmartRTL Unavailable, Using Land Mode",
     _BRAKE: "Trying Land Mode",
 }
-# Bits of FS_OPTIONS, which let the flight continue in spite of a failsafe: (modes, bit, text).
+# FS_OPTIONS that continue the flight in spite of a failsafe: (modes, bit, text).
 _IF_LANDING = 8
 _RADIO_OPTIONS = (
     (frozenset({"AUTO"}), 1, "Continuing Auto"),
@@ -89,9 +89,9 @@ _ESTIMATOR_TIMEOUT_S = 1.0
 
 
 class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
-    """Radio, ground station, battery and estimator failsafes, and disarming after DISARM_DELAY.
+    """Failsafes of radio, ground station, battery and estimator, and disarming after DISARM_DELAY.
 
-    Terrain, vibration and dead reckoning are not checked. Action 6 does not search the mission for a landing sequence.
+    Not simulated: failsafes of terrain, vibration and dead reckoning, and the landing sequence of action 6 (AUTO).
     """
 
     BATTERY_PRIORITIES: ClassVar[tuple[int, ...]] = (
@@ -184,7 +184,7 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
         return action
 
     def act_on_battery(self, action: int) -> None:
-        """Execute the action. On the ground the vehicle always disarms; a landing may continue."""
+        """Execute the action; on the ground disarm instead. With FS_OPTIONS bit 3 a landing continues."""
         if self._disarms("Battery"):
             return
         if self.vehicle.mode.is_landing and self._has_option(_IF_LANDING) and action != _NONE:
@@ -194,7 +194,7 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
         self._execute(action)
 
     def _check_estimator(self) -> None:
-        """Detect the loss of a position that was good before. A disarmed vehicle only reports it."""
+        """Detect the loss of the position estimate. A disarmed vehicle only reports it."""
         copter = self.vehicle
         if copter.navigation.has_position:
             self._had_position = True
@@ -221,7 +221,7 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
         self.warn(f"EKF Failsafe: changed to {copter.mode.name} Mode", MavSeverity.CRITICAL)
 
     def _check_idling(self) -> None:
-        """Disarm after DISARM_DELAY of idling on the ground."""
+        """Disarm if the motors have idled on the ground for DISARM_DELAY."""
         copter, delay = self.vehicle, self.vehicle.parameters["DISARM_DELAY"]
         idles = copter.is_armed and copter.is_landed and copter.motors.is_idle
         if 0 < delay <= self._idling.seconds(idles and delay > 0, copter.now):
@@ -235,11 +235,11 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
         return action
 
     def _disarms(self, name: str) -> bool:
-        """Disarm on the ground, independent of the action, and return True."""
+        """Disarm a landed vehicle and return True; return False in the air or if a mission is about to take off."""
         copter = self.vehicle
         if not copter.is_landed or (copter.mode.needs_mission and not copter.motors.is_idle):
             return False
-        if name == "Radio":  # the firmware reports the other failsafes after disarming
+        if name == "Radio":  # The firmware reports the other failsafes after disarming.
             self.warn("Radio Failsafe - Disarming")
         copter.arming.disarm()
         if name != "Radio":
@@ -271,7 +271,10 @@ _FENCE_ACTIONS: dict[int, tuple[int, ...]] = {
 
 
 class CopterFence(ArduPilotFence[CopterHost]):
-    """FENCE_ACTION: nothing (0), RTL (1), LAND (2), SMART_RTL (3, 5), BRAKE (4); LAND if that fails or far outside."""
+    """Fence. FENCE_ACTION: report only (0), RTL (1), LAND (2), SMART_RTL (3, 5), BRAKE (4).
+
+    It changes to LAND instead if the mode is refused, or more than 100 m outside the fence.
+    """
 
     PERIOD_S: ClassVar[float] = 0.1
     CHECKS_DISARMED: ClassVar[bool] = True
@@ -303,7 +306,7 @@ class CopterFence(ArduPilotFence[CopterHost]):
         return MavSeverity.WARNING, f"Mode change to {mode.name} failed: in fence recovery"
 
     def mode_changed(self) -> None:
-        """Give the pilot ten seconds, unless the fence only reports."""
+        """Suspend the fence's actions for ten seconds, unless it only reports."""
         super().mode_changed()
         if self.vehicle.parameters["FENCE_ACTION"] != REPORT_ONLY:
             self.recover_by_hand()

@@ -28,10 +28,10 @@ class GuidedSubmode(Enum):
 
 
 class CopterGuided(CopterModeBase):
-    """Holds its position at first. A position target stays; other set-points expire after GUID_TIMEOUT seconds.
+    """GUIDED: holds the position until the first target. Targets other than a position expire after GUID_TIMEOUT.
 
-    A change of the submode resets the speed limits to WPNAV_SPEED and its siblings, as ArduCopter does, so
-    DO_CHANGE_SPEED is valid for the flight to the present kind of target.
+    As in ArduCopter, a change of the submode resets the speed limits to WPNAV_SPEED, WPNAV_SPEED_UP and
+    WPNAV_SPEED_DN: DO_CHANGE_SPEED is valid until the kind of target changes.
     """
 
     number: int = CopterMode.GUIDED
@@ -77,7 +77,7 @@ class CopterGuided(CopterModeBase):
         velocity: Ned | None = None,
         acceleration: Ned | None = None,
     ) -> None:
-        """Enter a submode and replace the targets that are given."""
+        """Enter a submode and replace the targets that are not None."""
         if self.submode is not submode:
             self._start(submode)
         self.position = self.position if position is None else position
@@ -86,7 +86,7 @@ class CopterGuided(CopterModeBase):
         self._updated_at = self.vehicle.now
 
     def set_target(self, position: Ned | None, velocity: Ned | None, acceleration: Ned | None) -> bool:
-        """Follow a set-point; return False if its combination of vectors is not supported."""
+        """Follow a set-point; return False if the combination of vectors is not supported."""
         if velocity is not None:
             submode = GuidedSubmode.VELOCITY if position is None else GuidedSubmode.POSITION_VELOCITY
             acceleration = acceleration or _ZERO
@@ -100,7 +100,7 @@ class CopterGuided(CopterModeBase):
         return True
 
     def lean(self, roll: float, pitch: float, climb: float) -> None:
-        """Lean by angles in radians and climb (m/s); a climb on the ground takes off."""
+        """Hold roll and pitch (radians) and a climb rate (m/s); on the ground a positive climb rate takes off."""
         self.submode = GuidedSubmode.ATTITUDE
         self._attitude, self._attitude_climb = (roll, pitch), climb
         self._updated_at = self.vehicle.now
@@ -138,7 +138,7 @@ class CopterGuided(CopterModeBase):
         elif self.submode is GuidedSubmode.ATTITUDE:
             self._run_attitude()
         elif copter.is_landed:
-            copter.hold_position()  # a target does not take off
+            copter.hold_position()  # Only a take-off command or a climb rate leaves the ground.
         else:
             copter.motors.wanted = True
             self._run_target()
@@ -194,7 +194,7 @@ _MAX_VELOCITY_M_S = 1000.0
 
 
 class CopterSetpoints:
-    """Handlers of the set-point messages. In GUIDED an invalid message stops the vehicle, as in the firmware."""
+    """Handlers of the set-point messages. As in the firmware, an invalid message in GUIDED stops the vehicle."""
 
     def __init__(self, copter: CopterHost) -> None:
         self._copter = copter
@@ -254,8 +254,8 @@ class CopterSetpoints:
             return
         rates_ignored = mask & _ALL_RATES
         size = math.sqrt(sum(part * part for part in target.q))
-        ill = mask & AttitudeMask.THROTTLE_IGNORE or rates_ignored not in (0, _ALL_RATES)
-        if ill or (not mask & AttitudeMask.ATTITUDE_IGNORE and not abs(size - 1.0) < 1e-3):
+        is_invalid = mask & AttitudeMask.THROTTLE_IGNORE or rates_ignored not in (0, _ALL_RATES)
+        if is_invalid or (not mask & AttitudeMask.ATTITUDE_IGNORE and not abs(size - 1.0) < 1e-3):
             guided.enter(force=False)
             return
         roll = pitch = 0.0
@@ -264,7 +264,7 @@ class CopterSetpoints:
             copter.motion.face(yaw)
         elif not rates_ignored:
             copter.motion.turn(target.body_yaw_rate)
-        # Thrust is a climb rate, 0.5 holds the altitude. The other meaning (GUID_OPTIONS) is not simulated.
+        # Thrust is a climb rate; 0.5 holds the altitude. Thrust as throttle (GUID_OPTIONS bit 3) is not simulated.
         share = (max(0.0, min(1.0, target.thrust)) - 0.5) * 2.0
         name = "WPNAV_SPEED_UP" if share > 0 else "WPNAV_SPEED_DN"
         guided.lean(roll, pitch, share * copter.parameters[name] / 100.0)

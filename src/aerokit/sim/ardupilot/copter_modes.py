@@ -1,4 +1,4 @@
-"""ArduCopter's heading control, and the modes that fly by the sticks, land and return."""
+"""ArduCopter's heading control, its piloted modes, and the modes that land and return."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class AutoYaw:
     def default(self, *, returning: bool = False) -> None:
         """Apply WP_YAW_BEHAVIOR: hold (0), look ahead (1), look ahead except when returning home (2).
 
-        Every new guided target calls this, and so ends a commanded heading or region of interest.
+        Every new guided target calls this, which ends a commanded heading or region of interest.
         """
         behaviour = int(self._copter.parameters["WP_YAW_BEHAVIOR"])
         if behaviour == 1 or (behaviour == 2 and not returning):
@@ -40,7 +40,7 @@ class AutoYaw:
             self.hold()
 
     def fixed(self, heading: float, rate: float = 0.0, direction: int = 0) -> None:
-        """Turn to a heading (radians). ``rate`` 0 is the default rate, ``direction`` 1 clockwise, -1 the other way."""
+        """Turn to a heading (radians). ``rate`` 0 is the default rate, ``direction`` 1 clockwise, -1 anticlockwise."""
         motion = self._copter.motion
         self._heading, self._apply = wrap_pi(heading), self._go_to_heading
         self._rate = 0.0
@@ -49,7 +49,7 @@ class AutoYaw:
             self._rate = direction * (rate or motion.limits.turn_rate_rad_s)
 
     def keep_fixed(self, tolerance: float) -> bool:
-        """Turn to the last `fixed` heading again; return True if it is reached within ``tolerance`` radians."""
+        """Turn to the last `fixed` heading again; return True within ``tolerance`` radians of it."""
         self._apply = self._go_to_heading
         return abs(wrap_pi(self._heading - self._copter.motion.yaw)) <= tolerance
 
@@ -62,7 +62,7 @@ class AutoYaw:
         self._rate, self._apply = rate, self._turn
 
     def region_of_interest(self, point: Ned | None) -> None:
-        """Look at a place until the next target; None ends it. A gimbal, if fitted, turns instead of the vehicle."""
+        """Turn towards a place until the next target; None stops. If a gimbal is fitted, it turns instead."""
         gimbal = self._copter.gimbal
         gimbal.look_at(point)
         if point is None:
@@ -72,7 +72,7 @@ class AutoYaw:
             self._apply = self._look_at_roi
 
     def stop_turning(self) -> None:
-        """End a turn rate because its stream has stopped."""
+        """Stop turning because the set-points with a turn rate have stopped."""
         if self._apply == self._turn:
             self.hold()
 
@@ -94,7 +94,7 @@ class AutoYaw:
         motion = self._copter.motion
         offset = wrap_pi(self._heading - motion.yaw)
         if self._rate and math.copysign(1, offset) != math.copysign(1, self._rate):
-            motion.turn(self._rate)  # the long way round
+            motion.turn(self._rate)  # The commanded direction is the longer way.
             return
         self._rate = 0.0
         motion.face(self._heading)
@@ -106,7 +106,7 @@ class AutoYaw:
 
 
 class CopterHost(ArduPilotVehicle):
-    """A copter as its modes and failsafes see it."""
+    """Interface of a copter that its modes and failsafes use."""
 
     def reset_controllers(self) -> None:
         self.yaw: AutoYaw = AutoYaw(self)
@@ -138,7 +138,7 @@ class CopterHost(ArduPilotVehicle):
         return math.dist(target, self.motion.place)
 
     def hold_position(self) -> None:
-        """Keep still; on the ground the motors idle."""
+        """Hold the position; on the ground let the motors idle."""
         self.motors.wanted = not self.is_landed
         self.motion.seek_velocity(0.0, 0.0, 0.0)
 
@@ -164,7 +164,7 @@ class CopterModeBase(ArduPilotMode):
 
 
 class CopterTakeOff:
-    """Vertical climb that waits for the motors, for the modes with take-off by command."""
+    """Vertical climb of a commanded take-off; it begins once the motors have spooled up."""
 
     def __init__(self, copter: CopterHost, altitude_m: float) -> None:
         self._copter = copter
@@ -191,7 +191,10 @@ _STABILIZE_CLIMB_M_S = 6.0
 
 
 class CopterPilotedMode(CopterModeBase):
-    """Attitude by stick, altitude held. Sticks keep the position of RC_CHANNELS_OVERRIDE or of the test."""
+    """Base of the piloted modes: sticks control the attitude, the altitude is held.
+
+    Stick positions come from RC_CHANNELS_OVERRIDE, or from the test (``copter.rc``).
+    """
 
     takes_off: bool = True
     """True if the mode supports take-off by command."""
@@ -234,7 +237,7 @@ class CopterPilotedMode(CopterModeBase):
         self.vehicle.motion.seek_attitude(roll * _FULL_STICK_LEAN_RAD, pitch * _FULL_STICK_LEAN_RAD, -climb)
 
     def take_off(self, altitude_m: float, *, must_navigate: bool) -> bool:
-        # Without position control the pilot has to do the horizontal part.
+        # Without position control the pilot must control the horizontal position.
         if not self.takes_off or (must_navigate and not self.needs_position):
             return False
         self._take_off = CopterTakeOff(self.vehicle, altitude_m)
@@ -243,14 +246,14 @@ class CopterPilotedMode(CopterModeBase):
 
 
 class CopterStabilize(CopterPilotedMode):
-    """Attitude and throttle by stick. With a low throttle stick it descends fast."""
+    """STABILIZE and ACRO: sticks control attitude and throttle. With a low throttle stick the copter sinks fast."""
 
     needs_position = False
     has_manual_throttle = True
     takes_off = False
 
     def climb_from_stick(self) -> float:
-        # A throttle rather than a climb rate: half a stick hovers.
+        # The stick is a throttle rather than a climb rate: the middle hovers.
         throttle = self.vehicle.rc[2]
         if self.vehicle.is_landed and throttle <= _MID_STICK:
             return 0.0
@@ -258,7 +261,7 @@ class CopterStabilize(CopterPilotedMode):
 
 
 class CopterLoiter(CopterPilotedMode):
-    """Position and altitude held; sticks move them. A low throttle stick descends and lands."""
+    """LOITER and similar modes: hold the position; sticks are velocities. A low throttle stick lands."""
 
     def fly(self, roll: float, pitch: float, climb: float) -> None:
         velocity = (-pitch * _LOITER_SPEED_M_S, roll * _LOITER_SPEED_M_S, -climb)
@@ -271,7 +274,7 @@ _SMART_RTL_EXTRA_ALTITUDE_M = 2.0
 
 
 class CopterLand(CopterModeBase):
-    """Vertical landing: WPNAV_SPEED_DN down to LAND_ALT_LOW, then LAND_SPEED; disarms on the ground."""
+    """LAND: descends with WPNAV_SPEED_DN to LAND_ALT_LOW, then with LAND_SPEED; disarms on the ground."""
 
     needs_position = False
     can_arm = False
@@ -286,7 +289,7 @@ class CopterLand(CopterModeBase):
 
 
 class CopterRtl(CopterModeBase):
-    """Climb to RTL_ALT (less near home), return to home or a rally point, wait RTL_LOIT_TIME, land."""
+    """RTL: climbs to RTL_ALT (less near home), flies to home or a rally point, waits RTL_LOIT_TIME, lands."""
 
     can_arm = False
     can_change_speed = True
@@ -323,7 +326,7 @@ class CopterRtl(CopterModeBase):
 
     @property
     def destination(self) -> Ned | None:
-        """Place of return at the altitude of the present phase."""
+        """Target of the current phase."""
         north, east, down = self._place
         if self._phase == "climb":
             return (self.vehicle.motion.north, self.vehicle.motion.east, self._altitude_down)
@@ -333,7 +336,7 @@ class CopterRtl(CopterModeBase):
         copter, target = self.vehicle, self.destination
         if self._phase == "land":
             copter.land()
-        elif copter.is_landed:  # waits for DISARM_DELAY
+        elif copter.is_landed:  # The copter disarms after DISARM_DELAY.
             copter.motors.wanted = False
         elif target is not None:
             self._next_phase(copter.fly_to(target, self.speed))
@@ -351,7 +354,7 @@ class CopterRtl(CopterModeBase):
 
 
 class CopterSmartRtl(CopterModeBase):
-    """Return along the recorded path without its loops and land at its start. See `SmartPath`."""
+    """SMART_RTL: flies back along the simplified path and lands at its start. See `SmartPath`."""
 
     can_arm = False
     returns_on_path = True
@@ -374,7 +377,7 @@ class CopterSmartRtl(CopterModeBase):
             self._way[-1] = (north, east, down - metres)
 
     def leave(self) -> None:
-        """Restore the points that were not reached, because they are still the way back."""
+        """Restore the points that were not reached, so that a later SMART_RTL can use them."""
         if self._way:
             self._raise_last(-_SMART_RTL_EXTRA_ALTITUDE_M)
             self.vehicle.path.restore(self._way)

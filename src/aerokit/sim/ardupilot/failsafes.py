@@ -19,8 +19,8 @@ _PERIOD_S = 0.1
 class BatteryFailsafe:
     """Checks voltage and remaining charge while the vehicle is armed.
 
-    ``priorities`` lists the actions of BATT_FS_LOW_ACT and BATT_FS_CRT_ACT, most severe first. An action that is less
-    severe than an earlier one is not executed.
+    ``priorities`` lists the actions of BATT_FS_LOW_ACT and BATT_FS_CRT_ACT, most severe first. An action is not
+    executed after a more severe one.
     """
 
     def __init__(self, vehicle: ArduPilotHost, priorities: Sequence[int], act: Callable[[int], None]) -> None:
@@ -30,10 +30,10 @@ class BatteryFailsafe:
         self._voltage_low = {_LOW: ConditionTimer(), _CRITICAL: ConditionTimer()}
         self.level: int = _OK  # 0 OK, 1 low, 2 critical; it never decreases.
         self.priority: int = len(self._priorities)
-        """Index of the most severe action so far in ``priorities``."""
+        """Index in ``priorities`` of the most severe action executed so far."""
 
     def update(self) -> None:
-        """Check now. The voltage must stay low for BATT_LOW_TIMER, a low charge counts at once."""
+        """Check now. A low charge counts at once, a low voltage only after BATT_LOW_TIMER."""
         if not self._vehicle.motors.is_armed:
             return
         level = max(self._below(_LOW), self._below(_CRITICAL))
@@ -66,14 +66,14 @@ class BatteryFailsafe:
         return None
 
     def _below(self, level: int) -> int:
-        """Return the level if its limit has been passed for long enough, else 0."""
+        """Return the level if the battery has been below its limits for long enough, else 0."""
         volts, charge = self._is_below(level)
         low_for = self._voltage_low[level].seconds(volts, self._vehicle.now)
         timer = self._vehicle.parameters["BATT_LOW_TIMER"]
         return level if charge or 0 < timer < low_for else _OK
 
     def _is_below(self, level: int) -> tuple[bool, bool]:
-        """Return whether voltage and charge are below the limits of the level now."""
+        """Return True for the voltage and for the charge if they are below the limits of the level."""
         parameters, name = self._vehicle.parameters, _NAMES[level]
         volts, charge = parameters[f"BATT_{name}_VOLT"], parameters[f"BATT_{name}_MAH"]
         is_charge_low = charge > 0 and self._remaining_mah() < charge
@@ -84,7 +84,7 @@ class BatteryFailsafe:
 
 
 class ArduPilotFailsafes(Generic[HostT]):
-    """Failsafes, checked ten times a second. Each acts once and reports it with a text.
+    """Failsafes, checked ten times a second. A failsafe acts once when it triggers, and sends a text.
 
     A subclass overrides `update` with the checks of its firmware and `act_on_battery` with the battery actions.
     """
@@ -107,7 +107,7 @@ class ArduPilotFailsafes(Generic[HostT]):
 
     @property
     def battery_is_low(self) -> bool:
-        """True if the battery was low or critical while the vehicle was armed."""
+        """True once the battery has been low or critical on an armed vehicle."""
         return self.battery.level > 0
 
     @property
@@ -129,7 +129,7 @@ class ArduPilotFailsafes(Generic[HostT]):
         return self.vehicle.now - self.ground_station_seen_at
 
     def update(self) -> None:
-        """Run all checks once: here battery and fence."""
+        """Run all checks once. The base class checks battery and fence."""
         self.battery.update()
         self.vehicle.fence.update()
 
@@ -141,7 +141,7 @@ class ArduPilotFailsafes(Generic[HostT]):
         self.vehicle.send_text(severity, text)
 
     def change_to(self, *modes: int) -> bool:
-        """Change to the first of these modes that can be entered; return False if none can."""
+        """Change to the first mode that is not refused; return False if all are refused."""
         return any(self.vehicle.set_mode(mode) for mode in modes)
 
 
@@ -165,10 +165,10 @@ class ArmingCheck(IntFlag):
 
 
 class ArduPilotArming(Generic[HostT]):
-    """Runs the arming checks once a second, reports failures every 30 s while disarmed, arms and disarms.
+    """Arms and disarms. Runs the arming checks once a second and reports failures every 30 s while disarmed.
 
-    `common_reasons` has the checks of all firmwares; a new failure of one of them is reported at once. A subclass adds
-    its own checks in `own_reasons` and `final_reasons`.
+    `common_reasons` has the checks of all firmwares, whose new failures are reported at once. A subclass adds its own
+    checks in `own_reasons` and `final_reasons`.
     """
 
     ARMED_TEXT: ClassVar[str] = "Throttle armed"
@@ -201,7 +201,7 @@ class ArduPilotArming(Generic[HostT]):
         return [*self.common_reasons(), *self.own_reasons()]
 
     def common_reasons(self) -> list[str]:
-        """Run the checks of all firmwares, in their order."""
+        """Run the checks that all firmwares have, in the order of the firmwares."""
         vehicle, check = self.vehicle, ArmingCheck
         found = list(vehicle.faults.prearm_failures)
         if vehicle.calibrations.is_compass_running:
@@ -225,7 +225,7 @@ class ArduPilotArming(Generic[HostT]):
         return []
 
     def final_reasons(self) -> list[str]:
-        """Run the checks that only an arming request triggers: here that the sticks are centred."""
+        """Run the checks of arming requests only. The base class checks that the sticks are centred."""
         options = int(self.vehicle.parameters["RC_OPTIONS"])
         if not self.is_checked(ArmingCheck.RC) or not self.vehicle.rc.is_receiving:
             return []
@@ -256,7 +256,7 @@ class ArduPilotArming(Generic[HostT]):
         return () if nav.home is not None else ("AHRS: waiting for home",)
 
     def position_reasons(self) -> Sequence[str]:
-        """Check the position; here every mode needs GPS."""
+        """Check the position. In the base class every mode needs GPS."""
         return self.gps_reasons() if self.is_checked(ArmingCheck.GPS) else ()
 
     def _check(self) -> None:
@@ -286,7 +286,7 @@ class ArduPilotArming(Generic[HostT]):
 
     @property
     def needs_arming(self) -> bool:
-        """False with ARMING_REQUIRE 0: the vehicle is always armed then."""
+        """False with ARMING_REQUIRE 0, which keeps the vehicle armed."""
         return self.vehicle.parameters.get("ARMING_REQUIRE", 1) != _NOT_REQUIRED
 
     def _follow_requirement(self) -> None:
@@ -324,7 +324,7 @@ class ArduPilotArming(Generic[HostT]):
         """Called after arming."""
 
     def disarm(self, *, force: bool = True) -> bool:
-        """Stop the motors and return True; without ``force`` only on the ground."""
+        """Stop the motors and return True; without ``force`` return False in the air."""
         vehicle = self.vehicle
         if not vehicle.motors.is_armed:
             return True

@@ -1,4 +1,4 @@
-"""Geofence of a simulated ArduPilot: the limits in force, their breaches, and the reports of them."""
+"""Geofence of a simulated ArduPilot: limits, uploaded zones, breaches and their reports."""
 
 from __future__ import annotations
 
@@ -45,16 +45,16 @@ class FenceZones:
                     corners = []
 
     def __bool__(self) -> bool:
-        """Return True if there is a zone; a return point is none."""
+        """Return True if there is a zone; a return point does not count."""
         return bool(self._inside or self._outside)
 
     @property
     def smallest_inclusion_m(self) -> float:
-        """Radius of the smallest inclusion circle; infinity without one."""
+        """Radius of the smallest inclusion circle; infinity if there is none."""
         return min((zone.radius for zone in self._inside if isinstance(zone, CircleZone)), default=math.inf)
 
     def breach_m(self, place: Point, *, union: bool = False) -> float:
-        """Return metres beyond the border, negative within. With ``union`` one inclusion zone suffices."""
+        """Return metres beyond the border; negative within. With ``union``, being in one inclusion zone suffices."""
         inside = [zone.outside_m(place) for zone in self._inside]
         outside = [-zone.outside_m(place) for zone in self._outside]
         if union and inside:
@@ -98,7 +98,7 @@ def _distance(place: Point, start: Point, end: Point) -> float:
 
 
 def _crosses(place: Point, start: Point, end: Point) -> bool:
-    """Return True if a ray to the north crosses the side."""
+    """Return True if a ray from ``place`` to the north crosses the side."""
     if (start[1] > place[1]) == (end[1] > place[1]):
         return False
     share = (place[1] - start[1]) / (end[1] - start[1])
@@ -110,7 +110,7 @@ _MAX_ALT, _CIRCLE = int(FenceType.ALT_MAX), int(FenceType.CIRCLE)
 _POLYGON, _MIN_ALT = int(FenceType.POLYGON), int(FenceType.ALT_MIN)
 _NAMES = {_MAX_ALT: "Max Alt", _CIRCLE: "Circle", _POLYGON: "Polygon", _MIN_ALT: "Min Alt"}
 _ALL = _MAX_ALT | _CIRCLE | _POLYGON | _MIN_ALT
-# An old breach counts as new when the vehicle is this much farther out.
+# A breach counts as new again when the vehicle is this much farther outside.
 _BACKUP_M = 20.0
 _RECOVERY_S = 10.0
 _STATUS_INTERVAL_S = 1.0
@@ -119,21 +119,20 @@ _WHEN_ARMED = 3
 _DEFAULTS = {"FENCE_ALT_MAX": 100.0, "FENCE_ALT_MIN": -10.0, "FENCE_AUTOENABLE": 0.0}
 
 REPORT_ONLY = 0
-"""Value of FENCE_ACTION, the same for every kind of vehicle."""
+"""FENCE_ACTION that only reports, on every kind of vehicle."""
 
 
 class ArduPilotFence(Generic[HostT]):
     """Checks height, distance from home and the uploaded zones; `update` is called 10 times a second.
 
-    A breach is reported with FENCE_STATUS; a subclass adds the reaction of its firmware in `act`. This class is the
-    fence of ArduSub, which only reports, and only while armed. Slowing down before the fence (AVOID_ENABLE) is not
-    simulated.
+    FENCE_STATUS reports a breach; a subclass adds the reaction of its firmware in `act`. This class is the fence of
+    ArduSub, which only reports breaches, while armed. Braking before the fence (AVOID_ENABLE) is not simulated.
     """
 
     PERIOD_S: ClassVar[float] = 1.0 / 3.0
     """Minimum interval between two checks."""
     CIRCLE_BACKUP_M: ClassVar[float] = 20.0
-    """Distance by which an old breach of the circle must grow to count as new."""
+    """Metres by which a breach of the circle must grow to count as new again."""
     CHECKS_DISARMED: ClassVar[bool] = False
     MITIGATION: ClassVar[int] = FenceMitigate.UNKNOWN
     """FENCE_MITIGATE in FENCE_STATUS; UNKNOWN for firmwares without AVOID_ENABLE."""
@@ -160,7 +159,7 @@ class ArduPilotFence(Generic[HostT]):
 
     @property
     def present(self) -> int:
-        """Configured kinds; polygons only if zones are uploaded."""
+        """Configured kinds of fences; polygons only if zones are uploaded."""
         return self.configured if self.zones else self.configured & ~_POLYGON
 
     @property
@@ -183,7 +182,7 @@ class ArduPilotFence(Generic[HostT]):
         return present, enforced, not (present and self.breached)
 
     def enable(self, on: bool, kinds: int = _ALL, *, by_hand: bool = True) -> int:
-        """Enable or disable configured kinds and return those that changed."""
+        """Enable or disable kinds of fences that are configured; return the kinds that changed."""
         kinds &= self.configured
         if by_hand and kinds & _MIN_ALT:
             self._floor_by_hand = on
@@ -253,7 +252,7 @@ class ArduPilotFence(Generic[HostT]):
         return new
 
     def _judge(self, kind: int, beyond: float) -> int:
-        """Return the kind if it is newly breached. A backup fence farther out makes an old breach a new one."""
+        """Return the kind if its breach is new, else 0. A breach that grows by the backup distance counts as new."""
         if beyond < 0.0 or (kind == _POLYGON and beyond == 0.0):
             self._clear(kind)
             return 0
@@ -264,7 +263,7 @@ class ArduPilotFence(Generic[HostT]):
         return kind
 
     def _beyond(self, place: Ned) -> dict[int, float]:
-        """Return metres beyond each limit, negative within."""
+        """Return metres beyond each limit by kind; negative within."""
         parameters = self.vehicle.parameters
         home = self.vehicle.navigation.home or (0.0, 0.0, 0.0)
         height = home[2] - place[2]
@@ -313,7 +312,7 @@ class ArduPilotFence(Generic[HostT]):
         """Called when the last breach has ended."""
 
     def refusal(self, mode: ArduPilotMode) -> tuple[int, str] | None:
-        """Return severity and text if the fence forbids to enter the mode."""
+        """Return severity and text of the refusal if the fence forbids the mode, else None."""
         return None
 
     def mode_changed(self) -> None:
@@ -321,12 +320,12 @@ class ArduPilotFence(Generic[HostT]):
         self.caused_mode = False
 
     def beyond_m(self, kinds: int) -> float:
-        """Return by how many metres the limits of these kinds are exceeded, at most."""
+        """Return the metres by which the vehicle exceeds the most exceeded limit of these kinds."""
         beyond = self._beyond(self.vehicle.motion.place)
         return max(beyond[kind] for kind in _NAMES if kinds & kind)
 
     def forbids_modes(self) -> bool:
-        """Return True if FENCE_OPTIONS forbids to leave the mode that a breach caused."""
+        """Return True while FENCE_OPTIONS forbids leaving the mode that a breach caused."""
         forbidden = int(self.vehicle.parameters["FENCE_OPTIONS"]) & _NO_MODE_CHANGE
         return bool(forbidden and self.enabled and self.breached and self.caused_mode)
 
@@ -340,7 +339,7 @@ class ArduPilotFence(Generic[HostT]):
         return self.vehicle.parameters.get(name, _DEFAULTS[name])
 
     def report(self, event: str, kinds: int) -> None:
-        """Send a text about an event of these kinds, if any."""
+        """Send a text with the kinds and the event, unless ``kinds`` is 0."""
         if kinds:
             self.vehicle.send_text(MavSeverity.NOTICE, f"{_joined_names(kinds)} {event}")
 

@@ -42,16 +42,15 @@ class _Refused(Exception):
 class ArduPilotFtp(FtpServer):
     """MAVFTP with the limits of the firmware (GCS_FTP.cpp).
 
-    The worker processes its queue every 2 ms. Requests beyond five are lost, also during a burst. A burst cannot be
-    stopped. A repeated sequence number gets the last reply again.
+    A worker processes the queue every 2 ms. The queue holds five requests; more are lost, also during a burst. A burst
+    cannot be stopped. The answer to a repeated sequence number is the last reply.
 
-    The client chooses the session number. While a session has an open file and was used in the last 3 s, requests of
-    other sessions are refused. Only its client closes it, or the next session after those 3 s. A close is always
-    acknowledged, even if writing failed.
+    The client chooses the session number. A session with an open file blocks other sessions until its client closes
+    it, or has sent nothing for 3 s. A close is always acknowledged, even if writing failed.
     """
 
     burst_interval_s: float
-    """Seconds between two blocks of a burst: 0 with flow control, else a burst uses a third of the link."""
+    """Seconds between two blocks of a burst."""
 
     def __init__(
         self,
@@ -148,7 +147,7 @@ class ArduPilotFtp(FtpServer):
         if file is None:
             return
         self._session = _NO_SESSION
-        with suppress(FileFault):  # the firmware does not report it either
+        with suppress(FileFault):  # The firmware does not report the error.
             file.close()
 
     def _terminate(self, request: FtpPacket) -> FtpPacket:
@@ -193,7 +192,7 @@ class ArduPilotFtp(FtpServer):
         return request.acknowledge(offset=request.offset)
 
     def _burst(self, request: FtpPacket, channel: Channel, number: int) -> None:
-        """Send one block and schedule the next. The session cannot change meanwhile."""
+        """Send one block and schedule the next. No other request is processed until the burst ends."""
         step = request.size or DATA_SIZE
         offset = request.offset + number * step
         try:
@@ -238,7 +237,7 @@ class ArduPilotFtp(FtpServer):
         return request.acknowledge(listing, offset=request.offset)
 
     def _entries(self, path: str) -> list[Entry]:
-        """List a folder with `.` and `..`, as on Linux; the root also lists its mounts."""
+        """List a folder with `.` and `..`, like Linux; the root folder also contains the listed mounts."""
         entries = self.files.entries(path)
         if self.files.mounted(path) is not None:
             return entries
@@ -282,7 +281,7 @@ class ArduPilotFtp(FtpServer):
 
 
 def _path(request: FtpPacket) -> str:
-    """Return the path, whose size must be that of the text, with or without its NUL."""
+    """Return the path; the request's size must be its length, with or without the final NUL."""
     length = len(request.data.partition(b"\0")[0])
     if request.size == 0 or request.size - length not in (0, 1):
         raise _Refused(MavFtpErr.INVALIDDATASIZE)

@@ -1,7 +1,7 @@
 """Servo gimbal (MNT1_TYPE 1) of a simulated ArduPilot.
 
-Servos report nothing, so the telemetry is the set-point. Pitch and roll are relative to the horizon, yaw to the
-vehicle's nose or to north. With MNT1_TYPE 0 there is no gimbal and its commands fail.
+Servos have no feedback, so telemetry reports the set-point. Pitch and roll are relative to the horizon, yaw to the
+vehicle's nose or to north. With MNT1_TYPE 0 there is no gimbal, and gimbal commands fail.
 """
 
 from __future__ import annotations
@@ -47,13 +47,13 @@ DEFAULTS = {
     "MNT1_YAW_MAX": 180.0,
     **dict.fromkeys((f"MNT1_{place}_{axis}" for place in ("RETRACT", "NEUTRAL") for axis in "XYZ"), 0.0),
 }
-"""Defaults of parameters that a small table may not contain."""
-_UNTURNED = frozenset({MavMountMode.RETRACT, MavMountMode.NEUTRAL})
+"""Defaults for parameters that a vehicle with a reduced ``parameter_count`` may lack."""
+_FIXED_ANGLE_MODES = frozenset({MavMountMode.RETRACT, MavMountMode.NEUTRAL})
 
 
 @dataclass(frozen=True)
 class MountTarget:
-    """Target in degrees; ``rates`` in degrees per second change it from time ``since``."""
+    """Target angles in degrees, which ``rates`` (degrees per second) change from the time ``since`` on."""
 
     roll: float = 0.0
     pitch: float = 0.0
@@ -82,14 +82,14 @@ class ArduPilotGimbal:
         return self._vehicle.parameters["MNT1_TYPE"] != 0
 
     def setting(self, name: str) -> float:
-        """Return a parameter."""
+        """Return a parameter, or its default if the parameter table lacks it."""
         parameters = self._vehicle.parameters
         return parameters[name] if name in parameters else DEFAULTS[name]
 
     @property
     def angles(self) -> tuple[float, float, float]:
         """Roll, pitch and yaw (from the nose) of the servos in degrees."""
-        if self.mode in _UNTURNED:
+        if self.mode in _FIXED_ANGLE_MODES:
             return (self.target.roll, self.target.pitch, self.target.yaw)
         target, motion = self.target, self._vehicle.motion
         yaw = self._limited("YAW", self._from_nose(target))
@@ -101,9 +101,9 @@ class ArduPilotGimbal:
 
     @property
     def target(self) -> MountTarget:
-        if self.mode == MavMountMode.RC_TARGETING:  # No stick moves: all channels are centred.
+        if self.mode == MavMountMode.RC_TARGETING:  # The sticks of the gimbal are not simulated; they rest centred.
             return MountTarget(self._middle("ROLL"), self._middle("PITCH"), 0.0, self.is_yaw_locked)
-        if self.mode in _UNTURNED:
+        if self.mode in _FIXED_ANGLE_MODES:
             place = MavMountMode(self.mode).name
             roll, pitch, yaw = (self.setting(f"MNT1_{place}_{axis}") for axis in "XYZ")
             return MountTarget(roll, pitch, yaw)
@@ -126,7 +126,7 @@ class ArduPilotGimbal:
         return replace(target, roll=roll, pitch=pitch, yaw=yaw)
 
     def _angles_to(self, place: Ned | None) -> MountTarget:
-        """Return the angles to a position; the current target without a position."""
+        """Return the angles to a position; the current target if ``place`` or the vehicle's position is unknown."""
         motion = self._vehicle.motion
         if place is not None and self._vehicle.navigation.has_position:
             north, east, down = place[0] - motion.north, place[1] - motion.east, place[2] - motion.down
@@ -146,7 +146,7 @@ class ArduPilotGimbal:
         return (self.setting(f"MNT1_{axis}_MIN") + self.setting(f"MNT1_{axis}_MAX")) / 2.0
 
     def set_mode(self, mode: int) -> None:
-        """Set a MAV_MOUNT_MODE; others are ignored."""
+        """Set a MAV_MOUNT_MODE; unknown values are ignored."""
         if mode in list(MavMountMode):
             self._target = self.target
             self.mode = mode
@@ -168,7 +168,7 @@ class ArduPilotGimbal:
         self.mode = MavMountMode.MAVLINK_TARGETING
 
     def look_at(self, place: Ned | None) -> None:
-        """Point at a position; None stops that."""
+        """Point at a position; None returns to the default mode."""
         self._region = place
         if place is not None:
             self.set_mode(MavMountMode.GPS_POINT)
@@ -206,7 +206,7 @@ class ArduPilotGimbal:
             self._vehicle.send(status)
 
     def manage(self, flags: int, angles: tuple[float, float, float], rates: tuple[float, float, float]) -> int:
-        """Apply GIMBAL_MANAGER_FLAGS with angles or rates (roll, pitch, yaw; NaN if unset); return a MAV_RESULT."""
+        """Apply GIMBAL_MANAGER_FLAGS with angles or rates (roll, pitch, yaw; NaN if not given); return a MAV_RESULT."""
         from_north = bool(flags & GimbalManagerFlags.YAW_LOCK)
         if flags & GimbalManagerFlags.RETRACT:
             self.set_mode(MavMountMode.RETRACT)
@@ -223,7 +223,7 @@ class ArduPilotGimbal:
         return MavResult.ACCEPTED
 
     def warn(self) -> None:
-        """Warn about invalid angles, such as hundredths of degrees."""
+        """Send the text about invalid angles, which a client causes that sends hundredths of degrees."""
         self._vehicle.send_text(MavSeverity.WARNING, "Mount: invalid angle targets")
 
     def attitude_status(self) -> m.GimbalDeviceAttitudeStatus | None:
@@ -267,7 +267,7 @@ class ArduPilotGimbal:
 
 
 def _device_flags(gimbal: ArduPilotGimbal) -> int:
-    """Yaw is reported relative to the nose, even if it is locked to north."""
+    """Return GIMBAL_DEVICE_FLAGS; yaw is reported relative to the nose, even if it is locked to north."""
     flags = GimbalDeviceFlags.ROLL_LOCK | GimbalDeviceFlags.PITCH_LOCK | GimbalDeviceFlags.YAW_IN_VEHICLE_FRAME
     if gimbal.mode == MavMountMode.RETRACT:
         flags |= GimbalDeviceFlags.RETRACT

@@ -1,6 +1,6 @@
-"""Base classes below all parts of a simulated ArduPilot: the vehicle as its parts see it, flight modes, motors.
+"""Interfaces and base classes of the parts of a simulated ArduPilot: vehicle, flight modes, motors.
 
-No part imports the vehicle that is composed of them. Parts see each other through the protocols defined here.
+The parts do not import the class of the vehicle. They use the vehicle and each other through these interfaces.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ HostT = TypeVar("HostT", bound="ArduPilotHost")
 
 
 class ArduPilotMode:
-    """A flight mode. The defaults here refuse or do nothing."""
+    """A flight mode. By default optional operations are refused or do nothing."""
 
     number: int
     name: str
@@ -38,15 +38,15 @@ class ArduPilotMode:
     refused_because: str = "init failed"
     """Reason reported when `enter` returns False."""
     returns_on_path: bool = False
-    """True for SMART_RTL, which drives back along the recorded path."""
+    """True for SMART_RTL, which returns along the recorded path."""
     notices_landing: bool = True
     """True if the land detector may declare the vehicle landed in this mode."""
     is_landing: bool = False
     is_taking_off: bool = False
     is_available: bool = True
-    """False for a mode whose requirements are never met."""
+    """False for a mode that the simulation always refuses."""
     entry_texts: tuple[str, ...] = ()
-    """Texts sent when the mode is entered or refused, with `entry_severity`."""
+    """Texts sent with `entry_severity` when the mode is entered or refused."""
     entry_severity: int = MavSeverity.INFO
 
     def __init__(self, vehicle: Any) -> None:
@@ -59,17 +59,17 @@ class ArduPilotMode:
         return self.is_available
 
     def leave(self) -> None:
-        """Called when another mode takes over."""
+        """Called when another mode has been entered."""
 
     def update(self, dt: float) -> None:
         """Set the targets of motors and motion for the next ``dt`` seconds."""
 
     def take_off(self, altitude_m: float, *, must_navigate: bool) -> bool:
-        """Climb to metres above home; return False if the mode has no take-off by command."""
+        """Climb to an altitude above home; return False if the mode does not support commanded take-off."""
         return False
 
     def pause(self) -> bool:
-        """Stop in place; return False if there is nothing to pause."""
+        """Stop at the current place; return False if the mode cannot be paused now."""
         return False
 
     def resume(self) -> bool:
@@ -87,7 +87,7 @@ class ArduPilotMode:
 def variant(
     make: Callable[[HostT], ArduPilotMode], number: int, name: str, **traits: Any
 ) -> Callable[[HostT], ArduPilotMode]:
-    """Return a row of a mode table: another mode's behaviour under a new name, with some traits changed."""
+    """Return a factory of a mode with the behaviour of ``make``, but another number, name and ``traits``."""
 
     def build(host: HostT) -> ArduPilotMode:
         mode = make(host)
@@ -101,7 +101,7 @@ def variant(
 
 
 class ConditionTimer:
-    """Measures for how long a condition has been true."""
+    """Measures the time since a condition became true."""
 
     def __init__(self) -> None:
         self._since: float | None = None
@@ -129,7 +129,7 @@ _STOPPED_PWM, _IDLE_PWM, _FULL_PWM = 1000, 1100, 2000
 class ArduPilotMotors:
     """Arming delay, spool-up and power consumption of the motors of a quadrotor.
 
-    ``spool`` goes from 0 (idle or stopped) to 1 (able to lift); setting ``wanted`` requests spool-up.
+    ``spool`` is 0 for idle or stopped motors and 1 for motors that can lift. Set ``wanted`` to request spool-up.
     """
 
     def __init__(self, vehicle: Any) -> None:
@@ -148,17 +148,17 @@ class ArduPilotMotors:
 
     @property
     def is_idle(self) -> bool:
-        """True while the motors turn at their lowest speed or stand still."""
+        """True while the motors are stopped or turn at idle speed."""
         return self.spool <= 0.0
 
     @property
     def current_a(self) -> float:
-        """Current of all motors and the electronics."""
+        """Current in amperes of motors and electronics."""
         return 0.08 * self.is_armed + self.throttle * _AMPERES_AT_FULL
 
     @property
     def pwm(self) -> int:
-        """Pulse of each motor in SERVO_OUTPUT_RAW; minimal until the arming delay is over."""
+        """Pulse width of each motor in SERVO_OUTPUT_RAW (µs); minimal until the arming delay is over."""
         if not (self.is_armed and self.may_turn):
             return _STOPPED_PWM
         return round(_IDLE_PWM + 20 * self.spool + self.throttle * (_FULL_PWM - _IDLE_PWM) * 1.3)
@@ -187,7 +187,7 @@ class ArduPilotMotors:
         self.throttle = 0.0 if throttle < 0.0 else throttle if throttle < 1.0 else 1.0
 
 
-# The parts as other parts see them.
+# Interfaces of the parts, for other parts.
 
 
 class ArduPilotNavigationHost(Protocol):
@@ -289,14 +289,14 @@ _ABSOLUTE = frozenset({MavFrame.GLOBAL, MavFrame.GLOBAL_INT})
 
 
 class ArduPilotHost(SimulatedAutopilot):
-    """A simulated ArduPilot as its parts see it; `ArduPilotVehicle` composes them."""
+    """Interface of a simulated ArduPilot for its parts; `ArduPilotVehicle` implements it."""
 
     KIND: ClassVar[Kind]
     """Firmware; selects the parameter table."""
     FIRMWARE: ClassVar[str]
     """Firmware name in the banner."""
     FRAME: ClassVar[str | None] = None
-    """Frame text in the banner, if any."""
+    """Text about the frame in the banner; None sends none."""
     GIT_HASH: ClassVar[bytes] = b"5ae20c17"
 
     parameters: SimParameters
@@ -336,7 +336,7 @@ class ArduPilotHost(SimulatedAutopilot):
         return self.navigation.altitude_above_home
 
     def set_mode(self, number: int) -> bool:
-        """Change the mode and broadcast a heartbeat; return False and send a text if it is refused."""
+        """Change the mode and broadcast a heartbeat; if the mode is refused, send a text and return False."""
         raise NotImplementedError
 
     def available_modes(self) -> list[m.AvailableModes]:
@@ -362,14 +362,14 @@ class ArduPilotHost(SimulatedAutopilot):
         return (motion.north + offset[0], motion.east + offset[1], motion.down + offset[2])
 
     def send_banner(self) -> None:
-        """Send firmware, hash and frame as texts."""
+        """Send texts with firmware version, board id and frame."""
         self.info(f"{self.FIRMWARE} V{self.version} ({self.GIT_HASH.decode()})")
         self.info(self.uid.hex()[:32])
         if self.FRAME is not None:
             self.info(self.FRAME)
 
     def point(self, latitude_e7: int, longitude_e7: int, altitude: float, frame: int) -> Ned | None:
-        """Convert a global position to the world frame; None for invalid values or an unknown frame."""
+        """Convert a global position to the world frame; return None for invalid values or an unknown frame."""
         valid = abs(latitude_e7) <= 900_000_000 and abs(longitude_e7) <= 1_800_000_000
         if not valid or not math.isfinite(altitude):
             return None

@@ -17,13 +17,13 @@ KINDS: tuple[Kind, ...] = ("copter", "plane", "rover", "sub")
 
 
 def parameters_of(kind: Kind, count: int | None = None) -> SimParameters:
-    """Return the parameters of a firmware, or ``count`` of them including all that the simulation reads."""
+    """Return the parameters of a firmware; ``count`` limits them, but keeps all that the simulation reads."""
     used = [name for (name,) in rows_of(kind, "used_parameters.csv")]
     return SimParameters.from_text(_read(f"{kind}.param.csv"), used=used, count=count)
 
 
 def rows_of(kind: Kind, file: str) -> Iterator[list[str]]:
-    """Yield the rows of a table that are valid for a firmware, without the last column, which lists the firmwares."""
+    """Yield the rows of a table whose last column names the firmware, without that column."""
     for line in _read(file).splitlines():
         *row, kinds = line.split(",")
         if kinds == "all" or kind in kinds.split():
@@ -39,11 +39,11 @@ def _read(file: str) -> str:
 
 @dataclass(frozen=True)
 class BootTimeline:
-    """Seconds from power-on to the events of a boot. The defaults were measured on ArduCopter 4.7-dev in SITL."""
+    """Seconds from power-on to the events of the boot. The defaults are measured on ArduCopter 4.7-dev in SITL."""
 
     heartbeat: float = 0.92
     ready: float = 2.36
-    """Initialised: streams start, missions are accepted; half a second later the state leaves BOOT."""
+    """Initialised: streams start and missions are accepted; half a second later MAV_STATE_BOOT ends."""
     estimator_active: float = 4.36
     tilt_aligned: float = 5.70
     yaw_aligned: float = 5.80
@@ -53,18 +53,18 @@ class BootTimeline:
     healthy: float = 22.40
     """The attitude reference is healthy; a second later the vehicle can be armed in modes without GPS."""
     position_good: float = 41.55
-    """The estimator uses GPS: modes that need a position are available."""
+    """The estimator uses GPS; modes that need a position become available."""
     estimator_leads_early: bool = True
-    """True if the estimator is the attitude reference from its start, not only once it uses GPS."""
+    """True if the estimator provides the attitude as soon as it is active, False if only once it uses GPS."""
 
     def scaled(self, seconds: float) -> BootTimeline:
-        """Return the timeline scaled to end after ``seconds``; 0 is ready at once."""
+        """Return the timeline scaled to end after ``seconds``; with 0 the vehicle is ready at once."""
         factor = seconds / self.position_good
         times = {field.name: getattr(self, field.name) * factor for field in fields(self) if field.type == "float"}
         return replace(self, **times)
 
 
-# Measured in SITL with default parameters; columns in the order of the fields.
+# Measured in SITL with default parameters; values in the order of the fields.
 BOOT_TIMELINES: dict[Kind, BootTimeline] = {
     "copter": BootTimeline(),
     "plane": BootTimeline(0.92, 2.04, 9.94, 12.08, 12.12, 8.74, 8.94, 19.12, 21.40, 20.15, False),

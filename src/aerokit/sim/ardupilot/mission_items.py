@@ -1,6 +1,6 @@
-"""Mission items as ArduPilot stores them: in fifteen bytes, so that params lose digits or are dropped.
+"""Storage of mission items in ArduPilot: fifteen bytes per item, so that params lose digits or are dropped.
 
-`stored` converts an item to its storage and back, as a client sees it that uploads and downloads a mission.
+`stored` converts an uploaded item to the item that a client downloads afterwards.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from aerokit.sim.ardupilot.kinds import Kind
 from aerokit.sim.missions import float32
 
 _MAX_ALTITUDE_M = 83000.0
-_GIVEN_BACK: dict[int, int] = {
+_DOWNLOADED_FRAMES: dict[int, int] = {
     MavFrame.MISSION: MavFrame.GLOBAL,
     MavFrame.GLOBAL: MavFrame.GLOBAL,
     MavFrame.GLOBAL_INT: MavFrame.GLOBAL,
@@ -32,12 +32,12 @@ _C = MavCmd
 
 
 class StoredCommand(NamedTuple):
-    """Storage of a command."""
+    """Format in which ArduPilot stores a command."""
 
     name: str
-    """Name in status texts; empty if no mission can contain it."""
+    """Name in status texts; empty if a mission cannot contain the command."""
     parameters: str
-    """Storage of params 1 to 4 (and x, y, z if they are no position), see `_KEEPERS`. Empty: not at all."""
+    """Storage types of params 1 to 4, and of x, y, z without a position; see `_CONVERSIONS`. Empty: unsupported."""
     has_place: bool
     """True if ``x``, ``y`` and ``z`` are a position."""
 
@@ -54,8 +54,8 @@ def _read_commands() -> dict[int, StoredCommand]:
 STORED_COMMANDS: dict[int, StoredCommand] = _read_commands()
 _UNKNOWN = StoredCommand("?", "", has_place=False)
 
-# Differences of ArduPlane: acceptance radius and passing distance are stored; there are no splines.
-_OF_A_PLANE: dict[int, str] = {_C.NAV_WAYPOINT: "-BB-", _C.NAV_SPLINE_WAYPOINT: ""}
+# ArduPlane stores acceptance radius and passing distance of waypoints, and has no splines.
+_PLANE_PARAMETERS: dict[int, str] = {_C.NAV_WAYPOINT: "-BB-", _C.NAV_SPLINE_WAYPOINT: ""}
 
 _NAN_ALLOWED: dict[int, tuple[int, ...]] = {
     _C.NAV_WAYPOINT: (3,),
@@ -78,8 +78,9 @@ def has_location(command: int) -> bool:
 
 
 def is_place(latitude_e7: float, longitude_e7: float) -> int:
-    """Return ACCEPTED, or the MAV_MISSION_RESULT of the invalid coordinate. Compared in single precision, as in the
-    firmware.
+    """Return ACCEPTED, or the MAV_MISSION_RESULT of the invalid coordinate.
+
+    Like the firmware, it compares in single precision.
     """
     if not abs(float32(latitude_e7)) <= 900_000_000:
         return MavMissionResult.INVALID_PARAM5_X
@@ -88,16 +89,16 @@ def is_place(latitude_e7: float, longitude_e7: float) -> int:
 
 
 def altitude_frame(frame: int) -> int | None:
-    """Return the frame in which an altitude is downloaded; None for an unsupported frame."""
-    return _GIVEN_BACK.get(frame)
+    """Return the MAV_FRAME of an altitude after upload and download; None for an unsupported frame."""
+    return _DOWNLOADED_FRAMES.get(frame)
 
 
 def stored(item: MissionItem, kind: Kind = "copter") -> MissionItem | int:
-    """Return the item as downloaded, or the MAV_MISSION_RESULT that refuses it."""
+    """Return the item that a download sends, or the MAV_MISSION_RESULT that refuses the upload."""
     result = _check_numbers(item)
     if result == MavMissionResult.ACCEPTED and item.command in (0, 1):
         result = MavMissionResult.INVALID
-    layout = _OF_A_PLANE.get(item.command) if kind == "plane" else None
+    layout = _PLANE_PARAMETERS.get(item.command) if kind == "plane" else None
     layout = STORED_COMMANDS.get(item.command, _UNKNOWN).parameters if layout is None else layout
     if result == MavMissionResult.ACCEPTED and not layout:
         result = MavMissionResult.UNSUPPORTED
@@ -105,7 +106,7 @@ def stored(item: MissionItem, kind: Kind = "copter") -> MissionItem | int:
         return result
     assert layout is not None
     numbers = (item.param1, item.param2, item.param3, item.param4, float(item.x), float(item.y), item.z)
-    kept = [_KEEPERS[kind](number) for kind, number in zip(layout.ljust(7, "-"), numbers, strict=True)]
+    kept = [_CONVERSIONS[kind](number) for kind, number in zip(layout.ljust(7, "-"), numbers, strict=True)]
     if item.command == _C.NAV_LOITER_TURNS:
         kept[:4] = _kept_turns(item)
     p1, p2, p3, p4, x, y, z = kept
@@ -140,7 +141,10 @@ def _kept_place(item: MissionItem) -> tuple[float, float, float, int] | int:
 
 
 def _kept_turns(item: MissionItem) -> tuple[float, float, float, float]:
-    """Turns and radius have a byte each: fractions of a turn in 256ths, a radius above 255 m in tens of metres."""
+    """Return params 1 to 4 of NAV_LOITER_TURNS. Turns and radius have one byte each.
+
+    Less than one turn is stored in 256ths, a radius above 255 m in tens of metres.
+    """
     turns, radius = item.param1, abs(item.param3)
     is_part = 0 < turns < 1
     count = int(min(255.0, turns * 256 if is_part else turns)) & 0xFF
@@ -150,7 +154,7 @@ def _kept_turns(item: MissionItem) -> tuple[float, float, float, float]:
 
 
 def whole(value: float) -> int:
-    """Truncate towards zero, as C does; 0 for values beyond the range."""
+    """Truncate towards zero, as C does; 0 for values beyond 32 bits."""
     return int(value) if abs(value) < 2**31 else 0
 
 
@@ -170,8 +174,8 @@ def _signed(value: int, bits: int) -> float:
     return float(value - (1 << bits) if value >> bits - 1 else value)
 
 
-# Conversions by storage type: a C type, hundredths, a sign, an angle, a boolean, or not stored.
-_KEEPERS: dict[str, Callable[[float], float]] = {
+# Conversions of a value to its storage and back, by storage type.
+_CONVERSIONS: dict[str, Callable[[float], float]] = {
     "-": lambda _: 0.0,
     "f": float32,
     "e": _half,

@@ -1,7 +1,7 @@
 """ArduPilot's lists of mission items: commands, fence and rally points.
 
 An upload changes commands and rally points in place, item by item, so an aborted upload leaves a mixture of the old
-and the new list. A fence is collected separately and validated as a whole at the end.
+and the new list. A fence is collected first, and validated and stored at the end of the upload.
 """
 
 from __future__ import annotations
@@ -19,29 +19,29 @@ _MIN_RALLY_M, _MAX_RALLY_M = -32768, 32767
 
 
 class ItemList:
-    """A list as the mission protocol uses it. Results are MAV_MISSION_RESULTs."""
+    """Base of the three lists of items. Results are MAV_MISSION_RESULTs."""
 
     name: ClassVar[str]
-    """Name of the list in texts about uploads."""
+    """Name of the list in status texts."""
 
     def __init__(self, capacity: int) -> None:
         self.capacity = capacity  # Maximum number of items.
 
     @property
     def count(self) -> int:
-        """Number of items that MISSION_COUNT reports now."""
+        """Number of items in MISSION_COUNT."""
         raise NotImplementedError
 
     def items(self) -> list[MissionItem]:
-        """Return all stored items as a download returns them."""
+        """Return all items that a download sends."""
         return [item for seq in range(self.count) if not isinstance(item := self.item(seq), int)]
 
     def item(self, seq: int) -> MissionItem | int:
-        """Return an item, or the result if there is none."""
+        """Return an item, or the result that reports a missing item."""
         raise NotImplementedError
 
     def begin(self, count: int) -> None:
-        """Start an upload of a new list of this length."""
+        """Start an upload of ``count`` items."""
         raise NotImplementedError
 
     def begin_update(self) -> None:
@@ -64,7 +64,7 @@ class ItemList:
 
 
 class CommandList(ItemList):
-    """The mission. Item 0 is home; it is not stored but read from ``home`` at each download."""
+    """The mission. Item 0 is home, which each download reads from ``home``."""
 
     name = "Mission"
 
@@ -78,7 +78,7 @@ class CommandList(ItemList):
         super().__init__(capacity)
         self._kind: Kind = kind
         self._home, self._is_running = home, is_running
-        self._commands: list[MissionItem] = []  # [0] only holds home's place
+        self._commands: list[MissionItem] = []  # Index 0 is a placeholder for home.
         self.version: int = 0  # Incremented whenever an item changes.
 
     @property
@@ -86,16 +86,16 @@ class CommandList(ItemList):
         return len(self._commands)
 
     def item(self, seq: int) -> MissionItem | int:
-        if seq == 0:  # home can be read without a mission
+        if seq == 0:  # Home can be read without a mission.
             return self._home()
         return self._commands[seq] if seq < len(self._commands) else MavMissionResult.INVALID_SEQUENCE
 
     def command(self, index: int) -> MissionItem | None:
-        """Return a command for execution; None beyond the end and for home."""
+        """Return the command to execute at this index; None beyond the end and for home."""
         return self._commands[index] if 0 < index < len(self._commands) else None
 
     def add_home(self) -> None:
-        """Called when home is set: it becomes item 0 of an empty mission."""
+        """Make home item 0 of an empty mission; called when home is set."""
         if not self._commands:
             self._commands.append(self._home())
 
@@ -104,7 +104,7 @@ class CommandList(ItemList):
         self.version += 1
 
     def put(self, seq: int, item: MissionItem, last: int) -> int:
-        """Replace or append an item. Item 0 is validated and ignored; an empty list gets its home first."""
+        """Replace or append an item. Item 0 is validated, then ignored. Home is added to an empty list first."""
         kept = stored(item, self._kind)
         if isinstance(kept, int):
             return kept
@@ -161,7 +161,7 @@ class RallyList(ItemList):
         return len(self._points)
 
     def item(self, seq: int) -> MissionItem | int:
-        """Return a point; one at 0, 0 counts as missing."""
+        """Return a point; a point at latitude and longitude 0 counts as missing."""
         if seq >= len(self._points):
             return MavMissionResult.INVALID_SEQUENCE
         point = self._points[seq]
@@ -217,7 +217,7 @@ Warn = Callable[[str], None]
 
 
 class FenceList(ItemList):
-    """Fence. During an upload `count` is that of the upload, while `item` reads the stored fence."""
+    """Fence. During an upload, `count` is the number of uploaded items, while `item` reads the stored fence."""
 
     name = "Fence"
 

@@ -1,7 +1,7 @@
 """Execution of a mission by a simulated ArduPilot (AP_Mission).
 
-Navigation commands run one after the other. The "do" and "condition" commands between two of them run while the second
-one does. The mode that flies the mission starts and verifies the commands.
+Navigation commands run one after the other. "Do" and "condition" commands run together with the navigation command
+that follows them. The mode that flies the mission starts commands and checks their completion.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _WITH_TARGET = frozenset({_C.DO_JUMP, _C.JUMP_TAG, _C.DO_JUMP_TAG})
 _TAKE_OFFS = frozenset({_C.NAV_TAKEOFF, _C.NAV_VTOL_TAKEOFF})
 _BEFORE_TAKE_OFF = frozenset({_C.DO_AUX_FUNCTION, _C.NAV_DELAY})
 _NAVIGATION_BEYOND = frozenset({_C.NAV_SET_YAW_SPEED, _C.NAV_SCRIPT_TIME, _C.NAV_ATTITUDE_TIME})
-# Commands that complete at once on every vehicle, without a report.
+# Commands that complete at once on every vehicle, without a status text.
 _INSTANT = frozenset(
     {
         _C.DO_GRIPPER, _C.DO_SET_SERVO, _C.DO_SET_RELAY, _C.DO_REPEAT_SERVO, _C.DO_REPEAT_RELAY,
@@ -54,7 +54,7 @@ class MissionMode(ArduPilotMode):
 
     def disarmed(self) -> None:
         """Called after the motors have stopped."""
-        # An unfinished mission starts again and waits on the ground.
+        # Disarming restarts an unfinished mission, which then waits on the ground.
         if self.vehicle.mode is self:
             self.vehicle.mission.update()
 
@@ -98,12 +98,12 @@ class MissionMode(ArduPilotMode):
 
 
 def is_navigation(item: MissionItem) -> bool:
-    """Return True for a navigation command, which ends the navigation command before it."""
+    """Return True for a navigation command, only one of which runs at a time."""
     return item.command <= _C.NAV_LAST or item.command in _NAVIGATION_BEYOND
 
 
 class MissionRun:
-    """Progress in the mission. Index 0 is home (meaning no command), 1 the first command."""
+    """Progress in the mission. Index 1 is the first command; index 0 (home) means that there is no command."""
 
     def __init__(self, vehicle: ArduPilotHost, mode: MissionMode) -> None:
         self._vehicle, self._mode = vehicle, mode
@@ -117,7 +117,7 @@ class MissionRun:
 
     @property
     def is_present(self) -> bool:
-        """True if there are commands besides home."""
+        """True if the mission contains a command besides home."""
         return self._list.count > 1
 
     @property
@@ -126,7 +126,7 @@ class MissionRun:
 
     @property
     def is_being_flown(self) -> bool:
-        """True while it runs with the motors armed, when it cannot be cleared."""
+        """True while the mission runs with armed motors; it cannot be cleared then."""
         return self.is_running and self._vehicle.motors.is_armed
 
     @property
@@ -151,7 +151,7 @@ class MissionRun:
         return self.is_take_off(begin)
 
     def is_take_off(self, index: int) -> bool:
-        """Return True if the first navigation command from ``index`` on, except delays, is a take-off."""
+        """Return True if the first navigation command from ``index`` on is a take-off, delays excepted."""
         for _, item in self.navigation_from(index):
             if item.command not in _BEFORE_TAKE_OFF:
                 return item.command in _TAKE_OFFS
@@ -190,7 +190,7 @@ class MissionRun:
             self._complete()
 
     def stop(self) -> None:
-        """Stop because another mode takes over; the progress is kept."""
+        """Stop the mission because the mode changed; the progress is kept."""
         if self.is_running:
             self._state = MissionState.NOT_STARTED
 
@@ -298,7 +298,7 @@ class MissionRun:
         self._mode.end_mission()
 
     def _next(self, index: int, *, counts: bool) -> tuple[int, MissionItem] | None:
-        """Return the first command from ``index`` on that is no jump, following jumps. ``counts`` counts them."""
+        """Return the first command from ``index`` on, following jumps. ``counts`` decrements their repetitions."""
         first_jump = 0
         for _ in range(_MAX_JUMPS):
             while (item := self._list.command(index)) is not None and item.command not in (
@@ -345,7 +345,7 @@ def horizontal_distance(vehicle: ArduPilotHost, place: Ned | None) -> float:
 
 
 def set_home_from(vehicle: ArduPilotHost, item: MissionItem) -> None:
-    """Execute DO_SET_HOME of a mission: the position of the item, or the present one if it has none."""
+    """Execute DO_SET_HOME of a mission: set home to the item's position, or to the vehicle's if it has none."""
     point: Ned | None = vehicle.motion.place
     if item.param1 != 1 and (item.x, item.y, item.z) != (0, 0, 0):
         point = vehicle.point(int(item.x), int(item.y), item.z, item.frame)

@@ -1,7 +1,7 @@
 """Mission protocol of ArduPilot.
 
-It accepts one upload at a time for each list (mission, fence, rally points); meanwhile other components can neither
-upload nor download that list. Downloads are stateless: any item can be requested at any time.
+The server accepts one upload at a time for each list (mission, fence, rally points). Until an upload ends, other
+components can neither upload nor download that list. Downloads are stateless: items can be requested in any order.
 https://mavlink.io/en/services/mission.html
 """
 
@@ -77,14 +77,12 @@ class ArduPilotMissionServer:
         return bool(self._uploads)
 
     def items(self, mission_type: int) -> list[MissionItem]:
-        """Return the items as downloaded, home first; empty for an unknown type."""
+        """Return the items that a download sends, home first; empty for an unknown type."""
         items = self._lists.get(mission_type)
         return [] if items is None else items.items()
 
     def replace(self, mission_type: int, items: Sequence[MissionItem], *, start: int = 0, clear: bool = True) -> int:
-        """Store items as a file upload does; return the MAV_MISSION_RESULT. ``clear`` False is supported for the
-        mission only.
-        """
+        """Store items as a file upload does; return the MAV_MISSION_RESULT. Only missions support ``clear=False``."""
         if mission_type == MavMissionType.MISSION:
             if clear:
                 self._clear(self.commands)
@@ -101,7 +99,7 @@ class ArduPilotMissionServer:
         return _R.ACCEPTED
 
     def reset(self) -> None:
-        """Handle a reboot: uploads are dropped, items stay."""
+        """Drop uploads, as a reboot does; stored items stay."""
         self._uploads.clear()
 
     def _home(self) -> MissionItem:
@@ -119,7 +117,7 @@ class ArduPilotMissionServer:
         self._vehicle.send(m.MissionAck(*sender_of(message), result, mission_type), channel)
 
     def _list_for(self, message: Message, mission_type: int, channel: Channel) -> ItemList | None:
-        """Return the list of this type, or refuse the request and return None."""
+        """Return the list of this type; if it is not supported, refuse the request and return None."""
         items = self._lists.get(mission_type)
         if items is not None and mission_type != MavMissionType.MISSION and channel.version == 1:
             self._warn("Need mavlink2 for item transfer")
@@ -179,7 +177,10 @@ class ArduPilotMissionServer:
         self._vehicle.send(item_message_float(item, place, request.seq, to, mission_type, current), channel)
 
     def _is_current(self, item: MissionItem, mission_type: int) -> bool:
-        """The firmware compares the item's command with the index of the current item."""
+        """Return True if the firmware marks the item as current.
+
+        The firmware compares the item's command, instead of its index, with the index of the current item.
+        """
         return mission_type == MavMissionType.MISSION and item.command == self._vehicle.mission.nav_index
 
     def _on_count(self, count: m.MissionCount, channel: Channel) -> None:
@@ -324,7 +325,7 @@ class ArduPilotMissionServer:
         self._acknowledge(request, _R.ACCEPTED if done else _R.ERROR, mission_type, channel)
 
     def _on_set_current(self, request: m.MissionSetCurrent, channel: Channel) -> None:
-        """The answer has the requested index, even if another item is flown."""
+        """Set the current item; MISSION_CURRENT has the requested index, even if another item runs."""
         if self._vehicle.mission.set_current(request.seq):
             self._vehicle.send(self._vehicle.mission.message(request.seq), channel)
 
@@ -335,7 +336,7 @@ class ArduPilotMissionServer:
         return done
 
     def _guide(self, item: MissionItem, current: int) -> int:
-        """Handle an item that is a target for GUIDED, as its ``current`` specifies."""
+        """Handle an item whose ``current`` field makes it a target for GUIDED."""
         kept = stored(item, self._vehicle.KIND)
         if isinstance(kept, int):
             return kept

@@ -10,7 +10,7 @@ from aerokit.mavlink.enums import GpsFixType, MavMissionType, MavSeverity
 from aerokit.sim.ardupilot.host import ArduPilotHost
 from aerokit.sim.motion import GlobalPoint, LocalFrame, Ned
 
-# Plain integers, because operators of flags are slow and these are tested at every tick.
+# Plain integers, because operators of flags are slow and every tick tests these bits.
 _ATTITUDE, _POS_HORIZ_ABS, _POS_VERT_ABS = map(int, (Ekf.ATTITUDE, Ekf.POS_HORIZ_ABS, Ekf.POS_VERT_ABS))
 _DEAD_RECKONING = int(Ekf.ATTITUDE | Ekf.VELOCITY_VERT | Ekf.POS_VERT_ABS)
 _ATTITUDE_ONLY = int(_DEAD_RECKONING | Ekf.VELOCITY_HORIZ | Ekf.CONST_POS_MODE)
@@ -23,7 +23,7 @@ _GPS_CHECK_INTERVAL_S = 0.1
 
 
 class ArduPilotNavigation:
-    """Estimator state. It advances along the boot timeline and degrades with ``faults.gps_lost`` or SIM_GPS1_ENABLE 0.
+    """State of GPS and estimator; follows the boot timeline, ``faults.gps_lost`` and SIM_GPS1_ENABLE.
 
     Positions are in the world frame, whose origin is the power-on location.
     """
@@ -95,14 +95,14 @@ class ArduPilotNavigation:
         return (local[0] + north, local[1] + east, local[2] + down)
 
     def set_home(self, point: Ned, *, lock: bool) -> None:
-        """Set home and broadcast it; with ``lock`` arming does not move it any longer."""
+        """Set home and broadcast it; with ``lock`` later arming does not move it."""
         self.home = point
         self.home_is_locked = self.home_is_locked or lock
         self._vehicle.missions.commands.add_home()
         self._vehicle.call_later(0.0, self._vehicle.send_home)
 
     def set_origin(self, point: Ned) -> bool:
-        """Set the estimator's origin; return False if it is set already or the vehicle still boots."""
+        """Set the estimator's origin; return False if it is already set or the vehicle is still booting."""
         if self.origin is not None or not self._vehicle.is_initialised:
             return False
         self.origin = point
@@ -184,8 +184,8 @@ class ArduPilotNavigation:
 def best_return_place(vehicle: ArduPilotHost, home: Ned, *, is_allowed: Callable[[Ned], bool] = lambda _: True) -> Ned:
     """Return the place where RTL ends: the nearest allowed rally point at its own height, or home.
 
-    Rally points farther away than RALLY_LIMIT_KM are ignored (0: no limit). With RALLY_INCL_HOME home competes with
-    the rally points.
+    Rally points farther away than RALLY_LIMIT_KM are ignored (0: no limit). With RALLY_INCL_HOME the result is home if
+    it is nearer than the rally points.
     """
     here = (vehicle.motion.north, vehicle.motion.east)
     parameters = vehicle.parameters
@@ -208,15 +208,15 @@ def best_return_place(vehicle: ArduPilotHost, home: Ned, *, is_allowed: Callable
 _PERIOD_S, _FAILURE_TIMEOUT_S, _LOW_SPACE_REPORT_INTERVAL_S = 1.0 / 3.0, 15.0, 10.0
 _CLEAN_UP_AFTER_POINTS = 50
 _LOW_SPACE_POINTS = 9
-# Shares of SRTL_ACCURACY: smaller bends are removed, parts that come closer to each other are joined.
+# Shares of SRTL_ACCURACY: bends below _BEND are removed; segments closer to each other than _LOOP are joined.
 _BEND, _LOOP = 0.5, 0.99
 
 
 class SmartPath:
-    """Path that SMART_RTL returns on: at most SRTL_POINTS points, SRTL_ACCURACY metres apart.
+    """Recorded path of SMART_RTL: at most SRTL_POINTS points, SRTL_ACCURACY metres apart.
 
-    It starts where the vehicle was armed or first had a position. After 15 s without a position, or when there is no
-    space left, the path is deactivated and SMART_RTL is refused.
+    The path starts where the vehicle was armed or first had a position. After 15 s without a position or without free
+    space it is deactivated, and SMART_RTL is refused.
     """
 
     def __init__(self, vehicle: ArduPilotHost, *, only_armed: bool) -> None:
@@ -236,7 +236,7 @@ class SmartPath:
         self._vehicle.every(_PERIOD_S, self.update)
 
     def reset(self) -> None:
-        """Discard the path and start a new one here, as arming does. Without a position the path is inactive."""
+        """Discard the path and start a new one at the vehicle, as arming does; inactive without a position."""
         parameters = self._vehicle.parameters
         self._points.clear()
         self._cleaned, self.is_active, self._is_started = 0, False, True
@@ -248,7 +248,7 @@ class SmartPath:
             self.is_active = True
 
     def take_way_back(self) -> list[Ned]:
-        """Return the simplified path, last point first, and stop recording it."""
+        """Return the simplified path, last point first, and clear the recorded path."""
         accuracy = self._vehicle.parameters["SRTL_ACCURACY"]
         way = prune(simplify(self._points, _BEND * accuracy), _LOOP * accuracy)
         self._points.clear()
@@ -256,12 +256,12 @@ class SmartPath:
         return way[::-1]
 
     def restore(self, way: Sequence[Ned]) -> None:
-        """Put the points of `take_way_back` that were not reached back into the path."""
+        """Record again those points of `take_way_back` that were not reached."""
         self._points[:] = list(way)[::-1]
         self._cleaned = len(self._points)
 
     def update(self) -> None:
-        """Record the present position if it is far enough from the last point."""
+        """Record the current position if it is far enough from the last point."""
         vehicle = self._vehicle
         if not self.is_active:
             if not self._is_started and vehicle.navigation.has_position:
@@ -306,7 +306,7 @@ class SmartPath:
 
 
 def simplify(path: Sequence[Ned], tolerance: float) -> list[Ned]:
-    """Return the path without points that are within ``tolerance`` metres of the line through the others."""
+    """Return the path without points within ``tolerance`` metres of the line between their neighbours."""
     if len(path) < 3:
         return list(path)
     distances = [_distance_to_line(point, path[0], path[-1]) for point in path[1:-1]]
@@ -318,9 +318,9 @@ def simplify(path: Sequence[Ned], tolerance: float) -> list[Ned]:
 
 
 def prune(path: Sequence[Ned], tolerance: float) -> list[Ned]:
-    """Return the path without loops: parts that come within ``tolerance`` metres of each other are joined.
+    """Return the path without loops: segments within ``tolerance`` metres of each other are joined.
 
-    The earliest loop is removed first, and of several the longest.
+    Loops are removed in the order of their starts; of loops with the same start, only the longest.
     """
     points = list(path)
     first = 0
@@ -354,7 +354,7 @@ def _distance_to_line(point: Ned, start: Ned, end: Ned) -> float:
 
 
 def _closest_approach(one: Ned, one_end: Ned, other: Ned, other_end: Ned) -> tuple[float, Ned] | None:
-    """Return the distance of two line segments and the point midway; None if they are parallel."""
+    """Return the distance of two line segments and the midpoint between them; None if they are parallel."""
     line1, line2, between = _minus(one_end, one), _minus(other_end, other), _minus(one, other)
     a, b, c = _dot(line1, line1), _dot(line1, line2), _dot(line2, line2)
     d, e = _dot(line1, between), _dot(line2, between)

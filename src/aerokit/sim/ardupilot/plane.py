@@ -1,4 +1,4 @@
-"""`SimulatedPlane`: an ArduPlane 4.7 with fixed wings without sockets, threads or a clock of its own."""
+"""`SimulatedPlane`: an ArduPlane 4.7 with fixed wings that uses no sockets, threads or system clock."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _MIN_ANGLE_DEG, _MIN_AIRSPEED_M_S = 3.0, 5
 
 
 class PlaneArming(ArduPilotArming[PlaneHost]):
-    """Needs GPS in every mode, plausible limits, and a mode that can start on the ground."""
+    """ArduPlane's arming checks: GPS in every mode, plausible limits, and a mode that can start on the ground."""
 
     def own_reasons(self) -> list[str]:
         parameters, mode = self.vehicle.parameters, self.vehicle.mode
@@ -58,7 +58,7 @@ _FULL_AMPERES = 25.0
 
 
 class PlaneEngine(ArduPilotMotors):
-    """Engine whose throttle follows the motion model."""
+    """Engine of a plane; its throttle is that of the motion model."""
 
     @property
     def current_a(self) -> float:
@@ -72,7 +72,7 @@ class PlaneEngine(ArduPilotMotors):
 _REST_S = 1.0
 _LIFTING_MODES = range(PlaneMode.QSTABILIZE, PlaneMode.QACRO + 1)
 
-# In the order of AVAILABLE_MODES. The modes of lifting rotors do not exist, as without Q_ENABLE.
+# In the order of AVAILABLE_MODES. As with Q_ENABLE 0, modes of lifting rotors do not exist.
 _MODES: tuple[Callable[[Any], ArduPilotMode], ...] = (
     variant(
         modes.PlanePilotedMode, PlaneMode.MANUAL, "MANUAL",
@@ -102,10 +102,10 @@ _MODES: tuple[Callable[[Any], ArduPilotMode], ...] = (
 
 
 class SimulatedPlane(PlaneHost):
-    """Behaves as ArduPlane does where a client can observe it; flies with `FixedWing`.
+    """ArduPlane, as far as a client can observe it. `FixedWing` is the motion model.
 
-    Takes the arguments of `ArduPilotVehicle`. It starts on a runway along its heading. Not simulated: lifting rotors,
-    parachutes.
+    Takes the arguments of `ArduPilotVehicle`. The plane starts on a runway along its heading. Not simulated: lifting
+    rotors, parachutes.
     """
 
     KIND: ClassVar[Kind] = "plane"
@@ -124,7 +124,7 @@ class SimulatedPlane(PlaneHost):
     failsafes: PlaneFailsafes  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def make_commands(self) -> dict[int, CommandHandler]:
-        # NAV_TAKEOFF is for lifting rotors; there is no command to land.
+        # NAV_TAKEOFF needs lifting rotors; ArduPlane has no command to land.
         return {
             **common_commands(self),
             MavCmd.NAV_TAKEOFF: lambda _: MavResult.FAILED,
@@ -180,8 +180,8 @@ class SimulatedPlane(PlaneHost):
         return self.change_to(PlaneMode.AUTO)
 
     def _reposition(self, command: ReceivedCommand) -> int:
-        """Circle at a place. Param 3 is the radius, a param 4 other than 0 means anticlockwise."""
-        if command.is_long:  # ArduPilot defines no altitude frame for COMMAND_LONG here
+        """Fly to a place and circle there. Param 3 is the radius; param 4 other than 0 means anticlockwise."""
+        if command.is_long:  # COMMAND_LONG does not specify the altitude frame that ArduPilot requires here.
             return MavResult.UNSUPPORTED
         point = self.point(*command.place(), command.z, command.altitude_frame)
         if point is None:

@@ -1,7 +1,7 @@
 """AUTO and GUIDED of a simulated ArduPlane.
 
-Simulated in AUTO: take-off, waypoints, loitering without limit, for a time, for turns and to an altitude, landing,
-return to launch, delays, speed, home, jumps; servo and camera commands. Other commands are skipped.
+Simulated in AUTO: take-off, waypoints, all kinds of loitering, landing, return to launch, delays, speed, home, jumps;
+servo and camera commands. Other commands are skipped.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _ON_CIRCLE_SHARE = 1.3
 
 
 class PlaneAuto(PlaneNavigatingMode, MissionMode):
-    """Flies the mission. `MissionRun` selects the commands; after the last one the mode changes to RTL."""
+    """AUTO: `MissionRun` selects the commands; after the last command the mode changes to RTL."""
 
     number: int = PlaneMode.AUTO
     name = "AUTO"
@@ -64,7 +64,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         return self._manoeuvre == _LAND
 
     def enter(self, *, force: bool) -> bool:
-        """Start or resume the mission; without one return at once."""
+        """Start or resume the mission; without a mission change to RTL."""
         plane = self.vehicle
         if plane.mode is self and plane.is_armed and plane.mission.is_running:
             return True
@@ -78,7 +78,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
             self.vehicle.mission.start_or_resume()
 
     def disarmed(self) -> None:
-        """Do nothing: disarming has reset the progress."""
+        """Does nothing: disarming has already reset the progress."""
 
     def update(self, dt: float) -> None:
         plane = self.vehicle
@@ -156,7 +156,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         return True
 
     def _has_passed(self, index: int) -> bool:
-        """Return True within WP_RADIUS of the waypoint, or beyond it."""
+        """Return True within WP_RADIUS of the waypoint, or once the plane has passed it."""
         assert self._place is not None
         wing, (north, east, _), start = self.vehicle.wing, self._place, self._start
         distance = horizontal_distance(self.vehicle, self._place)
@@ -187,7 +187,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         plane.info(f"Landing approach start at {plane.altitude_m:.1f}m")
 
     def _return(self, _: MissionItem) -> None:
-        # RTL is a mode change (`start_command` in ArduPlane's commands_logic.cpp); the mission stops here.
+        # ArduPlane changes the mode (`start_command` in commands_logic.cpp), which stops the mission.
         self.vehicle.set_mode(PlaneMode.RTL)
 
     def _wait(self, _: MissionItem) -> None:
@@ -201,7 +201,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
     def _set_home(self, item: MissionItem) -> None:
         plane = self.vehicle
         point: Ned | None = plane.wing.place
-        if item.param1 != 1:  # unlike on Copter, zeros are a position
+        if item.param1 != 1:  # On Plane, unlike on Copter, zeros are a position.
             point = plane.point(int(item.x), int(item.y), item.z, item.frame)
         if point is not None:
             plane.navigation.set_home(point, lock=False)
@@ -220,10 +220,10 @@ class _TimedValue:
 
 
 class PlaneGuided(PlaneNavigatingMode):
-    """Circles around its target.
+    """GUIDED: flies to the target and circles there.
 
-    A commanded course is valid until a new target or no course is commanded. Bank, pitch and throttle of
-    SET_ATTITUDE_TARGET expire after three seconds each.
+    A commanded course is valid until the next target, or until it is cancelled. Bank, pitch and throttle of
+    SET_ATTITUDE_TARGET expire separately after three seconds.
     """
 
     number: int = PlaneMode.GUIDED
@@ -250,7 +250,7 @@ class PlaneGuided(PlaneNavigatingMode):
         self._course = course
 
     def set_attitude(self, message: m.SetAttitudeTarget) -> None:
-        """Follow the parts that the mask selects. A rate that is not ignored selects its angle."""
+        """Follow those of bank, pitch and throttle that the mask selects. An angle is selected by its rate's bit."""
         ignored, now = message.type_mask, self.vehicle.now
         roll, pitch, _ = euler_from_quaternion(*message.q)
         whole = not ignored & Mask.ATTITUDE_IGNORE and ignored & _RATES == _RATES
@@ -282,7 +282,7 @@ class PlaneGuided(PlaneNavigatingMode):
 
 
 class PlaneSetpoints:
-    """Handlers of set-point messages in GUIDED. Of position targets ArduPlane uses the altitude only."""
+    """Handlers of set-point messages in GUIDED. ArduPlane uses only the altitude of position targets."""
 
     def __init__(self, plane: PlaneHost) -> None:
         self._plane = plane
@@ -299,7 +299,7 @@ class PlaneSetpoints:
         return self._plane.mode is self._guided
 
     def _on_local(self, message: m.SetPositionTargetLocalNed, _: Channel) -> None:
-        """Change the altitude of the target by ``z`` metres down."""
+        """Lower the target by ``z`` metres."""
         plane, target = self._plane, self._guided.destination
         if not self._is_guided or message.coordinate_frame != MavFrame.LOCAL_OFFSET_NED or target is None:
             return
@@ -324,7 +324,7 @@ class PlaneSetpoints:
 
 
 def guided_commands(plane: PlaneHost) -> dict[int, CommandHandler]:
-    """Return the handlers of the commands that change speed, altitude and course in GUIDED."""
+    """Return handlers of the commands that change speed, altitude and course in GUIDED."""
 
     def in_guided(handler: Callable[[PlaneHost, PlaneGuided, ReceivedCommand], int]) -> CommandHandler:
         def handle(command: ReceivedCommand) -> int:
@@ -351,7 +351,10 @@ def _change_speed(plane: PlaneHost, guided: PlaneGuided, command: ReceivedComman
 
 
 def _change_altitude(plane: PlaneHost, guided: PlaneGuided, command: ReceivedCommand) -> int:
-    """Param 3 is the climb rate in m/s, 0 the maximum. The firmware refuses the altitudes 0 and -1."""
+    """Change the altitude. Param 3 is the climb rate in m/s, 0 for the maximum.
+
+    The firmware refuses the altitudes 0 and -1.
+    """
     point = plane.point(0, 0, command.z, command.altitude_frame)
     if command.z in _INVALID_ALTITUDES or point is None:
         return MavResult.DENIED
@@ -360,7 +363,7 @@ def _change_altitude(plane: PlaneHost, guided: PlaneGuided, command: ReceivedCom
 
 
 def _change_heading(_: PlaneHost, guided: PlaneGuided, command: ReceivedCommand) -> int:
-    """Params: HEADING_TYPE, degrees. Heading and course over ground are the same here; DEFAULT ends it."""
+    """Fly a course: param 1 is a HEADING_TYPE (heading and course are treated alike), param 2 is in degrees."""
     if not 0.0 <= command.param2 < 360.0:
         return MavResult.DENIED
     if command.param1 == HeadingType.DEFAULT:
@@ -373,7 +376,7 @@ def _change_heading(_: PlaneHost, guided: PlaneGuided, command: ReceivedCommand)
 
 
 def _change_target_altitude(plane: PlaneHost, command: ReceivedCommand) -> int:
-    """Params: metres, MAV_FRAME. Accepted in every mode, but only GUIDED follows it."""
+    """Change the altitude: param 1 in metres, param 2 a MAV_FRAME. Accepted in every mode, but only GUIDED uses it."""
     point = plane.point(0, 0, command.param1, whole(command.param2))
     if point is None:
         return MavResult.DENIED

@@ -1,4 +1,4 @@
-"""ArduPlane's failsafes and fence: short and long failsafe of the radio, ground station, battery."""
+"""ArduPlane's failsafes (radio, ground station, battery) and its fence."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from aerokit.sim.ardupilot.plane_modes import PlaneHost
 from aerokit.sim.motion import Ned
 
 _NONE, _SHORT, _LONG, _GCS = range(4)
-# The throttle failsafe starts after 1 s without pulses and a count of 0.2 s.
+# The throttle failsafe starts 0.2 s after the throttle is low, or after 1 s without pulses.
 _SILENT_S, _COUNT_S = 1.0, 0.2
 # FS_SHORT_ACTN, FS_LONG_ACTN, FS_GCS_ENABL and the battery actions.
 _SHORT_BEST_GUESS, _SHORT_FBWA, _SHORT_DISABLED, _SHORT_FBWB = 0, 2, 3, 4
@@ -37,10 +37,11 @@ _LONG_MODES: dict[int, tuple[int, ...]] = {
 
 
 class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
-    """FS_SHORT_ACTN a second after the loss of the radio, FS_LONG_ACTN FS_LONG_TIMEOUT later; armed or not.
+    """Failsafes of radio, ground station and battery, which act on armed and disarmed planes.
 
-    If the radio returns during the short failsafe, the previous mode is restored. Not simulated: the weak signal of
-    FS_GCS_ENABL 2, parachutes, termination.
+    FS_SHORT_ACTN is executed a second after the radio is lost, FS_LONG_ACTN after a further FS_LONG_TIMEOUT. The
+    previous mode is restored if the radio returns before that. Not simulated: the weak signal of FS_GCS_ENABL 2,
+    parachutes, termination.
     """
 
     BATTERY_PRIORITIES: ClassVar[tuple[int, ...]] = (_TERMINATE, _PARACHUTE, _QLAND, _LAND, _BATTERY_RTL, 0)
@@ -172,7 +173,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         return self.vehicle.mode.number == PlaneMode.TAKEOFF and self.vehicle.mode.is_taking_off
 
     def _resume_pending(self) -> None:
-        """Start the long failsafe that had to wait for the end of a take-off."""
+        """Start a long failsafe that was postponed until the end of a take-off."""
         if self._is_pending and not self._is_in_take_off:
             self._is_pending = False
             if self.vehicle.mode.number == PlaneMode.TAKEOFF:
@@ -191,14 +192,14 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
                 self.change_to(*first, PlaneMode.RTL)
 
     def refuse_termination(self) -> None:
-        """Report why the flight is not terminated: AFS_ENABLE is 0, or AFS_TERM_ACTION is not set."""
+        """Send the reason why the flight is not terminated: AFS_ENABLE is 0, or AFS_TERM_ACTION is not set."""
         text = "AFS not enabled, can't terminate the vehicle"
         if self.vehicle.parameters["AFS_ENABLE"]:
             text = "Unable to terminate, termination is not configured"
         self.warn(text, MavSeverity.INFO)
 
     def _land_by_mission(self) -> bool:
-        """Jump to DO_LAND_START and change to AUTO; return False if there is none."""
+        """Change to AUTO at DO_LAND_START; return False if the mission does not contain it."""
         plane = self.vehicle
         items = enumerate(plane.missions.commands.items())
         start = next((index for index, item in items if item.command == MavCmd.DO_LAND_START), None)
@@ -216,10 +217,10 @@ _RETURNS = frozenset({_RTL, _GUIDED, _GUIDED_THROTTLE, _AUTOLAND})
 
 
 class PlaneFence(ArduPilotFence[PlaneHost]):
-    """FENCE_ACTION: nothing (0), RTL (1), GUIDED to the return point (6, 7), AUTOLAND or RTL (8).
+    """Fence. FENCE_ACTION: report only (0), RTL (1), GUIDED to the return point (6, 7), AUTOLAND or RTL (8).
 
-    During a return other breaches are ignored. If the fence is disabled on the way to the return point, the previous
-    mode is restored.
+    Further breaches are ignored during a return. Disabling the fence on the way to the return point restores the
+    previous mode.
     """
 
     CIRCLE_BACKUP_M: ClassVar[float] = 100.0
@@ -251,7 +252,7 @@ class PlaneFence(ArduPilotFence[PlaneHost]):
             plane.guided.go_to(self.return_place())
 
     def return_place(self) -> Ned:
-        """Return the fence's return point or home, at FENCE_RET_ALT or half-way between the altitude limits."""
+        """Return the uploaded return point or home, at FENCE_RET_ALT or half-way between the altitude limits."""
         plane, parameters = self.vehicle, self.vehicle.parameters
         home = plane.home_or_ground
         if parameters["FENCE_RET_RALLY"]:

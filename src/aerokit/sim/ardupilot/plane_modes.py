@@ -1,4 +1,4 @@
-"""ArduPlane's landing, and its flight modes except AUTO and GUIDED. The table of modes is in `plane`."""
+"""ArduPlane's landing, and its flight modes except AUTO and GUIDED."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from aerokit.sim.vehicle_motion import FixedWing
 
 
 class PlaneHost(ArduPilotVehicle):
-    """An aeroplane as its modes and failsafes see it."""
+    """Interface of a plane that its modes and failsafes use."""
 
     def make_motion(self, wind: SimulatedWind | None) -> Motion:
         self.wing: FixedWing = FixedWing(self.rng, wind=wind)
-        """The motion model; the same as ``motion``."""
+        """The motion model; the same object as ``motion``."""
         self._read_limits()
         return self.wing
 
@@ -32,7 +32,7 @@ class PlaneHost(ArduPilotVehicle):
 
     def reset_controllers(self) -> None:
         self.take_off_yaw: float | None = None
-        """Heading of the take-off in radians; None before."""
+        """Heading of the take-off in radians; None before the first take-off."""
         self.rest_timer: ConditionTimer = ConditionTimer()
 
     @property
@@ -41,15 +41,15 @@ class PlaneHost(ArduPilotVehicle):
 
     @property
     def home_or_ground(self) -> Ned:
-        """Home, or the ground at the power-on location while home is not set."""
+        """Home, or the power-on location while home is not set."""
         return self.navigation.home or (0.0, 0.0, self.wing.ground_down)
 
     def is_valid_airspeed(self, airspeed: float) -> bool:
-        """Return True from AIRSPEED_MIN to AIRSPEED_MAX (m/s)."""
+        """Return True if an airspeed (m/s) is within AIRSPEED_MIN and AIRSPEED_MAX."""
         return self.parameters["AIRSPEED_MIN"] <= airspeed <= self.parameters["AIRSPEED_MAX"]
 
     def lift_off(self) -> None:
-        """Start to move: first on the ground, then in the air."""
+        """Leave the landed state at the start of a take-off roll."""
         if self.is_landed:
             self._read_limits()
             self.is_landed: bool = False
@@ -57,7 +57,7 @@ class PlaneHost(ArduPilotVehicle):
             self.take_off_yaw = self.wing.yaw
 
     def climb_out(self) -> None:
-        """Fly straight on with full throttle, and climb once the airspeed suffices."""
+        """Keep the take-off heading at cruise speed, and climb once the airspeed suffices."""
         wing = self.wing
         self.lift_off()
         if wing.is_on_ground:
@@ -74,7 +74,10 @@ _CORRECTION_LENGTH_M = 80.0
 
 
 class PlaneLanding:
-    """Landing on ``point``: approach, flare, roll-out, disarming. With ``start`` the approach begins there."""
+    """Landing on ``point``: approach, flare, roll-out, disarming.
+
+    The approach begins at ``start``; None begins it at the current position.
+    """
 
     def __init__(self, plane: PlaneHost, point: Ned, start: Ned | None = None) -> None:
         self._plane = plane
@@ -107,7 +110,7 @@ class PlaneLanding:
         plane, wing, (north, east, down) = self._plane, self._plane.wing, self.point
         course = math.atan2(east - self._from[1], north - self._from[0])
         cos_course, sin_course = math.cos(course), math.sin(course)
-        # Metres to go along the approach (negative beyond the point), and metres off the approach line.
+        # Metres to the point along the approach line (negative beyond the point), and metres beside that line.
         remaining = (north - wing.north) * cos_course + (east - wing.east) * sin_course
         aside = (east - wing.east) * cos_course - (north - wing.north) * sin_course
         flare_time = wing.velocity_down * plane.parameters["LAND_FLARE_SEC"]
@@ -128,7 +131,7 @@ class PlaneLanding:
         self._plane.info(f"Flare {height:.1f}m sink={sink:.2f} speed={speed:.1f} dist={remaining:.1f}")
 
     def _wait(self) -> None:
-        """Disarm LAND_DISARMDELAY after the stop."""
+        """Disarm LAND_DISARMDELAY seconds after the plane has stopped."""
         plane, wing = self._plane, self._plane.wing
         if math.isnan(self._stopped_at):
             self._stopped_at = plane.now
@@ -149,7 +152,7 @@ _NAVIGATES = MavModeFlag.GUIDED_ENABLED | MavModeFlag.STABILIZE_ENABLED
 
 
 class PlaneModeBase(ArduPilotMode):
-    """Base of ArduPlane's modes, which can be entered without a position."""
+    """Base of ArduPlane's modes. All of them can be entered without a position."""
 
     vehicle: PlaneHost
     needs_position = False
@@ -162,7 +165,7 @@ class PlaneModeBase(ArduPilotMode):
 
 
 class PlanePilotedMode(PlaneModeBase):
-    """Bank, climb and speed by the sticks; it glides with a low throttle."""
+    """Base of the piloted modes: sticks control bank, climb and speed; with a low throttle the plane glides."""
 
     has_manual_throttle = True
 
@@ -173,7 +176,7 @@ class PlanePilotedMode(PlaneModeBase):
             wing.roll_out()
             return
         plane.lift_off()
-        climb = self.stick(1) * wing.wing.climb_m_s  # a stick that is pulled back is above the middle
+        climb = self.stick(1) * wing.wing.climb_m_s  # Pulling the stick gives positive values.
         if plane.rc[2] <= _LOW_THROTTLE:
             climb = min(climb, 0.0) - wing.wing.glide_sink_m_s
         speed = max(throttle * 2 * plane.cruise_m_s, 0.0)
@@ -181,7 +184,7 @@ class PlanePilotedMode(PlaneModeBase):
 
 
 class PlaneAltitudeMode(PlaneModeBase):
-    """Base of modes that hold altitude and speed and roll out on the ground."""
+    """FBWB, and base of modes that hold altitude and speed; on the ground the plane rolls to a stop."""
 
     def __init__(self, plane: PlaneHost) -> None:
         super().__init__(plane)
@@ -204,13 +207,13 @@ class PlaneAltitudeMode(PlaneModeBase):
         return self.stick(1) * self.vehicle.parameters["FBWB_CLIMB_RATE"]
 
     def steer(self, climb: float) -> None:
-        """Bank by the stick."""
+        """Bank as the roll stick commands, with this climb rate."""
         wing = self.vehicle.wing
         wing.bank_and_climb(self.vehicle.cruise_m_s, self.stick(0) * wing.wing.bank_rad, climb)
 
 
 class PlaneCruise(PlaneAltitudeMode):
-    """Like FBWB, but holds the course over ground while the roll stick is centred."""
+    """CRUISE: like FBWB, but holds the course over ground while the roll stick is centred."""
 
     def __init__(self, plane: PlaneHost) -> None:
         super().__init__(plane)
@@ -228,7 +231,7 @@ class PlaneCruise(PlaneAltitudeMode):
 
 
 class PlaneCircle(PlaneAltitudeMode):
-    """Turns gently at a constant altitude, without GPS."""
+    """CIRCLE: turns with a small bank angle at constant altitude, without GPS."""
 
     flags: int = _NAVIGATES
 
@@ -241,7 +244,7 @@ class PlaneCircle(PlaneAltitudeMode):
 
 
 class PlaneNavigatingMode(PlaneModeBase):
-    """Flies to a place and circles there: by default the place where the mode was entered."""
+    """LOITER, and base of modes that fly to a place and circle there; by default where the mode was entered."""
 
     flags: int = _NAVIGATES
 
@@ -274,7 +277,7 @@ class PlaneNavigatingMode(PlaneModeBase):
 
 
 class PlaneRtl(PlaneNavigatingMode):
-    """Returns to home at RTL_ALTITUDE (negative: the present altitude) or to a rally point, and circles there."""
+    """RTL: flies to a rally point or home and circles there, at RTL_ALTITUDE (negative: the current altitude)."""
 
     can_arm = False
 
@@ -289,7 +292,7 @@ class PlaneRtl(PlaneNavigatingMode):
 
 
 class PlaneTakeOff(PlaneNavigatingMode):
-    """Takes off once armed, climbs to TKOFF_ALT and circles TKOFF_DIST ahead."""
+    """TAKEOFF: takes off once armed, climbs to TKOFF_ALT and circles TKOFF_DIST ahead of the start."""
 
     def enter(self, *, force: bool) -> bool:
         super().enter(force=force)
@@ -326,13 +329,16 @@ class PlaneTakeOff(PlaneNavigatingMode):
 
 
 class PlaneAutoland(PlaneNavigatingMode):
-    """Lands where it took off, in the same direction. Needs flight; armed again after landing, it disarms at once."""
+    """AUTOLAND: lands at home in the direction of the take-off. It can only be entered in flight.
+
+    If the plane is armed again after landing, it disarms at once.
+    """
 
     is_landing = True
 
     def enter(self, *, force: bool) -> bool:
         plane = self.vehicle
-        if plane.mode is self and plane.is_landed:  # armed again after landing
+        if plane.mode is self and plane.is_landed:  # Arming in AUTOLAND enters it again.
             return True
         if plane.is_landed:
             plane.send_text(MavSeverity.WARNING, "Must already be flying!")

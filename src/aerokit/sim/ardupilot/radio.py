@@ -23,9 +23,9 @@ _ROLL, _PITCH, _THROTTLE, _YAW, _FORWARD, _LATERAL = range(6)
 
 
 class ArduPilotRadio:
-    """RC channels in microseconds, from index 0 (``radio[2]`` is the throttle), overrides included.
+    """RC channels: pulse widths in microseconds by index (``radio[2]`` is the throttle), with overrides applied.
 
-    Setting an item moves a stick or switch of the transmitter, which has eight.
+    Assigning an item moves one of the transmitter's eight sticks and switches.
     """
 
     def __init__(self, vehicle: ArduPilotHost) -> None:
@@ -53,7 +53,7 @@ class ArduPilotRadio:
 
     @property
     def channels(self) -> tuple[int, ...]:
-        """The 18 channels of RC_CHANNELS; 0 where the transmitter has none."""
+        """The 18 channels of RC_CHANNELS; 0 for channels that the transmitter lacks."""
         if not self._overrides and self._failure != _LOW_THROTTLE:
             return (*self._sticks, *(0,) * (_CHANNELS - len(self._sticks)))
         return tuple(self[index] for index in range(_CHANNELS))
@@ -68,7 +68,7 @@ class ArduPilotRadio:
         return any(value and since > limit for value, since in self._overrides.values())
 
     def override(self, pulses: Mapping[int, int]) -> None:
-        """Override channels, by index from 0, for RC_OVERRIDE_TIME; 0 releases a channel."""
+        """Override channels (index → µs) for RC_OVERRIDE_TIME; 0 releases a channel."""
         for index, value in pulses.items():
             self._overrides[index] = (value, self._vehicle.now)
 
@@ -77,7 +77,7 @@ class ArduPilotRadio:
         return self._vehicle.parameters.get("SIM_RC_FAIL", 0.0)
 
     def release_overrides(self) -> None:
-        """Drop all overrides, as a reboot or a lost ground station does."""
+        """Drop all overrides, as a reboot or the loss of the ground station does."""
         self._overrides.clear()
 
     def listen(self) -> None:
@@ -85,12 +85,12 @@ class ArduPilotRadio:
         self._vehicle.on(m.RcChannelsOverride, self._on_override)
 
     def _override_time(self) -> float:
-        """Seconds that an override is valid; a negative RC_OVERRIDE_TIME means no limit."""
+        """Return the seconds for which an override is valid; a negative RC_OVERRIDE_TIME means no limit."""
         seconds = self._vehicle.parameters["RC_OVERRIDE_TIME"]
         return math.inf if seconds < 0 else seconds
 
     def _on_override(self, override: m.RcChannelsOverride, _: Channel) -> None:
-        """Accept overrides of the ground station MAV_GCS_SYSID only. 0 releases channels 1 to 8 only."""
+        """Apply overrides of the ground station MAV_GCS_SYSID. 0 releases a channel only from 1 to 8."""
         vehicle = self._vehicle
         if sender_of(override)[0] != vehicle.parameters["MAV_GCS_SYSID"]:
             return
@@ -111,8 +111,8 @@ _CENTRE, _SUB_MIN_PWM, _SUB_MAX_PWM, _SUB_SCALE = 1500, 1100, 1900, 0.4
 class ArduPilotJoystick:
     """MANUAL_CONTROL of Copter and Plane: x is pitch, y roll, z throttle (0 to 1000), r yaw (-1000 to 1000).
 
-    Only messages of the ground station MAV_GCS_SYSID to this vehicle count; they also count as its heartbeat. Axes are
-    overrides like those of RC_CHANNELS_OVERRIDE; an axis without a value releases its channel.
+    Only messages from the ground station MAV_GCS_SYSID to this vehicle are used; they also count as its heartbeats.
+    Axes become overrides like those of RC_CHANNELS_OVERRIDE; an axis without a value releases its channel.
     """
 
     def __init__(self, vehicle: ArduPilotHost) -> None:
@@ -138,15 +138,15 @@ class ArduPilotJoystick:
         }
 
     def pulse(self, channel: int, value: int, *, lowest: int = -1000, reverse: bool = False) -> int:
-        """Scale an axis to RCn_MIN … RCn_MAX; 0 if it has no value."""
+        """Scale an axis to RCn_MIN … RCn_MAX; return 0 for an axis without a value."""
         if value == _NO_VALUE:
             return 0
         low, high = self.setting(f"RC{channel + 1}_MIN", 1100.0), self.setting(f"RC{channel + 1}_MAX", 1900.0)
         share = ((-value if reverse else value) - lowest) / (1000 - lowest)
-        return int(low + (high - low) * share) & 0xFFFF  # the firmware does not check the range of an axis
+        return int(low + (high - low) * share) & 0xFFFF  # The firmware does not check the range of an axis.
 
     def setting(self, name: str, default: float) -> float:
-        """Return a parameter that a small parameter table may lack."""
+        """Return a parameter, or the default if the parameter table lacks it."""
         return self._vehicle.parameters.get(name, default)
 
 
@@ -179,7 +179,7 @@ _SERVOS = 32
 _RELAYS = {"rover": 2}
 _FUNCTIONS = 320
 _SAVE_WAYPOINT = 7
-# RC options that the firmwares refused in SITL.
+# Auxiliary functions that the firmwares refused in SITL.
 _REFUSED_FUNCTIONS: dict[Kind, tuple[int, ...]] = {
     "copter": (0,),
     "plane": (0, _SAVE_WAYPOINT),
@@ -191,7 +191,7 @@ _AUX_POSITIONS = (0.0, 1.0, 2.0)
 
 
 class AuxiliaryOutputs:
-    """Servos, relays and auxiliary switches, as DO_SET_SERVO, DO_SET_RELAY and DO_AUX_FUNCTION set them."""
+    """Servos, relays and auxiliary switches, set by DO_SET_SERVO, DO_SET_RELAY and DO_AUX_FUNCTION."""
 
     def __init__(self, vehicle: ArduPilotHost) -> None:
         self._vehicle = vehicle
@@ -204,7 +204,7 @@ class AuxiliaryOutputs:
         return _RELAYS.get(self._vehicle.KIND, 1)
 
     def is_free(self, output: int) -> bool:
-        """Return True if an output has no function (SERVOn_FUNCTION), or follows a stick."""
+        """Return True if SERVOn_FUNCTION assigns an output no function or only a stick."""
         return self._vehicle.parameters.get(f"SERVO{output}_FUNCTION", 0) in _FREE_FUNCTIONS
 
     def set_servo(self, command: ReceivedCommand) -> int:
@@ -226,7 +226,7 @@ class AuxiliaryOutputs:
         return MavResult.ACCEPTED
 
     def repeat_relay(self, command: ReceivedCommand) -> int:
-        """Execute DO_REPEAT_RELAY, which leaves the relay in its present state."""
+        """Execute DO_REPEAT_RELAY, after which the relay has its previous state."""
         is_valid = 0 <= command.param1 < self.relay_count
         return MavResult.ACCEPTED if is_valid else MavResult.FAILED
 

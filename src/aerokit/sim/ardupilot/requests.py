@@ -1,4 +1,4 @@
-"""Streams and single messages of a simulated ArduPilot: by id and interval, by stream group, or once."""
+"""Requests for streams (by message id or stream group) and for single messages of a simulated ArduPilot."""
 
 from __future__ import annotations
 
@@ -49,24 +49,24 @@ DISPLAY_VALUES: dict[str, float] = {
 class ArduPilotMessageRequests:
     """SET_MESSAGE_INTERVAL, GET_MESSAGE_INTERVAL, REQUEST_MESSAGE and REQUEST_DATA_STREAM.
 
-    Stream rates are parameters of the port (MAV1_EXTRA1 and so on), read at the start. REQUEST_DATA_STREAM changes
-    them: Plane saves and announces the change, the other firmwares undo it at the next reboot.
+    Stream rates are parameters of the port (MAV1_EXTRA1 …), which take effect at boot. REQUEST_DATA_STREAM changes
+    them: Plane saves and broadcasts the change, the other firmwares undo it at the next reboot.
     """
 
     def __init__(self, vehicle: ArduPilotHost, *, stream_groups: bool = True) -> None:
         self._vehicle = vehicle
         self._supported = _SUPPORTED_MESSAGES[vehicle.KIND]
-        # Messages of each stream; some of them are sent only under conditions.
+        # Stream group → ids of its messages; some messages are sent only under conditions.
         self._groups: dict[int, tuple[int, ...]] = dict.fromkeys(_RATE_PARAMETERS, ())
         for stream, message_id, _ in rows_of(vehicle.KIND, "stream_groups.csv"):
             self._groups[Stream[stream]] += (int(message_id),)
-        # Rate parameter → saved value, and the value that replaces it until the next reboot.
+        # Rate parameter → value after the next reboot, and the value until then.
         self._saved: dict[str, tuple[float, int]] = {}
         if stream_groups:
             vehicle.on(m.RequestDataStream, self._on_group)
 
     def set_interval(self, command: ReceivedCommand) -> int:
-        """Set an interval in microseconds; -1 is off, 0 the default (off, except for the heartbeat)."""
+        """Set an interval in microseconds; -1 is off, 0 is the default (one second for HEARTBEAT, else off)."""
         message_id, interval_us = whole(command.param1), whole(command.param2)
         if command.param3 != 0.0:
             return MavResult.DENIED
@@ -109,7 +109,7 @@ class ArduPilotMessageRequests:
         return MavResult.ACCEPTED
 
     def send_soon(self, message_id: int, channel: Channel) -> None:
-        """Send a message after the present answer."""
+        """Send a message after the acknowledgement that is sent now."""
 
         def send() -> None:
             message = self._vehicle.build(message_id)
@@ -119,7 +119,7 @@ class ArduPilotMessageRequests:
         self._vehicle.call_later(0.0, send)
 
     def _send_modes(self, index: int, channel: Channel) -> None:
-        """Send the mode with this index (from 1), or all for 0, and AVAILABLE_MODES_MONITOR every 5 s afterwards."""
+        """Send the mode with this index (from 1; 0 for all), and AVAILABLE_MODES_MONITOR every 5 s from now on."""
         vehicle = self._vehicle
         modes = vehicle.available_modes()
         for message in modes if index == 0 else modes[index - 1 : index]:
@@ -139,7 +139,7 @@ class ArduPilotMessageRequests:
             self._store_rate(f"{self._prefix(channel)}ADSB", rate)
 
     def start_channel(self, channel: Channel, first: float) -> None:
-        """Start the streams that the port's parameters select, at the time ``first``."""
+        """Start the streams that the port's parameters select; ``first`` is the time of the first messages."""
         for stream, suffix in _RATE_PARAMETERS.items():
             rate = self._vehicle.parameters.get(f"{self._prefix(channel)}{suffix}", 0.0)
             if rate > 0:

@@ -1,4 +1,4 @@
-"""`SimulatedRover`: an ArduRover 4.7 car without sockets, threads or a clock of its own."""
+"""`SimulatedRover`: an ArduRover 4.7 car that uses no sockets, threads or system clock."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ _NEEDS_LOCATION = 1
 
 
 class RoverArming(ArduPilotArming[RoverHost]):
-    """Needs a position only in modes that use it, or always with ARMING_NEED_LOC."""
+    """ArduRover's arming checks: a position only in modes that use it, or in all modes with ARMING_NEED_LOC."""
 
     def ahrs_reasons(self) -> Sequence[str]:
-        return ()  # checked after GPS, in `position_reasons`
+        return ()  # `position_reasons` checks the estimator after GPS.
 
     def position_reasons(self) -> Sequence[str]:
         """Check GPS, then the estimator and its position."""
@@ -59,7 +59,7 @@ class RoverArming(ArduPilotArming[RoverHost]):
         self.vehicle.path.reset()
 
     def disarm(self, *, force: bool = True) -> bool:
-        """Disarm at any time. The place becomes home unless home was set by a command."""
+        """Disarm, even while driving. The current place becomes home unless a command has set home."""
         rover, was_armed = self.vehicle, self.vehicle.is_armed
         if not super().disarm(force=True):
             return False
@@ -90,10 +90,10 @@ _DRIVES_ITSELF = frozenset(
 
 
 class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
-    """FS_ACTION follows FS_TIMEOUT after the loss of radio or ground station, armed or not, except in RTL and HOLD.
+    """Failsafes. FS_ACTION is executed FS_TIMEOUT after radio or ground station are lost, except in RTL and HOLD.
 
-    Both are one failsafe in the firmware. The link that is checked first after the time-out gives it its name, so a
-    lost ground station is reported as "Radio Failsafe" if the radio is checked too.
+    It is also executed on a disarmed rover. The firmware treats both links as one failsafe and names it after the link
+    that it checks first: if it checks the radio too, it reports a lost ground station as "Radio Failsafe".
     """
 
     BATTERY_PRIORITIES: ClassVar[tuple[int, ...]] = (
@@ -109,7 +109,7 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
 
     @property
     def is_any_active(self) -> bool:
-        return bool(self._triggered) or self.estimator  # a low battery is not critical here
+        return bool(self._triggered) or self.estimator  # On Rover a low battery is not MAV_STATE_CRITICAL.
 
     def update(self) -> None:
         self._check_radio()
@@ -163,7 +163,7 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
         return rover.mode.number != RoverMode.RTL
 
     def act_on_battery(self, action: int) -> None:
-        """Execute an action; those of FS_ACTION and the battery are the same."""
+        """Execute an action of FS_ACTION or of the battery failsafe, which have the same numbers."""
         if action == _TERMINATE:
             self.vehicle.arming.disarm()
         else:
@@ -189,7 +189,7 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
             self.warn("EKF failsafe", MavSeverity.CRITICAL)
 
     def _check_wheels(self) -> None:
-        """Detect that the rover does not move although it should (FS_CRASH_CHECK)."""
+        """Detect a rover that does not move although its mode drives it (FS_CRASH_CHECK)."""
         rover, action = self.vehicle, int(self.vehicle.parameters["FS_CRASH_CHECK"])
         tries = rover.is_armed and rover.mode.number in _DRIVES_ITSELF and rover.faults.motor_failed
         is_stuck = bool(action) and tries and rover.motion.ground_speed_m_s < _STUCK_M_S
@@ -205,7 +205,10 @@ _HOLD_BEYOND_M = 100.0
 
 
 class RoverFence(ArduPilotFence[RoverHost]):
-    """FENCE_ACTION has the actions of FS_ACTION; HOLD far outside. There are no altitude limits and no texts."""
+    """Fence. FENCE_ACTION has the actions of FS_ACTION; more than 100 m outside the rover changes to HOLD.
+
+    It has no altitude limits and sends no texts.
+    """
 
     PERIOD_S: ClassVar[float] = 0.1
     CHECKS_DISARMED: ClassVar[bool] = True
@@ -229,7 +232,10 @@ class RoverFence(ArduPilotFence[RoverHost]):
 
 
 class RoverSetpoints(GuidedSetpoints):
-    """Accepts a heading or turn rate without a velocity; thrust is a share of the waypoint speed."""
+    """Handlers of set-point messages. ArduRover also accepts a heading or a turn rate without a velocity.
+
+    Thrust is a share of the waypoint speed.
+    """
 
     vehicle: RoverHost  # pyright: ignore[reportIncompatibleVariableOverride]
 
@@ -237,11 +243,11 @@ class RoverSetpoints(GuidedSetpoints):
         self.vehicle.info(f"Ignoring {message.NAME}; set ACC_IGNORE in mask")
 
     def is_complete(self, target: GuidedTarget) -> bool:
-        # Heading and turn rate together are refused without a velocity.
+        # Without a velocity, either a heading or a turn rate is accepted, but not both.
         return super().is_complete(target) or (target.yaw is None) != (target.yaw_rate is None)
 
     def steer(self, message: SetAttitudeTarget) -> None:
-        """Drive with the thrust; a turn rate has precedence over the heading."""
+        """Drive at the speed of the thrust; a turn rate has precedence over the heading."""
         if message.type_mask & AttitudeMask.THROTTLE_IGNORE:
             return
         speed = self.vehicle.waypoint_speed * max(-1.0, min(1.0, message.thrust))
@@ -274,13 +280,13 @@ _MANUAL_INPUT = frozenset({"MANU", "ACRO", "STER"})
 
 
 class SimulatedRover(RoverHost):
-    """Behaves as ArduRover does where a client can observe it; drives with `GroundMotion`.
+    """ArduRover, as far as a client can observe it. `GroundMotion` is the motion model.
 
-    Takes the arguments of `ArduPilotVehicle`. It has 1,235 parameters. Simulated: MANUAL, ACRO, STEERING and SIMPLE by
-    the sticks, HOLD, LOITER and CIRCLE (standing), AUTO, GUIDED, RTL and SMART_RTL. Take-off and landing are unknown
-    commands.
+    Takes the arguments of `ArduPilotVehicle`. It has 1,235 parameters. Simulated modes: MANUAL, ACRO, STEERING and
+    SIMPLE (driven by the sticks), HOLD, LOITER and CIRCLE (which only stop), AUTO, GUIDED, RTL and SMART_RTL. Commands
+    to take off and land are UNSUPPORTED.
 
-    Not simulated: boats, driving in circles, slowing down before a fence.
+    Not simulated: boats, driving in circles, braking before a fence.
     """
 
     KIND: ClassVar[Kind] = "rover"
@@ -298,7 +304,7 @@ class SimulatedRover(RoverHost):
     JOYSTICK: ClassVar[type[ArduPilotJoystick]] = RoverJoystick
 
     def make_motion(self, wind: SimulatedWind | None) -> GroundMotion:
-        """Create the motion model with the present limits; wind is reported but has no effect."""
+        """Create the motion model with the limits of the parameters; wind is reported but has no effect."""
         parameters = self.parameters
         limits = GroundLimits(
             acceleration_m_s2=parameters["ATC_ACCEL_MAX"] or 1.0,

@@ -19,7 +19,7 @@ _THROTTLE = 2
 
 
 class RoverHost(RoverSubVehicle):
-    """A rover as its modes and failsafes see it."""
+    """Interface of a rover that its modes and failsafes use."""
 
     motion: GroundMotion  # pyright: ignore[reportIncompatibleVariableOverride]
 
@@ -33,7 +33,7 @@ class RoverHost(RoverSubVehicle):
 
     @property
     def top_speed(self) -> float:
-        """SPEED_MAX in m/s, or the speed that CRUISE_SPEED at CRUISE_THROTTLE implies."""
+        """SPEED_MAX in m/s; if that is 0, CRUISE_SPEED extrapolated from CRUISE_THROTTLE to full throttle."""
         parameters = self.parameters
         return parameters["SPEED_MAX"] or 100.0 * parameters["CRUISE_SPEED"] / parameters["CRUISE_THROTTLE"]
 
@@ -42,7 +42,7 @@ class RoverHost(RoverSubVehicle):
         return self.parameters["WP_SPEED"] or self.parameters["CRUISE_SPEED"]
 
     def has_arrived(self, place: Ned) -> bool:
-        """Return True at a place where the rover stops, or just beyond it."""
+        """Return True if the rover has reached a place where it stops, or just passed it."""
         motion = self.motion
         north, east = place[0] - motion.north, place[1] - motion.east
         away = math.hypot(north, east)
@@ -51,7 +51,7 @@ class RoverHost(RoverSubVehicle):
         return away <= _ARRIVED_M or (behind and away <= near and motion.ground_speed_m_s > _STANDING_M_S)
 
     def has_passed(self, place: Ned) -> bool:
-        """Return True within WP_RADIUS of a place where the rover does not stop."""
+        """Return True within WP_RADIUS of a place that the rover only passes."""
         motion = self.motion
         away = math.hypot(place[0] - motion.north, place[1] - motion.east)
         return away <= self.parameters["WP_RADIUS"]
@@ -71,14 +71,14 @@ class _Manual(_Mode):
 
 
 class _Hold(_Mode):
-    """Stands still; a boat would drive back."""
+    """HOLD, LOITER and CIRCLE: stops and stays there."""
 
     def update(self, dt: float) -> None:
         self.vehicle.motion.stop()
 
 
 class _Rtl(_Mode):
-    """Drives straight to home or a rally point with RTL_SPEED or WP_SPEED, and stays armed there."""
+    """RTL: drives straight to home or a rally point with RTL_SPEED or WP_SPEED, and stays armed there."""
 
     can_arm = False
     can_change_speed = True
@@ -120,7 +120,7 @@ class _Rtl(_Mode):
 
 
 class _SmartRtl(_Rtl):
-    """Returns along the recorded path without its loops. See `SmartPath`."""
+    """SMART_RTL: returns along the simplified path. See `SmartPath`."""
 
     returns_on_path = True
 
@@ -165,12 +165,12 @@ class RoverAuto(RoverSubAuto):
         return f"{text}. Loiter for {seconds:.0f} seconds" if seconds > 0 else text
 
     def finish(self) -> None:
-        # Of MIS_DONE_BEHAVE only standing is simulated.
+        # Only MIS_DONE_BEHAVE 0 (HOLD) is simulated.
         self.vehicle.send_text(MavSeverity.NOTICE, "Mission Complete")
 
 
 class RoverGuided(_Mode):
-    """GUIDED: drives to a place, or with a velocity and turn rate for three seconds."""
+    """GUIDED: drives to a place, or for three seconds with a velocity and turn rate."""
 
     number: int = RoverMode.GUIDED
     name = "GUID"

@@ -1,4 +1,4 @@
-"""Base of the simulated Rover and Sub: vehicles without take-off and landing, their guided targets and missions."""
+"""Base of the simulated Rover and Sub, which neither take off nor land: guided targets and missions."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ _FIXED = frozenset({MavFrame.LOCAL_NED, MavFrame.LOCAL_OFFSET_NED})
 
 @dataclass(frozen=True)
 class GuidedTarget:
-    """Target of one set-point message in the world frame; None is not given."""
+    """Target of a set-point message, in the world frame; None means not given."""
 
     position: Ned | None = None
     velocity: Ned | None = None
     backwards: bool = False
-    """Reverse: a velocity against the first axis together with a heading or a turn rate."""
+    """True for reverse: the velocity's first component is negative, and a heading or turn rate is given."""
     yaw: float | None = None
     yaw_rate: float | None = None
     timeout_s: float = 3.0
-    """Validity of a velocity; a position stays."""
+    """Seconds for which a velocity is valid; a position does not expire."""
 
 
 class GuidedTargetMode(Protocol):
-    """The mode that follows targets."""
+    """Interface of a mode that follows targets."""
 
     number: int
 
@@ -49,14 +49,14 @@ class GuidedTargetMode(Protocol):
 
 
 class GuidedSetpoints:
-    """Handlers of the set-point messages, which ignore invalid messages. A subclass sets what its firmware supports."""
+    """Handlers of the set-point messages; invalid messages are ignored. Subclasses select what a firmware supports."""
 
     BODY_FRAMES: ClassVar[frozenset[int]] = _BODY
-    """MAV_FRAMEs with vectors relative to the heading."""
+    """MAV_FRAMEs whose vectors are relative to the heading."""
     RELATIVE_YAW_FRAMES: ClassVar[frozenset[int]] = _BODY
-    """MAV_FRAMEs with a yaw relative to the heading."""
+    """MAV_FRAMEs whose yaw is relative to the heading."""
     GLOBAL_YAW: ClassVar[bool] = True
-    """True if yaw and turn rate of global targets are used."""
+    """True if the firmware uses yaw and turn rate of global targets."""
 
     def __init__(self, vehicle: ArduPilotVehicle, mode: GuidedTargetMode) -> None:
         self.vehicle: ArduPilotVehicle = vehicle
@@ -66,14 +66,14 @@ class GuidedSetpoints:
         vehicle.on(SetAttitudeTarget, self._on_attitude)
 
     def refuse_acceleration(self, message: PositionTarget) -> None:
-        """Called for a message with an acceleration, which is ignored."""
+        """Called for a message that is ignored because it contains an acceleration."""
 
     def steer(self, message: SetAttitudeTarget) -> None:
         """Execute SET_ATTITUDE_TARGET."""
         raise NotImplementedError
 
     def is_complete(self, target: GuidedTarget) -> bool:
-        """Return True if the target is sufficient to move."""
+        """Return True if the firmware accepts this combination of values."""
         return target.position is not None or target.velocity is not None
 
     @property
@@ -124,7 +124,7 @@ class RoverSubVehicle(ArduPilotVehicle):
 
     @property
     def is_at_rest(self) -> bool:
-        """True if nothing moves while the vehicle is disarmed."""
+        """True if the vehicle does not move."""
         raise NotImplementedError
 
     @property
@@ -138,7 +138,7 @@ class RoverSubVehicle(ArduPilotVehicle):
 
     @is_landed.setter
     def is_landed(self, _: bool) -> None:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Ignored: there is no take-off."""
+        """Ignore the value, because these vehicles do not take off."""
 
     def stick(self, index: int) -> float:
         """Return a stick position, -1 to 1."""
@@ -202,7 +202,7 @@ class RoverSubAuto(MissionMode):
         raise NotImplementedError
 
     def refuse(self) -> None:
-        """Report that there is no mission."""
+        """Send a text, if the firmware does, because there is no mission."""
 
     def travel(self, place: Ned, *, stops: bool) -> None:
         """Move towards a place for one tick."""

@@ -1,4 +1,4 @@
-"""Files, logs, parameters and signing key of a simulated ArduPilot, with their servers."""
+"""Files, logs, parameters and signing key of a simulated ArduPilot, and their protocol servers."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ _PARAMETERS_SHARE, _BURST_SHARE, _LOG_SHARE = 0.3, 1 / 3, 0.5
 
 
 class ArduPilotStorage:
-    """Files, logs and parameters with their servers.
+    """Protocol servers of files, logs and parameters.
 
-    ``link_bytes_per_s`` is the assumed data rate of a port without flow control: a parameter list uses 30 % of it, a
-    file burst a third. None: flow control, as on USB and in a network.
+    ``link_bytes_per_s`` is the data rate of a port without flow control, of which a parameter list uses 30 %, a file
+    burst a third and a log download half. None means flow control, as on USB and in a network.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class ArduPilotStorage:
             self.parameters.burst = self.logs.burst = 1
 
     def restart(self) -> None:
-        """Drop transfers and sessions; files stay."""
+        """Drop transfers and sessions, as a reboot does; files stay."""
         self.parameters.restart()
         self.ftp.restart()
         self.logs.restart()
@@ -102,11 +102,12 @@ _SIGNING_OFF = 1
 
 
 class ArduPilotSigning(VehicleSigning):
-    """Does not announce a new key, stores its time stamp every 30 seconds, and starts a minute ahead of it.
+    """Message signing of ArduPilot. The time stamp is stored every 30 seconds; after a boot it starts a minute ahead.
 
     The first port is considered secure, like USB on a flight controller: it signs, but accepts unsigned frames. Set
     ``trusts_first_port`` to False, and call `load`, for a vehicle whose only link is a radio. Bit 0 of MAV1_OPTIONS,
-    MAV2_OPTIONS … turns signing off on the first, second … port at the next boot or SETUP_SIGNING.
+    MAV2_OPTIONS … turns signing off on the first, second … port at the next boot or SETUP_SIGNING. A new key is not
+    announced.
     """
 
     AHEAD: ClassVar[int] = ONE_MINUTE
@@ -135,7 +136,7 @@ class ArduPilotSigning(VehicleSigning):
         self._ardupilot.call_later(self._ardupilot.timeline.gps_fix, self._on_gps_time)
 
     def _on_gps_time(self) -> None:
-        """Time stamps are never before GPS time."""
+        """Advance the time stamps to GPS time."""
         stamp = timestamp_at(int(self._ardupilot.unix_time))
         for channel in self._ardupilot.channels:
             if channel.signing is not None:

@@ -1,4 +1,4 @@
-"""`SimulatedSub`: an ArduSub 4.7 with vectored thrusters, without sockets, threads or a clock of its own."""
+"""`SimulatedSub`: an ArduSub 4.7 with vectored thrusters that uses no sockets, threads or system clock."""
 
 from __future__ import annotations
 
@@ -39,7 +39,10 @@ _DISARMS = frozenset({_ARM_TOGGLE, _DISARM})
 
 
 class SubArming(ArduPilotArming[SubHost]):
-    """Checks radio and battery by default (ARMING_CHECK 448), never a position. A joystick button must disarm."""
+    """ArduSub's arming checks: by default radio and battery (ARMING_CHECK 448), never a position.
+
+    A joystick button must have a disarm function.
+    """
 
     ARMED_TEXT: ClassVar[str] = "Arming motors"
     DISARMED_TEXT: ClassVar[str] = "Disarming motors"
@@ -61,7 +64,7 @@ class SubArming(ArduPilotArming[SubHost]):
         return _SHIFT in plain and any(int(parameters[f"{name}SFUNCTION"]) in _DISARMS for name in names)
 
 
-# FS_GCS_ENABLE; 1 only warns.
+# Actions of FS_GCS_ENABLE; 1 only warns.
 _FAILSAFE_DISARM, _HOLD, _SURFACE = 2, 3, 4
 _GCS_MODES = {_HOLD: SubMode.ALT_HOLD, _SURFACE: SubMode.SURFACE}
 _BATTERY_DISARM, _BATTERY_SURFACE = 2, 3
@@ -73,7 +76,7 @@ _STICKS, _STICK_MIDDLE = 6, 1500
 
 
 class SubFailsafes(ArduPilotFailsafes[SubHost]):
-    """Most failsafes act only while the vehicle is armed. Terrain, estimator and crash are not checked."""
+    """ArduSub's failsafes, most of which act only while armed. Terrain, estimator and crash are not simulated."""
 
     BATTERY_PRIORITIES: ClassVar[tuple[int, ...]] = (_BATTERY_DISARM, _BATTERY_SURFACE, 1, 0)
 
@@ -87,7 +90,7 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
 
     @property
     def is_any_active(self) -> bool:
-        # A lost radio alone is not critical here.
+        # On Sub a lost radio alone is not MAV_STATE_CRITICAL.
         hull = self.pressure.is_exceeded or self.temperature.is_exceeded
         return self.pilot or self.battery_is_low or self.ground_station or self.leak or hull
 
@@ -173,7 +176,7 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
 
 
 class _HullLimit:
-    """Limit FS_PRESS_MAX (Pa) or FS_TEMP_MAX (°C), exceeded after two seconds and reported every 30 s."""
+    """Limit FS_PRESS_MAX (Pa) or FS_TEMP_MAX (°C): its failsafe triggers after two seconds and warns every 30 s."""
 
     def __init__(self, quantity: str, prefix: str) -> None:
         self.is_exceeded: bool = False
@@ -195,7 +198,10 @@ class _HullLimit:
 
 
 class SubSetpoints(GuidedSetpoints):
-    """Thrust is a climb rate, 0.5 holds the depth; lean angles have no effect. Yaw is relative in one frame only."""
+    """Handlers of set-point messages. Thrust is a climb rate, 0.5 holds the depth; roll and pitch have no effect.
+
+    Yaw is relative to the heading only in BODY_OFFSET_NED.
+    """
 
     BODY_FRAMES: ClassVar[frozenset[int]] = GuidedSetpoints.BODY_FRAMES | {MavFrame.BODY_FRD}
     RELATIVE_YAW_FRAMES: ClassVar[frozenset[int]] = frozenset({MavFrame.BODY_OFFSET_NED})
@@ -218,7 +224,7 @@ _THROTTLE = 2
 
 
 class SubMotors(ArduPilotMotors):
-    """Thrusters that hold the depth or follow the stick; a throttle of 0.5 is no thrust."""
+    """Thrusters, which hold the depth or follow the throttle stick; a throttle of 0.5 is no thrust."""
 
     @property
     def current_a(self) -> float:
@@ -238,13 +244,14 @@ _BASE = MavModeFlag.CUSTOM_MODE_ENABLED | MavModeFlag.STABILIZE_ENABLED | MavMod
 
 
 class SimulatedSub(SubHost):
-    """Behaves as ArduSub does where a client can observe it; moves with `UnderwaterMotion`.
+    """ArduSub, as far as a client can observe it. `UnderwaterMotion` is the motion model.
 
     Takes the arguments of `ArduPilotVehicle`; ``home`` is at the surface, so altitudes above home are negative. It has
-    1,386 parameters. Simulated: MANUAL, STABILIZE, ACRO, ALT_HOLD and POSHOLD by the sticks, GUIDED, AUTO and SURFACE.
-    It can be armed without a position in modes that need none. Take-off is an unknown command.
+    1,386 parameters. Simulated modes: MANUAL, STABILIZE, ACRO, ALT_HOLD and POSHOLD (driven by the sticks), GUIDED,
+    AUTO and SURFACE. It can be armed without a position in modes that need none. Take-off is UNSUPPORTED.
 
-    Not simulated: CIRCLE, SURFTRAK and MOTORDETECT (they hold still), currents. After a reboot it is at the surface.
+    Not simulated: currents; CIRCLE, SURFTRAK and MOTORDETECT, which behave like ALT_HOLD. A reboot moves the vehicle
+    to the surface.
     """
 
     KIND: ClassVar[Kind] = "sub"
@@ -259,7 +266,7 @@ class SimulatedSub(SubHost):
     JOYSTICK: ClassVar[type[ArduPilotJoystick]] = SubJoystick
 
     def make_motion(self, wind: SimulatedWind | None) -> UnderwaterMotion:
-        """Create the motion model. SIM_BUOYANCY 1 lifts with 0.1 m/s; wind has no effect."""
+        """Create the motion model. SIM_BUOYANCY 1 is an upward acceleration of 0.1 m/s²; wind has no effect."""
         return UnderwaterMotion(self.rng, buoyancy_m_s2=self.parameters["SIM_BUOYANCY"] / 10.0)
 
     def listen_for_setpoints(self) -> None:

@@ -1,4 +1,4 @@
-"""Flight modes of a simulated ArduSub. MOTORDETECT and SURFTRAK hold still; ACRO and STABILIZE move by the sticks."""
+"""Flight modes of a simulated ArduSub. MOTORDETECT and SURFTRAK act like ALT_HOLD, ACRO and STABILIZE like MANUAL."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _THROTTLE, _YAW, _FORWARD, _LATERAL = 2, 3, 4, 5
 
 
 class SubHost(RoverSubVehicle):
-    """A submarine as its modes and failsafes see it."""
+    """Interface of a submarine that its modes and failsafes use."""
 
     display_names: cycle[str]
     """Names of `DISPLAY_VALUES` in the order in which they are sent."""
@@ -39,7 +39,7 @@ class SubHost(RoverSubVehicle):
         return math.dist(self._below_surface(place), self.motion.place)
 
     def travel(self, place: Ned, speed: float, *, looks_ahead: bool = True) -> None:
-        """Move towards a place with a speed in m/s, vertically within WPNAV_SPEED_UP and WPNAV_SPEED_DN."""
+        """Move towards a place at a speed in m/s; WPNAV_SPEED_UP and WPNAV_SPEED_DN limit the vertical speed."""
         motion, parameters = self.motion, self.parameters
         north, east, down = self._below_surface(place)
         up, dn = parameters["WPNAV_SPEED_UP"] / 100.0, parameters["WPNAV_SPEED_DN"] / 100.0
@@ -66,7 +66,7 @@ class _Mode(ArduPilotMode):
         return 0.0 if abs(share) < _DEADZONE else share
 
     def sideways(self) -> tuple[float, float]:
-        """Turn by the stick; return the velocity of the sticks, north and east."""
+        """Turn as the yaw stick commands; return the commanded velocity north and east in m/s."""
         motion = self.vehicle.motion
         motion.turn(self.stick(_YAW) * _FULL_STICK_TURN_RAD_S)
         forward, right = self.stick(_FORWARD) * _FULL_STICK_M_S, self.stick(_LATERAL) * _FULL_STICK_M_S
@@ -74,12 +74,12 @@ class _Mode(ArduPilotMode):
         return north, east
 
     def climb(self) -> float:
-        """Return the climb rate of the throttle stick in m/s."""
+        """Return the climb rate that the throttle stick commands, in m/s."""
         return self.stick(_THROTTLE) * (self.vehicle.parameters["PILOT_SPEED_UP"] / 100.0)
 
 
 class _Manual(_Mode):
-    """Thrust by the sticks; with a centred throttle it drifts up."""
+    """MANUAL, STABILIZE and ACRO: sticks control the thrust; with a centred throttle the vehicle drifts up."""
 
     needs_position = False
     has_manual_throttle = True
@@ -93,7 +93,7 @@ class _Manual(_Mode):
 
 
 class _AltHold(_Mode):
-    """Depth held; the throttle stick changes it."""
+    """ALT_HOLD and similar modes: hold the depth, which the throttle stick changes."""
 
     needs_position = False
 
@@ -102,7 +102,7 @@ class _AltHold(_Mode):
 
 
 class _Surface(_AltHold):
-    """Rises with WPNAV_SPEED_UP; changes to ALT_HOLD at the surface."""
+    """SURFACE: rises with WPNAV_SPEED_UP, and changes to ALT_HOLD at the surface."""
 
     is_landing = True
 
@@ -114,7 +114,7 @@ class _Surface(_AltHold):
 
 
 class SubAuto(RoverSubAuto):
-    """AUTO of ArduSub: straight to each place, looking ahead; after the last command it stays."""
+    """AUTO of ArduSub: moves straight to each place, nose first, and stays after the last command."""
 
     number: int = SubMode.AUTO
     name = "AUTO"
@@ -138,7 +138,7 @@ class SubAuto(RoverSubAuto):
 
 
 class SubGuided(_Mode):
-    """GUIDED: a place that stays, or a velocity for three seconds; at first it holds still."""
+    """GUIDED: moves to a place, or for three seconds with a velocity; without a target it holds still."""
 
     number: int = SubMode.GUIDED
     name = "GUIDED"
@@ -162,11 +162,11 @@ class SubGuided(_Mode):
         return True
 
     def go_to(self, position: Ned) -> None:
-        """Go to a place and stay there; above the surface means at the surface."""
+        """Go to a place and stay there; a place above the surface is lowered to the surface."""
         self._place, self._target, self._heading = position, None, None
 
     def set_target(self, target: GuidedTarget) -> None:
-        """Follow a target; a position has precedence over a velocity, and its path starts from rest (seen in SITL)."""
+        """Follow a target; a position has precedence over a velocity. In SITL a new position starts from rest."""
         if target.position is not None:
             motion = self.vehicle.motion
             motion.velocity_north = motion.velocity_east = motion.velocity_down = 0.0

@@ -1,4 +1,4 @@
-"""Messages about the state of a simulated ArduPilot, and the tables of all messages of each firmware."""
+"""Builders of messages about the state of a simulated ArduPilot, and the table of all builders by firmware."""
 
 from __future__ import annotations
 
@@ -51,18 +51,18 @@ _LOG_AFTER_DISARMING_S = 15.0
 
 @dataclass(frozen=True)
 class _Sensors:
-    """Bits of SYS_STATUS of a firmware, besides GPS."""
+    """Sensor bits of a firmware in SYS_STATUS, except GPS."""
 
     working: int
-    """Present, enabled and healthy from the start."""
+    """Bits that are present, enabled and healthy from power-on."""
     control: int = _ALL_CONTROL
-    """Supported kinds of control."""
+    """Kinds of control that the firmware supports."""
     always: int = 0
     """Kinds of control that are enabled in every mode."""
     only_healthy: int = 0
-    """Healthy, but neither present nor enabled."""
+    """Bits that are healthy, but neither present nor enabled."""
     unhealthy: int = 0
-    """Present and enabled, but not healthy."""
+    """Bits that are present and enabled, but not healthy."""
 
 
 _SENSORS: dict[Kind, _Sensors] = {
@@ -143,7 +143,7 @@ _NOTHING_REACHED = 0xFFFF
 _AIR_DENSITY = 1.225
 # Output indices of the motors with ESC telemetry.
 _MOTORS = {"copter": (0, 1, 2, 3), "plane": (2,)}
-# Flags and mode before the vehicle is initialised; Copter and Sub report their real mode.
+# Base mode and custom mode until the vehicle is initialised; Copter and Sub report their real mode.
 _BOOT_MODE: dict[str, tuple[int, int]] = {
     "plane": (MavModeFlag.STABILIZE_ENABLED | MavModeFlag.CUSTOM_MODE_ENABLED, PlaneMode.INITIALIZING),
     "rover": (MavModeFlag.MANUAL_INPUT_ENABLED | MavModeFlag.CUSTOM_MODE_ENABLED, RoverMode.INITIALIZING),
@@ -151,7 +151,7 @@ _BOOT_MODE: dict[str, tuple[int, int]] = {
 
 
 def heartbeat(vehicle: ArduPilotVehicle) -> m.Heartbeat:
-    """Build HEARTBEAT: BOOT until half a second after initialisation, or CALIBRATING in a boot mode."""
+    """Build HEARTBEAT. Until the boot ends, the state is BOOT, or CALIBRATING while a boot mode is reported."""
     base_mode, mode, state = vehicle.base_mode, vehicle.mode.number, MavState.BOOT
     if not vehicle.is_initialised and vehicle.KIND in _BOOT_MODE:
         base_mode, mode = _BOOT_MODE[vehicle.KIND]
@@ -251,7 +251,7 @@ def _display_value(sub: SubHost) -> m.NamedValueFloat:
 
 
 def _rover_hud(rover: RoverHost) -> m.VfrHud:
-    # Without airspeed and climb; the throttle is positive also in reverse.
+    # ArduRover sends neither airspeed nor climb rate, and a positive throttle in reverse.
     motion, place = rover.motion, rover.navigation.position
     heading = int(math.degrees(motion.yaw) % 360.0)
     throttle = round(abs(rover.motors.throttle) * 100)
@@ -260,7 +260,7 @@ def _rover_hud(rover: RoverHost) -> m.VfrHud:
 
 
 _MIDDLE, _STICK_RANGE = 1500, 500
-# A surface or thruster goes from 1100 to 1900.
+# Control surfaces and thrusters use 1100 to 1900 µs.
 _SURFACE_RANGE = 400
 _ROVER_DEADZONE = 30
 _OUTPUTS = 16
@@ -273,7 +273,7 @@ def _copter_outputs(vehicle: ArduPilotVehicle) -> m.ServoOutputRaw:
 
 
 def _plane_outputs(plane: PlaneHost) -> m.ServoOutputRaw:
-    """Aileron, elevator, throttle, rudder; the sticks in MANUAL, with the throttle only while armed."""
+    """Build SERVO_OUTPUT_RAW with aileron, elevator, throttle and rudder, which follow the sticks in MANUAL."""
     wing, is_armed = plane.wing, plane.motors.is_armed
     throttle = 1000 + (round(1000 * plane.motors.throttle) if is_armed else 0)
     if plane.mode.number == PlaneMode.MANUAL:
@@ -287,7 +287,7 @@ def _plane_outputs(plane: PlaneHost) -> m.ServoOutputRaw:
 
 
 def _rover_outputs(rover: RoverHost) -> m.ServoOutputRaw:
-    """Steering (also while disarmed) on output 1, the motor on output 3."""
+    """Build SERVO_OUTPUT_RAW with steering on output 1 (also while disarmed) and the motor on output 3."""
     if rover.mode.has_manual_throttle:
         away = abs(rover.rc[0] - _MIDDLE) - _ROVER_DEADZONE
         size = min(_STICK_RANGE, int(away * _STICK_RANGE / (_STICK_RANGE - _ROVER_DEADZONE)))
@@ -299,7 +299,7 @@ def _rover_outputs(rover: RoverHost) -> m.ServoOutputRaw:
 
 
 def _sub_outputs(sub: SubHost) -> m.ServoOutputRaw:
-    """Four vectored and two vertical thrusters; the axes of the camera on outputs 8 and 10."""
+    """Build SERVO_OUTPUT_RAW with four vectored and two vertical thrusters, and camera axes on outputs 8 and 10."""
     thrusters = [_MIDDLE] * 6
     if sub.motors.is_armed:
         yaw, forward, lateral, roll = (
@@ -386,9 +386,9 @@ BUILDERS_OF_KIND: dict[Kind, Builders] = {
         **_without(m.Wind.ID, m.TerrainRequest.ID, m.EscTelemetry1To4.ID, *_COPTER_TARGETS),
         m.ServoOutputRaw.ID: _sub_outputs,
         m.NamedValueFloat.ID: _display_value,
-        # The third barometer is used as a thermometer only.
+        # ArduSub sends SCALED_PRESSURE3 for a thermometer, without a pressure.
         m.ScaledPressure3.ID: lambda sub: m.ScaledPressure3(sub.time_boot_ms, 0.0, 0.0, 3620, 0),
         m.ExtendedSysState.ID: lambda _: m.ExtendedSysState(0, 0),
     },
 }
-"""Builders of the messages of each firmware; others are not sent."""
+"""Firmware → message id → function that builds the message. Other messages are not sent."""

@@ -1,4 +1,4 @@
-"""Messages about attitude, position, velocity, targets and surroundings of a simulated ArduPilot."""
+"""Builders of messages about attitude, position, velocity, targets and terrain of a simulated ArduPilot."""
 
 from __future__ import annotations
 
@@ -214,7 +214,7 @@ def _target_local(vehicle: ArduPilotVehicle) -> m.PositionTargetLocalNed | None:
 
 
 def _is_navigating(vehicle: ArduPilotVehicle) -> bool:
-    """Return True in modes with NAV_CONTROLLER_OUTPUT: on Plane all but MANUAL, on Rover a few."""
+    """Return True in modes with NAV_CONTROLLER_OUTPUT: on Plane all but MANUAL, on Rover those that navigate."""
     mode = vehicle.mode
     if vehicle.KIND == "plane":
         return mode.number != PlaneMode.MANUAL
@@ -243,7 +243,7 @@ def _terrain_report(vehicle: ArduPilotVehicle) -> m.TerrainReport:
 
 
 def _terrain_request(vehicle: ArduPilotVehicle) -> m.TerrainRequest | None:
-    """Request the whole block around the vehicle, which has no terrain data."""
+    """Build a request for all terrain data around the vehicle, because it has none."""
     place = vehicle.navigation.position
     if place is None:
         return None

@@ -1,4 +1,4 @@
-"""`ArduPilotVehicle`: the base of all simulated ArduPilots. It composes their parts, boots, and changes modes."""
+"""`ArduPilotVehicle`: base of the simulated ArduPilots, which creates their parts, boots and changes modes."""
 
 # pyright: reportIncompatibleVariableOverride=false
 # `ArduPilotHost` declares protocols; here each part has its concrete type.
@@ -44,20 +44,19 @@ ModeT = TypeVar("ModeT", bound="ArduPilotMode")
 
 
 class ArduPilotVehicle(ArduPilotHost):
-    """Base of the simulated ArduPilots. A subclass sets the class attributes and overrides commands and motion.
+    """Base of the simulated ArduPilots. A subclass sets the class attributes and implements commands and motion.
 
     - ``home``: power-on location: latitude, longitude (degrees), altitude AMSL (m); ``heading_deg``: initial heading
-    - ``boot_time_s``: seconds until the estimator has a position; real hardware takes 41.5, 0 is ready at once
-    - ``boot_text``: the plain text that a serial or TCP port sends before the first frame
+    - ``boot_time_s``: seconds until the estimator has a position; SITL takes 41.5; with 0 the vehicle is ready at once
+    - ``boot_text``: True sends the plain text that a serial or TCP port sends before the first frame
     - ``version``: version in AUTOPILOT_VERSION and the banner; ``parameters``: values that differ from the defaults;
-      ``parameter_count``: fewer parameters than the firmware has, for quick tests; ``parameter_errors``: sends
-      PARAM_ERROR
+      ``parameter_count``: reduces the number of parameters, for quick tests; ``parameter_errors``: sends PARAM_ERROR
     - ``logs``: logs of earlier runs; ``link_bytes_per_s``: see `ArduPilotStorage`
     - ``battery_percent``: initial charge; ``battery_capacity_mah``: size of the pack
     - ``wind``: constant wind and gusts; ``rangefinder_reach_m``: 0 means no range finder
-    - ``unsupported_commands``: MAV_CMDs that this firmware does not implement (SET_MESSAGE_INTERVAL if it is old);
-      ``stream_groups`` False: without REQUEST_DATA_STREAM
-    - ``components``: other components on its links: `SimulatedCamera`, `SimulatedGimbal`, or plain heartbeats
+    - ``unsupported_commands``: MAV_CMDs to answer UNSUPPORTED, such as SET_MESSAGE_INTERVAL for an old firmware;
+      ``stream_groups``: False ignores REQUEST_DATA_STREAM
+    - ``components``: further components: `SimulatedCamera`, `SimulatedGimbal`, or `ExtraComponent`
     - ``unix_time_at_boot``: GPS time at simulated second 0
     - ``signing_key``: see `ArduPilotSigning`
     """
@@ -77,7 +76,7 @@ class ArduPilotVehicle(ArduPilotHost):
     HOME_NEEDS_ORIGIN: ClassVar[bool] = True
     """True if home cannot be set before the estimator has an origin."""
     REPORTS_HOME: ClassVar[bool] = False
-    """True if a text reports the new home."""
+    """True if a text reports each new home."""
 
     def __init__(
         self,
@@ -135,11 +134,11 @@ class ArduPilotVehicle(ArduPilotHost):
         self.storage: ArduPilotStorage = ArduPilotStorage(
             self, logs, parameter_errors=parameter_errors, link_bytes_per_s=link_bytes_per_s
         )
-        """Files, logs, and their servers."""
+        """Protocol servers of files, logs and parameters."""
         self.files: FileTree = self.storage.files
 
     def _reset(self) -> None:
-        """Create everything that does not survive a power cycle."""
+        """Create the parts that do not survive a power cycle."""
         self.is_initialised: bool = False
         self.has_left_boot: bool = False
         self.is_landed: bool = self.motion.is_on_ground
@@ -185,7 +184,7 @@ class ArduPilotVehicle(ArduPilotHost):
         """Register the handlers of set-point messages."""
 
     def look_at(self, place: Ned | None) -> None:
-        """Point the gimbal, if there is one, at a place; None ends it."""
+        """Point the gimbal, if there is one, at a place; None stops that."""
         self.gimbal.look_at(place)
 
     def may_go_to(self, place: Ned) -> bool:
@@ -193,14 +192,14 @@ class ArduPilotVehicle(ArduPilotHost):
         return True
 
     def reset_controllers(self) -> None:
-        """Create the controllers of this kind of vehicle after a power cycle. The modes exist already."""
+        """Create the controllers of this kind of vehicle; called at power-on, after the modes are created."""
 
     def unknown_mode(self, number: int) -> tuple[int, str]:
-        """Return severity and text of the refusal of a mode that does not exist."""
+        """Return severity and text for a mode number that does not exist."""
         return MavSeverity.WARNING, f"No such mode {number}"
 
     def refusal(self, mode: ArduPilotMode, reason: str) -> str:
-        """Return the text of a refused mode change."""
+        """Return the text that reports a refused mode change."""
         return f"Mode change to {mode.name} failed: {reason}"
 
     @property
@@ -228,12 +227,12 @@ class ArduPilotVehicle(ArduPilotHost):
         return self.storage.ftp
 
     def is_addressed(self, message: Message) -> bool:
-        """Also accept messages to absent components of this system (MAVLink_routing.cpp)."""
+        """Return True also for absent components of this system, as in the firmware (MAVLink_routing.cpp)."""
         system, component = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
         return system in (0, self.system_id) and all(component != other.component_id for other in self.components)
 
     def boot(self) -> None:
-        """Schedule what happens while the vehicle boots."""
+        """Restart the servers and schedule the events of the boot."""
         self.storage.restart()
         self.requests.restart()
         if self._boot_text:
@@ -255,7 +254,7 @@ class ArduPilotVehicle(ArduPilotHost):
         self.has_left_boot = True
 
     def start_channel(self, channel: Channel) -> None:
-        """Start heartbeats, time synchronisation and the streams that the port's parameters (MAV1_EXTRA1 …) select."""
+        """Start heartbeats, TIMESYNC and the streams that the port's parameters (MAV1_EXTRA1 …) select."""
         first, ready = self.booted_at + self.timeline.heartbeat, self.booted_at + self.timeline.ready
         timesync = self.booted_at + _TIMESYNC_INTERVAL_S
         channel.streams.set_interval(m.Heartbeat.ID, 1.0, max(self.now, first))
@@ -263,7 +262,7 @@ class ArduPilotVehicle(ArduPilotHost):
         self.requests.start_channel(channel, max(self.now, ready))
 
     def restart(self) -> None:
-        """Reboot now: silence, then the whole boot again. Stream rates and estimates are reset."""
+        """Reboot: send nothing for a while, then boot again with default stream rates and estimates."""
         self.parameters["STAT_BOOTCNT"] += 1
         if not self.motion.is_on_ground:
             self.motion.down = self.motion.ground_down
@@ -274,7 +273,7 @@ class ArduPilotVehicle(ArduPilotHost):
         self.reboot(_REBOOT_SILENCE_S)
 
     def send_text(self, severity: int, text: str) -> None:
-        """Queue a text. As in the firmware, the reason of a refusal is sent after the acknowledgement."""
+        """Queue a text, so that the reason of a refusal follows the acknowledgement, as in the firmware."""
         if self.is_initialised:
             self.call_later(0.0, lambda: super(ArduPilotVehicle, self).send_text(severity, text))
         else:

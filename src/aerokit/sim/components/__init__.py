@@ -1,4 +1,4 @@
-"""Cameras and gimbals with a component id of their own, for any simulated vehicle.
+"""Simulated cameras and gimbals: separate MAVLink components that any simulated vehicle can carry.
 
 ```python
 copter = SimulatedCopter(components=[SimulatedCamera(), SimulatedGimbal()])

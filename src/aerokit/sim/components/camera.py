@@ -55,7 +55,7 @@ _CAN_ALWAYS_RECORD = CameraCapFlags.CAN_CAPTURE_VIDEO_IN_IMAGE_MODE
 
 
 def camera_commands(camera: CameraBody) -> dict[int, CommandHandler]:
-    """Return handlers by MAV_CMD, including the requests that REQUEST_MESSAGE replaced."""
+    """Return handlers by MAV_CMD, including the older requests that REQUEST_MESSAGE supersedes."""
     pictures, videos, settings = _Pictures(camera), _Videos(camera), _Settings(camera)
     return {
         MavCmd.IMAGE_START_CAPTURE: pictures.start,
@@ -96,16 +96,14 @@ def _legacy_requests(camera: CameraBody) -> dict[int, CommandHandler]:
 
 
 class _Pictures:
-    """Single images, series and the memory card."""
+    """Commands for images, series of images and the memory card."""
 
     def __init__(self, camera: CameraBody) -> None:
         self._camera = camera
         self._last_number = 0
 
     def start(self, command: ReceivedCommand) -> int:
-        """Param 1 must be 0 or 1 (this camera). A single image whose sequence number (param 4) repeats is not taken
-        again.
-        """
+        """Take images if param 1 is 0 or 1 (this camera). A repeated sequence number (param 4) takes no image."""
         camera, captures = self._camera, self._camera.captures
         interval = command.param2 if math.isfinite(command.param2) else 0.0
         count, number = whole(command.param3), whole(command.param4)
@@ -155,7 +153,7 @@ class _Pictures:
 
 
 class _Videos:
-    """Recording and streaming."""
+    """Commands for recording and streaming."""
 
     def __init__(self, camera: CameraBody) -> None:
         self._camera = camera
@@ -193,7 +191,7 @@ class _Videos:
 
 
 class _Settings:
-    """Mode, zoom and focus; each change is announced by CAMERA_SETTINGS."""
+    """Commands for mode, zoom and focus; each of them sends CAMERA_SETTINGS."""
 
     def __init__(self, camera: CameraBody) -> None:
         self._camera = camera
@@ -231,7 +229,7 @@ class _Settings:
         return self._send_settings()
 
     def set_source(self, command: ReceivedCommand) -> int:
-        """RGB, or IR on a thermal camera."""
+        """Accept RGB, and IR on a thermal camera (param 2)."""
         source = whole(command.param2)
         sources = {
             CameraSource.DEFAULT,
@@ -258,9 +256,9 @@ def _has_wrong_mode(camera: CameraBody, wrong: int, unless: int) -> bool:
 
 
 class SimulatedCamera(CameraBody):
-    """Takes images, series and videos, and reports the true position and attitude of each image.
+    """Camera component that takes images, series and videos, with the true position and attitude of each image.
 
-    - ``component_id``: MAVLink's cameras are 100 to 105; ``system_id``: None uses the vehicle's
+    - ``component_id``: MAVLink reserves 100 to 105 for cameras; ``system_id``: None uses the vehicle's
     - ``vendor``, ``model``, ``definition_uri``, ``capabilities`` (CAMERA_CAP_FLAGS), ``resolution`` (pixels):
       content of CAMERA_INFORMATION. Without HAS_MODES it takes images and videos at any time.
     - ``streams``: addresses of video streams, such as ``rtsp://192.168.0.10:8554/main``; no video is sent
@@ -268,12 +266,12 @@ class SimulatedCamera(CameraBody):
       thermal one; None for a visible-light camera
     - ``picture``: content of image files (JPEG), or a function of the capture that returns it; the files are in
       ``/DCIM`` and served by MAVFTP
-    - ``gimbal``: the gimbal it is mounted on; images have its direction
+    - ``gimbal``: the gimbal that carries the camera and determines the direction of images
     - ``capacity_mib``, ``image_mib``, ``video_mib_s``: size of the card, of an image, of a second of video
     - ``shutter_s``: seconds until an image is available
 
-    Settings (PARAM_EXT) follow ``camera_definition.xml`` beside this file, or ``definition``; the camera serves the
-    file by MAVFTP. ``definition_uri`` announces another location; an empty one announces none.
+    ``definition`` defines the settings (PARAM_EXT); the default is ``camera_definition.xml`` beside this file. The
+    camera serves the definition by MAVFTP. ``definition_uri`` announces another location; "" announces none.
 
     Images, settings and files survive a reboot; modes and series do not. A tracked target is kept until
     ``tracking.lose()``.

@@ -55,7 +55,7 @@ class CameraBody(CameraHost):
     TYPE: ClassVar[int] = MavType.CAMERA
 
     parameters: ExtendedParameters
-    """Settings; available once the camera is on a vehicle."""
+    """Settings; available once the camera has joined a vehicle."""
 
     def __init__(
         self,
@@ -211,7 +211,7 @@ def _information(camera: CameraBody) -> m.CameraInformation:
 
 
 def _images(camera: CameraBody, command: ReceivedCommand | None) -> list[m.CameraImageCaptured]:
-    """Param 2 is the first index, -1 for all; param 3 the last one, 0 for one image, -1 for all that follow."""
+    """Select images: param 2 is the first index or -1 for all, param 3 the last index, 0 for one or -1 for all."""
     images = camera.captures.images
     if command is None:
         return images[-1:]
@@ -264,7 +264,7 @@ def _flags(camera: CameraBody, stream: int) -> int:
 
 
 def _thermal_range(camera: CameraBody) -> list[m.CameraThermalRange]:
-    """Cold at the upper left, hot at the lower right."""
+    """Return the range with the coldest point at the upper left, the hottest at the lower right."""
     if camera.thermal_celsius is None:
         return []
     coldest, hottest = camera.thermal_celsius
@@ -273,5 +273,5 @@ def _thermal_range(camera: CameraBody) -> list[m.CameraThermalRange]:
 
 
 def _field_of_view() -> int:
-    """Horizontal, in degrees."""
+    """Return the horizontal field of view in degrees."""
     return round(math.degrees(2 * math.atan(_SENSOR_MM[0] / 2 / FOCAL_LENGTH_MM)))

@@ -36,7 +36,7 @@ _NUMBER = 1
 
 
 class MemoryCard:
-    """A memory card; sizes are in MiB. Assign ``is_inserted`` to remove it, ``used_mib`` to fill it."""
+    """A memory card; sizes are in MiB. Set ``is_inserted`` to False to remove it, assign ``used_mib`` to fill it."""
 
     def __init__(self, capacity_mib: float) -> None:
         self.capacity_mib = capacity_mib
@@ -59,7 +59,7 @@ class MemoryCard:
         self.used_mib = 0.0
 
     def information(self, camera: SimulatedComponent, number: int) -> list[StorageInformation]:
-        """Return STORAGE_INFORMATION of a card number; 0 selects all."""
+        """Return STORAGE_INFORMATION of the card with this number; 0 selects all cards."""
         if number not in (0, _NUMBER):
             return []
         is_inserted = self.is_inserted
@@ -82,7 +82,7 @@ class MemoryCard:
 
 
 class CameraHost(SimulatedComponent):
-    """The camera, as its captures and tracking use it."""
+    """Interface of a camera that its captures and its tracking use."""
 
     capabilities: int
     card: MemoryCard
@@ -109,12 +109,12 @@ _NOWHERE = (math.nan, math.nan, math.nan, math.nan)
 
 
 class Captures:
-    """Takes images and videos. An image is taken at once and available ``shutter_s`` later (CAMERA_IMAGE_CAPTURED)."""
+    """Takes images and videos. CAMERA_IMAGE_CAPTURED follows ``shutter_s`` after an image is taken."""
 
     def __init__(self, camera: CameraHost) -> None:
         self._camera = camera
         self.images: list[CameraImageCaptured] = []
-        """Images since the image log was cleared; the position is the image index."""
+        """Images since the image log was last cleared, by image index."""
         self.interval_s: float = 0.0
         """Interval of the series."""
         self._remaining = 0
@@ -183,7 +183,7 @@ class Captures:
             camera.send(self.status())
 
     def _shoot(self) -> partial[CameraImageCaptured]:
-        """Return CAMERA_IMAGE_CAPTURED of this moment; index and result follow when it is stored."""
+        """Return CAMERA_IMAGE_CAPTURED with time, position and attitude, still without index and result."""
         camera, pose = self._camera, pose_of(self._camera.vehicle)
         place = None if pose is None else pose.place
         angles = camera.angles()
@@ -201,7 +201,7 @@ class Captures:
         )
 
     def record(self, status_interval_s: float) -> None:
-        """Start a video; CAMERA_CAPTURE_STATUS is sent at this interval, 0 for never."""
+        """Start a video; sends CAMERA_CAPTURE_STATUS at this interval, or never for 0."""
         self._recording_since = self._camera.now
         self._camera.send(self.status())
         if 0.0 < status_interval_s < math.inf:
@@ -217,12 +217,12 @@ class Captures:
             self._camera.send(self.status())
 
     def _send_status_every(self, recording: float, interval_s: float) -> None:
-        def tell() -> None:
+        def send_status() -> None:
             if self._recording_since == recording:
                 self._camera.send(self.status())
                 self._send_status_every(recording, interval_s)
 
-        self._camera.call_later(interval_s, tell)
+        self._camera.call_later(interval_s, send_status)
 
     def status(self) -> CameraCaptureStatus:
         camera = self._camera
@@ -250,7 +250,7 @@ _AUTO = (SetFocusType.AUTO, SetFocusType.AUTO_SINGLE, SetFocusType.AUTO_CONTINUO
 
 
 class Axis:
-    """A value from 0 to 100 percent that rests, or moves until it is stopped or reaches its end."""
+    """A lens setting from 0 to 100 percent, at rest or moving at constant speed."""
 
     def __init__(self, now: Callable[[], float]) -> None:
         self._now = now
@@ -270,12 +270,12 @@ class Axis:
         self._speed = max(-1.0, min(1.0, speed)) * _PERCENT_S
 
     def step(self, steps: float) -> None:
-        """Move by this number of tenths of the range."""
+        """Move by ``steps`` tenths of the range."""
         self.set(self.percent + steps * _STEP_PERCENT)
 
 
 class Lens:
-    """Zoom of factor ten, and focus; automatic focus sets the middle."""
+    """Zoom (up to ten times) and focus of a camera; automatic focus sets 50 percent."""
 
     def __init__(self, now: Callable[[], float]) -> None:
         self.zoom: Axis = Axis(now)
@@ -317,13 +317,13 @@ class Lens:
         return True
 
 
-# A camera that points higher sees no position on the ground.
+# Above this pitch the optical axis meets the ground too far away, or never.
 _MAX_GROUND_PITCH_RAD = -math.radians(5)
 _UNKNOWN, _ACCURACY_M = math.nan, 1.0
 
 
 class Tracking:
-    """Tracks a point or a rectangle; call ``lose()`` to lose the target."""
+    """Tracking of a point or a rectangle in the image; call ``lose()`` to lose the target."""
 
     def __init__(self, camera: CameraHost) -> None:
         self._camera = camera
@@ -332,7 +332,7 @@ class Tracking:
     def reset(self) -> None:
         self.mode: CameraTrackingMode = CameraTrackingMode.NONE
         self.place: tuple[float, ...] = ()
-        """x, y, radius; or left, top, right, bottom."""
+        """x, y and radius of a point; or left, top, right and bottom of a rectangle; shares of the image."""
         self.is_lost: bool = False
 
     def lose(self) -> None:
@@ -378,7 +378,7 @@ class Tracking:
         return m.CameraTrackingImageStatus(self._flags, mode, Target.IN_STATUS, x, y, radius, left, top, right, bottom)
 
     def geo_status(self) -> list[m.CameraTrackingGeoStatus]:
-        """Return CAMERA_TRACKING_GEO_STATUS: where the optical axis meets the ground at home altitude."""
+        """Return CAMERA_TRACKING_GEO_STATUS with the intersection of optical axis and ground at home altitude."""
         pose, angles = pose_of(self._camera.vehicle), self._camera.angles()
         if pose is None or angles is None or angles[1] > _MAX_GROUND_PITCH_RAD:
             return []

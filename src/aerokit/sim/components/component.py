@@ -1,4 +1,4 @@
-"""Base of simulated devices with a component id of their own: heartbeat, commands, streams, settings, faults."""
+"""Base of simulated devices that are separate components: heartbeat, commands, streams, settings, faults."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from aerokit.sim.vehicle import SimulatedVehicle
 
 
 class Pose(NamedTuple):
-    """Position and attitude (radians)."""
+    """Position and attitude (radians) of a vehicle."""
 
     place: GlobalPoint
     height_m: float
-    """Above home."""
+    """Metres above home."""
     roll: float
     pitch: float
     yaw: float
 
 
 def pose_of(vehicle: SimulatedVehicle) -> Pose | None:
-    """Return the true pose of a vehicle; None if it has none, such as a recording."""
+    """Return the true pose of a vehicle; None for a vehicle without one, such as a recording."""
     try:
         place = true_place(vehicle)
     except InvalidArgument:
@@ -45,8 +45,8 @@ def pose_of(vehicle: SimulatedVehicle) -> Pose | None:
 def serve_files(component: SimulatedComponent, files: FileTree) -> FtpServer:
     """Serve files by MAVFTP under the component's address, as PX4 does; call it in ``listen()``.
 
-    The tree may change at any time, see `FileTree.put`. Sessions end at power-off, files stay. ``faults.no_ftp`` of
-    the component turns it off.
+    The files may change at any time, see `FileTree.put`. Power-off ends sessions and keeps files. The component's
+    ``faults.no_ftp`` turns the server off.
     """
     from aerokit.sim.px4.ftp import Px4Ftp  # Imported here because most components serve no files.
 
@@ -58,17 +58,17 @@ def serve_files(component: SimulatedComponent, files: FileTree) -> FtpServer:
 _HEARTBEAT_INTERVAL_S = 1.0
 _MAVLINK_VERSION = 3
 
-# Returns the messages of one id to send now; the command is given for REQUEST_MESSAGE.
+# Returns the current messages of one id; the argument is the REQUEST_MESSAGE command, None for a stream.
 Builder = Callable[["ReceivedCommand | None"], "Iterable[Message]"]
 
 
 class SimulatedComponent:
     """A device on a vehicle's links that is switched on and rebooted with the vehicle.
 
-    It receives messages addressed to it and broadcasts. An unknown broadcast command is ignored, an unknown command
-    to this component is UNSUPPORTED. `faults` apply to its own traffic, in addition to those of the vehicle.
+    The component receives broadcasts and messages addressed to it. It ignores an unknown broadcast command and answers
+    UNSUPPORTED to an unknown command with its address. Its `faults` apply in addition to those of the vehicle.
 
-    A component belongs to one vehicle; adding it to a second one raises InvalidArgument.
+    A component belongs to one vehicle; adding it to a second vehicle raises InvalidArgument.
     """
 
     TYPE: ClassVar[int]
@@ -100,14 +100,14 @@ class SimulatedComponent:
 
     @property
     def vehicle(self) -> SimulatedVehicle:
-        """The vehicle it is on; InvalidArgument before it is added to one."""
+        """The vehicle that carries the component; raises InvalidArgument before it is added to a vehicle."""
         if self._vehicle is None:
-            raise InvalidArgument("the component is on no vehicle yet; pass it in components= of a vehicle")
+            raise InvalidArgument("the component is not on a vehicle yet; pass it in components= of a vehicle")
         return self._vehicle
 
     @property
     def system_id(self) -> int:
-        """The vehicle's system id, unless another one was given."""
+        """The system id passed to the component, or else the vehicle's."""
         return self.vehicle.system_id if self._system_id is None else self._system_id
 
     @property
@@ -121,7 +121,7 @@ class SimulatedComponent:
         return self.vehicle.time_boot_ms
 
     def join(self, vehicle: SimulatedVehicle) -> None:
-        """Called by the vehicle it is added to."""
+        """Join a vehicle; the vehicle calls this."""
         if self._vehicle is not None:
             raise InvalidArgument("the component is on another vehicle already; create one for each vehicle")
         self._vehicle = vehicle
@@ -157,7 +157,7 @@ class SimulatedComponent:
         self.vehicle.observe(message_class, on_message)
 
     def send(self, message: Message, channel: Channel | None = None) -> None:
-        """Send on one channel, or on all if it is None."""
+        """Send on one channel, or on all if ``channel`` is None."""
         if not (self.faults.frozen or self.faults.drops_outgoing(message, self.vehicle.rng)):
             self.vehicle.send(message, channel, (self.system_id, self.component_id))
 
@@ -174,7 +174,7 @@ class SimulatedComponent:
         self.vehicle.call_at(when, action)
 
     def stream(self, message_id: int, interval_s: float, channel: Channel | None = None) -> None:
-        """Stream messages of an id from now on, on one channel or on all; an interval of 0 stops the stream."""
+        """Stream messages of this id on one channel, or on all if None; an interval of 0 stops the stream."""
         key = (channel, message_id)
         if interval_s <= 0.0:
             self._streams.pop(key, None)
@@ -214,7 +214,7 @@ class SimulatedComponent:
         return self.answer_with(whole(command.param1), command)
 
     def _set_interval(self, command: ReceivedCommand) -> int:
-        """0 and -1 stop the stream: only streams of `start` have a default rate."""
+        """Set or stop a stream. 0 (default rate) stops it as -1 does, because streams have no default rate."""
         message_id = whole(command.param1)
         if message_id not in self._builders:
             return MavResult.DENIED
@@ -242,11 +242,11 @@ _ZEROS: dict[str, SettingValue] = {"bool": False, "float": 0.0, "double": 0.0, "
 
 
 class ExtendedParameters:
-    """Settings served by PARAM_EXT, defined by a camera definition file; create it in ``listen()``.
+    """Settings that a camera definition defines and PARAM_EXT serves; create it in ``listen()``.
 
-    A list is sent at a hundred parameters a second. Values that the definition does not allow are VALUE_UNSUPPORTED;
-    setting a read-only or excluded parameter FAILED. Write-only parameters are not listed. Values survive a reboot.
-    ``mute_parameters`` and ``parameter_limits`` of the component's faults apply.
+    A list is sent at a hundred parameters a second, without write-only parameters. The answer to a value that the
+    definition does not allow is VALUE_UNSUPPORTED, to setting a read-only or excluded parameter FAILED. Values survive
+    a reboot. ``mute_parameters`` and ``parameter_limits`` of the component's faults apply.
 
     https://mavlink.io/en/services/parameter_ext.html
     """
@@ -254,9 +254,9 @@ class ExtendedParameters:
     def __init__(self, component: SimulatedComponent, definition: CameraDefinition) -> None:
         self.definition = definition
         self.values: dict[str, SettingValue] = {}
-        """Current values; may be changed at any time."""
+        """Current values; assign them at any time."""
         self.slow: dict[str, float] = {}
-        """Name → seconds that setting it takes; it is IN_PROGRESS until then."""
+        """Name → seconds that setting the parameter takes; the answer is IN_PROGRESS until then."""
         self._component = component
         self._pending: set[str] = set()
         self._list_number = 0
@@ -271,10 +271,10 @@ class ExtendedParameters:
             self.values[name] = _ZEROS.get(setting.type, 0) if setting.default is None else setting.default
 
     def refresh(self) -> None:
-        """Called before a value is sent or set, to update values that change by themselves."""
+        """Called before a value is sent or set; overridden to update values that the device changes."""
 
     def can_set(self, name: str) -> bool:
-        """Return True if a setting can be set now; else the answer is FAILED."""
+        """Return True if a setting can be changed now; otherwise the answer is FAILED."""
         return True
 
     def on_set(self, name: str, value: SettingValue) -> None:

@@ -42,7 +42,7 @@ def gimbal_manager_status(gimbal: SimulatedGimbal) -> m.GimbalManagerStatus:
 
 
 def _flags(gimbal: SimulatedGimbal) -> int:
-    """Roll and pitch are always relative to the horizon."""
+    """Return GIMBAL_MANAGER_FLAGS; roll and pitch are always relative to the horizon."""
     flags = gimbal.flags & (Flags.RETRACT | Flags.NEUTRAL) | Flags.ROLL_LOCK | Flags.PITCH_LOCK
     if gimbal.is_yaw_locked:
         return flags | Flags.YAW_LOCK | Flags.YAW_IN_EARTH_FRAME
@@ -104,7 +104,7 @@ Angles = tuple[float, float, float]
 
 
 class _GimbalControl:
-    """Handles commands and messages of one gimbal."""
+    """Handles the commands and messages to one gimbal."""
 
     def __init__(self, gimbal: SimulatedGimbal) -> None:
         self._gimbal = gimbal
@@ -113,7 +113,7 @@ class _GimbalControl:
         return whole(device_id) in (0, self._gimbal.component_id)
 
     def configure(self, command: ReceivedCommand) -> int:
-        """Params 1 and 2: primary control, 3 and 4: secondary; an id, -1 unchanged, -2 the sender, -3 release."""
+        """Set primary (params 1, 2) and secondary control (3, 4): an id, -1 unchanged, -2 the sender, -3 release."""
         gimbal, sender = self._gimbal, command.sender
         numbers = [command.param1, command.param2, command.param3, command.param4]
         if not self._is_mine(command.z) or not all(_RELEASE <= number <= 255 for number in numbers):
@@ -124,7 +124,7 @@ class _GimbalControl:
         return MavResult.ACCEPTED
 
     def pitch_and_yaw(self, command: ReceivedCommand) -> int:
-        """Degrees and degrees per second; NaN leaves an axis unset."""
+        """Apply angles in degrees or rates in degrees per second; NaN means not given."""
         if not self._is_mine(command.z) or not self._gimbal.is_in_control(command.sender):
             return MavResult.DENIED
         pitch, yaw, pitch_rate, yaw_rate = map(
@@ -134,7 +134,7 @@ class _GimbalControl:
         return MavResult.ACCEPTED if done else MavResult.DENIED
 
     def look_at(self, command: ReceivedCommand) -> int:
-        """The altitude of a COMMAND_LONG is above mean sea level."""
+        """Point at a position; the altitude of a COMMAND_LONG is above mean sea level."""
         gimbal = self._gimbal
         if not self._is_mine(command.param1) or not gimbal.is_in_control(command.sender):
             return MavResult.DENIED
@@ -147,7 +147,7 @@ class _GimbalControl:
         return MavResult.ACCEPTED
 
     def follow(self, command: ReceivedCommand) -> int:
-        """Param 1 is the system id to follow."""
+        """Follow the vehicle whose system id is param 1."""
         gimbal = self._gimbal
         if not self._is_mine(command.param2) or not gimbal.is_in_control(command.sender):
             return MavResult.DENIED
@@ -155,7 +155,7 @@ class _GimbalControl:
         return MavResult.ACCEPTED
 
     def on_global_position(self, message: m.GlobalPositionInt, _: Channel) -> None:
-        """Position of a vehicle that may be followed."""
+        """Update the target if the message comes from the followed vehicle."""
         self._gimbal.update_followed(sender_of(message)[0], GlobalPoint(message.lat, message.lon, message.alt * 1e-3))
 
     def look_ahead(self, command: ReceivedCommand) -> int:
@@ -166,7 +166,7 @@ class _GimbalControl:
         return MavResult.ACCEPTED
 
     def apply(self, flags: int, angles: Angles, rates: Angles) -> bool:
-        """Apply angles, or else rates; return False if neither is given."""
+        """Apply the angles, or the rates if an angle is NaN; return False if both contain NaN."""
         gimbal = self._gimbal
         locked = bool(flags & (Flags.YAW_LOCK | Flags.YAW_IN_EARTH_FRAME))
         if flags & (Flags.RETRACT | Flags.NEUTRAL):
@@ -184,7 +184,7 @@ class _GimbalControl:
             self._apply_attitude(message)
 
     def on_device_attitude(self, message: m.GimbalDeviceSetAttitude, _: Channel) -> None:
-        """Control by another manager, such as an autopilot: applied only while no one else is in control."""
+        """Apply the set-point of another manager, such as an autopilot, unless a third component is in control."""
         if self._gimbal.primary in ((0, 0), sender_of(message)):
             self._apply_attitude(message)
 
@@ -199,7 +199,7 @@ class _GimbalControl:
             self.apply(message.flags, (0.0, message.pitch, message.yaw), (0.0, message.pitch_rate, message.yaw_rate))
 
     def on_manual_control(self, message: m.GimbalManagerSetManualControl, _: Channel) -> None:
-        """Rates are shares of the slew rate, -1 to 1."""
+        """Apply angles, or rates from -1 to 1 as shares of the slew rate."""
         gimbal = self._gimbal
         if self._is_mine(message.gimbal_device_id) and gimbal.is_in_control(sender_of(message)):
             rates = (0.0, message.pitch_rate * gimbal.slew_rad_s, message.yaw_rate * gimbal.slew_rad_s)
@@ -207,7 +207,7 @@ class _GimbalControl:
 
 
 def _owner(before: Owner, wanted: tuple[int, int], sender: Owner) -> Owner:
-    """Return the owner that one pair of params specifies."""
+    """Return the component in control after one pair of params; (0, 0) is none."""
     if _SENDER in wanted:
         return sender
     if _RELEASE in wanted:
@@ -222,17 +222,17 @@ _STILL: Angles = (0.0, 0.0, 0.0)
 
 
 class SimulatedGimbal(SimulatedComponent):
-    """A gimbal device with a manager of its own; it turns at a limited rate and can point at positions.
+    """A gimbal device and its gimbal manager; it turns at a limited rate and can point at positions.
 
-    It accepts commands from the component in control, at first none: claim it with
-    MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE. Commands of others are DENIED, their messages ignored.
+    Only the component in control can command the gimbal; initially no component is. Take control with
+    MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE. Commands of other components are DENIED, their messages are ignored.
 
-    - ``component_id``: MAVLink's gimbals are 154 and 171 to 175; ``system_id``: None uses the vehicle's
+    - ``component_id``: MAVLink reserves 154 and 171 to 175 for gimbals; ``system_id``: None uses the vehicle's
     - ``roll_deg``, ``pitch_deg``, ``yaw_deg``: minimum and maximum angle; roll and pitch relative to the horizon
     - ``slew_deg_s``: turn rate
     - ``attitude_rate_hz``: rate of GIMBAL_DEVICE_ATTITUDE_STATUS
 
-    Not simulated: the attitude of the vehicle, which a real gimbal compensates, motor failures, a second manager.
+    Not simulated: compensation of the vehicle's attitude, motor failures, a second manager.
     """
 
     TYPE: ClassVar[int] = MavType.GIMBAL
@@ -260,13 +260,13 @@ class SimulatedGimbal(SimulatedComponent):
     def _reset(self) -> None:
         self.primary: tuple[int, int] = (0, 0)
         self.secondary: tuple[int, int] = (0, 0)
-        """System and component ids in control; zeros if none."""
+        """System and component id of the component in secondary control; zeros if none."""
         self.flags: int = 0
         """GIMBAL_MANAGER_FLAGS of the latest command."""
         self.region: GlobalPoint | None = None
-        """Position it points at."""
+        """Position to point at; None without a region of interest."""
         self.followed: int = 0
-        """System id of the vehicle it follows; 0 if none."""
+        """System id of the followed vehicle; 0 if none."""
         self._from: Angles = _STILL
         self._since = 0.0
         self._target: Angles = _STILL
@@ -274,7 +274,7 @@ class SimulatedGimbal(SimulatedComponent):
         self._is_locked = False
 
     def start(self) -> None:
-        """Called at power-on: no one is in control, and it looks ahead."""
+        """Called at power-on: reset control and direction, and start the streams."""
         self._reset()
         self._since = self.now
         self.stream(m.GimbalManagerStatus.ID, _STATUS_INTERVAL_S)
@@ -309,7 +309,7 @@ class SimulatedGimbal(SimulatedComponent):
 
     @property
     def is_yaw_locked(self) -> bool:
-        """True if its yaw stays fixed relative to north."""
+        """True if the yaw is fixed relative to north."""
         return self._is_locked or self.region is not None
 
     def angles(self) -> Angles:
@@ -339,7 +339,7 @@ class SimulatedGimbal(SimulatedComponent):
         return (self._limited(0, roll), self._limited(1, pitch), self._limited(2, yaw))
 
     def _angles_to(self, region: GlobalPoint) -> Angles:
-        """Return the angles to a position, yaw from north; the target if the vehicle has no position."""
+        """Return the angles to a position, yaw from north; the current target if the vehicle has no position."""
         pose = pose_of(self.vehicle)
         if pose is None:
             return self._target
@@ -355,12 +355,12 @@ class SimulatedGimbal(SimulatedComponent):
         return max(low, min(high, angle))
 
     def point(self, angles: Angles, flags: int, *, locked: bool) -> None:
-        """Turn to angles in radians; ``locked``: yaw is relative to north, else to the nose."""
+        """Turn to angles in radians; yaw is relative to north if ``locked``, otherwise to the nose."""
         self._begin(flags)
         self._target, self._is_locked = angles, locked
 
     def turn(self, rates: Angles, flags: int, *, locked: bool) -> None:
-        """Turn at these rates in radians per second, limited to its slew rate."""
+        """Turn at these rates in radians per second, limited to the slew rate."""
         current = self.angles_from_north() if locked else self.angles()
         self._begin(flags)
         limit = self.slew_rad_s
@@ -368,7 +368,7 @@ class SimulatedGimbal(SimulatedComponent):
         self._target, self._rates, self._is_locked = current, (roll, pitch, yaw), locked
 
     def look_at(self, place: GlobalPoint | None) -> None:
-        """Point at a position; None returns to ahead."""
+        """Point at a position; None points ahead again."""
         self._begin(0)
         self.region = place
 

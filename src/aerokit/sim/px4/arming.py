@@ -13,7 +13,7 @@ from aerokit.sim.commands import ReceivedCommand
 from aerokit.sim.px4 import modes
 from aerokit.sim.px4.host import Px4Host
 
-# Sensor → percentages that are reported, and seconds between them.
+# Sensor → reported percentages, and seconds between two reports.
 _AUTOMATIC_CALIBRATIONS: dict[str, tuple[Sequence[int], float]] = {
     "gyro": (range(0, 101, 10), 0.3),
     "baro": ((), 0.5),
@@ -32,7 +32,7 @@ _SIDE_INTERVAL_S = 0.8
 
 
 class Px4Calibration:
-    """Sensor calibration on the ground, one at a time."""
+    """Sensor calibration on the ground; one calibration runs at a time."""
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
@@ -109,13 +109,13 @@ _MODES_ENDED_BY_DISARMING = frozenset({modes.TAKEOFF, modes.LAND, modes.PRECISIO
 
 
 class Px4Arming:
-    """Arming checks, their texts, and the log that each arming starts."""
+    """Arming and disarming, with the arming checks and the log that each arming starts."""
 
     def __init__(self, px4: Px4Host, calibration: Px4Calibration) -> None:
         self._px4, self._calibration = px4, calibration
         self.since: float = -math.inf  # Time of the last arming.
         self.is_terminated: bool = False
-        """True after DO_FLIGHTTERMINATION stopped the motors, until a restart."""
+        """True from DO_FLIGHTTERMINATION, which stops the motors, until a restart."""
         self._is_logging = False
 
     def reasons(self) -> list[str]:
@@ -136,7 +136,7 @@ class Px4Arming:
 
     @property
     def is_possible(self) -> bool:
-        """True if all checks pass, as HEARTBEAT (STANDBY) and SYS_STATUS (pre-arm bit) report."""
+        """True if all checks pass; HEARTBEAT (STANDBY) and SYS_STATUS (pre-arm bit) report it."""
         return self._px4.is_ready and self._mode_allows and not self.reasons()
 
     @property
@@ -146,7 +146,7 @@ class Px4Arming:
         return modes.MODES[mode].can_arm and self._px4.can_run(mode)
 
     def arm(self, by: str = "external command") -> bool:
-        """Arm if the checks allow it."""
+        """Arm and return True, or report the failed checks."""
         px4 = self._px4
         if px4.is_armed:
             return True
@@ -177,7 +177,7 @@ class Px4Arming:
         return throttle <= _CENTRE_THROTTLE if px4.mode in _CLIMB_MODES else throttle < _LOW_THROTTLE
 
     def disarm(self, by: str, *, force: bool = False) -> bool:
-        """Stop the motors; in flight only with ``force``."""
+        """Stop the motors and return True; without ``force`` return False in flight."""
         px4 = self._px4
         if not px4.is_armed:
             return True
@@ -201,7 +201,7 @@ class Px4Arming:
         px4.send(CommandLong(px4.system_id, MavComponent.PARACHUTE, MavCmd.DO_PARACHUTE, 0, 2.0, *(0.0,) * 6))
 
     def start_first_log(self) -> None:
-        """Start the log of the boot; the first flight is written into it."""
+        """Start the log at boot, which also records the first flight."""
         self._start_log()
 
     def _start_log(self) -> None:

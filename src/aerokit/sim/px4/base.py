@@ -1,7 +1,7 @@
 """`Px4Vehicle`: boot, state, modes and flight of a simulated PX4."""
 
 # pyright: reportIncompatibleVariableOverride=false
-# The host declares interfaces; the classes here have the concrete types.
+# `Px4Host` declares protocols; the attributes here have the concrete types.
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ _MODES_ENDED_BY_LANDING = frozenset({modes.TAKEOFF, modes.LAND, modes.PRECISION_
 
 
 class Px4Vehicle(Px4Host):
-    """A PX4 without its commands and telemetry; see `SimulatedPx4` for the arguments."""
+    """Base of the simulated PX4, without commands and telemetry; see `SimulatedPx4` for the arguments."""
 
     CAPABILITIES: ClassVar[int] = 0xE8FF
     VEHICLE_TYPE: ClassVar[int] = MavType.QUADROTOR
@@ -109,13 +109,13 @@ class Px4Vehicle(Px4Host):
         self.missions: Px4MissionServer = Px4MissionServer(self)
         """Mission, fence and rally points; they survive a reboot."""
         self.camera_trigger: Px4CameraTrigger = Px4CameraTrigger(self)
-        """Enabled while the parameter TRIG_MODE is not 0."""
+        """Camera trigger, enabled while the parameter TRIG_MODE is not 0."""
         self._reset()
         self._listen()
         self.storage: Px4Storage = Px4Storage(
             self, logs, parameter_file=parameter_file, link_bytes_per_s=link_bytes_per_s
         )
-        """Files, logs and parameters with their servers."""
+        """Protocol servers of files, logs and parameters."""
         self.files: FileTree = self.storage.files
 
     def make_commands(self) -> dict[int, CommandHandler]:
@@ -123,7 +123,7 @@ class Px4Vehicle(Px4Host):
         raise NotImplementedError
 
     def can_build(self, message_id: int) -> bool:
-        """Return True if there is a builder of this message."""
+        """Return True if the vehicle can send this message."""
         raise NotImplementedError
 
     def _make_motion(self, wind: SimulatedWind | None) -> Motion:
@@ -215,7 +215,7 @@ class Px4Vehicle(Px4Host):
         ready_at = max(self.now, self.booted_at + self._boot_time_s)
         self.call_at(
             ready_at, lambda: self.send_built(m.GpsGlobalOrigin.ID, channel)
-        )  # Sent once, and when it changes.
+        )  # PX4 sends the origin once, and again when it changes.
 
     def restart(self) -> None:
         self.motion.down = self.motion.ground_down
@@ -225,7 +225,7 @@ class Px4Vehicle(Px4Host):
         self.reboot(_REBOOT_SILENCE_S)
 
     def send_text(self, severity: int, text: str) -> None:
-        """Every text has an id, and most end in a tab; a text is sent after the answer in progress."""
+        """Queue a text with an id, and mostly a final tab; it follows the answer that is being sent."""
         self.call_later(0.0, partial(self.events.send_for, text))
         text = on_the_wire(text)
         number, self._next_text_id = self._next_text_id, (self._next_text_id + 1) & 0xFFFF
@@ -256,7 +256,7 @@ class Px4Vehicle(Px4Host):
         self.switch_to(modes.TERMINATION)
 
     def change_mode(self, mode: Px4Mode) -> bool:
-        """Handle a mode request: any mode while disarmed; while armed only modes that can run, and LAND always."""
+        """Handle a mode request. While armed, modes that cannot run are refused, except LAND."""
         if self.is_armed and mode != modes.LAND and not self.can_run(mode):
             return False
         if mode not in _MODES_ENDED_BY_LANDING:
@@ -275,7 +275,7 @@ class Px4Vehicle(Px4Host):
         return True
 
     def can_run(self, mode: Px4Mode) -> bool:
-        """Return True if the mode has what it needs: sticks, a mission, set-points, a position."""
+        """Return True if the requirements of the mode are met: sticks, mission, set-points or position."""
         traits = modes.MODES.get(mode)
         if traits is None or self.arming.is_terminated or (mode == modes.MISSION and not self.mission.is_valid):
             return False
@@ -289,7 +289,7 @@ class Px4Vehicle(Px4Host):
         """Change the mode; the next heartbeat reports it."""
         self.mode = mode
         self.flight.enter(mode)
-        if mode == modes.RTL and self.is_armed:  # PX4 informs its own components.
+        if mode == modes.RTL and self.is_armed:  # PX4 informs the other components of the vehicle.
             self.send(m.CommandLong(self.system_id, 0, MavCmd.NAV_RETURN_TO_LAUNCH, 0, *(0.0,) * 7))
 
     def leave_ground(self) -> None:
@@ -297,7 +297,7 @@ class Px4Vehicle(Px4Host):
         self.info("Takeoff detected")
 
     def on_sticks_moved(self, size: float) -> None:
-        """Switch to POSITION if the sticks moved by COM_RC_STICK_OV per cent in a mode that COM_RC_OVERRIDE covers."""
+        """Switch to POSITION if the sticks moved by COM_RC_STICK_OV per cent and COM_RC_OVERRIDE includes the mode."""
         if self.is_armed and not self.is_landed and self.failsafes.can_be_overridden(size):
             self.info("Pilot took over using sticks")
             self.change_mode(modes.POSITION)
@@ -357,6 +357,6 @@ class Px4Vehicle(Px4Host):
             self.arming.disarm("auto preflight disarming")
 
     def _on_ping(self, ping: m.Ping, channel: Channel) -> None:
-        """Only a broadcast PING is a request."""
+        """Answer a broadcast PING; an addressed PING is itself an answer."""
         if ping.target_system == ping.target_component == 0:
             self.send(m.Ping(ping.time_usec, ping.seq, *sender_of(ping)), channel)

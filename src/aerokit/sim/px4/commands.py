@@ -1,4 +1,4 @@
-"""Commands (MAV_CMD) of a simulated PX4, answered as the firmware does."""
+"""Handlers of the commands (MAV_CMD) of a simulated PX4, with the conditions and results of the firmware."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _ACCEPTED = (
     _C.DO_SET_ROI_NONE, _C.DO_SET_ROI, _C.DO_SET_SAFETY_SWITCH_STATE,
 )  # fmt: skip
 
-# Left to modules that do not run in this configuration, so there is no answer.
+# Not answered, because the modules that handle them do not run in this configuration.
 _UNANSWERED = (
     _C.NAV_DELAY, _C.DO_DIGICAM_CONTROL, _C.DO_MOUNT_CONFIGURE, _C.DO_MOUNT_CONTROL, _C.DO_SET_CAM_TRIGG_DIST,
     _C.DO_SET_CAM_TRIGG_INTERVAL, _C.PREFLIGHT_UAVCAN, _C.REQUEST_CAMERA_INFORMATION, _C.SET_CAMERA_MODE,
@@ -51,7 +51,7 @@ def _refuse_high_latency(px4: Px4Vehicle) -> int:
 
 
 def _test_actuator(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
-    """No visible effect; param 5 is a motor, a servo, or from 1000 an output function."""
+    """Accept a motor, a servo or (from 1000) an output function as param 5; the test has no visible effect."""
     if px4.is_armed:
         return MavResult.DENIED
     function = whole(command.x)
@@ -60,7 +60,7 @@ def _test_actuator(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
 
 
 def _store(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
-    """No visible effect; unknown actions are not answered."""
+    """Accept known actions without a visible effect; unknown actions are not answered."""
     if px4.is_armed:
         return MavResult.TEMPORARILY_REJECTED
     return MavResult.ACCEPTED if whole(command.param1) in _STORAGE_ACTIONS else None
@@ -146,7 +146,7 @@ class _Flight:
         return MavResult.ACCEPTED if done else MavResult.TEMPORARILY_REJECTED
 
     def set_mode(self, command: ReceivedCommand) -> int:
-        """Acknowledge twice: the link module always answers ACCEPTED, then the commander sends the result."""
+        """Set a mode and acknowledge twice: PX4's link module always accepts, then the commander sends the result."""
         self._px4.commands.answer(command, MavResult.ACCEPTED)
         return set_mode(self._px4, whole(command.param1), (whole(command.param2), whole(command.param3)))
 
@@ -163,7 +163,7 @@ class _Flight:
         return result
 
     def take_off(self, command: ReceivedCommand) -> int:
-        """``param7`` is AMSL; NaN uses MIS_TAKEOFF_ALT above home."""
+        """Take off to param 7 (AMSL); NaN uses MIS_TAKEOFF_ALT above home."""
         result = self._change(modes.TAKEOFF)
         if result == MavResult.ACCEPTED and math.isfinite(command.z):
             self._plan_take_off(self._px4.frame.origin.altitude_m - command.z)
@@ -186,7 +186,7 @@ class _Flight:
         return self._change(modes.RTL, "Returning to launch")
 
     def start_mission(self, command: ReceivedCommand) -> int:
-        """Change the mode and arm."""
+        """Change to MISSION and arm."""
         px4 = self._px4
         if not px4.mission.is_valid:
             px4.send_text(MavSeverity.CRITICAL, "Mission start denied! No valid mission")
@@ -199,7 +199,7 @@ class _Flight:
         return result
 
     def reposition(self, command: ReceivedCommand) -> int:
-        """NaN (INT32_MAX) latitude and longitude keep the position, a NaN altitude (AMSL) keeps the height."""
+        """Go to a position. NaN or INT32_MAX as latitude or longitude keep the place, NaN as altitude the height."""
         if whole(command.param2) != 1:
             return MavResult.UNSUPPORTED
         result = self._change(modes.HOLD)
@@ -240,7 +240,7 @@ class _Flight:
         return self._change(modes.ORBIT)
 
     def change_altitude(self, command: ReceivedCommand) -> int:
-        """``param1`` is AMSL."""
+        """Change the altitude to param 1 (AMSL)."""
         result = self._change(modes.HOLD)
         if result == MavResult.ACCEPTED and math.isfinite(command.param1):
             flight = self._px4.flight
@@ -248,7 +248,7 @@ class _Flight:
         return result
 
     def terminate(self, command: ReceivedCommand) -> int:
-        """Only ``param1`` 1 is accepted."""
+        """Terminate the flight if param 1 is 1."""
         if command.param1 != 1.0 or not self._px4.is_armed:
             return MavResult.DENIED
         self._px4.terminate()
@@ -315,7 +315,7 @@ class _Requests:
         self._px4 = px4
 
     def send_now(self, message_id: int, command: ReceivedCommand) -> int:
-        """Send a message before its acknowledgement; DENIED if there is none."""
+        """Send a message before the acknowledgement; return DENIED if it cannot be sent."""
         message = None if message_id in _NOT_ON_REQUEST else self._px4.build(message_id)
         self._px4.rates.on_requested(command.channel, message_id)
         if message is None:

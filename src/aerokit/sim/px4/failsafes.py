@@ -1,9 +1,9 @@
 """Failsafes of a simulated PX4: battery, ground station, manual control, geofence.
 
-https://docs.px4.io/main/en/config/safety.html. The most severe action applies. Before returning or landing the
-vehicle holds for COM_FAIL_ACT_T seconds. A mode change by the user overrides the action until another failure
-occurs. Simulated: warnings, HOLD, RETURN, LAND, disarming and flight termination. Not simulated: events with the
-cause, deferring, parachutes, predicted breaches (GF_PREDICT).
+https://docs.px4.io/main/en/config/safety.html. The most severe action is executed. Before RETURN or LAND the vehicle
+holds for COM_FAIL_ACT_T seconds. A mode change by the user overrides the action until another failure occurs.
+Simulated actions: warnings, HOLD, RETURN, LAND, disarming and flight termination. Not simulated: events with the
+cause, deferred failsafes, parachutes, predicted breaches (GF_PREDICT).
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ _NO_ACTION, _WARNING = 0, 1
 
 
 class Px4Fence:
-    """Geofence, checked while GF_ACTION is not 0. Being inside one inclusion is enough."""
+    """Geofence, checked while GF_ACTION is not 0. The vehicle must be inside at least one inclusion."""
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
         self._is_valid = True
 
     def on_uploaded(self) -> None:
-        """Use a new list of areas; one that excludes home is reported and ignored."""
+        """Use the uploaded areas; a fence that excludes home is reported and ignored."""
         home = self._px4.home
         self._is_valid = self._areas_allow(home[0], home[1])
         if not self._is_valid:
@@ -50,7 +50,7 @@ class Px4Fence:
         return self.breaches_at(motion.place)
 
     def allows(self, place: Ned) -> bool:
-        """Return True if the vehicle may be sent to this point; always with no action or a warning only."""
+        """Return True if GF_ACTION only warns or does nothing, or if the point breaches no limit."""
         action = round(self._px4.parameters["GF_ACTION"])
         return action in (_NO_ACTION, _WARNING) or not self.breaches_at(place)
 
@@ -80,7 +80,7 @@ class Px4Fence:
         return not inclusions or any(inclusions)
 
     def _areas(self, north: float, east: float) -> Iterator[tuple[bool, bool]]:
-        """Return for each area whether it is an inclusion, and whether the point is inside."""
+        """Yield two values for each area: True if it is an inclusion, and True if the point is inside it."""
         items, index = self._items(), 0
         while index < len(items):
             item = items[index]
@@ -140,7 +140,7 @@ _BATTERY_TEXTS = {
 
 
 class Px4Failsafes:
-    """Checks for failures five times a second and acts on them."""
+    """Checks for failures five times a second and executes failsafe actions."""
 
     battery_state: MavBatteryChargeState
 
@@ -149,7 +149,7 @@ class Px4Failsafes:
         self.fence: Px4Fence = Px4Fence(px4)
         self.action: FailsafeAction = _A.NONE  # Current action.
         self.battery_state = MavBatteryChargeState.OK
-        """MAV_BATTERY_CHARGE_STATE; it never improves while armed."""
+        """State of charge; it never improves while armed."""
         self.has_station: bool = False  # True while heartbeats of a ground station are received.
         self._station_at = -math.inf
         self._had_manual_control = False
@@ -204,7 +204,7 @@ class Px4Failsafes:
         return MavBatteryChargeState.LOW if share < limits["BAT_LOW_THR"] else MavBatteryChargeState.OK
 
     def _battery_action(self) -> FailsafeAction:
-        """COM_LOW_BAT_ACT: 0 warns, 2 lands, 3 returns, and lands in an emergency."""
+        """Return the action of COM_LOW_BAT_ACT: 0 warns, 2 lands, 3 returns (and lands in an emergency)."""
         state, action = self.battery_state, round(self._px4.parameters["COM_LOW_BAT_ACT"])
         if state == MavBatteryChargeState.OK:
             return _A.NONE
@@ -214,7 +214,7 @@ class Px4Failsafes:
         return _A.LAND if lands else _A.RETURN
 
     def arming_reasons(self) -> list[str]:
-        """Return the texts of the reasons that prevent arming."""
+        """Return the texts of the failures that prevent arming."""
         reasons = list(self.fence.breaches)
         level = self._battery_level()
         if level >= MavBatteryChargeState.CRITICAL:
@@ -224,7 +224,7 @@ class Px4Failsafes:
         return reasons
 
     def on_armed(self) -> None:
-        """Ignore what is already missing at arming."""
+        """Reset all actions; failures that exist at arming do not trigger a failsafe."""
         self._had_manual_control = self._px4.sticks.are_fresh
         self._battery_at_arming = self._reported_battery_level = self.battery_state = self._battery_level()
         self._reset()
@@ -248,7 +248,7 @@ class Px4Failsafes:
         return _LINK_ACTIONS.get(round(self._px4.parameters["NAV_DLL_ACT"]), _A.NONE)
 
     def _sticks_action(self) -> FailsafeAction:
-        """Only sticks that were available since arming can be lost."""
+        """Return the action for lost sticks, if they have been received since arming."""
         sticks = self._px4.sticks
         self._had_manual_control = self._had_manual_control or sticks.are_fresh
         if (
@@ -261,13 +261,13 @@ class Px4Failsafes:
         return _LINK_ACTIONS.get(round(self._px4.parameters["NAV_RCL_ACT"]), _A.NONE)
 
     def can_be_overridden(self, moved: float) -> bool:
-        """Return True if sticks moved this far (2 is end to end) end the current mode."""
+        """Return True if a stick movement of this size (2 is end to end) ends the current mode."""
         values, mode = self._px4.parameters, self._px4.mode
         bit = 1 if mode[0] == 4 or mode == ORBIT else 2 if mode == OFFBOARD else 0
         return bool(round(values["COM_RC_OVERRIDE"]) & bit) and moved * 100 >= values["COM_RC_STICK_OV"]
 
     def _is_excepted(self, parameter: str) -> bool:
-        """Return True if the mode's bit is set: 1 mission, 2 hold and other automatic modes, 4 offboard."""
+        """Return True if the parameter excepts the mode: bit 1 MISSION, 2 other automatic modes, 4 OFFBOARD."""
         mode = self._px4.intended_mode
         bit = {MISSION: 1, OFFBOARD: 4}.get(mode, 2 if mode[0] == 4 else 0)
         return bool(round(self._px4.parameters[parameter]) & bit)
@@ -281,7 +281,7 @@ class Px4Failsafes:
         return _FENCE_ACTIONS.get(round(self._px4.parameters["GF_ACTION"]), _A.WARN) if breaches else _A.NONE
 
     def check(self) -> None:
-        """Update the state and act; does nothing after a flight termination."""
+        """Check for failures and execute the action; does nothing after a flight termination."""
         if self._px4.arming.is_terminated:
             return
         self._watch_station()
@@ -293,7 +293,10 @@ class Px4Failsafes:
         self._execute(self._choose())
 
     def _update(self, failing: dict[str, FailsafeAction]) -> None:
-        """A new failure starts the delay and ends an override; an action stays until the mode is changed."""
+        """Update the active failures.
+
+        A new failure starts the delay and ends an override. An action stays active until the mode is changed.
+        """
         for cause, action in failing.items():
             if cause not in self._active and action >= _A.HOLD:
                 self._is_taken_over = False
@@ -337,7 +340,7 @@ class Px4Failsafes:
         self._px4.send_text(MavSeverity.CRITICAL, text)
 
     def override(self) -> None:
-        """The user changed the mode: drop failures that have ended, and reduce the action to a warning."""
+        """Handle a mode change by the user: drop failures that have ended, and reduce the action to a warning."""
         self._active = {cause: action for cause, action in self._active.items() if cause in self._failing}
         if self.action > _A.WARN:
             self._is_taken_over = bool(self._active)

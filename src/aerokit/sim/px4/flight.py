@@ -1,4 +1,4 @@
-"""Navigator of a simulated PX4: flies each mode."""
+"""Navigator of a simulated PX4, which controls the motion in each mode."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _BACK_TO_CIRCLE_PER_S = 0.5
 
 
 class Px4Orbit:
-    """A circle; a negative radius is counter-clockwise."""
+    """Circle of ORBIT; a negative radius is counter-clockwise."""
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
@@ -28,7 +28,7 @@ class Px4Orbit:
         self.speed_m_s: float = 1.0
 
     def plan(self, radius_m: float, speed_m_s: float, place: tuple[float, float], down: float) -> bool:
-        """Set a new circle; return False, without a change, if its radius is out of range."""
+        """Set a new circle; if its radius is out of range, keep the old circle and return False."""
         if not _RADII_M[0] <= abs(radius_m) <= _RADII_M[1]:
             return False
         self.radius_m = radius_m
@@ -66,7 +66,7 @@ _RELATIVE = (MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT)
 
 
 def return_destination(px4: Px4Host) -> Ned:
-    """Return north, east, and the level from which heights above the destination are counted."""
+    """Return the place of the return: north, east, and the down coordinate from which its heights are counted."""
     kind = round(px4.parameters["RTL_TYPE"])
     points = [_place(px4, item) for item in px4.missions.items(MavMissionType.RALLY)]
     if kind not in (*_NEAREST, _RALLY_FIRST) or not points:
@@ -88,7 +88,7 @@ _YAW_FROM_M_S = 0.5
 
 
 class Px4Flight:
-    """Navigator: target, speeds, and phase of modes that have several."""
+    """Navigator: target, speeds, and the phase of a take-off or return."""
 
     def __init__(self, vehicle: Px4Host) -> None:
         self._vehicle = vehicle
@@ -96,7 +96,7 @@ class Px4Flight:
         self.destination: Ned = (0.0, 0.0, 0.0)  # Landing point of RTL: home or a rally point.
         self.heading: float | None = None
         self.speed_m_s: float = 0.0
-        self.lifts_off: bool = False  # True if the mode is to leave the ground.
+        self.lifts_off: bool = False  # True if the mode requests to leave the ground.
         self.by_hand: Px4ManualFlight = Px4ManualFlight(vehicle)
         self.orbit: Px4Orbit = Px4Orbit(vehicle)
         self._phase = ""
@@ -178,9 +178,7 @@ class Px4Flight:
             self.target = target
 
     def plan_take_off(self, down: float | None = None) -> None:
-        """Climb vertically to ``down``; by default to MIS_TAKEOFF_ALT above home, or the current height if that is
-        higher.
-        """
+        """Plan a vertical climb to ``down``; None is MIS_TAKEOFF_ALT above home, but not below the current height."""
         vehicle, motion = self._vehicle, self._vehicle.motion
         self._is_default_height = down is None
         if down is None:
@@ -209,9 +207,7 @@ class Px4Flight:
             motion.face(math.atan2(motion.velocity_east, motion.velocity_north))
 
     def descend(self) -> None:
-        """Descend at MPC_Z_V_AUTO_DN above MPC_LAND_ALT1 and MPC_LAND_SPEED below MPC_LAND_ALT2, interpolated in
-        between.
-        """
+        """Descend, at MPC_Z_V_AUTO_DN above MPC_LAND_ALT1, at MPC_LAND_SPEED below MPC_LAND_ALT2."""
         vehicle, limits = self._vehicle, self._vehicle.parameters
         fast, slow = limits["MPC_Z_V_AUTO_DN"], limits["MPC_LAND_SPEED"]
         high, low = limits["MPC_LAND_ALT1"], limits["MPC_LAND_ALT2"]
@@ -219,7 +215,7 @@ class Px4Flight:
         vehicle.motion.seek_velocity(0.0, 0.0, slow + (fast - slow) * share)
 
     def _plan_return(self) -> None:
-        """Return at RTL_RETURN_ALT above the landing point, or at RTL_DESCEND_ALT if it is near."""
+        """Plan a return at RTL_RETURN_ALT above the landing point, or at RTL_DESCEND_ALT if it is near."""
         vehicle = self._vehicle
         self.destination = return_destination(vehicle)
         north, east, down = vehicle.motion.north, vehicle.motion.east, vehicle.motion.down
@@ -230,7 +226,7 @@ class Px4Flight:
         self.target = (north, east, min(down, self.destination[2] - height))
         amsl = vehicle.frame.origin.altitude_m - self.target[2]
         text = f"RTL: start return at {amsl:.0f} m ({height:.0f} m above destination)"
-        vehicle.call_later(0.0, lambda: vehicle.info(text))  # Sent after the text of the command that started it.
+        vehicle.call_later(0.0, lambda: vehicle.info(text))  # PX4 sends it after the text of the command.
 
     def _return(self) -> None:
         vehicle, motion = self._vehicle, self._vehicle.motion

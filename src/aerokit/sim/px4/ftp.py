@@ -1,4 +1,4 @@
-"""MAVFTP of PX4: one session per port, immediate answers, bursts from the main loop."""
+"""MAVFTP server of PX4: one session per port, immediate answers, bursts from the main loop."""
 
 from __future__ import annotations
 
@@ -30,20 +30,20 @@ class _Port:
     size: int = 0
     used_at: float = 0.0
     errno: int = 0
-    """Error of the latest failure. PX4 never clears it, and EEXIST changes every later refusal."""
+    """Error of the latest failure. PX4 never clears it: after EEXIST, every refusal reports FILEEXISTS."""
     reply: FtpPacket | None = None
     burst: FtpPacket | None = field(default=None, repr=False)
     """Sequence number and offset of the next block."""
     burst_sent: int = 0
-    """Bytes of the burst so far."""
+    """Bytes that the burst has sent."""
 
 
 class Px4Ftp(FtpServer):
-    """Sessions always have number 0; a session is closed after 10 s without a request.
+    """MAVFTP server of PX4. Sessions always have number 0; a session is closed after 10 s without a request.
 
-    A burst ignores the requested size and sends ``burst`` blocks every ``burst_interval_s`` seconds. It is complete
-    after 35 kB, and must be requested again, or ends with the error "end of file". Small replies are repeated for a
-    repeated sequence number.
+    A burst ignores the requested size and sends ``burst`` blocks every ``burst_interval_s`` seconds. It ends after
+    35 kB, so that the client must request the next burst, or with EOF. A small reply is sent again if its sequence
+    number is repeated.
     """
 
     burst = 24
@@ -132,20 +132,20 @@ class Px4Ftp(FtpServer):
             return 0
 
     def _watch(self, port: _Port) -> None:
-        """Close the session when it times out."""
+        """Schedule the time-out that closes the session."""
         file = port.file
 
-        def look() -> None:
+        def close_if_due() -> None:
             if port.file is not file or file is None:
                 return
             if self._vehicle.now < (end := port.used_at + _SESSION_TIMEOUT_S):
-                self._vehicle.call_at(end, look)
+                self._vehicle.call_at(end, close_if_due)
                 return
             port.reply = None
             with suppress(FileFault):
                 self._close(port)
 
-        self._vehicle.call_at(port.used_at + _SESSION_TIMEOUT_S, look)
+        self._vehicle.call_at(port.used_at + _SESSION_TIMEOUT_S, close_if_due)
 
     def _read(self, port: _Port, request: FtpPacket) -> FtpPacket:
         if request.session != 0 or port.file is None:
@@ -235,7 +235,7 @@ class Px4Ftp(FtpServer):
         try:
             return self._change(request, lambda path: self.files.truncate(path, request.offset))
         except FileFault:
-            return request.refuse_errno(port.errno)  # The error of an earlier failure, as in the firmware.
+            return request.refuse_errno(port.errno)  # The firmware reports the error of an earlier failure.
 
     def _rename(self, port: _Port, request: FtpPacket) -> FtpPacket:
         first, _, rest = request.data[: request.size].partition(b"\0")

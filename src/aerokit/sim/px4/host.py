@@ -1,7 +1,7 @@
 """Interfaces between the modules of a simulated PX4.
 
-`Px4Host` declares the vehicle and the protocols declare its modules, so that none of them
-imports `Px4Vehicle`, which imports them all.
+`Px4Host` declares the vehicle, and the protocols declare its modules. The modules use these interfaces because they
+cannot import `Px4Vehicle`, which imports the modules.
 """
 
 from __future__ import annotations
@@ -149,7 +149,7 @@ class Px4Host(SimulatedAutopilot):
         raise NotImplementedError
 
     def can_run(self, mode: Px4Mode) -> bool:
-        """Return True if the mode has what it needs: sticks, a mission, set-points, a position."""
+        """Return True if the requirements of the mode are met: sticks, mission, set-points or position."""
         raise NotImplementedError
 
     def change_mode(self, mode: Px4Mode) -> bool:
@@ -173,5 +173,5 @@ class Px4Host(SimulatedAutopilot):
         raise NotImplementedError
 
     def on_sticks_moved(self, size: float) -> None:
-        """Called with the distance that the sticks moved."""
+        """Called with the distance by which the sticks moved; 2 is end to end."""
         raise NotImplementedError

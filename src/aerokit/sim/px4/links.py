@@ -1,7 +1,7 @@
-"""Output of a simulated PX4 by link: stream rates, status texts, and the events of those texts.
+"""Output of a simulated PX4 by link: stream rates, status texts, and the events that correspond to texts.
 
-https://mavlink.io/en/services/events.html. Event ids and log levels were recorded from a real PX4. Not simulated:
-events without a text, the health report of the components, REQUEST_EVENT.
+https://mavlink.io/en/services/events.html. Event ids and log levels are those of a recording of a real PX4. Not
+simulated: events without a text, the health report of the components, REQUEST_EVENT.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _RETURN_TEXT = re.compile(r"RTL: start return at (-?\d+) m \((-?\d+) m above des
 
 
 class Px4Events:
-    """Sends events. The sequence starts ten below its overflow, so that clients are tested with it."""
+    """Sends events. The sequence starts ten below its overflow, so that tests of clients cover the overflow."""
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
@@ -47,7 +47,7 @@ class Px4Events:
         return CurrentEventSequence((self._next - 1) & 0xFFFF, 0)
 
     def send_for(self, text: str) -> None:
-        """Send the event of a status text, if it has one."""
+        """Send the event that corresponds to a status text, if there is one."""
         event = _event_of(text)
         if event is None:
             return
@@ -90,7 +90,7 @@ _MAX_QUEUED, _MAX_AGE_S = 8, 5.0
 
 
 class Px4TextLinks:
-    """Sends texts on links with a ground station (streams/STATUSTEXT.hpp), and queues them shortly on others."""
+    """Sends texts on links with a ground station (streams/STATUSTEXT.hpp); on other links queues them for 5 s."""
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
@@ -98,7 +98,7 @@ class Px4TextLinks:
         self._waiting: dict[Channel, deque[tuple[float, list[Statustext]]]] = {}
 
     def on_station_heartbeat(self, channel: Channel) -> None:
-        """Handle a ground station's HEARTBEAT: send the texts that were queued recently."""
+        """Handle a ground station's HEARTBEAT: send the texts queued in the last 5 s."""
         self._station_at[channel] = self._px4.now
         for sent_at, chunks in self._waiting.pop(channel, ()):
             if self._px4.now - sent_at < _MAX_AGE_S:
@@ -135,16 +135,16 @@ _FAST_MESSAGES = (
     m.ServoOutputRaw.ID,
 )
 _SIMULATION_RATES_HZ = {m.RcChannels.ID: 20.0, m.OpticalFlowRad.ID: 10.0, m.Statustext.ID: 20.0}
-# Rates that are fixed on every link.
+# Rates that are the same on every link and cannot be changed.
 _ALWAYS_HZ = {m.Heartbeat.ID: 1.0, m.MissionCurrent.ID: 1.0, m.CurrentEventSequence.ID: 0.3}
 
 _OFF, _ON_CHANGE = -1, 0
 
 
 class Px4StreamRates:
-    """Stream rates by link. The position in ``modes`` is the link; further links use the last mode.
+    """Stream rates by link. ``modes`` are the modes of the first, second … link; further links use the last mode.
 
-    "normal" is the ground-station link of PX4's simulation, where some messages are sent at ``fast_hz``.
+    The "normal" link is the ground-station link of PX4's simulation, on which some messages are sent at ``fast_hz``.
     """
 
     def __init__(self, modes: Sequence[str], is_built: Callable[[int], bool], fast_hz: float) -> None:
@@ -176,7 +176,7 @@ class Px4StreamRates:
         return {**rates, **fast, **_SIMULATION_RATES_HZ}
 
     def interval_us(self, channel: Channel, message_id: int) -> int:
-        """Return the interval for MESSAGE_INTERVAL: -1 is off or unknown, 0 is on change."""
+        """Return the interval for MESSAGE_INTERVAL: -1 means off or unknown, 0 means sent on change."""
         if message_id == m.Heartbeat.ID:
             return 1_000_000
         return self._intervals_us.get(channel, {}).get(message_id, _OFF)
@@ -194,7 +194,7 @@ class Px4StreamRates:
         return MavResult.ACCEPTED
 
     def on_requested(self, channel: Channel, message_id: int) -> None:
-        """Handle a single request: the message is now reported as sent on change."""
+        """Handle a single request, after which MESSAGE_INTERVAL reports the message as sent on change."""
         intervals_us = self._intervals_us.get(channel, {})
         if intervals_us.get(message_id) == _OFF:
             intervals_us[message_id] = _ON_CHANGE
@@ -206,7 +206,7 @@ def _interval_us(rate_hz: float) -> int:
 
 @lru_cache(maxsize=1)
 def _table() -> dict[str, dict[int, float]]:
-    """Link mode → message id → rate in Hz; 0 is on request only."""
+    """Return link mode → message id → rate in Hz; messages with rate 0 are sent only on request."""
     data = pkgutil.get_data(__name__, "stream_rates.csv")
     assert data is not None
     rows = list(csv.DictReader(data.decode().splitlines()))

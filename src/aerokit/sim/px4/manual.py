@@ -1,4 +1,4 @@
-"""Manual control of a simulated PX4: sticks (MANUAL_CONTROL) and the modes flown by them."""
+"""Manual control of a simulated PX4: stick positions and the manual modes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _CHANNEL_PARAMETERS = ("RC_MAP_ROLL", "RC_MAP_PITCH", "RC_MAP_YAW", "RC_MAP_THRO
 
 
 class Px4Sticks:
-    """Latest stick positions from -1 to 1; right, forward, clockwise and up are positive."""
+    """Latest stick positions, -1 to 1; right, forward, clockwise and up are positive."""
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
@@ -38,7 +38,7 @@ class Px4Sticks:
 
     @property
     def are_wanted(self) -> bool:
-        """False if COM_RC_IN_MODE is 4."""
+        """True if manual control is enabled (COM_RC_IN_MODE is not 4)."""
         return round(self._px4.parameters["COM_RC_IN_MODE"]) != _NO_MANUAL_CONTROL
 
     @property
@@ -75,14 +75,14 @@ class Px4Sticks:
 
 
 def _share(pulse_us: int) -> float:
-    """Scale a pulse of 1000 to 2000 µs to -1 to 1; 0 for an unused channel."""
+    """Scale a pulse of 1000 to 2000 µs to -1 to 1; return 0 for an unused channel."""
     if pulse_us in (0, _UNUSED):
         return 0.0
     return max(-1.0, min(1.0, (pulse_us - 1500) / 500))
 
 
 def curved(value: float, share: float, dead_zone: float = 0.0) -> float:
-    """Apply a dead zone (MPC_HOLD_DZ) and a cubic ``share`` (MPC_XY_MAN_EXPO) to a stick value."""
+    """Apply a dead zone (MPC_HOLD_DZ) and a curve with a cubic ``share`` (MPC_XY_MAN_EXPO) to a stick position."""
     size = abs(value)
     if size <= dead_zone:
         return 0.0
@@ -94,7 +94,7 @@ _EXPO, _DEAD_ZONE = 0.6, 0.1
 _SLOW_SHARE = 0.3
 _LIFTS_OFF_ABOVE = 0.05
 _AT_REST_M_S = 0.3
-# Time constant of the motion's velocity control.
+# Time constant of the velocity control in `Motion`.
 _THRUST_AHEAD_S = 0.3
 
 _HOLDS_HEIGHT = frozenset({ALTITUDE, ALTITUDE_CRUISE, POSITION, POSITION_SLOW})
@@ -102,7 +102,7 @@ _HOLDS_PLACE = frozenset({POSITION, POSITION_SLOW})
 
 
 class Px4ManualFlight:
-    """Converts sticks to motion; `update` runs at 50 Hz in manual modes."""
+    """Converts stick positions to motion targets; `update` runs at 50 Hz in manual modes."""
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
@@ -160,7 +160,7 @@ class Px4ManualFlight:
         motion.seek_velocity(offset_north, offset_east, down)
 
     def _height_velocity(self) -> float:
-        """Return the vertical velocity (m/s down) of the stick, or the one that holds the height."""
+        """Return the commanded vertical velocity (m/s down); a centred stick holds the height."""
         px4, motion = self._px4, self._px4.motion
         wanted = curved(px4.sticks.throttle, _EXPO, _DEAD_ZONE)
         if wanted > 0:
@@ -177,14 +177,14 @@ class Px4ManualFlight:
 
     @property
     def _thrust(self) -> float:
-        """Thrust relative to hovering: a centred stick hovers, MPC_MANTHR_MIN is the lower end."""
+        """Thrust relative to hovering: 1 for a centred stick; the lowest stick commands MPC_MANTHR_MIN."""
         values, throttle = self._px4.parameters, self._px4.sticks.throttle
         hover, min_thrust = values["MPC_THR_HOVER"], values["MPC_MANTHR_MIN"]
         thrust = hover + (throttle * (1.0 - hover) if throttle > 0 else throttle * (hover - min_thrust))
         return thrust / hover
 
     def _velocity_of_thrust(self) -> float:
-        """Return the vertical velocity that the thrust produces."""
+        """Return the vertical velocity (m/s down) to which the thrust accelerates."""
         motion = self._px4.motion
         lift = self._thrust * math.cos(motion.roll) * math.cos(motion.pitch)
         return motion.velocity_down + (1.0 - lift) * GRAVITY_M_S2 * _THRUST_AHEAD_S

@@ -33,7 +33,7 @@ _MAX_FIRST_DISTANCE_M = 10_000.0
 
 
 def rejection(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
-    """Return why a mission cannot be flown, or None. Gliding is not checked."""
+    """Return the reason why a mission cannot be flown, or None. Glide slopes of landings are not checked."""
     if px4.VEHICLE_TYPE == MavType.QUADROTOR and any(item.command in _VTOL for item in items):
         return "Mission contains VTOL items but vehicle is not a VTOL"
     has_place = False
@@ -52,7 +52,7 @@ def rejection(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
 
 
 def _missing_landing(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
-    """MIS_TKO_LAND_REQ: 1 requires a take-off, 2 a landing, 3 both, 4 both or none; the default of a plane is 2."""
+    """Check MIS_TKO_LAND_REQ: 1 requires a take-off, 2 (a plane's default) a landing, 3 both, 4 both or none."""
     if "MIS_TKO_LAND_REQ" not in px4.parameters or not items:  # The multicopter's parameter table does not contain it.
         return None
     takes_off, lands = (any(item.command in kind for item in items) for kind in (_TAKE_OFFS, _LANDINGS))
@@ -90,7 +90,7 @@ def _landing_problem(items: Sequence[MissionItem]) -> str | None:
 
 
 def outside_fence(px4: Px4Host, items: Sequence[MissionItem]) -> int | None:
-    """Return the number, from 1, of the first item outside the geofence."""
+    """Return the number (from 1) of the first item outside the geofence, or None."""
     for number, item in enumerate(items, start=1):
         if item.command in _WITH_PLACE:
             north, east = px4.frame.to_local(round(item.x), round(item.y))
@@ -100,7 +100,7 @@ def outside_fence(px4: Px4Host, items: Sequence[MissionItem]) -> int | None:
 
 
 def warning(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
-    """Return the warning about a valid mission, such as a first waypoint that is far away."""
+    """Return a warning if the first waypoint of a mission is far away, or None."""
     for item in items:
         if item.command in _WITH_PLACE:
             north, east = px4.frame.to_local(round(item.x), round(item.y))
@@ -127,11 +127,11 @@ _ACTIVE_MODES = (MISSION, TAKEOFF, LAND)
 
 
 class Px4Mission:
-    """Flies the mission; `update` runs while it is in charge."""
+    """Mission mode; `update` runs at every tick in flight."""
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
-        self.current: int = 0  # Index of the item that is flown, or will be.
+        self.current: int = 0  # Index of the item that is flown now or next.
         self.reached: int = -1  # Index of the item that was reached last; -1 before the first.
         self.is_finished: bool = False  # True after the last item.
         self.is_valid: bool = False  # True if there is a mission that can be flown.
@@ -163,7 +163,7 @@ class Px4Mission:
 
     @property
     def state(self) -> int:
-        """MISSION_STATE; other cases leave it unchanged."""
+        """MISSION_STATE; a disarmed mission without progress keeps the previous state."""
         if not self.is_valid:
             self._state = MissionState.NO_MISSION
         elif self.is_finished:
@@ -181,7 +181,7 @@ class Px4Mission:
         return self._item is not None and not self.is_finished and self._phase != "land"
 
     def on_replaced(self, current: int) -> None:
-        """Handle a new mission; a mission that is being flown is restarted."""
+        """Handle an uploaded mission; in mission mode, restart with it."""
         self.current, self.is_finished = max(0, current), False
         self.forget_reached()
         self._jumps.clear()
@@ -195,7 +195,7 @@ class Px4Mission:
             self._px4.change_mode(HOLD)
 
     def _check(self) -> None:
-        """An invalid mission stays stored and is treated as none."""
+        """Check the stored mission and send the problems; an invalid mission stays stored, but is not flown."""
         items = self._px4.missions.commands
         problem, doubt = rejection(self._px4, items), warning(self._px4, items)
         outside = outside_fence(self._px4, items)
@@ -220,7 +220,7 @@ class Px4Mission:
             self._begin_item()
 
     def enter(self) -> None:
-        """Start the mode; a finished mission starts again."""
+        """Enter the mode; a finished mission starts again."""
         if not self.is_valid:
             return
         if self.is_finished or self.current >= self.count:
@@ -257,13 +257,13 @@ class Px4Mission:
             px4.call_later(0.0, self._return)
 
     def _return(self) -> None:
-        """The mission has ended: it is not resumed after the landing."""
+        """Change to HOLD, then to RTL, so that the mission is not resumed after the landing."""
         self._px4.change_mode(HOLD)
         if self._px4.change_mode(RTL):
             self._px4.info("Returning to launch")
 
     def _jump(self, item: MissionItem) -> int:
-        """Return the next index. Each jump is made as often as it specifies, and reported to the uploader."""
+        """Return the next index. PX4 counts the repetitions, and sends the changed item to the last client."""
         done, index = self._jumps.get(self.current, 0), self.current
         if done >= item.param2:
             self._jumps.pop(index, None)
@@ -288,7 +288,7 @@ class Px4Mission:
             px4.flight.target = target
 
     def _climb(self, down: float | None) -> None:
-        """Climb vertically first, to the altitude of the take-off item or MIS_TAKEOFF_ALT above home."""
+        """Start a vertical climb to ``down``; None is MIS_TAKEOFF_ALT above home."""
         px4, motion = self._px4, self._px4.motion
         if down is None:
             down = px4.home[2] - px4.parameters["MIS_TAKEOFF_ALT"]
@@ -301,14 +301,14 @@ class Px4Mission:
         return item.command == _C.NAV_WAYPOINT and math.isfinite(item.param4)
 
     def _place(self, item: MissionItem) -> tuple[float, float, float]:
-        """Return the position of an item. PX4 flies to 0, 0 as to any other position."""
+        """Return the position of an item. For PX4, latitude and longitude 0 are an ordinary position."""
         px4, motion = self._px4, self._px4.motion
         north, east = px4.frame.to_local(round(item.x), round(item.y))
         above = px4.home[2] if item.frame == MavFrame.GLOBAL_RELATIVE_ALT else px4.frame.origin.altitude_m
         return (north, east, above - item.z if math.isfinite(item.z) else motion.down)
 
     def update(self) -> None:
-        """Run one tick in flight: steer, and check whether the item is reached."""
+        """Run one tick in flight: set the motion target and check if the item is reached."""
         item, flight = self._item, self._px4.flight
         if item is None or self.is_finished:
             flight.go()
@@ -350,14 +350,14 @@ class Px4Mission:
         return self._px4.now - self._arrived_at >= (item.param1 if waits else 0.0)
 
     def on_landed(self) -> None:
-        """Handle the landing: it ends a mission that lands."""
+        """Handle a landing, which completes a landing item."""
         if self._px4.mode == MISSION and self._phase == "land" and not self.is_finished:
             self._reach()
             if self._advance():
                 self._begin_item()
 
     def _advance(self) -> bool:
-        """Select the next item; return False after the last one."""
+        """Select the next item; after the last item finish the mission and return False."""
         if self.current + 1 < self.count:
             self.current += 1
             return True
@@ -376,12 +376,12 @@ class Px4Mission:
         px4.call_later(0.0, self._hold)
 
     def _hold(self) -> None:
-        """Hold after the mission, as the commander does unless another mode was chosen."""
+        """Change to HOLD after the mission, unless the mode was changed in the meantime."""
         if self.is_finished and self._px4.mode == MISSION and self._px4.is_armed and not self._px4.is_landed:
             self._px4.change_mode(HOLD)
 
     def _reach(self) -> None:
-        """Report at once; of several items at the same time only the last."""
+        """Report the current item as reached; of several items in the same tick only the last is reported."""
         if self.reached == self.current:
             return
         self.reached = self.current

@@ -1,4 +1,4 @@
-"""Mission items as PX4 stores them: params that its structure has no field for come back as 0."""
+"""Storage of mission items in PX4: a download has 0 for params that the storage has no field for."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ _C, _F = MavCmd, MavFrame
 _DATA = pkgutil.get_data(__name__, "mission_commands.csv")
 assert _DATA is not None
 _ROWS = list(csv.DictReader(_DATA.decode().splitlines()))
-# Commands in global frames → how params 1 to 4 are stored, see `_KEEPERS`.
+# Command in a global frame → storage types of params 1 to 4, see `_CONVERSIONS`.
 _PLACES = {int(MavCmd[row["command"]]): row["with_place"] for row in _ROWS if row["with_place"]}
-# Commands in MAV_FRAME_MISSION; all seven numbers are stored.
+# Commands in MAV_FRAME_MISSION, of which all seven params are stored.
 _WITHOUT_PLACE = frozenset(int(MavCmd[row["command"]]) for row in _ROWS if row["without_place"] == "1")
 
 _ROI_COMMANDS = (_C.NAV_ROI, _C.DO_SET_ROI)
@@ -43,7 +43,7 @@ _RADIANS_PER_DEGREE, _DEGREES_PER_RADIAN = float32(_PI / 180.0), float32(180.0 /
 def stored(item: MissionItem, mission_type: int, *, is_int: bool = True) -> MissionItem | int:
     """Return the item as stored (in frames 0, 2 and 3), or the MAV_MISSION_RESULT that refuses it.
 
-    ``is_int``: it was sent as MISSION_ITEM_INT; PX4 accepts the frames 5 and 6 only there.
+    ``is_int`` is True for a MISSION_ITEM_INT, the only message in which PX4 accepts the frames 5 and 6.
     """
     frame = _INT_FRAMES.get(item.frame, item.frame) if is_int else item.frame
     if frame in (_F.GLOBAL, _F.GLOBAL_RELATIVE_ALT):
@@ -64,12 +64,12 @@ def stored(item: MissionItem, mission_type: int, *, is_int: bool = True) -> Miss
 
 
 def as_downloaded(item: MissionItem, *, as_int: bool) -> MissionItem:
-    """Return the item as sent in a download: a position has the frame that fits the message."""
+    """Return the item that a download sends, with the frame that matches the kind of message."""
     return item.replace(frame=_AS_INT.get(item.frame, item.frame)) if as_int else item
 
 
 def checksum(items: Sequence[MissionItem], before: int = 0) -> int:
-    """Return the opaque id of items: a CRC-32 over the uploaded messages."""
+    """Return the opaque id of a list of items: a CRC-32 over the uploaded messages."""
     crc = before
     for item in items:
         head = struct.pack("<BHB4f", item.frame, item.command, item.autocontinue, *_params(item))
@@ -87,7 +87,7 @@ def _floats(item: MissionItem) -> bytes:
 
 
 def _as_fence_point(item: MissionItem) -> MissionItem:
-    """Position, size and altitude; the altitude frame is not stored."""
+    """Return position, size and altitude of a fence item; PX4 does not store its altitude frame."""
     if item.frame == _F.MISSION:
         return MissionItem(item.command, item.frame, item.param1, z=item.z, autocontinue=False)
     place = {"x": item.x, "y": item.y, "z": item.z}
@@ -104,7 +104,7 @@ def _with_place(item: MissionItem, frame: int) -> MissionItem | int:
             return MavMissionResult.INVALID_PARAM1
         command = _C.DO_SET_ROI
     numbers = (item.param1, item.param2, item.param3, item.param4)
-    one, two, three, four = (_KEEPERS[kind](number) for kind, number in zip(layout, numbers, strict=True))
+    one, two, three, four = (_CONVERSIONS[kind](number) for kind, number in zip(layout, numbers, strict=True))
     return item.replace(command=command, frame=frame, param1=one, param2=two, param3=three, param4=four)
 
 
@@ -132,7 +132,7 @@ def _rounded(value: float) -> int:
 
 
 def _heading(degrees: float) -> float:
-    """0 to 360; it is stored in radians, in single precision."""
+    """Convert a heading in degrees to its storage (radians, single precision) and back to 0 to 360."""
     if not math.isfinite(degrees):
         return math.nan
     radians = float32(degrees * _RADIANS_PER_DEGREE)
@@ -142,8 +142,8 @@ def _heading(degrees: float) -> float:
     return float32(radians * _DEGREES_PER_RADIAN)
 
 
-# Conversions by storage type: unchanged, 16-bit integer, rounded integer, boolean, heading, not stored.
-_KEEPERS: dict[str, Callable[[float], float]] = {
+# Conversions of a value to its storage and back, by storage type.
+_CONVERSIONS: dict[str, Callable[[float], float]] = {
     "-": lambda _: 0.0,
     "f": float32,
     "u": lambda value: float(_whole(value) & 0xFFFF),

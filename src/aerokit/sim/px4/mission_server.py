@@ -1,6 +1,6 @@
 """Mission protocol of PX4: one transfer per link, with a time-out of five seconds.
 
-An upload is buffered, and replaces the stored list when its last item is received. Items can only be downloaded in
+An upload is buffered, and replaces the stored list after its last item. Items can be downloaded only in ascending
 order. https://mavlink.io/en/services/mission.html
 """
 
@@ -31,7 +31,7 @@ class TransferState(Enum):
 
 
 class Px4MissionLink:
-    """State machine of one link, with the texts and results of the firmware; each ``on_…`` handles one message."""
+    """State machine of one link; each ``on_…`` method handles one message. Texts and results are the firmware's."""
 
     def __init__(self, px4: Px4Host, server: Px4MissionServer, channel: Channel) -> None:
         self._px4, self._server, self._channel = px4, server, channel
@@ -67,7 +67,7 @@ class Px4MissionLink:
         self._px4.send(kind(*self._partner, self._seq, self._type), self._channel)
 
     def send_changed(self, seq: int) -> None:
-        """Send an item of the mission that the vehicle changed itself."""
+        """Send a mission item that the vehicle has changed."""
         if self._state is TransferState.IDLE and self._partner != _NO_PARTNER:
             self._type = 0
             self._send_item(seq)
@@ -124,9 +124,9 @@ class Px4MissionLink:
     def on_request_list(self, request: m.MissionRequestList) -> None:
         """Start or restart a download.
 
-        When all items were sent, only the final acknowledgement is missing. The firmware also takes an upload for
-        that if as many items have arrived as it had before: the upload ends then, but blocks all others until a
-        download times out.
+        A download of which all items were sent counts as complete. The firmware misjudges an upload in the same way,
+        once as many items have arrived as are stored: it ends that upload, but refuses other uploads until a download
+        times out.
         """
         if self._seq == self._server.count(self._type):
             self._state = TransferState.IDLE
@@ -140,7 +140,7 @@ class Px4MissionLink:
         self._send_count()
 
     def on_request(self, request: AnyRequest) -> None:
-        """Send the next item, or repeat the previous one; any other index ends the download."""
+        """Send the next item, or the previous item again; any other index ends the download."""
         self._uses_int = isinstance(request, m.MissionRequestInt)
         if sender_of(request) != self._partner:
             self._warn("WPM: REJ. CMD: partner id mismatch")
@@ -166,7 +166,7 @@ class Px4MissionLink:
         self._warn("WPM: REJ. CMD: Req. WP was unexpected")
 
     def on_ack(self, ack: m.MissionAck) -> None:
-        """End a download. During an upload: cancel it, or switch between MISSION_REQUEST_INT and MISSION_REQUEST."""
+        """End a download; cancel an upload, or change the kind of its requests (UNSUPPORTED)."""
         if sender_of(ack) != self._partner:
             self._warn("REJ. WP CMD: partner id mismatch")
         elif self._state is TransferState.SENDING and ack.mission_type == self._type:
@@ -199,7 +199,7 @@ class Px4MissionLink:
         self._request_item()
 
     def _accept(self, count: m.MissionCount) -> bool:
-        """Return True if items are to be requested."""
+        """Start an upload and return True; return False after refusing it or storing an empty list."""
         sender, server = sender_of(count), self._server
         if server.uploading is not None:
             self._acknowledge(sender, _R.ERROR)
@@ -219,7 +219,7 @@ class Px4MissionLink:
         return False
 
     def on_item(self, message: AnyItem) -> None:
-        """Handle an item of an upload; an unexpected one is ignored."""
+        """Handle an item of an upload; an unexpected item is ignored."""
         is_int = isinstance(message, m.MissionItemInt)
         self._uses_int = is_int
         if sender_of(message) != self._partner:
@@ -231,7 +231,7 @@ class Px4MissionLink:
             if message.seq == self._seq:
                 self._receive_item(message, is_int=is_int)
         elif self._state is TransferState.IDLE and self._seq == message.seq + 1:
-            self._acknowledge(self._partner, _R.ACCEPTED, self._id)  # Our last acknowledgement was lost.
+            self._acknowledge(self._partner, _R.ACCEPTED, self._id)  # The client missed the acknowledgement.
         else:
             why = "No transfer" if self._state is TransferState.IDLE else "Busy"
             self._warn(f"IGN MISSION_ITEM: {why}")
@@ -261,7 +261,7 @@ class Px4MissionLink:
         self._acknowledge(self._partner, _R.ACCEPTED, self._id)
 
     def on_clear_all(self, request: m.MissionClearAll) -> None:
-        """Clear a list while idle; else only a text is sent."""
+        """Clear a list if no transfer is running, otherwise send a text."""
         if self._state is not TransferState.IDLE:
             self._warn("WPM: IGN CLEAR CMD: Busy")
             return
@@ -290,7 +290,7 @@ _CAPACITIES: dict[int, int] = {
 
 
 class Px4MissionServer:
-    """Mission, fence and rally points, shared by all links."""
+    """Server of mission, fence and rally points, which all links share."""
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
@@ -324,7 +324,7 @@ class Px4MissionServer:
         self._link(channel).on_item(message)
 
     def reset(self) -> None:
-        """Handle a reboot: transfers are dropped, items stay."""
+        """Drop transfers, as a reboot does; stored items stay."""
         self._links.clear()
         self.uploading = None
 
@@ -334,11 +334,11 @@ class Px4MissionServer:
         return self.uploading is not None or any(not link.is_idle for link in self._links.values())
 
     def items(self, mission_type: int) -> list[MissionItem]:
-        """Return the items as downloaded; empty for an unknown type."""
+        """Return the items that a download sends; empty for an unknown type."""
         return [as_downloaded(item, as_int=True) for item in self._items.get(mission_type, ())]
 
     def replace(self, mission_type: int, items: Sequence[MissionItem], *, start: int = 0, clear: bool = True) -> int:
-        """Store a whole list and return the MAV_MISSION_RESULT. PX4 itself cannot do this."""
+        """Store a whole list and return the MAV_MISSION_RESULT. PX4 has no such operation."""
         if mission_type not in _CAPACITIES or start or not clear:
             return MavMissionResult.ERROR
         kept = [stored(item, mission_type) for item in items]

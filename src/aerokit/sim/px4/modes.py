@@ -43,13 +43,13 @@ class Px4ModeTraits:
     """Name, base mode and requirements of a mode."""
 
     name: str
-    """Name in "Switching to … is currently not available"."""
+    """Name in the status text "Switching to … is currently not available"."""
     base_mode: int
     """MAV_MODE_FLAG while disarmed."""
     needs_sticks: bool = False
     needs_position: bool = True
     can_arm: bool = True
-    """False if the vehicle cannot be armed in this mode."""
+    """True if the vehicle can be armed in this mode."""
 
 
 MODES: Final[dict[Px4Mode, Px4ModeTraits]] = {
@@ -81,7 +81,7 @@ SELECTABLE: Final = frozenset(MODES) - {ORBIT, TERMINATION, VTOL_TAKEOFF}
 """Modes accepted by DO_SET_MODE and SET_MODE; ORBIT is started by DO_ORBIT."""
 
 STICK_MODES: Final = frozenset(mode for mode, traits in MODES.items() if traits.needs_sticks)
-"""Manual modes."""
+"""Manual modes, which need sticks."""
 
 STANDARD_MODES: Final[dict[int, Px4Mode]] = {
     1: POSITION,

@@ -1,4 +1,4 @@
-"""OFFBOARD mode of a simulated PX4: streamed set-points for position, velocity or acceleration of each axis.
+"""OFFBOARD mode of a simulated PX4, which follows streamed set-points.
 
 https://docs.px4.io/main/en/flight_modes/offboard.html
 """
@@ -17,13 +17,13 @@ from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.modes import OFFBOARD, POSITION, RTL
 
 _NAN3: Ned = (math.nan, math.nan, math.nan)
-# The ground is level, so that an altitude above terrain equals one above home.
+# The simulated ground is level, so that altitudes above terrain are treated as altitudes above home.
 _GLOBAL_FRAMES = (MavFrame.GLOBAL_INT, MavFrame.GLOBAL_RELATIVE_ALT_INT, MavFrame.GLOBAL_TERRAIN_ALT_INT)
 _CLIMB_AT_FULL_THRUST_M_S = 5.0
 
 
 class Px4Offboard:
-    """The latest set-point; received in every mode, flown in OFFBOARD."""
+    """The latest set-point. It is stored in every mode, and followed in OFFBOARD."""
 
     def __init__(self, vehicle: Px4Host) -> None:
         self._vehicle = vehicle
@@ -79,7 +79,7 @@ class Px4Offboard:
         self._vehicle.send_text(MavSeverity.CRITICAL, text)
 
     def _store(self, target: PositionTarget, position: Ned, *, body: bool) -> bool:
-        """Store a set-point; return False if it has neither position, velocity nor acceleration."""
+        """Store a set-point; return False if position, velocity and acceleration are all missing."""
         setpoint = Setpoint.of(target)
         position, velocity, acceleration = setpoint.axes(position)
         if all(math.isnan(part) for part in (*position, *velocity, *acceleration)):
@@ -103,7 +103,7 @@ class Px4Offboard:
         self.updated_at = self._vehicle.now
 
     def watch(self) -> None:
-        """Return to launch when set-points stop (1.16: POSITION), and resume when they start again."""
+        """Switch to RTL (1.16: POSITION) when set-points stop, and back to OFFBOARD when they resume."""
         vehicle = self._vehicle
         if vehicle.intended_mode != OFFBOARD or vehicle.failsafes.acts:
             return

@@ -1,10 +1,10 @@
 """Payload of a simulated PX4: gimbal and camera trigger.
 
-Gimbal on its AUX outputs (MNT_MODE_OUT 0), with gimbal manager; enabled by MNT_MODE_IN 0 or 4.
+MNT_MODE_IN 0 or 4 enables a gimbal on the AUX outputs (MNT_MODE_OUT 0) and its gimbal manager.
 
-Servos report nothing, so the telemetry is the set-point. It accepts commands only from the component in control, but
-a region of interest from everyone. It has no secondary control, no retracted position, and ignores
-GIMBAL_MANAGER_SET_PITCHYAW. When a return starts, PX4 takes control for a moment and turns the gimbal to neutral.
+Servos have no feedback, so telemetry reports the set-point. Only the component in control can command the gimbal, but
+every component can set a region of interest. The gimbal has no secondary control and no retracted position, and
+ignores GIMBAL_MANAGER_SET_PITCHYAW. When a return starts, PX4 takes control briefly and centres the gimbal.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.modes import RTL
 from aerokit.sim.vehicle import sender_of
 
-# Values of MNT_MODE_IN: radio and MAVLink, MAVLink only.
+# Values of MNT_MODE_IN that enable the gimbal: input by radio and MAVLink, or by MAVLink only.
 _FITTED_BY = frozenset({0, 4})
 _DEVICE_ID = 1
 _LIMITS = ((-45.0, 45.0), (-45.0, 45.0), (-180.0, 180.0))
@@ -46,7 +46,7 @@ class Px4Gimbal:
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
-        self.in_control: tuple[int, int] = (0, 0)  # System and component id; zeros if no one is in control.
+        self.in_control: tuple[int, int] = (0, 0)  # System and component id in control; zeros if none.
         self._target, self._rates, self._since = _NEUTRAL, _NEUTRAL, 0.0
         self._flags = 0
         self._place: tuple[int, int, float] | None = None
@@ -55,7 +55,7 @@ class Px4Gimbal:
         px4.on(m.GimbalManagerSetAttitude, self._on_attitude)
 
     def start(self) -> None:
-        """Called at power-on: neutral, and no one in control."""
+        """Called at power-on: reset direction and control."""
         parameters = self._px4.parameters
         self.is_fitted = "MNT_MODE_IN" in parameters and parameters["MNT_MODE_IN"] in _FITTED_BY
         self.rest()
@@ -99,7 +99,7 @@ class Px4Gimbal:
         return (0.0, max(math.radians(_LIMITS[1][0]), pitch), math.atan2(east, north))
 
     def apply(self, flags: int, angles: Angles, rates: Angles) -> None:
-        """Apply angles, and rates in addition; RETRACT is accepted without an effect."""
+        """Apply angles, which the rates then change; RETRACT is accepted without an effect."""
         if flags & Flags.RETRACT:
             return
         current = self.angles()
@@ -122,7 +122,7 @@ class Px4Gimbal:
         is_going_home = self._px4.mode == RTL
         if is_going_home and not self._was_returning:
             self.rest()
-            self.in_control = (0, 0)  # PX4 itself was in control for a moment.
+            self.in_control = (0, 0)  # PX4 takes control and releases it at once.
         self._was_returning = is_going_home
 
     def _on_attitude(self, message: m.GimbalManagerSetAttitude, _: Channel) -> None:
@@ -157,7 +157,7 @@ _SELF, _RELEASE = -2, -3
 
 
 def gimbal_commands(gimbal: Px4Gimbal) -> dict[int, CommandHandler]:
-    """Return handlers by MAV_CMD; they do not answer without a gimbal."""
+    """Return handlers by MAV_CMD; without a gimbal, most commands are not answered."""
 
     def if_fitted(handler: Callable[[Px4Gimbal, ReceivedCommand], int]) -> CommandHandler:
         return lambda command: handler(gimbal, command) if gimbal.is_fitted else None
@@ -173,7 +173,7 @@ def gimbal_commands(gimbal: Px4Gimbal) -> dict[int, CommandHandler]:
 
 
 def _configure(gimbal: Px4Gimbal, command: ReceivedCommand) -> int:
-    """Ids; -2 is PX4 itself rather than the sender. Secondary control is not supported."""
+    """Set the ids in control. In PX4, -2 is the autopilot rather than the sender; -3 releases control."""
     own = gimbal.own_ids
     now = []
     for number, before, mine, sender in zip(
@@ -200,7 +200,7 @@ def _pitch_and_yaw(gimbal: Px4Gimbal, command: ReceivedCommand) -> int:
 
 
 def _control_mount(gimbal: Px4Gimbal, command: ReceivedCommand) -> int:
-    """Unknown modes are accepted, too."""
+    """Handle DO_MOUNT_CONTROL; unknown modes are accepted without an effect."""
     mode = whole(command.z)
     if mode in (MavMountMode.RETRACT, MavMountMode.NEUTRAL):
         gimbal.rest()
@@ -212,7 +212,7 @@ def _control_mount(gimbal: Px4Gimbal, command: ReceivedCommand) -> int:
 
 
 def _set_roi(gimbal: Px4Gimbal, command: ReceivedCommand | None) -> int:
-    """The altitude is taken as AMSL in every frame."""
+    """Point at a position, or reset without a command. PX4 uses the altitude as AMSL in every frame."""
     if command is None:
         gimbal.rest()
     elif math.isfinite(command.z):
@@ -226,9 +226,9 @@ _GEOTAG_DELAY_S = 0.02
 
 
 class Px4CameraTrigger:
-    """Reports each image by CAMERA_TRIGGER, and by CAMERA_IMAGE_CAPTURED if ``sends_image_captured``.
+    """Camera trigger, which sends CAMERA_TRIGGER, and with ``sends_image_captured`` also CAMERA_IMAGE_CAPTURED.
 
-    While it is disabled its commands are not answered, as on the real vehicle.
+    As on the real vehicle, commands to a disabled trigger are not answered.
     """
 
     sequence: int
@@ -273,7 +273,7 @@ class Px4CameraTrigger:
         return MavResult.ACCEPTED
 
     def _switch(self, command: ReceivedCommand) -> int | None:
-        """Param 1 enables, 2 resets the sequence, 3 pauses; -1 leaves each unchanged."""
+        """Handle DO_TRIGGER_CONTROL: param 1 enables, 2 resets the sequence, 3 pauses; -1 changes nothing."""
         if not self.is_fitted:
             return None
         was_running = self.is_running

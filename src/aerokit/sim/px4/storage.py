@@ -1,4 +1,4 @@
-"""Files, logs, parameters and signing key of a simulated PX4, with their servers."""
+"""Files, logs, parameters and signing key of a simulated PX4, and their protocol servers."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from aerokit.sim.parameters import ParameterPackMount, SimParameters
 from aerokit.sim.px4.ftp import Px4Ftp
 from aerokit.sim.px4.host import Px4Host
 
-# Parameters that the simulation reads, or whose presence clients check.
+# Parameters that the simulation reads or clients expect.
 _USED_PARAMETERS = """
 BAT1_CAPACITY BAT1_N_CELLS BAT1_SOURCE BAT_CRIT_THR BAT_EMERGEN_THR BAT_LOW_THR CAL_ACC0_ID
 CBRK_SUPPLY_CHK COM_ARM_WO_GPS COM_DISARM_LAND COM_DISARM_PRFLT COM_DL_LOSS_T COM_FAIL_ACT_T
@@ -39,8 +39,9 @@ RTL_LOITER_RAD RTL_MIN_DIST RTL_RETURN_ALT RTL_TYPE RWTO_RAMP_TIME SDLOG_MODE SY
 
 
 def px4_parameters(count: int | None = None, table: str = "quadrotor") -> SimParameters:
-    """Return the 910 parameters of a "quadrotor", the 978 of an "airplane", or ``count`` of them including the used
-    ones.
+    """Return the parameters of a "quadrotor" (910) or an "airplane" (978).
+
+    ``count`` limits their number, but keeps all that the simulation reads.
     """
     data = pkgutil.get_data(__name__, f"{table}.param.csv")
     assert data is not None
@@ -50,8 +51,8 @@ def px4_parameters(count: int | None = None, table: str = "quadrotor") -> SimPar
 class Px4ParameterMount(ParameterPackMount):
     """``@PARAM`` files of PX4.
 
-    Unlike ArduPilot's, an open reports the exact size, neither a value nor its default crosses a block of 239 bytes,
-    and uploaded parameters are applied as they arrive.
+    Unlike in ArduPilot, opening the file reports the exact size, neither a value nor its default extends over the end
+    of a block of 239 bytes, and uploaded parameters are applied as they arrive.
     """
 
     def __init__(self, parameters: SimParameters, apply: Callable[[str, float], None]) -> None:
@@ -63,10 +64,10 @@ class Px4ParameterMount(ParameterPackMount):
 
 
 class _Writer(FileHandle):
-    """An upload that is applied as it arrives.
+    """Upload of parameters, which are applied as they arrive.
 
-    Repeated bytes are acknowledged again; a gap fails the upload. Closing an incomplete upload fails, but keeps the
-    parameters applied so far.
+    Repeated bytes are acknowledged again. A gap makes the upload fail, as does closing an incomplete upload; the
+    parameters applied until then are kept.
     """
 
     def __init__(self, parameters: SimParameters, apply: Callable[[str, float], None]) -> None:
@@ -138,10 +139,10 @@ _LINK_SHARE = 0.5
 
 
 class Px4Storage:
-    """Files, logs and parameters with their servers.
+    """Protocol servers of files, logs and parameters.
 
     ``parameter_file`` serves ``@PARAM/param.pck``, as PX4 does since August 2026. ``link_bytes_per_s`` is the
-    configured data rate of the port; None is that of a network.
+    configured data rate of the port; None is the rate of a network link.
     """
 
     def __init__(
@@ -173,7 +174,7 @@ class Px4Storage:
             self.parameters.burst = self.ftp.burst = self.logs.burst = 1
 
     def restart(self) -> None:
-        """Drop transfers and sessions; files stay."""
+        """Drop transfers and sessions, as a reboot does; files stay."""
         self.parameters.restart()
         self.ftp.restart()
         self.logs.restart()
@@ -204,9 +205,9 @@ _UNSIGNED = frozenset((Heartbeat.ID, AdsbVehicle.ID, Collision.ID))
 
 
 class Px4Signing(VehicleSigning):
-    """Announces a new key, and accepts unsigned heartbeats; 1.16 does not support signing.
+    """Message signing of PX4, which reports a new key by a text and accepts unsigned heartbeats.
 
-    The time stamp is stored only when a key is set.
+    The time stamp is stored only when a key is set. Version 1.16 does not support signing.
     """
 
     def __init__(self, vehicle: Px4Host, key: SigningKey | None, timestamp: int) -> None:

@@ -1,4 +1,4 @@
-"""Streamed messages of a simulated PX4."""
+"""Builders of the streamed messages of a simulated PX4, and the table of all builders."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ def _attitude_target(px4: Px4Vehicle) -> m.AttitudeTarget:
 
 
 def _global_position(px4: Px4Vehicle) -> m.GlobalPositionInt | None:
-    """Omitted without a position, whereas ArduPilot sends zeros."""
+    """Build GLOBAL_POSITION_INT; without a position PX4 does not send it, whereas ArduPilot sends zeros."""
     if not px4.has_position:
         return None
     motion = px4.motion
@@ -234,7 +234,7 @@ def global_origin(px4: Px4Vehicle) -> m.GpsGlobalOrigin:
 
 
 def _target_local(px4: Px4Vehicle) -> m.PositionTargetLocalNed:
-    """While disarmed, only a downward thrust."""
+    """Build POSITION_TARGET_LOCAL_NED; while disarmed, PX4 sends only a downward acceleration of 100 m/s²."""
     motion = px4.motion
     yaw = motion.yaw
     if not px4.is_armed:
@@ -278,7 +278,7 @@ def _ping(px4: Px4Vehicle) -> m.Ping:
 
 
 def available_modes(_: Px4Vehicle) -> list[m.AvailableModes]:
-    """Return AVAILABLE_MODES. PX4 names no mode that is a standard mode (RETURN, LAND …)."""
+    """Return AVAILABLE_MODES. PX4 sends no name for a standard mode (RETURN, LAND …)."""
     listed, count = _AVAILABLE_MODES, len(_AVAILABLE_MODES) + _EXTERNAL_MODES
     messages = []
     for index, mode in enumerate(listed, start=1):
@@ -293,7 +293,7 @@ def available_modes(_: Px4Vehicle) -> list[m.AvailableModes]:
 
 
 GIMBAL_MESSAGES = frozenset({m.GimbalDeviceAttitudeStatus.ID, m.GimbalManagerInformation.ID, m.GimbalManagerStatus.ID})
-"""Messages of the gimbal."""
+"""Ids of the messages that only a vehicle with a gimbal sends."""
 
 BUILDERS: dict[int, Callable[[Px4Vehicle], Message | None]] = {
     m.Heartbeat.ID: _heartbeat,

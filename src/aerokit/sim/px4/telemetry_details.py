@@ -1,4 +1,4 @@
-"""Identity and sensor messages of a simulated PX4."""
+"""Builders of identity and sensor messages of a simulated PX4."""
 
 from __future__ import annotations
 
@@ -211,7 +211,7 @@ def _odometry(px4: Px4Vehicle) -> m.Odometry:
 
 
 def _rc_channels(px4: Px4Vehicle) -> m.RcChannels | None:
-    """Only while RC_CHANNELS_OVERRIDE is received, because there is no receiver."""
+    """Build RC_CHANNELS from RC_CHANNELS_OVERRIDE, because the vehicle has no RC receiver."""
     if not px4.sticks.has_channels:
         return None
     channels = px4.sticks.channels
@@ -233,7 +233,7 @@ def _timesync(px4: Px4Vehicle) -> m.Timesync:
 
 
 def _position_target_global(px4: Px4Vehicle) -> m.PositionTargetGlobalInt | None:
-    """Only while armed."""
+    """Build POSITION_TARGET_GLOBAL_INT, which PX4 sends only while armed."""
     if not px4.is_armed or not px4.has_position:
         return None
     place, motion = px4.frame.to_global(*px4.flight.target), px4.motion
@@ -243,7 +243,7 @@ def _position_target_global(px4: Px4Vehicle) -> m.PositionTargetGlobalInt | None
 
 
 def _time_estimate(px4: Px4Vehicle) -> m.TimeEstimateToTarget:
-    """Only the return is estimated: change of height, flight home, descent."""
+    """Build TIME_ESTIMATE_TO_TARGET with the time of a return: change of height, flight home, descent."""
     if px4.is_landed:
         return m.TimeEstimateToTarget(-1, -1, -1, -1, -1)
     motion, flight = px4.motion, px4.flight

@@ -1,4 +1,4 @@
-"""`SimulatedPx4` and `SimulatedPx4Plane`."""
+"""Simulated PX4 multicopter and plane: `SimulatedPx4` and `SimulatedPx4Plane`."""
 
 from __future__ import annotations
 
@@ -25,24 +25,19 @@ from aerokit.sim.vehicle_motion import FixedWing, WingLimits
 
 
 class SimulatedPx4(Px4Vehicle):
-    """A PX4 v1.16 or v1.17 multicopter as clients see it; it flies as `Motion` does.
+    """PX4 v1.16 or v1.17 multicopter, as far as a client can observe it. `Motion` is the motion model.
 
-    Simulated: arming and its denial, every mode with its double acknowledgement, take-off to an AMSL altitude, hold,
-    reposition, orbit, land, return to home or a rally point, sticks (MANUAL_CONTROL), offboard with time-out and
-    failsafe, flight termination, calibration, default streams at the rates of the link mode, every message that the
-    real one sends on request, heartbeats at 1 Hz, chunked texts that end in a tab, their events, bytewise parameters
-    with _HASH_CHECK, its own commands to component 0, broadcast pings, failsafes of battery, ground station, manual
-    control and geofence. Not simulated: REQUEST_EVENT, returning along a mission (RTL_TYPE 2), estimator failures
-    other than a lost GPS, follow-me, external modes. A camera is a separate component; without one its commands are
-    not answered. MNT_MODE_IN 4 enables a gimbal.
+    Not simulated: REQUEST_EVENT, returning along a mission (RTL_TYPE 2), estimator failures other than a lost GPS,
+    follow-me, external modes. A camera is a separate component; without it, camera commands are not answered.
+    MNT_MODE_IN 4 enables a gimbal.
 
     - ``home``: latitude, longitude (degrees), altitude AMSL (m); ``heading_deg``: initial heading
-    - ``boot_time_s``: seconds until it can be armed
-    - ``version``: 1.16 accepts unknown modes and switches to POSITION when offboard set-points stop; 1.17 refuses
-      them, returns, and refuses a COMMAND_INT in a frame other than GLOBAL_INT
+    - ``boot_time_s``: seconds until the vehicle can be armed
+    - ``version``: 1.16 accepts unknown modes, and switches to POSITION when offboard set-points stop. 1.17 refuses
+      unknown modes, switches to RTL instead, and refuses a COMMAND_INT in a frame other than GLOBAL_INT
     - ``fast_rate_hz``: rate of attitude, position and targets on "normal" links
     - ``link_modes``: MAV_n_MODE of the first link, the second …: "normal", "onboard", "config" or "minimal"
-    - ``parameters``: values that differ from the defaults; ``parameter_count``: fewer than all 910, for quick tests;
+    - ``parameters``: values that differ from the defaults; ``parameter_count``: limits their number, for quick tests;
       ``parameter_file``, ``link_bytes_per_s``: see `Px4Storage`; ``logs``: logs of earlier flights
     - ``signing_key``: see `Px4Signing`
     """
@@ -52,7 +47,7 @@ class SimulatedPx4(Px4Vehicle):
         return px4_commands(self)
 
     def can_build(self, message_id: int) -> bool:
-        """Return True if there is a builder of this message; gimbal messages need a gimbal."""
+        """Return True if the vehicle can send this message; gimbal messages require a gimbal."""
         return message_id in BUILDERS and (message_id not in GIMBAL_MESSAGES or self.gimbal.is_fitted)
 
     def build(self, message_id: int) -> Message | None:
@@ -61,7 +56,7 @@ class SimulatedPx4(Px4Vehicle):
         return None if builder is None else builder(self)
 
     def refusal_of_command(self, command: ReceivedCommand) -> int | None:
-        """Refuse frames, a NaN sent as integer, and INT32_MAX sent as float (mavlink_receiver.cpp)."""
+        """Refuse unsupported frames, NaN sent as integer and INT32_MAX sent as float (mavlink_receiver.cpp)."""
         return refusal_by_place(command, checks_frame=not self.version.startswith("1.16"))
 
     def _on_set_mode(self, request: m.SetMode, channel: Channel) -> None:
@@ -153,7 +148,7 @@ class Px4PlaneFlight(Px4Flight):
         self._motion.head(self.course, self.speed_m_s, climb)
 
     def _take_off(self) -> None:
-        """After the climb, circle the point where the altitude was reached."""
+        """Climb out; once the altitude is reached, circle that point."""
         self.climb_out()
         if self._motion.down > self.target[2]:
             return
@@ -189,7 +184,7 @@ class Px4PlaneFlight(Px4Flight):
         motion.head(course, self._plane.parameters["FW_AIRSPD_MIN"] * 1.3, climb)
 
     def _return(self) -> None:
-        """Climb, fly home, circle down to RTL_DESCEND_ALT; land unless RTL_LAND_DELAY is negative."""
+        """Climb, fly to the destination, circle down to RTL_DESCEND_ALT; land unless RTL_LAND_DELAY is negative."""
         motion, plane = self._motion, self._plane
         if self._phase == "land":
             self.circle_down()
@@ -244,7 +239,7 @@ class Px4PlaneMission(Px4Mission):
             self._phase = "land"
 
     def update(self) -> None:
-        """Run one tick: steer, and check whether the item is reached."""
+        """Run one tick: set the motion target and check if the item is reached."""
         item, flight = self._item, self._plane.flight
         if item is None or self.is_finished:
             flight.circle()
@@ -295,7 +290,7 @@ class Px4PlaneMission(Px4Mission):
         return near and abs(down - motion.down) <= plane.parameters["NAV_FW_ALT_RAD"]
 
     def _hold(self) -> None:
-        """Hold after a mission that ended in flight, as the commander does."""
+        """Change to HOLD after the mission, and keep the target."""
         target = self._plane.flight.target
         super()._hold()
         if self._plane.mode == modes.HOLD:
@@ -306,14 +301,14 @@ _AMPERES_AT_FULL = 20.0
 
 
 class SimulatedPx4Plane(SimulatedPx4):
-    """A PX4 plane (MAV_TYPE 1, airframe 10041); it flies as `FixedWing` does, see `SimulatedPx4` for the arguments.
+    """PX4 plane (MAV_TYPE 1, airframe 10041). `FixedWing` is the motion model; see `SimulatedPx4` for the arguments.
 
-    It takes off from a runway along its heading, circles at NAV_LOITER_RAD where a multicopter hovers, returns to a
-    circle above home without landing (RTL_LAND_DELAY is -1), lands in circles (LAND) or on a straight glide path at
-    the end of a mission, and requires a landing in missions that start on the ground (MIS_TKO_LAND_REQ). Armed on
-    the ground it stays armed. It has 978 parameters and an airspeed sensor. Sticks control bank, climb and speed in
-    every manual mode. Not simulated, in addition to `SimulatedPx4`: hand launch, stalls, aborted landings, figures
-    of eight; OFFBOARD circles a position.
+    The plane takes off from a runway along its heading, and circles at NAV_LOITER_RAD where a multicopter hovers. RTL
+    ends in a circle above home without landing (RTL_LAND_DELAY is -1). LAND descends in circles; a mission ends with a
+    straight glide path, and must contain a landing (MIS_TKO_LAND_REQ). Sticks control bank, climb and speed in every
+    manual mode; OFFBOARD circles a position. The plane is not disarmed automatically before take-off.
+
+    Not simulated, in addition to `SimulatedPx4`: hand launch, stalls, aborted landings, figures of eight.
     """
 
     VEHICLE_TYPE: ClassVar[int] = MavType.FIXED_WING
@@ -343,7 +338,7 @@ class SimulatedPx4Plane(SimulatedPx4):
         return Px4PlaneMission(self)
 
     def switch_to_hold(self) -> None:
-        """The take-off is complete."""
+        """Change to HOLD, because the take-off is complete."""
         self.switch_to(modes.HOLD)
 
     def _moves(self) -> bool:

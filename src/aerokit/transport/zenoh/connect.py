@@ -140,7 +140,7 @@ class ZenohConnect(NetworkLink):
             session.declare_subscriber(keys.from_vehicle(client), frames),
             session.declare_subscriber(keys.notices(client), callback(self._on_notice)),
             session.declare_subscriber(keys.beacon, callback(self._on_beacon)),
-            # The whole fleet, for the error text if the name does not exist.
+            # Subscribe to the whole fleet, so that the error text can list its names.
             liveliness.declare_subscriber(KeySpace(keys.fleet, "*").alive(), on_liveliness, history=True),
             liveliness.declare_token(keys.client(client)),
         ]
@@ -197,7 +197,7 @@ class ZenohConnect(NetworkLink):
             return
         try:
             self._publisher.put(data, attachment=stamp.encode())
-        except Exception:  # of zenoh: the session has ended
+        except Exception:  # zenoh's error after the end of the session
             self._drop(1)
 
     # ---------------------------------------------------------------------------------- supervision

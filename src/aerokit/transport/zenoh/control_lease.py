@@ -36,7 +36,7 @@ LEASE_TIMEOUT_S = 5.0
 NOTICE_INTERVAL_S = 0.5
 """Minimum interval of notices about refused messages of one kind; set-points come 20 times a second."""
 
-# Messages without effect on the vehicle other than on streams. Any client may send them.
+# Messages that change nothing on the vehicle except its streams. Any client may send them.
 READ_MESSAGES = frozenset(
     (
         "Heartbeat", "SystemTime", "Timesync", "Ping", "Statustext", "CommandAck", "MessageInterval", "LoggingAck",
@@ -47,7 +47,7 @@ READ_MESSAGES = frozenset(
     )
 )  # fmt: skip
 
-# The same for commands.
+# Commands that change nothing on the vehicle except its streams.
 READ_COMMANDS = frozenset(
     (
         MavCmd.REQUEST_MESSAGE, MavCmd.SET_MESSAGE_INTERVAL, MavCmd.GET_MESSAGE_INTERVAL, MavCmd.GET_HOME_POSITION,
@@ -58,7 +58,7 @@ READ_COMMANDS = frozenset(
     )
 )  # fmt: skip
 
-# The same for MAVFTP operations.
+# MAVFTP operations that change no file.
 READ_FILES = frozenset(
     (
         MavFtpOpcode.NONE, MavFtpOpcode.TERMINATESESSION, MavFtpOpcode.RESETSESSION, MavFtpOpcode.LISTDIRECTORY,
@@ -142,7 +142,7 @@ class ControlLease:
 
 
 class ClientFilter:
-    """Passes the frames that one client may send, and makes notices of the others."""
+    """Accepts the frames that one client may send, and creates notices about refused frames."""
 
     def __init__(self, client: str, lease: ControlLease) -> None:
         self.refused: int = 0
@@ -181,7 +181,7 @@ class ClientFilter:
         return b"".join(accepted), notices
 
     def _is_namesake(self, nonce: int, mode: ControlMode, now: float) -> bool:
-        """Return True if another program used this name recently, and this one does not take control."""
+        """Return True if another program recently used this name, unless this program takes control."""
         if self._nonce not in (None, nonce) and mode != "take" and now - self._nonce_at <= LEASE_TIMEOUT_S:
             return True
         self._nonce, self._nonce_at = nonce, now
@@ -190,14 +190,14 @@ class ClientFilter:
     def refuse_late(self, data: bytes, now: float) -> list[RefusalNotice]:
         """Refuse an outdated datagram. Return notices of its commands.
 
-        They have no answer, because the client may have repeated the command already.
+        The notices have no answer, because the client may have repeated the command already.
         """
         notices: list[RefusalNotice] = []
         for frame in _framer().receive(data, now):
             if is_read(frame):
                 self.refused += 1
             else:
-                notices += self._refuse(frame, _decoded(frame), "it came too late", None, now, is_late=True)
+                notices += self._refuse(frame, _decoded(frame), "it arrived too late", None, now, is_late=True)
         return notices
 
     def _refuse(
@@ -234,7 +234,7 @@ def _decoded(frame: Frame) -> Message | None:
 
 
 def _answer(frame: Frame, message: Message, reason: str) -> bytes:
-    """Return the frames by which a vehicle would reject a message; empty if it has none, or for broadcasts."""
+    """Return the frames by which a vehicle would reject a message; empty if none exist, or for broadcasts."""
     fields: object = message
     system: int = getattr(fields, "target_system", 0)
     component: int = getattr(fields, "target_component", 0) or 1
@@ -336,7 +336,7 @@ class VehicleSideTracker:
         self.epoch: int | None = None
         """Epoch of the tracked vehicle side; None before the first beacon."""
         self.lease_holder: str | None = None
-        """Client that holds the control lease, by the last beacon."""
+        """Client that holds the control lease according to the last beacon; None: free."""
         self.late: int = 0
         """Dropped frames and beacons that arrived too late."""
         self.foreign: int = 0

@@ -24,7 +24,7 @@ from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument
 
 VERSION = 1
-"""Protocol version. Messages with another one are ignored."""
+"""Protocol version. Messages of other versions are ignored."""
 
 ControlMode = str
 """Control that a client requests: "free" (if it is free), "take" (in any case), "never" (read only)."""
@@ -95,16 +95,16 @@ class KeySpace(Snapshot):
 
 
 class Beacon(Snapshot):
-    """Sent by a vehicle side twice a second, with its clock."""
+    """Message that a vehicle side sends twice a second, with its clock."""
 
     epoch: int
     """Random number of this run of the vehicle side."""
     number: int
-    """Counts from 1."""
+    """Number of this beacon, counted from 1."""
     clock_s: float
-    """Seconds on its own clock."""
+    """Time on the vehicle side's clock, in seconds."""
     lease_holder: str | None = None
-    """Client that has control."""
+    """Client that has control; None: free."""
 
     def encode(self) -> bytes:
         fields = {"version": VERSION, "epoch": self.epoch, "number": self.number, "clock_s": self.clock_s}
@@ -123,14 +123,14 @@ class Beacon(Snapshot):
 
 
 class Stamp(Snapshot):
-    """Attachment of a client's datagrams: the last beacon it received."""
+    """Attachment of a client's datagrams, with the last beacon that the client received."""
 
     epoch: int
     beacon: int
     nonce: int
     """Random number of the client's link."""
     sequence: int
-    """Counts from 1."""
+    """Number of the datagram, counted from 1."""
     mode: ControlMode = "free"
 
     def encode(self) -> bytes:
@@ -148,12 +148,12 @@ class Stamp(Snapshot):
 
 
 class RefusalNotice(Snapshot):
-    """Sent by a vehicle side to a client after refusing a command."""
+    """Message from a vehicle side to a client whose command it refused."""
 
     message: str
     """Name of the MAVLink message, e.g. "COMMAND_LONG"."""
     reason: str
-    """As a clause."""
+    """Reason for the refusal, as a clause."""
     lease_holder: str | None = None
     """Client that has control, if that is the reason."""
     answer: bytes = b""

@@ -33,13 +33,14 @@ from aerokit.transport.zenoh.session import (
 )
 
 MAX_CLIENTS = 64
-"""Further clients are ignored, unless one has been silent for `CLIENT_TIMEOUT_S`."""
+"""Maximum number of clients. A further one is ignored unless a client has been silent for `CLIENT_TIMEOUT_S`."""
 
 CLIENT_TIMEOUT_S = 30.0
 """Silence after which a client may be replaced by a new one."""
 
 _MIN_BEACON_INTERVAL_S = 0.02
 _RIVAL_TIMEOUT_S = 2.5 * BEACON_INTERVAL_S
+_RIVAL_QUERY_TIMEOUT_S = 1.0
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
@@ -123,7 +124,8 @@ class ZenohListen(NetworkLink):
         self._send_beacon()
 
     def _find_rivals(self, queue: LoopQueue[Callable[[], object]], zenoh: Any, session: Any) -> None:
-        # Runs on a thread. A token alone does not show that the name is in use: it may be of a program that was killed.
+        # Runs on a thread. A liveliness token alone does not prove that the name is in use, because the token of a
+        # killed program remains for a while.
         def on_beacon(sample: Any) -> None:
             payload = payload_of(sample)
             if len(payload) <= MAX_PAYLOAD_BYTES:
@@ -131,7 +133,9 @@ class ZenohListen(NetworkLink):
 
         self._zenoh = zenoh
         self._declared = [session.declare_subscriber(self._keys.beacon, on_beacon)]
-        self._has_others = any(True for _ in session.liveliness().get(self._keys.alive(), timeout=1.0))
+        self._has_others = any(
+            True for _ in session.liveliness().get(self._keys.alive(), timeout=_RIVAL_QUERY_TIMEOUT_S)
+        )
 
     def _serve(self, queue: LoopQueue[Callable[[], object]]) -> None:
         zenoh, session, keys = self._zenoh, self._session, self._keys
@@ -189,19 +193,19 @@ class ZenohListen(NetworkLink):
         if client is None and len(self._clients) >= MAX_CLIENTS:
             self._remove_silent_client()
         if client is None and len(self._clients) < MAX_CLIENTS:
-            with contextlib.suppress(InvalidArgument):  # the key of another program
+            with contextlib.suppress(InvalidArgument):  # the name is not from an aerokit client
                 client = self._clients[name] = ClientFilter(check_name("client", name), self._lease)
                 client.received_at = self._now()
         return client
 
     def _remove_silent_client(self) -> None:
-        # A sender without a liveliness token, or whose end was not noticed, must not block new clients.
+        # A client without a liveliness token, or whose end was missed, must not block new clients.
         oldest = min(self._clients, key=lambda name: self._clients[name].received_at)
         if self._now() - self._clients[oldest].received_at > CLIENT_TIMEOUT_S:
             self._remove_client(str(oldest))
 
     def _on_client_joined(self, name: str) -> None:
-        # An extra beacon, so that the client need not wait for the next one.
+        # Send an extra beacon, so that the client need not wait for the next one.
         if self._add_client(name) is not None and self._timer is not None:
             self._timer.cancel()
             delay_s = max(0.0, self._beacon_at + _MIN_BEACON_INTERVAL_S - self._now())
@@ -241,7 +245,7 @@ class ZenohListen(NetworkLink):
     def _try(self, put: Callable[[], object]) -> None:
         try:
             put()
-        except Exception:  # of zenoh: the session has ended
+        except Exception:  # zenoh's error after the end of the session
             self._drop(1)
 
     def _now(self) -> float:

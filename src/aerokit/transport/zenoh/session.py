@@ -18,7 +18,7 @@ from aerokit.transport.link import BaseLink, import_optional
 ItemT = TypeVar("ItemT")
 
 MAX_QUEUED = 2048
-"""Items that wait for a blocked event loop. Then the oldest is dropped."""
+"""Maximum number of items that wait for a blocked event loop. A further item replaces the oldest."""
 
 _MAX_PER_ITERATION = 256  # so that other tasks can run
 
@@ -26,7 +26,8 @@ _MAX_PER_ITERATION = 256  # so that other tasks can run
 class LoopQueue(Generic[ItemT]):
     """Queue from other threads to the event loop: ``post(item)`` in any thread calls ``process(item)`` on the loop.
 
-    At most ``limit`` items wait; then the oldest is dropped and counted. The loop is woken once for all waiting items.
+    At most ``limit`` items wait. A further item replaces the oldest, which is counted as dropped. The loop is woken
+    once for all waiting items.
     """
 
     def __init__(self, process: Callable[[ItemT], object], limit: int = MAX_QUEUED) -> None:
@@ -78,7 +79,7 @@ class LoopQueue(Generic[ItemT]):
 async def open_in_thread(work: Callable[[], ItemT], close: Callable[[ItemT], object]) -> ItemT:
     """Run ``work()`` in a thread of the loop's executor and return what it opens.
 
-    A thread cannot be stopped. If this is cancelled, the result is passed to ``close`` as soon as it is available.
+    A thread cannot be stopped. After a cancellation, the result is passed to ``close`` as soon as it is available.
     """
     opening = asyncio.get_running_loop().run_in_executor(None, work)
 
@@ -94,11 +95,11 @@ async def open_in_thread(work: Callable[[], ItemT], close: Callable[[ItemT], obj
 
 
 MAX_PAYLOAD_BYTES = 65535
-"""Larger payloads are ignored. Both sides send single frames, or those of one datagram."""
+"""Maximum payload; larger ones are ignored. Both sides send single frames or the frames of one datagram."""
 
 _CONNECT_FAILED = "Unable to connect to any of"
 
-_ENDPOINTS = re.compile(r"[a-z]+/[^\s,()\[\]]+")  # "[Single(tcp/a:1)]", by 1.6 "[tcp/a:1]"
+_ENDPOINTS = re.compile(r"[a-z]+/[^\s,()\[\]]+")  # zenoh 1.6 writes "[tcp/a:1]", others "[Single(tcp/a:1)]"
 
 _TX = "transport/link/tx/queue"
 
@@ -121,18 +122,18 @@ class NetworkOptions(Snapshot):
     listen: tuple[str, ...] = ()
     """Endpoints to listen on."""
     mode: str = ""
-    """"peer" or "client"; "": client if there are endpoints to connect to and none to listen on, otherwise peer."""
+    """Mode: "peer" or "client"; "": client if endpoints are given in `connect` only, otherwise peer."""
     config: str = ""
     """zenoh configuration file (JSON5): TLS, access control, queues."""
 
     @property
     def scouts(self) -> bool:
-        """True if peers are discovered by multicast, unless the file disables it: when no endpoints are given."""
+        """True if no endpoints are given: peers are then discovered by multicast, unless the file disables it."""
         return not (self.connect or self.listen)
 
 
 class NetworkLink(BaseLink):
-    """Common base of both sides: a session, its declarations, and a timer."""
+    """Common base of both sides of a zenoh link: a session, its declarations, and a timer."""
 
     def __init__(self, address: str) -> None:
         super().__init__(address)

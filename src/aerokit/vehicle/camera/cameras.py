@@ -36,9 +36,10 @@ MAVFTP = re.compile(r"(?:mftp|mavlinkftp)://.|/.", re.IGNORECASE)
 class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
     """One camera: photos, video, lens, tracking, storage, streams (https://mavlink.io/en/services/camera.html).
 
-    ``vehicle.camera`` is the first camera, ``vehicle.camera_at(number)`` any: one with its own component id (100 to
-    105), or one attached to the autopilot (1 to 6), e.g. ArduPilot's drivers and PX4's trigger. Calls outside its
-    reported capabilities are refused before anything is sent. Cells are polled only while your program uses them.
+    ``vehicle.camera`` is the first camera; ``vehicle.camera_at(number)`` is any camera: one with its own component id
+    (100 to 105), or one attached to the autopilot (1 to 6), e.g. ArduPilot's drivers and PX4's trigger. Calls outside
+    the camera's reported capabilities are refused before anything is sent. Cells are polled only while your program
+    uses them.
     """
 
     def __init__(self, link: CameraLink) -> None:
@@ -56,7 +57,7 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
         return self._link.number
 
     async def wait_found(self, *, timeout: float = 10.0) -> CameraInformation:
-        """Wait until the camera is found and has identified itself; other calls do so by themselves.
+        """Wait until the camera is found and has identified itself; other calls wait for that by themselves.
 
         Raises:
             CommandRejected: the camera refused to identify itself.
@@ -74,8 +75,8 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
 
         Sends MAV_CMD_IMAGE_START_CAPTURE (https://mavlink.io/en/services/camera.html), or MAV_CMD_DO_DIGICAM_CONTROL
         to PX4's trigger and to cameras that do not support the former. The order is sent again only if the camera
-        then reports that it is not taking a picture and has taken none. A lost CAMERA_IMAGE_CAPTURED is requested. If
-        you cancel the call, the camera may still take the picture.
+        reports afterwards that it has taken no picture and is taking none. A lost CAMERA_IMAGE_CAPTURED is requested.
+        If you cancel the call, the camera may still take the picture.
 
         Args:
             timeout: seconds to wait for the report.

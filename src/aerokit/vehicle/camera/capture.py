@@ -49,7 +49,7 @@ class Capture(Snapshot):
     """One picture. Values that the camera did not report are None, or an empty text.
 
     - ``camera``: 1 to 6 for a camera attached to the autopilot, otherwise its component id; ``index`` counts from 0
-    - ``success``: False if the camera failed to take it; None if it did not say so (CAMERA_TRIGGER)
+    - ``success``: False if the camera failed to take the picture; None if not reported (CAMERA_TRIGGER)
     - ``received_at``: when the message arrived, on the loop's clock; ``taken_at``: seconds since 1970
     - ``place`` and attitude of the camera: ``quaternion`` (w, x, y, z), angles from the horizon and from north
     - ``file_url``: ``mftp:///…`` on the camera itself, or ``http://…``

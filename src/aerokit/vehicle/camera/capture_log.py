@@ -33,13 +33,13 @@ FETCH_ATTEMPTS, REQUEST_TIMEOUT_S = 12, 1.0
 TRIGGER_GRACE_S = 0.3
 # Messages of two types with the same index within this time report the same picture.
 DUPLICATE_WINDOW_S = 10.0
-# A status that is older than the newest one by less than this arrived out of order; by more, the camera restarted.
+# A status that is older than the newest by less than this arrived out of order; an older one means a restart.
 REORDER_WINDOW_MS = 5000
-# The index may exceed the reported count by this much; a camera beyond that counts in another way than the standard.
+# The index may exceed the reported count by this much. The count of a camera beyond that is not the standard's.
 MAX_COUNT_LEAD = 100
 # A jump over more indices than this is an outlier until a second picture confirms it.
 MAX_INDEX_GAP = 1000
-# CAMERA_FEEDBACK counts in 16 bits: an index that is lower by more than half the range has restarted.
+# CAMERA_FEEDBACK counts in 16 bits: the index has wrapped around if it is lower by more than half the range.
 HALF_RANGE = FEEDBACK_INDEX_RANGE // 2
 
 
@@ -209,7 +209,7 @@ class CaptureLog:
         self._update_highest(entry)
         if isinstance(message, m.CameraImageCaptured):
             self._count_boot_ms = message.time_boot_ms
-        # Only of a camera that counts as the standard says.
+        # Only the count of a camera that follows the standard is used.
         if self._is_count_used and capture.index <= self._count + MAX_COUNT_LEAD:
             self._count = max(self._count, capture.index)
         self._publish(message, capture, is_new=is_new)

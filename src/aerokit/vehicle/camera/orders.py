@@ -29,15 +29,15 @@ MessageT = TypeVar("MessageT", bound=Message)
 # Camera device ids of cameras that are attached to the autopilot and have no component id of their own.
 AUTOPILOT_CAMERA_IDS = range(1, 7)
 
-# Limit for orders that must not be executed twice: each is sent again only after the one before was found lost.
+# Maximum transmissions of an order that must not be executed twice; each requires that the previous one was lost.
 MAX_ORDER_ATTEMPTS = 8
 
 
 class _ResendGuard:
     """Decides whether a command to a camera may be sent again.
 
-    A camera with its own component id must have been received since the command; the HEARTBEAT of the autopilot says
-    nothing about it.
+    A camera with its own component id must have sent a message since the command. The HEARTBEAT of the autopilot does
+    not show that the camera is there.
     """
 
     def __init__(self, link: CameraOrders, sent: SentCommand) -> None:
@@ -80,8 +80,8 @@ class CameraOrders:
 
     def heartbeat_at(self) -> float:
         """Loop time of the camera's last HEARTBEAT; -inf while the vehicle is silent."""
-        heard_at = self._session.connection.last_heartbeat_at(self._session.system_id, self.component.component_id)
-        return heard_at if self._context.arbiter.is_known else -math.inf
+        received_at = self._session.connection.last_heartbeat_at(self._session.system_id, self.component.component_id)
+        return received_at if self._context.arbiter.is_known else -math.inf
 
     @property
     def on_finish(self) -> list[Callable[[], None]]:
@@ -100,7 +100,7 @@ class CameraOrders:
 
     @contextmanager
     def new_order(self, subject: str) -> Iterator[Order]:
-        """Begin an order; withdraw it if the block raises, settle it otherwise."""
+        """Begin an order; withdraw it if the block raises, otherwise commit it."""
         order = self.begin_order(subject)
         try:
             yield order
@@ -224,7 +224,7 @@ DOUBTFUL_POLL_INTERVAL_S = 60.0
 
 
 class _PolledCell:
-    """Poll state of one cell: notices that the program reads or watches it. Implements ``Feed`` of the cell."""
+    """Poll state of one cell, and whether the program reads or watches the cell. Implements ``Feed`` of the cell."""
 
     def __init__(
         self, now: Callable[[], float], cell: StateCell[Any], message_type: type[Message], period_s: float

@@ -28,11 +28,11 @@ CONTROL, TRIGGER = MavCmd.DO_DIGICAM_CONTROL, MavCmd.DO_TRIGGER_CONTROL
 TRIGGER_INTERVAL = MavCmd.DO_SET_CAM_TRIGG_INTERVAL
 # A series is checked after this long without a capture.
 CHECK_INTERVAL_S, STATUS_TIMEOUT_S = 1.0, 2.0
-# Status requests before an order, to a camera that has answered them before, and to others.
+# Number of status requests before an order: to a camera that has answered one before, and to any other camera.
 STATUS_ATTEMPTS, FIRST_STATUS_ATTEMPTS = 8, 3
-# Checks of a silent series without a result before it is given up.
+# Maximum number of checks without a result, after which a silent series has failed.
 MAX_SILENT_CHECKS = 6
-# An index in a series is plausible up to this many captures above twice the number that its interval allows.
+# A series may be ahead of its newest capture by twice the number that its interval allows, plus this many.
 MAX_EXTRA_CAPTURES = 10
 # After this many unanswered requests in a row, the remaining gap is skipped.
 MAX_UNANSWERED = 3
@@ -257,7 +257,7 @@ class PhotoInterval:
             await self._check_silence(silent)
 
     def _first_after_reset(self, capture: Capture) -> Capture | None:
-        # The camera has counted from 0 again if two successive indices say so: a single one could be corrupt.
+        # Two successive indices show that the camera counts from 0 again; a single index could be corrupt.
         before, self._possible_first = self._possible_first, None
         if self._log.reset_at > self._began_at and self._next is not None and capture.index < self._next:
             self._possible_first = capture

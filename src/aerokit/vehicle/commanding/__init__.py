@@ -1,1 +1,1 @@
-"""Orders: their validity, what may be sent again, and every action that moves a vehicle or stops it."""
+"""Orders to a vehicle: their validity, their retries, and every action that moves or stops the vehicle."""

@@ -1,6 +1,4 @@
-"""``CommandArbiter``: tracks which orders of the program are valid. Pilots and failsafes take precedence over all of
-them.
-"""
+"""``CommandArbiter``: tracks which orders of the program are valid. Pilots and failsafes take precedence over all."""
 
 from __future__ import annotations
 
@@ -23,24 +21,24 @@ if TYPE_CHECKING:
 MODE_GRACE_S = 3.0
 """Seconds by which HEARTBEAT (1 Hz) may lag behind an accepted command that changes the mode."""
 ARM_HEARTBEAT_DELAY_S = 1.5
-"""Seconds after an accepted arm command in which a HEARTBEAT (1 Hz) may still report the state before it."""
+"""Seconds after an accepted arm command in which a HEARTBEAT (1 Hz) may still report the previous state."""
 MODE_MAX_AGE_S = 2.5
 """Maximum age in seconds of a HEARTBEAT that describes the vehicle's present state; two may be lost. The
 ground-station failsafes of ArduPilot and PX4 act later (FS_GCS_TIMEOUT 5 s, COM_DL_LOSS_T 10 s).
 """
 OWN_MODES_MAX_AGE_S = 10.0
-"""Seconds in which a mode that the program ordered may still appear without being a takeover."""
+"""Seconds in which a mode that the program ordered may still appear without counting as a takeover."""
 
 STEERING, ACTION = "steering", "action"
-"""STEERING is the topic of every order that steers; ACTION of those given by actions and raw commands."""
+"""STEERING is the topic of all steering orders; ACTION is the topic of those given by actions and raw commands."""
 
 
-def was_armed_by_order(disarmed_told_at: float, accepted_at: float) -> bool:
+def was_armed_by_order(disarmed_at: float, accepted_at: float) -> bool:
     """Return True if the vehicle was armed by the order that it accepted at this time.
 
     A vehicle that reported being disarmed after the ack was armed by another party.
     """
-    return disarmed_told_at <= accepted_at + ARM_HEARTBEAT_DELAY_S
+    return disarmed_at <= accepted_at + ARM_HEARTBEAT_DELAY_S
 
 
 class CommandArbiter:
@@ -89,7 +87,7 @@ class CommandArbiter:
 
     def _is_newest(self, order: Order) -> bool:
         newest = (self.latest(topic) for topic in order.ended_by)
-        return not order.is_withdrawn and all(each is None or each.number <= order.number for each in newest)
+        return not order.is_withdrawn and all(newer is None or newer.number <= order.number for newer in newest)
 
     def _register(self, order: Order, topics: Iterable[Topic]) -> None:
         self._latest.update(dict.fromkeys(topics, order))
@@ -156,7 +154,7 @@ class CommandArbiter:
         """Create an order that does not steer (speed, home, arming …), or one command ``of`` an order to a device.
 
         Raises:
-            OperationRejected: a newer order to the device was given since.
+            OperationRejected: a newer order to the device was given.
         """
         if of is not None and not of.is_newest:
             raise OperationRejected(f"{SUPERSEDED}; the rest of the order was not sent")
@@ -166,7 +164,7 @@ class CommandArbiter:
         try:
             yield order
         finally:
-            self._orders = [each for each in self._orders if each is not order]
+            self._orders = [posted for posted in self._orders if posted is not order]
 
     @contextmanager
     def post(
@@ -296,7 +294,7 @@ class CommandArbiter:
         """Distrust the reported mode until the vehicle's answer is known; a cancellation or time-out leaves it
         unknown.
 
-        A refusal restores the previous doubt: an earlier order may still take effect.
+        A refusal restores the previous doubt, because an earlier order may still take effect.
         """
         was_in_doubt, self.mode_is_in_doubt = self.mode_is_in_doubt, True
         try:
@@ -324,7 +322,7 @@ class CommandArbiter:
         return self._new(
             modes,
             ended_by,
-            {each.custom_mode for each in (*expected, *self._posted_modes())},
+            {mode.custom_mode for mode in (*expected, *self._posted_modes())},
             settles_at=self.mode_settles_at,
             any_until=self._any_mode_until,
             ends_flight=ends_flight,
@@ -351,12 +349,12 @@ class CommandArbiter:
         """Return True if these are modes to land or to return in."""
         autopilot, is_vtol = self._telemetry.autopilot, self._telemetry.is_vtol
         ends = {autopilot.mode_for("land", is_vtol=is_vtol), autopilot.mode_for("return", is_vtol=is_vtol)}
-        numbers = {each.custom_mode for each in ends if each is not None}
-        return bool(modes) and {each.custom_mode for each in modes} <= numbers
+        numbers = {mode.custom_mode for mode in ends if mode is not None}
+        return bool(modes) and {mode.custom_mode for mode in modes} <= numbers
 
     def _posted_modes(self) -> tuple[Mode, ...]:
         """Modes that posted orders may still bring about, including superseded ones."""
-        return tuple(mode for each in self._posted if not each.is_confirmed for mode in each.modes)
+        return tuple(mode for order in self._posted if not order.is_confirmed for mode in order.modes)
 
     def _steers(self) -> bool:
         """True while the vehicle is in a mode of the newest order and there was no takeover."""
@@ -371,8 +369,8 @@ class CommandArbiter:
 
     def _on_mode(self, _: Mode | None, mode: Mode) -> None:
         followers: tuple[Order | SentCommand, ...] = (*self._watched(), *self._sent)
-        for each in followers:
-            each.on_mode(mode, self._telemetry.mode.updated_at)
+        for follower in followers:
+            follower.on_mode(mode, self._telemetry.mode.updated_at)
 
     def _on_state(self, _: int | None, state: int) -> None:
         for order in self._watched():
@@ -386,8 +384,8 @@ class CommandArbiter:
         if not armed:
             self._disarmed_at = self._telemetry.armed.updated_at
         followers: tuple[Order | SentCommand, ...] = (*self._watched(), *self._sent)
-        for each in followers:
-            each.on_armed(armed, self._telemetry.armed.updated_at)
+        for follower in followers:
+            follower.on_armed(armed, self._telemetry.armed.updated_at)
 
     def _note_armed_anew(self) -> None:
         self._armed_at = self._telemetry.armed.updated_at

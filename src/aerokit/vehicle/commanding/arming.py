@@ -67,19 +67,19 @@ class ArmingActions(VehicleBase):
             OperationTimeout: not ready within ``timeout`` seconds; the text lists what is missing, and recent status
                 texts.
         """
-        told = self.telemetry
-        cells = (told.sensors, told.estimator, told.position, told.home, told.armed)
+        telemetry = self.telemetry
+        cells = (telemetry.sensors, telemetry.estimator, telemetry.position, telemetry.home, telemetry.armed)
         with (
             self._session.streaming("sensors", "estimator", "position"),
-            ChangeSignal(self._session, *cells, every_arrival=True) as news,
+            ChangeSignal(self._session, *cells, every_arrival=True) as changes,
             anyio.move_on_after(timeout),
         ):
             while self._health.missing_for_flight():
                 self.connection.raise_if_ended()
-                await news.next(timeout)
+                await changes.next(timeout)
             return
-        said = dict.fromkeys(self._health.arming_texts(self.connection.now() - PREARM_REPORT_INTERVAL_S))
-        still = [*self._health.missing_for_flight(), *said] or ["nothing"]
+        recent_texts = dict.fromkeys(self._health.arming_texts(self.connection.now() - PREARM_REPORT_INTERVAL_S))
+        still = [*self._health.missing_for_flight(), *recent_texts] or ["nothing"]
         missing = "\n  - ".join([*still, *self._health.unarmable_mode()])
         raise OperationTimeout(
             f"the vehicle was not ready within {timeout:g} s ({self._session.describe_link()}); still missing:\n"
@@ -97,15 +97,15 @@ class ArmingActions(VehicleBase):
         """Arm the motors and wait until HEARTBEAT reports armed: **propellers may start to turn**.
 
         If the present mode does not allow arming (RTL or LAND after a flight, OFFBOARD), the mode is changed first.
-        The command is sent once, because a HEARTBEAT that reports disarmed may mean that a pilot has disarmed since.
-        After a cancellation, or an error other than a refusal, the command may still be executed. The vehicle is
-        therefore monitored for 15 seconds and disarmed if this command arms it (it accepts the command, or is armed
-        at the next HEARTBEAT and there was no takeover), as long as the connection is open. Logger "aerokit" warns
-        about the outcome, and about an arming that cannot be attributed to this command, which is left alone.
+        The command is sent once: a HEARTBEAT that reports disarmed may mean that a pilot has disarmed the vehicle.
+        After a cancellation, or an error other than a refusal, the command may still be executed. aerokit therefore
+        monitors the vehicle for 15 seconds, as long as the connection is open. It disarms the vehicle if this command
+        arms it: the vehicle accepts the command, or reports armed in the next HEARTBEAT without a takeover. An arming
+        that cannot be attributed to this command is left alone. Logger "aerokit" warns about the outcome.
 
         Args:
-            mode: the mode to arm in; None: the present mode, or one that ``take_off`` starts in if that does not
-                allow it.
+            mode: the mode to arm in. None: the present mode, or one that ``take_off`` starts in if the present mode
+                does not allow arming.
             force: skip the vehicle's own arming checks. Dangerous.
             timeout: seconds for HEARTBEAT to report armed after the command was accepted.
             max_silence_s: raise when no heartbeat was received for this long; None: wait until ``timeout``.
@@ -114,7 +114,8 @@ class ArmingActions(VehicleBase):
             InvalidArgument: there is no such mode, or it does not allow arming. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has its pre-arm texts, failing sensors and missing
                 estimates. Where the vehicle can run its checks on request, they are run again for this.
-            CommandTimeout: there was no acknowledgement, and it did not arm; the text says whether it may still arm.
+            CommandTimeout: there was no acknowledgement, and the vehicle did not arm; the text says whether it may
+                still arm.
             OperationRejected: it is armed already in a mode other than ``mode`` (nothing was sent), or another party
                 disarmed it or changed its mode meanwhile.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
@@ -222,23 +223,25 @@ class ArmingActions(VehicleBase):
         sensors = self.telemetry.sensors
         with self._session.streaming("sensors"), anyio.move_on_after(MODE_READY_TIMEOUT_S):
             since = self.connection.now()
-            await sensors.wait_until(lambda each: sensors.updated_at > since and each.prearm_checks_pass is not False)
+            await sensors.wait_until(
+                lambda health: sensors.updated_at > since and health.prearm_checks_pass is not False
+            )
 
     # ------------------------------------------------------------------------------ rebooting
 
     async def reboot(self, *, force: bool = False, timeout: float = 60.0) -> None:
-        """Reboot the autopilot and wait until it is back: its time since boot has restarted.
+        """Reboot the autopilot and wait until its time since boot has restarted.
 
         Args:
             force: reboot while armed as well: **a flying vehicle falls**.
-            timeout: seconds until it is back.
+            timeout: seconds until the vehicle has restarted.
 
         Raises:
             OperationRejected: it is armed, or not known to be disarmed. Nothing was sent.
             CommandRejected: it refused.
             CommandTimeout: there was no acknowledgement, and it did not reboot.
             LinkLost: the link went down with the vehicle (USB, TCP); connect again.
-            OperationTimeout: it did not come back.
+            OperationTimeout: it did not restart in time.
         """
         if not force and not self.telemetry.is_confirmed_disarmed:
             state = "armed" if self.telemetry.is_armed else "not known to be disarmed"
@@ -255,8 +258,8 @@ class ArmingActions(VehicleBase):
                 await self._await_reboot(reboots)
                 return
         if unanswered is not None:
-            raise CommandTimeout(f"{unanswered}; it is sent only once, and may still be executed")
-        raise OperationTimeout(f"reboot: not back within {timeout:g} s; {self._session.describe_link()}")
+            raise CommandTimeout(f"{unanswered}; the command is sent only once, and may still be executed")
+        raise OperationTimeout(f"reboot: no restart within {timeout:g} s; {self._session.describe_link()}")
 
     async def _order_reboot(self, force: bool) -> None:
         """Send the command once: if only the acknowledgement was lost, a second one would reboot the vehicle again."""

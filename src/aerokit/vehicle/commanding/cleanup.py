@@ -29,10 +29,10 @@ logger: logging.Logger = logging.getLogger("aerokit")
 
 
 class BackgroundTask:
-    """One background task of the vehicle. A new one replaces the previous one; leaving the vehicle's block waits
-    briefly.
+    """One background task of the vehicle. A new task replaces the previous one; leaving the vehicle's block waits
+    briefly for it.
 
-    ``name`` is the task's name; ``what_it_leaves`` completes the warning if the block is left before it is done.
+    ``name`` is the task's name; ``what_it_leaves`` completes the warning if the block is left before the task is done.
     """
 
     def __init__(self, session: VehicleSession, name: str, what_it_leaves: str) -> None:
@@ -46,7 +46,7 @@ class BackgroundTask:
         return self._scope is not None
 
     def start(self, work: Callable[[], Awaitable[None]]) -> None:
-        """Run this, as long as the connection is open."""
+        """Run ``work`` in the background, as long as the connection is open."""
         scope, is_over = Cancellation(), asyncio.Event()
         self._scope, self._is_over = scope, is_over
 
@@ -98,12 +98,12 @@ MAX_HOLD_ATTEMPTS = 3
 # Seconds to wait for the acknowledgement of a hold sent without waiting, and number of attempts.
 HOLD_ACK_TIMEOUT_S, MAX_HOLD_RESENDS = 0.5, 10
 
-# A NaN position means "here", and includes the braking distance.
+# NaN means the present position, and leaves room for braking.
 STOP_HERE = (MavCmd.DO_REPOSITION, -1, MavDoRepositionFlags.CHANGE_MODE, 0, *(math.nan,) * 4)
 
 
 class FlightCleanup:
-    """Stops the vehicle: as an order of the program, and after an order was abandoned.
+    """Makes the vehicle hold, as an order of the program or after an order was abandoned.
 
     ``stop_stream`` stops the active set-point stream, with a reason.
     """
@@ -122,9 +122,7 @@ class FlightCleanup:
         await self.stop_in(mode, self._arbiter.order(mode))
 
     async def stop_in(self, mode: Mode, order: Order) -> None:
-        """Order the vehicle to hold in any case. PX4 in LOITER may be flying to a place, where the mode alone would
-        not stop it.
-        """
+        """Order the vehicle to hold even if it is in the hold mode: PX4 in LOITER may be flying to a place."""
         if self._holds_by_reposition:
             await self._sender.follow_up_command(order, *STOP_HERE)
             await self._sender.ensure_mode(mode, order)
@@ -132,7 +130,7 @@ class FlightCleanup:
             await self._sender.change_mode(mode, order, reported_since=order.given_at)
 
     async def _confirm_hold(self, mode: Mode, order: Order) -> None:
-        """Wait for the acknowledgement of :meth:`_send_hold`, and send it again without one."""
+        """Wait for the acknowledgement of :meth:`_send_hold`; resend the hold if none arrives."""
         by_mode = (MavCmd.DO_SET_MODE, *self._session.autopilot.mode_order(mode).params)
         command, *params = STOP_HERE if self._holds_by_reposition else by_mode
         await self._sender.run_command(
@@ -153,9 +151,8 @@ class FlightCleanup:
 
         One command is sent at once if a recent HEARTBEAT describes the vehicle's state, otherwise after the next one,
         unless a failsafe or a pilot has taken over. A background task waits for the confirmation, as long as the
-        connection is open. Nothing is sent if the order has ended, if nothing of it was sent to a vehicle that
-        another party flies, or if the vehicle is disarmed. Returns True if the command was sent, or may be sent
-        later.
+        connection is open. Nothing is sent if the order has ended, if nothing of it was sent to a vehicle that another
+        party flies, or if the vehicle is disarmed. Returns True if the command was sent, or may be sent later.
         """
         if not order.may_move:
             return False
@@ -245,7 +242,7 @@ ARM_WATCH_S = 15.0
 ACK_S = 3.0
 """Seconds after a HEARTBEAT that reports armed in which the COMMAND_ACK of the order may arrive."""
 
-# Seconds that leaving the block waits for it.
+# Seconds that leaving the block waits for the outcome.
 ARM_CLOSE_TIMEOUT_S = 1.5
 
 
@@ -258,17 +255,17 @@ class ArmCleanup:
         self._task = BackgroundTask(session, "aerokit late arming", unsure)
 
     def text(self) -> str:
-        """The hint for error texts that an arm command may still be executed."""
+        """Return the hint for error texts that an arm command may still be executed."""
         unsent = self._session.connection.unsent_bytes
         hint = f"; {unsent} bytes are still in the send buffer" if unsent else ""
-        return f"it may still be executed{hint}: a vehicle that it arms within {ARM_WATCH_S:g} s is disarmed"
+        return f"it may still be executed{hint}; if it arms the vehicle within {ARM_WATCH_S:g} s, aerokit disarms it"
 
     def watch(self, order: Order, was_armed: bool) -> None:
         """Start monitoring: the abandoned arm command may have been received, or may still arrive."""
         self._session.connection.discard_unsent()
-        self._task.start(partial(self._look, order, was_armed, self._arbiter.arming_orders))
+        self._task.start(partial(self._watch_arming, order, was_armed, self._arbiter.arming_orders))
 
-    async def _look(self, order: Order, was_armed: bool, count: int) -> None:
+    async def _watch_arming(self, order: Order, was_armed: bool, count: int) -> None:
         armed = self._session.telemetry.armed
         disarmed_at = [order.given_at]
         stop = armed.observe(
@@ -301,11 +298,11 @@ class ArmCleanup:
             return
         if not await self._has_armed(order, disarmed_at):
             logger.warning(
-                "the vehicle armed after an arm command was abandoned, and it is not certain that this command"
-                " armed it: it stays armed"
+                "the vehicle armed after an arm command was abandoned: it stays armed, because another party may have"
+                " armed it"
             )
             return
-        logger.warning("an abandoned arm command has armed the vehicle: it is disarmed again")
+        logger.warning("an abandoned arm command has armed the vehicle: aerokit disarms it again")
         with anyio.CancelScope(shield=True):
             try:
                 with self._arbiter.auxiliary_order(ends_flight=True) as order:
@@ -316,11 +313,11 @@ class ArmCleanup:
     async def _has_armed(self, order: Order, disarmed_at: float) -> bool:
         """Return True if this order armed the vehicle, and not a pilot.
 
-        That is the case if the vehicle accepted it and has not reported being disarmed since. Without an
-        acknowledgement the time decides, unless there was a takeover.
+        It did so if the vehicle accepted it and has not reported being disarmed since. Without an acknowledgement, it
+        did so if the next HEARTBEAT reports armed and there was no takeover.
         """
-        told_after = self._session.telemetry.armed.updated_at - order.given_at
-        if not order.end and told_after <= ARM_HEARTBEAT_DELAY_S:
+        reported_after_s = self._session.telemetry.armed.updated_at - order.given_at
+        if not order.end and reported_after_s <= ARM_HEARTBEAT_DELAY_S:
             return True
         if not self._is_accepted(disarmed_at):
             await anyio.sleep(ACK_S)

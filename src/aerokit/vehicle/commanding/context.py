@@ -39,8 +39,8 @@ class VehicleContext:
 
     async def finish(self) -> bool:
         """Hold the vehicle if a flight was abandoned, when its block is left; return True if there was one."""
-        for each in tuple(self.on_finish):
-            each()
+        for callback in tuple(self.on_finish):
+            callback()
         self.flight_cleanup.end_flights()
         is_given_up = self.flight_cleanup.is_hold_pending
         await self.flight_cleanup.finish()

@@ -41,7 +41,7 @@ CLIMB_DETECTED_M = 0.5
 
 MODE_TIMEOUT_S = 6.0
 
-# Home is at the surface: a submarine below this depth has not surfaced, but left the mode on the way.
+# Home is at the surface. A submarine that leaves the mode below this depth has not surfaced.
 MAX_SURFACE_DEPTH_M = 1.5
 
 
@@ -58,12 +58,12 @@ class FlightActions(VehicleBase):
     ) -> None:
         """Take off and climb to ``altitude_m`` above home; returns at that altitude.
 
-        The vehicle must be armed. Its mode is changed if the autopilot needs that. After a cancellation or a time-out
-        the vehicle is told to hold where it is.
+        The vehicle must be armed. Its mode is changed if the autopilot needs that. After a cancellation or a time-out,
+        aerokit orders the vehicle to hold where it is.
 
         Args:
             altitude_m: metres above home, above 0, at most 10,000.
-            timeout: seconds until it is there.
+            timeout: seconds until the vehicle is at that altitude.
             max_silence_s: raise when no heartbeat was received for this long; None: wait until ``timeout``.
 
         Raises:
@@ -112,7 +112,7 @@ class FlightActions(VehicleBase):
         if state is None and not altitude > MIN_FLYING_HEIGHT_M:
             return error
         height = f", {altitude:.1f} m above home" if altitude > -math.inf else ""
-        why = f"it is {state or 'probably in the air'}{height} and takes off from the ground only; use go_to() to climb"
+        why = f"it is {state or 'probably in the air'}{height} and can only take off from the ground; go_to() climbs"
         explained = CommandRejected(f"{error}", command=error.command, result=error.result, reasons=(why,))
         explained.reasons = (*error.reasons, why)
         return explained
@@ -146,11 +146,11 @@ class FlightActions(VehicleBase):
         state_before = landed.latest
 
         def is_rising() -> bool:
-            is_told = landed.latest != state_before and landed.latest in (
+            is_reported = landed.latest != state_before and landed.latest in (
                 MavLandedState.IN_AIR,
                 MavLandedState.TAKEOFF,
             )
-            return is_told or self._position.altitude_relative() > begins_at + CLIMB_DETECTED_M
+            return is_reported or self._position.altitude_relative() > begins_at + CLIMB_DETECTED_M
 
         return is_rising
 
@@ -221,9 +221,7 @@ class FlightActions(VehicleBase):
             await self._await_home(order, timeout, max_silence_s)
 
     async def _await_ground(self, what: str, order: Order, timeout: float | None, max_silence_s: float | None) -> None:
-        """Wait for the ground. Only messages received after the order count: a stale state would end a landing in the
-        air.
-        """
+        """Wait until messages received after the order report the ground; older ones would end the wait in the air."""
         armed, landed, mode = self.telemetry.armed, self.telemetry.landed_state, self.telemetry.mode
         accepted_at = self.connection.now()
 
@@ -311,7 +309,7 @@ class ModeActions(VehicleBase):
     async def hold(self) -> None:
         """Stop and stay (a fixed wing circles); returns when HEARTBEAT reports the autopilot's mode for that.
 
-        Copter BRAKE, Plane LOITER, Rover HOLD (a boat LOITER), Sub POSHOLD; PX4 LOITER where it comes to a stop.
+        The mode is BRAKE on Copter, LOITER on Plane and boats, HOLD on Rover, POSHOLD on Sub and LOITER on PX4.
 
         Raises:
             NotSupported: this vehicle has no mode for it. Nothing was sent.

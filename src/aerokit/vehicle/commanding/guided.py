@@ -1,8 +1,8 @@
 """Guided set-points, streamed at a fixed rate while a program supplies them.
 
 An autopilot stops by itself when set-points stop arriving (ArduCopter after 3 s, PX4 after 0.5 s). Resending the last
-set-point without limit would defeat that. Here the stream ends, and the vehicle is told to hold, when the code that
-supplies set-points ends, raises, is cancelled, stops supplying them or blocks the event loop, and when the vehicle
+set-point without limit would defeat that. Here the stream ends, and aerokit orders the vehicle to hold, when the code
+that supplies set-points ends, raises, is cancelled, stops supplying them or blocks the event loop, and when the vehicle
 falls silent.
 """
 
@@ -48,8 +48,8 @@ __all__ = ["Guided", "SetpointStream"]
 
 SetpointT = TypeVar("SetpointT")
 
-# Number of immediate transmissions of a position set-point that must not be repeated needlessly, as
-# protection against loss, and the interval of later ones.
+# A position set-point that restarts the path is sent this many times at once, in case one is lost, then at this
+# interval.
 INITIAL_REPEATS, REPEAT_INTERVAL_S = 3, 5.0
 # Seconds for which the initial set-point is streamed before OFFBOARD is requested: PX4 requires a running
 # stream.
@@ -62,8 +62,8 @@ class Guided:
 
     Every stream takes ``rate_hz`` (transmission rate of the latest set-point, 2 to 100), ``valid_for_s`` (how long a
     set-point may be resent without a new one) and ``max_lag_s`` (how late the event loop may be). NotSupported is
-    raised for a kind that this type of vehicle does not obey. Rates and seconds are in real time: a simulation at ten
-    times the speed needs ten times the rate.
+    raised for a kind that this type of vehicle does not support. Rates and seconds are in real time: a simulation at
+    ten times the speed needs ten times the rate.
     """
 
     def __init__(self, context: VehicleContext) -> None:
@@ -142,7 +142,7 @@ class Guided:
         autopilot = self._context.session.autopilot
         if kind not in autopilot.setpoints.names:
             obeyed = ", ".join(autopilot.setpoints.names) or "none"
-            raise NotSupported(f"{autopilot.firmware} does not obey {kind} set-points; those it obeys: {obeyed}")
+            raise NotSupported(f"{autopilot.firmware} does not support {kind} set-points; supported: {obeyed}")
         return SetpointStream(self._context, encode, initial, *limits)
 
 
@@ -151,9 +151,9 @@ class SetpointStream(Generic[SetpointT]):
     """Sends the latest set-point at a fixed rate while the ``async with`` block supplies set-points.
 
     Entering the block changes to the set-point mode (GUIDED, OFFBOARD) with the initial set-point. Leaving it in any
-    way tells the vehicle to hold. If the stream stops by itself, ``set`` and leaving the block raise
-    :class:`SetpointStreamStopped`; a vehicle that does not move for twelve seconds although it should stops it as
-    well. If it stopped because a pilot or a failsafe changed the mode, nothing more is sent to the vehicle.
+    way makes the vehicle hold. The stream stops by itself for the reasons above, and if the vehicle should move but
+    stays in place for twelve seconds; then ``set`` and leaving the block raise :class:`SetpointStreamStopped`. After a
+    pilot or a failsafe has changed the mode, nothing more is sent to the vehicle.
     """
 
     def __init__(
@@ -350,11 +350,11 @@ class SetpointStream(Generic[SetpointT]):
         return None
 
     def _stop(self, reason: str, *, hold: bool = True) -> None:
-        """Stop the stream from inside; tell the vehicle to hold unless there was a takeover."""
+        """Stop the stream from inside; order the vehicle to hold unless there was a takeover."""
         self._end()
         is_confirmed = hold and self._hold()
         self._stopped = SetpointStreamStopped(
-            f"the set-point stream has stopped: {reason}" + ("; the vehicle was told to hold" if is_confirmed else "")
+            f"the set-point stream has stopped: {reason}" + ("; a hold was ordered" if is_confirmed else "")
         )
 
     def _hold(self) -> bool:

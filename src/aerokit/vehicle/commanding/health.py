@@ -81,7 +81,7 @@ class Health:
         return self._session.deduplicate_reasons(*(reason for reasons in found for reason in reasons))
 
     def unarmable_mode(self) -> list[str]:
-        """Return that the present mode does not allow arming, if so."""
+        """Return a text if the present mode does not allow arming, else nothing."""
         mode = self._telemetry.mode.latest
         is_unarmable = mode is not None and mode.name in self._autopilot.unarmable_modes
         return [self.unarmable_text(mode)] if mode is not None and is_unarmable else []

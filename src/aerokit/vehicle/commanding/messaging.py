@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 ALL_GROUPS = ALL_COMPONENTS = 0
 
-COMES_WITHIN_S = 3.0
+FIRST_MESSAGE_TIMEOUT_S = 3.0
 
 MAX_RETRY_INTERVAL_S = 60.0
 
@@ -45,7 +45,7 @@ REQUESTED_STREAMS: tuple[type[Message], ...] = (
 )
 
 # States that every vehicle should stream.
-NEEDED = (
+REQUIRED_STATES = (
     "attitude",
     "position",
     "ground_speed_m_s",
@@ -64,37 +64,39 @@ def every_stream(session: VehicleSession, rate_hz: float) -> Iterator[None]:
     tasks = BackgroundTasks(session.connection.fail)
     with ExitStack() as ends:
         if session.autopilot.stream_groups:
-            heard = _StreamMonitor(session, ends)
-            tasks.start(lambda: _keep_asking(session, rate_hz, heard), "aerokit streams")
+            monitor = _StreamMonitor(session, ends)
+            tasks.start(lambda: _request_repeatedly(session, rate_hz, monitor), "aerokit streams")
         else:
-            tasks.start(lambda: _want_missing(session, rate_hz, ends), "aerokit streams")
+            tasks.start(lambda: _request_missing(session, rate_hz, ends), "aerokit streams")
         try:
             yield
         finally:
             tasks.cancel()
 
 
-async def _keep_asking(session: VehicleSession, rate_hz: float, heard: _StreamMonitor) -> None:
-    retry_interval_s = COMES_WITHIN_S
+async def _request_repeatedly(session: VehicleSession, rate_hz: float, monitor: _StreamMonitor) -> None:
+    retry_interval_s = FIRST_MESSAGE_TIMEOUT_S
     rate = max(1, round(rate_hz))
     while True:
         session.send(m.RequestDataStream(session.system_id, ALL_COMPONENTS, ALL_GROUPS, rate, 1))
-        heard.forget()
+        monitor.forget()
         with anyio.move_on_after(retry_interval_s):
-            await heard.must_request.wait()
-            retry_interval_s = COMES_WITHIN_S
+            await monitor.must_request.wait()
+            retry_interval_s = FIRST_MESSAGE_TIMEOUT_S
             continue
         retry_interval_s = min(2 * retry_interval_s, MAX_RETRY_INTERVAL_S)
-        if heard.something:
-            await heard.must_request.wait()
-            retry_interval_s = COMES_WITHIN_S
+        if monitor.has_received:
+            await monitor.must_request.wait()
+            retry_interval_s = FIRST_MESSAGE_TIMEOUT_S
 
 
-async def _want_missing(session: VehicleSession, rate_hz: float, ends: ExitStack) -> None:
-    await anyio.sleep(COMES_WITHIN_S)
+async def _request_missing(session: VehicleSession, rate_hz: float, ends: ExitStack) -> None:
+    await anyio.sleep(FIRST_MESSAGE_TIMEOUT_S)
     telemetry = session.telemetry
-    missing = [name for name in NEEDED if not telemetry.cells[name].is_known]
-    for message_type in dict.fromkeys(each for name in missing for each in telemetry.required_messages(name)):
+    missing = [name for name in REQUIRED_STATES if not telemetry.cells[name].is_known]
+    for message_type in dict.fromkeys(
+        message_type for name in missing for message_type in telemetry.required_messages(name)
+    ):
         ends.callback(session.rates.request(message_type, rate_hz))
 
 
@@ -102,7 +104,7 @@ class _StreamMonitor:
     """Tracks whether streamed messages arrive, and whether the streams must be requested again."""
 
     def __init__(self, session: VehicleSession, ends: ExitStack) -> None:
-        self.something = False
+        self.has_received = False
         self.must_request = asyncio.Event()
         self._system_id = session.system_id
         bus = session.connection.bus
@@ -112,10 +114,10 @@ class _StreamMonitor:
             ends.callback(bus.attach_event(event_type, self._on_event))
 
     def forget(self) -> None:
-        self.something, self.must_request = False, asyncio.Event()
+        self.has_received, self.must_request = False, asyncio.Event()
 
     def _on_message(self, message: Message) -> None:
-        self.something = True
+        self.has_received = True
 
     def _on_event(self, event: Event) -> None:
         if event.system_id in (0, self._system_id):
@@ -123,7 +125,7 @@ class _StreamMonitor:
 
 
 # ``target_system`` of a message to all systems.
-EVERYBODY = 0
+ALL_SYSTEMS = 0
 
 ItemT = TypeVar("ItemT", bound="Message | Event")
 
@@ -152,7 +154,7 @@ class MessagingActions(VehicleBase):
 
         Args:
             command: the number, or a member of ``enums.MavCmd``.
-            params: param1 to param7; missing ones are 0, NaN where the command allows it.
+            params: param1 to param7; missing ones are 0, or NaN where the command allows it.
             component_id: the target component instead of the autopilot; 0: all components, and the autopilot's ack
                 counts.
             retries: how often it is sent again without an ack, from 0; ``confirmation`` increments each time. A
@@ -198,8 +200,8 @@ class MessagingActions(VehicleBase):
         """Send any MAV_CMD as COMMAND_INT: param1 to param4, ``x``, ``y``, ``z`` in ``frame`` (MAV_FRAME).
 
         ``x`` and ``y`` are latitude and longitude in 1e-7 degrees, or 1e-4 m in local frames; ``z`` is in metres.
-        With ``or_long``, firmware that does not support it as COMMAND_INT gets a COMMAND_LONG with degrees, in frame
-        0 only. All else as for :meth:`command`.
+        With ``or_long``, firmware that does not support the command as COMMAND_INT gets a COMMAND_LONG with degrees;
+        this requires frame 0. All else as for :meth:`command`.
         """
         if or_long and frame != MavFrame.GLOBAL:
             raise InvalidArgument(f"frame = {frame} is not allowed with or_long: MAV_FRAME_GLOBAL (0)")
@@ -222,8 +224,8 @@ class MessagingActions(VehicleBase):
     def send(self, message: Message) -> None:
         """Send one message unchanged, once; never blocks. The caller sets its ``target_system``.
 
-        A steering command (as by :meth:`command`) and SET_MODE are newer orders and end those of actions. A set-point
-        supersedes what was :meth:`posted` about motion. Messages to another system do neither.
+        A steering command and SET_MODE are orders and end the action in progress, as with :meth:`command`. A set-point
+        supersedes :meth:`posted` orders about motion. Messages to another system do neither.
 
         Raises:
             InvalidArgument: a field is out of range; nothing was sent.
@@ -237,7 +239,7 @@ class MessagingActions(VehicleBase):
         :meth:`send`.
         """
         target = getattr(message, "target_system", self.system_id)
-        subjects = subjects_of(message) if target in (EVERYBODY, self.system_id) else ()
+        subjects = subjects_of(message) if target in (ALL_SYSTEMS, self.system_id) else ()
         if subjects == ARM_ALONE and isinstance(message, (CommandInt, CommandLong)):
             self._arbiter.note_own_arming(message.param1 == 1)
         elif subjects and isinstance(message, (CommandInt, CommandLong, SetMode)):
@@ -259,9 +261,9 @@ class MessagingActions(VehicleBase):
         """Open an order without waiting for its effect, so that mode, arming and take-off can be sent in one go.
 
         Within the block its commands are sent again right after a HEARTBEAT until they are acknowledged or their
-        effect is reported. They are not sent again after a newer order about the same subject, after a mode that
-        neither this order nor one of the last ten seconds explains, or, for orders about motion, after disarming. An
-        abandoned order does not make the vehicle hold, and late arming is not monitored; use the actions for that.
+        effect is reported. Retries end with a newer order about the same subject, with a mode that neither this order
+        nor an order of the last ten seconds explains and, for orders about motion, with disarming. An abandoned order
+        does not make the vehicle hold, and late arming is not monitored; use the actions for that.
 
         Args:
             subjects: ``"mode"``, ``"motion"`` or ``"arm"``; the first one is what the order is about, and it also
@@ -317,10 +319,10 @@ class MessagingActions(VehicleBase):
     def streams(self, rate_hz: float) -> Iterator[None]:
         """Request all streams of the vehicle at ``rate_hz`` for the duration of the ``with`` block.
 
-        For recordings, ground stations, and firmware without rates of single messages. ArduPilot is asked by
+        For recordings, ground stations, and firmware without rates of single messages. ArduPilot receives
         REQUEST_DATA_STREAM (whole Hz, at least 1), again after a reboot or a silence and while nothing arrives; it
-        continues to stream afterwards. Other autopilots stream by themselves; missing common states are requested as
-        by :meth:`rate`.
+        continues to stream after the block. Other autopilots stream by themselves; missing common states are requested
+        as by :meth:`rate`.
 
         Raises:
             InvalidArgument: the rate is not above 0 and at most 1000. Nothing was sent.

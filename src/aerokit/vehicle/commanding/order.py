@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 Subject = Literal["mode", "motion", "arm"]
 """The part of the vehicle that an order controls."""
 Topic: TypeAlias = Hashable
-"""The thing that an order controls: a subject of the vehicle, or any key for a device such as a camera or a gimbal."""
+"""The topic of an order: a subject of the vehicle, or any key for a device such as a camera or a gimbal."""
 
 ROI: Topic = "region of interest"
 """Topic of orders that point the autopilot's gimbal, or the nose, at a place."""
@@ -65,7 +65,7 @@ mode (COM_FAIL_ACT_T), and an order that arrives in that time cancels the failsa
 """
 # MISSION_ITEM.current of an item that the vehicle flies to at once.
 GUIDED_ITEM = (2, 3)
-QUESTIONS = frozenset(
+REQUEST_COMMANDS = frozenset(
     (
         MavCmd.RUN_PREARM_CHECKS,
         MavCmd.GET_MESSAGE_INTERVAL,
@@ -102,7 +102,7 @@ def is_worse(state: int, before: int | None) -> bool:
 def failsafe_text(state: int) -> str:
     """Return a clause about the failsafe, for error texts."""
     name = MavState(state).name
-    return f"a failsafe became active (MAV_STATE_{name}): it keeps the vehicle, which is not told to hold"
+    return f"a failsafe became active (MAV_STATE_{name}) and keeps control; no hold was ordered"
 
 
 class Order:
@@ -115,8 +115,8 @@ class Order:
     Modes are classified as follows. ``mode_before`` was active when the order was given, ``modes`` are the order's
     own, ``expected`` modes may still appear because the program ordered them shortly before, in any sequence until
     ``settles_at``. Until ``any_until`` every mode is accepted, because the program sent a raw command with an unknown
-    effect. Any other mode is attributed to the pilot or a failsafe. With ``requires_mode_change`` only a change to an
-    own mode ends the validity of the expected ones; being in it already does not.
+    effect. Any other mode is attributed to the pilot or a failsafe. Expected modes are no longer accepted once an own
+    mode is reported; with ``requires_mode_change`` only after a change to it, not if the vehicle was in it already.
     """
 
     def __init__(
@@ -266,8 +266,8 @@ class Order:
 class SentCommand:
     """One command of an order after its first transmission. Decides whether it may be sent again.
 
-    It may as long as the vehicle reports neither its effect nor an action of another party. A change to one of
-    ``modes``, or to ``armed``, is an effect; ``is_done`` reports any other one.
+    It may be sent again while the vehicle has reported neither its effect nor an action of another party. A change to
+    one of ``modes``, or to ``armed``, is an effect; ``is_done`` reports any other effect.
     """
 
     def __init__(

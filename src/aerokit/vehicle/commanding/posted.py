@@ -1,4 +1,4 @@
-"""`PostedOrder`: an order that need not be waited for before the next one is given."""
+"""`PostedOrder`: an order that does not delay the next one, because its effect need not be awaited."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ if TYPE_CHECKING:
 __all__ = ["PostedOrder"]
 
 POLL_INTERVAL_S = 0.05
-MAX_MODE_ATTEMPTS, ASK_AGAIN_S = 4, 0.5
+MAX_MODE_ATTEMPTS, MODE_RETRY_INTERVAL_S = 4, 0.5
 
 
 @checks_arguments
 class PostedOrder:
-    """An order that need not be waited for; created by :meth:`aerokit.Vehicle.posted`."""
+    """An order whose effect need not be awaited; created by :meth:`aerokit.Vehicle.posted`."""
 
     def __init__(self, session: VehicleSession, arbiter: CommandArbiter, sender: OrderSender, order: Order) -> None:
         self._session, self._arbiter, self._sender, self._order = session, arbiter, sender, order
@@ -119,21 +119,21 @@ class PostedOrder:
                     return
                 if error.result != MavResult.TEMPORARILY_REJECTED or not attempts_left:
                     raise
-                if not await self._stands(timeout):
+                if not await self._is_still_valid(timeout):
                     raise
             else:
                 return
 
-    async def _stands(self, timeout: float) -> bool:
+    async def _is_still_valid(self, timeout: float) -> bool:
         """Wait for the next HEARTBEAT; return True if the order is still valid after it."""
-        answered_at, told = self._session.connection.now(), self._session.telemetry.armed
-        await anyio.sleep(ASK_AGAIN_S)
+        answered_at, armed = self._session.connection.now(), self._session.telemetry.armed
+        await anyio.sleep(MODE_RETRY_INTERVAL_S)
         with (
-            ChangeSignal(self._session, told, every_arrival=True) as news,
+            ChangeSignal(self._session, armed, every_arrival=True) as changes,
             anyio.move_on_after(timeout),
         ):
-            while told.updated_at <= answered_at or not self._arbiter.is_known:
-                await news.next(POLL_INTERVAL_S)
+            while armed.updated_at <= answered_at or not self._arbiter.is_known:
+                await changes.next(POLL_INTERVAL_S)
             return not self.end
         return False
 

@@ -1,4 +1,4 @@
-"""Waiting for an operation in progress, and failing as soon as it cannot succeed any more."""
+"""Waits for operations in progress, and fails as soon as they can no longer succeed."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.session.session import VehicleSession
 
 POLL_INTERVAL_S = 0.25
-"""Poll interval in seconds, because a silence brings no message."""
+"""Poll interval in seconds, because no message arrives during a silence."""
 
 MAX_SILENCE_S = 10.0
 
@@ -59,7 +59,7 @@ async def await_progress(
     telemetry = session.telemetry
     cells = (telemetry.mode, telemetry.armed, telemetry.position, telemetry.landed_state)
     done_since: float | None = None
-    with ChangeSignal(session, *cells) as news:
+    with ChangeSignal(session, *cells) as changes:
         while True:
             now = session.connection.now()
             session.connection.raise_if_ended()
@@ -77,7 +77,7 @@ async def await_progress(
                 )
             if stillness is not None and (still := stillness()):
                 raise OperationTimeout(f"{what}: {still}; {describe()}; {session.describe_link()}")
-            await news.next(POLL_INTERVAL_S)
+            await changes.next(POLL_INTERVAL_S)
 
 
 def _height_when_disarmed(session: VehicleSession) -> str:
@@ -118,7 +118,7 @@ class ChangeSignal:
 
 
 class StallDetector:
-    """Detects a vehicle that has accepted an order to move and stays where it is.
+    """Detects a vehicle that has accepted an order to move and does not move.
 
     It reports nothing without positions, nor before ``STALL_TIMEOUT_S`` seconds, because a vehicle may turn or spool
     up.
@@ -133,7 +133,7 @@ class StallDetector:
         self._top_m, self._max_sink_m_s = -math.inf, 0.0
 
     def __call__(self) -> str | None:
-        """Return how long it has not moved, as a clause; None if it moves or its position is unknown."""
+        """Return a clause about how long the vehicle has not moved; None if it moves or its position is unknown."""
         now, cell = self._session.connection.now(), self._session.telemetry.position
         here = cell.latest
         if here is None or cell.age > POSITION_MAX_AGE_S:
@@ -159,7 +159,7 @@ class StallDetector:
 
 
 def _metres(one: Position, other: Position) -> float:
-    above = [(each.altitude_relative_m, each.altitude_amsl_m) for each in (one, other)]
+    above = [(position.altitude_relative_m, position.altitude_amsl_m) for position in (one, other)]
     climbed = next((abs(a - b) for a, b in zip(*above, strict=True) if a is not None and b is not None), 0.0)
     return one.distance_to(other) + climbed
 
@@ -190,7 +190,7 @@ class VehiclePosition:
         return math.hypot(along, self._altitude_difference(here, target))
 
     def check_reach(self, name: str, places: Iterable[Position], max_distance_m: float) -> None:
-        """Raise InvalidArgument for a place farther away than this; accept all while the position is unknown."""
+        """Raise InvalidArgument for a place farther away than the limit; accept all while the position is unknown."""
         check_range("max_distance_m", max_distance_m, 0, math.inf, above=True)
         here = self._telemetry.position.latest
         if here is None:
@@ -229,13 +229,13 @@ class VehiclePosition:
         return position.updated_at >= started and position.age <= POSITION_MAX_AGE_S
 
     def altitude_relative(self) -> float:
-        """Return metres above home; −inf while unknown."""
+        """Return the altitude above home in metres; −inf while unknown."""
         here = self._telemetry.position.latest
         altitude = None if here is None else here.altitude_relative_m
         return -math.inf if altitude is None else altitude
 
     def home_altitude(self) -> float:
-        """Return metres above mean sea level; raise ValueUnknownError while home is not known."""
+        """Return the altitude of home above mean sea level in metres; raise ValueUnknownError while it is unknown."""
         return self._telemetry.home.value.altitude_amsl_m
 
     def global_target(self, target: Position) -> tuple[int, int, float, bool]:
@@ -263,5 +263,5 @@ class VehiclePosition:
 
     @property
     def takes_relative_altitude(self) -> bool:
-        """Return True if the autopilot takes altitudes relative to home."""
+        """Return True if the autopilot supports altitudes relative to home."""
         return self._autopilot.reposition is None or self._autopilot.reposition.relative_altitude

@@ -11,7 +11,7 @@ from aerokit.errors import CommandRejected, CommandTimeout, NotSupported, Operat
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.protocols.command import ATTEMPT_TIMEOUT_S, MAX_ATTEMPTS, rejection
 from aerokit.vehicle.commanding.arbiter import MODE_GRACE_S, MODE_MAX_AGE_S
-from aerokit.vehicle.commanding.order import ARM_ALONE, CHANGED_BY_COMMAND, QUESTIONS
+from aerokit.vehicle.commanding.order import ARM_ALONE, CHANGED_BY_COMMAND, REQUEST_COMMANDS
 from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, await_progress
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 FORCE = 21196
 """param2 of COMPONENT_ARM_DISARM that skips the pre-arm checks."""
-ACCEPTANCE_REVOKED = "the vehicle accepted it first and refused it then"
+ACCEPTANCE_REVOKED = "the vehicle accepted the command and then refused it"
 
 
 class OrderSender:
@@ -75,7 +75,7 @@ class OrderSender:
             raise OperationRejected(f"{order.end}; the rest of the order was not sent")
 
     def _unanswered(self, error: CommandTimeout, order: Order) -> Exception:
-        """Prefer the takeover as the reason of a time-out."""
+        """Return the takeover as the error if there was one, otherwise the time-out."""
         if order.takeover_reason or (order.failsafe and order.end):
             return OperationRejected(str(error), reasons=self._session.texts_since(order.given_at))
         return error
@@ -193,8 +193,8 @@ class OrderSender:
 
     async def ensure_mode(self, mode: Mode, order: Order) -> None:
         """Change the mode unless a recent HEARTBEAT already reports it."""
-        is_told = self._session.telemetry.is_in(mode) and self._session.telemetry.mode.age <= MODE_MAX_AGE_S
-        if self._arbiter.mode_is_in_doubt or not is_told:
+        is_reported = self._session.telemetry.is_in(mode) and self._session.telemetry.mode.age <= MODE_MAX_AGE_S
+        if self._arbiter.mode_is_in_doubt or not is_reported:
             await self.change_mode(mode, order)
 
     def mode_for(self, action: str, purpose: Purpose) -> Mode:
@@ -246,16 +246,16 @@ class OrderSender:
         retries: int | None,
         **options: Any,
     ) -> CommandAck:
-        """Send any command for the program itself; ``send`` is a method of the command sender."""
+        """Send a raw command of the program by ``send``, a method of the command sender."""
         started = self._session.connection.now()
         if retries is None:
-            retries = MAX_ATTEMPTS - 1 if command in QUESTIONS else 0
+            retries = MAX_ATTEMPTS - 1 if command in REQUEST_COMMANDS else 0
         check_range("retries", retries, 0, 1000)
         options["attempts"] = 1 + retries
         if options["attempt_timeout"] is None and not retries:
             options["attempt_timeout"] = MAX_ATTEMPTS * ATTEMPT_TIMEOUT_S
         try:
-            if command in QUESTIONS:
+            if command in REQUEST_COMMANDS:
                 return await send(command, *params, **options)
             names = self._session.telemetry.mode_names
             modes = self._session.autopilot.modes_of_command(command, params, names)

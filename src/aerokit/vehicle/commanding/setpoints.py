@@ -38,7 +38,7 @@ IGNORE_POSITION, IGNORE_VELOCITY, IGNORE_ACCELERATION = 0x007, 0x038, 0x1C0
 IGNORE_YAW, IGNORE_YAW_RATE = 0x400, 0x800
 IGNORE_BODY_RATES = 0x07
 # Below this speed, or within this many arrival radii, a vehicle that obeys may stand still.
-SLOW_M_S, FAR = 0.3, 2.0
+SLOW_M_S, MAX_RESTING_RADII = 0.3, 2.0
 
 
 class VelocitySetpoint(Snapshot):
@@ -92,7 +92,7 @@ class PositionSetpoint(Snapshot):
 class AttitudeSetpoint(Snapshot):
     """Attitude in degrees and ``thrust`` from 0 to 1.
 
-    ArduCopter reads ``thrust`` as climb rate in GUIDED unless GUID_OPTIONS says otherwise: 0.5 holds the altitude.
+    ArduCopter reads ``thrust`` as climb rate in GUIDED unless GUID_OPTIONS selects thrust: 0.5 holds the altitude.
     PX4 reads it as collective thrust.
     """
 
@@ -108,7 +108,7 @@ def wants_motion(setpoint: object, context: VehicleContext) -> bool:
         return math.hypot(setpoint.north_m_s, setpoint.east_m_s, setpoint.down_m_s) >= SLOW_M_S
     if isinstance(setpoint, BodyVelocitySetpoint):
         return math.hypot(setpoint.forward_m_s, setpoint.right_m_s, setpoint.down_m_s) >= SLOW_M_S
-    far_m = FAR * context.session.autopilot.arrival_radius_m
+    far_m = MAX_RESTING_RADII * context.session.autopilot.arrival_radius_m
     if isinstance(setpoint, PositionSetpoint):
         return far_m < context.vehicle_position.distance_to(setpoint.position) < math.inf
     here = context.session.telemetry.local_position.latest
@@ -172,7 +172,7 @@ class SetpointEncoder:
         everything = IGNORE_POSITION | IGNORE_VELOCITY | IGNORE_ACCELERATION
         mask, yaw, yaw_rate = _yaw(yaw_deg, yaw_rate_deg_s)
         none = (0.0, 0.0, 0.0)
-        vectors = [vector if group == each else none for each in _GROUPS]
+        vectors = [vector if group == name else none for name in _GROUPS]
         return SetPositionTargetLocalNed(
             self._time_ms(),
             self._session.system_id,
@@ -232,7 +232,7 @@ _GROUPS = (IGNORE_POSITION, IGNORE_VELOCITY, IGNORE_ACCELERATION)
 def _yaw(yaw_deg: float | None, yaw_rate_deg_s: float | None) -> tuple[int, float, float]:
     """Return type-mask bits, yaw in radians and yaw rate in radians per second."""
     if yaw_deg is not None and yaw_rate_deg_s is not None:
-        raise InvalidArgument("give yaw_deg or yaw_rate_deg_s, not both")
+        raise InvalidArgument(f"yaw_deg = {yaw_deg} and yaw_rate_deg_s = {yaw_rate_deg_s} are not allowed together")
     _check_finite("yaw", yaw_deg or 0.0, yaw_rate_deg_s or 0.0)
     mask = (IGNORE_YAW if yaw_deg is None else 0) | (IGNORE_YAW_RATE if yaw_rate_deg_s is None else 0)
     return mask, math.radians(yaw_deg or 0.0), math.radians(yaw_rate_deg_s or 0.0)

@@ -52,9 +52,9 @@ class TravelActions(VehicleBase):
     ) -> None:
         """Fly to a place and return on arrival.
 
-        After a cancellation, a time-out or a silence the vehicle is told to hold where it is, unless another order
-        was given meanwhile or another party changed the mode. A silent vehicle is told to hold when it is received
-        again, if it is still on its way then. Sends MAV_CMD_DO_REPOSITION
+        After a cancellation, a time-out or a silence, aerokit orders the vehicle to hold where it is, unless another
+        order was given meanwhile or another party changed the mode. After a silence it waits for the next heartbeat,
+        and orders the hold if the vehicle is still on its way. Sends MAV_CMD_DO_REPOSITION
         (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_REPOSITION), or SET_POSITION_TARGET_GLOBAL_INT to a
         vehicle that does not support it.
 
@@ -213,8 +213,8 @@ class TravelActions(VehicleBase):
     ) -> None:
         """Turn on the spot and return when the vehicle has this heading.
 
-        ArduPilot: MAV_CMD_CONDITION_YAW in GUIDED, which is set first. PX4 has no such command and stops to turn:
-        MAV_CMD_DO_REPOSITION.
+        ArduPilot: changes to GUIDED and sends MAV_CMD_CONDITION_YAW. PX4 has no such command: the vehicle stops and
+            turns by MAV_CMD_DO_REPOSITION.
 
         Args:
             heading_deg: −360 to 360, clockwise from north; with ``relative`` an angle to turn by, negative to the
@@ -353,7 +353,7 @@ class LookActions(VehicleBase):
     """Pointing the nose or the gimbal at a place. A new order replaces the previous one."""
 
     async def look_at(self, target: Position) -> None:
-        """Point nose or gimbal at a place, until :meth:`stop_looking`; without an altitude, at the vehicle's own.
+        """Point nose or gimbal at a place until :meth:`stop_looking`; without an altitude, at the vehicle's altitude.
 
         Sends MAV_CMD_DO_SET_ROI_LOCATION (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_ROI_LOCATION), or
         MAV_CMD_DO_SET_ROI to old firmware.
@@ -402,9 +402,7 @@ class LookActions(VehicleBase):
 
     @staticmethod
     def _raise_if_superseded(order: Order) -> None:
-        """Raise if the order was superseded. A mode of the program's own does not matter, because the ROI applies in
-        any.
-        """
+        """Raise if the order was superseded. A mode change by the program does not count: a ROI applies in any mode."""
         if order.end and not order.takeover_reason:
             raise OperationRejected(f"{order.end}; the rest of the order was not sent")
 

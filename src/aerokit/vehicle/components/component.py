@@ -134,17 +134,17 @@ class Component(ReadOnly):
 
     @property
     def age(self) -> float:
-        """Seconds since its last HEARTBEAT; inf before the first."""
+        """Seconds since the last HEARTBEAT of the component; inf before the first."""
         connection = self._session.connection
         return connection.now() - connection.last_heartbeat_at(self.system_id, self.component_id)
 
     @property
     def is_silent(self) -> bool:
-        """True if its last HEARTBEAT is older than 3.5 seconds, or none was received."""
+        """True if the component's last HEARTBEAT is older than 3.5 seconds, or none was received."""
         return self.age > SILENT_AFTER_S
 
     async def information(self, *, timeout: float = 3.0) -> ComponentInformation:
-        """Request its identity and capabilities (COMPONENT_INFORMATION_BASIC).
+        """Request identity and capabilities of the component (COMPONENT_INFORMATION_BASIC).
 
         Raises:
             CommandRejected: it does not support the message.
@@ -162,10 +162,10 @@ class Component(ReadOnly):
         )
 
     async def metadata(self, kind: MetadataKind = "general", *, timeout: float = 3.0) -> dict[str, Any]:
-        """Read one of its metadata files (COMPONENT_METADATA) by MAVFTP and return the JSON object.
+        """Read a metadata file of the component (COMPONENT_METADATA) by MAVFTP and return its JSON object.
 
         Args:
-            kind: ``"general"`` lists the others: ``"parameter"``, ``"commands"``, ``"peripherals"``, ``"events"``,
+            kind: ``"general"`` lists the other files: ``"parameter"``, ``"commands"``, ``"peripherals"``, ``"events"``,
                 ``"actuators"``. PX4 has general, parameter, events and actuators.
             timeout: seconds to wait for the address of the file.
 
@@ -186,7 +186,7 @@ class Component(ReadOnly):
         raise NotSupported(f"component {self.component_id} has no {kind} metadata")
 
     async def fetch(self, uri: str, *, idle_timeout_s: float = 10.0) -> bytes:
-        """Return the content of a file by the address that a component has reported, at most 16 MB.
+        """Return the content of a file, at most 16 MB, by an address that a component has reported.
 
         Args:
             uri: ``mftp://path`` is on this component, ``mftp://[;comp=1]path`` on another component of the vehicle;
@@ -238,7 +238,7 @@ class Component(ReadOnly):
         Args:
             message_type: class of the message.
             params: param2 to param6, e.g. the number of a camera, stream or storage.
-            timeout: seconds to wait; it is requested up to three times.
+            timeout: seconds to wait; the message is requested up to three times.
             where: predicate to select one of several messages.
 
         Raises:
@@ -286,7 +286,7 @@ class Component(ReadOnly):
         return self._session.subscriber.subscribe(types, capacity, overflow, rate_hz)
 
     def message(self, message_type: type[MessageT], *, rate_hz: float | None = None) -> StateCell[MessageT]:
-        """Return a cell with its latest message of a type; as :meth:`aerokit.Vehicle.message`."""
+        """Return a cell with the component's latest message of a type; as :meth:`aerokit.Vehicle.message`."""
         return self._session.subscriber.cell(message_type, rate_hz)
 
     @contextmanager
@@ -300,17 +300,17 @@ class Component(ReadOnly):
 
     @cached_property
     def files(self) -> Files:
-        """Its files, by MAVFTP."""
+        """The component's files, by MAVFTP."""
         return self._make_files()
 
     @cached_property
     def parameters(self) -> Parameters:
-        """Its parameters (PARAM_VALUE)."""
+        """The component's parameters (PARAM_VALUE)."""
         return self._make_parameters()
 
     @cached_property
     def settings(self) -> Settings:
-        """Its settings (PARAM_EXT), which may be texts; for cameras explained by the camera definition file."""
+        """The component's settings (PARAM_EXT). A camera definition file explains those of a camera."""
         from aerokit.vehicle.components.settings import Settings
 
         async def information() -> m.CameraInformation:
@@ -323,7 +323,7 @@ METADATA_TYPES = {metadata_type.name.lower(): int(metadata_type) for metadata_ty
 
 
 async def _general_uri(component: Component, timeout: float) -> str:
-    """Address of the general metadata, from COMPONENT_METADATA, or COMPONENT_INFORMATION of older firmware."""
+    """Return the address of the general metadata, from COMPONENT_METADATA or the older COMPONENT_INFORMATION."""
     try:
         return (await component.request(m.ComponentMetadata, timeout=timeout)).uri
     except CommandRejected:

@@ -82,10 +82,10 @@ class ComponentSession:
         self._session.at_close(*functions)
 
     def describe_link(self) -> str:
-        heard_at = self.connection.last_heartbeat_at(self.system_id, self.component_id)
-        if heard_at == -math.inf:
+        received_at = self.connection.last_heartbeat_at(self.system_id, self.component_id)
+        if received_at == -math.inf:
             return f"no heartbeat of component {self.component_id} of system {self.system_id} was received"
-        age = self.connection.now() - heard_at
+        age = self.connection.now() - received_at
         signatures = self.connection.describe_signature_problems(self.system_id)
         prefix = f"{signatures}; " if signatures else ""
         return f"{prefix}last heartbeat of component {self.component_id} {age:.1f} s ago"

@@ -1,4 +1,4 @@
-"""``component.settings``: with names, options and rules from a camera definition file.
+"""``component.settings``: settings of a component, explained by a camera definition file.
 
 https://mavlink.io/en/services/parameter_ext.html, https://mavlink.io/en/services/camera_def.html
 """
@@ -45,7 +45,7 @@ class Settings:
 
     A camera definition file explains the settings: :meth:`fetch_definition` reads it from the camera, :meth:`load`
     from a local file. From then on you can use the names of options, and values that are out of range or excluded by
-    other settings are refused before anything is sent. Without it, values are sent unchanged.
+    other settings are refused before anything is sent. Without a definition, values are sent unchanged.
 
     All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
     total; then OperationTimeout), if they send anything. You can cancel any call.
@@ -173,7 +173,8 @@ class Settings:
         """Return all settings by name, in the component's order; immediately if they were downloaded before.
 
         Raises:
-            ParameterTimeout: the list is incomplete, or the component has none; ``table`` has what has arrived.
+            ParameterTimeout: the list is incomplete, or the component has none; ``table`` has the settings that
+                arrived.
         """
         transfers = self._transfers
         with transfers.limit(timeout):
@@ -199,7 +200,7 @@ class Settings:
         return (await self.read(name, idle_timeout_s=idle_timeout_s, timeout=timeout)).value
 
     async def read(self, name: str, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None) -> Setting:
-        """Request one setting from the component; ``table[name]`` has the local copy.
+        """Request one setting from the component, bypassing the local copy in ``table``.
 
         Raises:
             InvalidArgument: the name is empty, or longer than 16 characters.
@@ -257,7 +258,7 @@ class Settings:
         if own.name not in self._known and not own.write_only:
             to_read.append(own.name)
         answers = await self._read(to_read, idle_timeout_s) if to_read else {}
-        self._missing |= {name: None for name, each in answers.items() if isinstance(each, ParameterRejected)}
+        self._missing |= {name: None for name, answer in answers.items() if isinstance(answer, ParameterRejected)}
         if own.name in answers:
             _found(answers[own.name])
         wanted = definition.checked(own.name, value, self._values())
@@ -303,7 +304,7 @@ class Settings:
                 self._known.pop(name, None)
 
     def _values(self) -> dict[str, SettingValue]:
-        return {name: each.value for name, each in self._known.items()}
+        return {name: setting.value for name, setting in self._known.items()}
 
     def _must_be_read(self, setting: SettingDefinition) -> bool:
         is_known = setting.name in self._known or setting.name in self._missing or self._is_complete

@@ -1,4 +1,4 @@
-"""``FileChannel`` and ``LogChannel``: operations with one vehicle by MAVFTP and LOG_*, one at a time, always ended."""
+"""``FileChannel`` and ``LogChannel``: operations with one vehicle by MAVFTP and LOG_*, one at a time."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ class FileChannel:
         raise AssertionError("a loop that returns or raises")
 
     async def _open(self, opcode: MavFtpOpcode, path: str, idle_timeout_s: float) -> RemoteFile:
-        """Open a file. If another session is in the way, wait once for the vehicle to time it out."""
+        """Open a file. If another session blocks it, wait once until the vehicle has timed that session out."""
         may_wait, may_be_ours = True, True
         while True:
             request = self._request(opcode, path, self.client.next_session(), idle_timeout_s)
@@ -198,7 +198,7 @@ class FileChannel:
             self.transfers.background.start(lambda: closing.confirm(self.transfers), "aerokit close file")
 
     async def _finish_closing(self, session: int, idle_timeout_s: float) -> None:
-        """Wait until a session is closed that :meth:`_close_soon` has started to close."""
+        """Wait for the confirmation of a session that :meth:`_close_soon` is closing."""
         closing = self._closing[session]
         await closing.ended.wait()
         if not closing.request.is_answered:

@@ -97,8 +97,8 @@ class Files:
     ) -> None:
         """Copy a file to this computer. It is written to ``<to>.part`` and renamed when it is complete.
 
-        With ``resume``, the ``<to>.part`` of an interrupted download is kept if the vehicle's file is not shorter,
-        and the result is verified by CRC-32 if the vehicle can compute it; if it differs, the whole file is read
+        With ``resume``, the download continues the ``<to>.part`` of an interrupted one, unless the vehicle's file is
+        shorter. The result is verified by CRC-32 if the vehicle can compute it; if it differs, the whole file is read
         again. Files whose names begin with ``@`` are always read completely.
 
         Raises:

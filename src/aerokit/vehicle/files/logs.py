@@ -85,9 +85,9 @@ class Logs:
     All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
     total; None for no limit). You can cancel any call; the vehicle then stops sending.
 
-    ArduPilot answers the LOG_* messages only while disarmed, and ends its current log when one is read by them; by
-    MAVFTP its logs can also be read in flight. A log that is still being written is read up to its current end; if that
-    exceeds the size in its entry, logger "aerokit" reports it (INFO).
+    ArduPilot answers LOG_* messages only while disarmed, and reading a log by them ends its current log. By MAVFTP,
+    logs can also be read in flight. A log that is still being written is read up to its current end. If that exceeds
+    the size in the entry, logger "aerokit" reports it (INFO).
     """
 
     def __init__(self, transfers: Transfers, files: Files) -> None:
@@ -211,7 +211,7 @@ class Logs:
     async def _locate(
         self, log: LogEntry | int, method: LogMethod, idle_timeout_s: float, timeout: float | None
     ) -> tuple[str | None, LogEntry]:
-        """Return the path for MAVFTP (None: use LOG_*), and the entry, which LOG_* needs to be current."""
+        """Return the path for MAVFTP (None: use LOG_*) and the entry. LOG_* requires an entry that is up to date."""
         prefers_messages = method == "log" or (method == "auto" and self._transfers.autopilot.prefers_log_messages)
         if isinstance(log, LogEntry) and not prefers_messages:
             path = await self._path(log, idle_timeout_s)
@@ -240,7 +240,7 @@ class Logs:
     async def _entry(
         self, log: LogEntry | int, idle_timeout_s: float, timeout: float | None, *, may_be_silent: bool
     ) -> LogEntry:
-        """Return the current entry. Asked for an id that does not exist, ArduPilot lists nonexistent logs endlessly."""
+        """Return the current entry. If asked for an unknown id, ArduPilot lists nonexistent logs without end."""
         log_id, only = (log, None) if isinstance(log, int) else (log.id, log.id)
         async with self._channel.operation(f"log {log_id}", timeout):
             entries = await self._entries(idle_timeout_s, only, MAX_UNANSWERED_REQUESTS if may_be_silent else None)
@@ -320,8 +320,8 @@ async def log_path(
     """Return the path of a log for MAVFTP; None if the file cannot be identified.
 
     ArduPilot's log 1 is the lowest of its numbered files such as ``00000001.BIN``. PX4 writes a list of paths to a file
-    when its logs are requested, in the order of the ids. The size must match the entry; it may be larger for a log that
-    is, or (``has_grown``) may have been, still growing.
+    when its logs are requested, in the order of the ids. The size must match the entry, except for a log that is still
+    growing, or was growing at the time of the entry (``has_grown``).
     """
     for directory in directories:
         try:

@@ -131,7 +131,7 @@ class ReleaseCommand:
             detach()
 
 
-# Time for the manager to report by itself that we are in control; then it is asked, within the second time in all.
+# Seconds in which the manager may confirm our control unrequested, and seconds in all, after a request as well.
 STATUS_TIMEOUT_S, CONFIRM_TIMEOUT_S = 0.5, 3.0
 
 STATUS_HZ = 1.0
@@ -143,9 +143,9 @@ class GimbalControl:
 
     Entering takes control from any other station and returns when the manager confirms it. Leaving releases it, without
     waiting if the block exits by an error or cancellation. When another station takes control, aerokit publishes
-    ``GimbalControlLost``; orders to the gimbal, including running ones, raise :class:`GimbalTaken`, and so does leaving
-    the block unless your program has seen the loss. Control is not released then. Another station that uses your own
-    system and component id cannot be detected.
+    ``GimbalControlLost``, and orders to the gimbal, including running ones, raise :class:`GimbalTaken`. Leaving the
+    block then raises it too, unless your program has already seen the loss, and releases nothing. Another station that
+    uses your own system and component id cannot be detected.
 
     Entering raises:
         NotSupported: the vehicle has no gimbal manager, or its manager has no secondary control.

@@ -64,28 +64,28 @@ class GimbalInformation(Snapshot):
     uid: int = 0
 
     def can(self, capability: int) -> bool:
-        """Return True if it has this capability, a member of ``enums.GimbalManagerCapFlags``."""
+        """Return True if the gimbal has this capability, a member of ``enums.GimbalManagerCapFlags``."""
         return bool(self.capabilities & capability)
 
     @property
     def can_retract(self) -> bool:
-        """True if it has a retracted position."""
+        """True if the gimbal has a retracted position."""
         return self.can(Can.HAS_RETRACT)
 
     @property
     def has_neutral(self) -> bool:
-        """True if it has a neutral position."""
+        """True if the gimbal has a neutral position."""
         return self.can(Can.HAS_NEUTRAL)
 
     @property
     def axes(self) -> tuple[str, ...]:
-        """The axes it rotates about, of ``"roll"``, ``"pitch"``, ``"yaw"``."""
+        """The axes about which the gimbal rotates, of ``"roll"``, ``"pitch"``, ``"yaw"``."""
         bits = (("roll", Can.HAS_ROLL_AXIS), ("pitch", Can.HAS_PITCH_AXIS), ("yaw", Can.HAS_YAW_AXIS))
         return tuple(name for name, bit in bits if self.can(bit))
 
     @property
     def can_point_at_location(self) -> bool:
-        """True if its manager can point it at a global position."""
+        """True if the manager can point the gimbal at a global position."""
         return self.can(Can.CAN_POINT_LOCATION_GLOBAL)
 
 
@@ -126,7 +126,7 @@ def _version(number: int) -> str:
 # Gimbals without their own component id are numbered from 1 to this.
 MAX_GIMBAL_NUMBER = 6
 
-# A status older by less than this arrived out of order; by more, the manager has rebooted.
+# A status that is older by less than this arrived out of order; an older one means that the manager has rebooted.
 REORDER_WINDOW_MS = 5_000
 
 ATTITUDE_MESSAGES = "GIMBAL_DEVICE_ATTITUDE_STATUS or MOUNT_ORIENTATION"
@@ -216,7 +216,7 @@ class GimbalDevice:
 
     @property
     def is_in_use(self) -> bool:
-        """True while this program controls it or waits for an order to it."""
+        """True while this program controls the gimbal or waits for an order to it."""
         return bool(self.control_blocks or self.pending_orders)
 
     @contextmanager
@@ -254,7 +254,7 @@ class GimbalDevice:
             self._manager_rank = max(self._manager_rank, rank)
         elif self.manager_id is None or rank > self._manager_rank or is_gone:
             self.manager_id, self._manager_rank = component_id, rank
-            self._status_ms = 0  # The clock of the new manager is another one.
+            self._status_ms = 0  # The new manager has another clock.
 
     def reset(self) -> None:
         self.reboots += 1

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 MAX_GIMBALS = 32
 GIMBAL_COMPONENT_IDS = frozenset((154, *range(171, 176)))
 UNKNOWN_ATTITUDE = GimbalAttitude(None, None, None, None)
-# A component that was silent for longer, while the autopilot was not, is gone.
+# A component is gone after this many seconds of silence during which the autopilot was not silent.
 MAX_SILENCE_S = 10.0
 # Precedence of managers. A device that manages itself ranks as RANK_INFORMATION, whatever it sends.
 RANK_STATUS, RANK_INFORMATION, RANK_AUTOPILOT = 1, 2, 3
@@ -166,7 +166,7 @@ class GimbalRegistry:
     def _managed_device(
         self, message: GimbalManagerStatus | GimbalManagerInformation, device_id: int
     ) -> GimbalDevice | None:
-        """Subject of a manager message; None unless the sender is the manager that counts."""
+        """Return the gimbal that a manager message is about; None unless the sender is the selected manager."""
         frame = message.received_frame
         if frame is None:
             return None

@@ -79,14 +79,14 @@ class RoiMixin(GimbalMixin):
     async def look_at(
         self, target: Position, *, wait: bool = True, tolerance_deg: float = 5.0, timeout: float = 15.0
     ) -> None:
-        """Keep it pointed at a position; returns when it points there.
+        """Keep the gimbal pointed at a position; returns when it points there.
 
-        Sends MAV_CMD_DO_SET_ROI_LOCATION. Without an altitude, it is taken to be at the vehicle's own. A copter whose
+        Sends MAV_CMD_DO_SET_ROI_LOCATION. A target without an altitude is at the vehicle's own altitude. A copter whose
         gimbal does not pan turns its nose.
 
         Args:
             target: the position.
-            wait: False: return when it was accepted.
+            wait: False: return when the manager has accepted the order.
             tolerance_deg: accepted deviation in each axis, above 0 to 45.
             timeout: seconds to wait.
 
@@ -122,13 +122,13 @@ class RoiMixin(GimbalMixin):
     async def look_at_system(
         self, system_id: int, *, wait: bool = True, tolerance_deg: float = 5.0, timeout: float = 15.0
     ) -> None:
-        """Keep it pointed at another vehicle (MAV_CMD_DO_SET_ROI_SYSID); returns when it points there.
+        """Keep the gimbal pointed at another vehicle (MAV_CMD_DO_SET_ROI_SYSID); returns when it points there.
 
         The gimbal's manager and this connection both need the position of the other vehicle (GLOBAL_POSITION_INT).
 
         Args:
             system_id: its MAVLink system id, 1 to 255.
-            wait: False: return when it was accepted.
+            wait: False: return when the manager has accepted the order.
             tolerance_deg: accepted deviation in each axis, above 0 to 45.
             timeout: seconds to wait.
 
@@ -184,15 +184,16 @@ INFORMATION_TIMEOUT_S = 2.0
 class Gimbal(ReadOnly, PointingMixin, RoiMixin):
     """One gimbal, by the gimbal protocol v2 (https://mavlink.io/en/services/gimbal_v2.html), or an older mount.
 
-    ``vehicle.gimbal`` is the first one, ``vehicle.gimbals`` has all. An order returns when the gimbal reports that it
-    points there, and ends when another one is given. The gimbal keeps the direction while the vehicle moves. If the
+    ``vehicle.gimbal`` is the first one, ``vehicle.gimbals`` has all. An order returns when the gimbal reports the
+    ordered direction, and ends when another order is given. The gimbal keeps the direction while the vehicle moves. If
+    the
     manager requires control, an order outside a block of :meth:`control` claims it until :meth:`release`.
     """
 
     async def information(self) -> GimbalInformation:
         """Request capabilities, limits and identity (GIMBAL_MANAGER_INFORMATION, GIMBAL_DEVICE_INFORMATION).
 
-        Afterwards, angles beyond its limits are refused before anything is sent.
+        Afterwards, angles beyond the gimbal's limits are refused before anything is sent.
 
         Raises:
             CommandRejected: there is no gimbal manager, or it does not support the messages.
@@ -246,7 +247,7 @@ class Gimbal(ReadOnly, PointingMixin, RoiMixin):
         valid_for_s: float = 1.0,
         max_lag_s: float = 0.5,
     ) -> GimbalRates:
-        """Turn it at rates for the duration of an ``async with`` block that feeds them; see :class:`GimbalRates`.
+        """Turn the gimbal at rates during an ``async with`` block that feeds them; see :class:`GimbalRates`.
 
         Args:
             pitch_deg_s: the first rate in degrees per second, −720 to 720; positive is up.

@@ -266,7 +266,7 @@ class GimbalOrders:
             await self.send(order, CONFIGURE, *params)
 
     def raise_if_taken(self) -> None:
-        """Raise GimbalTaken if an open control block has lost control and no other one has it."""
+        """Raise GimbalTaken if an open control block has lost control, and no other block has it."""
         blocks = self.device.control_blocks.values()
         if not any(block.is_held for block in blocks):
             for block in blocks:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.gimbal.device import GimbalDevice
     from aerokit.vehicle.gimbal.orders import GimbalOrders
 
-# A gimbal that turns by less than this in this time stands still; attitudes arrive about five times a second.
+# A gimbal that turns by less than this angle in this time stands still; attitudes arrive about five times a second.
 STILL_S, STILL_DEG = 0.4, 0.5
 
 # Pitch, roll, yaw from north, yaw from the nose; None: any.
@@ -34,7 +34,7 @@ Angles = tuple[float | None, float | None, float | None, float | None]
 
 
 class AngleTarget:
-    """Angles to reach within a tolerance; ``wanted`` returns them on each call, None while they are unknown."""
+    """Angles to reach within a tolerance. ``wanted`` returns the angles at each call, None while they are unknown."""
 
     def __init__(self, wanted: Callable[[], Angles | None], tolerance_deg: float, unknown: str = "") -> None:
         self._wanted, self._tolerance_deg, self._unknown = wanted, tolerance_deg, unknown
@@ -162,7 +162,7 @@ MIN_BEARING_DISTANCE_M = 1.0
 
 
 def ordered_angles(pitch: float, yaw: float, roll: float | None, *, from_nose: bool) -> Angles:
-    """Angles of an order; straight down or up, any yaw is right."""
+    """Return the angles of an order; None for the yaw when pointing straight down or up, where any yaw is right."""
     is_upright = abs(pitch) > MAX_PITCH_FOR_YAW_DEG
     turned = None if is_upright else yaw
     return (pitch, roll, None if from_nose else turned, turned if from_nose else None)
@@ -211,15 +211,15 @@ class PointingMixin(GimbalMixin):
         tolerance_deg: float = 3.0,
         timeout: float = 10.0,
     ) -> None:
-        """Point it at angles; returns when it reports that it points there.
+        """Point the gimbal at angles; returns when it reports these angles.
 
         Args:
             pitch_deg: from the horizon, −360 to 360: 0 is level, −90 straight down.
             yaw_deg: −360 to 360, clockwise from north (``frame="earth"``) or from the nose (``"vehicle"``).
             roll_deg: from the horizon, −360 to 360. Other values than 0 need the mount command, which turns the camera
                 with the vehicle: a yaw from north is right only at the time of the order.
-            frame: reference of the yaw, which it keeps afterwards.
-            wait: False: return when it was accepted.
+            frame: reference of the yaw, which the gimbal keeps afterwards.
+            wait: False: return when the manager has accepted the order.
             tolerance_deg: accepted deviation in each axis, above 0 to 45.
             timeout: seconds to wait.
 
@@ -262,10 +262,10 @@ class PointingMixin(GimbalMixin):
             await wait_until_there(orders, order, what, target, since=since, timeout=timeout)
 
     async def neutral(self, *, wait: bool = True, timeout: float = 10.0) -> None:
-        """Turn it to its neutral position, usually level and straight ahead; returns when it rests there.
+        """Turn the gimbal to its neutral position, usually level and straight ahead; returns when it rests there.
 
         Args:
-            wait: False: return when it was accepted.
+            wait: False: return when the manager has accepted the order.
             timeout: seconds to wait.
 
         Raises:
@@ -279,10 +279,10 @@ class PointingMixin(GimbalMixin):
         await self._rest("neutral", NEUTRAL, MavMountMode.NEUTRAL, wait=wait, timeout=timeout)
 
     async def retract(self, *, wait: bool = True, timeout: float = 10.0) -> None:
-        """Retract it; returns when it rests there.
+        """Retract the gimbal; returns when it rests there.
 
         Args:
-            wait: False: return when it was accepted.
+            wait: False: return when the manager has accepted the order.
             timeout: seconds to wait.
 
         Raises:
@@ -299,7 +299,7 @@ class PointingMixin(GimbalMixin):
         await self._rest("retract", RETRACT, MavMountMode.RETRACT, wait=wait, timeout=timeout)
 
     async def release(self) -> None:
-        """Return it to the pilot's sticks, and release control that was claimed outside of a control block.
+        """Return the gimbal to the pilot's sticks, and release control that was claimed outside of a control block.
 
         Raises:
             CommandRejected: the vehicle refused.

@@ -209,7 +209,7 @@ class MissionTracker:
         self._on_state(reported.state)
 
     def _detect_repeat(self, before: int | None, current: int | None) -> None:
-        # The vehicle approaches an item again that it has reached before. PX4 may report an item as reached before it
+        # The vehicle approaches an item that it has reached before. PX4 may report an item as reached before it
         # becomes the current one.
         if current is not None and current == self.reached:
             is_long_ago = self._session.connection.now() - self._reached_at > REPEAT_AFTER_S

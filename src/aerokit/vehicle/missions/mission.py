@@ -34,17 +34,17 @@ LANDING_COMMANDS = (MavCmd.NAV_RETURN_TO_LAUNCH, MavCmd.NAV_LAND, MavCmd.NAV_VTO
 # MISSION_CURRENT is sent at 1 Hz or faster, and may be lost.
 END_GRACE_S = 2.0
 
-# A return may end at a rally point, whose position is unknown here: it is taken as finished after this time.
+# A return may end at a rally point, whose position is unknown here, so it counts as finished after this time.
 RETURN_TIMEOUT_S = 300.0
 
 
 class MissionEndDetector:
     """Detects the end of a mission.
 
-    A mission ends when the vehicle reports that it is complete, or has landed and disarmed at its last item. If it
-    ends with a landing, or with a return that ends in one, it must be on the ground: PX4 reports completion when the
-    return starts, which it flies in another mode. A return without a landing ends at home. Vehicles that do not report
-    a mission state must have reached the last item.
+    A mission ends when the vehicle reports that it is complete, or has landed and disarmed at its last item. A mission
+    that ends with a landing, or with a return that ends in one, has ended only once the vehicle is on the ground: PX4
+    reports completion when the return starts, and flies it in another mode. A return without a landing ends at home.
+    Vehicles that do not report a mission state must have reached the last item.
     """
 
     def __init__(
@@ -139,8 +139,8 @@ class MissionEndDetector:
 class MissionControl(VehiclePlan["Mission"]):
     """The mission of a vehicle: ``await vehicle.mission.upload(mission)``, ``start()``, ``wait_finished()``.
 
-    Item numbers count from 0, and home is not an item, for all autopilots. Starting, pausing and resuming are
-    orders like taking off: the newest one wins.
+    Item numbers count from 0, and home is not an item, for all autopilots. Starting, pausing and resuming are orders:
+    each supersedes earlier orders to move, and ends with a later one.
     """
 
     def __init__(self, context: PlanContext) -> None:
@@ -193,7 +193,7 @@ class MissionControl(VehiclePlan["Mission"]):
         The vehicle must be armed: **it takes off** if the mission begins with a take-off. A copter on the ground needs
         a take-off item first. If you cancel the call, aerokit orders the vehicle to hold.
 
-        Sends MISSION_START to ArduPilot, which then takes off from the ground, and changes the mode of others.
+        Sends MISSION_START to ArduPilot, which then takes off from the ground. Other autopilots get a mode change.
 
         Raises:
             InvalidArgument: there is no such item. Nothing was sent.
@@ -223,7 +223,7 @@ class MissionControl(VehiclePlan["Mission"]):
     async def pause(self) -> None:
         """Hold and remember the current item; returns when HEARTBEAT reports the hold mode.
 
-        Raises OperationRejected if it is not flying its mission, else as :meth:`Vehicle.hold`.
+        Raises OperationRejected if the vehicle is not flying its mission, else as :meth:`Vehicle.hold`.
         """
         vehicle_context, session = self._vehicle_context, self._session
         mode = vehicle_context.sender.mode_for("mission.pause", "hold")
@@ -255,7 +255,7 @@ class MissionControl(VehiclePlan["Mission"]):
         self._is_paused = False
 
     async def wait_finished(self, *, timeout: float | None = None, max_silence_s: float | None = MAX_SILENCE_S) -> None:
-        """Wait until the mission has been flown to its end; for one that ends with landing, until it has landed.
+        """Wait until the mission has been flown to its end; if it ends with a landing, until the vehicle has landed.
 
         A :meth:`pause` by another task does not end the wait. Cancelling this call does not stop the vehicle.
 
@@ -264,8 +264,8 @@ class MissionControl(VehiclePlan["Mission"]):
             max_silence_s: fail after this many seconds without a heartbeat; None for no limit.
 
         Raises:
-            OperationRejected: it no longer flies the mission: a pilot, a failsafe or another order changed the mode, or
-                it disarmed on the way. ``reasons`` has what the vehicle reported.
+            OperationRejected: the vehicle no longer flies the mission: a pilot, a failsafe or another order changed the
+                mode, or it disarmed on the way. ``reasons`` has what the vehicle reported.
             OperationTimeout: not finished in time.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
         """

@@ -64,14 +64,14 @@ class VehiclePlan(ReadOnly, Generic[PlanT]):
             on_progress: called with the progress in items, or in bytes of a file.
 
         See https://mavlink.io/en/services/mission.html. PX4 keeps the old items until it has all of the new ones.
-        ArduPilot overwrites missions and rally points one by one (a fence at the end), After a failure it may hold
-        old and new items; the error then says so. ("holds" is also a flight mode.)
+        ArduPilot overwrites missions and rally points item by item, and a fence at the end. After a failure it may have
+        both old and new items; the error then states that.
 
         Raises:
             InvalidArgument: the plan is invalid, or has a position that is too far away. Nothing was sent.
             MissionRejected: the vehicle refused; see ``item``, ``result`` and ``reasons``.
-            MissionTimeout: it stopped answering; ``missing`` are the items it did not confirm.
-            VerificationFailed: it confirmed, but holds something else.
+            MissionTimeout: it stopped answering; ``missing`` has the items that it did not confirm.
+            VerificationFailed: it confirmed the plan, but has other items.
             NotSupported: ``"ftp"`` was requested, but it has none.
             FileError, FileTimeout: the same for a file, with ``"ftp"``.
             OperationTimeout: not done within ``timeout``.
@@ -114,7 +114,7 @@ class VehiclePlan(ReadOnly, Generic[PlanT]):
             InvalidArgument: an argument is invalid. Nothing was sent.
             MissionRejected: the vehicle refused.
             MissionTimeout: it stopped answering.
-            VerificationFailed: it confirmed, but still holds items.
+            VerificationFailed: it confirmed, but still has items.
             OperationTimeout: not done within ``timeout``.
         """
         async with self._transfer(idle_timeout_s, timeout, None) as transfer:
@@ -152,7 +152,7 @@ class FenceControl(VehiclePlan["Fence"]):
     """The fence of a vehicle: ``await vehicle.fence.upload(Fence(polygons=[...]))``.
 
     For ArduPilot, uploading does not enable the fence: use :meth:`enable`, or the parameter FENCE_ENABLE. PX4 always
-    obeys its fence; GF_ACTION defines its reaction.
+    enforces its fence; GF_ACTION defines its reaction.
     """
 
     async def enable(self, on: bool = True) -> None:

@@ -51,7 +51,7 @@ class PlanChannel:
         self._context = context
         self._options: dict[str, Any] = {"idle_timeout_s": idle_timeout_s, "on_progress": on_progress}
         self._path = PACKED_PATHS[mission_type]
-        # True if the vehicle may hold some of our items.
+        # True if the vehicle may have some of our items.
         self._has_changed = False
         # True if positions are sent as 32-bit floats, because the vehicle does not support MISSION_ITEM_INT.
         self.is_single_precision: bool = False
@@ -179,10 +179,10 @@ class PlanChannel:
         if is_silent and exchange.was_sent_completely:
             return "; all items were sent, but whether the vehicle accepted them is unknown: call download()"
         if is_overwritten and self._has_changed:
-            return "; the vehicle now holds some new and some old items: upload again, or clear"
+            return "; the vehicle now has some new and some old items: upload again, or clear"
         if is_overwritten and is_silent:
             return "; if the vehicle received the request, it has cut its plan to the new number of items"
-        return "; the vehicle still holds its previous items"
+        return "; the vehicle still has its previous items"
 
 
 PLAN_NAMES = ("mission", "fence", "rally points")
@@ -296,7 +296,7 @@ class PlanTransfer(Generic[PlanT]):
             if end.is_confirmed:
                 raise
             raise MissionRejected(
-                f"{self._name}: the vehicle refused at about item {end.item}, and now holds something else",
+                f"{self._name}: the vehicle refused at about item {end.item}, and now has other items",
                 result=MavMissionResult.ERROR,
                 item=end.item,
                 reasons=error.differences,
@@ -355,7 +355,7 @@ class PlanTransfer(Generic[PlanT]):
         return True
 
     def _changes(self, items: Sequence[MissionItem]) -> list[int] | None:
-        """Numbers of the items that differ from the known plan; None if that has another number of items."""
+        """Return the numbers of the items that differ from the known plan; None if its number of items differs."""
         held = self._cache.items
         if held is None or len(held) != len(items):
             return None
@@ -395,7 +395,7 @@ class PlanTransfer(Generic[PlanT]):
 
     def _raise_mismatch(self, differences: tuple[str, ...]) -> None:
         self._cache.forget(self._context.now())
-        message = f"{self._name}: the vehicle confirmed the plan, but holds something else"
+        message = f"{self._name}: the vehicle confirmed the plan, but has other items"
         raise VerificationFailed(message, differences=differences)
 
     @property

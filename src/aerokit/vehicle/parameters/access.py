@@ -33,7 +33,7 @@ UploadMethod = Literal["auto", "ftp", "set"]
 CacheChoice = bool | str | os.PathLike[str]
 """False: no cache; True: the user's cache directory; or the path of another directory."""
 
-# MAVFTP is taken as unsupported after this long, or this many attempts, without an answer, even if it is advertised.
+# MAVFTP counts as unsupported after this time, or this many attempts, without an answer, even if it is advertised.
 FTP_PROBE_TIMEOUT_S, FTP_PROBE_ATTEMPTS = 2.0, 3
 ANSWER_DELAY_S = 0.1
 # SET_MESSAGE_INTERVAL: the default rate of the autopilot.
@@ -123,7 +123,7 @@ class ParameterAccess:
 
     @contextmanager
     def _ftp_probe(self) -> Iterator[None]:
-        """Raise FileTimeout early if MAVFTP is not answered at all: some relays drop it, and there is another way."""
+        """Raise FileTimeout early if MAVFTP is not answered: some relays drop it, and the list needs no MAVFTP."""
         connection, round_trip = self._transfers.connection, self._transfers.round_trip
         timeout_s = max(FTP_PROBE_TIMEOUT_S, FTP_PROBE_ATTEMPTS * round_trip.timeout_s())
         answers: list[object] = []

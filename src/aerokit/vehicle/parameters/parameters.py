@@ -89,8 +89,9 @@ class Parameters(ReadOnly):
     def load_metadata(self, path: str | os.PathLike[str]) -> Metadata:
         """Read ArduPilot's ``apm.pdef.xml`` or ``apm.pdef.json``, or PX4's ``parameters.xml`` or ``parameters.json``.
 
-        Metadata is advice: a write outside the documented range is done, and its result has a ``note``; only values
-        that the type cannot represent are refused. It also lists changes that need a reboot. PX4's has the defaults.
+        Metadata does not restrict writes: a value outside the documented range is set, and its result has a ``note``.
+            Only values that the type cannot represent are refused. Metadata also identifies changes that need a reboot.
+            PX4's has the defaults.
 
         Raises:
             FileFormatError: the file is damaged, or of another kind.
@@ -116,9 +117,9 @@ class Parameters(ReadOnly):
             method: ``"ftp"`` reads one small file with the defaults (``@PARAM/param.pck``), ``"list"`` requests one
                 message for each parameter; ``"auto"`` uses the file if there is one.
             refresh: download again, even if the parameters are known or cached.
-            cache: keep the list on disk, and use it while the vehicle's parameter hash is unchanged: the second
-                connect takes one request. True means the user's cache directory, or pass one. Only PX4 has a hash; it
-                does not cover parameters that PX4 changes by itself, so they may be outdated. Off by default.
+            cache: keep the list on disk, and use it while the vehicle's parameter hash is unchanged: the second connect
+                takes one request. True means the user's cache directory; or pass a path. Only PX4 has a hash; it does
+                not cover parameters that PX4 changes by itself, so they may be outdated. Off by default.
             idle_timeout_s: fail after this many seconds without progress.
             timeout: seconds in total.
             on_progress: called with the number of parameters, or bytes of the file, so far and in total.
@@ -135,17 +136,17 @@ class Parameters(ReadOnly):
     async def get(
         self, name: str, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None
     ) -> int | float:
-        """Request one value; for arguments and errors see :meth:`read`."""
+        """Request one value from the vehicle; for arguments and errors see :meth:`read`."""
         return (await self.read(name, idle_timeout_s=idle_timeout_s, timeout=timeout)).value
 
     async def read(
         self, name: str, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None
     ) -> Parameter:
-        """Request one parameter from the vehicle; ``table[name]`` has the local copy.
+        """Request one parameter from the vehicle, bypassing the local copy in ``table``.
 
         Raises:
             InvalidArgument: the name is empty, or longer than 16 characters.
-            ParameterRejected: the vehicle has no such parameter: it answers so, or answers others but not this one.
+            ParameterRejected: the vehicle reports that it has no such parameter, or answers only requests for others.
             ParameterTimeout: there was no answer.
         """
         with self._transfers.limit(timeout):
@@ -164,7 +165,7 @@ class Parameters(ReadOnly):
 
         Returns:
             For each name the parameter, or the error that :meth:`get` would have raised. Its ``code`` is None if the
-            vehicle did not deny the parameter, but answered others and not this one.
+                vehicle did not report an error, but answered only requests for others.
 
         Raises:
             InvalidArgument: a name is empty, or longer than 16 characters. Nothing was sent.
@@ -196,7 +197,7 @@ class Parameters(ReadOnly):
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> dict[str, ParameterWrite]:
-        """Set several parameters concurrently; return one result each: check its ``error``.
+        """Set several parameters concurrently; return a result for each of them: check its ``error``.
 
         Parameters that appear only when another one is set (ArduPilot's ``…_ENABLE``) are set after it.
 

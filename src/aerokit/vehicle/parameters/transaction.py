@@ -81,7 +81,7 @@ class _Block:
                 self._registry.add(name, self)
 
     def _release_own(self) -> list[Parameter]:
-        """Return the parameters this block must restore; those of overlapping blocks are passed to the next block."""
+        """Return the parameters that this block must restore. An overlapping block restores those that it shares."""
         own = []
         for name, before in self._before.items():
             later = self._registry.remove(name, self)

@@ -29,7 +29,7 @@ ParameterFailure = ParameterRejected | ParameterTimeout
 
 
 class ResolvedParameter(Snapshot):
-    """A parameter of the vehicle, under the name ``asked`` of the program; ``is_fresh``: it was just read."""
+    """A parameter of the vehicle, under the name ``requested`` by the program; ``is_fresh``: it was just read."""
 
     requested: str
     parameter: Parameter
@@ -107,7 +107,7 @@ class NameResolver:
         return name.upper() if self._access.has_upper_case_names else name
 
     def _unknown_names(self, names: Iterable[str]) -> dict[str, None]:
-        """All names of the parameters that are unknown under each of their names."""
+        """Return all possible names of those parameters that are not known under any of them."""
         from aerokit.parameters.renames import other_names, resolve_rename
 
         store = self._access.store
@@ -161,9 +161,9 @@ class ParameterWrite(Snapshot):
     """Result of writing one parameter, in the name and unit that the program used.
 
     ``outcome`` is ``"set"``: the vehicle confirmed the value and its type; ``"unchanged"``: it had this value before;
-    ``"rounded"`` or ``"clamped"``: it set another value, near to the ``requested`` one or not; ``"failed"``: see
-    ``error``, ``value`` is the last known one, or NaN. ``note`` has further information: another name on this vehicle,
-    a documented range that the value is outside of, a reboot that it needs.
+    ``"rounded"``: it set a value near the ``requested`` one; ``"clamped"``: it set another value; ``"failed"``: see
+    ``error``, and ``value`` is the last known one, or NaN. ``note`` has further information: another name on this
+    vehicle, a documented range that the value is outside of, a reboot that is needed.
     """
 
     name: str

@@ -221,7 +221,7 @@ class CommandSender:
                 self._expect_answers(key, exchange.pending_answers, earlier[exchange.answers :])
 
     def _make_way(self, key: _Key) -> None:
-        """Abort a running command whose order has ended, so that the newer one need not wait."""
+        """Abort a running command whose order has ended, so that the newer command need not wait."""
         order_status = self._standings.get(key)
         if order_status is not None and order_status.end:
             text = f"no COMMAND_ACK for {command_name(key[1])} yet; not sent again: {order_status.end}"

@@ -60,7 +60,7 @@ def check_rate(message_type: type[Message], hz: float) -> None:
 
 
 class _Stream:
-    """State of one message type: the requested rates, the rate asked of the vehicle, and the count received."""
+    """State of one message type: the rates that are needed, the rate last requested, and the count received."""
 
     def __init__(self, message_type: type[Message], component_id: int) -> None:
         self.message_type, self._component_id = message_type, component_id
@@ -79,7 +79,7 @@ class _Stream:
 
     @property
     def needed_hz(self) -> float:
-        """The highest requested rate; 0, the autopilot's own rate, without requests."""
+        """The highest rate needed; 0 (the autopilot's own rate) if no rate is needed."""
         return max(self.requests.values(), default=AUTOPILOT_DEFAULT)
 
     @property
@@ -184,7 +184,7 @@ class MessageRates:
         return stream
 
     async def _request_all_due(self) -> None:
-        """Send one request after another, the most urgent first: a new one does not wait for unanswered ones."""
+        """Request the due streams one at a time, the most urgent first; an unanswered stream is tried again last."""
         while not self._legacy and (stream := self._most_urgent()) is not None:
             await self._request_by_command(stream)
         if self._legacy:
@@ -192,8 +192,8 @@ class MessageRates:
 
     def _most_urgent(self) -> _Stream | None:
         now = self._connection.now()
-        due = (each for each in self._streams.values() if each.is_due and now >= each.not_before)
-        return min(due, key=lambda each: (each.failures, each.is_optional), default=None)
+        due = (stream for stream in self._streams.values() if stream.is_due and now >= stream.not_before)
+        return min(due, key=lambda stream: (stream.failures, stream.is_optional), default=None)
 
     async def _request_by_command(self, stream: _Stream) -> None:
         hz = stream.needed_hz
@@ -213,7 +213,7 @@ class MessageRates:
                 return
             self._was_refused(stream, error)
         except CommandTimeout:
-            # Otherwise a reboot has reset all streams meanwhile.
+            # A reboot in the meantime has made all streams due again, so the failure does not count.
             if reset_count == self._reset_count:
                 stream.failures += 1
                 stream.not_before = self._connection.now() + min(2.0**stream.failures, MAX_RETRY_INTERVAL_S)
@@ -255,8 +255,8 @@ class MessageRates:
     def _publish_unavailable(self, stream: _Stream, reason: str) -> None:
         if stream.is_optional:
             return
-        told = (self._connection.now(), self._system_id, stream.message_type.NAME, reason, self._component_id)
-        self._connection.bus.publish(StreamUnavailable(*told))
+        fields = (self._connection.now(), self._system_id, stream.message_type.NAME, reason, self._component_id)
+        self._connection.bus.publish(StreamUnavailable(*fields))
 
     # ------------------------------------------------------------------------------ watching
 
@@ -340,7 +340,7 @@ class ComponentSubscriber:
         rates.
         """
         self._connection.check_types(types)
-        messages: list[type[Message]] = [each for each in types if issubclass(each, Message)]
+        messages: list[type[Message]] = [type_ for type_ in types if issubclass(type_, Message)]
         if rate_hz is not None:
             for message in messages:
                 check_rate(message, rate_hz)
@@ -349,10 +349,10 @@ class ComponentSubscriber:
             wanted = sink if entire_system else self._only(sink)
             detach = self._connection.attach(types, wanted, system_id=self._system_id)
             detach.append(self._connection.on_end(subscription.close))
-            for each in messages:
-                hz = subscription_rate_hz(each) if rate_hz is None else rate_hz
+            for message_type in messages:
+                hz = subscription_rate_hz(message_type) if rate_hz is None else rate_hz
                 if hz is not None:
-                    detach.append(self._rates.request(each, hz))
+                    detach.append(self._rates.request(message_type, hz))
             return detach
 
         subscription: Subscription[ItemT] = Subscription(attach, capacity=capacity, overflow=overflow)

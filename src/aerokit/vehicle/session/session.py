@@ -56,9 +56,7 @@ EAGER_REQUESTS, EAGER_S = 4, 0.3
 
 
 async def learn_constants(connection: Connection, commands: CommandSender, telemetry: Telemetry) -> None:
-    """Request version, home, origin and modes until they are known, while the connection is open, also after a
-    reboot.
-    """
+    """Request version, home, origin and modes until they are known, again after a reboot, until the link closes."""
     has_requested_modes = False
     await _learn_version(commands, telemetry)
     while connection.is_open:
@@ -108,7 +106,7 @@ RESULTS_OF_REFUSAL = (MavResult.TEMPORARILY_REJECTED, MavResult.DENIED, MavResul
 class VehicleSession:
     """The autopilot of one remote system: its address, state, commands, message rates, transfers and silence.
 
-    ``on_reboot`` has the callbacks for a reboot of the vehicle.
+    ``on_reboot`` holds callbacks that are called when the vehicle reboots.
     """
 
     def __init__(self, connection: Connection, system_id: int, component_id: int, heartbeat: Heartbeat) -> None:
@@ -184,7 +182,7 @@ class VehicleSession:
         self.rates.close()
 
     def at_close(self, *functions: Detach) -> None:
-        """Register callbacks for when the vehicle's block is left; called at once if it was."""
+        """Register callbacks for the end of the vehicle's block. They are called at once if it has ended already."""
         self._detach += functions
         if self.is_closed:
             for function in functions:
@@ -213,9 +211,7 @@ class VehicleSession:
 
     @contextmanager
     def streaming(self, *names: str) -> Iterator[None]:
-        """Request the messages of these states for the duration of the block, even if the program disabled default
-        rates.
-        """
+        """Request the messages of these states during the block, even if the program disabled the default rates."""
         releases = [
             self.rates.request(message_type, ACTION_HZ, is_optional=True)
             for name in names
@@ -232,7 +228,7 @@ class VehicleSession:
         """Collect acks that refuse a command after an earlier ack accepted it (PX4 acks some commands twice)."""
         refusals: list[CommandAck] = []
 
-        def note(ack: CommandAck) -> None:
+        def collect(ack: CommandAck) -> None:
             frame = ack.received_frame
             is_its = frame is not None and frame.component_id == self.component_id
             if ack.command != command or not is_its or not self.commands.is_for_us(ack):
@@ -242,7 +238,7 @@ class VehicleSession:
             elif ack.result in RESULTS_OF_REFUSAL:
                 refusals.append(ack)
 
-        detach = self.connection.bus.attach(CommandAck, note, system_id=self.system_id)
+        detach = self.connection.bus.attach(CommandAck, collect, system_id=self.system_id)
         try:
             yield refusals
         finally:
@@ -258,9 +254,9 @@ class VehicleSession:
         Informational texts ("ArduPilot Ready") are left out.
         """
         texts = [
-            each.text
-            for each in self.telemetry.texts_since(since)
-            if each.severity <= MavSeverity.WARNING or self.autopilot.is_refusal(each.text)
+            text.text
+            for text in self.telemetry.texts_since(since)
+            if text.severity <= MavSeverity.WARNING or self.autopilot.is_refusal(text.text)
         ]
         return CommandRejected(
             str(error).partition("\n")[0],
@@ -278,7 +274,7 @@ class VehicleSession:
 
     def texts_since(self, at: float) -> tuple[str, ...]:
         """Return the status texts (STATUSTEXT) received since this time of the loop's clock, oldest first."""
-        return tuple(each.text for each in self.telemetry.texts_since(at))
+        return tuple(text.text for text in self.telemetry.texts_since(at))
 
     @property
     def heartbeat_age(self) -> float:
@@ -290,10 +286,10 @@ class VehicleSession:
         received, lost = self.connection.counts(self.system_id)
         loss = f"{100 * lost / (received + lost):.0f} % of its frames lost" if received + lost else "nothing received"
         signatures = self._describe_signatures()
-        why = f"{signatures}; " if signatures else ""
+        signature_problems = f"{signatures}; " if signatures else ""
         texts = self.texts_since(self.connection.now() - 10.0)
-        said = f", status texts: {'; '.join(texts[-3:])}" if texts else ""
-        return f"{why}last heartbeat {self.heartbeat_age:.1f} s ago, {loss}{said}"
+        recent_texts = f", status texts: {'; '.join(texts[-3:])}" if texts else ""
+        return f"{signature_problems}last heartbeat {self.heartbeat_age:.1f} s ago, {loss}{recent_texts}"
 
     def _describe_signatures(self) -> str:
         return self.connection.describe_signature_problems(self.system_id)
@@ -355,8 +351,8 @@ class VehicleSession:
 
     def _on_reboot(self) -> None:
         self.telemetry.forget()
-        for each in self.on_reboot:
-            each()
+        for callback in self.on_reboot:
+            callback()
 
     def _on_end(self, error: Exception) -> None:
         self.background.cancel()

@@ -55,8 +55,8 @@ async def set_up_signing(session: VehicleSession, signing: Signing | None, timeo
 
 
 def _check_vehicle(session: VehicleSession) -> None:
-    heard = session.connection.heartbeats.get((session.system_id, session.component_id))
-    frame = None if heard is None else heard.received_frame
+    heartbeat = session.connection.heartbeats.get((session.system_id, session.component_id))
+    frame = None if heartbeat is None else heartbeat.received_frame
     if session.connection.mavlink_version == 1 or (frame is not None and frame.version == 1):
         whose = "our" if session.connection.mavlink_version == 1 else "the vehicle's"
         raise NotSupported(f"setup_signing: {whose} frames are MAVLink 1, which has no signatures")

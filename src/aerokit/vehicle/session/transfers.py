@@ -60,7 +60,7 @@ class Transfers:
     ) -> None:
         self.connection = connection
         self.began_at: float = connection.now()
-        """Start of the session. Sequence numbers are derived from it, so that they differ from an earlier program's."""
+        """Start time of the session. Sequence numbers derive from it, to differ from those of an earlier program."""
         self.system_id: int = system_id
         self.component_id: int = component_id
         self.autopilot = autopilot
@@ -74,8 +74,8 @@ class Transfers:
     async def run(self, exchange: Exchange[ResultT], *, timeout: float | None = None) -> ResultT:
         """Run one exchange to its end and return its result.
 
-        A time-out of the exchange gets a description of the link; exceeding ``timeout`` seconds raises
-        :class:`OperationTimeout`. Cancellation ends it at once.
+        The text of a time-out includes a description of the link. :class:`OperationTimeout` is also raised after
+        ``timeout`` seconds. Cancellation ends the exchange at once.
         """
         if self.is_closed:
             raise ConnectionClosed("the block of this vehicle was left; nothing was sent")

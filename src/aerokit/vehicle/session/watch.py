@@ -31,13 +31,12 @@ if TYPE_CHECKING:
     from aerokit.events import LinkState
     from aerokit.mavlink.frame import Frame
 
-# Reordered messages decrease the time since boot by less than this, a reboot by more, unless it was very
-# recent.
+# A reboot decreases the time since boot by more than this, unless the boot before was very recent. Reordered messages
+# decrease it by less.
 REBOOT_STEP_MS = 3000
-# The decreased time must persist for this long, and in at least two messages; one delayed message is no
-# reboot.
+# The decreased time must persist for this long and in at least two messages, because one message may be late.
 REBOOT_CONFIRM_S = 0.2
-# After an accepted reboot command: booting takes longer than this, and no message is delayed by as much.
+# Limit after an accepted reboot command: booting takes longer than this, and no message is delayed by as much.
 MIN_REBOOT_STEP_MS = 2000
 CLOCK_SPAN_S = 5.0
 REPORT_PERIOD_S = 1.0
@@ -136,8 +135,8 @@ class VehicleWatch:
     def on_time_answer(self, requested_at: float, milliseconds: int) -> None:
         """Process the time since boot from an answer to our TIMESYNC request.
 
-        A request sent after the previous answer can only return an earlier time after a reboot, so no confirmation is
-        needed, however fast a simulation runs.
+        An answer to a request that was sent after the previous answer has an earlier time only after a reboot. No
+        confirmation is needed, however fast a simulation runs.
         """
         before_at, before = self._last_answer
         if requested_at <= before_at:
@@ -181,7 +180,7 @@ class VehicleWatch:
             self._note_time(frame, "time_boot_ms", int.from_bytes(frame.body[17:21], "little"))
 
     def _on_timesync(self, message: Timesync) -> None:
-        """Process answers to our requests, which also a vehicle without streams sends."""
+        """Process answers to our requests; a vehicle without streams sends them, too."""
         frame = message.received_frame
         if message.tc1 != 0 and frame is not None and frame.component_id == self._component_id:
             self._note_time(frame, "TIMESYNC", message.tc1 // 1_000_000)
@@ -281,7 +280,7 @@ class LinkWatch:
         if message.tc1 != 0 and message.ts1 in self._open_requests:
             self._open_requests.remove(message.ts1)
             now = self._connection.now()
-            if now - frame.received_at < CHECK_INTERVAL_S:  # Otherwise this program was late in reading it.
+            if now - frame.received_at < CHECK_INTERVAL_S:  # An older answer was delayed by this program itself.
                 self._round_trip_s = now - message.ts1 / 1e9
             self._on_answer(message.ts1 / 1e9, message.tc1 // 1_000_000)
 
@@ -303,5 +302,5 @@ class LinkWatch:
         self._connection.bus.publish(report)
 
     def _count(self) -> tuple[float, tuple[int, int], int]:
-        total = sum(each.bytes for each in self._connection.statistics())
+        total = sum(statistics.bytes for statistics in self._connection.statistics())
         return self._connection.now(), self._connection.counts(self._system_id), total

@@ -139,7 +139,7 @@ class StatusText(Snapshot):
     severity: int
     text: str
     at: float = 0.0
-    """Time at which it was complete, in seconds of the event loop's clock."""
+    """Time at which the text was complete, in seconds of the event loop's clock."""
 
     @property
     def is_error(self) -> bool:
@@ -187,8 +187,8 @@ def landed_state(message: messages.ExtendedSysState) -> int | None:
 
 def landed_state_of_heartbeat(message: messages.Heartbeat, context: Context) -> int | None:
     """Return the landed state that some autopilots encode in HEARTBEAT."""
-    told = context.autopilot.landed_state_of(message)
-    return None if told is None else MavLandedState(told)
+    state = context.autopilot.landed_state_of(message)
+    return None if state is None else MavLandedState(state)
 
 
 def version(message: messages.AutopilotVersion, context: Context) -> AutopilotVersion:

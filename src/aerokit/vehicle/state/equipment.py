@@ -53,7 +53,7 @@ LOOKING_DOWN = 25
 
 GPS_FIX_TYPE_3D = 3
 
-# Maximum value of a cell; a pack of more than 65.5 V occupies several "cells" with it.
+# Largest value of one cell. The voltage of a pack above 65.5 V is the sum of several "cells", all but the last at it.
 FULL_CELL = 0xFFFE
 
 INVALID_QUALITY = 1
@@ -130,7 +130,7 @@ class Power(Snapshot):
 
 
 class RcChannels(Snapshot):
-    """Pulse widths from the remote control in µs, None: channel unused; ``rssi`` 0 to 254, None: unknown."""
+    """Pulse widths of the remote control in µs (None: unused channel); ``rssi`` is 0 to 254 (None: unknown)."""
 
     channels_us: tuple[int | None, ...]
     rssi: int | None = None
@@ -152,7 +152,7 @@ class Vibration(Snapshot):
 
 
 def distance_sensors(message: messages.DistanceSensor, context: Context) -> tuple[RangeFinder, ...]:
-    """Return the known sensors, with this one replaced or added."""
+    """Return the known sensors with the sensor of this message replaced or added."""
     quality = message.signal_quality
     is_valid = quality != INVALID_QUALITY
     sensor = RangeFinder(
@@ -203,7 +203,7 @@ def _gps_receiver(message: messages.GpsRawInt | messages.Gps2Raw, index: int) ->
 
 
 def batteries(message: messages.BatteryStatus, context: Context) -> tuple[Battery, ...]:
-    """Return the known batteries, with this one replaced or added; cells 11 to 14 are 0 if absent."""
+    """Return the known batteries with the battery of this message replaced or added; cells 11 to 14 are 0 if absent."""
     cells = [mv for mv in message.voltages if mv != U16]
     cells += [mv for mv in message.voltages_ext if mv not in (0, U16)]
     is_pack = len(cells) == 1 or FULL_CELL in cells
@@ -233,7 +233,7 @@ def main_battery(message: messages.SysStatus, context: Context) -> tuple[Battery
 
 
 def current(centiampere: int, autopilot: Autopilot) -> float | None:
-    """Return amperes; None for the autopilot's value for unknown."""
+    """Return the current in amperes; None for the autopilot's value for unknown."""
     return None if centiampere in autopilot.unknown_currents_ca else centiampere / 100
 
 
@@ -250,7 +250,7 @@ def rc_channels(message: messages.RcChannels) -> RcChannels:
 
 
 def servo_outputs(message: messages.ServoOutputRaw, context: Context) -> ServoOutputs:
-    """Return the known outputs, with the sixteen of this port replaced (eight in MAVLink 1)."""
+    """Return the known outputs with the sixteen of this port replaced (eight in MAVLink 1)."""
     frame = message.received_frame
     outputs: tuple[int, ...] = _SERVOS(message)[: 8 if frame is not None and frame.version == 1 else 16]
     before: tuple[int, ...] = () if context.before is None else context.before.outputs_us
@@ -260,15 +260,15 @@ def servo_outputs(message: messages.ServoOutputRaw, context: Context) -> ServoOu
 
 
 def vibration(message: messages.Vibration) -> Vibration:
-    """Levels and clipping counters."""
+    """Return vibration levels and clipping counts."""
     clippings = (message.clipping_0, message.clipping_1, message.clipping_2)
     return Vibration(message.vibration_x, message.vibration_y, message.vibration_z, clippings)
 
 
 def _with(items: tuple[Any, ...] | None, item: Any, key: Callable[[Any], int]) -> tuple[Any, ...]:
-    """Return the items sorted by key, with this one replaced or added."""
+    """Return the items sorted by key, with this item replaced or added."""
     number = key(item)
-    return tuple(sorted((item, *(each for each in items or () if key(each) != number)), key=key))
+    return tuple(sorted((item, *(existing for existing in items or () if key(existing) != number)), key=key))
 
 
 def _id_of(item: Battery | RangeFinder) -> int:
@@ -292,10 +292,10 @@ STRAIGHT = 0.99999
 class GimbalAttitude(Snapshot):
     """Attitude of a gimbal in degrees, None if not reported.
 
-    ``pitch_deg`` (0 level, −90 straight down) and ``roll_deg`` are from the horizon, ``yaw_deg`` 0 to 360 clockwise
+    ``pitch_deg`` (0 level, −90 straight down) and ``roll_deg`` are from the horizon. ``yaw_deg`` is 0 to 360 clockwise
     from north, ``yaw_from_nose_deg`` −180 to 180 clockwise from the vehicle's nose. While the vehicle's heading is
-    unknown, the yaw of a gimbal that reports it relative to north is from the nose; for MOUNT_STATUS (ArduPilot
-    before 4.3) it is the raw number, whatever its reference.
+    unknown, ``yaw_deg`` may be relative to the nose. From MOUNT_STATUS (ArduPilot before 4.3) ``yaw_deg`` is the raw
+    number, which may have either reference.
     """
 
     pitch_deg: float | None
@@ -312,7 +312,7 @@ def from_status(message: MountStatus) -> GimbalAttitude:
 def from_orientation(message: MountOrientation, heading: float | None) -> GimbalAttitude:
     """Return the attitude of MOUNT_ORIENTATION, whose yaw from north may be missing.
 
-    ``heading``: the vehicle's heading in degrees; while unknown, yaw is from the nose.
+    ``heading`` is the vehicle's heading in degrees; while it is unknown, ``yaw_deg`` is relative to the nose.
     """
     if message.yaw_absolute and math.isfinite(message.yaw_absolute):
         yaw = _compass(message.yaw_absolute)
@@ -326,8 +326,8 @@ def from_orientation(message: MountOrientation, heading: float | None) -> Gimbal
 def from_device(message: GimbalDeviceAttitudeStatus, heading: float | None) -> GimbalAttitude:
     """Return the attitude of GIMBAL_DEVICE_ATTITUDE_STATUS.
 
-    ``heading``: the vehicle's heading in degrees, for a gimbal that reports yaw from the nose without the difference
-    to north; while neither is known, yaw is from the nose.
+    A yaw from the nose is converted to north by the difference in the message, or by the vehicle's ``heading`` in
+    degrees. While neither is known, ``yaw_deg`` stays relative to the nose.
     """
     pitch, roll, yaw = _euler(message.q)
     has_delta = message.flags & (YAW_IN_VEHICLE_FRAME | YAW_IN_EARTH_FRAME) and math.isfinite(message.delta_yaw)
@@ -350,10 +350,10 @@ def _is_from_nose(flags: int) -> bool:
 
 def _euler(q: tuple[float, ...]) -> tuple[float, float, float]:
     """Return pitch, roll, yaw in degrees; for a camera that points straight up or down all rotation is yaw."""
-    length = math.sqrt(sum(each * each for each in q))
+    length = math.sqrt(sum(component * component for component in q))
     if not length > 0:
         return math.nan, math.nan, math.nan
-    w, x, y, z = (each / length for each in q)
+    w, x, y, z = (component / length for component in q)
     sine = max(-1.0, min(1.0, 2 * (w * y - z * x)))
     if abs(sine) > STRAIGHT:
         return (

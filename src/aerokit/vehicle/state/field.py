@@ -38,12 +38,12 @@ class MessageSource(Generic[T]):
 
     Args:
         message: name of its class, so that not all messages are imported.
-        decode: returns the value, or None if the message does not have it; None: handled by the telemetry itself.
+        decode: returns the value, or None if the message has no value. None: the telemetry handles the message itself.
         needs_context: ``decode`` takes a :class:`Context` as well.
-        hz: the default rate to request.
-        fallback: used only while no better message has reported the state recently.
-        alternative: some autopilots send this message alternative of the first one.
-        instance_field: the field that distinguishes several instances, each of which counts.
+        hz: the default rate to request, in Hz.
+        fallback: the message is used only while no better message has reported the state recently.
+        alternative: some autopilots send this message instead of the first one.
+        instance_field: the field that distinguishes several instances, all of which are kept.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class MessageSource(Generic[T]):
         instance_field: str | None = None,
     ) -> None:
         if message not in MESSAGE_IDS:
-            raise ValueError(f"{message} is no message class")
+            raise ValueError(f"{message} is not a message class")
         self.message: str = message
         self.decode = decode
         self.needs_context: bool = needs_context
@@ -77,7 +77,7 @@ class StateField(Generic[T]):
 
     Args:
         sources: the messages that report it, the best first.
-        waits_for: shown in error texts while it is unknown; default: the requested messages.
+        waits_for: shown in error texts while the state is unknown; default: the requested messages.
         eager: decode when the message arrives, not on the first access.
     """
 
@@ -85,7 +85,7 @@ class StateField(Generic[T]):
 
     def __init__(self, *sources: MessageSource[T], waits_for: str = "", eager: bool = False) -> None:
         if not sources:
-            raise ValueError("a state needs a message that tells it")
+            raise ValueError("a state needs at least one message that reports it")
         self.sources = sources
         self.eager: bool = eager
         self._waits_for = waits_for
@@ -106,11 +106,13 @@ class StateField(Generic[T]):
 
     def requested_from(self, autopilot: Autopilot) -> list[type[Message]]:
         """Return the messages to request from this autopilot for this state."""
-        names = [each.message for each in self.sources[:1]] + [e.message for e in self.sources if e.alternative]
+        names = [source.message for source in self.sources[:1]] + [
+            source.message for source in self.sources if source.alternative
+        ]
         return [kind for kind in map(message_type, names) if autopilot.sends(kind)]
 
     def waits_for(self, autopilot: Autopilot) -> str:
-        """Return the messages that report it, for error texts."""
+        """Return the messages that report the state, for error texts."""
         return self._waits_for or " or ".join(kind.NAME for kind in self.requested_from(autopilot))
 
 
@@ -152,8 +154,8 @@ def scaled(value: int, unknown: int, divisor: int) -> float | None:
     return None if value == unknown else value / divisor
 
 
-# Maximum time in seconds until a frame is decoded even if the value is not read, because a later frame may
-# lack a value that this one has (a position without a fix).
+# Maximum delay in seconds of decoding a frame whose value is not read. A later frame may lack a value that this one
+# has, such as a position without a fix.
 MAX_DECODE_DELAY_S = 5.0
 
 _HEADER_LENGTH = 9

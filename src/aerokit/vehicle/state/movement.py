@@ -41,12 +41,12 @@ __all__ = [
 ]
 
 # Positions within 0.01 degrees of 0°N 0°E are treated as missing.
-NOWHERE = 100_000
+MIN_COORDINATE = 100_000
 SAME_ALTITUDE_MM = 100
 
 
 class Home(Snapshot):
-    """The home position (HOME_POSITION); ``north_m`` … are from the origin, None if not reported."""
+    """The home position (HOME_POSITION); ``north_m`` … are from the local origin, None if not reported."""
 
     latitude_deg: float
     longitude_deg: float
@@ -57,7 +57,7 @@ class Home(Snapshot):
 
     @property
     def position(self) -> Position:
-        """The place as a target without an altitude, so that going there keeps the present altitude."""
+        """Home as a target without an altitude: flying there keeps the present altitude."""
         return Position(self.latitude_deg, self.longitude_deg)
 
 
@@ -145,7 +145,7 @@ def place(latitude: int, longitude: int) -> tuple[float, float] | None:
 
     Without a fix, autopilots report 0, 0 or a place near it: ArduPlane was observed to dead-reckon from there.
     """
-    if abs(latitude) < NOWHERE and abs(longitude) < NOWHERE:
+    if abs(latitude) < MIN_COORDINATE and abs(longitude) < MIN_COORDINATE:
         return None
     if abs(latitude) > 900_000_000 or abs(longitude) > 1_800_000_000:
         return None
@@ -155,7 +155,7 @@ def place(latitude: int, longitude: int) -> tuple[float, float] | None:
 def position(message: messages.GlobalPositionInt, context: Context) -> Position | None:
     """Return the position, None before the first fix.
 
-    Until home is set, ``relative_alt`` equals the altitude above mean sea level.
+    Until home is set, ``relative_alt`` equals the altitude above mean sea level and is left out.
     """
     where = place(message.lat, message.lon)
     if where is None:

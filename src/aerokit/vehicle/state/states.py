@@ -39,8 +39,9 @@ if TYPE_CHECKING:
 
 
 class States:
-    """State cells: each has ``.value`` (ValueUnknownError before the first), ``.latest`` (None before), ``.age`` in
-    seconds, ``.source``, ``.fresh(within=s)``, ``await .wait_until(predicate, held_for=s)`` and ``.changes()``.
+    """State cells: each has ``.value`` (raises ValueUnknownError before the first value), ``.latest`` (None before it),
+    ``.age`` in seconds, ``.source``, ``.fresh(within=s)``, ``await .wait_until(predicate, held_for=s)`` and
+    ``.changes()``.
     """
 
     mode: StateField[Mode] = StateField(
@@ -98,7 +99,7 @@ class States:
     local_position: StateField[LocalPosition] = StateField(
         MessageSource("LocalPositionNed", movement.local_position, hz=10.0)
     )
-    """Metres and m/s north, east, down of the estimator's origin (LOCAL_POSITION_NED)."""
+    """Position in metres and velocity in m/s, north, east, down from the local origin (LOCAL_POSITION_NED)."""
 
     ground_speed_m_s: StateField[float] = StateField(MessageSource("VfrHud", movement.ground_speed_m_s, hz=5.0))
     """Ground speed in m/s (VFR_HUD)."""
@@ -112,7 +113,7 @@ class States:
     """Climb rate in m/s, up is positive (VFR_HUD)."""
 
     throttle_percent: StateField[float] = StateField(MessageSource("VfrHud", movement.throttle_percent, hz=5.0))
-    """Throttle, 0 to 100 (VFR_HUD)."""
+    """Throttle in percent (VFR_HUD)."""
 
     gps: StateField[tuple[GpsReceiver, ...]] = StateField(
         MessageSource("GpsRawInt", equipment.first_gps, needs_context=True, hz=2.0),
@@ -206,16 +207,16 @@ STATES: Mapping[str, StateField[Any]] = {
 
 def _by_message() -> dict[str, list[tuple[StateField[Any], MessageSource[Any]]]]:
     found: dict[str, list[tuple[StateField[Any], MessageSource[Any]]]] = {}
-    for told in STATES.values():
-        for source in told.sources:
-            found.setdefault(source.message, []).append((told, source))
+    for field in STATES.values():
+        for source in field.sources:
+            found.setdefault(source.message, []).append((field, source))
     return found
 
 
 SOURCES: Mapping[str, list[tuple[StateField[Any], MessageSource[Any]]]] = _by_message()
 """Name of a message class → the states that it reports, and how."""
 
-LAZY = tuple(name for name, rows in SOURCES.items() if not any(told.eager for told, _ in rows))
+LAZY = tuple(name for name, rows in SOURCES.items() if not any(field.eager for field, _ in rows))
 """Messages that are decoded on access to one of their states."""
 
 DEFAULT_RATES_HZ: Mapping[str, float] = {

@@ -16,7 +16,7 @@ __all__ = ["StatusTextAssembler"]
 
 CHUNK_LENGTH = 50
 CHUNK_TIMEOUT_S = 2.0
-REMEMBERED = 64
+MAX_RECENT_TEXTS = 64
 # Maximum chunks of one text; a longer text is invalid and passed on in parts.
 MAX_CHUNKS = 20
 # Maximum number of incomplete texts of all components.
@@ -35,7 +35,7 @@ class StatusTextAssembler:
 
     def __init__(self) -> None:
         self._open: dict[tuple[_Sender, int], _OpenText] = {}
-        self._recent: deque[StatusText] = deque(maxlen=REMEMBERED)
+        self._recent: deque[StatusText] = deque(maxlen=MAX_RECENT_TEXTS)
 
     def receive(self, message: Statustext, now: float) -> list[StatusText]:
         """Process one message and return the texts that are complete now."""

@@ -14,12 +14,12 @@ from aerokit.vehicle.state.field import message_type
 if TYPE_CHECKING:
     from aerokit.vehicle.state.field import StateField
 
-HEAD = """# What a vehicle tells
+HEAD = """# Vehicle state
 
-Each is a cell of the vehicle: `vehicle.position.value`, `.latest`, `.age`, `.source`, `.fresh(within=1)`,
+Every state is a cell of the vehicle: `vehicle.position.value`, `.latest`, `.age`, `.source`, `.fresh(within=1)`,
 `await vehicle.position.wait_until(…)`, `async for … in vehicle.position.changes()`. Values are in SI units and
-degrees; their classes are in [vehicle/state](../src/aerokit/vehicle/state). The messages are named with the best
-source first, and with the rate at which the vehicle is asked for them unless `connect(rates=…)` says otherwise.
+degrees; their classes are in [vehicle/state](../src/aerokit/vehicle/state). The last column lists the messages that
+report the state, the best source first, with the rates that aerokit requests unless you pass `connect(rates=…)`.
 
 | State | Type | What it is | Messages |
 |---|---|---|---|
@@ -46,12 +46,12 @@ def documentation() -> dict[str, tuple[str, str]]:
 def rendered() -> str:
     """Return the whole page."""
     texts = documentation()
-    return HEAD + "".join(_row(name, *texts[name], told) for name, told in states.STATES.items())
+    return HEAD + "".join(_row(name, *texts[name], field) for name, field in states.STATES.items())
 
 
-def _row(name: str, kind: str, text: str, told: StateField[Any]) -> str:
+def _row(name: str, kind: str, text: str, field: StateField[Any]) -> str:
     sources = ", ".join(
-        f"{message_type(each.message).NAME}{f' at {each.hz:g} Hz' if each.hz else ''}" for each in told.sources
+        f"{message_type(source.message).NAME}{f' at {source.hz:g} Hz' if source.hz else ''}" for source in field.sources
     )
     return f"| `{name}` | `{kind}` | {text.partition(' (')[0].rstrip('.')} | {sources} |\n"
 

@@ -59,14 +59,14 @@ class Telemetry(States):
         self._mode_names: dict[int, str] = {}
         self._context = Context(self.autopilot, self._mode_names, lambda: self.home.is_known)
         self._cells: dict[str, StateCell[Any]] = {
-            name: StateCell(name, clock, told.waits_for(self.autopilot), stamp=self._time_of_arrival)
-            for name, told in STATES.items()
+            name: StateCell(name, clock, field.waits_for(self.autopilot), stamp=self._time_of_arrival)
+            for name, field in STATES.items()
         }
         handlers = {name: self._handler(name) for name in (*SOURCES, "AvailableModes")}
-        self._handlers = {MESSAGE_IDS[name]: self._entry(name, each) for name, each in handlers.items()}
+        self._handlers = {MESSAGE_IDS[name]: self._entry(name, handler) for name, handler in handlers.items()}
         self._streams = {MESSAGE_IDS[name]: self._streamed(name, handlers[name]) for name in LAZY}
         for cell_name, cell in self._cells.items():
-            feeding = (each.message for each in STATES[cell_name].sources if each.message in LAZY)
+            feeding = (source.message for source in STATES[cell_name].sources if source.message in LAZY)
             cell._feed_from(*(self._streams[MESSAGE_IDS[name]] for name in feeding))
 
     # ------------------------------------------------------------------------------- feeding
@@ -185,7 +185,7 @@ class Telemetry(States):
         return take
 
     def _handle(self, handler: Handler, message: Message, source: Source, frame: Frame | None) -> None:
-        """Process a message: a value is as old as the frame that it was received in, whenever it is decoded."""
+        """Process a message. Its values are as old as the frame that contained it, regardless of when it is decoded."""
         before, self._arrived_at = self._arrived_at, None if frame is None else frame.received_at
         try:
             handler(message, source)
@@ -200,7 +200,7 @@ class Telemetry(States):
         }
         if class_name in by_itself:
             return by_itself[class_name]
-        handlers = [self._handler_for(self._cells[told.name], each) for told, each in SOURCES[class_name]]
+        handlers = [self._handler_for(self._cells[field.name], source) for field, source in SOURCES[class_name]]
 
         def handler(message: Any, source: Source) -> None:
             for handler in handlers:
@@ -217,7 +217,7 @@ class Telemetry(States):
         decode, context = by.decode, self._context
         assert decode is not None
 
-        def tell(message: Any, source: Source) -> None:
+        def update(message: Any, source: Source) -> None:
             value = decode(message)
             if value is not None:
                 cell.set(value, source)
@@ -228,7 +228,7 @@ class Telemetry(States):
             if value is not None:
                 cell.set(value, source)
 
-        handler = update_with_context if by.needs_context else tell
+        handler = update_with_context if by.needs_context else update
 
         def update_unless_better(message: Any, source: Source) -> None:
             if not self._has_better(cell, source):
@@ -245,8 +245,8 @@ class Telemetry(States):
             self._handle(handler, decoded, source, frame)
 
         rows = SOURCES[class_name]
-        cells = [self._cells[told.name] for told, _ in rows]
-        instance_field = next((each.instance_field for _, each in rows if each.instance_field is not None), None)
+        cells = [self._cells[field.name] for field, _ in rows]
+        instance_field = next((source.instance_field for _, source in rows if source.instance_field is not None), None)
         instance_at = None if instance_field is None else offset_of(kind, instance_field)
         return StreamedMessage(self.component_id, cells, instance_at, apply, self._lock)
 
@@ -258,7 +258,7 @@ class Telemetry(States):
             and self._time_of_arrival() - cell.updated_at < FALLBACK_DELAY_S
         )
 
-    # ------------------------------------------------------------------- what is not one value
+    # ------------------------------------------------------------- messages of more than a value
 
     def _is_of_autopilot(self, heartbeat: messages.Heartbeat) -> bool:
         """Return False for the heartbeat of a ground station or companion that uses the autopilot's ids."""

@@ -10,7 +10,7 @@ from order_flights import Flown
 
 from aerokit.hub.message_rules import ORDER_MAX_AGE_S, MessageKind, kind_of
 from aerokit.hub.switch import MAX_POLL_INTERVAL_S
-from aerokit.vehicle.commanding.order import QUESTIONS
+from aerokit.vehicle.commanding.order import REQUEST_COMMANDS
 
 ARM_WATCH_S = ORDER_MAX_AGE_S + MAX_POLL_INTERVAL_S + 0.001
 ROUNDING_S = 1e-6
@@ -29,7 +29,7 @@ def orders_in(crossings: list[TrafficEntry]) -> list[TrafficEntry]:
         crossing
         for crossing in crossings
         if kind_of(crossing.message.NAME, is_for_one=True) is MessageKind.ORDER
-        and getattr(crossing.message, "command", None) not in QUESTIONS
+        and getattr(crossing.message, "command", None) not in REQUEST_COMMANDS
     ]
 
 

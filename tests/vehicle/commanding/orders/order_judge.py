@@ -22,7 +22,7 @@ from aerokit.mavlink.messages import (
     SetPositionTargetLocalNed,
 )
 from aerokit.vehicle.commanding.arbiter import ARM_HEARTBEAT_DELAY_S
-from aerokit.vehicle.commanding.order import CHANGED_BY_COMMAND, FAILSAFE_STATES, QUESTIONS
+from aerokit.vehicle.commanding.order import CHANGED_BY_COMMAND, FAILSAFE_STATES, REQUEST_COMMANDS
 
 ENDS_FLIGHT = ("disarm", "land", "return_to_launch")
 MODE_MAX_AGE_S = 2.6
@@ -57,7 +57,7 @@ def orders_in(traffic: RecordedTraffic) -> Iterator[TrafficEntry]:
     """Return the sent messages that change something."""
     for message in traffic.sent:
         command = getattr(message.message, "command", None)
-        is_command = isinstance(message.message, (CommandLong, CommandInt)) and command not in QUESTIONS
+        is_command = isinstance(message.message, (CommandLong, CommandInt)) and command not in REQUEST_COMMANDS
         if is_command or isinstance(message.message, SetMode):
             yield message
 
