@@ -11,7 +11,8 @@ import pytest
 
 import aerokit
 from aerokit.apps.cli import main
-from aerokit.logs.flights import evidence_in_texts, falls
+from aerokit.logs.flights.failsafes import evidence_in_texts
+from aerokit.logs.flights.falls import falls
 from aerokit.logs.flights.flight import FlightLog, LoggedText
 from aerokit.testing import open_flight, run_virtual
 

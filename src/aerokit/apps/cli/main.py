@@ -166,10 +166,10 @@ class Parser(argparse.ArgumentParser):
     ) -> tuple[Any, list[str]]:
         """Report unrecognized arguments in the subparser, which has the right usage message."""
         if args is not None and not isinstance(self, _TopParser):
-            if problem := misplaced_address(self, args):
-                self.error(problem)
             if self._subparsers is None:
                 self._check_option_names(args)
+            if problem := misplaced_address(self, args):
+                self.error(problem)
         namespace, unknown = super().parse_known_args(args, namespace)
         if unknown:
             self._fail_unrecognized(unknown)
@@ -180,7 +180,7 @@ class Parser(argparse.ArgumentParser):
         options = list(args[: args.index("--")] if "--" in args else args)
         names = [option.partition("=")[0] for option in options if option.startswith("--")]
         for name in names:
-            if not any(known.startswith(name) for known in self._option_string_actions):
+            if name != "--connect" and not any(known.startswith(name) for known in self._option_string_actions):
                 self._fail_unrecognized([name])
 
     def _fail_unrecognized(self, unknown: Sequence[str]) -> NoReturn:

@@ -7,8 +7,8 @@ from bisect import bisect_left
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
-from aerokit.logs.flights.failsafes import failsafes
-from aerokit.logs.flights.falls import falls
+from aerokit.logs.flights.failsafes import Failsafe, failsafes
+from aerokit.logs.flights.falls import Fall, falls
 from aerokit.logs.flights.flight import ModeChange, TangentPlane
 from aerokit.logs.report.page import Chart, Paragraphs
 from aerokit.logs.report.simplification import MAX_COORDINATE, simplify
@@ -334,7 +334,8 @@ def _fence(flight: FlightLog) -> list[dict[str, Any]]:
 
 def _failsafe_markers(flight: FlightLog, places: Sequence[tuple[float, float]]) -> list[dict[str, Any]]:
     found, names = [], []
-    for event in (*failsafes(flight), *falls(flight)):
+    events: list[Failsafe | Fall] = [*failsafes(flight), *falls(flight)]
+    for event in events:
         row = flight.track.index_at(event.time_s)
         if row >= 0 and places[row][0] == places[row][0]:
             found.append(places[row])
