@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
 _MAX_START_DISTANCE_M = 1000.0
 _SIM_BOOT_TIME_S = 2.0
+_NOTHING_SENT = "nothing was sent"
 
 
 class PlanFlight(SupervisedFlight):
@@ -48,15 +49,16 @@ class PlanFlight(SupervisedFlight):
     ) -> None:
         super().__init__(vehicle, report, interrupts, options.on_interrupt)
         self._plan, self._options, self._report = plan, options, report
-        self.has_sent: bool = False
-        """True once the upload has begun."""
+        self.sent: str = _NOTHING_SENT
+        """What the vehicle received before it was armed, for the message after Ctrl-C."""
 
     async def _fly(self) -> int:
         vehicle = self._vehicle
         self._print(f"found {vehicle.autopilot.firmware}, system {vehicle.system_id}")
         self._check_vehicle()
-        self.has_sent = True
+        self.sent = "the upload was not completed, nothing was armed"
         await upload_parts(vehicle, self._plan, self._options)
+        self.sent = "the plan is on the vehicle, nothing was armed"
         confirmed_mission = await self._download_mission() if self._needs_confirmation else ()
         self._print("waiting until it is ready")
         await vehicle.wait_ready(timeout=self._options.ready)
@@ -201,8 +203,7 @@ async def run_fly(options: argparse.Namespace) -> int:
     if code is None:
         code = INTERRUPTED
     if code == INTERRUPTED and not any(flight.armed_by_us for flight in flights):
-        has_sent = any(flight.has_sent for flight in flights)
-        sent = "the plan may be on the vehicle, nothing was armed" if has_sent else "nothing was sent"
+        sent = flights[-1].sent if flights else _NOTHING_SENT
         emit(options, "interrupted", {}, f"interrupted; {sent}")
     return code
 

@@ -177,6 +177,7 @@ class Parser(argparse.ArgumentParser):
 
     def _check_option_names(self, args: Sequence[str]) -> None:
         # Checked first: otherwise argparse takes the value after an unknown option for a positional argument.
+        # misplaced_address() reports --connect, with the right command line.
         options = list(args[: args.index("--")] if "--" in args else args)
         names = [option.partition("=")[0] for option in options if option.startswith("--")]
         for name in names:

@@ -174,14 +174,15 @@ class _Bar(tqdm):  # type: ignore[misc]  # tqdm has no annotations
 
 
 @contextmanager
-def progress_bar(what: str, unit: str) -> Iterator[OnProgress]:
-    """Show a progress bar; yields the ``on_progress`` callback. ``unit`` is ``"B"`` for bytes, else the noun for
-    one item.
+def progress_bar(what: str, unit: str | None) -> Iterator[OnProgress]:
+    """Show a progress bar; yields the ``on_progress`` callback. ``unit`` is ``"B"`` for bytes, the noun for one
+    item, or None for a percentage only.
     """
     is_bytes = unit == "B"
     with _Bar(
         desc=what,
         unit=unit if is_bytes else f" {unit}",
+        bar_format=None if unit else "{desc}: {percentage:3.0f} %|{bar}| {elapsed}",
         unit_scale=is_bytes,
         unit_divisor=1024 if is_bytes else 1000,
         file=sys.stderr,
