@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import time
+import warnings
 from collections import Counter
 from pathlib import Path
 
@@ -17,8 +18,9 @@ from cli_harness import HOME, MISSION, run_on, run_with
 from aerokit import messages as m
 from aerokit.apps.cli import main
 from aerokit.apps.cli.main import COMMANDS, GROUPS, RUN
-from aerokit.apps.cli.output import near_names, suggestion
+from aerokit.apps.cli.output import near_names, plain_warnings, suggestion
 from aerokit.mavlink.tlog import read_tlog
+from aerokit.parameters.renames import ParameterRenamedWarning
 from aerokit.sim import SimulatedCamera, SimulatedCopter, SimulatedGimbal
 from aerokit.testing import run_virtual
 
@@ -254,3 +256,17 @@ def test_completion_in_zsh_completes_line(shell_environment: dict[str, str], tmp
         process.wait()
         os.close(ours)
         os.close(theirs)
+
+
+# ------------------------------------------------------------------------------------------- warnings
+
+
+def test_library_warning_is_printed_as_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    shown: list[object] = []
+    with warnings.catch_warnings():
+        warnings.showwarning = lambda message, *_: shown.append(message)
+        with plain_warnings():
+            warnings.showwarning("RTL_ALT_M is still called RTL_ALT", ParameterRenamedWarning, "params.py", 1)
+            warnings.showwarning("another library's", UserWarning, "other.py", 1)
+    assert capsys.readouterr().err == "aerokit: RTL_ALT_M is still called RTL_ALT\n"
+    assert shown == ["another library's"]
