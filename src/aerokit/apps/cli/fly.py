@@ -50,7 +50,7 @@ class PlanFlight(SupervisedFlight):
         super().__init__(vehicle, report, interrupts, options.on_interrupt)
         self._plan, self._options, self._report = plan, options, report
         self.sent: str = _NOTHING_SENT
-        """What the vehicle received before it was armed, for the message after Ctrl-C."""
+        """Description of what was sent before arming, for the message after Ctrl-C."""
 
     async def _fly(self) -> int:
         vehicle = self._vehicle
