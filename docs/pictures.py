@@ -55,7 +55,7 @@ def main(names: list[str]) -> None:
     makers |= {name: partial(fly_on_virtual_time, name) for name in ON_VIRTUAL_TIME}
     makers |= {name: partial(fly_on_a_socket, name) for name in ON_A_SOCKET}
     screens = IMAGES / "screens"
-    makers["monitor"] = partial(take_monitor, IMAGES / "monitor.svg")
+    makers["monitor"] = partial(take_monitor, IMAGES / "monitor.svg", screens / "monitor-wide.svg")
     makers["report"] = partial(take_report, IMAGES / "report.png", screens / "report.png", screens / "report-phone.png")
     makers["serve"] = partial(
         take_page, IMAGES / "serve.png", screens / "serve-flying.png", screens / "serve-phone.png"

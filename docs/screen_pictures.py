@@ -40,17 +40,16 @@ from aerokit.sim import HOME, SimulatedCopter, simulated_link
 from aerokit.testing import open_flight, run_virtual
 from aerokit.vehicle.connect import vehicles_on
 
-MONITOR_SIZE = 100, 28
-"""Columns and rows."""
 ADDRESS = "127.0.0.1:14588"
 
 
-def take_monitor(target: Path) -> None:
-    """Save the monitor with three copters, two of them in the air."""
-    target.write_text(run_virtual(_fly_and_draw_monitor()), encoding="utf-8")
+def take_monitor(target: Path, wide: Path) -> None:
+    """Save the monitor with three copters, two of them in the air, in a small and in a wide terminal."""
+    for path, columns, rows in ((target, 100, 28), (wide, 200, 50)):
+        path.write_text(run_virtual(_fly_and_draw_monitor(columns, rows)), encoding="utf-8")
 
 
-async def _fly_and_draw_monitor() -> str:
+async def _fly_and_draw_monitor(columns: int, rows: int) -> str:
     latitude_deg, longitude_deg, altitude_m = HOME
     copters = [
         SimulatedCopter(
@@ -65,7 +64,7 @@ async def _fly_and_draw_monitor() -> str:
     ):
         model, commands = MonitorModel(connection, vehicles), BackgroundTasks(connection.fail)
         app = Monitor(model, commands, "udpin:0.0.0.0:14550")
-        async with app.run_test(size=MONITOR_SIZE) as pilot:
+        async with app.run_test(size=(columns, rows)) as pilot:
             await anyio.sleep(2)
             flying = [vehicle for vehicle in model.vehicles.values() if vehicle.system_id < 3]
             async with anyio.create_task_group() as group:
