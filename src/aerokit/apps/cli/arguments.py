@@ -164,8 +164,10 @@ def number(low: float, high: float) -> Callable[[str], float]:
 def assignment(text: str) -> tuple[str, int | float]:
     """Parse ``NAME=VALUE`` for a parameter; whole numbers may be hexadecimal (0x1F)."""
     name, mark, value = text.partition("=")
+    if not mark:
+        raise ArgumentTypeError(f"{text!r} has no value: write NAME=VALUE without spaces")
     try:
-        number = parse_number(value if mark else "")
+        number = parse_number(value)
     except ValueError:
         raise ArgumentTypeError(f"{text!r} is not NAME=VALUE with a finite number") from None
     try:

@@ -24,6 +24,7 @@ from aerokit.errors import (
 )
 
 if TYPE_CHECKING:
+    import logging
     from collections.abc import Iterable, Iterator, Mapping
 
 
@@ -84,10 +85,12 @@ def _text(error: BaseException) -> str:
 
 @contextmanager
 def plain_warnings() -> Iterator[None]:
-    """Within the block, print warnings of this library without the line of code that caused them."""
+    """Within the block, print warnings of this library without code and without advice on code."""
+    import logging
     import warnings
 
     original = warnings.showwarning
+    logger = logging.getLogger("aerokit")
 
     def show(message: Any, category: type[Warning], *arguments: Any, **options: Any) -> None:
         if category.__module__.partition(".")[0] == "aerokit":
@@ -95,9 +98,21 @@ def plain_warnings() -> Iterator[None]:
         else:
             original(message, category, *arguments, **options)
 
-    with warnings.catch_warnings():
-        warnings.showwarning = show
-        yield
+    logger.addFilter(_describe_busy_computer)
+    try:
+        with warnings.catch_warnings():
+            warnings.showwarning = show
+            yield
+    finally:
+        logger.removeFilter(_describe_busy_computer)
+
+
+def _describe_busy_computer(record: logging.LogRecord) -> bool:
+    """Replace the warning of a blocked event loop, which advises programmers: a command only waits for the computer."""
+    if str(record.msg).startswith("the event loop was blocked") and isinstance(record.args, tuple):
+        record.msg = "this computer was busy for %.1f s: no messages or heartbeats were processed"
+        record.args = record.args[:1]
+    return True
 
 
 DONE, FAILED, WRONG_ARGUMENTS, NO_VEHICLE, TIMED_OUT, REFUSED, UNREADABLE, NOT_INSTALLED = range(8)

@@ -32,7 +32,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def _add_reading(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     listing = add_action(actions, "list", _list, "List parameters with their values.")
-    pattern = listing.add_argument("pattern", nargs="?", default="*", help="names to list: 'BATT_*' (all)")
+    pattern = listing.add_argument("pattern", nargs="?", default="*", help="part of the names, or 'BATT_*' (all)")
     offer(pattern, parameter_names)
     listing.add_argument("--changed", action="store_true", help="only those that differ from their default")
     get = add_action(actions, "get", _get, "Read single parameters.")
@@ -57,7 +57,9 @@ async def _list(options: argparse.Namespace) -> int:
         table = await _download(vehicle, options)
     if options.changed:
         table = table.changed_from_default()
-    found = [value for name, value in table.items() if fnmatch.fnmatch(name, options.pattern.upper())]
+    pattern = options.pattern.upper()
+    pattern = pattern if any(mark in pattern for mark in "*?[") else f"*{pattern}*"
+    found = [value for name, value in table.items() if fnmatch.fnmatch(name, pattern)]
     _emit_parameters(options, found)
     if not found and options.pattern != "*":
         hint = suggestion(options.pattern.strip("*"), table, 3)
