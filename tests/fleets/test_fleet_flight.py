@@ -84,6 +84,7 @@ async def test_lost_member_returns_and_is_available_again() -> None:
         assert list(await stage.fleet.land()) == ["north/1", "north/2"]
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("policy", "mode"), [("hold_others", "BRAKE"), ("return_others", "RTL"), ("land_others", "LAND")]
 )

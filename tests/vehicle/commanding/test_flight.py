@@ -378,6 +378,7 @@ async def test_land_after_cancelled_go_to_continues() -> None:
         assert flying.copter.is_landed
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("order", ["hold", "land", "set_mode", "stream"])
 async def test_refused_background_hold_is_not_next_ack(order: str) -> None:
     """COMMAND_ACK carries no request id: the ack of a cancelled call must not fail the next one."""
