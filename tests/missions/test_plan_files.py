@@ -546,3 +546,9 @@ def test_damaged_plan_file_raises_only_our_errors(seed: int, junk: object) -> No
     except FileFormatError:
         return
     assert written(plan) == document
+
+
+def test_plan_file_of_other_version_is_not_called_incomplete() -> None:
+    with pytest.raises(FileFormatError, match=r"version.*9") as caught:
+        read({"fileType": "Plan", "version": 9})
+    assert "required" not in str(caught.value)
