@@ -14,6 +14,7 @@ from aerokit.vehicle.connect import warn_if_left_flying
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterator
     from contextlib import AbstractAsyncContextManager, AbstractContextManager
+    from typing import TypeAlias
 
     from typing_extensions import Self
 
@@ -37,6 +38,18 @@ if TYPE_CHECKING:
     from aerokit.vehicle.parameters.writing import ParameterWrite
     from aerokit.vehicle.rtk.ntrip import NtripClient
     from aerokit.vehicle.vehicle import Vehicle
+
+    Block: TypeAlias = (
+        CameraBlock
+        | Following
+        | GimbalControl
+        | GimbalRates
+        | LogStream
+        | NtripClient
+        | PhotoInterval
+        | SetpointStream[Any]
+        | Shell
+    )
 
 
 class BlockingContext:
@@ -83,11 +96,7 @@ T = TypeVar("T")
 
 EnteredT = TypeVar("EnteredT")
 
-BlockT = TypeVar(
-    "BlockT",
-    bound="CameraBlock | Following | GimbalControl | GimbalRates | LogStream | NtripClient | PhotoInterval"
-    " | SetpointStream[Any] | Shell",
-)
+BlockT = TypeVar("BlockT", bound="Block")
 
 ShieldedT = TypeVar("ShieldedT", bound="TemporaryParameters | Transaction")
 
