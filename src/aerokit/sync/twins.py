@@ -4294,7 +4294,7 @@ class Vehicle(VehicleTwin):
 
     def orbit(
         self,
-        center: Position,
+        center: Position | Home,
         *,
         radius_m: float,
         speed_m_s: float = 2.0,
@@ -4315,7 +4315,8 @@ class Vehicle(VehicleTwin):
         the vehicle stops. ArduPlane circles a place in GUIDED (MAV_CMD_DO_REPOSITION).
 
         Args:
-            center: the middle of the circle; its altitude is that of the circle, without one the vehicle's own.
+            center: the middle of the circle; its altitude is that of the circle, without one, or for home, the
+                vehicle's own.
             radius_m: above 0, at most 10,000. PX4's multicopters refuse more than MC_ORBIT_RAD_MAX.
             speed_m_s: ground speed, above 0, at most 50. A fixed wing ignores it.
             turns: number of turns, above 0, at most 1000; None: until the call is cancelled, or another order is given.
@@ -4351,7 +4352,7 @@ class Vehicle(VehicleTwin):
 
     def figure_eight(
         self,
-        center: Position,
+        center: Position | Home,
         *,
         major_radius_m: float,
         minor_radius_m: float,
@@ -4397,7 +4398,7 @@ class Vehicle(VehicleTwin):
 
     def loiter(
         self,
-        target: Position | None = None,
+        target: Position | Home | None = None,
         *,
         radius_m: float | None = None,
         clockwise: bool = True,

@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Literal
 from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit.errors import InvalidArgument, NotSupported
 from aerokit.mavlink.enums import MavCmd, MavDoRepositionFlags, MavType, MavVtolState, OrbitYawBehaviour
+from aerokit.position import travel_target
 from aerokit.vehicle.commanding.context import VehicleBase
 from aerokit.vehicle.commanding.follow_target import FollowTarget
 from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M, MAX_SILENCE_S, await_progress
 
 if TYPE_CHECKING:
     from aerokit.autopilots import Mode
-    from aerokit.position import Position
+    from aerokit.position import Home, Position
     from aerokit.vehicle.commanding.closed_paths import TurnCounter
     from aerokit.vehicle.commanding.follow import FollowStream
 
@@ -45,7 +46,7 @@ class ManeuverActions(VehicleBase):
 
     async def orbit(
         self,
-        center: Position,
+        center: Position | Home,
         *,
         radius_m: float,
         speed_m_s: float = 2.0,
@@ -66,7 +67,8 @@ class ManeuverActions(VehicleBase):
         the vehicle stops. ArduPlane circles a place in GUIDED (MAV_CMD_DO_REPOSITION).
 
         Args:
-            center: the middle of the circle; its altitude is that of the circle, without one the vehicle's own.
+            center: the middle of the circle; its altitude is that of the circle, without one, or for home, the
+                vehicle's own.
             radius_m: above 0, at most 10,000. PX4's multicopters refuse more than MC_ORBIT_RAD_MAX.
             speed_m_s: ground speed, above 0, at most 50. A fixed wing ignores it.
             turns: number of turns, above 0, at most 1000; None: until the call is cancelled, or another order is given.
@@ -95,7 +97,7 @@ class ManeuverActions(VehicleBase):
         if turns is not None:
             check_range("turns", turns, 0, MAX_ROUNDS, above=True)
         counter = _turn_counter(radius_m, clockwise=clockwise)
-        flight = RoundFlight(self._context, "orbit", center, counter, turns, timeout, max_silence_s)
+        flight = RoundFlight(self._context, "orbit", travel_target(center), counter, turns, timeout, max_silence_s)
         if self.autopilot.circles_by == "setpoints":
             flight.check_place(max_distance_m)
             path = Circle(radius_m, clockwise=clockwise, first_phase=flight.bearing_rad)
@@ -107,7 +109,7 @@ class ManeuverActions(VehicleBase):
 
     async def figure_eight(
         self,
-        center: Position,
+        center: Position | Home,
         *,
         major_radius_m: float,
         minor_radius_m: float,
@@ -149,7 +151,9 @@ class ManeuverActions(VehicleBase):
             if rounds * 2 != int(rounds * 2):
                 raise InvalidArgument(f"rounds = {rounds!r} is not allowed: a multiple of a half")
         counter = LobeCounter(major_radius_m, axis_deg)
-        flight = RoundFlight(self._context, "figure_eight", center, counter, rounds, timeout, max_silence_s)
+        flight = RoundFlight(
+            self._context, "figure_eight", travel_target(center), counter, rounds, timeout, max_silence_s
+        )
         if not self._is_on_wings and self.autopilot.setpoints.trajectory:
             flight.check_place(max_distance_m)
             path = Eight(major_radius_m, minor_radius_m, axis_deg, clockwise=clockwise)
@@ -165,7 +169,7 @@ class ManeuverActions(VehicleBase):
 
     async def loiter(
         self,
-        target: Position | None = None,
+        target: Position | Home | None = None,
         *,
         radius_m: float | None = None,
         clockwise: bool = True,
@@ -207,7 +211,7 @@ class ManeuverActions(VehicleBase):
                 )
         elif turns is not None:
             raise InvalidArgument(f"turns = {turns!r} is not allowed without radius_m")
-        center = self.telemetry.position.value if target is None else target
+        center = self.telemetry.position.value if target is None else travel_target(target)
         if radius_m is None:
             counter = None
             flags = MavDoRepositionFlags.CHANGE_MODE
