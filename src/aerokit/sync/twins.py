@@ -39,7 +39,6 @@ from aerokit.vehicle.camera.controls import FORMAT_TIMEOUT_S
 from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M, MAX_SILENCE_S
 from aerokit.vehicle.commanding.setpoints import AccelerationSetpoint, BodyVelocitySetpoint, VelocitySetpoint
 from aerokit.vehicle.connect import connect as connect_async
-from aerokit.vehicle.devices.actuators import ILLUMINATOR
 from aerokit.vehicle.devices.winch import ACTION_TIMEOUT_S
 from aerokit.vehicle.files.logs import ERASE_PATIENCE_S
 
@@ -1462,7 +1461,7 @@ class Actuators(TwinOf["AsyncActuators"]):
         """
         self._loop.run(self.aio.lower_landing_gear)
 
-    def set_lights(self, on: bool, *, component_id: int = ILLUMINATOR) -> None:
+    def set_lights(self, on: bool, *, component_id: int = MavComponent.ILLUMINATOR) -> None:
         """Switch an illuminator, and return when ILLUMINATOR_STATUS reports it (MAV_CMD_ILLUMINATOR_ON_OFF).
 
         For lights that are a MAVLink component. ArduPilot and PX4 do not have the command; lights on an output of
