@@ -55,6 +55,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.commanding.setpoints import PositionSetpoint as PositionSetpoint
     from aerokit.vehicle.commanding.setpoints import TrajectorySetpoint as TrajectorySetpoint
     from aerokit.vehicle.commanding.setpoints import VelocitySetpoint as VelocitySetpoint
+    from aerokit.vehicle.commanding.sticks import StickInput as StickInput
     from aerokit.vehicle.connect import connect as connect
     from aerokit.vehicle.vehicle import Vehicle as Vehicle
 
@@ -101,6 +102,7 @@ __getattr__, __dir__, __all__ = lazy_exports(
             "TrajectorySetpoint",
             "VelocitySetpoint",
         ),
+        "aerokit.vehicle.commanding.sticks": ("StickInput",),
         "aerokit.vehicle.connect": ("connect",),
         "aerokit.vehicle.vehicle": ("Vehicle",),
     },

@@ -11,15 +11,18 @@ from call_stage import Stage
 from call_table import CALLS, KEY
 from camera_calls import BLOCKING
 from component_calls import COMPONENTS_BLOCKING
+from stream_calls import STREAMS_BLOCKING
 
 import aerokit.sync
 from aerokit import (
     AccelerationSetpoint,
+    AttitudeRateSetpoint,
     AttitudeSetpoint,
     BodyVelocitySetpoint,
     LocalPositionSetpoint,
     PositionSetpoint,
     Signing,
+    TrajectorySetpoint,
     VelocitySetpoint,
     messages,
 )
@@ -33,6 +36,7 @@ Do = Callable[[Any], object]
 CLASSES: tuple[type, ...] = (
     twins.Vehicle,
     twins.Guided,
+    twins.StickStream,
     twins.Gimbal,
     twins.Component,
     twins.Settings,
@@ -236,6 +240,8 @@ WRITTEN: dict[str, Do] = {
     "Guided.position": _stream("position", lambda s: PositionSetpoint(s.target())),
     "Guided.attitude": _stream("attitude", lambda _: AttitudeSetpoint(0, 2, 0, thrust=0.5)),
     "SetpointStream.fly": _stream("velocity", lambda _: VelocitySetpoint(north_m_s=1.0)),
+    "Guided.attitude_rate": _stream("attitude_rate", lambda _: AttitudeRateSetpoint(pitch_deg_s=1.0)),
+    "Guided.trajectory": _stream("trajectory", lambda _: TrajectorySetpoint(3, 3, -6)),
     "SetpointStream.set": _set,
     "Parameters.temporarily": _temporarily,
     "Parameters.transaction": _transaction,
@@ -263,4 +269,4 @@ WRITTEN: dict[str, Do] = {
 def blocking_calls() -> dict[str, Do]:
     """Return the calls by name; coroutine functions of the other table have no twin."""
     shared = {name: call.do for name, call in CALLS.items() if not inspect.iscoroutinefunction(call.do)}
-    return {**shared, **WRITTEN, **BLOCKING, **COMPONENTS_BLOCKING}
+    return {**shared, **WRITTEN, **BLOCKING, **COMPONENTS_BLOCKING, **STREAMS_BLOCKING}

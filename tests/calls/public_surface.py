@@ -16,6 +16,7 @@ from aerokit.vehicle.camera.link import CameraBlock
 from aerokit.vehicle.camera.photos import PhotoInterval
 from aerokit.vehicle.commanding.guided import Guided, SetpointStream
 from aerokit.vehicle.commanding.posted import PostedOrder
+from aerokit.vehicle.commanding.sticks import StickStream
 from aerokit.vehicle.components.component import Component
 from aerokit.vehicle.components.settings import Settings
 from aerokit.vehicle.files.files import Files
@@ -34,6 +35,7 @@ CLASSES: tuple[type, ...] = (
     aerokit.Vehicle,
     Guided,
     SetpointStream,
+    StickStream,
     Gimbal,
     Component,
     Gimbals,

@@ -16,11 +16,14 @@ from aerokit import Position, messages
 from aerokit.errors import InvalidArgument
 from aerokit.missions import Fence, Mission, RallyPoints
 from aerokit.vehicle.commanding.setpoints import (
+    ActuatorSetpoint,
     AttitudeSetpoint,
     LocalPositionSetpoint,
     PositionSetpoint,
+    TrajectorySetpoint,
     VelocitySetpoint,
 )
+from aerokit.vehicle.commanding.sticks import StickInput
 
 __all__ = ["Misuse", "misuses", "misuses_of", "refusal_of"]
 
@@ -94,8 +97,13 @@ WRONG: dict[str, tuple[object, ...]] = {
 }
 """Annotation → values that it does not allow."""
 WRONG["type[ItemT]"] = WRONG["type[MessageT]"] = WRONG["type[Message]"]
-for _setpoint in ("Velocity", "BodyVelocity", "Acceleration", "LocalPosition", "Position", "Attitude"):
-    WRONG[f"{_setpoint}Setpoint"] = (*NOTHING, *STRANGE, *TEXT, *NUMBER, PLACE)
+_SETPOINTS = (
+    *("Velocity", "BodyVelocity", "Acceleration", "LocalPosition", "Position", "Attitude"),
+    *("AttitudeRate", "Trajectory", "Actuator"),
+)
+for _value in (*(f"{kind}Setpoint" for kind in _SETPOINTS), "StickInput"):
+    WRONG[_value] = (*NOTHING, *STRANGE, *TEXT, *NUMBER, PLACE)
+WRONG["StickInput | None"] = (*STRANGE, *TEXT, *NUMBER, PLACE)
 WRONG["CacheChoice"] = (*NOTHING, *STRANGE, *NUMBER)
 WRONG["Capture"] = (*NOTHING, *STRANGE, *TEXT, *NUMBER)
 for _literal in (
@@ -145,6 +153,9 @@ RIGHT: dict[str, object] = {
     "SetpointT": VelocitySetpoint(),
     "PositionSetpoint": PositionSetpoint(PLACE),
     "LocalPositionSetpoint": LocalPositionSetpoint(0, 0, -5),
+    "TrajectorySetpoint": TrajectorySetpoint(0, 0, -5),
+    "ActuatorSetpoint": ActuatorSetpoint((0.0,) * 8),
+    "StickInput": StickInput(),
     "AttitudeSetpoint": AttitudeSetpoint(0, 0, 0, thrust=0.5),
 }
 """Annotation → a value for a required parameter while another one is wrong."""

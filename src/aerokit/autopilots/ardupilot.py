@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, ClassVar
 
-from aerokit.autopilots.base import Autopilot, GimbalRules, Purpose, Reposition, SetpointRules, TakeOff
+from aerokit.autopilots.base import Autopilot, GimbalRules, Purpose, Reposition, SetpointRules, StickRules, TakeOff
 from aerokit.autopilots.modes import ModeTable
 from aerokit.autopilots.telemetry import ARDUPILOT_GROUPS, ATTITUDE_AND_HEIGHT, POS_HORIZ_ABS, bit_names
 from aerokit.mavlink.enums import EkfStatusFlags, MavCmd, MavLandedState, MavState, MavType
@@ -216,11 +216,14 @@ class ArduCopter(ArduPilot):
     purposes: ClassVar[Mapping[str, str]] = {
         "hold": "BRAKE",  # LOITER follows the throttle stick, which is down or absent while a program flies
         "land": "LAND",
+        "precision_land": "LAND",  # with PLND_ENABLED
         "return": "RTL",
         "setpoint": "GUIDED",
+        "sticks": "LOITER",
         "take_off": "GUIDED",
         "mission": "AUTO",
     }
+    sticks: StickRules | None = StickRules()
     setpoints: SetpointRules = SetpointRules(body_yaw_is_relative=True, attitude_rate=True, trajectory=True)
     reposition: Reposition | None = Reposition(relative_altitude=True, yaw=False, speed=False)
     condition_yaw = True
@@ -263,9 +266,11 @@ class ArduPlane(ArduPilot):
         "land": "AUTOLAND",
         "return": "RTL",
         "setpoint": "GUIDED",
+        "sticks": "FBWA",
         "take_off": "TAKEOFF",
         "mission": "AUTO",
     }
+    sticks: StickRules | None = StickRules()
     setpoints: SetpointRules = SetpointRules(
         local_position=False, global_position=False, velocity=False, acceleration=False
     )
@@ -293,7 +298,7 @@ class ArduPlane(ArduPilot):
         return is_vtol or self.vehicle_type in VTOLS
 
 
-_QUADPLANE: Mapping[str, str] = {"land": "QLAND", "return": "QRTL", "take_off": "GUIDED"}
+_QUADPLANE: Mapping[str, str] = {"land": "QLAND", "return": "QRTL", "sticks": "QLOITER", "take_off": "GUIDED"}
 
 
 class ArduRover(ArduPilot):
@@ -306,8 +311,10 @@ class ArduRover(ArduPilot):
         "hold": "HOLD",
         "return": "RTL",
         "setpoint": "GUIDED",
+        "sticks": "MANUAL",
         "mission": "AUTO",
     }
+    sticks: StickRules | None = StickRules(signed_throttle=True)
     setpoints: SetpointRules = SetpointRules(acceleration=False, body_yaw_is_relative=True)
     reposition: Reposition | None = Reposition(relative_altitude=True, yaw=False, speed=False)
     arrival_radius_m: float = 4.0
@@ -329,8 +336,10 @@ class ArduSub(ArduPilot):
         "hold": "POSHOLD",
         "land": "SURFACE",
         "setpoint": "GUIDED",
+        "sticks": "ALT_HOLD",
         "mission": "AUTO",
     }
+    sticks: StickRules | None = StickRules(release="channels")
     setpoints: SetpointRules = SetpointRules(acceleration=False, position_restarts_path=True)
     mode_when_landed: ClassVar[str | None] = "ALT_HOLD"  # at the surface
     reposition: Reposition | None = Reposition(relative_altitude=True, yaw=False, speed=False)

@@ -30,7 +30,7 @@ NAN = math.nan
 _BYTEWISE = MavProtocolCapability.PARAM_ENCODE_BYTEWISE.value
 _C_CAST = MavProtocolCapability.PARAM_ENCODE_C_CAST.value
 
-Purpose = Literal["hold", "land", "return", "setpoint", "take_off", "mission"]
+Purpose = Literal["hold", "land", "precision_land", "return", "setpoint", "sticks", "take_off", "mission"]
 """Purpose for which a program uses a mode."""
 
 # Maps a MAV_CMD to the purposes of the modes that it may lead to. An autopilot may use several modes for one purpose.
@@ -97,6 +97,18 @@ class SetpointRules(Snapshot):
         return tuple(kind.replace("_", " ") for kind in kinds if getattr(self, kind))
 
 
+class StickRules(Snapshot):
+    """Interpretation of MANUAL_CONTROL.
+
+    - ``signed_throttle``: the throttle is from −1000 to 1000; otherwise from 0 to 1000.
+    - ``release``: "axes" without a value, or overriding "channels" with 0, returns the sticks to the transmitter;
+      "none": there is no such message.
+    """
+
+    signed_throttle: bool = False
+    release: Literal["axes", "channels", "none"] = "axes"
+
+
 class GimbalRules(Snapshot):
     """Implementation of the gimbal protocol v2 by a gimbal manager. The defaults follow the standard.
 
@@ -161,6 +173,8 @@ class Autopilot:
     purposes: ClassVar[Mapping[str, str]] = {}
     """Maps purposes to names of modes."""
     setpoints: SetpointRules = SetpointRules(*[False] * 5)
+    sticks: StickRules | None = None
+    """None if MANUAL_CONTROL is not known to work."""
     actuators_until: tuple[int, int] | None = None
     """First version (major, minor) without SET_ACTUATOR_CONTROL_TARGET; None if no version supports it."""
     reposition: Reposition | None = None

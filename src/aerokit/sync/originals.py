@@ -78,6 +78,7 @@ TWINS = (
     ),
     Twin("aerokit.vehicle.commanding.guided.SetpointStream", "StreamTwin", parameter="SetpointT"),
     Twin("aerokit.vehicle.commanding.guided.Guided"),
+    Twin("aerokit.vehicle.commanding.sticks.StickStream", "BlockTwin"),
     Twin("aerokit.vehicle.gimbal.control.GimbalControl", "BlockTwin"),
     Twin("aerokit.vehicle.gimbal.rates.GimbalRates", "BlockTwin"),
     Twin("aerokit.vehicle.gimbal.gimbal.Gimbal", called=_names("device_id")),

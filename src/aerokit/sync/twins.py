@@ -100,6 +100,8 @@ if TYPE_CHECKING:
         PositionSetpoint,
         TrajectorySetpoint,
     )
+    from aerokit.vehicle.commanding.sticks import StickInput
+    from aerokit.vehicle.commanding.sticks import StickStream as AsyncStickStream
     from aerokit.vehicle.components.component import Component as AsyncComponent
     from aerokit.vehicle.components.component import ComponentInformation, ComponentStatus, MetadataKind
     from aerokit.vehicle.components.settings import Settings as AsyncSettings
@@ -154,6 +156,7 @@ __all__ = [
     "SetpointStream",
     "Settings",
     "StateCell",
+    "StickStream",
     "Subscription",
     "TemporaryParameters",
     "Transaction",
@@ -599,6 +602,52 @@ class Guided(TwinOf["AsyncGuided"]):
             self._loop,
             self._loop.call(self.aio.actuators, initial, rate_hz=rate_hz, valid_for_s=valid_for_s, max_lag_s=max_lag_s),
         )
+
+
+class StickStream(BlockTwin["AsyncStickStream"]):
+    """Sends the latest stick positions at a fixed rate while the ``async with`` block supplies them.
+
+    Entering the block sends the initial positions for a second and then changes to the mode. Leaving it in any way
+    orders the vehicle to hold and releases the sticks. If the stream stops by itself (no new positions, a blocked event
+    loop, a silent vehicle), ``set`` and leaving the block raise :class:`SetpointStreamStopped`. If a pilot or a
+    failsafe changes the mode, the sticks are released at once and no hold is ordered.
+
+    If the program is killed, ArduPilot returns to the transmitter after RC_OVERRIDE_TIME (3 s), and PX4 treats the
+    sticks as lost after COM_RC_LOSS_T (0.5 s). PX4 has no release, so every end of a stream is such a loss: without
+    another source of manual control it acts as NAV_RCL_ACT says (return by default), also in its hold mode unless
+    COM_RCL_EXCEPT has bit 1. ArduCopter without a transmitter acts on the loss as FS_THR_ENABLE says.
+
+    Entering raises:
+        InvalidArgument: a position is out of range. Nothing was sent.
+        NotSupported: this type of vehicle has no sticks. Nothing was sent.
+        OperationRejected: a parameter makes the vehicle ignore the sticks, or keep them for ever; the text names it.
+        ParameterTimeout: the vehicle did not report these parameters. Nothing else was sent.
+        CommandRejected: the vehicle refused the mode.
+        BusyError: another set-point stream is open.
+    """
+
+    @property
+    def is_running(self) -> bool:
+        """True while values are being sent."""
+        return self.aio.is_running
+
+    def set(self, sticks: StickInput) -> None:
+        """Move the sticks; the positions are sent at the next tick and repeated until ``valid_for_s`` has passed.
+
+        Raises:
+            InvalidArgument: a position is out of range; the previous ones remain in force until they expire.
+            SetpointStreamStopped: the stream has ended by itself, or the block was left.
+        """
+        self._loop.call(self.aio.set, sticks)
+
+    def move(self, sticks: StickInput, duration_s: float) -> None:
+        """Keep the sticks in one position for ``duration_s`` seconds.
+
+        Raises:
+            InvalidArgument: a position is out of range.
+            SetpointStreamStopped: the stream ended meanwhile.
+        """
+        self._loop.run(self.aio.move, sticks, duration_s)
 
 
 class GimbalControl(BlockTwin["AsyncGimbalControl"]):
@@ -3641,6 +3690,40 @@ class Vehicle(VehicleTwin):
     def guided(self) -> Guided:
         """Set-point streams: velocity, position, acceleration, attitude."""
         return self._part("guided", Guided)
+
+    def sticks(
+        self,
+        initial: StickInput | None = None,
+        *,
+        mode: str | int | None = None,
+        rate_hz: float = 20.0,
+        valid_for_s: float = 0.5,
+        max_lag_s: float = 0.5,
+    ) -> StickStream:
+        """Fly by stick positions of your program (MANUAL_CONTROL): ``async with vehicle.sticks() as sticks: …``.
+
+        Args:
+            initial: positions while the mode is entered; None centres all sticks.
+            mode: the piloted mode. By default LOITER (ArduCopter), FBWA or QLOITER (ArduPlane), MANUAL (ArduPilot
+                Rover), ALT_HOLD (ArduSub), POSCTL (PX4).
+            rate_hz: transmission rate of the latest positions, 2 to 400.
+            valid_for_s: seconds for which they may be repeated without new ones.
+            max_lag_s: how late the event loop may be.
+
+        Raises:
+            InvalidArgument: a rate or a time is out of range, or the autopilot has no such mode.
+        """
+        return StickStream(
+            self._loop,
+            self._loop.call(
+                self.aio.sticks,
+                initial,
+                mode=mode,
+                rate_hz=rate_hz,
+                valid_for_s=valid_for_s,
+                max_lag_s=max_lag_s,
+            ),
+        )
 
     @property
     def gimbal(self) -> Gimbal:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.camera.cameras import Camera, Cameras
     from aerokit.vehicle.commanding.context import VehicleContext
     from aerokit.vehicle.commanding.guided import Guided
+    from aerokit.vehicle.commanding.sticks import StickInput, StickStream
     from aerokit.vehicle.components.component import Component, Components, ComponentStatus
     from aerokit.vehicle.files.files import Files
     from aerokit.vehicle.files.logs import Logs
@@ -127,6 +128,33 @@ class Vehicle(ReadOnly, FlightActions, TravelActions, LookActions, ArmingActions
         from aerokit.vehicle.commanding.guided import Guided
 
         return Guided(self._context)
+
+    def sticks(
+        self,
+        initial: StickInput | None = None,
+        *,
+        mode: str | int | None = None,
+        rate_hz: float = 20.0,
+        valid_for_s: float = 0.5,
+        max_lag_s: float = 0.5,
+    ) -> StickStream:
+        """Fly by stick positions of your program (MANUAL_CONTROL): ``async with vehicle.sticks() as sticks: …``.
+
+        Args:
+            initial: positions while the mode is entered; None centres all sticks.
+            mode: the piloted mode. By default LOITER (ArduCopter), FBWA or QLOITER (ArduPlane), MANUAL (ArduPilot
+                Rover), ALT_HOLD (ArduSub), POSCTL (PX4).
+            rate_hz: transmission rate of the latest positions, 2 to 400.
+            valid_for_s: seconds for which they may be repeated without new ones.
+            max_lag_s: how late the event loop may be.
+
+        Raises:
+            InvalidArgument: a rate or a time is out of range, or the autopilot has no such mode.
+        """
+        from aerokit.vehicle.commanding.sticks import StickStream
+
+        limits = (rate_hz, valid_for_s, max_lag_s)
+        return StickStream(self._context, self.parameters.probe, mode, initial, *limits)
 
     @cached_property
     def gimbal(self) -> Gimbal:

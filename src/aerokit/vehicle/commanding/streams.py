@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 import anyio
 
 from aerokit._internal.arguments import check_range, checks_arguments
-from aerokit.errors import BusyError, OperationRejected, SetpointStreamStopped
+from aerokit.errors import BusyError, OperationRejected, ParameterTimeout, SetpointStreamStopped
+from aerokit.parameters import Parameter
 from aerokit.vehicle.commanding.progress import StallDetector
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Awaitable, Callable, Mapping
     from types import TracebackType
 
     from typing_extensions import Self
@@ -26,7 +27,10 @@ if TYPE_CHECKING:
     from aerokit.vehicle.commanding.context import VehicleContext
     from aerokit.vehicle.commanding.order import Order
 
-__all__ = ["MAX_RATE_HZ", "SteeringStream", "ValueStream"]
+    Probe = Callable[..., Awaitable[Mapping[str, object]]]
+    """``Parameters.probe``, which is in a room above this one."""
+
+__all__ = ["MAX_RATE_HZ", "StallWatch", "SteeringStream", "ValueStream", "known_values"]
 
 ValueT = TypeVar("ValueT")
 
@@ -143,6 +147,7 @@ class ValueStream(Generic[ValueT]):
         """Stop the stream from inside; order the vehicle to hold unless there was a takeover."""
         self._end()
         is_confirmed = hold and self._hold()
+        self._release()
         self._stopped = SetpointStreamStopped(
             f"the {self._NAME} has stopped: {reason}" + ("; a hold was ordered" if is_confirmed else "")
         )
@@ -150,6 +155,9 @@ class ValueStream(Generic[ValueT]):
     def _hold(self) -> bool:
         """Order the vehicle to hold, without waiting; return True if it was sent."""
         return False
+
+    def _release(self) -> None:
+        """End the effect of the last value, where the vehicle would continue it."""
 
     def _end(self) -> None:
         """Stop sending."""
@@ -210,10 +218,12 @@ class SteeringStream(ValueStream[ValueT]):
             await self._enter(mode, order)
         except OperationRejected:  # The pilot or failsafe that took over keeps the vehicle.
             self._end()
+            self._release()
             raise
         except BaseException:
             self._end()
             self._hold()
+            self._release()
             raise
         return self
 
@@ -226,7 +236,10 @@ class SteeringStream(ValueStream[ValueT]):
         if self._stopped is None and (reason := self._takeover()):
             self._stop(reason, hold=False)
         if self._stopped is None:
-            await self._leave(exc)
+            try:
+                await self._leave(exc)
+            finally:
+                self._release()
         elif exc is None and not self._is_reported:
             raise self._stopped
 
@@ -281,6 +294,15 @@ class SteeringStream(ValueStream[ValueT]):
         super()._end()
         if self._context.flight_cleanup.stop_stream == self._stop:
             self._context.flight_cleanup.stop_stream = None
+
+
+async def known_values(probe: Probe, *names: str) -> dict[str, float]:
+    """Return the values of those parameters that the vehicle has; raise ParameterTimeout if it did not answer."""
+    answers = await probe(*names)
+    for answer in answers.values():
+        if isinstance(answer, ParameterTimeout):
+            raise answer
+    return {name: float(answer.value) for name, answer in answers.items() if isinstance(answer, Parameter)}
 
 
 class StallWatch:
