@@ -34,6 +34,7 @@ ROOMS = {
         {"session"},
         {"commanding"},
         {"gimbal"},
+        {"external"},
         {"files"},
         {"parameters", "missions"},
         {"components"},

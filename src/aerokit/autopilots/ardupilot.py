@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, ClassVar
 
 from aerokit.autopilots.base import Autopilot, GimbalRules, Purpose, Reposition, SetpointRules, StickRules, TakeOff
+from aerokit.autopilots.external import ARDUPILOT_EXTERNAL, ExternalRules
 from aerokit.autopilots.modes import ModeTable
 from aerokit.autopilots.telemetry import ARDUPILOT_GROUPS, ATTITUDE_AND_HEIGHT, POS_HORIZ_ABS, bit_names
 from aerokit.mavlink.enums import EkfStatusFlags, MavCmd, MavLandedState, MavState, MavType
@@ -178,6 +179,7 @@ class ArduPilot(Autopilot):
     sets_current_by_command = True
     accepts_ftp_session_ids = True
     has_upper_case_parameters = True
+    external: ExternalRules = ARDUPILOT_EXTERNAL
     log_suffix = ".bin"
     video_addresses_camera = True
     log_directories: ClassVar[tuple[str, str]] = ("/APM/LOGS", "/logs")

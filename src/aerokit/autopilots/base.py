@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from aerokit._internal.values import Snapshot
+from aerokit.autopilots.external import ExternalRules
 from aerokit.autopilots.modes import CUSTOM_MODE_ENABLED, NO_MODES, Mode, ModeTable, base_mode_name
 from aerokit.autopilots.telemetry import (
     ATTITUDE_AND_HEIGHT,
@@ -92,8 +93,10 @@ class SetpointRules(Snapshot):
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the supported kinds."""
-        kinds = ("local_position", "global_position", "velocity", "acceleration", "attitude")
-        kinds = (*kinds, "attitude_rate", "trajectory")
+        kinds = (
+            *("local_position", "global_position", "velocity", "acceleration", "attitude"),
+            *("attitude_rate", "trajectory"),
+        )
         return tuple(kind.replace("_", " ") for kind in kinds if getattr(self, kind))
 
 
@@ -173,6 +176,8 @@ class Autopilot:
     purposes: ClassVar[Mapping[str, str]] = {}
     """Maps purposes to names of modes."""
     setpoints: SetpointRules = SetpointRules(*[False] * 5)
+    external: ExternalRules = ExternalRules()
+    """Measurements of other sensors that the autopilot accepts by MAVLink."""
     sticks: StickRules | None = None
     """None if MANUAL_CONTROL is not known to work."""
     actuators_until: tuple[int, int] | None = None

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from aerokit.vehicle.camera.link import CameraBlock
     from aerokit.vehicle.camera.photos import PhotoInterval
     from aerokit.vehicle.commanding.guided import SetpointStream
+    from aerokit.vehicle.commanding.sticks import StickStream
+    from aerokit.vehicle.external.streams import MeasurementStream
     from aerokit.vehicle.gimbal.control import GimbalControl
     from aerokit.vehicle.gimbal.gimbal import Gimbals  # noqa: F401
     from aerokit.vehicle.gimbal.rates import GimbalRates
@@ -80,7 +82,8 @@ EnteredT = TypeVar("EnteredT")
 
 BlockT = TypeVar(
     "BlockT",
-    bound="CameraBlock | Following | GimbalControl | GimbalRates | PhotoInterval | SetpointStream[Any]",
+    bound="CameraBlock | Following | GimbalControl | GimbalRates | MeasurementStream[Any] | PhotoInterval"
+    " | SetpointStream[Any] | StickStream",
 )
 
 ShieldedT = TypeVar("ShieldedT", bound="TemporaryParameters | Transaction")
@@ -190,6 +193,10 @@ class BlockTwin(TwinOf[BlockT]):
 
 class StreamTwin(BlockTwin["SetpointStream[T]"], Generic[T]):
     """Twin of a stream that sends set-points while its ``with`` block runs."""
+
+
+class MeasurementTwin(BlockTwin["MeasurementStream[T]"], Generic[T]):
+    """Twin of a stream of measurements that is open while its ``with`` block runs."""
 
 
 class GimbalsTwin(TwinOf["Gimbals"], Generic[T]):
