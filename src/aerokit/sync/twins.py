@@ -699,7 +699,7 @@ class MeasurementStream(MeasurementTwin[MeasurementT]):
 
     @property
     def estimator_use(self) -> EstimatorUse:
-        """Whether the vehicle's estimator uses these measurements.
+        """Use of these measurements by the vehicle's estimator.
 
         No message reports this. It is derived from EKF_STATUS_REPORT or ESTIMATOR_STATUS and from the parameters at
         the beginning of the block. "used": the estimator has a position or velocity, and its parameters allow no other
@@ -761,8 +761,9 @@ class External(TwinOf["AsyncExternal"]):
         return MeasurementStream(self._loop, self._loop.call(self.aio.gps, rate_hz=rate_hz, valid_for_s=valid_for_s))
 
     def obstacles(self, *, rate_hz: float = 10.0, valid_for_s: float = 0.5) -> MeasurementStream[ObstacleSectors]:
-        """Supply distances around the vehicle (OBSTACLE_DISTANCE). ArduPilot needs PRX1_TYPE 2; PX4 uses them if CP_DIST
-        is above 0.
+        """Supply distances around the vehicle (OBSTACLE_DISTANCE).
+
+        ArduPilot needs PRX1_TYPE 2; PX4 uses them if CP_DIST is above 0.
         """
         return MeasurementStream(
             self._loop,
@@ -799,7 +800,10 @@ class External(TwinOf["AsyncExternal"]):
         )
 
     def optical_flow(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[FlowMeasurement]:
-        """Supply optical flow (OPTICAL_FLOW; OPTICAL_FLOW_RAD to PX4). ArduPilot needs FLOW_TYPE 5, PX4 EKF2_OF_CTRL."""
+        """Supply optical flow (OPTICAL_FLOW; OPTICAL_FLOW_RAD to PX4).
+
+        ArduPilot needs FLOW_TYPE 5, PX4 EKF2_OF_CTRL.
+        """
         return MeasurementStream(
             self._loop,
             self._loop.call(self.aio.optical_flow, rate_hz=rate_hz, valid_for_s=valid_for_s),
@@ -837,10 +841,11 @@ class External(TwinOf["AsyncExternal"]):
         )
 
     def set_origin(self, origin: Position, *, timeout: float = 10.0) -> None:
-        """Set the origin of the estimator's local frame (SET_GPS_GLOBAL_ORIGIN); returns when GPS_GLOBAL_ORIGIN reports it.
+        """Set the origin of the estimator's local frame, and wait until GPS_GLOBAL_ORIGIN reports it.
 
-        A vehicle without GPS needs it for global positions. It is sent once; the message has no acknowledgement. Returns
-        at once if the vehicle has this origin already. After a cancellation the vehicle may have accepted it.
+        A vehicle without GPS needs it for global positions. SET_GPS_GLOBAL_ORIGIN is sent once; it has no
+        acknowledgement. Returns at once if the vehicle has this origin already. After a cancellation the vehicle may
+        have accepted it.
 
         Args:
             origin: latitude, longitude and altitude above mean sea level.

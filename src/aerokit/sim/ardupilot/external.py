@@ -1,4 +1,4 @@
-"""Measurements that a companion computer sends to a simulated ArduPilot: external navigation, landing targets, sensors."""
+"""Measurements that a companion computer sends to a simulated ArduPilot: poses, landing targets, sensors."""
 
 from __future__ import annotations
 

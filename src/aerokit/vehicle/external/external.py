@@ -74,8 +74,9 @@ class External:
         return self._stream("gps", GpsMeasurement, self._encode.gps, rate_hz, valid_for_s)
 
     def obstacles(self, *, rate_hz: float = 10.0, valid_for_s: float = 0.5) -> MeasurementStream[ObstacleSectors]:
-        """Supply distances around the vehicle (OBSTACLE_DISTANCE). ArduPilot needs PRX1_TYPE 2; PX4 uses them if CP_DIST
-        is above 0.
+        """Supply distances around the vehicle (OBSTACLE_DISTANCE).
+
+        ArduPilot needs PRX1_TYPE 2; PX4 uses them if CP_DIST is above 0.
         """
         return self._stream("obstacles", ObstacleSectors, self._encode.obstacles, rate_hz, valid_for_s)
 
@@ -97,7 +98,10 @@ class External:
         return self._stream("landing_target", TargetMeasurement, self._encode.landing_target, rate_hz, valid_for_s)
 
     def optical_flow(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[FlowMeasurement]:
-        """Supply optical flow (OPTICAL_FLOW; OPTICAL_FLOW_RAD to PX4). ArduPilot needs FLOW_TYPE 5, PX4 EKF2_OF_CTRL."""
+        """Supply optical flow (OPTICAL_FLOW; OPTICAL_FLOW_RAD to PX4).
+
+        ArduPilot needs FLOW_TYPE 5, PX4 EKF2_OF_CTRL.
+        """
         return self._stream("optical_flow", FlowMeasurement, self._encode.optical_flow, rate_hz, valid_for_s)
 
     async def set_wind(
@@ -131,10 +135,11 @@ class External:
         await self._context.sender.auxiliary_command(MavCmd.EXTERNAL_WIND_ESTIMATE, *params)
 
     async def set_origin(self, origin: Position, *, timeout: float = 10.0) -> None:
-        """Set the origin of the estimator's local frame (SET_GPS_GLOBAL_ORIGIN); returns when GPS_GLOBAL_ORIGIN reports it.
+        """Set the origin of the estimator's local frame, and wait until GPS_GLOBAL_ORIGIN reports it.
 
-        A vehicle without GPS needs it for global positions. It is sent once; the message has no acknowledgement. Returns
-        at once if the vehicle has this origin already. After a cancellation the vehicle may have accepted it.
+        A vehicle without GPS needs it for global positions. SET_GPS_GLOBAL_ORIGIN is sent once; it has no
+        acknowledgement. Returns at once if the vehicle has this origin already. After a cancellation the vehicle may
+        have accepted it.
 
         Args:
             origin: latitude, longitude and altitude above mean sea level.

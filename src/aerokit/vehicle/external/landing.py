@@ -48,9 +48,10 @@ class LandingReport(Snapshot):
     """Course of a precision landing that has ended on the ground, disarmed.
 
     ``last_target`` is the last measurement, ``unseen_s`` its age at the end; a camera rarely sees the target from close
-    by. ``losses`` are the times of more than a second without the target before that. ``climbed_m`` is how far the vehicle climbed in
-    between: a retry of ArduPilot, a search of PX4. ``used_target`` is False if no measurement was sent during the
-    descent, so that the vehicle landed wherever its firmware chose. ``texts`` are the vehicle's status texts.
+    by. ``losses`` are the times of more than a second without the target before that. ``climbed_m`` is how far the
+    vehicle climbed in between: a retry of ArduPilot, a search of PX4. ``used_target`` is False if no measurement was
+    sent during the descent, so that the vehicle landed wherever its firmware chose. ``texts`` are the vehicle's status
+    texts.
     """
 
     last_target: TargetMeasurement | None

@@ -122,7 +122,7 @@ class MeasurementStream(Generic[MeasurementT]):
 
     @property
     def estimator_use(self) -> EstimatorUse:
-        """Whether the vehicle's estimator uses these measurements.
+        """Use of these measurements by the vehicle's estimator.
 
         No message reports this. It is derived from EKF_STATUS_REPORT or ESTIMATOR_STATUS and from the parameters at
         the beginning of the block. "used": the estimator has a position or velocity, and its parameters allow no other

@@ -58,7 +58,7 @@ class OdometryMeasurement(Snapshot):
 
 
 class PoseMeasurement(Snapshot):
-    """Pose of the vehicle by vision or motion capture: position in metres north, east, down, and attitude in degrees."""
+    """Pose of the vehicle by vision or motion capture: metres north, east, down, and attitude in degrees."""
 
     north_m: float
     east_m: float
@@ -84,8 +84,8 @@ class SpeedMeasurement(Snapshot):
 class GpsMeasurement(Snapshot):
     """Position of a satellite receiver (GPS_INPUT).
 
-    ``fix`` is GPS_FIX_TYPE (3 is a 3D fix), ``yaw_deg`` the heading of a receiver with two antennas, ``unix_time_s`` the
-    time of the fix in seconds since 1970 (UTC). ``instance`` is the number of the receiver, from 0.
+    ``fix`` is GPS_FIX_TYPE (3 is a 3D fix), ``yaw_deg`` the heading of a receiver with two antennas, ``unix_time_s``
+    the time of the fix in seconds since 1970 (UTC). ``instance`` is the number of the receiver, from 0.
     """
 
     latitude_deg: float
