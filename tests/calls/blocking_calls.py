@@ -37,6 +37,8 @@ CLASSES: tuple[type, ...] = (
     twins.Vehicle,
     twins.Guided,
     twins.StickStream,
+    twins.External,
+    twins.MeasurementStream,
     twins.Gimbal,
     twins.Component,
     twins.Settings,

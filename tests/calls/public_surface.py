@@ -19,6 +19,8 @@ from aerokit.vehicle.commanding.posted import PostedOrder
 from aerokit.vehicle.commanding.sticks import StickStream
 from aerokit.vehicle.components.component import Component
 from aerokit.vehicle.components.settings import Settings
+from aerokit.vehicle.external.external import External
+from aerokit.vehicle.external.streams import MeasurementStream
 from aerokit.vehicle.files.files import Files
 from aerokit.vehicle.files.logs import Logs
 from aerokit.vehicle.gimbal.control import GimbalControl
@@ -36,6 +38,8 @@ CLASSES: tuple[type, ...] = (
     Guided,
     SetpointStream,
     StickStream,
+    External,
+    MeasurementStream,
     Gimbal,
     Component,
     Gimbals,

@@ -12,7 +12,7 @@ from camera_beside import camera_of, settings_of
 from camera_calls import AWAITED
 from component_calls import COMPONENTS_AWAITED
 from provoked import Do, Provocation, Table, ignored, refused
-from stream_calls import STREAMS_AWAITED
+from stream_calls import ARDUPILOT_STREAMS, STREAMS_AWAITED
 
 import aerokit
 from aerokit import (
@@ -368,7 +368,10 @@ CALLS: dict[str, Call] = {
     "Guided.attitude_rate": _stream("attitude_rate", lambda _: AttitudeRateSetpoint(pitch_deg_s=1.0)),
     "Guided.trajectory": _stream("trajectory", lambda _: TrajectorySetpoint(3, 3, -6, north_m_s=0.1)),
     "SetpointStream.fly": Call(_fly, airborne),
-    **{name: Call(do, place, before=before) for name, (do, place, before) in STREAMS_AWAITED.items()},
+    **{
+        name: Call(do, place, COPTER if name in ARDUPILOT_STREAMS else BOTH, before=before)
+        for name, (do, place, before) in STREAMS_AWAITED.items()
+    },
     # ------------------------------------------------------------------------------------- Camera
     **{name: Call(do) for name, do in AWAITED.items()},
     # --------------------------------------------------------------------------------- components

@@ -44,6 +44,7 @@ class ExternalRules(Snapshot):
     - ``has_vision_speed``: it reads VISION_SPEED_ESTIMATE; otherwise ODOMETRY without a pose is sent
     - ``flow_in_radians``: it reads OPTICAL_FLOW_RAD instead of OPTICAL_FLOW
     - ``target_is_local``: it needs the landing target in the local frame instead of relative to the vehicle
+    - ``constant_position_at_rest``: the flag CONST_POS_MODE is also set for a vehicle at rest that has a position
     - ``origin_is_final``: it refuses another origin of the local frame once it has one
     """
 
@@ -53,6 +54,7 @@ class ExternalRules(Snapshot):
     has_vision_speed: bool = True
     flow_in_radians: bool = False
     target_is_local: bool = False
+    constant_position_at_rest: bool = False
     origin_is_final: bool = False
 
     def find(self, kind: ExternalKind) -> ExternalRule | None:
@@ -110,5 +112,6 @@ PX4_EXTERNAL = ExternalRules(
     has_mocap=False,  # EKF2.hpp subscribes to vehicle_visual_odometry only
     has_vision_speed=False,
     flow_in_radians=True,
+    constant_position_at_rest=True,  # seen in flight; ArduPilot sets it only without aiding
     target_is_local=True,  # mavlink_receiver.cpp, handle_message_landing_target
 )

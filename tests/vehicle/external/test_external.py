@@ -13,7 +13,6 @@ from flight_harness import Flight, Px4Flight, block_loop, open_flight, open_px4
 from aerokit import Position
 from aerokit import messages as m
 from aerokit.errors import (
-    CommandRejected,
     InvalidArgument,
     NotSupported,
     OperationRejected,
@@ -34,8 +33,13 @@ pytestmark = pytest.mark.anyio
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 STILL = v.OdometryMeasurement((0.0, 0.0, 0.0), LEVEL)
 COPTER_PARAMETERS: dict[str, float] = {
-    "VISO_TYPE": 1, "GPS1_TYPE": 14, "PRX1_TYPE": 2, "RNGFND1_TYPE": 10, "FLOW_TYPE": 5,
-    "PLND_ENABLED": 1, "PLND_TYPE": 1,
+    "VISO_TYPE": 1,
+    "GPS1_TYPE": 14,
+    "PRX1_TYPE": 2,
+    "RNGFND1_TYPE": 10,
+    "FLOW_TYPE": 5,
+    "PLND_ENABLED": 1,
+    "PLND_TYPE": 1,
 }
 PX4_PARAMETERS: dict[str, float] = {"EKF2_EV_CTRL": 15, "EKF2_OF_CTRL": 1}
 
@@ -332,10 +336,13 @@ async def test_px4_target_without_position_raises() -> None:
 # ----------------------------------------------------------------------------- origin and wind
 
 
-async def test_set_wind_sends_command_or_raises() -> None:
+async def test_set_wind_reaches_vehicle() -> None:
+    async with open_px4() as flight4:
+        await flight4.vehicle.external.set_wind(5.0, 270.0)
+        assert flight4.px4.external.wind == (5.0, 270.0)
     async with open_flight() as flight:
-        with pytest.raises(CommandRejected):  # not simulated
-            await flight.vehicle.external.set_wind(5.0, 270.0)
+        await flight.vehicle.external.set_wind(5.0, 270.0)
+        assert flight.copter.external.wind == (5.0, 270.0)
         (sent,) = flight.wire.commands(MavCmd.EXTERNAL_WIND_ESTIMATE)
         assert (sent.param1, sent.param2, sent.param3, sent.param4) == (5.0, 1.0, 270.0, 15.0)
         with pytest.raises(InvalidArgument):
@@ -425,9 +432,10 @@ async def test_px4_without_gps_flies_by_odometry() -> None:
             await anyio.sleep(5.0)
             await vehicle.external.set_origin(ORIGIN)
             await vehicle.wait_ready()
+            assert use_of(stream) == "used"
             await vehicle.arm()
             await vehicle.take_off(5.0)
-            assert stream.estimator_use == "used"
+            assert use_of(stream) == "used"
             await vehicle.go_to(vehicle.position.value.offset(east_m=10.0))
             assert simulated.motion.east == pytest.approx(10.0, abs=2.0)
         tasks.cancel_scope.cancel()

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavFrame
+from aerokit.mavlink.enums import MavFrame, MavResult
 from aerokit.mavlink.message import Message
 from aerokit.sim.ardupilot.host import ArduPilotHost
 from aerokit.sim.channel import Channel
-from aerokit.sim.commands import rotated
+from aerokit.sim.commands import ReceivedCommand, rotated
 
 _EXTERNAL_NAVIGATION = (m.Odometry, m.VisionPositionEstimate, m.AttPosMocap)
 _SENSORS = (
@@ -32,6 +32,7 @@ class ArduPilotExternal:
         self.latest: dict[type[Message], Message] = {}
         self._navigation_at = self._target_at = -math.inf
         self._target: tuple[float, float] = (0.0, 0.0)
+        self.wind: tuple[float, float] | None = None  # Speed in m/s, and direction in degrees that it comes from.
 
     def listen(self) -> None:
         """Register the handlers."""
@@ -41,7 +42,6 @@ class ArduPilotExternal:
         for sensor in _SENSORS:
             vehicle.on(sensor, self._on_sensor)
         vehicle.on(m.LandingTarget, self._on_target)
-        vehicle.on(m.SetGpsGlobalOrigin, self._on_origin)
 
     @property
     def navigation_age_s(self) -> float:
@@ -82,11 +82,9 @@ class ArduPilotExternal:
         north, east, _down = rotated((target.x, target.y, target.z), motion.yaw)
         self._target, self._target_at = (motion.north + north, motion.east + east), self._vehicle.now
 
-    def _on_origin(self, message: m.SetGpsGlobalOrigin, channel: Channel) -> None:
-        vehicle = self._vehicle
-        if message.target_system != vehicle.system_id:
-            return
-        frame = vehicle.frame
-        north, east = frame.to_local(message.latitude, message.longitude)
-        if vehicle.navigation.set_origin((north, east, frame.origin.altitude_m - message.altitude / 1000)):
-            vehicle.send_built(m.GpsGlobalOrigin.ID, channel)
+    def set_wind(self, command: ReceivedCommand) -> int:
+        """Execute EXTERNAL_WIND_ESTIMATE; the wind has no effect."""
+        if command.param1 < 0 or not 0 <= command.param3 <= 360:
+            return MavResult.DENIED
+        self.wind = (command.param1, command.param3)
+        return MavResult.ACCEPTED

@@ -6,7 +6,8 @@ import math
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavFrame
+from aerokit.mavlink.enums import MavFrame, MavResult
+from aerokit.sim.commands import ReceivedCommand
 from aerokit.sim.motion import GlobalPoint
 
 if TYPE_CHECKING:
@@ -32,6 +33,8 @@ class Px4External:
         """Origin set by SET_GPS_GLOBAL_ORIGIN."""
         self._vision_at = self._target_at = -math.inf
         self._target: tuple[float, float] = (0.0, 0.0)
+        self.wind: tuple[float, float] | None = None
+        """Speed in m/s, and direction in degrees that the wind comes from, by EXTERNAL_WIND_ESTIMATE."""
         px4.on(m.Odometry, self._on_vision)
         px4.on(m.VisionPositionEstimate, self._on_vision)
         px4.on(m.LandingTarget, self._on_target)
@@ -57,6 +60,11 @@ class Px4External:
         """Place of the landing target (north, east) in the world frame; None if it was lost for PLD_BTOUT seconds."""
         is_fresh = self._px4.now - self._target_at <= self._px4.parameters["PLD_BTOUT"]
         return self._target if is_fresh else None
+
+    def set_wind(self, command: ReceivedCommand) -> int:
+        """Execute EXTERNAL_WIND_ESTIMATE; the wind has no effect."""
+        self.wind = (command.param1, command.param3)
+        return MavResult.ACCEPTED
 
     def _on_vision(self, message: Message, _: Channel) -> None:
         if isinstance(message, m.Odometry) and not math.isfinite(message.x):

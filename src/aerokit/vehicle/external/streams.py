@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Generic, Literal, TypeAlias, TypeVar
 
 from aerokit._internal.arguments import check_kind, check_range, checks_arguments
 from aerokit.errors import NotSupported, OperationRejected, SetpointStreamStopped
+from aerokit.mavlink.enums import MavLandedState
 from aerokit.mavlink.messages import Timesync
 from aerokit.vehicle.commanding.streams import MAX_RATE_HZ, known_values
 
@@ -137,7 +138,12 @@ class MeasurementStream(Generic[MeasurementT]):
         if estimator.age > ESTIMATOR_MAX_AGE_S or not self._sent:
             return "unknown"
         has_position = health.has_relative_position or health.has_absolute_position
-        if health.flags & CONSTANT_POSITION or not has_position:
+        # PX4 sets the flag also for a vehicle at rest.
+        is_resting = self._session.telemetry.landed_state.latest == MavLandedState.ON_GROUND
+        is_constant = health.flags & CONSTANT_POSITION and not (
+            is_resting and self._session.autopilot.external.constant_position_at_rest
+        )
+        if is_constant or not has_position:
             return "not used"
         known = [(self._parameters[name], allowed) for name, allowed in rule.sole_source if name in self._parameters]
         is_alone = rule.sole_source[0][0] in self._parameters and all(value in allowed for value, allowed in known)
