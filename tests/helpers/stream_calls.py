@@ -150,6 +150,9 @@ STREAMS_BLOCKING: dict[str, BlockingDo] = {
     "StickStream.set": _blocking_sticks,
     "StickStream.move": _blocking_sticks,
     **{f"External.{kind}": _blocking_supply(kind) for kind in MEASUREMENTS},
+    "Vehicle.land_on": lambda s: s.vehicle.land_on(
+        lambda: TargetMeasurement(0.1, 0.0, 5.0), acquire_timeout=0.2, timeout=0.5
+    ),
     "External.set_wind": lambda s: s.vehicle.external.set_wind(5.0, 270.0),
     "External.set_origin": lambda s: s.vehicle.external.set_origin(s.vehicle.origin.value),
     "MeasurementStream.send": _blocking_supply("odometry"),
