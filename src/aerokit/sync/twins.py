@@ -418,8 +418,9 @@ class SetpointStream(StreamTwin[SetpointT]):
     """Sends the latest set-point at a fixed rate while the ``async with`` block supplies set-points.
 
     Entering the block changes to the set-point mode (GUIDED, OFFBOARD) with the initial set-point. Leaving it in any
-    way makes the vehicle hold. The stream stops by itself for the reasons above, and if the vehicle should move but
-    stays in place for twelve seconds; then ``set`` and leaving the block raise :class:`SetpointStreamStopped`. After a
+    way makes the vehicle hold. The stream stops by itself without a new set-point for ``valid_for_s``, if the event
+    loop is late by ``max_lag_s``, if the vehicle leaves the mode, disarms or falls silent, and if it should move but
+    stays in place for twelve seconds. Then ``set`` and leaving the block raise :class:`SetpointStreamStopped`. After a
     pilot or a failsafe has changed the mode, nothing more is sent to the vehicle.
     """
 
@@ -966,8 +967,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
 
     ``vehicle.gimbal`` is the first one, ``vehicle.gimbals`` has all. An order returns when the gimbal reports the
     ordered direction, and ends when another order is given. The gimbal keeps the direction while the vehicle moves. If
-    the
-    manager requires control, an order outside a block of :meth:`control` claims it until :meth:`release`.
+    the manager requires control, an order outside a block of :meth:`control` claims it until :meth:`release`.
     """
 
     @cached_property
@@ -1014,7 +1014,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
             CommandTimeout: there was no answer.
             GimbalTaken: your program had control and lost it.
             OperationRejected: another order was given meanwhile, or the vehicle rebooted.
-            OperationTimeout: it did not get there in time; the text has the last attitude.
+            OperationTimeout: the gimbal did not reach the direction in time; the text has the last attitude.
             HeartbeatTimeout: the vehicle fell silent.
         """
         self._loop.run(self.aio.look_at, target, wait=wait, tolerance_deg=tolerance_deg, timeout=timeout)
@@ -1044,7 +1044,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
             CommandTimeout: there was no answer.
             GimbalTaken: your program had control and lost it.
             OperationRejected: another order was given meanwhile, or the vehicle rebooted.
-            OperationTimeout: it did not get there in time; the text has the last attitude.
+            OperationTimeout: the gimbal did not reach the direction in time; the text has the last attitude.
             HeartbeatTimeout: the vehicle fell silent.
         """
         self._loop.run(self.aio.look_at_system, system_id, wait=wait, tolerance_deg=tolerance_deg, timeout=timeout)
@@ -1093,7 +1093,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
             CommandTimeout: there was no answer.
             GimbalTaken: your program had control and lost it.
             OperationRejected: another order was given meanwhile, or the vehicle rebooted.
-            OperationTimeout: it did not get there in time; the text has the last attitude.
+            OperationTimeout: the gimbal did not reach the direction in time; the text has the last attitude.
             HeartbeatTimeout: the vehicle fell silent.
         """
         self._loop.run(
@@ -1119,7 +1119,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
             CommandTimeout: there was no answer.
             GimbalTaken: your program had control and lost it.
             OperationRejected: another order was given meanwhile, or the vehicle rebooted.
-            OperationTimeout: it did not get there in time; the text has the last attitude.
+            OperationTimeout: the gimbal did not reach the direction in time; the text has the last attitude.
             HeartbeatTimeout: the vehicle fell silent.
         """
         self._loop.run(self.aio.neutral, wait=wait, timeout=timeout)
@@ -1132,12 +1132,12 @@ class Gimbal(TwinOf["AsyncGimbal"]):
             timeout: seconds to wait.
 
         Raises:
-            NotSupported: its manager accepts the order but does nothing (PX4). Nothing was sent.
+            NotSupported: the manager would accept the order but not execute it (PX4). Nothing was sent.
             CommandRejected: the manager refused.
             CommandTimeout: there was no answer.
             GimbalTaken: your program had control and lost it.
             OperationRejected: another order was given meanwhile, or the vehicle rebooted.
-            OperationTimeout: it did not get there in time; the text has the last attitude.
+            OperationTimeout: the gimbal did not reach the direction in time; the text has the last attitude.
             HeartbeatTimeout: the vehicle fell silent.
         """
         self._loop.run(self.aio.retract, wait=wait, timeout=timeout)
@@ -1253,7 +1253,7 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
 
     @property
     def end(self) -> str:
-        """The reason why none of its commands is sent again, as a clause; empty while they may be."""
+        """Reason why no command of the order is sent again, as a clause; empty while commands may be sent."""
         return self.aio.end
 
     def command(self, command: int, *params: float, component_id: int | None = None) -> None:
@@ -1304,10 +1304,10 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
             component_id: as for :meth:`command`.
 
         Raises:
-            InvalidArgument: the mode is not one of the order's, or the block was left. Nothing was sent.
+            InvalidArgument: the mode is not one of the modes of the order, or the block was left. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement.
-            OperationTimeout: it accepted and stayed in another mode.
+            OperationTimeout: the vehicle accepted the mode but stayed in another one.
         """
         self._loop.run(self.aio.set_mode, mode, timeout=timeout, component_id=component_id)
 
@@ -1693,8 +1693,8 @@ class Parameters(TwinOf["AsyncParameters"]):
         """Read ArduPilot's ``apm.pdef.xml`` or ``apm.pdef.json``, or PX4's ``parameters.xml`` or ``parameters.json``.
 
         Metadata does not restrict writes: a value outside the documented range is set, and its result has a ``note``.
-            Only values that the type cannot represent are refused. Metadata also identifies changes that need a reboot.
-            PX4's has the defaults.
+        Only values that the type cannot represent are refused. Metadata also identifies changes that need a reboot.
+        The metadata of PX4 contains the defaults.
 
         Raises:
             FileFormatError: the file is damaged, or of another kind.
@@ -1953,10 +1953,10 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         Raises:
             InvalidArgument: the plan is invalid, or has a position that is too far away. Nothing was sent.
             MissionRejected: the vehicle refused; see ``item``, ``result`` and ``reasons``.
-            MissionTimeout: it stopped answering; ``missing`` has the items that it did not confirm.
-            VerificationFailed: it confirmed the plan, but has other items.
-            NotSupported: ``"ftp"`` was requested, but it has none.
-            FileError, FileTimeout: the same for a file, with ``"ftp"``.
+            MissionTimeout: the vehicle stopped answering; ``missing`` has the items that it did not confirm.
+            VerificationFailed: the vehicle confirmed the plan, but has different items.
+            NotSupported: ``"ftp"`` was requested, but the vehicle does not support it.
+            FileError, FileTimeout: the vehicle refused or did not answer an operation on a file, with ``"ftp"``.
             OperationTimeout: not done within ``timeout``.
         """
         self._loop.run(
@@ -2003,8 +2003,8 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
             MissionRejected: the vehicle refused.
-            MissionTimeout: it stopped answering.
-            VerificationFailed: it confirmed, but still has items.
+            MissionTimeout: the vehicle stopped answering.
+            VerificationFailed: the vehicle confirmed the command, but still has items.
             OperationTimeout: not done within ``timeout``.
         """
         self._loop.run(self.aio.clear, idle_timeout_s=idle_timeout_s, timeout=timeout)
@@ -2053,9 +2053,9 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
 
         Raises:
             InvalidArgument: there is no such item. Nothing was sent.
-            OperationRejected: it is not armed, or its mode changed meanwhile.
+            OperationRejected: the vehicle is not armed, or its mode changed meanwhile.
             CommandRejected: the vehicle refused: it has no mission, no position, …; see ``reasons``.
-            OperationTimeout: it accepted but stayed in another mode.
+            OperationTimeout: the vehicle accepted the command but stayed in another mode.
             NotSupported: this type of vehicle has no mission mode.
         """
         self._loop.run(self.aio.start, item, timeout=timeout)
@@ -2141,10 +2141,10 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
         Raises:
             InvalidArgument: the plan is invalid, or has a position that is too far away. Nothing was sent.
             MissionRejected: the vehicle refused; see ``item``, ``result`` and ``reasons``.
-            MissionTimeout: it stopped answering; ``missing`` has the items that it did not confirm.
-            VerificationFailed: it confirmed the plan, but has other items.
-            NotSupported: ``"ftp"`` was requested, but it has none.
-            FileError, FileTimeout: the same for a file, with ``"ftp"``.
+            MissionTimeout: the vehicle stopped answering; ``missing`` has the items that it did not confirm.
+            VerificationFailed: the vehicle confirmed the plan, but has different items.
+            NotSupported: ``"ftp"`` was requested, but the vehicle does not support it.
+            FileError, FileTimeout: the vehicle refused or did not answer an operation on a file, with ``"ftp"``.
             OperationTimeout: not done within ``timeout``.
         """
         self._loop.run(
@@ -2191,8 +2191,8 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
             MissionRejected: the vehicle refused.
-            MissionTimeout: it stopped answering.
-            VerificationFailed: it confirmed, but still has items.
+            MissionTimeout: the vehicle stopped answering.
+            VerificationFailed: the vehicle confirmed the command, but still has items.
             OperationTimeout: not done within ``timeout``.
         """
         self._loop.run(self.aio.clear, idle_timeout_s=idle_timeout_s, timeout=timeout)
@@ -2204,7 +2204,7 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
 
         Raises:
             CommandRejected: the vehicle refused; PX4 does not support the command.
-            CommandTimeout: it did not answer.
+            CommandTimeout: the vehicle did not answer.
         """
         self._loop.run(self.aio.enable, on)
 
@@ -2249,10 +2249,10 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
         Raises:
             InvalidArgument: the plan is invalid, or has a position that is too far away. Nothing was sent.
             MissionRejected: the vehicle refused; see ``item``, ``result`` and ``reasons``.
-            MissionTimeout: it stopped answering; ``missing`` has the items that it did not confirm.
-            VerificationFailed: it confirmed the plan, but has other items.
-            NotSupported: ``"ftp"`` was requested, but it has none.
-            FileError, FileTimeout: the same for a file, with ``"ftp"``.
+            MissionTimeout: the vehicle stopped answering; ``missing`` has the items that it did not confirm.
+            VerificationFailed: the vehicle confirmed the plan, but has different items.
+            NotSupported: ``"ftp"`` was requested, but the vehicle does not support it.
+            FileError, FileTimeout: the vehicle refused or did not answer an operation on a file, with ``"ftp"``.
             OperationTimeout: not done within ``timeout``.
         """
         self._loop.run(
@@ -2299,8 +2299,8 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
             MissionRejected: the vehicle refused.
-            MissionTimeout: it stopped answering.
-            VerificationFailed: it confirmed, but still has items.
+            MissionTimeout: the vehicle stopped answering.
+            VerificationFailed: the vehicle confirmed the command, but still has items.
             OperationTimeout: not done within ``timeout``.
         """
         self._loop.run(self.aio.clear, idle_timeout_s=idle_timeout_s, timeout=timeout)
@@ -2370,8 +2370,8 @@ class Camera(TwinOf["AsyncCamera"]):
         Raises:
             NotSupported: the camera has no modes. Nothing was sent.
             CommandRejected: the camera refused: it is busy, or does not support this mode.
-            CommandTimeout: it did not answer.
-            OperationTimeout: it accepted, but reports another mode; or no camera was found.
+            CommandTimeout: the camera did not answer.
+            OperationTimeout: the camera accepted the command but reports another mode, or no camera was found.
         """
         self._loop.run(self.aio.set_mode, mode, timeout=timeout)
 
@@ -2400,7 +2400,7 @@ class Camera(TwinOf["AsyncCamera"]):
         Raises:
             InvalidArgument: ``number`` is out of range. Nothing was sent.
             CommandRejected: the camera refused: it is busy, or there is no such medium.
-            CommandTimeout: it did not answer; it may be formatting.
+            CommandTimeout: the camera did not answer; it may be formatting.
             OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.format_storage, number, timeout=timeout, on_progress=on_progress)
@@ -2410,7 +2410,7 @@ class Camera(TwinOf["AsyncCamera"]):
 
         Raises:
             CommandRejected: the camera refused.
-            CommandTimeout: it did not answer.
+            CommandTimeout: the camera did not answer.
             OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.reset_settings)
@@ -2440,7 +2440,7 @@ class Camera(TwinOf["AsyncCamera"]):
             InvalidArgument: an argument is out of range. Nothing was sent.
             NotSupported: the camera cannot track a point. Nothing was sent.
             CommandRejected: the camera refused.
-            CommandTimeout: it did not answer.
+            CommandTimeout: the camera did not answer.
             OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.track_point, x, y, radius=radius, status_hz=status_hz)
@@ -2459,7 +2459,7 @@ class Camera(TwinOf["AsyncCamera"]):
             InvalidArgument: an argument is out of range, or the rectangle is empty. Nothing was sent.
             NotSupported: the camera cannot track a rectangle. Nothing was sent.
             CommandRejected: the camera refused.
-            CommandTimeout: it did not answer.
+            CommandTimeout: the camera did not answer.
             OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.track_rectangle, left, top, right, bottom, status_hz=status_hz)
@@ -2470,7 +2470,7 @@ class Camera(TwinOf["AsyncCamera"]):
         Raises:
             NotSupported: the camera cannot track. Nothing was sent.
             CommandRejected: the camera refused.
-            CommandTimeout: it did not answer.
+            CommandTimeout: the camera did not answer.
             OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.stop_tracking)
@@ -2487,7 +2487,7 @@ class Camera(TwinOf["AsyncCamera"]):
             InvalidArgument: ``steps`` is out of range. Nothing was sent.
             NotSupported: the camera has no zoom. Nothing was sent.
             CommandRejected: the camera refused.
-            CommandTimeout: it did not answer; it may have zoomed.
+            CommandTimeout: the camera did not answer; it may have zoomed.
             OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.zoom_step, steps)
@@ -2525,7 +2525,7 @@ class Camera(TwinOf["AsyncCamera"]):
             InvalidArgument: ``steps`` is out of range. Nothing was sent.
             NotSupported: the camera cannot be focused. Nothing was sent.
             CommandRejected: the camera refused.
-            CommandTimeout: it did not answer; it may have moved.
+            CommandTimeout: the camera did not answer; it may have moved.
             OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.focus_step, steps)
@@ -2544,7 +2544,7 @@ class Camera(TwinOf["AsyncCamera"]):
         Raises:
             NotSupported: the camera cannot be focused. Nothing was sent.
             CommandRejected: the camera refused.
-            CommandTimeout: it did not answer.
+            CommandTimeout: the camera did not answer.
             OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.auto_focus, kind)
@@ -2592,8 +2592,8 @@ class Camera(TwinOf["AsyncCamera"]):
             InvalidArgument: ``status_hz`` is out of range. Nothing was sent.
             NotSupported: the camera records no video. Nothing was sent.
             CommandRejected: the camera refused: it is busy, or in the wrong mode.
-            CommandTimeout: it did not answer; it may be recording.
-            OperationTimeout: it accepted but does not record, or no camera was found.
+            CommandTimeout: the camera did not answer; it may be recording.
+            OperationTimeout: the camera accepted the command but does not record, or no camera was found.
         """
         self._loop.run(self.aio.start_video, status_hz=status_hz, timeout=timeout)
 
@@ -2603,8 +2603,8 @@ class Camera(TwinOf["AsyncCamera"]):
         Raises:
             NotSupported: the camera records no video. Nothing was sent.
             CommandRejected: the camera refused.
-            CommandTimeout: it did not answer.
-            OperationTimeout: it accepted but still records, or no camera was found.
+            CommandTimeout: the camera did not answer.
+            OperationTimeout: the camera accepted the command but still records, or no camera was found.
         """
         self._loop.run(self.aio.stop_video, timeout=timeout)
 
@@ -2637,7 +2637,7 @@ class Camera(TwinOf["AsyncCamera"]):
             InvalidArgument: the number is out of range. Nothing was sent.
             NotSupported: the camera has no streams. Nothing was sent.
             CommandRejected: the camera refused, or has no such stream.
-            CommandTimeout: it did not answer.
+            CommandTimeout: the camera did not answer.
             OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.start_streaming, stream)
@@ -2663,7 +2663,7 @@ class Camera(TwinOf["AsyncCamera"]):
 
         Raises:
             CommandRejected: the camera refused, or has no such sensor.
-            CommandTimeout: it did not answer.
+            CommandTimeout: the camera did not answer.
             OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.select_source, primary, secondary)
@@ -2706,9 +2706,9 @@ class Camera(TwinOf["AsyncCamera"]):
         Raises:
             NotSupported: the camera takes no pictures. Nothing was sent.
             CommandRejected: the camera refused: it is busy, or in the wrong mode.
-            CommandTimeout: it did not answer; it may have taken the picture.
-            OperationRejected: it failed to take the picture.
-            OperationTimeout: it reported no picture, or no camera was found.
+            CommandTimeout: the camera did not answer; it may have taken the picture.
+            OperationRejected: the camera failed to take the picture.
+            OperationTimeout: the camera reported no picture, or no camera was found.
         """
         return self._loop.run(self.aio.take_photo, timeout=timeout)
 
@@ -2826,7 +2826,7 @@ class Settings(TwinOf["AsyncSettings"]):
 
         Raises:
             NotSupported: the camera names no definition file.
-            CommandRejected, OperationTimeout: it did not send CAMERA_INFORMATION.
+            CommandRejected, OperationTimeout: the camera did not send CAMERA_INFORMATION.
             InvalidArgument: the address has another scheme.
             FileFormatError: the file is invalid, or has more than 16 MB.
             FileError, FileTimeout, RemoteProtocolError: as for :meth:`aerokit.vehicle.files.files.Files.read`.
@@ -2945,8 +2945,8 @@ class Component(TwinOf["AsyncComponent"]):
         """Request identity and capabilities of the component (COMPONENT_INFORMATION_BASIC).
 
         Raises:
-            CommandRejected: it does not support the message.
-            OperationTimeout: it did not answer within ``timeout`` seconds.
+            CommandRejected: the component does not support the message.
+            OperationTimeout: the component did not answer within ``timeout`` seconds.
         """
         return self._loop.run(self.aio.information, timeout=timeout)
 
@@ -2959,9 +2959,9 @@ class Component(TwinOf["AsyncComponent"]):
             timeout: seconds to wait for the address of the file.
 
         Raises:
-            NotSupported: it has no such file, or the file is not on the vehicle.
+            NotSupported: the component has no such file, or the file is not on the vehicle.
             FileFormatError: the file is damaged.
-            FileError, FileTimeout: it cannot be read.
+            FileError, FileTimeout: the file cannot be read.
         """
         return self._loop.run(self.aio.metadata, kind, timeout=timeout)
 
@@ -3016,7 +3016,7 @@ class Component(TwinOf["AsyncComponent"]):
             where: predicate to select one of several messages.
 
         Raises:
-            CommandRejected: it refused.
+            CommandRejected: the component refused.
             OperationTimeout: the message did not arrive.
         """
         return self._loop.run(self.aio.request, message_type, *params, timeout=timeout, where=where)
@@ -3501,7 +3501,7 @@ class Vehicle(VehicleTwin):
             InvalidArgument: this vehicle has no such mode; the text lists its modes. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             OperationRejected: a pilot or a failsafe has chosen another mode meanwhile.
-            OperationTimeout: it accepted and stayed in another mode, or did not acknowledge.
+            OperationTimeout: the vehicle did not acknowledge, or accepted the mode but stayed in another one.
         """
         self._loop.run(self.aio.set_mode, mode, timeout=timeout)
 
@@ -3514,7 +3514,7 @@ class Vehicle(VehicleTwin):
             NotSupported: this vehicle has no mode for it. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             OperationRejected: a pilot or a failsafe has chosen another mode meanwhile.
-            OperationTimeout: it accepted and stayed in another mode, or did not acknowledge.
+            OperationTimeout: the vehicle did not acknowledge, or accepted the mode but stayed in another one.
         """
         self._loop.run(self.aio.hold)
 
@@ -3597,10 +3597,10 @@ class Vehicle(VehicleTwin):
                 estimates. Where the vehicle can run its checks on request, they are run again for this.
             CommandTimeout: there was no acknowledgement, and the vehicle did not arm; the text says whether it may
                 still arm.
-            OperationRejected: it is armed already in a mode other than ``mode`` (nothing was sent), or another party
-                disarmed it or changed its mode meanwhile.
+            OperationRejected: the vehicle is armed already in a mode other than ``mode`` (nothing was sent), or another
+                party disarmed it or changed its mode meanwhile.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
-            OperationTimeout: it accepted the command and did not arm.
+            OperationTimeout: the vehicle accepted the command but did not arm.
         """
         self._loop.run(self.aio.arm, mode=mode, force=force, timeout=timeout, max_silence_s=max_silence_s)
 
@@ -3622,7 +3622,7 @@ class Vehicle(VehicleTwin):
             CommandRejected: the vehicle refused, usually because it is flying.
             CommandTimeout: there was no acknowledgement.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
-            OperationTimeout: it accepted the command and did not disarm.
+            OperationTimeout: the vehicle accepted the command but did not disarm.
         """
         self._loop.run(self.aio.disarm, force=force, timeout=timeout, max_silence_s=max_silence_s)
 
@@ -3634,11 +3634,11 @@ class Vehicle(VehicleTwin):
             timeout: seconds until the vehicle has restarted.
 
         Raises:
-            OperationRejected: it is armed, or not known to be disarmed. Nothing was sent.
-            CommandRejected: it refused.
+            OperationRejected: the vehicle is armed, or not known to be disarmed. Nothing was sent.
+            CommandRejected: the vehicle refused.
             CommandTimeout: there was no acknowledgement, and it did not reboot.
             LinkLost: the link went down with the vehicle (USB, TCP); connect again.
-            OperationTimeout: it did not restart in time.
+            OperationTimeout: the vehicle did not restart in time.
         """
         self._loop.run(self.aio.reboot, force=force, timeout=timeout)
 
@@ -3703,7 +3703,7 @@ class Vehicle(VehicleTwin):
             OperationRejected: the mode changed (a pilot, a failsafe) or the vehicle disarmed on the way.
             CommandTimeout: there was no acknowledgement.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
-            OperationTimeout: it did not arrive in time, or does not move.
+            OperationTimeout: the vehicle did not arrive in time, or does not move.
         """
         self._loop.run(
             self.aio.go_to,
@@ -3739,8 +3739,8 @@ class Vehicle(VehicleTwin):
     ) -> None:
         """Turn on the spot and return when the vehicle has this heading.
 
-        ArduPilot: changes to GUIDED and sends MAV_CMD_CONDITION_YAW. PX4 has no such command: the vehicle stops and
-            turns by MAV_CMD_DO_REPOSITION.
+        An ArduPilot vehicle changes to GUIDED and gets MAV_CMD_CONDITION_YAW. PX4 does not support this command, so the
+        vehicle stops and turns by MAV_CMD_DO_REPOSITION.
 
         Args:
             heading_deg: −360 to 360, clockwise from north; with ``relative`` an angle to turn by, negative to the
@@ -3756,7 +3756,7 @@ class Vehicle(VehicleTwin):
             CommandRejected: the vehicle refused.
             OperationRejected: the mode changed or it disarmed meanwhile.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
-            OperationTimeout: it did not reach the heading in time.
+            OperationTimeout: the vehicle did not reach the heading in time.
         """
         self._loop.run(
             self.aio.set_heading,
@@ -3783,7 +3783,7 @@ class Vehicle(VehicleTwin):
             InvalidArgument: the place has no altitude above mean sea level. Nothing was sent.
             CommandRejected: the vehicle refused: it has no position, or the place is invalid.
             CommandTimeout: there was no acknowledgement.
-            OperationTimeout: it accepted, and HOME_POSITION did not report it.
+            OperationTimeout: the vehicle accepted the command, but HOME_POSITION does not report the new place.
         """
         self._loop.run(self.aio.set_home, place, timeout=timeout)
 
@@ -3814,11 +3814,11 @@ class Vehicle(VehicleTwin):
         Raises:
             InvalidArgument: the altitude is out of range. Nothing was sent.
             NotSupported: this type of vehicle cannot take off.
-            OperationRejected: it is not armed or is flying already, or its mode changed or it disarmed meanwhile.
+            OperationRejected: the vehicle is not armed, is flying already, or changed its mode or disarmed meanwhile.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
-            OperationTimeout: it did not reach the altitude in time, or does not move.
+            OperationTimeout: the vehicle did not reach the altitude in time, or does not move.
             ValueUnknownError: home is not known, and PX4 needs its altitude.
         """
         self._loop.run(self.aio.take_off, altitude_m, timeout=timeout, max_silence_s=max_silence_s)
@@ -3838,7 +3838,7 @@ class Vehicle(VehicleTwin):
             CommandTimeout: there was no acknowledgement.
             OperationRejected: the mode changed meanwhile.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
-            OperationTimeout: it was not on the ground in time.
+            OperationTimeout: the vehicle was not on the ground in time.
         """
         self._loop.run(self.aio.land, timeout=timeout, max_silence_s=max_silence_s)
 

@@ -67,7 +67,7 @@ class ZenohListen(NetworkLink):
         self._freshness = FreshnessChecker(random.getrandbits(32))
         self._lease = ControlLease()
         self._clients: dict[Peer, ClientFilter] = {}
-        self._refused = 0  # of former clients
+        self._refused = 0  # number of refused messages of former clients
         self._zenoh: Any = None
         self._publisher: Any = None
         self._has_others = self._is_serving = False
@@ -133,7 +133,9 @@ class ZenohListen(NetworkLink):
 
         self._zenoh = zenoh
         self._declared = [session.declare_subscriber(self._keys.beacon, on_beacon)]
-        self._has_others = any(True for _ in session.liveliness().get(self._keys.alive(), timeout=_RIVAL_QUERY_TIMEOUT_S))
+        self._has_others = any(
+            True for _ in session.liveliness().get(self._keys.alive(), timeout=_RIVAL_QUERY_TIMEOUT_S)
+        )
 
     def _serve(self, queue: LoopQueue[Callable[[], object]]) -> None:
         zenoh, session, keys = self._zenoh, self._session, self._keys

@@ -216,7 +216,7 @@ class SteeringStream(ValueStream[ValueT]):
         order.may_move = order.may_move or self._session.telemetry.is_in(mode)
         try:
             await self._enter(mode, order)
-        except OperationRejected:  # The pilot or failsafe that took over keeps the vehicle.
+        except OperationRejected:  # The pilot or failsafe that took over keeps control.
             self._end()
             self._release()
             raise
