@@ -6,6 +6,7 @@ Left stick: throttle and yaw; right stick: forward and right. Release all sticks
 Button 1 (B) ends the flight: the vehicle holds, the sticks are released, and it lands.
 """
 
+# pyright: reportMissingImports=false
 from __future__ import annotations
 
 import asyncio

@@ -34,7 +34,7 @@ async def up(vehicle: Vehicle, choice: Choice) -> None:
     await vehicle.take_off(ALTITUDE_M, timeout=choice.seconds(120))
 
 
-def limits(choice: Choice) -> dict[str, float]:
+def limits(choice: Choice) -> dict[str, Any]:
     """Return limits of a stream for a busy machine."""
     return {} if choice.is_virtual else {"valid_for_s": 3.0, "max_lag_s": 3.0}
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Generic, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, NoReturn, TypeAlias, TypeVar
 
 from aerokit._internal.async_block import ReadOnly
 from aerokit.errors import ConnectionClosed
@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from aerokit.vehicle.parameters.transaction import TemporaryParameters, Transaction
     from aerokit.vehicle.parameters.writing import ParameterWrite
     from aerokit.vehicle.vehicle import Vehicle
+
+    Stream: TypeAlias = MeasurementStream[Any] | SetpointStream[Any] | StickStream
 
 
 class BlockingContext:
@@ -80,11 +82,7 @@ T = TypeVar("T")
 
 EnteredT = TypeVar("EnteredT")
 
-BlockT = TypeVar(
-    "BlockT",
-    bound="CameraBlock | Following | GimbalControl | GimbalRates | MeasurementStream[Any] | PhotoInterval"
-    " | SetpointStream[Any] | StickStream",
-)
+BlockT = TypeVar("BlockT", bound="CameraBlock | Following | GimbalControl | GimbalRates | PhotoInterval | Stream")
 
 ShieldedT = TypeVar("ShieldedT", bound="TemporaryParameters | Transaction")
 

@@ -25,8 +25,8 @@ __all__ = ["StickInput", "StickStream"]
 
 # An axis without a value: ArduPilot releases its channel (GCS_Common.cpp, manual_override).
 NO_VALUE = 0x7FFF
-# RC_CHANNELS_OVERRIDE: release a channel, or leave it as it is.
-RELEASED, UNCHANGED = 0, 0xFFFF
+# RC_CHANNELS_OVERRIDE: release a channel (1 to 8, and 9 to 18), or leave it as it is.
+RELEASED, RELEASED_UPPER, UNCHANGED = 0, 0xFFFE, 0xFFFF
 # Channels that MANUAL_CONTROL overrides on ArduSub, from 1 (joystick.cpp).
 SUB_CHANNELS = 11
 MAX_BUTTONS = 0xFFFF
@@ -165,10 +165,10 @@ class StickStream(SteeringStream[StickInput]):
         self._has_sent = False
         message: Message | None = None
         if self._rules.release == "axes":
-            message = ManualControl(self._session.system_id, *(NO_VALUE,) * 4, 0)
+            message = ManualControl(self._session.system_id, NO_VALUE, NO_VALUE, NO_VALUE, NO_VALUE, 0)
         elif self._rules.release == "channels":
-            channels = ((RELEASED,) * 8, (UNCHANGED - 1,) * (SUB_CHANNELS - 8), (UNCHANGED,) * (18 - SUB_CHANNELS))
-            values = (value for part in channels for value in part)
+            upper = SUB_CHANNELS - 8
+            values = [RELEASED] * 8 + [RELEASED_UPPER] * upper + [UNCHANGED] * (10 - upper)
             message = RcChannelsOverride(self._session.system_id, self._session.component_id, *values)
         if message is not None:
             with contextlib.suppress(AerokitError):  # The overrides expire by themselves.

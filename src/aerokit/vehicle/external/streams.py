@@ -96,7 +96,8 @@ class MeasurementStream(Generic[MeasurementT]):
     ) -> None:
         check_range("rate_hz", rate_hz, 0, MAX_RATE_HZ, above=True)
         check_range("valid_for_s", valid_for_s, 0, 60, above=True)
-        self._session, self._kind, self._value_type, self._encode = session, kind, value_type, encode
+        self._session, self._value_type, self._encode = session, value_type, encode
+        self._kind: ExternalKind = kind
         self._answers, self._probe = answers, probe
         self._period_s, self._valid_for_s = 1 / rate_hz, valid_for_s
         self._parameters: dict[str, float] = {}
