@@ -11,6 +11,7 @@ from call_stage import Stage
 from call_table import CALLS, KEY
 from camera_calls import BLOCKING
 from component_calls import COMPONENTS_BLOCKING
+from device_calls import BLOCKING_DEVICES
 from stream_calls import STREAMS_BLOCKING
 
 import aerokit.sync
@@ -55,6 +56,10 @@ CLASSES: tuple[type, ...] = (
     twins.RallyControl,
     twins.Files,
     twins.Logs,
+    twins.Actuators,
+    twins.Gripper,
+    twins.Winch,
+    twins.Shell,
     twins.StateCell,
     twins.Subscription,
     twins.Connection,
@@ -271,4 +276,4 @@ WRITTEN: dict[str, Do] = {
 def blocking_calls() -> dict[str, Do]:
     """Return the calls by name; coroutine functions of the other table have no twin."""
     shared = {name: call.do for name, call in CALLS.items() if not inspect.iscoroutinefunction(call.do)}
-    return {**shared, **WRITTEN, **BLOCKING, **COMPONENTS_BLOCKING, **STREAMS_BLOCKING}
+    return {**shared, **WRITTEN, **BLOCKING, **COMPONENTS_BLOCKING, **BLOCKING_DEVICES, **STREAMS_BLOCKING}

@@ -116,6 +116,12 @@ for _literal in (
     "LogMethod",
     "Overflow",
     "Subject",
+    "SpinIntent",
+    "ReleaseIntent",
+    "FailureIntent",
+    "FailingUnit",
+    "FailureKind",
+    "Severity",
 ):
     WRONG[_literal] = (*STRANGE, *NUMBER, "quick")
 
@@ -150,6 +156,11 @@ RIGHT: dict[str, object] = {
     "PlanT": Mission(),
     "SourceName": "rgb",
     "ModeName": "photo",
+    "SpinIntent": "spin motor",
+    "ReleaseIntent": "release parachute",
+    "FailureIntent": "inject failure",
+    "FailingUnit": "gps",
+    "FailureKind": "off",
     "SetpointT": VelocitySetpoint(),
     "PositionSetpoint": PositionSetpoint(PLACE),
     "LocalPositionSetpoint": LocalPositionSetpoint(0, 0, -5),

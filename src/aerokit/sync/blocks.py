@@ -27,7 +27,9 @@ if TYPE_CHECKING:
     from aerokit.vehicle.camera.photos import PhotoInterval
     from aerokit.vehicle.commanding.guided import SetpointStream
     from aerokit.vehicle.commanding.sticks import StickStream
+    from aerokit.vehicle.devices.shell import Shell
     from aerokit.vehicle.external.streams import MeasurementStream
+    from aerokit.vehicle.files.log_stream import LogStream
     from aerokit.vehicle.gimbal.control import GimbalControl
     from aerokit.vehicle.gimbal.gimbal import Gimbals  # noqa: F401
     from aerokit.vehicle.gimbal.rates import GimbalRates
@@ -82,7 +84,9 @@ T = TypeVar("T")
 
 EnteredT = TypeVar("EnteredT")
 
-BlockT = TypeVar("BlockT", bound="CameraBlock | Following | GimbalControl | GimbalRates | PhotoInterval | Stream")
+BlockT = TypeVar(
+    "BlockT", bound="CameraBlock | Following | GimbalControl | GimbalRates | LogStream | PhotoInterval | Shell | Stream"
+)
 
 ShieldedT = TypeVar("ShieldedT", bound="TemporaryParameters | Transaction")
 
@@ -226,6 +230,16 @@ class PhotoIntervalTwin(BlockTwin["PhotoInterval"]):
         return self
 
     def __next__(self) -> Capture:
+        return _next_of(self._loop, self.aio)
+
+
+class LogStreamTwin(BlockTwin["LogStream"]):
+    """A flight log while PX4 writes it; an iterator over its bytes."""
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> bytes:
         return _next_of(self._loop, self.aio)
 
 

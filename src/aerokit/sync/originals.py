@@ -87,7 +87,12 @@ TWINS = (
     Twin("aerokit.vehicle.gimbal.gimbal.Gimbals", "GimbalsTwin", called=_names("ids"), parameter='"Gimbal"'),
     Twin("aerokit.vehicle.commanding.posted.PostedOrder"),
     Twin("aerokit.vehicle.files.files.Files"),
+    Twin("aerokit.vehicle.files.log_stream.LogStream", "LogStreamTwin"),
     Twin("aerokit.vehicle.files.logs.Logs"),
+    Twin("aerokit.vehicle.devices.actuators.Actuators"),
+    Twin("aerokit.vehicle.devices.gripper.Gripper"),
+    Twin("aerokit.vehicle.devices.winch.Winch"),
+    Twin("aerokit.vehicle.devices.shell.Shell", "BlockTwin"),
     Twin("aerokit.vehicle.parameters.transaction.TemporaryParameters", "TemporarilyTwin"),
     Twin("aerokit.vehicle.parameters.transaction.Transaction", "TransactionTwin"),
     Twin("aerokit.vehicle.parameters.parameters.Parameters", direct=_names("load_metadata known")),
@@ -105,7 +110,8 @@ TWINS = (
         without=_names("telemetry"),
         direct=_names("distance_to describe_now"),
         parts=_names(
-            "camera cameras components external guided gimbal gimbals files logs parameters mission fence rally"
+            "actuators camera cameras components external guided gimbal gimbals files logs parameters mission fence"
+            " rally"
         ),
     ),
     Twin("aerokit.fleets.formation.Following", "BlockTwin", direct=_names("error_m"), page="fleet_twins"),

@@ -13,6 +13,7 @@ from aerokit.vehicle.commanding.flight import FlightActions, ModeActions
 from aerokit.vehicle.commanding.messaging import MessagingActions
 from aerokit.vehicle.commanding.progress import MAX_SILENCE_S
 from aerokit.vehicle.commanding.travel import LookActions, TravelActions
+from aerokit.vehicle.devices.actions import DeviceActions
 from aerokit.vehicle.missions.context import PlanContext
 from aerokit.vehicle.state.field import MESSAGE_IDS
 
@@ -45,7 +46,16 @@ PICTURE_MESSAGE_IDS = tuple(MESSAGE_IDS[name] for name in ("CameraImageCaptured"
 
 
 @checks_arguments
-class Vehicle(ReadOnly, FlightActions, TravelActions, LookActions, ArmingActions, ModeActions, MessagingActions):
+class Vehicle(
+    ReadOnly,
+    FlightActions,
+    TravelActions,
+    LookActions,
+    ArmingActions,
+    ModeActions,
+    MessagingActions,
+    DeviceActions,
+):
     """One remote vehicle. Coroutines send commands to it; properties only read. Every call can be cancelled.
 
     Create it with :func:`aerokit.connect`. State is held in cells (``vehicle.position.value``, ``.age``,
@@ -127,7 +137,7 @@ class Vehicle(ReadOnly, FlightActions, TravelActions, LookActions, ArmingActions
 
     @cached_property
     def guided(self) -> Guided:
-        """Set-point streams: velocity, position, acceleration, attitude."""
+        """Set-point streams: velocity, position, acceleration, attitude, body rates, trajectory, actuators."""
         from aerokit.vehicle.commanding.guided import Guided
 
         return Guided(self._context)
@@ -232,7 +242,7 @@ class Vehicle(ReadOnly, FlightActions, TravelActions, LookActions, ArmingActions
         """The vehicle's flight logs."""
         from aerokit.vehicle.files.logs import Logs
 
-        return Logs(self._session.transfers, self.files)
+        return Logs(self._session.transfers, self.files, self._context)
 
     @cached_property
     def parameters(self) -> Parameters:
@@ -268,10 +278,9 @@ class Vehicle(ReadOnly, FlightActions, TravelActions, LookActions, ArmingActions
     async def setup_signing(self, signing: Signing | None, *, timeout: float = 5.0) -> None:
         """Install a signing key on the vehicle and sign all traffic with it from then on; None removes the key.
 
-        **The key is sent unencrypted**: do this over a cable or a private link. Returns when the vehicle's frames
-        active. Every other vehicle on this connection needs the key too, or ``signing.allow_unsigned``. The vehicle may
-        accept the key even if the call is cancelled. See docs/signing.md.
-        cancellation the vehicle may have accepted the key nevertheless. See docs/signing.md.
+        **The key is sent unencrypted**: do this over a cable or a private link. Returns when the vehicle's frames are
+        signed with the key. Every other vehicle on this connection needs the key too, or ``signing.allow_unsigned``.
+        After a cancellation the vehicle may have accepted the key nevertheless. See docs/signing.md.
 
         Args:
             signing: the key, as for ``connect(signing=…)``.
