@@ -137,6 +137,18 @@ async def test_sticks_refused_by_parameter_raise(changed: dict[str, float], reas
             pass  # the place is free again
 
 
+async def test_pilot_while_parameters_are_read_keeps_vehicle() -> None:
+    async with in_the_air() as flight:
+        flight.copter.faults.drop_incoming = 6
+        flight.wire.clear()
+        flight.pilot_takes_over(CopterMode.ALT_HOLD)
+        with pytest.raises(OperationRejected, match="from GUIDED to ALT_HOLD before anything was ordered"):
+            async with flight.vehicle.sticks():
+                raise AssertionError("entered")
+        assert not flight.wire.mode_orders()
+        assert not flight.wire.all(m.ManualControl)
+
+
 @pytest.mark.parametrize("source", [0.0, 4.0])
 async def test_px4_ignoring_mavlink_sticks_raises(source: float) -> None:
     async with open_px4() as flight:

@@ -164,6 +164,19 @@ async def test_pilot_ends_precision_landing() -> None:
         assert not flight.wire.all(m.LandingTarget)
 
 
+async def test_pilot_before_first_sight_keeps_vehicle() -> None:
+    """The landing is ordered when the target is seen, but not against a pilot who has taken over meanwhile."""
+    simulated = copter()
+    async with open_flight(simulated) as flight:
+        await flight.take_off()
+        see = camera(simulated.motion, blind=lambda: flight.vehicle.mode_name == "GUIDED")
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(take_over_after, flight, 3.0)
+            with pytest.raises(OperationRejected, match="from GUIDED to LOITER before anything was ordered"):
+                await flight.vehicle.land_on(see)
+        assert not flight.wire.mode_orders()
+
+
 async def take_over_after(flight: Flight, seconds: float) -> None:
     await anyio.sleep(seconds)
     flight.pilot_takes_over(CopterMode.LOITER)

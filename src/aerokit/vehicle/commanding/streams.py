@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     Probe = Callable[..., Awaitable[Mapping[str, object]]]
     """``Parameters.probe``, which is in a room above this one."""
 
-__all__ = ["MAX_RATE_HZ", "StallWatch", "SteeringStream", "ValueStream", "known_values"]
+__all__ = ["MAX_RATE_HZ", "StallWatch", "SteeringStream", "TakeoverCheck", "ValueStream", "known_values"]
 
 ValueT = TypeVar("ValueT")
 
@@ -207,8 +207,10 @@ class SteeringStream(ValueStream[ValueT]):
         mode = self._wanted_mode()
         self._was_entered = True
         cleanup.stop_stream = self._stop
+        check = TakeoverCheck(self._context, mode)
         try:
             await self._check_support()
+            check.raise_if_changed(self._NAME)
         except BaseException:
             self._end()
             raise
@@ -294,6 +296,24 @@ class SteeringStream(ValueStream[ValueT]):
         super()._end()
         if self._context.flight_cleanup.stop_stream == self._stop:
             self._context.flight_cleanup.stop_stream = None
+
+
+class TakeoverCheck:
+    """Refuses to order a mode if another party has changed the mode since an earlier moment of the same call."""
+
+    def __init__(self, context: VehicleContext, wanted: Mode) -> None:
+        session = context.session
+        self._telemetry, self._wanted = session.telemetry, wanted
+        self._before = session.telemetry.mode.latest
+        is_vtol = session.telemetry.is_vtol
+        self._take_off, self._hold = (session.autopilot.mode_for(p, is_vtol=is_vtol) for p in ("take_off", "hold"))
+
+    def raise_if_changed(self, what: str) -> None:
+        """Raise OperationRejected if the mode has changed, except by the end of a take-off."""
+        before, mode = self._before, self._telemetry.mode.latest
+        if before is None or mode in (before, self._wanted) or (before, mode) == (self._take_off, self._hold):
+            return
+        raise OperationRejected(f"{what}: the mode changed from {before} to {mode} before anything was ordered")
 
 
 async def known_values(probe: Probe, *names: str) -> dict[str, float]:

@@ -16,6 +16,7 @@ from aerokit._internal.values import Snapshot
 from aerokit.errors import OperationTimeout, ValueUnknownError
 from aerokit.mavlink.messages import Attitude, LocalPositionNed
 from aerokit.vehicle.commanding.progress import await_progress
+from aerokit.vehicle.commanding.streams import TakeoverCheck
 from aerokit.vehicle.external.values import TargetMeasurement
 
 if TYPE_CHECKING:
@@ -135,12 +136,14 @@ async def land_on(
     check_range("acquire_timeout", acquire_timeout, 0, 3600, above=True)
     session = context.session
     mode = context.sender.mode_for("land_on", "precision_land")
+    check = TakeoverCheck(context, mode)
     async with external.landing_target(rate_hz=rate_hz) as stream:
         tracker = TargetTracker(context, stream, 1 / rate_hz)
         reader = asyncio.get_running_loop().create_task(tracker.run(target))
         with _positions(context, rate_hz), session.streaming("position", "landed_state"):
             try:
                 await _acquire(tracker, reader, acquire_timeout)
+                check.raise_if_changed("land_on")
                 sent_before = stream.sent
                 order = context.arbiter.order(mode)
                 await context.sender.change_mode(mode, order, reported_since=order.given_at)
