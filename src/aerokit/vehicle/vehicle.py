@@ -195,7 +195,7 @@ class Vehicle(
 
         Args:
             target: a function, also a coroutine function, that returns a
-                :class:`~aerokit.vehicle.external.values.TargetMeasurement`, or None while the target is not visible;
+                :class:`aerokit.TargetMeasurement`, or None while the target is not visible;
                 or an asynchronous iterable of them.
             rate_hz: rate at which the function is called, and the highest rate of LANDING_TARGET.
             acquire_timeout: seconds until the target must be seen first; the landing is ordered after that.
