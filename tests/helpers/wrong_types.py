@@ -103,6 +103,7 @@ _SETPOINTS = (
 )
 for _value in (*(f"{kind}Setpoint" for kind in _SETPOINTS), "StickInput"):
     WRONG[_value] = (*NOTHING, *STRANGE, *TEXT, *NUMBER, PLACE)
+WRONG["TargetSource"] = (*NOTHING, [PLACE], (47.0, 8.0), {"a": "b"}, 1j, *TEXT, *NUMBER, PLACE)
 WRONG["StickInput | None"] = (*STRANGE, *TEXT, *NUMBER, PLACE)
 WRONG["CacheChoice"] = (*NOTHING, *STRANGE, *NUMBER)
 WRONG["Capture"] = (*NOTHING, *STRANGE, *TEXT, *NUMBER)
@@ -167,6 +168,7 @@ RIGHT: dict[str, object] = {
     "TrajectorySetpoint": TrajectorySetpoint(0, 0, -5),
     "ActuatorSetpoint": ActuatorSetpoint((0.0,) * 8),
     "StickInput": StickInput(),
+    "TargetSource": lambda: None,
     "AttitudeSetpoint": AttitudeSetpoint(0, 0, 0, thrust=0.5),
 }
 """Maps an annotation to a valid value, for required parameters in a call whose wrong value is another parameter."""
