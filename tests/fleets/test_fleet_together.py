@@ -430,6 +430,8 @@ async def test_px4_fleet_flies_and_detects_pilot() -> None:
         for order in (both.wait_ready(), both.arm(), both.take_off(10)):
             (await order).raise_for_errors()
         (await both.go_to(lambda member: member.vehicle.position.value.offset(north_m=20))).raise_for_errors()
+        homes = {name: member.vehicle.home.value for name, member in both.members.items()}
+        (await both.go_to(homes)).raise_for_errors()
         line = Formation.line(["south/2"], 10.0, frame="north")
         async with both.following(line, leader="south/1") as following:
             await anyio.sleep(20)

@@ -75,7 +75,7 @@ if TYPE_CHECKING:
         Setting,
         SettingValue,
     )
-    from aerokit.position import Position
+    from aerokit.position import Home, Position
     from aerokit.protocols.exchange import OnProgress
     from aerokit.transport.link import Link
     from aerokit.transport.sockets import PeerFilter
@@ -166,7 +166,7 @@ if TYPE_CHECKING:
         RawImu,
         WinchStatus,
     )
-    from aerokit.vehicle.state.movement import Attitude, Home, LocalPosition, Velocity, Wind
+    from aerokit.vehicle.state.movement import Attitude, LocalPosition, Velocity, Wind
 
 __all__ = [
     "Actuators",
@@ -1013,7 +1013,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
 
     def look_at(
         self,
-        target: Position,
+        target: Position | Home,
         *,
         wait: bool = True,
         tolerance_deg: float = 5.0,
@@ -4197,7 +4197,7 @@ class Vehicle(VehicleTwin):
         """
         self._loop.run(self.aio.reboot, force=force, timeout=timeout)
 
-    def look_at(self, target: Position) -> None:
+    def look_at(self, target: Position | Home) -> None:
         """Point nose or gimbal at a place until :meth:`stop_looking`; without an altitude, at the vehicle's altitude.
 
         Sends MAV_CMD_DO_SET_ROI_LOCATION (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_ROI_LOCATION), or
@@ -4223,7 +4223,7 @@ class Vehicle(VehicleTwin):
 
     def go_to(
         self,
-        target: Position,
+        target: Position | Home,
         *,
         speed_m_s: float | None = None,
         heading_deg: float | None = None,
@@ -4242,7 +4242,7 @@ class Vehicle(VehicleTwin):
 
         Args:
             target: latitude and longitude, and an altitude above home or above mean sea level; without an altitude
-                the present one is kept.
+                the present one is kept, also for ``vehicle.home.value``.
             speed_m_s: ground speed from now on, above 0; None keeps the present one.
             heading_deg: heading on arrival, 0–360 clockwise from north; None leaves it to the autopilot.
             tolerance_m: arrival radius in metres; None: the default of the type of vehicle.
@@ -4323,7 +4323,7 @@ class Vehicle(VehicleTwin):
             max_silence_s=max_silence_s,
         )
 
-    def set_home(self, place: Position | None = None, *, timeout: float = 5.0) -> None:
+    def set_home(self, place: Position | Home | None = None, *, timeout: float = 5.0) -> None:
         """Move the home position, to a place or to the vehicle's present position, and wait until HOME_POSITION
         reports it.
 
@@ -4342,7 +4342,7 @@ class Vehicle(VehicleTwin):
         """
         self._loop.run(self.aio.set_home, place, timeout=timeout)
 
-    def distance_to(self, target: Position) -> float:
+    def distance_to(self, target: Position | Home) -> float:
         """Return the distance to ``target`` in metres, three-dimensional if ``target`` has an altitude.
 
         Infinite while the position is unknown.

@@ -17,6 +17,7 @@ from aerokit.sim import SimulatedCamera, SimulatedCopter, SimulatedGimbal
 SEEN: set[str] = set()
 TESTED_ELSEWHERE = {
     "conversion",
+    "report",
     "serving",
     "bridging",
     "publishing",
@@ -117,9 +118,9 @@ def test_json_of_demo_matches_documentation(capsys: pytest.CaptureFixture[str]) 
 
 def test_json_of_sim_matches_documentation(capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["sim", "tcpin:127.0.0.1:0", "--duration", "1", "--speedup", "20", "--picture", "track.svg"]
-    assert main([*arguments, "--json"]) == 0
+    assert main([*arguments, "--fault", "gps_lost@0.5", "--json"]) == 0
     printed = records(capsys.readouterr().out)
-    assert [each["type"] for each in printed] == ["simulated", "stopped", "saved"]
+    assert [each["type"] for each in printed] == ["simulated", "fault", "stopped", "saved"]
     SEEN.update(record["type"] for record in printed)
 
 
