@@ -9,6 +9,7 @@ from typing import Any
 
 import anyio
 import pytest
+from calibration_calls import CALIBRATIONS
 from call_stage import Stage, open_stage
 from call_table import provocations
 from camera_calls import CAMERA
@@ -21,6 +22,7 @@ from provoked_flight import FLIGHT
 from provoked_gimbals import GIMBALS
 from provoked_settings import SETTINGS
 from provoked_transfers import TRANSFERS
+from rtk_calls import RTK
 from stream_calls import stream_provocations
 
 from aerokit import errors
@@ -36,6 +38,8 @@ PROVOCATIONS = {
     **CAMERA,
     **COMPONENTS,
     **DEVICE_ERRORS,
+    **CALIBRATIONS,
+    **RTK,
     **stream_provocations(),
 }
 PROMISED = documented()

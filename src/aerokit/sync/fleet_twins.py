@@ -531,13 +531,13 @@ class Fleet(FleetTwin, Selection):
         """Send RTCM corrections (RTK, DGPS) as GPS_RTCM_DATA, once on each link.
 
         Args:
-            rtcm: one or more RTCM 3 messages, each of 720 bytes at most.
+            rtcm: one or more whole RTCM 3 messages, each of 720 bytes at most.
 
         Returns:
             The number of MAVLink messages sent on each link.
 
         Raises:
-            InvalidArgument: a message is longer, or ``rtcm`` is empty. Nothing was sent.
+            InvalidArgument: a message is incomplete, damaged or longer, or ``rtcm`` is empty. Nothing was sent.
             ConnectionClosed, LinkLost: a link has ended; the links before it got the corrections.
         """
         return self._loop.call(self.aio.send_corrections, rtcm)

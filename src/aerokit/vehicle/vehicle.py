@@ -20,6 +20,7 @@ from aerokit.vehicle.state.field import MESSAGE_IDS
 if TYPE_CHECKING:
     from aerokit.connection.cells import StateCell
     from aerokit.mavlink.signing import Signing
+    from aerokit.vehicle.calibration.calibration import CalibrationControl
     from aerokit.vehicle.camera.cameras import Camera, Cameras
     from aerokit.vehicle.commanding.context import VehicleContext
     from aerokit.vehicle.commanding.guided import Guided
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.missions.mission import MissionControl
     from aerokit.vehicle.missions.plans import FenceControl, RallyControl
     from aerokit.vehicle.parameters.parameters import Parameters
+    from aerokit.vehicle.rtk.rtk import Rtk
 
 __all__ = ["Vehicle", "overview"]
 
@@ -271,6 +273,20 @@ class Vehicle(
         from aerokit.vehicle.missions.plans import RallyControl
 
         return RallyControl(self._plans)
+
+    @cached_property
+    def calibrate(self) -> CalibrationControl:
+        """CalibrationControl of sensors, radio and ESCs, step by step."""
+        from aerokit.vehicle.calibration.calibration import CalibrationControl
+
+        return CalibrationControl(self._context, lambda: self.parameters)
+
+    @cached_property
+    def rtk(self) -> Rtk:
+        """RTCM corrections for the satellite receivers, from your program or from an NTRIP caster."""
+        from aerokit.vehicle.rtk.rtk import Rtk
+
+        return Rtk(self._context)
 
     def __repr__(self) -> str:
         return f"<Vehicle {self.system_id}/{self.component_id} {self.autopilot.firmware}, {self.describe_link()}>"

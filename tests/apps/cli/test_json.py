@@ -27,7 +27,7 @@ TESTED_ELSEWHERE = {
     "endpoint",
 }
 """Records of commands that need an extra, a browser or a viewer."""
-RARE = {"missed", "gimbal_silent", "interrupted"}
+RARE = {"missed", "gimbal_silent", "interrupted", "calibration_cancelled"}
 
 
 @pytest.fixture(autouse=True)
@@ -82,6 +82,7 @@ GROUPS = {
         ["gimbal", "info"],
         ["gimbal", "neutral"],
     ),
+    "calibration": (["calibrate", "gyroscope"], ["calibrate", "compass"]),
     "link": (
         ["status"],
         ["events", "--seconds", "2", "--all"],

@@ -101,6 +101,12 @@ COMMANDS = (
         " map. Keys command hold, land and return, after a confirmation.",
     ),
     CliCommand("params", "params", "Read, set, save, load and compare the parameters of a vehicle."),
+    CliCommand(
+        "calibrate",
+        "calibrate",
+        "Calibrate a sensor, the remote control or the ESCs. Shows what to do and how to place the vehicle, step by"
+        " step; Ctrl-C cancels the calibration on the vehicle.",
+    ),
     CliCommand("mission", "mission", "Transfer, show and check missions, fences and rally points."),
     CliCommand(
         "fly",
@@ -147,7 +153,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "without a vehicle": ("sim", "demo", "doctor", "report", "convert", "completion"),
     "watch vehicles": ("status", "monitor", "serve", "events", "record"),
     "fly": ("fly", "mission", RUN),
-    "parameters, files, devices": ("params", "files", "logs", "camera", "gimbal"),
+    "parameters, files, devices": ("params", "calibrate", "files", "logs", "camera", "gimbal"),
     "connect programs": ("hub", "bridge"),
 }
 """Commands by task, for the help."""

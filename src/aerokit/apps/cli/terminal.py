@@ -44,6 +44,13 @@ async def confirm(question: str) -> bool:
     return answer.strip().lower() in ("y", "yes")
 
 
+async def press_enter() -> bool:
+    """Wait for a line of input. Return False at the end of the input."""
+    _discard_typed_input()
+    print("  press Enter when done (Ctrl-C cancels) ", end="", file=sys.stderr, flush=True)
+    return bool(await _read_line())
+
+
 def _discard_typed_input() -> None:
     """Discard earlier typed input, which cannot be an answer to a question that was not shown yet."""
     try:
