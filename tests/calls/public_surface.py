@@ -17,12 +17,15 @@ from aerokit.vehicle.camera.link import CameraBlock
 from aerokit.vehicle.camera.photos import PhotoInterval
 from aerokit.vehicle.commanding.guided import Guided, SetpointStream
 from aerokit.vehicle.commanding.posted import PostedOrder
+from aerokit.vehicle.commanding.sticks import StickStream
 from aerokit.vehicle.components.component import Component
 from aerokit.vehicle.components.settings import Settings
 from aerokit.vehicle.devices.actuators import Actuators
 from aerokit.vehicle.devices.gripper import Gripper
 from aerokit.vehicle.devices.shell import Shell
 from aerokit.vehicle.devices.winch import Winch
+from aerokit.vehicle.external.external import External
+from aerokit.vehicle.external.streams import MeasurementStream
 from aerokit.vehicle.files.files import Files
 from aerokit.vehicle.files.log_stream import LogStream
 from aerokit.vehicle.files.logs import Logs
@@ -42,6 +45,9 @@ CLASSES: tuple[type, ...] = (
     aerokit.Vehicle,
     Guided,
     SetpointStream,
+    StickStream,
+    External,
+    MeasurementStream,
     Gimbal,
     Component,
     Gimbals,

@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, ClassVar
 
-from aerokit.autopilots.base import Autopilot, GimbalRules, Purpose, Reposition, SetpointRules, TakeOff
+from aerokit.autopilots.base import Autopilot, GimbalRules, Purpose, Reposition, SetpointRules, StickRules, TakeOff
+from aerokit.autopilots.external import ARDUPILOT_EXTERNAL, ExternalRules
 from aerokit.autopilots.modes import ModeTable
 from aerokit.autopilots.telemetry import ARDUPILOT_GROUPS, ATTITUDE_AND_HEIGHT, POS_HORIZ_ABS, bit_names
 from aerokit.mavlink.enums import EkfStatusFlags, MavCmd, MavLandedState, MavState, MavType
@@ -186,6 +187,7 @@ class ArduPilot(Autopilot):
     sets_current_by_command = True
     accepts_ftp_session_ids = True
     has_upper_case_parameters = True
+    external: ExternalRules = ARDUPILOT_EXTERNAL
     log_suffix = ".bin"
     video_addresses_camera = True
     log_directories: ClassVar[tuple[str, str]] = ("/APM/LOGS", "/logs")
@@ -233,12 +235,15 @@ class ArduCopter(ArduPilot):
     purposes: ClassVar[Mapping[str, str]] = {
         "hold": "BRAKE",  # LOITER follows the throttle stick, which is down or absent while a program flies
         "land": "LAND",
+        "precision_land": "LAND",  # with PLND_ENABLED
         "return": "RTL",
         "setpoint": "GUIDED",
+        "sticks": "LOITER",
         "take_off": "GUIDED",
         "mission": "AUTO",
     }
-    setpoints: SetpointRules = SetpointRules(body_yaw_is_relative=True)
+    sticks: StickRules | None = StickRules()
+    setpoints: SetpointRules = SetpointRules(body_yaw_is_relative=True, attitude_rate=True, trajectory=True)
     reposition: Reposition | None = Reposition(relative_altitude=True, yaw=False, speed=False)
     condition_yaw = True
     lands_after_return = True
@@ -281,9 +286,11 @@ class ArduPlane(ArduPilot):
         "land": "AUTOLAND",
         "return": "RTL",
         "setpoint": "GUIDED",
+        "sticks": "FBWA",
         "take_off": "TAKEOFF",
         "mission": "AUTO",
     }
+    sticks: StickRules | None = StickRules()
     setpoints: SetpointRules = SetpointRules(
         local_position=False, global_position=False, velocity=False, acceleration=False
     )
@@ -311,7 +318,7 @@ class ArduPlane(ArduPilot):
         return is_vtol or self.vehicle_type in VTOLS
 
 
-_QUADPLANE: Mapping[str, str] = {"land": "QLAND", "return": "QRTL", "take_off": "GUIDED"}
+_QUADPLANE: Mapping[str, str] = {"land": "QLAND", "return": "QRTL", "sticks": "QLOITER", "take_off": "GUIDED"}
 
 
 class ArduRover(ArduPilot):
@@ -325,8 +332,10 @@ class ArduRover(ArduPilot):
         "hold": "HOLD",
         "return": "RTL",
         "setpoint": "GUIDED",
+        "sticks": "MANUAL",
         "mission": "AUTO",
     }
+    sticks: StickRules | None = StickRules(signed_throttle=True)
     setpoints: SetpointRules = SetpointRules(acceleration=False, body_yaw_is_relative=True)
     reposition: Reposition | None = Reposition(relative_altitude=True, yaw=False, speed=False)
     arrival_radius_m: float = 4.0
@@ -349,8 +358,10 @@ class ArduSub(ArduPilot):
         "hold": "POSHOLD",
         "land": "SURFACE",
         "setpoint": "GUIDED",
+        "sticks": "ALT_HOLD",
         "mission": "AUTO",
     }
+    sticks: StickRules | None = StickRules(release="channels")
     setpoints: SetpointRules = SetpointRules(acceleration=False, position_restarts_path=True)
     mode_when_landed: ClassVar[str | None] = "ALT_HOLD"  # at the surface
     reposition: Reposition | None = Reposition(relative_altitude=True, yaw=False, speed=False)
