@@ -19,6 +19,7 @@ import command_rtt
 import decode
 import deliver
 import import_time
+import jitter
 import table
 from table import Row
 
@@ -37,6 +38,9 @@ MEASURES: dict[tuple[str, ...], Measure] = {
     ("deliver_telemetry", "deliver_async_for"): lambda quick: deliver.rows(1, SHORT) if quick else deliver.rows(),
     ("command_rtt_pymavlink", "command_rtt_mavsdk"): lambda quick: (
         command_rtt.rows(1, 20) if quick else command_rtt.rows()
+    ),
+    tuple(f"jitter_{rate_hz}" for rate_hz in jitter.RATES_HZ): lambda quick: (
+        jitter.rows(1, 0.3) if quick else jitter.rows()
     ),
     ("import", "import_ready"): lambda quick: (
         import_time.rows(1, fresh_byte_code=False) if quick else import_time.rows()

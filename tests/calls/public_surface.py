@@ -18,12 +18,15 @@ from aerokit.vehicle.camera.photos import PhotoInterval
 from aerokit.vehicle.commanding.follow import FollowStream
 from aerokit.vehicle.commanding.guided import Guided, SetpointStream
 from aerokit.vehicle.commanding.posted import PostedOrder
+from aerokit.vehicle.commanding.sticks import StickStream
 from aerokit.vehicle.components.component import Component
 from aerokit.vehicle.components.settings import Settings
 from aerokit.vehicle.devices.actuators import Actuators
 from aerokit.vehicle.devices.gripper import Gripper
 from aerokit.vehicle.devices.shell import Shell
 from aerokit.vehicle.devices.winch import Winch
+from aerokit.vehicle.external.external import External
+from aerokit.vehicle.external.streams import MeasurementStream
 from aerokit.vehicle.files.files import Files
 from aerokit.vehicle.files.log_stream import LogStream
 from aerokit.vehicle.files.logs import Logs
@@ -44,6 +47,9 @@ CLASSES: tuple[type, ...] = (
     Guided,
     SetpointStream,
     FollowStream,
+    StickStream,
+    External,
+    MeasurementStream,
     Gimbal,
     Component,
     Gimbals,

@@ -15,6 +15,7 @@ from component_calls import COMPONENTS_AWAITED
 from device_calls import BLOCKS, DEVICE_CALLS, DEVICES, DeviceCall, components_of, fit
 from provoked import Do, Provocation, Table, ignored, refused
 from rtk_calls import RTK_AWAITED
+from stream_calls import ARDUPILOT_STREAMS, STREAMS_AWAITED
 
 import aerokit
 from aerokit import (
@@ -504,6 +505,10 @@ CALLS: dict[str, Call] = {
     "Guided.attitude_rate": _stream("attitude_rate", lambda _: AttitudeRateSetpoint(pitch_deg_s=1.0)),
     "Guided.trajectory": _stream("trajectory", lambda _: TrajectorySetpoint(3, 3, -6, north_m_s=0.1)),
     "SetpointStream.fly": Call(_fly, airborne),
+    **{
+        name: Call(do, place, COPTER if name in ARDUPILOT_STREAMS else BOTH, before=before)
+        for name, (do, place, before) in STREAMS_AWAITED.items()
+    },
     # ------------------------------------------------------------------------------------- Camera
     **{name: Call(do) for name, do in AWAITED.items()},
     # ------------------------------------------------------------------------------- calibration

@@ -9,7 +9,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, ClassVar, Literal
 
-from aerokit.autopilots.base import VTOLS, Autopilot, GimbalRules, Purpose, Reposition, SetpointRules, TakeOff
+from aerokit.autopilots.base import (
+    VTOLS,
+    Autopilot,
+    GimbalRules,
+    Purpose,
+    Reposition,
+    SetpointRules,
+    StickRules,
+    TakeOff,
+)
+from aerokit.autopilots.external import ARDUPILOT_EXTERNAL, ExternalRules
 from aerokit.autopilots.modes import ModeTable
 from aerokit.autopilots.telemetry import ARDUPILOT_GROUPS, ATTITUDE_AND_HEIGHT, POS_HORIZ_ABS, bit_names
 from aerokit.mavlink.enums import EkfStatusFlags, MavCmd, MavLandedState, MavState, MavType, SpeedType
@@ -177,6 +187,7 @@ class ArduPilot(Autopilot):
     sets_current_by_command = True
     accepts_ftp_session_ids = True
     has_upper_case_parameters = True
+    external: ExternalRules = ARDUPILOT_EXTERNAL
     log_suffix = ".bin"
     video_addresses_camera = True
     log_directories: ClassVar[tuple[str, str]] = ("/APM/LOGS", "/logs")
@@ -225,11 +236,14 @@ class ArduCopter(ArduPilot):
     purposes: ClassVar[Mapping[str, str]] = {
         "hold": "BRAKE",  # LOITER follows the throttle stick, which is down or absent while a program flies
         "land": "LAND",
+        "precision_land": "LAND",  # with PLND_ENABLED
         "return": "RTL",
         "setpoint": "GUIDED",
+        "sticks": "LOITER",
         "take_off": "GUIDED",
         "mission": "AUTO",
     }
+    sticks: StickRules | None = StickRules()
     setpoints: SetpointRules = SetpointRules(body_yaw_is_relative=True, attitude_rate=True, trajectory=True)
     reposition: Reposition | None = Reposition(relative_altitude=True, yaw=False, speed=False)
     # An airspeed changes the ground speed (GCS_MAVLink_Copter.cpp, handle_MAV_CMD_DO_CHANGE_SPEED).
@@ -280,9 +294,11 @@ class ArduPlane(ArduPilot):
         "land": "AUTOLAND",
         "return": "RTL",
         "setpoint": "GUIDED",
+        "sticks": "FBWA",
         "take_off": "TAKEOFF",
         "mission": "AUTO",
     }
+    sticks: StickRules | None = StickRules()
     setpoints: SetpointRules = SetpointRules(
         local_position=False, global_position=False, velocity=False, acceleration=False
     )
@@ -317,7 +333,7 @@ class ArduPlane(ArduPilot):
         return is_vtol or self.vehicle_type in VTOLS
 
 
-_QUADPLANE: Mapping[str, str] = {"land": "QLAND", "return": "QRTL", "take_off": "GUIDED"}
+_QUADPLANE: Mapping[str, str] = {"land": "QLAND", "return": "QRTL", "sticks": "QLOITER", "take_off": "GUIDED"}
 
 
 class ArduRover(ArduPilot):
@@ -331,8 +347,10 @@ class ArduRover(ArduPilot):
         "hold": "HOLD",
         "return": "RTL",
         "setpoint": "GUIDED",
+        "sticks": "MANUAL",
         "mission": "AUTO",
     }
+    sticks: StickRules | None = StickRules(signed_throttle=True)
     setpoints: SetpointRules = SetpointRules(acceleration=False, body_yaw_is_relative=True)
     reposition: Reposition | None = Reposition(relative_altitude=True, yaw=False, speed=False)
     arrival_radius_m: float = 4.0
@@ -355,8 +373,10 @@ class ArduSub(ArduPilot):
         "hold": "POSHOLD",
         "land": "SURFACE",
         "setpoint": "GUIDED",
+        "sticks": "ALT_HOLD",
         "mission": "AUTO",
     }
+    sticks: StickRules | None = StickRules(release="channels")
     setpoints: SetpointRules = SetpointRules(acceleration=False, position_restarts_path=True)
     mode_when_landed: ClassVar[str | None] = "ALT_HOLD"  # at the surface
     reposition: Reposition | None = Reposition(relative_altitude=True, yaw=False, speed=False)

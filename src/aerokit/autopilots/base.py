@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from aerokit._internal.values import Snapshot
+from aerokit.autopilots.external import ExternalRules
 from aerokit.autopilots.modes import CUSTOM_MODE_ENABLED, NO_MODES, Mode, ModeTable, base_mode_name
 from aerokit.autopilots.telemetry import (
     ATTITUDE_AND_HEIGHT,
@@ -30,7 +31,7 @@ NAN = math.nan
 _BYTEWISE = MavProtocolCapability.PARAM_ENCODE_BYTEWISE.value
 _C_CAST = MavProtocolCapability.PARAM_ENCODE_C_CAST.value
 
-Purpose = Literal["hold", "land", "return", "setpoint", "take_off", "mission"]
+Purpose = Literal["hold", "land", "precision_land", "return", "setpoint", "sticks", "take_off", "mission"]
 """Purpose for which a program uses a mode."""
 
 # Maps a MAV_CMD to the purposes of the modes that it may lead to. An autopilot may use several modes for one purpose.
@@ -104,9 +105,23 @@ class SetpointRules(Snapshot):
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the supported kinds."""
-        kinds = ("local_position", "global_position", "velocity", "acceleration", "attitude")
-        kinds = (*kinds, "attitude_rate", "trajectory")
+        kinds = (
+            *("local_position", "global_position", "velocity", "acceleration", "attitude"),
+            *("attitude_rate", "trajectory"),
+        )
         return tuple(kind.replace("_", " ") for kind in kinds if getattr(self, kind))
+
+
+class StickRules(Snapshot):
+    """Interpretation of MANUAL_CONTROL.
+
+    - ``signed_throttle``: the throttle is from −1000 to 1000; otherwise from 0 to 1000.
+    - ``release``: "axes" without a value, or overriding "channels" with 0, returns the sticks to the transmitter;
+      "none": there is no such message.
+    """
+
+    signed_throttle: bool = False
+    release: Literal["axes", "channels", "none"] = "axes"
 
 
 class GimbalRules(Snapshot):
@@ -173,6 +188,10 @@ class Autopilot:
     purposes: ClassVar[Mapping[str, str]] = {}
     """Maps purposes to names of modes."""
     setpoints: SetpointRules = SetpointRules(*[False] * 5)
+    external: ExternalRules = ExternalRules()
+    """Measurements of other sensors that the autopilot accepts by MAVLink."""
+    sticks: StickRules | None = None
+    """None if MANUAL_CONTROL is not known to work."""
     actuators_until: tuple[int, int] | None = None
     """First version (major, minor) without SET_ACTUATOR_CONTROL_TARGET; None if no version supports it."""
     reposition: Reposition | None = None

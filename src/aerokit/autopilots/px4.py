@@ -14,9 +14,11 @@ from aerokit.autopilots.base import (
     Purpose,
     Reposition,
     SetpointRules,
+    StickRules,
     TakeOff,
     mode_numbers,
 )
+from aerokit.autopilots.external import PX4_EXTERNAL, ExternalRules
 from aerokit.autopilots.modes import CUSTOM_MODE_ENABLED, NO_MODES, Mode, ModeTable
 from aerokit.autopilots.telemetry import ATTITUDE_AND_HEIGHT, POS_HORIZ_ABS, PREARM_CHECK, SENSORS, bit_names
 from aerokit.errors import InvalidArgument
@@ -95,6 +97,8 @@ class Px4(Autopilot):
     # The MAVLink module acknowledges with ACCEPTED at once, then the commander with the result.
     acks_per_command: ClassVar[Mapping[int, int]] = {MavCmd.DO_SET_MODE: 2}
     setpoints: SetpointRules = SetpointRules(stream_before_mode=True, attitude_rate=True, trajectory=True)
+    sticks: StickRules | None = StickRules(release="none")
+    external: ExternalRules = PX4_EXTERNAL
     actuators_until = (1, 14)  # removed on 2023-03-06: MavlinkReceiver.cpp, commit 27658354
     reposition: Reposition | None = Reposition(relative_altitude=False, yaw=True, speed=True)
     gimbals: GimbalRules = GimbalRules(*[False] * 6)
@@ -114,8 +118,10 @@ class Px4(Autopilot):
     purposes: ClassVar[Mapping[str, str]] = {
         "hold": "LOITER",
         "land": "LAND",
+        "precision_land": "PRECLAND",
         "return": "RTL",
         "setpoint": "OFFBOARD",
+        "sticks": "POSCTL",
         "take_off": "TAKEOFF",
         "mission": "MISSION",
     }

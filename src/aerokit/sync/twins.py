@@ -26,6 +26,7 @@ from aerokit.sync.blocks import (
     ConnectionTwin,
     GimbalsTwin,
     LogStreamTwin,
+    MeasurementTwin,
     PhotoIntervalTwin,
     StreamTwin,
     SubscriptionTwin,
@@ -44,7 +45,6 @@ from aerokit.vehicle.commanding.setpoints import (
     VelocitySetpoint,
 )
 from aerokit.vehicle.connect import connect as connect_async
-from aerokit.vehicle.devices.actuators import ILLUMINATOR
 from aerokit.vehicle.devices.winch import ACTION_TIMEOUT_S
 from aerokit.vehicle.files.logs import ERASE_PATIENCE_S
 
@@ -109,6 +109,8 @@ if TYPE_CHECKING:
         PositionSetpoint,
         TrajectorySetpoint,
     )
+    from aerokit.vehicle.commanding.sticks import StickInput
+    from aerokit.vehicle.commanding.sticks import StickStream as AsyncStickStream
     from aerokit.vehicle.commanding.termination import ShutdownIntent, TerminationIntent
     from aerokit.vehicle.components.component import Component as AsyncComponent
     from aerokit.vehicle.components.component import ComponentInformation, ComponentStatus, MetadataKind
@@ -119,6 +121,20 @@ if TYPE_CHECKING:
     from aerokit.vehicle.devices.gripper import Gripper as AsyncGripper
     from aerokit.vehicle.devices.shell import Shell as AsyncShell
     from aerokit.vehicle.devices.winch import Winch as AsyncWinch
+    from aerokit.vehicle.external.external import External as AsyncExternal
+    from aerokit.vehicle.external.landing import LandingReport, TargetSource
+    from aerokit.vehicle.external.streams import EstimatorUse
+    from aerokit.vehicle.external.values import (
+        FlowMeasurement,
+        GpsMeasurement,
+        ObstaclePoints,
+        ObstacleSectors,
+        OdometryMeasurement,
+        PoseMeasurement,
+        RangeMeasurement,
+        SpeedMeasurement,
+        TargetMeasurement,
+    )
     from aerokit.vehicle.files.files import FileEntry
     from aerokit.vehicle.files.files import Files as AsyncFiles
     from aerokit.vehicle.files.logs import LogEntry, LogMethod
@@ -170,6 +186,7 @@ __all__ = [
     "Changes",
     "Component",
     "Connection",
+    "External",
     "FenceControl",
     "Files",
     "FollowStream",
@@ -181,6 +198,7 @@ __all__ = [
     "Guided",
     "LogStream",
     "Logs",
+    "MeasurementStream",
     "MissionControl",
     "NtripClient",
     "Parameters",
@@ -192,6 +210,7 @@ __all__ = [
     "Settings",
     "Shell",
     "StateCell",
+    "StickStream",
     "Subscription",
     "TemporaryParameters",
     "Transaction",
@@ -204,6 +223,7 @@ __all__ = [
 ItemT = TypeVar("ItemT", bound="Message | Event")
 MessageT = TypeVar("MessageT", bound="Message")
 SetpointT = TypeVar("SetpointT")
+MeasurementT = TypeVar("MeasurementT")
 T = TypeVar("T")
 
 
@@ -678,6 +698,243 @@ class FollowStream(BlockTwin["AsyncFollowStream"]):
             SetpointStreamStopped: it has stopped; the text has the reason.
         """
         self._loop.run(self.aio.fly, duration_s)
+
+
+class StickStream(BlockTwin["AsyncStickStream"]):
+    """Sends the latest stick positions at a fixed rate while the ``async with`` block supplies them.
+
+    Entering the block sends the initial positions for a second and then changes to the mode. Leaving it in any way
+    orders the vehicle to hold and releases the sticks. If the stream stops by itself (no new positions, a blocked event
+    loop, a silent vehicle), ``set`` and leaving the block raise :class:`SetpointStreamStopped`. If a pilot or a
+    failsafe changes the mode, the sticks are released at once and no hold is ordered.
+
+    If the program is killed, ArduPilot returns to the transmitter after RC_OVERRIDE_TIME (3 s), and PX4 treats the
+    sticks as lost after COM_RC_LOSS_T (0.5 s). PX4 has no release, so every end of a stream is such a loss: without
+    another source of manual control it acts as NAV_RCL_ACT says (return by default), also in its hold mode unless
+    COM_RCL_EXCEPT has bit 1. ArduCopter without a transmitter acts on the loss as FS_THR_ENABLE says.
+
+    Entering raises:
+        InvalidArgument: a position is out of range. Nothing was sent.
+        NotSupported: this type of vehicle has no sticks. Nothing was sent.
+        OperationRejected: a parameter makes the vehicle ignore the sticks, or keep them for ever; the text names it.
+        ParameterTimeout: the vehicle did not report these parameters. Nothing else was sent.
+        CommandRejected: the vehicle refused the mode.
+        BusyError: another set-point stream is open.
+    """
+
+    @property
+    def is_running(self) -> bool:
+        """True while values are being sent."""
+        return self.aio.is_running
+
+    def set(self, sticks: StickInput) -> None:
+        """Move the sticks; the positions are sent at the next tick and repeated until ``valid_for_s`` has passed.
+
+        Raises:
+            InvalidArgument: a position is out of range; the previous ones remain in force until they expire.
+            SetpointStreamStopped: the stream has ended by itself, or the block was left.
+        """
+        self._loop.call(self.aio.set, sticks)
+
+    def move(self, sticks: StickInput, duration_s: float) -> None:
+        """Keep the sticks in one position for ``duration_s`` seconds.
+
+        Raises:
+            InvalidArgument: a position is out of range.
+            SetpointStreamStopped: the stream ended meanwhile.
+        """
+        self._loop.run(self.aio.move, sticks, duration_s)
+
+
+class MeasurementStream(MeasurementTwin[MeasurementT]):
+    """Sends the measurements that you give to ``send``, each once, at most ``rate_hz`` times a second.
+
+    A measurement is never repeated: without new ones nothing is sent, and the vehicle acts as without its sensor. Of
+    several measurements within one period only the newest is sent. One that is older than ``valid_for_s`` when it
+    could be sent is dropped, after a blocked event loop for example; while the vehicle is silent all are dropped.
+    ``sent`` and ``dropped`` count them. The stream does not end by itself; it ends with the block.
+
+    Entering raises:
+        NotSupported: this firmware does not read such measurements. Nothing was sent.
+        OperationRejected: a parameter makes the vehicle ignore them; the text names it. Nothing else was sent.
+        ParameterTimeout: the vehicle did not report these parameters.
+    """
+
+    @property
+    def sent(self) -> int:
+        """Number of measurements that were sent."""
+        return self.aio.sent
+
+    @property
+    def dropped(self) -> int:
+        """Number of measurements that were not sent: replaced by a newer one, too old, or during a silence."""
+        return self.aio.dropped
+
+    @property
+    def is_open(self) -> bool:
+        """True inside the block."""
+        return self.aio.is_open
+
+    @property
+    def estimator_use(self) -> EstimatorUse:
+        """Use of these measurements by the vehicle's estimator.
+
+        No message reports this. It is derived from EKF_STATUS_REPORT or ESTIMATOR_STATUS and from the parameters at
+        the beginning of the block. "used": the estimator has a position or velocity, and its parameters allow no other
+        source. "not used": it has none. "unknown" in all other cases, such as with a GPS beside, for sensors that are
+        not a position, or without a recent report.
+        """
+        return self.aio.estimator_use
+
+    def send(self, measurement: MeasurementT) -> None:
+        """Send a measurement now, or at the end of the period if one was sent within it.
+
+        Raises:
+            InvalidArgument: a value is out of range; nothing was sent.
+            SetpointStreamStopped: the block was left or not entered.
+            ValueUnknownError: a landing target for PX4, whose attitude or local position is unknown.
+            ConnectionClosed: the connection has ended.
+        """
+        self._loop.call(self.aio.send, measurement)
+
+
+class External(TwinOf["AsyncExternal"]):
+    """Supplies the vehicle with measurements: ``async with vehicle.external.odometry() as stream: stream.send(…)``.
+
+    ``rate_hz`` (above 0, to 400) is the highest rate at which measurements are sent, ``valid_for_s`` the age at which
+    one is dropped. Time stamps are those of the event loop's clock, and aerokit answers the vehicle's TIMESYNC
+    requests with it meanwhile.
+    """
+
+    def odometry(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[OdometryMeasurement]:
+        """Supply pose and velocity (ODOMETRY). ArduPilot needs VISO_TYPE, PX4 EKF2_EV_CTRL."""
+        return MeasurementStream(
+            self._loop,
+            self._loop.call(self.aio.odometry, rate_hz=rate_hz, valid_for_s=valid_for_s),
+        )
+
+    def vision_position(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[PoseMeasurement]:
+        """Supply a pose (VISION_POSITION_ESTIMATE). ArduPilot needs VISO_TYPE, PX4 EKF2_EV_CTRL."""
+        return MeasurementStream(
+            self._loop,
+            self._loop.call(self.aio.vision_position, rate_hz=rate_hz, valid_for_s=valid_for_s),
+        )
+
+    def vision_speed(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[SpeedMeasurement]:
+        """Supply a velocity (VISION_SPEED_ESTIMATE; ODOMETRY without a pose to PX4)."""
+        return MeasurementStream(
+            self._loop,
+            self._loop.call(self.aio.vision_speed, rate_hz=rate_hz, valid_for_s=valid_for_s),
+        )
+
+    def motion_capture(self, *, rate_hz: float = 50.0, valid_for_s: float = 0.2) -> MeasurementStream[PoseMeasurement]:
+        """Supply a pose by motion capture (ATT_POS_MOCAP; VISION_POSITION_ESTIMATE to PX4)."""
+        return MeasurementStream(
+            self._loop,
+            self._loop.call(self.aio.motion_capture, rate_hz=rate_hz, valid_for_s=valid_for_s),
+        )
+
+    def gps(self, *, rate_hz: float = 5.0, valid_for_s: float = 0.5) -> MeasurementStream[GpsMeasurement]:
+        """Supply a satellite position (GPS_INPUT). ArduPilot needs GPS1_TYPE 14; PX4 does not read it."""
+        return MeasurementStream(self._loop, self._loop.call(self.aio.gps, rate_hz=rate_hz, valid_for_s=valid_for_s))
+
+    def obstacles(self, *, rate_hz: float = 10.0, valid_for_s: float = 0.5) -> MeasurementStream[ObstacleSectors]:
+        """Supply distances around the vehicle (OBSTACLE_DISTANCE).
+
+        ArduPilot needs PRX1_TYPE 2; PX4 uses them if CP_DIST is above 0.
+        """
+        return MeasurementStream(
+            self._loop,
+            self._loop.call(self.aio.obstacles, rate_hz=rate_hz, valid_for_s=valid_for_s),
+        )
+
+    def obstacle_points(self, *, rate_hz: float = 10.0, valid_for_s: float = 0.5) -> MeasurementStream[ObstaclePoints]:
+        """Supply places of obstacles (OBSTACLE_DISTANCE_3D). ArduPilot needs PRX1_TYPE 2; PX4 does not read them."""
+        return MeasurementStream(
+            self._loop,
+            self._loop.call(self.aio.obstacle_points, rate_hz=rate_hz, valid_for_s=valid_for_s),
+        )
+
+    def range_finder(self, *, rate_hz: float = 20.0, valid_for_s: float = 0.2) -> MeasurementStream[RangeMeasurement]:
+        """Supply a distance (DISTANCE_SENSOR). ArduPilot needs RNGFND1_TYPE 10 and its orientation."""
+        return MeasurementStream(
+            self._loop,
+            self._loop.call(self.aio.range_finder, rate_hz=rate_hz, valid_for_s=valid_for_s),
+        )
+
+    def landing_target(
+        self,
+        *,
+        rate_hz: float = 20.0,
+        valid_for_s: float = 0.3,
+    ) -> MeasurementStream[TargetMeasurement]:
+        """Supply the place of a landing target (LANDING_TARGET). ArduPilot needs PLND_ENABLED and PLND_TYPE 1.
+
+        ``vehicle.land_on`` does this and lands.
+        """
+        return MeasurementStream(
+            self._loop,
+            self._loop.call(self.aio.landing_target, rate_hz=rate_hz, valid_for_s=valid_for_s),
+        )
+
+    def optical_flow(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[FlowMeasurement]:
+        """Supply optical flow (OPTICAL_FLOW; OPTICAL_FLOW_RAD to PX4).
+
+        ArduPilot needs FLOW_TYPE 5, PX4 EKF2_OF_CTRL.
+        """
+        return MeasurementStream(
+            self._loop,
+            self._loop.call(self.aio.optical_flow, rate_hz=rate_hz, valid_for_s=valid_for_s),
+        )
+
+    def set_wind(
+        self,
+        speed_m_s: float,
+        direction_deg: float,
+        *,
+        speed_accuracy_m_s: float = 1.0,
+        direction_accuracy_deg: float = 15.0,
+    ) -> None:
+        """Supply an estimate of the wind (MAV_CMD_EXTERNAL_WIND_ESTIMATE); returns when it is acknowledged.
+
+        No message reports the effect. ArduPilot applies it to its simpler estimator (DCM), PX4 to EKF2.
+
+        Args:
+            speed_m_s: horizontal speed, 0 to 100.
+            direction_deg: direction that it comes from, 0 to 360.
+            speed_accuracy_m_s: one standard deviation, 0 to 100.
+            direction_accuracy_deg: one standard deviation, 0 to 180.
+
+        Raises:
+            InvalidArgument: a value is out of range. Nothing was sent.
+            CommandRejected: the vehicle refused, or does not support it.
+            CommandTimeout: there was no acknowledgement.
+        """
+        self._loop.run(
+            self.aio.set_wind,
+            speed_m_s,
+            direction_deg,
+            speed_accuracy_m_s=speed_accuracy_m_s,
+            direction_accuracy_deg=direction_accuracy_deg,
+        )
+
+    def set_origin(self, origin: Position, *, timeout: float = 10.0) -> None:
+        """Set the origin of the estimator's local frame, and wait until GPS_GLOBAL_ORIGIN reports it.
+
+        A vehicle without GPS needs it for global positions. SET_GPS_GLOBAL_ORIGIN is sent once; it has no
+        acknowledgement. Returns at once if the vehicle has this origin already. After a cancellation the vehicle may
+        have accepted it.
+
+        Args:
+            origin: latitude, longitude and altitude above mean sea level.
+            timeout: seconds until the vehicle reports it.
+
+        Raises:
+            InvalidArgument: the place has no altitude above mean sea level. Nothing was sent.
+            OperationRejected: ArduPilot has another origin and keeps it until a reboot. Nothing was sent.
+            OperationTimeout: the vehicle did not report it.
+        """
+        self._loop.run(self.aio.set_origin, origin, timeout=timeout)
 
 
 class GimbalControl(BlockTwin["AsyncGimbalControl"]):
@@ -1581,7 +1838,7 @@ class Actuators(TwinOf["AsyncActuators"]):
         """
         self._loop.run(self.aio.lower_landing_gear)
 
-    def set_lights(self, on: bool, *, component_id: int = ILLUMINATOR) -> None:
+    def set_lights(self, on: bool, *, component_id: int = MavComponent.ILLUMINATOR) -> None:
         """Switch an illuminator, and return when ILLUMINATOR_STATUS reports it (MAV_CMD_ILLUMINATOR_ON_OFF).
 
         For lights that are a MAVLink component. ArduPilot and PX4 do not have the command; lights on an output of
@@ -4742,8 +4999,94 @@ class Vehicle(VehicleTwin):
 
     @property
     def guided(self) -> Guided:
-        """Set-point streams: velocity, position, acceleration, attitude."""
+        """Set-point streams: velocity, position, acceleration, attitude, body rates, trajectory, actuators."""
         return self._part("guided", Guided)
+
+    def sticks(
+        self,
+        initial: StickInput | None = None,
+        *,
+        mode: str | int | None = None,
+        rate_hz: float = 20.0,
+        valid_for_s: float = 0.5,
+        max_lag_s: float = 0.5,
+    ) -> StickStream:
+        """Fly by stick positions of your program (MANUAL_CONTROL): ``async with vehicle.sticks() as sticks: …``.
+
+        Args:
+            initial: positions while the mode is entered; None centres all sticks.
+            mode: the piloted mode. By default LOITER (ArduCopter), FBWA or QLOITER (ArduPlane), MANUAL (ArduPilot
+                Rover), ALT_HOLD (ArduSub), POSCTL (PX4).
+            rate_hz: transmission rate of the latest positions, 2 to 400.
+            valid_for_s: seconds for which they may be repeated without new ones.
+            max_lag_s: how late the event loop may be.
+
+        Raises:
+            InvalidArgument: a rate or a time is out of range, or the autopilot has no such mode.
+        """
+        return StickStream(
+            self._loop,
+            self._loop.call(
+                self.aio.sticks,
+                initial,
+                mode=mode,
+                rate_hz=rate_hz,
+                valid_for_s=valid_for_s,
+                max_lag_s=max_lag_s,
+            ),
+        )
+
+    @property
+    def external(self) -> External:
+        """Measurements that your program supplies: odometry, vision, GPS, obstacles, ranges; the origin; the wind."""
+        return self._part("external", External)
+
+    def land_on(
+        self,
+        target: TargetSource,
+        *,
+        rate_hz: float = 20.0,
+        acquire_timeout: float = 10.0,
+        timeout: float | None = 300.0,
+        max_silence_s: float | None = MAX_SILENCE_S,
+    ) -> LandingReport:
+        """Land on a target that your program sees; returns on the ground, disarmed, with a report of the landing.
+
+        Streams LANDING_TARGET and uses the autopilot's own precision landing: LAND with PLND_ENABLED on ArduCopter,
+        PRECLAND on PX4. If the target is lost, the autopilot decides: ArduCopter retries or lands where it is
+        (PLND_STRICT, PLND_RET_MAX); PX4 climbs to PLD_SRCH_ALT, searches for PLD_SRCH_TOUT and then lands where it
+        is. The report says for how long the target was lost. After a cancellation the vehicle continues to land,
+        without new targets.
+
+        Args:
+            target: a function, also a coroutine function, that returns a
+                :class:`aerokit.TargetMeasurement`, or None while the target is not visible;
+                or an asynchronous iterable of them.
+            rate_hz: rate at which the function is called, and the highest rate of LANDING_TARGET.
+            acquire_timeout: seconds until the target must be seen first; the landing is ordered after that.
+            timeout: seconds until the vehicle is on the ground and disarmed; None: no limit.
+            max_silence_s: raise when no heartbeat was received for this long; None: no limit.
+
+        Raises:
+            InvalidArgument: a rate or a time is out of range, or the target is of another type.
+            NotSupported: this type of vehicle has no precision landing. Nothing was sent.
+            CommandRejected: the vehicle refused the mode.
+            CommandTimeout: there was no acknowledgement.
+            OperationRejected: a parameter makes the vehicle ignore the target (nothing else was sent), or the mode
+                changed meanwhile.
+            HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
+            OperationTimeout: the target was not seen in time (the landing was not ordered), or the vehicle was not
+                down in time.
+            ParameterTimeout: the vehicle did not report these parameters.
+        """
+        return self._loop.run(
+            self.aio.land_on,
+            target,
+            rate_hz=rate_hz,
+            acquire_timeout=acquire_timeout,
+            timeout=timeout,
+            max_silence_s=max_silence_s,
+        )
 
     @property
     def gimbal(self) -> Gimbal:

@@ -169,7 +169,7 @@ async def test_actuators_of_new_firmware_raise_not_supported(flying: Flight) -> 
     assert flying.wire.setpoints() == []
 
 
-async def test_px4_actuators_of_old_firmware_are_encoded() -> None:
+async def test_px4_actuators_of_old_firmware_are_flown() -> None:
     async with open_px4(SimulatedPx4(boot_time_s=1.0, version="1.13.3")) as flight:
         await flight.vehicle.version.wait_until(lambda version: version.number[:2] == (1, 13))
         stream = flight.vehicle.guided.actuators(ActuatorSetpoint((0.5, *(0.0,) * 7), group=1))
@@ -178,6 +178,11 @@ async def test_px4_actuators_of_old_firmware_are_encoded() -> None:
         with pytest.raises(InvalidArgument, match="8 numbers"):
             async with flight.vehicle.guided.actuators(ActuatorSetpoint((0.5,))):
                 raise AssertionError("entered")
+        await flight.take_off()
+        climb = ActuatorSetpoint((0.0, 0.0, 0.0, 0.7, *(0.0,) * 4))
+        async with flight.vehicle.guided.actuators(climb) as actuators:
+            await actuators.fly(climb, 2.0)
+            assert flight.px4.motion.velocity_down < -1.0
 
 
 async def test_px4_attitude_rate_is_flown() -> None:

@@ -31,6 +31,7 @@ from aerokit.sim.parameters import SimParameters
 from aerokit.sim.px4 import modes
 from aerokit.sim.px4.arming import Px4Arming, Px4Calibration
 from aerokit.sim.px4.console import Px4LogStream, Px4Shell
+from aerokit.sim.px4.external import Px4External
 from aerokit.sim.px4.failsafes import Px4Failsafes
 from aerokit.sim.px4.flight import Px4Flight
 from aerokit.sim.px4.ftp import Px4Ftp
@@ -166,6 +167,8 @@ class Px4Vehicle(Px4Host):
     def _listen(self) -> None:
         self.offboard: Px4Offboard = Px4Offboard(self)
         self.sticks: Px4Sticks = Px4Sticks(self)
+        self.external: Px4External = Px4External(self)
+        """Measurements received from companion computers."""
         self.gimbal: Px4Gimbal = Px4Gimbal(self)
         """Gimbal on the AUX outputs, enabled by MNT_MODE_IN."""
         self.shell: Px4Shell = Px4Shell(self)
@@ -188,7 +191,13 @@ class Px4Vehicle(Px4Host):
     @property
     def has_position(self) -> bool:
         """True if the estimator has a global position."""
-        return self.uptime >= 0.5 * self._boot_time_s and not self.faults.gps_lost
+        has_global = self.external.has_gps or (self.external.has_vision and self.has_origin)
+        return self.uptime >= 0.5 * self._boot_time_s and has_global
+
+    @property
+    def has_origin(self) -> bool:
+        """True if the local frame has a global origin."""
+        return self.external.has_gps or self.external.origin is not None
 
     def next_ping(self) -> int:
         """Return the sequence number of the next PING."""

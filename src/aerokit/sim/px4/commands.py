@@ -126,6 +126,7 @@ def px4_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
         MavCmd.DO_CHANGE_SPEED: flight.change_speed,
         MavCmd.MISSION_START: flight.start_mission,
         MavCmd.DO_SET_HOME: flight.set_home,
+        MavCmd.EXTERNAL_WIND_ESTIMATE: px4.external.set_wind,
         MavCmd.PREFLIGHT_CALIBRATION: lambda command: px4.calibration.command(command),
         MavCmd.RUN_PREARM_CHECKS: flight.run_prearm_checks,
         MavCmd.PREFLIGHT_REBOOT_SHUTDOWN: flight.reboot,

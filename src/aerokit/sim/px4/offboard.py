@@ -9,7 +9,12 @@ import math
 from collections.abc import Iterable
 
 from aerokit.mavlink.enums import AttitudeTargetTypemask, MavFrame, MavSeverity
-from aerokit.mavlink.messages import SetAttitudeTarget, SetPositionTargetGlobalInt, SetPositionTargetLocalNed
+from aerokit.mavlink.messages import (
+    SetActuatorControlTarget,
+    SetAttitudeTarget,
+    SetPositionTargetGlobalInt,
+    SetPositionTargetLocalNed,
+)
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import PositionTarget, Setpoint, rotated
 from aerokit.sim.motion import Ned, euler_from_quaternion
@@ -43,6 +48,7 @@ class Px4Offboard:
         vehicle.on(SetPositionTargetLocalNed, self._on_local)
         vehicle.on(SetPositionTargetGlobalInt, self._on_global)
         vehicle.on(SetAttitudeTarget, self._on_attitude)
+        vehicle.on(SetActuatorControlTarget, self._on_actuators)
 
     @property
     def is_fresh(self) -> bool:
@@ -111,6 +117,16 @@ class Px4Offboard:
             self._attitude, self._body_rates = euler_from_quaternion(*target.q), None
         if math.isfinite(target.thrust):
             self._thrust = target.thrust
+        self.updated_at = self._vehicle.now
+
+    def _on_actuators(self, target: SetActuatorControlTarget, _: Channel) -> None:
+        """Apply the thrust of group 0; PX4 1.14 and later ignore the message."""
+        if self._vehicle.version_number >= 1 << 24 | 14 << 16:
+            return
+        motion = self._vehicle.motion
+        self._attitude, self._body_rates = (motion.roll, motion.pitch, motion.yaw), None
+        if target.group_mlx == 0:
+            self._thrust = target.controls[3]
         self.updated_at = self._vehicle.now
 
     def watch(self) -> None:

@@ -289,7 +289,9 @@ class SetpointEncoder:
             self._session.component_id,
             IGNORE_ATTITUDE,
             (1.0, 0.0, 0.0, 0.0),
-            *map(math.radians, rates),
+            math.radians(s.roll_deg_s),
+            math.radians(s.pitch_deg_s),
+            math.radians(s.yaw_deg_s),
             s.thrust,
         )
 

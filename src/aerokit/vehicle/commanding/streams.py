@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 import anyio
 
 from aerokit._internal.arguments import check_range, checks_arguments
-from aerokit.errors import BusyError, OperationRejected, SetpointStreamStopped
+from aerokit.errors import BusyError, OperationRejected, ParameterTimeout, SetpointStreamStopped
+from aerokit.parameters import Parameter
 from aerokit.vehicle.commanding.progress import StallDetector
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Awaitable, Callable, Mapping
     from types import TracebackType
 
     from typing_extensions import Self
@@ -26,7 +27,10 @@ if TYPE_CHECKING:
     from aerokit.vehicle.commanding.context import VehicleContext
     from aerokit.vehicle.commanding.order import Order
 
-__all__ = ["MAX_RATE_HZ", "SteeringStream", "ValueStream"]
+    Probe = Callable[..., Awaitable[Mapping[str, object]]]
+    """``Parameters.probe``, which is in a room above this one."""
+
+__all__ = ["MAX_RATE_HZ", "StallWatch", "SteeringStream", "TakeoverCheck", "ValueStream", "known_values"]
 
 ValueT = TypeVar("ValueT")
 
@@ -143,6 +147,7 @@ class ValueStream(Generic[ValueT]):
         """Stop the stream from inside; order the vehicle to hold unless there was a takeover."""
         self._end()
         is_confirmed = hold and self._hold()
+        self._release()
         self._stopped = SetpointStreamStopped(
             f"the {self._NAME} has stopped: {reason}" + ("; a hold was ordered" if is_confirmed else "")
         )
@@ -150,6 +155,9 @@ class ValueStream(Generic[ValueT]):
     def _hold(self) -> bool:
         """Order the vehicle to hold, without waiting; return True if it was sent."""
         return False
+
+    def _release(self) -> None:
+        """End the effect of the last value, where the vehicle would continue it."""
 
     def _end(self) -> None:
         """Stop sending."""
@@ -201,8 +209,10 @@ class SteeringStream(ValueStream[ValueT]):
         mode = self._wanted_mode()
         self._was_entered = True
         cleanup.stop_stream = self._stop
+        check = TakeoverCheck(self._context, mode)
         try:
             await self._check_support()
+            check.raise_if_changed(self._NAME)
         except BaseException:
             self._end()
             raise
@@ -210,12 +220,14 @@ class SteeringStream(ValueStream[ValueT]):
         order.may_move = order.may_move or self._session.telemetry.is_in(mode)
         try:
             await self._enter(mode, order)
-        except OperationRejected:  # The pilot or failsafe that took over keeps the vehicle.
+        except OperationRejected:  # The pilot or failsafe that took over keeps control.
             self._end()
+            self._release()
             raise
         except BaseException:
             self._end()
             self._hold()
+            self._release()
             raise
         return self
 
@@ -228,7 +240,10 @@ class SteeringStream(ValueStream[ValueT]):
         if self._stopped is None and (reason := self._takeover()):
             self._stop(reason, hold=False)
         if self._stopped is None:
-            await self._leave(exc)
+            try:
+                await self._leave(exc)
+            finally:
+                self._release()
         elif exc is None and not self._is_reported:
             raise self._stopped
 
@@ -283,6 +298,33 @@ class SteeringStream(ValueStream[ValueT]):
         super()._end()
         if self._context.flight_cleanup.stop_stream == self._stop:
             self._context.flight_cleanup.stop_stream = None
+
+
+class TakeoverCheck:
+    """Refuses to order a mode if another party has changed the mode since an earlier moment of the same call."""
+
+    def __init__(self, context: VehicleContext, wanted: Mode) -> None:
+        session = context.session
+        self._telemetry, self._wanted = session.telemetry, wanted
+        self._before = session.telemetry.mode.latest
+        is_vtol = session.telemetry.is_vtol
+        self._take_off, self._hold = (session.autopilot.mode_for(p, is_vtol=is_vtol) for p in ("take_off", "hold"))
+
+    def raise_if_changed(self, what: str) -> None:
+        """Raise OperationRejected if the mode has changed, except by the end of a take-off."""
+        before, mode = self._before, self._telemetry.mode.latest
+        if before is None or mode in (before, self._wanted) or (before, mode) == (self._take_off, self._hold):
+            return
+        raise OperationRejected(f"{what}: the mode changed from {before} to {mode} before anything was ordered")
+
+
+async def known_values(probe: Probe, *names: str) -> dict[str, float]:
+    """Return the values of those parameters that the vehicle has; raise ParameterTimeout if it did not answer."""
+    answers = await probe(*names)
+    for answer in answers.values():
+        if isinstance(answer, ParameterTimeout):
+            raise answer
+    return {name: float(answer.value) for name, answer in answers.items() if isinstance(answer, Parameter)}
 
 
 class StallWatch:

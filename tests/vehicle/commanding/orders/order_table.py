@@ -12,6 +12,7 @@ from call_table import CALLS, Row, north
 import aerokit
 from aerokit import missions
 from aerokit.mavlink.enums import MavCmd
+from aerokit.vehicle.external.values import TargetMeasurement
 
 Give = Callable[[aerokit.Vehicle], Awaitable[object]]
 
@@ -25,6 +26,11 @@ async def _follow(vehicle: aerokit.Vehicle) -> None:
     target = north(vehicle, 12.0)
     async with vehicle.follow(lambda: target, distance_m=4) as following:
         await following.fly(6.0)
+
+
+async def _fly_by_sticks(vehicle: aerokit.Vehicle) -> None:
+    async with vehicle.sticks() as sticks:
+        await sticks.move(aerokit.StickInput(forward=0.3), 6.0)
 
 
 async def upload(vehicle: aerokit.Vehicle) -> None:
@@ -178,6 +184,26 @@ ROWS = (
         SET_MODE,
         modes=(("GUIDED", "BRAKE"), ("OFFBOARD", "LOITER")),
         holds=True,
+    ),
+    Row(
+        "sticks",
+        _fly_by_sticks,
+        SET_MODE,
+        modes=(("LOITER", "BRAKE"), ("POSCTL", "LOITER")),
+        holds=True,
+    ),
+    Row(
+        "land_on",
+        lambda v: v.land_on(lambda: TargetMeasurement(0.1, 0.1, 5.0, is_level=True), timeout=60),
+        SET_MODE,
+        modes=((), ("PRECLAND",)),
+        on=("px4",),  # ArduPilot needs parameters
+    ),
+    Row(
+        "external.set_wind",
+        lambda v: v.external.set_wind(3.0, 90.0),
+        int(MavCmd.EXTERNAL_WIND_ESTIMATE),
+        steers=False,
     ),
     Row(
         "mission.start",
