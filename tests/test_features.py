@@ -106,7 +106,7 @@ CALLS = {
     """,
 }
 """Calls of MAVSDK 4.1 by plugin; ``get_`` and ``subscribe_`` of one thing are one call. The wheel lacks ``core``."""
-PENDING = {}
+PENDING: set[str] = set()
 """Names on the page that are not built yet. Remove a name when it exists; a test fails otherwise."""
 MIN_FULL = 235
 

@@ -68,7 +68,7 @@ class TargetState(Snapshot):
     at: float
 
 
-class TargetTracker:
+class FollowedTarget:
     """The latest position of the target, and its velocity: reported by a vehicle, or computed from two positions."""
 
     def __init__(self, target: FollowTarget, now: Callable[[], float]) -> None:
@@ -154,7 +154,7 @@ class FollowStream(SteeringStream[TargetState]):
             raise NotSupported(f"follow: {autopilot.firmware} does not support position set-points; nothing was sent")
         nowhere = TargetState(Position(0.0, 0.0), (0.0, 0.0, 0.0), -math.inf)
         super().__init__(context, self._encode_place, nowhere, RATE_HZ, valid_for_s, MAX_LAG_S)
-        self._target, self._tracker = target, TargetTracker(target, self._now)
+        self._target, self._tracker = target, FollowedTarget(target, self._now)
         self._place, self._max_distance_m = place, max_distance_m
         self._reading: Cancellation | None = None
         self._end_reason = ""
