@@ -14,7 +14,6 @@ import anyio
 from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit.errors import BusyError, OperationRejected, ParameterTimeout, SetpointStreamStopped
 from aerokit.parameters import Parameter
-from aerokit.vehicle.commanding.progress import StallDetector
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
@@ -30,7 +29,7 @@ if TYPE_CHECKING:
     Probe = Callable[..., Awaitable[Mapping[str, object]]]
     """``Parameters.probe``, which is in a room above this one."""
 
-__all__ = ["MAX_RATE_HZ", "StallWatch", "SteeringStream", "TakeoverCheck", "ValueStream", "known_values"]
+__all__ = ["MAX_RATE_HZ", "SteeringStream", "TakeoverCheck", "ValueStream", "known_values"]
 
 ValueT = TypeVar("ValueT")
 
@@ -265,23 +264,17 @@ class SteeringStream(ValueStream[ValueT]):
         if self._is_stream_before_mode:
             self._begin_sending()
             await self._feed(self._value, LEAD_TIME_S)
-            await self._feeding_initial(mode, order)
+            self._is_entering = True
+            try:
+                await self._context.sender.ensure_mode(mode, order)
+            finally:
+                self._is_entering = False
+                self._set_at = self._now()
+            self._raise_if_stopped()
         else:
             await self._context.sender.ensure_mode(mode, order)
             self._begin_sending()
         self._mode = mode
-
-    async def _feeding_initial(self, mode: Mode, order: Order) -> None:
-        """Stream the initial value during the mode change. Not a task group, so that exceptions reach the user
-        unchanged.
-        """
-        self._is_entering = True
-        try:
-            await self._context.sender.ensure_mode(mode, order)
-        finally:
-            self._is_entering = False
-            self._set_at = self._now()
-        self._raise_if_stopped()
 
     def _takeover(self) -> str | None:
         mode = self._session.telemetry.mode.latest
@@ -325,18 +318,3 @@ async def known_values(probe: Probe, *names: str) -> dict[str, float]:
         if isinstance(answer, ParameterTimeout):
             raise answer
     return {name: float(answer.value) for name, answer in answers.items() if isinstance(answer, Parameter)}
-
-
-class StallWatch:
-    """Reports a vehicle that does not move for twelve seconds although the values of a stream want it to."""
-
-    def __init__(self, context: VehicleContext, wants_motion: Callable[[], bool]) -> None:
-        self._session, self._wants_motion = context.session, wants_motion
-        self._stillness = StallDetector(context.session)
-
-    def __call__(self) -> str | None:
-        """Return how long it has not moved, as a clause; None if it moves or need not."""
-        if not self._wants_motion():
-            self._stillness = StallDetector(self._session)
-            return None
-        return self._stillness()
