@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from aerokit._internal.arguments import check_kind, checks_arguments
 from aerokit.errors import NotSupported
+from aerokit.vehicle.commanding.progress import StallDetector
 from aerokit.vehicle.commanding.setpoints import (
     AccelerationSetpoint,
     ActuatorSetpoint,
@@ -26,7 +27,6 @@ from aerokit.vehicle.commanding.setpoints import (
     VelocitySetpoint,
     wants_motion,
 )
-from aerokit.vehicle.commanding.progress import StallDetector
 from aerokit.vehicle.commanding.streams import SteeringStream
 
 if TYPE_CHECKING:

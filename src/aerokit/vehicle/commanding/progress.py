@@ -277,6 +277,13 @@ class VehiclePosition:
         flies = self._autopilot.mode_for("take_off", is_vtol=self._telemetry.is_vtol) is not None
         return flies and landed.latest == MavLandedState.ON_GROUND and landed.age <= POSITION_MAX_AGE_S
 
+    def check_flying(self, what: str) -> None:
+        """Raise OperationRejected if the vehicle is disarmed or on the ground."""
+        if not self._telemetry.is_armed:
+            raise OperationRejected(f"{what}: the vehicle is not armed; nothing was sent")
+        if self.is_on_ground():
+            raise OperationRejected(f"{what}: the vehicle is on the ground: call take_off() first; nothing was sent")
+
     @property
     def takes_relative_altitude(self) -> bool:
         """Return True if the autopilot supports altitudes relative to home."""

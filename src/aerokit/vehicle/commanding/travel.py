@@ -84,10 +84,7 @@ class TravelActions(VehicleBase):
         self._position.check_reach("target", [target], max_distance_m)
         near_m = self._position.arrival_radius_m if tolerance_m is None else tolerance_m
         self._check_can_turn(heading_deg)
-        if not self.telemetry.is_armed:
-            raise OperationRejected("go_to: the vehicle is not armed; nothing was sent")
-        if self._position.is_on_ground():
-            raise OperationRejected("go_to: the vehicle is on the ground: call take_off() first; nothing was sent")
+        self._position.check_flying("go_to")
         mode = self._sender.mode_for("go_to", self.autopilot.reposition_purpose)
         order = self._arbiter.order(mode, self._sender.mode_for("go_to", "setpoint"))
         yaw = self._reposition_yaw(heading_deg)
