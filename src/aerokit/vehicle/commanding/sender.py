@@ -227,6 +227,16 @@ class OrderSender:
 
         return trouble
 
+    def stays_until_disarmed(self, order: Order) -> Callable[[], str | None]:
+        """Like :meth:`stays_in` the modes of the order, for one that ends by disarming, which may change the mode."""
+        stays, armed = self.stays_in(order, *order.modes), self._session.telemetry.armed
+
+        def trouble() -> str | None:
+            is_open = order.has_lost_mode and armed.updated_at < order.mode_lost_at
+            return None if is_open else stays()  # The next HEARTBEAT may report that it has landed and disarmed.
+
+        return trouble
+
     async def follow_up_command(self, order: Order, command: int, *params: float) -> None:
         """Send a further command of a steering order."""
         await self.run_command(order, self._session.commands.send_long, command, *params)

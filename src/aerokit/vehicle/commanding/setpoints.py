@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from aerokit._internal.arguments import check_range
+from aerokit._internal.arguments import check_finite, check_range
 from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavFrame
@@ -189,7 +189,7 @@ class SetpointEncoder:
             else:
                 mask |= ignored
                 values += ZERO
-        _check_finite("set-point", *values)
+        check_finite("set-point", *values)
         return SetPositionTargetLocalNed(self._time_ms(), *self._address, frame, mask, *values, yaw, yaw_rate)
 
     def body_velocity(self, s: BodyVelocitySetpoint) -> Message:
@@ -223,7 +223,7 @@ class SetpointEncoder:
 
     def attitude(self, s: AttitudeSetpoint) -> Message:
         """Return SET_ATTITUDE_TARGET with attitude and thrust."""
-        _check_finite("attitude", s.roll_deg, s.pitch_deg, s.yaw_deg, s.thrust)
+        check_finite("attitude", s.roll_deg, s.pitch_deg, s.yaw_deg, s.thrust)
         check_range("thrust", s.thrust, 0, 1)
         q = Attitude(s.roll_deg, s.pitch_deg, s.yaw_deg).quaternion
         return SetAttitudeTarget(self._time_ms(), *self._address, IGNORE_BODY_RATES, q, *ZERO, s.thrust)
@@ -254,12 +254,6 @@ def _yaw(yaw_deg: float | None, yaw_rate_deg_s: float | None) -> tuple[int, floa
     """Return type-mask bits, yaw in radians and yaw rate in radians per second."""
     if yaw_deg is not None and yaw_rate_deg_s is not None:
         raise InvalidArgument(f"yaw_deg = {yaw_deg} and yaw_rate_deg_s = {yaw_rate_deg_s} are not allowed together")
-    _check_finite("yaw", yaw_deg or 0.0, yaw_rate_deg_s or 0.0)
+    check_finite("yaw", yaw_deg or 0.0, yaw_rate_deg_s or 0.0)
     mask = (IGNORE_YAW if yaw_deg is None else 0) | (IGNORE_YAW_RATE if yaw_rate_deg_s is None else 0)
     return mask, math.radians(yaw_deg or 0.0), math.radians(yaw_rate_deg_s or 0.0)
-
-
-def _check_finite(what: str, *values: float) -> None:
-    for value in values:
-        if not math.isfinite(value):
-            raise InvalidArgument(f"{what}: {value!r} is not a finite number")

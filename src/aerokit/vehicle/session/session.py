@@ -213,10 +213,10 @@ class VehicleSession:
     # ----------------------------------------------------------------------------- receiving
 
     @contextmanager
-    def streaming(self, *names: str) -> Iterator[None]:
+    def streaming(self, *names: str, hz: float = ACTION_HZ) -> Iterator[None]:
         """Request the messages of these states during the block, even if the program disabled the default rates."""
         releases = [
-            self.rates.request(message_type, ACTION_HZ, is_optional=True)
+            self.rates.request(message_type, hz, is_optional=True)
             for name in names
             for message_type in self.telemetry.required_messages(name)
         ]
