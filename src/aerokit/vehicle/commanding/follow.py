@@ -14,14 +14,12 @@ from aerokit._internal.values import Snapshot
 from aerokit.connection.tasks import Cancellation
 from aerokit.errors import InvalidArgument, NotSupported, OperationTimeout
 from aerokit.position import Position
-from aerokit.vehicle.commanding.maneuvers import FollowTarget, HasTelemetry
+from aerokit.vehicle.commanding.follow_target import FollowTarget, HasTelemetry
 from aerokit.vehicle.commanding.progress import POSITION_MAX_AGE_S
 from aerokit.vehicle.commanding.setpoints import ZERO, PositionSetpoint, SetpointEncoder
 from aerokit.vehicle.commanding.streams import SteeringStream
 
 if TYPE_CHECKING:
-    from types import TracebackType
-
     from typing_extensions import Self
 
     from aerokit.autopilots import Mode
@@ -182,9 +180,7 @@ class FollowStream(SteeringStream[TargetState]):
             self._stop_reading()
             raise
 
-    async def __aexit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, exc_type: object, exc: BaseException | None, traceback: object) -> None:
         self._stop_reading()
         await super().__aexit__(exc_type, exc, traceback)
 

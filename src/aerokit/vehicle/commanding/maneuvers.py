@@ -3,33 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import AsyncIterable, Callable
-from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Literal
 
 from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit.errors import InvalidArgument, NotSupported
 from aerokit.mavlink.enums import MavCmd, MavDoRepositionFlags, MavType, MavVtolState, OrbitYawBehaviour, SpeedType
-from aerokit.position import Position, travel_target
+from aerokit.position import travel_target
 from aerokit.vehicle.commanding.context import VehicleBase
+from aerokit.vehicle.commanding.follow_target import FollowTarget
 from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M, MAX_SILENCE_S, await_progress
 
 if TYPE_CHECKING:
     from aerokit.autopilots import Mode
-    from aerokit.position import Home
+    from aerokit.position import Home, Position
     from aerokit.vehicle.commanding.closed_paths import TurnCounter
     from aerokit.vehicle.commanding.follow import FollowStream
 
 
-@runtime_checkable
-class HasTelemetry(Protocol):
-    """A vehicle, asynchronous or blocking."""
-
-    @property
-    def telemetry(self) -> Any: ...
-
-
-FollowTarget = HasTelemetry | AsyncIterable[Position] | Callable[[], Position | None]
-"""A vehicle, an asynchronous iterable of positions, or a function that returns the latest position or None."""
 Facing = Literal["center", "ahead", "initial", "free"]
 FlightState = Literal["fixed_wing", "multicopter"]
 
@@ -93,14 +83,9 @@ class ManeuverActions(VehicleBase):
             max_silence_s: raise when no heartbeat was received for this long; None: no limit.
 
         Raises:
-            InvalidArgument: an argument is out of range. Nothing was sent.
             NotSupported: this type of vehicle has no way to do it. Nothing was sent.
-            ValueUnknownError: position or home is needed here and not known.
-            OperationRejected: it is not flying, or the mode changed or it disarmed on the way.
-            CommandRejected: the vehicle refused.
-            CommandTimeout: there was no acknowledgement.
-            HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
-            OperationTimeout: it was not done in time, or does not move.
+
+        Otherwise raises as :meth:`go_to`.
         """
         from aerokit.vehicle.commanding.closed_paths import Circle
         from aerokit.vehicle.commanding.rounds import RoundFlight

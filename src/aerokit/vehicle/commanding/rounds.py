@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import anyio
 
@@ -62,7 +62,7 @@ class RoundFlight:
         position.check_reach("center", [center], max_distance_m)
         position.check_flying(what)
         frame = MavFrame.GLOBAL_RELATIVE_ALT_INT if is_relative else MavFrame.GLOBAL_INT
-        self._place = {"frame": frame, "x": latitude, "y": longitude, "z": altitude}
+        self._place: dict[str, Any] = {"frame": frame, "x": latitude, "y": longitude, "z": altitude}
 
     @property
     def bearing_rad(self) -> float:

@@ -215,11 +215,10 @@ class SetpointEncoder:
         """
         mask, yaw, yaw_rate = _yaw(s.yaw_deg, s.yaw_rate_deg_s)
         mask |= IGNORE_ACCELERATION | (IGNORE_VELOCITY if velocity is None else 0)
-        *place, is_relative = self._position.global_target(s.position)
+        latitude, longitude, altitude, is_relative = self._position.global_target(s.position)
         frame = MavFrame.GLOBAL_RELATIVE_ALT_INT if is_relative else MavFrame.GLOBAL_INT
-        return SetPositionTargetGlobalInt(
-            self._time_ms(), *self._address, frame, mask, *place, *(velocity or ZERO), *ZERO, yaw, yaw_rate
-        )
+        place = (latitude, longitude, altitude, *(velocity or ZERO))
+        return SetPositionTargetGlobalInt(self._time_ms(), *self._address, frame, mask, *place, *ZERO, yaw, yaw_rate)
 
     def attitude(self, s: AttitudeSetpoint) -> Message:
         """Return SET_ATTITUDE_TARGET with attitude and thrust."""
@@ -233,8 +232,8 @@ class SetpointEncoder:
         for name in ("roll_deg_s", "pitch_deg_s", "yaw_deg_s"):
             check_range(name, getattr(s, name), -MAX_BODY_RATE_DEG_S, MAX_BODY_RATE_DEG_S)
         check_range("thrust", s.thrust, 0, 1)
-        rates = map(math.radians, (s.roll_deg_s, s.pitch_deg_s, s.yaw_deg_s))
         q = (1.0, 0.0, 0.0, 0.0)
+        rates = (math.radians(s.roll_deg_s), math.radians(s.pitch_deg_s), math.radians(s.yaw_deg_s))
         return SetAttitudeTarget(self._time_ms(), *self._address, IGNORE_ATTITUDE, q, *rates, s.thrust)
 
     def actuators(self, s: ActuatorSetpoint) -> Message:

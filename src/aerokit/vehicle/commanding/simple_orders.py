@@ -49,11 +49,7 @@ class Argument(Snapshot):
     whole: bool = False
 
     def to_wire(self, value: float) -> float:
-        """Check the value and convert it to the unit of the command.
-
-        Raises:
-            InvalidArgument: it is out of range, or has a fraction.
-        """
+        """Check the value and convert it to the unit of the command."""
         check_range(self.name, value, self.minimum, self.maximum, above=self.above)
         if self.whole and value != int(value):
             raise InvalidArgument(f"{self.name} = {short_repr(value)} is not allowed: a whole number")
@@ -92,11 +88,7 @@ class SimpleOrder(Snapshot):
             )
 
     def wire_params(self, *values: float) -> tuple[float, ...]:
-        """Check the values of the arguments and return the parameters of the command.
-
-        Raises:
-            InvalidArgument: a value is out of range; the text names the argument.
-        """
+        """Check the values of the arguments and return the parameters of the command."""
         rest = iter(values)
         params = tuple(param.to_wire(next(rest)) if isinstance(param, Argument) else param for param in self.params)
         if left := tuple(rest):
@@ -123,15 +115,6 @@ class SimpleOrder(Snapshot):
             component_id: the target component; None: the autopilot.
             timeout: seconds after the acknowledgement until a message must report the effect.
             options: further arguments of `CommandSender.send_long`.
-
-        Raises:
-            InvalidArgument: a value is out of range. Nothing was sent.
-            NotSupported: the command is for the autopilot, which does not have it. Nothing was sent.
-            CommandRejected: the vehicle refused.
-            CommandTimeout: there was no acknowledgement.
-            OperationRejected: a newer order for the same device was given.
-            HeartbeatTimeout: the vehicle was silent for ten seconds while its effect was awaited.
-            OperationTimeout: the effect was not reported in time.
         """
         params = self.wire_params(*values)
         if component_id in (None, context.session.component_id):

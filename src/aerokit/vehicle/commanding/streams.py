@@ -17,7 +17,6 @@ from aerokit.parameters import Parameter
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
-    from types import TracebackType
 
     from typing_extensions import Self
 
@@ -230,12 +229,7 @@ class SteeringStream(ValueStream[ValueT]):
             raise
         return self
 
-    async def __aexit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    async def __aexit__(self, exc_type: object, exc: BaseException | None, traceback: object) -> None:
         if self._stopped is None and (reason := self._takeover()):
             self._stop(reason, hold=False)
         if self._stopped is None:

@@ -83,9 +83,9 @@ class MeasurementEncoder:
     def vision_position(self, value: v.PoseMeasurement) -> tuple[Message, ...]:
         """Return VISION_POSITION_ESTIMATE."""
         time, place, covariance = self._pose(value)
-        angles = (value.attitude.roll_deg, value.attitude.pitch_deg, value.attitude.yaw_deg)
-        count = _reset_counter(value.reset_counter)
-        return (m.VisionPositionEstimate(time, *place, *map(math.radians, angles), covariance, count),)
+        attitude, count = value.attitude, _reset_counter(value.reset_counter)
+        roll, pitch, yaw = map(math.radians, (attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg))
+        return (m.VisionPositionEstimate(time, *place, roll, pitch, yaw, covariance, count),)
 
     def motion_capture(self, value: v.PoseMeasurement) -> tuple[Message, ...]:
         """Return ATT_POS_MOCAP, or VISION_POSITION_ESTIMATE for an estimator that does not read it."""
@@ -203,11 +203,7 @@ class MeasurementEncoder:
         return (m.DistanceSensor(time, low, high, distance, LASER, 0, *place, signal_quality=value.quality or 0),)
 
     def landing_target(self, value: v.TargetMeasurement) -> tuple[Message, ...]:
-        """Return LANDING_TARGET relative to the vehicle, or in the local frame by its attitude and position.
-
-        Raises:
-            ValueUnknownError: attitude or local position are unknown and the autopilot needs them.
-        """
+        """Return LANDING_TARGET relative to the vehicle, or in the local frame by its attitude and position."""
         offset = (value.forward_m, value.right_m, value.down_m)
         check_finite("target", *offset)
         check_range("number", value.number, 0, 255)

@@ -14,7 +14,6 @@ from aerokit.vehicle.commanding.streams import MAX_RATE_HZ, known_values
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from types import TracebackType
 
     from typing_extensions import Self
 
@@ -205,12 +204,7 @@ class MeasurementStream(Generic[MeasurementT]):
         self._is_open = True
         return self
 
-    async def __aexit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         self._is_open, self._waiting = False, None
         if self._timer is not None:
             self._timer.cancel()

@@ -25,7 +25,6 @@ from aerokit.vehicle.gimbal.orders import CONFIGURE, GimbalOrders
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from types import TracebackType
 
     from typing_extensions import Self
 
@@ -236,9 +235,7 @@ class GimbalControl:
             raise
         return self
 
-    async def __aexit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, exc_type: object, exc: BaseException | None, traceback: object) -> None:
         if self._taken is not None:
             self._end()
             if exc is None and not self._was_raised:

@@ -94,12 +94,8 @@ class RoiMixin(GimbalMixin):
             InvalidArgument: the tolerance is out of range. Nothing was sent.
             NotSupported: the manager supports it for its first gimbal only. Nothing was sent.
             ValueUnknownError: the target needs home or the vehicle's altitude, which is unknown. Nothing was sent.
-            CommandRejected: the manager refused.
-            CommandTimeout: there was no answer.
-            GimbalTaken: your program had control and lost it.
-            OperationRejected: another order was given meanwhile, or the vehicle rebooted.
-            OperationTimeout: the gimbal did not reach the direction in time; the text has the last attitude.
-            HeartbeatTimeout: the vehicle fell silent.
+
+        Otherwise raises as :meth:`neutral`.
         """
         check_range("tolerance_deg", tolerance_deg, 0, 45, above=True)
         orders = self._orders
@@ -136,12 +132,8 @@ class RoiMixin(GimbalMixin):
         Raises:
             InvalidArgument: the system id or the tolerance is out of range. Nothing was sent.
             NotSupported: the manager does not support it. Nothing was sent.
-            CommandRejected: the manager refused.
-            CommandTimeout: there was no answer.
-            GimbalTaken: your program had control and lost it.
-            OperationRejected: another order was given meanwhile, or the vehicle rebooted.
-            OperationTimeout: the gimbal did not reach the direction in time; the text has the last attitude.
-            HeartbeatTimeout: the vehicle fell silent.
+
+        Otherwise raises as :meth:`neutral`.
         """
         if isinstance(system_id, bool):
             raise InvalidArgument(f"system_id = {system_id} is not allowed: 1 to 255")

@@ -18,8 +18,6 @@ from aerokit.vehicle.gimbal.control import ReleaseCommand
 from aerokit.vehicle.gimbal.orders import LEVEL, LOCKED, NAN, PITCHYAW, GimbalOrders
 
 if TYPE_CHECKING:
-    from types import TracebackType
-
     from typing_extensions import Self
 
     from aerokit.mavlink.message import Message
@@ -136,9 +134,7 @@ class GimbalRates:
             raise
         return self
 
-    async def __aexit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, exc_type: object, exc: BaseException | None, traceback: object) -> None:
         if self._stopped is None and (error := self._lost_to()):
             self._stop(error, zero=False)
         if self._stopped is None:

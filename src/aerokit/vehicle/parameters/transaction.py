@@ -16,8 +16,6 @@ from aerokit.parameters.parameter import same_value
 from aerokit.vehicle.parameters.writing import ResolvedParameter
 
 if TYPE_CHECKING:
-    from types import TracebackType
-
     from typing_extensions import Self
 
     from aerokit.parameters import ParameterDifference
@@ -156,9 +154,7 @@ class TemporaryParameters(_Block):
             raise
         return results
 
-    async def __aexit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, exc_type: object, exc: BaseException | None, traceback: object) -> None:
         await self._restore(exc)
 
 
@@ -230,9 +226,7 @@ class Transaction(_Block):
         self._is_open = True
         return self
 
-    async def __aexit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, exc_type: object, exc: BaseException | None, traceback: object) -> None:
         self._is_open = False
         if exc is None:
             self._discard()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import anyio
@@ -34,10 +35,9 @@ from aerokit.mavlink.messages import (
     HomePosition,
 )
 from aerokit.vehicle.session.commands import CommandSender
-from aerokit.vehicle.session.rates import ComponentSubscriber, MessageRates
+from aerokit.vehicle.session.rates import ComponentSubscriber, MessageRates, WatchedStream
 from aerokit.vehicle.session.transfers import Transfers
 from aerokit.vehicle.session.watch import LinkWatch, VehicleWatch
-from aerokit.vehicle.session.watched import WatchedStream
 from aerokit.vehicle.state.field import MESSAGE_IDS
 from aerokit.vehicle.state.states import STATES
 from aerokit.vehicle.state.telemetry import Telemetry
@@ -337,7 +337,8 @@ class VehicleSession:
             for source in state.sources:
                 kind = self.connection.bus.dialect.get(MESSAGE_IDS[source.message])
                 if source.watched_hz is not None and kind is not None and self.autopilot.sends(kind):
-                    cell._feed_from(*cell._feeds, WatchedStream(cell, self.rates, kind, source.watched_hz))
+                    request = partial(self.rates.request, kind, source.watched_hz, is_optional=True)
+                    cell._feed_from(*cell._feeds, WatchedStream(cell, request))
 
     def _on_link_chosen(self, event: LinkSelected) -> None:
         """Request all streams again, because an autopilot keeps separate rates for each of its ports."""
