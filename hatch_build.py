@@ -42,7 +42,8 @@ class WireBuildHook(BuildHookInterface[Any]):
     def _compiled(self) -> Path:
         from setuptools import Distribution, Extension
 
-        folder = tempfile.mkdtemp()
+        self._folder = tempfile.TemporaryDirectory()  # until the wheel is written
+        folder = self._folder.name
         extension = Extension(
             "aerokit._wire",
             [str(Path(self.root, "src", "aerokit", "_wire.c"))],

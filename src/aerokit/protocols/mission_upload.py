@@ -258,9 +258,7 @@ class MissionUpload(MissionExchange[UploadResult]):
     def _time_out(self, now: float) -> None:
         self._outbox += self.cancellation()
         missing = range(max(self._confirmed, self.offset), self._end)
-        details = (
-            f"items {format_ranges(missing)} were not confirmed" if self._is_accepted else "no item was requested"
-        )
+        details = f"items {format_ranges(missing)} were not confirmed" if self._is_accepted else "no item was requested"
         self._fail(
             MissionTimeout(
                 f"{self.kind}: the vehicle fell silent during the upload: {details}"

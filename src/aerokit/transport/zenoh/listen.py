@@ -133,7 +133,9 @@ class ZenohListen(NetworkLink):
 
         self._zenoh = zenoh
         self._declared = [session.declare_subscriber(self._keys.beacon, on_beacon)]
-        self._has_others = any(True for _ in session.liveliness().get(self._keys.alive(), timeout=_RIVAL_QUERY_TIMEOUT_S))
+        self._has_others = any(
+            True for _ in session.liveliness().get(self._keys.alive(), timeout=_RIVAL_QUERY_TIMEOUT_S)
+        )
 
     def _serve(self, queue: LoopQueue[Callable[[], object]]) -> None:
         zenoh, session, keys = self._zenoh, self._session, self._keys
