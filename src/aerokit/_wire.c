@@ -7,36 +7,34 @@
    owned during every call of Python code. Fields of messages are read and written in the slots of their class: the
    offsets are found, and verified, once for each class (`slot_of`).
 
-   Only the limited API is used, so that one binary serves all versions of Python from 3.10. Nothing is static but
-   constants: each interpreter has its own module state. An interpreter with its own GIL refuses the module, because
-   declaring support needs the API of 3.12, and uses the Python wire; so does free-threaded Python, for which
-   hatch_build.py does not build it, because the state of a framer is protected by the GIL. */
+   Only the limited API is used: one binary serves all versions of Python from 3.10. Nothing is static but constants:
+   each interpreter has its own module state. An interpreter with its own GIL refuses the module, because declaring
+   support needs the API of 3.12; free-threaded Python has no limited API. Both use the Python wire. */
 
 #define PY_SSIZE_T_CLEAN
 #include <Python.h>
-#include <structmember.h>
 
 #include <float.h>
-#include <stddef.h>
 #include <stdint.h>
 #include <string.h>
+#include <structmember.h>
 
 #define VERSION 1 /* as in _internal/wire.py */
 
 enum { MAGIC_V1 = 0xFE, MAGIC_V2 = 0xFD, SIGNED = 1, SIGNATURE = 13, HEADER = 9, MAX_PAYLOAD = 255, MAX_FRAME = 280 };
 
+enum { FRAME_FIELDS, SOURCE_FIELDS, COUNTER_FIELDS, FRAMER, TABLE, LAYOUT, TYPES };
+
 typedef struct {
-    PyTypeObject *frame_fields, *source_fields, *counter_fields, *framer, *table, *layout;
+    PyTypeObject *types[TYPES];
     PyTypeObject *frame; /* the class of Python, or NULL before `register_frame` */
-    PyObject *zero, *decode_body, *layout_name;
+    PyObject *zero, *layout_name;
     uint16_t crc[8][256];
 } State;
 
 enum { STATE_OBJECTS = offsetof(State, crc) / sizeof(PyObject *) };
 
-static unsigned u16(const uint8_t *at) {
-    return (unsigned)(at[0] | at[1] << 8);
-}
+static unsigned u16(const uint8_t *at) { return (unsigned)(at[0] | at[1] << 8); }
 
 static uint64_t little_endian(const uint8_t *at, int size) {
     uint64_t value = 0;
@@ -140,15 +138,13 @@ typedef struct {
     unsigned char system_id, component_id;
 } Frame;
 
+#define MEMBER(name, kind, Type, member) {name, kind, offsetof(Type, member), 0, NULL}
+
 static PyMemberDef frame_members[] = {
-    {"body", T_OBJECT_EX, offsetof(Frame, body), 0, NULL},
-    {"received_at", T_OBJECT_EX, offsetof(Frame, received_at), 0, NULL},
-    {"_raw", T_OBJECT_EX, offsetof(Frame, raw), 0, NULL},
-    {"message_id", T_UINT, offsetof(Frame, message_id), 0, NULL},
-    {"checksum", T_USHORT, offsetof(Frame, checksum), 0, NULL},
-    {"system_id", T_UBYTE, offsetof(Frame, system_id), 0, NULL},
-    {"component_id", T_UBYTE, offsetof(Frame, component_id), 0, NULL},
-    {0},
+    MEMBER("body", T_OBJECT_EX, Frame, body),        MEMBER("received_at", T_OBJECT_EX, Frame, received_at),
+    MEMBER("_raw", T_OBJECT_EX, Frame, raw),         MEMBER("message_id", T_UINT, Frame, message_id),
+    MEMBER("checksum", T_USHORT, Frame, checksum),   MEMBER("system_id", T_UBYTE, Frame, system_id),
+    MEMBER("component_id", T_UBYTE, Frame, component_id), {0},
 };
 
 static void frame_dealloc(PyObject *self) {
@@ -190,7 +186,7 @@ static PyObject *make_frame(State *state, const uint8_t *raw, Py_ssize_t size, P
 /* register_frame(class): set the class of frames. */
 static PyObject *wire_register_frame(PyObject *module, PyObject *frame) {
     State *state = PyModule_GetState(module);
-    if (!PyType_Check(frame) || !PyType_IsSubtype((PyTypeObject *)frame, state->frame_fields)) {
+    if (!PyType_Check(frame) || !PyType_IsSubtype((PyTypeObject *)frame, state->types[FRAME_FIELDS])) {
         PyErr_SetString(PyExc_TypeError, "the class of frames must be derived from FrameFields");
         return NULL;
     }
@@ -204,8 +200,8 @@ typedef struct {
     unsigned long long number; /* `SourceStatistics.expected`, or `FramerStatistics.bytes` */
 } Number;
 
-static PyMemberDef source_members[] = {{"expected", T_ULONGLONG, offsetof(Number, number), 0, NULL}, {0}};
-static PyMemberDef counter_members[] = {{"bytes", T_ULONGLONG, offsetof(Number, number), 0, NULL}, {0}};
+static PyMemberDef source_members[] = {MEMBER("expected", T_ULONGLONG, Number, number), {0}};
+static PyMemberDef counter_members[] = {MEMBER("bytes", T_ULONGLONG, Number, number), {0}};
 
 /* -------------------------------------------------------------------------- layouts of message classes */
 
@@ -223,9 +219,7 @@ typedef struct {
     int field_count, id, crc_extra, length, base_length;
 } Layout;
 
-static PyObject **at_slot(PyObject *object, Py_ssize_t slot) {
-    return (PyObject **)(void *)((char *)object + slot);
-}
+static PyObject **at_slot(PyObject *object, Py_ssize_t slot) { return (PyObject **)(void *)((char *)object + slot); }
 
 OWNER(layout, Layout, message_class, 1)
 
@@ -249,13 +243,7 @@ static Py_ssize_t slot_of(PyObject *message_class, PyObject *name) {
 }
 
 static int size_of(int kind) {
-    switch (kind) {
-    case 'h': case 'H': return 2;
-    case 'i': case 'I': case 'f': return 4;
-    case 'q': case 'Q': case 'd': return 8;
-    case 'b': case 'B': case 's': case 'p': return 1;
-    default: return 0;
-    }
+    return strchr("bBsp", kind) ? 1 : strchr("hH", kind) ? 2 : strchr("iIf", kind) ? 4 : strchr("qQd", kind) ? 8 : 0;
 }
 
 /* Fill the fields: 1, 0 if the class needs Python, -1 for an error. */
@@ -273,7 +261,7 @@ static int fill_layout(Layout *self, PyObject *rows) {
         Field *field = &self->memory[self->field_count];
         if (!PyArg_ParseTuple(PyTuple_GetItem(rows, self->field_count), "UCi", &name, &field->kind, &field->count))
             return -1;
-        field->size = size_of(field->kind);
+        field->size = field->kind ? size_of(field->kind) : 0;
         field->offset = at;
         field->slot = slot_of(self->message_class, name);
         if (field->slot <= 0 || field->size == 0 || field->count < 0 || field->count > MAX_PAYLOAD)
@@ -290,7 +278,7 @@ static int fill_layout(Layout *self, PyObject *rows) {
 static PyObject *wire_layout(PyObject *module, PyObject *args) {
     State *state = PyModule_GetState(module);
     PyObject *message_class, *rows;
-    Layout *self = (Layout *)PyType_GenericAlloc(state->layout, 0);
+    Layout *self = (Layout *)PyType_GenericAlloc(state->types[LAYOUT], 0);
     int result = -1;
     if (self != NULL && PyArg_ParseTuple(args, "O!iiiiO!", &PyType_Type, &message_class, &self->id, &self->crc_extra,
                                          &self->length, &self->base_length, &PyTuple_Type, &rows)) {
@@ -300,16 +288,19 @@ static PyObject *wire_layout(PyObject *module, PyObject *args) {
     if (result > 0)
         return (PyObject *)self;
     Py_XDECREF(self);
-    if (result < 0)
-        return NULL;
-    Py_RETURN_NONE;
+    return result < 0 ? NULL : new_reference(Py_None);
 }
 
 /* ------------------------------------------------------------------------------------------- decoding */
 
+typedef union { float number; uint32_t bits; } Single;
+typedef union { double number; uint64_t bits; } Double;
+
 /* Return the number at ``at``; NULL without an exception for a signalling NaN, of which versions of Python make
    different floats. */
 static PyObject *decode_number(int kind, const uint8_t *at) {
+    Single single;
+    int is_signalling;
     switch (kind) {
     case 'b': return PyLong_FromLong((int8_t)at[0]);
     case 'B': return PyLong_FromLong(at[0]);
@@ -319,18 +310,11 @@ static PyObject *decode_number(int kind, const uint8_t *at) {
     case 'I': return PyLong_FromLongLong((long long)little_endian(at, 4));
     case 'q': return PyLong_FromLongLong((int64_t)little_endian(at, 8));
     case 'Q': return PyLong_FromUnsignedLongLong(little_endian(at, 8));
-    case 'f': {
-        uint32_t bits = (uint32_t)little_endian(at, 4);
-        float value;
-        memcpy(&value, &bits, 4);
-        return (bits & 0x7FC00000) == 0x7F800000 && bits & 0x3FFFFF ? NULL : PyFloat_FromDouble(value);
-    }
-    default: {
-        uint64_t bits = little_endian(at, 8);
-        double value;
-        memcpy(&value, &bits, 8);
-        return PyFloat_FromDouble(value);
-    }
+    case 'f':
+        single.bits = (uint32_t)little_endian(at, 4);
+        is_signalling = (single.bits & 0x7FC00000) == 0x7F800000 && single.bits & 0x3FFFFF;
+        return is_signalling ? NULL : PyFloat_FromDouble(single.number);
+    default: return PyFloat_FromDouble((Double){.bits = little_endian(at, 8)}.number);
     }
 }
 
@@ -357,7 +341,7 @@ static PyObject *decode_field(const Field *field, const uint8_t *payload) {
 }
 
 /* Decode a `Frame.body` (header of nine bytes, payload). Both arguments must be owned by the caller. */
-static PyObject *decode_body(State *state, Layout *self, PyObject *body, PyObject *frame) {
+static PyObject *decode_body(Layout *self, PyObject *body, PyObject *frame) {
     PyObject *message = NULL, *value;
     if (!PyBytes_CheckExact(body) || self->message_class == NULL)
         goto python;
@@ -382,18 +366,17 @@ static PyObject *decode_body(State *state, Layout *self, PyObject *body, PyObjec
     return message;
 python:
     Py_XDECREF(message);
-    if (PyErr_Occurred() || self->message_class == NULL)
+    if (PyErr_Occurred() || self->message_class == NULL) /* NULL while it is being destroyed */
         return PyErr_Occurred() ? NULL : PyErr_NoMemory();
-    return PyObject_CallMethodObjArgs(self->message_class, state->decode_body, body, frame, NULL);
+    return PyObject_CallMethod(self->message_class, "decode_body", "OO", body, frame);
 }
 
 /* decode(body, frame): `Message.decode_body` of the class. */
-static PyObject *layout_decode(PyObject *self, PyTypeObject *type, PyObject *const *args, Py_ssize_t count, PyObject *names) {
-    if (count < 1 || count > 2 || names != NULL) {
-        PyErr_SetString(PyExc_TypeError, "decode() takes body and frame");
-        return NULL;
-    }
-    return decode_body(PyType_GetModuleState(type), (Layout *)self, args[0], count == 2 ? args[1] : Py_None);
+static PyObject *layout_decode(PyObject *self, PyObject *const *args, Py_ssize_t count) {
+    if (count == 1 || count == 2)
+        return decode_body((Layout *)self, args[0], count == 2 ? args[1] : Py_None);
+    PyErr_SetString(PyExc_TypeError, "decode() takes body and frame");
+    return NULL;
 }
 
 /* ------------------------------------------------------------------------------------------- encoding */
@@ -406,18 +389,10 @@ static int encode_number(int kind, int size, PyObject *value, uint8_t *at) {
         double number = PyFloat_AsDouble(value);
         if (PyErr_Occurred())
             return 0;
-        uint64_t bits;
-        memcpy(&bits, &number, 8);
-        if (kind == 'f') {
-            int is_finite = number - number == 0;
-            if ((is_finite && (number > FLT_MAX || number < -FLT_MAX)) || number != number) /* too large, or NaN */
-                return 0;
-            float narrow = (float)number;
-            uint32_t narrow_bits;
-            memcpy(&narrow_bits, &narrow, 4);
-            bits = narrow_bits;
-        }
-        put_little_endian(at, size, bits);
+        int is_finite = number - number == 0; /* NaN, and what may be too large, are left to Python */
+        if (kind == 'f' && (number != number || (is_finite && (number > FLT_MAX || number < -FLT_MAX))))
+            return 0;
+        put_little_endian(at, size, kind == 'f' ? (Single){(float)number}.bits : (Double){number}.bits);
         return 1;
     }
     if (!PyLong_Check(value))
@@ -431,14 +406,10 @@ static int encode_number(int kind, int size, PyObject *value, uint8_t *at) {
     long long number = PyLong_AsLongLongAndOverflow(value, &overflow);
     if (overflow || PyErr_Occurred())
         return 0;
-    int is_signed = kind == 'b' || kind == 'h' || kind == 'i' || kind == 'q';
-    if (kind != 'q') {
-        long long limit = 1LL << (8 * size - is_signed);
-        if (number >= limit || number < (is_signed ? -limit : 0))
-            return 0;
-    }
+    int is_signed = strchr("bhiq", kind) != NULL;
+    long long limit = kind == 'q' ? 0 : 1LL << (8 * size - is_signed);
     put_little_endian(at, size, (uint64_t)number);
-    return 1;
+    return !limit || (number < limit && number >= (is_signed ? -limit : 0));
 }
 
 /* Encode the value of a field, whose bytes are zero: 1, or 0 if Python has to. */
@@ -448,10 +419,8 @@ static int encode_field(const Field *field, PyObject *value, uint8_t *at) {
     if (field->kind == 's' || field->kind == 'p') {
         if (field->kind == 's' && PyUnicode_CheckExact(value))
             text = PyUnicode_AsUTF8AndSize(value, &length);
-        else if (field->kind == 'p' && PyBytes_CheckExact(value)) {
+        else if (field->kind == 'p' && PyBytes_CheckExact(value) && (length = PyBytes_Size(value)) <= size)
             text = PyBytes_AsString(value);
-            length = PyBytes_Size(value);
-        }
         if (text == NULL || length > size)
             return 0;
         memcpy(at, text, (size_t)length);
@@ -471,8 +440,8 @@ static int encode_field(const Field *field, PyObject *value, uint8_t *at) {
 static Py_ssize_t encode(State *state, PyObject *message, int version, const uint8_t head[4], uint8_t *frame) {
     Py_ssize_t total = 0;
     Layout *layout = (Layout *)PyObject_GetAttr((PyObject *)Py_TYPE(message), state->layout_name);
-    if (layout == NULL || Py_TYPE(layout) != state->layout || layout->message_class != (PyObject *)Py_TYPE(message) ||
-        (version == 1 && layout->id > 0xFF))
+    if (layout == NULL || Py_TYPE(layout) != state->types[LAYOUT] ||
+        layout->message_class != (PyObject *)Py_TYPE(message) || (version == 1 && layout->id > 0xFF))
         goto done;
     int header = version == 1 ? 6 : 10;
     uint8_t *payload = frame + header;
@@ -506,20 +475,13 @@ done:
 
 /* encode_frame(message, version, flags, sequence, system_id, component_id): a whole frame without its signature, or
    None if Python has to encode it; errors too are those of Python. */
-static PyObject *wire_encode_frame(PyObject *module, PyObject *const *args, Py_ssize_t count) {
+static PyObject *wire_encode_frame(PyObject *module, PyObject *args) {
     uint8_t head[4], frame[MAX_FRAME];
-    long numbers[5];
-    if (count != 6) {
-        PyErr_SetString(PyExc_TypeError, "encode_frame() takes six arguments");
+    PyObject *message = NULL;
+    int version = 2;
+    if (!PyArg_ParseTuple(args, "Oibbbb", &message, &version, &head[0], &head[1], &head[2], &head[3]))
         return NULL;
-    }
-    for (int i = 0; i < 5; i++)
-        numbers[i] = PyLong_AsLong(args[i + 1]);
-    for (int i = 0; i < 4; i++)
-        head[i] = (uint8_t)numbers[i + 1];
-    if (PyErr_Occurred())
-        return NULL;
-    Py_ssize_t size = encode(PyModule_GetState(module), args[0], (int)numbers[0], head, frame);
+    Py_ssize_t size = encode(PyModule_GetState(module), message, version, head, frame);
     if (size)
         return PyBytes_FromStringAndSize((char *)frame, size);
     if (PyErr_Occurred() && !PyErr_ExceptionMatches(PyExc_Exception))
@@ -542,6 +504,7 @@ typedef struct {
     PyObject *find_layout, *decode_in_python;
     Row *memory; /* the rows, hashed by message id, at most half full */
     uint32_t mask;
+    State *state; /* of the module, which the type keeps */
 } Table;
 
 OWNER(table, Table, owned, 3)
@@ -581,14 +544,15 @@ static PyObject *wire_table(PyObject *module, PyObject *args) {
     size_t room = 16;
     while (room < 2 * (size_t)PyDict_Size(rows))
         room *= 2;
-    Table *self = (Table *)PyType_GenericAlloc(state->table, 0);
+    Table *self = (Table *)PyType_GenericAlloc(state->types[TABLE], 0);
     if (self == NULL)
         return NULL;
     self->find_layout = new_reference(find_layout);
     self->decode_in_python = new_reference(decode_in_python);
     self->owned = PyList_New(0);
-    self->mask = (uint32_t)room - 1;
     self->memory = PyMem_Calloc(room, sizeof(Row));
+    self->mask = (uint32_t)room - 1;
+    self->state = state;
     int result = self->memory == NULL || self->owned == NULL ? -1 : 0;
     for (Py_ssize_t at = 0; result == 0 && PyDict_Next(rows, &at, &id, &row);)
         result = add_row(self, id, row);
@@ -599,16 +563,9 @@ static PyObject *wire_table(PyObject *module, PyObject *args) {
 }
 
 /* decode(frame): `Dialect.decode`. */
-static PyObject *table_decode(PyObject *object, PyTypeObject *type, PyObject *const *args, Py_ssize_t count,
-                              PyObject *names) {
+static PyObject *table_decode(PyObject *object, PyObject *frame) {
     Table *self = (Table *)object;
-    State *state = PyType_GetModuleState(type);
-    if (count != 1 || names != NULL) {
-        PyErr_SetString(PyExc_TypeError, "decode() takes exactly one frame");
-        return NULL;
-    }
-    PyObject *frame = args[0];
-    Row *row = Py_TYPE(frame) == state->frame ? find_row(self, ((Frame *)frame)->message_id) : NULL;
+    Row *row = Py_TYPE(frame) == self->state->frame ? find_row(self, ((Frame *)frame)->message_id) : NULL;
     if (row != NULL && row->layout == NULL) { /* the first message of its class */
         PyObject *layout = PyObject_CallFunctionObjArgs(self->find_layout, row->id, NULL);
         int result = layout == NULL ? -1 : PyList_Append(self->owned, layout);
@@ -618,10 +575,10 @@ static PyObject *table_decode(PyObject *object, PyTypeObject *type, PyObject *co
             return NULL;
     }
     PyObject *body = row == NULL ? NULL : ((Frame *)frame)->body;
-    if (body == NULL || Py_TYPE(row->layout) != state->layout)
+    if (body == NULL || Py_TYPE(row->layout) != self->state->types[LAYOUT])
         return PyObject_CallFunctionObjArgs(self->decode_in_python, frame, NULL);
     Py_INCREF(body);
-    PyObject *message = decode_body(state, (Layout *)row->layout, body, frame);
+    PyObject *message = decode_body((Layout *)row->layout, body, frame);
     Py_DECREF(body);
     return message;
 }
@@ -637,15 +594,12 @@ typedef struct {
     int is_simple; /* 1 if ``rest`` is the beginning of a single plausible frame, 0 if `_scan` of Python describes it */
 } Framer;
 
+#define OBJECT(name, member) MEMBER(name, T_OBJECT_EX, Framer, member)
+
 static PyMemberDef framer_members[] = {
-    {"wanted", T_OBJECT_EX, offsetof(Framer, wanted), 0, NULL},
-    {"late", T_OBJECT_EX, offsetof(Framer, late), 0, NULL},
-    {"foreign", T_OBJECT_EX, offsetof(Framer, foreign), 0, NULL},
-    {"statistics", T_OBJECT_EX, offsetof(Framer, statistics), 0, NULL},
-    {"_rest", T_OBJECT_EX, offsetof(Framer, rest), 0, NULL},
-    {"_sources", T_OBJECT_EX, offsetof(Framer, sources), 0, NULL},
-    {"_table", T_OBJECT_EX, offsetof(Framer, table), 0, NULL},
-    {0},
+    OBJECT("wanted", wanted),         OBJECT("late", late),   OBJECT("foreign", foreign),
+    OBJECT("statistics", statistics), OBJECT("_rest", rest), OBJECT("_sources", sources),
+    OBJECT("_table", table),          {0},
 };
 
 OWNER(framer, Framer, wanted, 8)
@@ -689,18 +643,16 @@ static int examine(const Run *run, Py_ssize_t begin, Py_ssize_t *end, Row **row)
 static int count_frame(Run *run, long key, int sequence) {
     Framer *self = (Framer *)run->framer;
     if (self->last_key == NULL || self->last_key_number != key) {
-        PyObject *old = self->last_key;
-        self->last_key = PyLong_FromLong(key);
+        Py_CLEAR(self->last_key);
         self->last_key_number = key;
-        Py_XDECREF(old);
-        if (self->last_key == NULL)
+        if ((self->last_key = PyLong_FromLong(key)) == NULL)
             return -1;
     }
     PyObject *source = PyDict_GetItemWithError(run->sources, self->last_key), *done = Py_None;
     Py_XINCREF(source);
     if (source == NULL && !PyErr_Occurred())
         source = PyObject_CallMethod(run->framer, "_add_source", "liO", key, sequence, run->now);
-    if (source != NULL && !PyObject_TypeCheck(source, run->state->source_fields)) {
+    if (source != NULL && !PyObject_TypeCheck(source, run->state->types[SOURCE_FIELDS])) {
         PyErr_SetString(PyExc_TypeError, "the counters of a sender must be SourceStatistics");
         Py_CLEAR(source);
     }
@@ -737,7 +689,8 @@ static int take_frame(Run *run, Py_ssize_t begin, Py_ssize_t end, const Row *row
 /* Find the next frame in Python: 1, 0 if there is none, -1 for an error. */
 static int search(Run *run, Py_ssize_t *begin, Py_ssize_t *end, Row **row) {
     int kept = *begin || !run->is_continued ? 0 : run->is_simple ? 1 : 2;
-    PyObject *found = PyObject_CallMethod(run->framer, "_find", "OniOO", run->data, *begin, kept, run->now, run->frames);
+    PyObject *found = PyObject_CallMethod(run->framer, "_find", "OniOO", run->data, *begin, kept, run->now,
+                                          run->frames);
     int result = found == NULL ? -1 : found != Py_None;
     if (result == 1) {
         *begin = PyLong_AsSsize_t(found);
@@ -778,10 +731,12 @@ static int receive(Run *run) {
 /* Own the objects of a call, and join the data with what was kept. */
 static int begin_run(Run *run, PyObject *data) {
     Framer *self = (Framer *)run->framer;
-    if (self->wanted == NULL || self->late == NULL || self->foreign == NULL || self->statistics == NULL ||
-        self->rest == NULL || self->sources == NULL || self->table == NULL || run->state->frame == NULL ||
-        !PyBytes_CheckExact(self->rest) || !PyDict_Check(self->sources) || Py_TYPE(self->table) != run->state->table ||
-        !PyObject_TypeCheck(self->statistics, run->state->counter_fields)) {
+    int is_ready = run->state->frame != NULL;
+    for (PyObject **member = &self->wanted; member < &self->last_key; member++)
+        is_ready = is_ready && *member != NULL;
+    if (!is_ready || !PyBytes_CheckExact(self->rest) || !PyDict_Check(self->sources) ||
+        Py_TYPE(self->table) != run->state->types[TABLE] ||
+        !PyObject_TypeCheck(self->statistics, run->state->types[COUNTER_FIELDS])) {
         PyErr_SetString(PyExc_RuntimeError, "the framer is not initialized");
         return -1;
     }
@@ -794,15 +749,11 @@ static int begin_run(Run *run, PyObject *data) {
     if (run->frames == NULL || run->data == NULL)
         return -1;
     ((Number *)self->statistics)->number += (unsigned long long)PyBytes_Size(run->data);
-    int is_late = PyObject_IsTrue(self->late), is_foreign = PyObject_IsTrue(self->foreign);
-    if (is_late < 0 || is_foreign < 0)
+    int is_stale = PyObject_IsTrue(self->late) | PyObject_IsTrue(self->foreign); /* -1 if one of them is */
+    PyObject *done = is_stale > 0 ? PyObject_CallMethod(run->framer, "_clear_out_of_order", NULL) : NULL;
+    Py_XDECREF(done);
+    if (is_stale < 0 || (is_stale && done == NULL))
         return -1;
-    if (is_late || is_foreign) {
-        PyObject *done = PyObject_CallMethod(run->framer, "_clear_out_of_order", NULL);
-        Py_XDECREF(done);
-        if (done == NULL)
-            return -1;
-    }
     if (PyBytes_Size(self->rest)) {
         run->is_continued = 1;
         run->is_simple = self->is_simple;
@@ -857,8 +808,8 @@ static Py_ssize_t record_end(const uint8_t *data, Py_ssize_t size, Py_ssize_t be
     return at[0] == MAGIC_V2 && at[2] <= SIGNED ? begin + 20 + at[1] + (at[2] ? SIGNATURE : 0) : -1;
 }
 
-/* tlog_records(data, begin): ([(time, frame), …], begin of the first one that Python has to judge). Each record here is
-   followed by the header of another one. */
+/* tlog_records(data, begin): ([(time, frame), …], begin of the first one that Python has to judge, because no header of
+   another one follows it). */
 static PyObject *wire_tlog_records(PyObject *module, PyObject *args) {
     PyObject *bytes, *records;
     Py_ssize_t begin, end;
@@ -887,19 +838,18 @@ static PyObject *wire_tlog_records(PyObject *module, PyObject *args) {
 /* --------------------------------------------------------------------------------------------- module */
 
 #define METHOD(name, function, flags) {name, (PyCFunction)(void (*)(void))function, flags, NULL}
-#define WITH_CLASS (METH_METHOD | METH_FASTCALL | METH_KEYWORDS)
 
-static PyMethodDef layout_methods[] = {METHOD("decode", layout_decode, WITH_CLASS), {0}};
-static PyMethodDef table_methods[] = {METHOD("decode", table_decode, WITH_CLASS), {0}};
-static PyMethodDef framer_methods[] = {METHOD("receive", framer_receive, WITH_CLASS), {0}};
+static PyMethodDef layout_methods[] = {METHOD("decode", layout_decode, METH_FASTCALL), {0}};
+static PyMethodDef table_methods[] = {METHOD("decode", table_decode, METH_O), {0}};
+static PyMethodDef framer_methods[] = {
+    METHOD("receive", framer_receive, METH_METHOD | METH_FASTCALL | METH_KEYWORDS), {0}};
 static PyMethodDef functions[] = {
     METHOD("x25", wire_x25, METH_O),
     METHOD("register_frame", wire_register_frame, METH_O),
     METHOD("layout", wire_layout, METH_VARARGS),
     METHOD("table", wire_table, METH_VARARGS),
-    METHOD("encode_frame", wire_encode_frame, METH_FASTCALL),
-    METHOD("tlog_records", wire_tlog_records, METH_VARARGS),
-    {0},
+    METHOD("encode_frame", wire_encode_frame, METH_VARARGS),
+    METHOD("tlog_records", wire_tlog_records, METH_VARARGS), {0},
 };
 
 #define GC_SLOTS(name)                                                                                                 \
@@ -915,7 +865,7 @@ static PyType_Slot framer_slots[] = {GC_SLOTS(framer), {Py_tp_members, framer_me
 
 enum { BASE = Py_TPFLAGS_DEFAULT | Py_TPFLAGS_BASETYPE, GC = Py_TPFLAGS_DEFAULT | Py_TPFLAGS_HAVE_GC };
 
-/* In the order of `State`. */
+/* In the order of `State.types`. */
 static PyType_Spec specs[] = {
     {"aerokit._wire.FrameFields", sizeof(Frame), 0, BASE, frame_slots},
     {"aerokit._wire.SourceFields", sizeof(Number), 0, BASE, source_slots},
@@ -928,15 +878,12 @@ static PyType_Spec specs[] = {
 static int wire_exec(PyObject *module) {
     State *state = PyModule_GetState(module);
     fill_crc_tables(state);
-    PyTypeObject **types[] = {&state->frame_fields, &state->source_fields, &state->counter_fields,
-                              &state->framer,       &state->table,         &state->layout};
-    for (size_t i = 0; i < sizeof specs / sizeof *specs; i++) {
-        *types[i] = (PyTypeObject *)PyType_FromModuleAndSpec(module, &specs[i], NULL);
-        if (*types[i] == NULL || PyModule_AddType(module, *types[i]) < 0)
+    for (int i = 0; i < TYPES; i++) {
+        state->types[i] = (PyTypeObject *)PyType_FromModuleAndSpec(module, &specs[i], NULL);
+        if (state->types[i] == NULL || PyModule_AddType(module, state->types[i]) < 0)
             return -1;
     }
     state->zero = PyFloat_FromDouble(0.0);
-    state->decode_body = PyUnicode_InternFromString("decode_body");
     state->layout_name = PyUnicode_InternFromString("_LAYOUT");
     return PyErr_Occurred() ? -1 : PyModule_AddIntConstant(module, "VERSION", VERSION);
 }
@@ -944,18 +891,10 @@ static int wire_exec(PyObject *module) {
 static int wire_traverse(PyObject *module, visitproc visit, void *arg) {
     return visit_all(PyModule_GetState(module), STATE_OBJECTS, visit, arg);
 }
-
-static int wire_clear(PyObject *module) {
-    return clear_all(PyModule_GetState(module), STATE_OBJECTS);
-}
+static int wire_clear(PyObject *module) { return clear_all(PyModule_GetState(module), STATE_OBJECTS); }
 
 static PyModuleDef_Slot slots[] = {{Py_mod_exec, wire_exec}, {0}};
 static struct PyModuleDef definition = {
-    PyModuleDef_HEAD_INIT, "aerokit._wire", "The compiled wire.", sizeof(State), functions, slots, wire_traverse,
-    wire_clear,            NULL,
-};
+    PyModuleDef_HEAD_INIT, "aerokit._wire", NULL, sizeof(State), functions, slots, wire_traverse, wire_clear, NULL};
 
-PyMODINIT_FUNC
-PyInit__wire(void) {
-    return PyModuleDef_Init(&definition);
-}
+PyMODINIT_FUNC PyInit__wire(void) { return PyModuleDef_Init(&definition); }
