@@ -188,9 +188,12 @@ def pictures(session: nox.Session) -> None:
 
 @nox.session
 def bench(session: nox.Session) -> None:
-    """Measure against pymavlink and MAVSDK, print the table, write bench.json."""
-    session.install("-e", ".", "mavsdk>=4")
+    """Measure against other libraries, print the table with each wire, write bench.json and bench-python.json."""
+    session.install("-e", ".", "mavsdk>=4", "mavio>=0.9")
+    session.install("mavkit>=0.3", success_codes=[0, 1, 2])  # binary, not for all platforms
     session.run("python", "benchmarks/run.py", *session.posargs)
+    python = ("--output", "bench-python.json")
+    session.run("python", "benchmarks/run.py", *session.posargs, *python, env={"AEROKIT_PURE": "1"})
 
 
 @nox.session

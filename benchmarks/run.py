@@ -1,8 +1,9 @@
-"""The whole table, side by side with pymavlink and MAVSDK; writes ``bench.json``.
+"""The whole table, side by side with pymavlink, MAVSDK, mavio and mavkit; writes ``bench.json``.
 
     python benchmarks/run.py                          # everything, about a minute
     python benchmarks/run.py import decode_skip       # these rows only
     python benchmarks/run.py --quick                  # a short check that it runs; the figures mean little
+    AEROKIT_PURE=1 python benchmarks/run.py           # without the compiled wire; the table names the wire
 
 Figures are medians of interleaved rounds; only the ratios are comparable between machines. A missed target is printed
 prominently, but is no failure: the exit code is 0.
@@ -19,14 +20,18 @@ import command_rtt
 import decode
 import deliver
 import import_time
+import logs
 import table
 from table import Row
+
+from aerokit import wire_implementation
 
 Measure = Callable[[bool], list[Row]]
 """Gives rows; with True in few rounds."""
 
 SHORT = "copter_short"
 DECODE = tuple(decode.RECORDINGS)
+LOGS = ("tlog_typed", "tlog_typed_mavio", "tlog_typed_mavkit", "tlog_typed_mavkit_json")
 
 MEASURES: dict[tuple[str, ...], Measure] = {
     (
@@ -35,6 +40,7 @@ MEASURES: dict[tuple[str, ...], Measure] = {
         *(f"decode_{kind}_{name}" for name in DECODE[1:] for kind in ("skip", "typed")),
     ): lambda quick: decode.rows(1, [SHORT, "quad_short"]) if quick else decode.rows(),
     ("deliver_telemetry", "deliver_async_for"): lambda quick: deliver.rows(1, SHORT) if quick else deliver.rows(),
+    LOGS: lambda quick: logs.rows(1, SHORT) if quick else logs.rows(),
     ("command_rtt_pymavlink", "command_rtt_mavsdk"): lambda quick: (
         command_rtt.rows(1, 20) if quick else command_rtt.rows()
     ),
@@ -53,6 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not set(wanted) <= set(NAMES):
         parser.error(f"the names are {', '.join(NAMES)}")
     rows = [each for each in _measured(wanted, options.quick) if each["name"] in wanted]
+    print(f"wire: {wire_implementation}")
     print(table.printed(rows))
     for name in sorted(set(wanted) - {each["name"] for each in rows}):
         print(f"{name}: left out, its peer is not installed")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import random
+from collections.abc import Container
 
 from target import Target
 
@@ -48,7 +49,8 @@ def fuzz_wire(data: bytes) -> None:
     """
     chance = random.Random(data[:4])
     framers = Framer(), PythonFramer()
-    wanted = chance.choice((None, frozenset(), {0: 1, 30: 1}, range(200)))
+    choices: tuple[Container[int] | None, ...] = (None, frozenset(), {0: 1, 30: 1}, range(200))
+    wanted = chance.choice(choices)
     for framer in framers:
         framer.wanted, framer.keep_unknown = wanted, bool(len(data) & 1)
     stream, now = data * 2, 0.0  # frames that are repeated, too

@@ -59,7 +59,14 @@ class Copyable:
 
 
 # Base classes with the fields that compiled code accesses.
-if TYPE_CHECKING or wire is None:
+if TYPE_CHECKING:
+
+    class FrameFields: ...
+
+    class SourceFields: ...
+
+    class CounterFields: ...
+elif wire is None:
     FrameFields, SourceFields, CounterFields = _FrameFields, _SourceFields, _CounterFields
 else:
 

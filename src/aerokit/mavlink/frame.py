@@ -6,6 +6,7 @@ https://mavlink.io/en/guide/serialization.html
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from aerokit._internal.wire import FrameFields, wire
 
@@ -27,7 +28,8 @@ class Frame(FrameFields):
     """One frame with a valid checksum. Treat it as immutable, because all receivers share it."""
 
     # No constructor, for speed: the framer sets the attributes, and properties compute the rest.
-    __slots__ = ()
+    if not TYPE_CHECKING:  # those of the base class
+        __slots__ = ()
 
     body: bytes
     """The data covered by the checksum: a header of nine bytes, in the layout of MAVLink 2, and the payload."""
