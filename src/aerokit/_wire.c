@@ -895,6 +895,6 @@ static int wire_clear(PyObject *module) { return clear_all(PyModule_GetState(mod
 
 static PyModuleDef_Slot slots[] = {{Py_mod_exec, wire_exec}, {0}};
 static struct PyModuleDef definition = {
-    PyModuleDef_HEAD_INIT, "aerokit._wire", NULL, sizeof(State), functions, slots, wire_traverse, wire_clear, NULL};
+    PyModuleDef_HEAD_INIT, "aerokit._wire", "The compiled wire.", sizeof(State), functions, slots, wire_traverse, wire_clear, NULL};
 
 PyMODINIT_FUNC PyInit__wire(void) { return PyModuleDef_Init(&definition); }

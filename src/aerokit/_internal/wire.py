@@ -69,12 +69,7 @@ if TYPE_CHECKING:
 elif wire is None:
     FrameFields, SourceFields, CounterFields = _FrameFields, _SourceFields, _CounterFields
 else:
-
-    class FrameFields(Copyable, wire.FrameFields):
-        __slots__ = ()
-
-    class SourceFields(Copyable, wire.SourceFields):
-        __slots__ = ()
-
-    class CounterFields(Copyable, wire.CounterFields):
-        __slots__ = ()
+    FrameFields, SourceFields, CounterFields = (
+        type(base.__name__, (Copyable, base), {"__slots__": ()})
+        for base in (wire.FrameFields, wire.SourceFields, wire.CounterFields)
+    )
