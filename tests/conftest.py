@@ -6,6 +6,7 @@ import gc
 import os
 import signal
 import sys
+from collections import Counter
 from collections.abc import AsyncIterator
 from typing import Any
 
@@ -20,7 +21,7 @@ if sys.dont_write_bytecode:  # else each worker and each child process would com
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a background job of a script: some tests interrupt themselves
     signal.signal(signal.SIGINT, signal.default_int_handler)
-settings.register_profile("aerokit", deadline=None, max_examples=60, derandomize=True)
+settings.register_profile("aerokit", deadline=None, max_examples=40, derandomize=True)
 settings.load_profile("aerokit")
 
 
@@ -46,6 +47,19 @@ def freeze_existing_objects(hypothesis_started: None) -> None:
 def pytest_xdist_auto_num_workers() -> int:
     """Twice the number of processors: many tests wait for sockets and other processes."""
     return 2 * (os.cpu_count() or 1)
+
+
+@pytest.hookimpl(tryfirst=True)  # before pytest deselects by marker
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the rows of tests marked ``sampled(n)`` as ``exhaustive``, except every ``n``-th."""
+    rows: Counter[str] = Counter()
+    for item in items:
+        sample = item.get_closest_marker("sampled")
+        if sample is not None and item.get_closest_marker("exhaustive") is None:
+            test = item.nodeid.partition("[")[0]
+            if rows[test] % sample.args[0]:
+                item.add_marker(pytest.mark.exhaustive)
+            rows[test] += 1
 
 
 def pytest_report_header() -> str:

@@ -72,6 +72,7 @@ loop.close()
 """
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     "program",
     [BLOCKING, CLASSIC, CALLED_FROM_ANOTHER_LIBRARY, HELD_FROM_A_TIMER],

@@ -35,6 +35,7 @@ def test_scale_benchmark_rows_have_figures_and_aims(tmp_path: Path) -> None:
     assert rows["copter_hundred"]["vehicles"] <= rows["copter_hundred"]["aerokit"]
 
 
+@pytest.mark.exhaustive
 def test_scale_benchmark_rejects_unknown_name() -> None:
     wrong = run("copter")
     assert wrong.returncode == 2

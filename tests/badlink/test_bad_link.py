@@ -39,6 +39,7 @@ ROUGH = Radio(
 )
 
 
+@pytest.mark.sampled(3)
 @each_case
 @pytest.mark.parametrize("loss", LOSSES, ids=lambda loss: f"{loss:.0%}")
 def test_transfer_ends_with_exact_content_and_leaves_nothing(case: Case, loss: float) -> None:
@@ -48,6 +49,7 @@ def test_transfer_ends_with_exact_content_and_leaves_nothing(case: Case, loss: f
         assert verdict.error is None
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("case", sampled(CASES, 12), ids=lambda case: case.name.replace(" ", "-"))
 def test_transfer_time_stays_near_ideal_with_losses(case: Case) -> None:
     for loss, most in ((0.05, 2.0), (0.2, 4.0)):
@@ -57,6 +59,7 @@ def test_transfer_time_stays_near_ideal_with_losses(case: Case) -> None:
         assert statistics.median(verdict.ratio for verdict in verdicts) <= most
 
 
+@pytest.mark.sampled(3)
 @each_case
 def test_repeated_reordered_and_damaged_frames_do_no_harm(case: Case) -> None:
     verdict = judge(case, TINY, ROUGH, seed=1)
@@ -64,6 +67,7 @@ def test_repeated_reordered_and_damaged_frames_do_no_harm(case: Case) -> None:
     assert verdict.error is None
 
 
+@pytest.mark.sampled(3)
 @each_case
 def test_three_seconds_of_silence_are_survived(case: Case) -> None:
     begin = 0.5 + 0.6 * case.ideal(make_copter(case, TINY, NARROW), TINY).seconds(NARROW)
@@ -73,6 +77,7 @@ def test_three_seconds_of_silence_are_survived(case: Case) -> None:
     assert verdict.error is None
 
 
+@pytest.mark.sampled(3)
 @each_case
 @pytest.mark.parametrize("share", [exhaustive(0.0), 0.4, exhaustive(0.9)])
 def test_dead_link_error_names_what_is_missing(case: Case, share: float) -> None:
@@ -84,6 +89,7 @@ def test_dead_link_error_names_what_is_missing(case: Case, share: float) -> None
     )  # a transfer has three parts at most, each with its own patience
 
 
+@pytest.mark.sampled(3)
 @each_case
 @pytest.mark.parametrize("share", [exhaustive(0.1), 0.5, exhaustive(0.95)])
 def test_cancelled_transfer_leaves_nothing_behind(case: Case, share: float) -> None:

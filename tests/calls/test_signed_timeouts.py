@@ -24,6 +24,7 @@ MAX_WAIT_S = 400.0
 WHY = "frames are signed and no key was given"
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(
     ("names", "autopilot"),
     sampled(

@@ -391,9 +391,9 @@ async def test_sink_may_subscribe_send_and_detach(link: MemoryLink) -> None:
 async def test_subscription_can_be_entered_once(link: MemoryLink) -> None:
     async with open_connection(link) as connection:
         subscription = connection.subscribe(Heartbeat)
-        with subscription, pytest.raises(BusyError, match="entered once"):
+        with subscription, pytest.raises(BusyError, match="entered only once"):
             subscription.__enter__()
-        with pytest.raises(BusyError, match="entered once"):
+        with pytest.raises(BusyError, match="entered only once"):
             subscription.__enter__()
 
 

@@ -317,6 +317,7 @@ def test_cancelled_at_any_iteration_leaves_nothing_behind() -> None:
         run_and_do(Interrupted().run, turns, lambda task: task.cancel())
 
 
+@pytest.mark.exhaustive
 def test_closed_at_any_iteration_leaves_nothing_behind() -> None:
     for turns in range(0, 150, 3):
         program = Interrupted()

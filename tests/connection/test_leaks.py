@@ -145,6 +145,7 @@ def test_link_lost_at_any_iteration(use: Use) -> None:
         assert type(task.exception()) in (type(None), LinkLost, SetpointStreamStopped), turns
 
 
+@pytest.mark.sampled(2)
 @each_use
 def test_connection_closed_at_any_iteration(use: Use) -> None:
     for turns in some_of(turns_of(use), 30):

@@ -134,6 +134,7 @@ def test_late_link_is_proven_by_its_clock() -> None:
     assert choice.used is choice.candidates[1]
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("late_s", [2.0, 4.0, 6.0])
 @pytest.mark.parametrize("dies", [False, True])
 async def test_late_copies_from_a_slow_link_are_dropped(late_s: float, dies: bool) -> None:

@@ -49,6 +49,7 @@ async def proven(connection: aerokit.Connection, link: int) -> None:
             await anyio.sleep(0.1)
 
 
+@pytest.mark.sampled(2)
 async def test_flight_continues_when_the_used_link_fails(vehicle: SimulatedVehicle) -> None:
     radios = Radios(2)
     received = ReceivedMessages(radios)
@@ -386,6 +387,7 @@ async def test_link_that_fails_after_clock_pause_is_left(seconds: float, is_sile
         assert flying.position.age < 1.0
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("seconds", sampled([0.1, 0.6, 0.8, 1.0, 1.5, 3.0], 3))
 @pytest.mark.parametrize("hiccups", [0, 1, 2])
 async def test_link_that_fails_after_reboot_is_left(seconds: float, hiccups: int) -> None:

@@ -330,6 +330,7 @@ def test_closed_vehicle_logs_no_dropped_warning(address: str, caplog: pytest.Log
     assert CLOSED not in caplog.text
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("collects", ["", "gc.collect()"])
 def test_program_exits_with_dropped_vehicle(collects: str) -> None:
     with served_copter() as address:

@@ -215,6 +215,7 @@ BLOCKING: dict[str, Callable[[dronekit.Vehicle], object]] = {
 }
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("name", BLOCKING)
 def test_ctrl_c_ends_blocking_call(vehicle: dronekit.Vehicle, name: str) -> None:
     threads = own_threads()
@@ -229,6 +230,7 @@ def test_ctrl_c_ends_blocking_call(vehicle: dronekit.Vehicle, name: str) -> None
     eventually(lambda: own_threads() == threads)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(
     ("ending", "last_mode"),
     [("", None), ("vehicle.mode = 'RTL'", "RTL"), ("vehicle.mode = 'LAND'; vehicle.close()", "LAND")],

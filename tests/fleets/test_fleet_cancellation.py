@@ -84,6 +84,7 @@ async def test_cancellation_during_policy_lets_landings_continue() -> None:
         assert stage.copters["north/2"].motion.is_on_ground
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("after_s", [0.001, 0.3, 4.0])
 async def test_cancelled_action_leaves_no_tasks_or_subscriptions(after_s: float) -> None:
     async with open_stage(3) as stage:

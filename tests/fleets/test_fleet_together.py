@@ -420,6 +420,7 @@ async def test_px4_after_mission_end_is_not_taken_over() -> None:
         (await both.land()).raise_for_errors()
 
 
+@pytest.mark.exhaustive
 async def test_px4_fleet_flies_and_detects_pilot() -> None:
     px4s = [SimulatedPx4(system_id=system_id, boot_time_s=1.0, seed=system_id) for system_id in (1, 2)]
     async with (

@@ -31,6 +31,7 @@ def circle(latency_s: float, near: Endpoint, far: Endpoint) -> tuple[Hub, Hub]:
     )
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("latency_s", SLOW_S)
 def test_dead_vehicle_behind_hub_loop_is_silent(latency_s: float) -> None:
     async def main() -> None:

@@ -94,6 +94,7 @@ def lossy(link: Link) -> FaultyLink:
     return FaultyLink(link, FaultModel(loss=0.03), seed=11)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("way", [through_a_hub, through_a_program], ids=["hub", "share"])
 @pytest.mark.parametrize("kind", ["ardupilot", exhaustive("px4")])
 def test_transfers_pass_in_both_directions_at_once(way: Any, kind: str) -> None:

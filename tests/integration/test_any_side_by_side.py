@@ -11,6 +11,7 @@ from side_by_side import Step, differences, program, run_simulated
 SPEEDUP = 5.0
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("seed", sampled(range(4), 4))
 @pytest.mark.parametrize("kind", ["copter", exhaustive("px4")])
 def test_program_of_one_seed_is_reproducible(kind: str, seed: int) -> None:

@@ -123,6 +123,7 @@ async def test_takeover_by_other_station_during_lost_ack_keeps_vehicle(choice: C
         assert vehicle.mode_name == "RTL"
 
 
+@pytest.mark.sampled(2)
 async def test_failsafe_during_real_outage_keeps_vehicle(choice: Choice) -> None:
     """Twelve seconds, with the failsafe for a lost ground station."""
     async with flying(choice) as (vehicle, path):
@@ -164,6 +165,7 @@ def command_in(raw: bytes) -> int:
     return int(getattr(STANDARD.decode(frame), "command", 0))
 
 
+@pytest.mark.sampled(2)
 async def test_fleet_member_taken_by_other_station_is_left_alone(choice: Choice) -> None:
     """It was flying before the fleet was opened; another member does not respond."""
     silent = SimulatedCopter(system_id=77, boot_time_s=0.0)
@@ -183,6 +185,7 @@ async def test_fleet_member_taken_by_other_station_is_left_alone(choice: Choice)
             assert vehicle.mode_name == before
 
 
+@pytest.mark.sampled(2)
 async def test_reboot_in_flight_ends_orders(choice: Choice) -> None:
     """ArduCopter obeys, by force, and falls; PX4 denies it and flies on."""
     async with flying(choice) as (vehicle, path):

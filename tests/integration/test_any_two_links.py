@@ -32,6 +32,7 @@ def _is_a_copter(choice: Choice) -> None:
         pytest.skip("it is flown by copters of both autopilots")
 
 
+@pytest.mark.sampled(2)
 async def test_one_of_two_links_is_cut_in_flight(choice: Choice) -> None:
     async with served_on_two(choice) as links:
         radios = [FaultyLink(link) for link in links]

@@ -96,6 +96,7 @@ def test_recorded_stream_in_pieces(flight: str) -> None:
     assert framer.statistics.bad_bytes == 0
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("size", [1, 13, 64, 4096])
 def test_recorded_serial_boot_text_is_skipped(size: int) -> None:
     path = recording(BOOT)

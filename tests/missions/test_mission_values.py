@@ -101,6 +101,7 @@ def test_check_rejects_other_objects() -> None:
         RallyPoints([None])  # type: ignore[list-item]
 
 
+@pytest.mark.exhaustive
 def test_check_rejects_too_many_items() -> None:
     Mission([RTL] * 65_535).check()
     with pytest.raises(InvalidArgument, match="65536 items are too many: at most 65535"):

@@ -101,6 +101,7 @@ def booting_vehicle(kind: type[SimulatedVehicle], seed: int) -> SimulatedVehicle
     return kind(seed=seed, **options)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("kind", KINDS)
 @settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
 @given(calls=scripts, cuts=st.lists(instants, max_size=30))
@@ -110,6 +111,7 @@ def test_step_size_does_not_change_the_bytes(
     assert fly(kind, calls, []) == fly(kind, calls, cuts)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("kind", KINDS)
 def test_seed_determines_the_bytes(kind: type[SimulatedVehicle]) -> None:
     calls: list[tuple[float, Message]] = [(2.0, STREAMS), (3.0, ARM), (3.1, TAKE_OFF)]

@@ -19,6 +19,7 @@ LAST = (MavCmd.PREFLIGHT_REBOOT_SHUTDOWN,)
 _ENDS = (*LAST, MavCmd.DO_FLIGHTTERMINATION, MavCmd.COMPONENT_ARM_DISARM)
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("number", [math.nan, math.inf, -1e30])
 @pytest.mark.parametrize("kind", KINDS)
 def test_any_command_with_nan_params_is_answered(kind: str, number: float) -> None:
@@ -38,6 +39,7 @@ def test_nan_arms_or_disarms_nothing(kind: str) -> None:
     assert MavResult.ACCEPTED not in results
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("number", [math.nan, math.inf])
 @pytest.mark.parametrize("kind", ["copter", "px4"])
 def test_commands_with_nan_params_in_flight_are_answered(kind: str, number: float) -> None:

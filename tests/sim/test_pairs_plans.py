@@ -47,6 +47,7 @@ def download(pair: Pair, mission_type: int) -> list[tuple[int, float, float, flo
     return places_of(came[mission_type == MISSION and not pair.is_px4 :])
 
 
+@pytest.mark.sampled(3)
 @each
 @pytest.mark.parametrize("mission_type", [MISSION, FENCE, POINTS])
 @few

@@ -132,6 +132,7 @@ async def test_loiter_circle_is_kept_in_wind() -> None:
         assert off == pytest.approx(80.0, abs=8.0)
 
 
+@pytest.mark.exhaustive
 async def test_plane_flies_mission_and_lands() -> None:
     plane = SimulatedPlane(boot_time_s=1.0)
     async with flown(plane) as vehicle:

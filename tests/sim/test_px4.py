@@ -448,6 +448,7 @@ def test_any_command_is_answered(command: int, numbers: tuple[float, ...], flyin
     assert client.framer.statistics.bad_crcs == 0
 
 
+@pytest.mark.exhaustive
 @settings(max_examples=15)
 @given(mask=st.integers(0, 0xFFF), frame=st.integers(0, 21), numbers=st.tuples(*(st.floats(width=32),) * 11))
 def test_any_setpoint_is_handled(mask: int, frame: int, numbers: tuple[float, ...]) -> None:

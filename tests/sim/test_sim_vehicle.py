@@ -247,6 +247,7 @@ def test_any_command_is_answered_once(command: int, numbers: tuple[float, ...], 
     assert abs(copter.motion.down) < 100
 
 
+@pytest.mark.exhaustive
 @settings(max_examples=40)
 @given(
     mask=st.integers(0, 0xFFF),

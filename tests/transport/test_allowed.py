@@ -83,7 +83,7 @@ async def test_open_connection_has_its_own_peers() -> None:
     async with aerokit.open_connection("udpin:127.0.0.1:0") as connection:
         wrong: list[dict[str, Any]] = [{"peers": "10.0.0.7"}, {"may_move": True}]
         for options in wrong:
-            with pytest.raises(InvalidArgument, match="pass it to open_connection"):
+            with pytest.raises(InvalidArgument, match="pass them to open_connection"):
                 async with aerokit.connect(connection, **options):
                     pytest.fail("not allowed")
 

@@ -49,6 +49,7 @@ def plain_socket(host: str = "127.0.0.1") -> Iterator[socket.socket]:
         yield sock
 
 
+@pytest.mark.sampled(5)
 @each_loop_and_the_fallback
 @each_traffic
 @HOSTS

@@ -176,7 +176,7 @@ class FrameReceiver:
         framers, gate, deliver = self.framers, self._gate, self._bus.deliver
         has_stale = bool(framer.late or framer.foreign)
         for frame in frames:
-            if self._is_closed:  # by a sink of an earlier frame
+            if self._is_closed:  # a sink closed the receiver while processing an earlier frame
                 return
             if multilink is not None and multilink.is_copy(frame, peer):
                 continue

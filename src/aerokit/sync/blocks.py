@@ -208,7 +208,7 @@ class GimbalsTwin(TwinOf["Gimbals"], Generic[T]):
         return self.get(device_id)
 
     def __iter__(self) -> Iterator[T]:
-        return iter([self.get(each) for each in self.ids])
+        return iter([self.get(device_id) for device_id in self.ids])
 
     def __len__(self) -> int:
         return len(self.ids)

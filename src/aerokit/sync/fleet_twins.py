@@ -76,10 +76,10 @@ class Following(BlockTwin["AsyncFollowing"]):
         return self._loop.run(self.aio.wait_stopped)
 
     def raise_if_stopped(self) -> None:
-        """Raise if following has stopped early. For loops in the block.
+        """Raise if following has stopped early. Call it in the loops of the block.
 
         Raises:
-            SetpointStreamStopped: it has stopped; the text has the reason.
+            SetpointStreamStopped: following has stopped; the text has the reason.
         """
         self._loop.call(self.aio.raise_if_stopped)
 
@@ -87,9 +87,9 @@ class Following(BlockTwin["AsyncFollowing"]):
 class Selection(SelectionTwin["AsyncSelection"]):
     """Some members of a fleet: ``fleet.group("alpha")``, ``fleet["north/*"]``.
 
-    Every action goes to all available members at once (not lost, taken over or released), and returns a
-    :class:`FleetResult` when each of them is done. If one fails, the fleet's policy decides what the others do, and the
-    action ends when they have done it. If the action is cancelled, all of them hold.
+    Every action runs on all available members at once: those that are not lost, taken over or released. It returns a
+    :class:`FleetResult` when all of them are done. If a member fails, the fleet's policy orders what the others do, and
+    the action ends when they have done it. If the action is cancelled, all of them hold.
     """
 
     @property
@@ -112,8 +112,8 @@ class Selection(SelectionTwin["AsyncSelection"]):
         A fleet with a ``min_distance_m`` compares the paths first, and separates crossing paths by altitude.
 
         Args:
-            targets: member's name → target; other members stay where they are. Or a function that returns a member's
-                target.
+            targets: member's name → target, where other members stay where they are; or a function that returns a
+                member's target.
             speed_m_s: ground speed; None: unchanged.
             max_distance_m: reject targets farther than this from the vehicle.
             timeout: seconds for each member and leg; None: no limit.
@@ -152,7 +152,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
 
         Args:
             targets: as for :meth:`go_to`.
-            min_distance_m: minimum distance between any two members in metres; None: the fleet's own.
+            min_distance_m: minimum distance between any two members in metres; None: that of the fleet.
             by: ``"layers"``: separate crossing paths by altitude; ``"corridors"``: by time, which needs ``speed_m_s``;
                 ``"refuse"``: refuse crossing paths.
             speed_m_s: ground speed of all members.
@@ -344,7 +344,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
 
         Args:
             missions: member's name → mission.
-            min_distance_m: minimum distance between any two paths in metres; None: the fleet's own.
+            min_distance_m: minimum distance between any two paths in metres; None: that of the fleet.
 
         Raises:
             InvalidArgument: a name is unknown, or an argument is missing.
@@ -366,7 +366,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
             action: the name of a method of :class:`aerokit.Vehicle` (``"set_speed"``, ``"mission.resume"``), or a
                 coroutine function that is called with each :class:`Member`.
             *arguments: positional arguments of the method.
-            timeout: seconds for each member; None: the action's own limit.
+            timeout: seconds for each member; None: the default of the action.
             stagger_s: delay in seconds between the starts of consecutive members; None: all at once.
             **options: keyword arguments of the method.
 
@@ -439,7 +439,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
         """Change the flight mode; see :meth:`aerokit.Vehicle.set_mode`.
 
         Args:
-            mode: name as in the autopilot's documentation, or its number.
+            mode: name as in the autopilot's documentation, or number.
             timeout: seconds for each member.
 
         Raises:
@@ -462,7 +462,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
             description: name of the barrier in errors.
 
         Raises:
-            FleetError: it did not become true for a member; this member has then failed, as in any action.
+            FleetError: the condition did not become true for a member, which counts as failed in this action.
         """
         return self._loop.run(self.aio.barrier, condition, timeout=timeout, description=description)
 
@@ -475,7 +475,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
             timeout: seconds until all of them are there.
 
         Raises:
-            FleetError: a member did not get there.
+            FleetError: a member did not reach the altitude in time.
         """
         return self._loop.run(self.aio.wait_at_altitude, altitude_m, tolerance_m=tolerance_m, timeout=timeout)
 
@@ -516,7 +516,7 @@ class Fleet(FleetTwin, Selection):
         self._loop.call(self.aio.reclaim, name)
 
     def release(self, name: str, reason: str = "released by the program") -> None:
-        """Exclude members from actions until :meth:`reclaim`. Sends nothing: they continue what they do.
+        """Exclude members from actions until :meth:`reclaim`. Sends nothing: they continue what they are doing.
 
         Args:
             name: a member's name or a pattern.

@@ -386,8 +386,9 @@ class SetpointStream(StreamTwin[SetpointT]):
     """Sends the latest set-point at a fixed rate while the ``async with`` block supplies set-points.
 
     Entering the block changes to the set-point mode (GUIDED, OFFBOARD) with the initial set-point. Leaving it in any
-    way makes the vehicle hold. The stream stops by itself for the reasons above, and if the vehicle should move but
-    stays in place for twelve seconds; then ``set`` and leaving the block raise :class:`SetpointStreamStopped`. After a
+    way makes the vehicle hold. The stream stops by itself without a new set-point for ``valid_for_s``, if the event
+    loop is late by ``max_lag_s``, if the vehicle leaves the mode, disarms or falls silent, and if it should move but
+    stays in place for twelve seconds. Then ``set`` and leaving the block raise :class:`SetpointStreamStopped`. After a
     pilot or a failsafe has changed the mode, nothing more is sent to the vehicle.
     """
 
@@ -531,9 +532,9 @@ class GimbalControl(BlockTwin["AsyncGimbalControl"]):
 
     Entering takes control from any other station and returns when the manager confirms it. Leaving releases it, without
     waiting if the block exits by an error or cancellation. When another station takes control, aerokit publishes
-    ``GimbalControlLost``; orders to the gimbal, including running ones, raise :class:`GimbalTaken`, and so does leaving
-    the block unless your program has seen the loss. Control is not released then. Another station that uses your own
-    system and component id cannot be detected.
+    ``GimbalControlLost``, and orders to the gimbal, including running ones, raise :class:`GimbalTaken`. Leaving the
+    block then raises it too, unless your program has already seen the loss, and releases nothing. Another station that
+    uses your own system and component id cannot be detected.
 
     Entering raises:
         NotSupported: the vehicle has no gimbal manager, or its manager has no secondary control.
@@ -631,9 +632,9 @@ class GimbalRates(BlockTwin["AsyncGimbalRates"]):
 class Gimbal(TwinOf["AsyncGimbal"]):
     """One gimbal, by the gimbal protocol v2 (https://mavlink.io/en/services/gimbal_v2.html), or an older mount.
 
-    ``vehicle.gimbal`` is the first one, ``vehicle.gimbals`` has all. An order returns when the gimbal reports that it
-    points there, and ends when another one is given. The gimbal keeps the direction while the vehicle moves. If the
-    manager requires control, an order outside a block of :meth:`control` claims it until :meth:`release`.
+    ``vehicle.gimbal`` is the first one, ``vehicle.gimbals`` has all. An order returns when the gimbal reports the
+    ordered direction, and ends when another order is given. The gimbal keeps the direction while the vehicle moves. If
+    the manager requires control, an order outside a block of :meth:`control` claims it until :meth:`release`.
     """
 
     @cached_property
@@ -661,14 +662,14 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         tolerance_deg: float = 5.0,
         timeout: float = 15.0,
     ) -> None:
-        """Keep it pointed at a position; returns when it points there.
+        """Keep the gimbal pointed at a position; returns when it points there.
 
-        Sends MAV_CMD_DO_SET_ROI_LOCATION. Without an altitude, it is taken to be at the vehicle's own. A copter whose
+        Sends MAV_CMD_DO_SET_ROI_LOCATION. A target without an altitude is at the vehicle's own altitude. A copter whose
         gimbal does not pan turns its nose.
 
         Args:
             target: the position.
-            wait: False: return when it was accepted.
+            wait: False: return when the manager has accepted the order.
             tolerance_deg: accepted deviation in each axis, above 0 to 45.
             timeout: seconds to wait.
 
@@ -680,7 +681,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
             CommandTimeout: there was no answer.
             GimbalTaken: your program had control and lost it.
             OperationRejected: another order was given meanwhile, or the vehicle rebooted.
-            OperationTimeout: it did not get there in time; the text has the last attitude.
+            OperationTimeout: the gimbal did not reach the direction in time; the text has the last attitude.
             HeartbeatTimeout: the vehicle fell silent.
         """
         self._loop.run(self.aio.look_at, target, wait=wait, tolerance_deg=tolerance_deg, timeout=timeout)
@@ -693,13 +694,13 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         tolerance_deg: float = 5.0,
         timeout: float = 15.0,
     ) -> None:
-        """Keep it pointed at another vehicle (MAV_CMD_DO_SET_ROI_SYSID); returns when it points there.
+        """Keep the gimbal pointed at another vehicle (MAV_CMD_DO_SET_ROI_SYSID); returns when it points there.
 
         The gimbal's manager and this connection both need the position of the other vehicle (GLOBAL_POSITION_INT).
 
         Args:
             system_id: its MAVLink system id, 1 to 255.
-            wait: False: return when it was accepted.
+            wait: False: return when the manager has accepted the order.
             tolerance_deg: accepted deviation in each axis, above 0 to 45.
             timeout: seconds to wait.
 
@@ -710,7 +711,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
             CommandTimeout: there was no answer.
             GimbalTaken: your program had control and lost it.
             OperationRejected: another order was given meanwhile, or the vehicle rebooted.
-            OperationTimeout: it did not get there in time; the text has the last attitude.
+            OperationTimeout: the gimbal did not reach the direction in time; the text has the last attitude.
             HeartbeatTimeout: the vehicle fell silent.
         """
         self._loop.run(self.aio.look_at_system, system_id, wait=wait, tolerance_deg=tolerance_deg, timeout=timeout)
@@ -736,15 +737,15 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         tolerance_deg: float = 3.0,
         timeout: float = 10.0,
     ) -> None:
-        """Point it at angles; returns when it reports that it points there.
+        """Point the gimbal at angles; returns when it reports these angles.
 
         Args:
             pitch_deg: from the horizon, −360 to 360: 0 is level, −90 straight down.
             yaw_deg: −360 to 360, clockwise from north (``frame="earth"``) or from the nose (``"vehicle"``).
             roll_deg: from the horizon, −360 to 360. Other values than 0 need the mount command, which turns the camera
                 with the vehicle: a yaw from north is right only at the time of the order.
-            frame: reference of the yaw, which it keeps afterwards.
-            wait: False: return when it was accepted.
+            frame: reference of the yaw, which the gimbal keeps afterwards.
+            wait: False: return when the manager has accepted the order.
             tolerance_deg: accepted deviation in each axis, above 0 to 45.
             timeout: seconds to wait.
 
@@ -759,7 +760,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
             CommandTimeout: there was no answer.
             GimbalTaken: your program had control and lost it.
             OperationRejected: another order was given meanwhile, or the vehicle rebooted.
-            OperationTimeout: it did not get there in time; the text has the last attitude.
+            OperationTimeout: the gimbal did not reach the direction in time; the text has the last attitude.
             HeartbeatTimeout: the vehicle fell silent.
         """
         self._loop.run(
@@ -774,10 +775,10 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         )
 
     def neutral(self, *, wait: bool = True, timeout: float = 10.0) -> None:
-        """Turn it to its neutral position, usually level and straight ahead; returns when it rests there.
+        """Turn the gimbal to its neutral position, usually level and straight ahead; returns when it rests there.
 
         Args:
-            wait: False: return when it was accepted.
+            wait: False: return when the manager has accepted the order.
             timeout: seconds to wait.
 
         Raises:
@@ -785,31 +786,31 @@ class Gimbal(TwinOf["AsyncGimbal"]):
             CommandTimeout: there was no answer.
             GimbalTaken: your program had control and lost it.
             OperationRejected: another order was given meanwhile, or the vehicle rebooted.
-            OperationTimeout: it did not get there in time; the text has the last attitude.
+            OperationTimeout: the gimbal did not reach the direction in time; the text has the last attitude.
             HeartbeatTimeout: the vehicle fell silent.
         """
         self._loop.run(self.aio.neutral, wait=wait, timeout=timeout)
 
     def retract(self, *, wait: bool = True, timeout: float = 10.0) -> None:
-        """Retract it; returns when it rests there.
+        """Retract the gimbal; returns when it rests there.
 
         Args:
-            wait: False: return when it was accepted.
+            wait: False: return when the manager has accepted the order.
             timeout: seconds to wait.
 
         Raises:
-            NotSupported: its manager accepts the order but does nothing (PX4). Nothing was sent.
+            NotSupported: the manager would accept the order but not execute it (PX4). Nothing was sent.
             CommandRejected: the manager refused.
             CommandTimeout: there was no answer.
             GimbalTaken: your program had control and lost it.
             OperationRejected: another order was given meanwhile, or the vehicle rebooted.
-            OperationTimeout: it did not get there in time; the text has the last attitude.
+            OperationTimeout: the gimbal did not reach the direction in time; the text has the last attitude.
             HeartbeatTimeout: the vehicle fell silent.
         """
         self._loop.run(self.aio.retract, wait=wait, timeout=timeout)
 
     def release(self) -> None:
-        """Return it to the pilot's sticks, and release control that was claimed outside of a control block.
+        """Return the gimbal to the pilot's sticks, and release control that was claimed outside of a control block.
 
         Raises:
             CommandRejected: the vehicle refused.
@@ -820,7 +821,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
     def information(self) -> GimbalInformation:
         """Request capabilities, limits and identity (GIMBAL_MANAGER_INFORMATION, GIMBAL_DEVICE_INFORMATION).
 
-        Afterwards, angles beyond its limits are refused before anything is sent.
+        Afterwards, angles beyond the gimbal's limits are refused before anything is sent.
 
         Raises:
             CommandRejected: there is no gimbal manager, or it does not support the messages.
@@ -846,7 +847,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         valid_for_s: float = 1.0,
         max_lag_s: float = 0.5,
     ) -> GimbalRates:
-        """Turn it at rates for the duration of an ``async with`` block that feeds them; see :class:`GimbalRates`.
+        """Turn the gimbal at rates during an ``async with`` block that feeds them; see :class:`GimbalRates`.
 
         Args:
             pitch_deg_s: the first rate in degrees per second, −720 to 720; positive is up.
@@ -919,7 +920,7 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
 
     @property
     def end(self) -> str:
-        """The reason why none of its commands is sent again, as a clause; empty while they may be."""
+        """Reason why no command of the order is sent again, as a clause; empty while commands may be sent."""
         return self.aio.end
 
     def command(self, command: int, *params: float, component_id: int | None = None) -> None:
@@ -970,10 +971,10 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
             component_id: as for :meth:`command`.
 
         Raises:
-            InvalidArgument: the mode is not one of the order's, or the block was left. Nothing was sent.
+            InvalidArgument: the mode is not one of the modes of the order, or the block was left. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement.
-            OperationTimeout: it accepted and stayed in another mode.
+            OperationTimeout: the vehicle accepted the mode but stayed in another one.
         """
         self._loop.run(self.aio.set_mode, mode, timeout=timeout, component_id=component_id)
 
@@ -1040,8 +1041,8 @@ class Files(TwinOf["AsyncFiles"]):
     ) -> None:
         """Copy a file to this computer. It is written to ``<to>.part`` and renamed when it is complete.
 
-        With ``resume``, the ``<to>.part`` of an interrupted download is kept if the vehicle's file is not shorter,
-        and the result is verified by CRC-32 if the vehicle can compute it; if it differs, the whole file is read
+        With ``resume``, the download continues the ``<to>.part`` of an interrupted one, unless the vehicle's file is
+        shorter. The result is verified by CRC-32 if the vehicle can compute it; if it differs, the whole file is read
         again. Files whose names begin with ``@`` are always read completely.
 
         Raises:
@@ -1191,9 +1192,9 @@ class Logs(TwinOf["AsyncLogs"]):
     All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
     total; None for no limit). You can cancel any call; the vehicle then stops sending.
 
-    ArduPilot answers the LOG_* messages only while disarmed, and ends its current log when one is read by them; by
-    MAVFTP its logs can also be read in flight. A log that is still being written is read up to its current end; if that
-    exceeds the size in its entry, logger "aerokit" reports it (INFO).
+    ArduPilot answers LOG_* messages only while disarmed, and reading a log by them ends its current log. By MAVFTP,
+    logs can also be read in flight. A log that is still being written is read up to its current end. If that exceeds
+    the size in the entry, logger "aerokit" reports it (INFO).
     """
 
     def list(self, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None) -> tuple[LogEntry, ...]:
@@ -1358,8 +1359,9 @@ class Parameters(TwinOf["AsyncParameters"]):
     def load_metadata(self, path: str | os.PathLike[str]) -> Metadata:
         """Read ArduPilot's ``apm.pdef.xml`` or ``apm.pdef.json``, or PX4's ``parameters.xml`` or ``parameters.json``.
 
-        Metadata is advice: a write outside the documented range is done, and its result has a ``note``; only values
-        that the type cannot represent are refused. It also lists changes that need a reboot. PX4's has the defaults.
+        Metadata does not restrict writes: a value outside the documented range is set, and its result has a ``note``.
+        Only values that the type cannot represent are refused. Metadata also identifies changes that need a reboot.
+        The metadata of PX4 contains the defaults.
 
         Raises:
             FileFormatError: the file is damaged, or of another kind.
@@ -1382,9 +1384,9 @@ class Parameters(TwinOf["AsyncParameters"]):
             method: ``"ftp"`` reads one small file with the defaults (``@PARAM/param.pck``), ``"list"`` requests one
                 message for each parameter; ``"auto"`` uses the file if there is one.
             refresh: download again, even if the parameters are known or cached.
-            cache: keep the list on disk, and use it while the vehicle's parameter hash is unchanged: the second
-                connect takes one request. True means the user's cache directory, or pass one. Only PX4 has a hash; it
-                does not cover parameters that PX4 changes by itself, so they may be outdated. Off by default.
+            cache: keep the list on disk, and use it while the vehicle's parameter hash is unchanged: the second connect
+                takes one request. True means the user's cache directory; or pass a path. Only PX4 has a hash; it does
+                not cover parameters that PX4 changes by itself, so they may be outdated. Off by default.
             idle_timeout_s: fail after this many seconds without progress.
             timeout: seconds in total.
             on_progress: called with the number of parameters, or bytes of the file, so far and in total.
@@ -1404,15 +1406,15 @@ class Parameters(TwinOf["AsyncParameters"]):
         )
 
     def get(self, name: str, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None) -> int | float:
-        """Request one value; for arguments and errors see :meth:`read`."""
+        """Request one value from the vehicle; for arguments and errors see :meth:`read`."""
         return self._loop.run(self.aio.get, name, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
     def read(self, name: str, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None) -> Parameter:
-        """Request one parameter from the vehicle; ``table[name]`` has the local copy.
+        """Request one parameter from the vehicle, bypassing the local copy in ``table``.
 
         Raises:
             InvalidArgument: the name is empty, or longer than 16 characters.
-            ParameterRejected: the vehicle has no such parameter: it answers so, or answers others but not this one.
+            ParameterRejected: the vehicle reports that it has no such parameter, or answers only requests for others.
             ParameterTimeout: there was no answer.
         """
         return self._loop.run(self.aio.read, name, idle_timeout_s=idle_timeout_s, timeout=timeout)
@@ -1429,7 +1431,7 @@ class Parameters(TwinOf["AsyncParameters"]):
 
         Returns:
             For each name the parameter, or the error that :meth:`get` would have raised. Its ``code`` is None if the
-            vehicle did not deny the parameter, but answered others and not this one.
+                vehicle did not report an error, but answered only requests for others.
 
         Raises:
             InvalidArgument: a name is empty, or longer than 16 characters. Nothing was sent.
@@ -1461,7 +1463,7 @@ class Parameters(TwinOf["AsyncParameters"]):
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> dict[str, ParameterWrite]:
-        """Set several parameters concurrently; return one result each: check its ``error``.
+        """Set several parameters concurrently; return a result for each of them: check its ``error``.
 
         Parameters that appear only when another one is set (ArduPilot's ``…_ENABLE``) are set after it.
 
@@ -1580,8 +1582,8 @@ class Parameters(TwinOf["AsyncParameters"]):
 class MissionControl(TwinOf["AsyncMissionControl"]):
     """The mission of a vehicle: ``await vehicle.mission.upload(mission)``, ``start()``, ``wait_finished()``.
 
-    Item numbers count from 0, and home is not an item, for all autopilots. Starting, pausing and resuming are
-    orders like taking off: the newest one wins.
+    Item numbers count from 0, and home is not an item, for all autopilots. Starting, pausing and resuming are orders:
+    each supersedes earlier orders to move, and ends with a later one.
     """
 
     def upload(
@@ -1612,16 +1614,16 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
             on_progress: called with the progress in items, or in bytes of a file.
 
         See https://mavlink.io/en/services/mission.html. PX4 keeps the old items until it has all of the new ones.
-        ArduPilot overwrites missions and rally points one by one (a fence at the end), After a failure it may hold
-        old and new items; the error then says so. ("holds" is also a flight mode.)
+        ArduPilot overwrites missions and rally points item by item, and a fence at the end. After a failure it may have
+        both old and new items; the error then states that.
 
         Raises:
             InvalidArgument: the plan is invalid, or has a position that is too far away. Nothing was sent.
             MissionRejected: the vehicle refused; see ``item``, ``result`` and ``reasons``.
-            MissionTimeout: it stopped answering; ``missing`` are the items it did not confirm.
-            VerificationFailed: it confirmed, but holds something else.
-            NotSupported: ``"ftp"`` was requested, but it has none.
-            FileError, FileTimeout: the same for a file, with ``"ftp"``.
+            MissionTimeout: the vehicle stopped answering; ``missing`` has the items that it did not confirm.
+            VerificationFailed: the vehicle confirmed the plan, but has different items.
+            NotSupported: ``"ftp"`` was requested, but the vehicle does not support it.
+            FileError, FileTimeout: the vehicle refused or did not answer an operation on a file, with ``"ftp"``.
             OperationTimeout: not done within ``timeout``.
         """
         self._loop.run(
@@ -1668,8 +1670,8 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
             MissionRejected: the vehicle refused.
-            MissionTimeout: it stopped answering.
-            VerificationFailed: it confirmed, but still holds items.
+            MissionTimeout: the vehicle stopped answering.
+            VerificationFailed: the vehicle confirmed the command, but still has items.
             OperationTimeout: not done within ``timeout``.
         """
         self._loop.run(self.aio.clear, idle_timeout_s=idle_timeout_s, timeout=timeout)
@@ -1714,13 +1716,13 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         The vehicle must be armed: **it takes off** if the mission begins with a take-off. A copter on the ground needs
         a take-off item first. If you cancel the call, aerokit orders the vehicle to hold.
 
-        Sends MISSION_START to ArduPilot, which then takes off from the ground, and changes the mode of others.
+        Sends MISSION_START to ArduPilot, which then takes off from the ground. Other autopilots get a mode change.
 
         Raises:
             InvalidArgument: there is no such item. Nothing was sent.
-            OperationRejected: it is not armed, or its mode changed meanwhile.
+            OperationRejected: the vehicle is not armed, or its mode changed meanwhile.
             CommandRejected: the vehicle refused: it has no mission, no position, …; see ``reasons``.
-            OperationTimeout: it accepted but stayed in another mode.
+            OperationTimeout: the vehicle accepted the command but stayed in another mode.
             NotSupported: this type of vehicle has no mission mode.
         """
         self._loop.run(self.aio.start, item, timeout=timeout)
@@ -1728,7 +1730,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
     def pause(self) -> None:
         """Hold and remember the current item; returns when HEARTBEAT reports the hold mode.
 
-        Raises OperationRejected if it is not flying its mission, else as :meth:`Vehicle.hold`.
+        Raises OperationRejected if the vehicle is not flying its mission, else as :meth:`Vehicle.hold`.
         """
         self._loop.run(self.aio.pause)
 
@@ -1740,7 +1742,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         self._loop.run(self.aio.resume, timeout=timeout)
 
     def wait_finished(self, *, timeout: float | None = None, max_silence_s: float | None = MAX_SILENCE_S) -> None:
-        """Wait until the mission has been flown to its end; for one that ends with landing, until it has landed.
+        """Wait until the mission has been flown to its end; if it ends with a landing, until the vehicle has landed.
 
         A :meth:`pause` by another task does not end the wait. Cancelling this call does not stop the vehicle.
 
@@ -1749,8 +1751,8 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
             max_silence_s: fail after this many seconds without a heartbeat; None for no limit.
 
         Raises:
-            OperationRejected: it no longer flies the mission: a pilot, a failsafe or another order changed the mode, or
-                it disarmed on the way. ``reasons`` has what the vehicle reported.
+            OperationRejected: the vehicle no longer flies the mission: a pilot, a failsafe or another order changed the
+                mode, or it disarmed on the way. ``reasons`` has what the vehicle reported.
             OperationTimeout: not finished in time.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
         """
@@ -1769,7 +1771,7 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
     """The fence of a vehicle: ``await vehicle.fence.upload(Fence(polygons=[...]))``.
 
     For ArduPilot, uploading does not enable the fence: use :meth:`enable`, or the parameter FENCE_ENABLE. PX4 always
-    obeys its fence; GF_ACTION defines its reaction.
+    enforces its fence; GF_ACTION defines its reaction.
     """
 
     def upload(
@@ -1800,16 +1802,16 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
             on_progress: called with the progress in items, or in bytes of a file.
 
         See https://mavlink.io/en/services/mission.html. PX4 keeps the old items until it has all of the new ones.
-        ArduPilot overwrites missions and rally points one by one (a fence at the end), After a failure it may hold
-        old and new items; the error then says so. ("holds" is also a flight mode.)
+        ArduPilot overwrites missions and rally points item by item, and a fence at the end. After a failure it may have
+        both old and new items; the error then states that.
 
         Raises:
             InvalidArgument: the plan is invalid, or has a position that is too far away. Nothing was sent.
             MissionRejected: the vehicle refused; see ``item``, ``result`` and ``reasons``.
-            MissionTimeout: it stopped answering; ``missing`` are the items it did not confirm.
-            VerificationFailed: it confirmed, but holds something else.
-            NotSupported: ``"ftp"`` was requested, but it has none.
-            FileError, FileTimeout: the same for a file, with ``"ftp"``.
+            MissionTimeout: the vehicle stopped answering; ``missing`` has the items that it did not confirm.
+            VerificationFailed: the vehicle confirmed the plan, but has different items.
+            NotSupported: ``"ftp"`` was requested, but the vehicle does not support it.
+            FileError, FileTimeout: the vehicle refused or did not answer an operation on a file, with ``"ftp"``.
             OperationTimeout: not done within ``timeout``.
         """
         self._loop.run(
@@ -1856,8 +1858,8 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
             MissionRejected: the vehicle refused.
-            MissionTimeout: it stopped answering.
-            VerificationFailed: it confirmed, but still holds items.
+            MissionTimeout: the vehicle stopped answering.
+            VerificationFailed: the vehicle confirmed the command, but still has items.
             OperationTimeout: not done within ``timeout``.
         """
         self._loop.run(self.aio.clear, idle_timeout_s=idle_timeout_s, timeout=timeout)
@@ -1869,7 +1871,7 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
 
         Raises:
             CommandRejected: the vehicle refused; PX4 does not support the command.
-            CommandTimeout: it did not answer.
+            CommandTimeout: the vehicle did not answer.
         """
         self._loop.run(self.aio.enable, on)
 
@@ -1908,16 +1910,16 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
             on_progress: called with the progress in items, or in bytes of a file.
 
         See https://mavlink.io/en/services/mission.html. PX4 keeps the old items until it has all of the new ones.
-        ArduPilot overwrites missions and rally points one by one (a fence at the end), After a failure it may hold
-        old and new items; the error then says so. ("holds" is also a flight mode.)
+        ArduPilot overwrites missions and rally points item by item, and a fence at the end. After a failure it may have
+        both old and new items; the error then states that.
 
         Raises:
             InvalidArgument: the plan is invalid, or has a position that is too far away. Nothing was sent.
             MissionRejected: the vehicle refused; see ``item``, ``result`` and ``reasons``.
-            MissionTimeout: it stopped answering; ``missing`` are the items it did not confirm.
-            VerificationFailed: it confirmed, but holds something else.
-            NotSupported: ``"ftp"`` was requested, but it has none.
-            FileError, FileTimeout: the same for a file, with ``"ftp"``.
+            MissionTimeout: the vehicle stopped answering; ``missing`` has the items that it did not confirm.
+            VerificationFailed: the vehicle confirmed the plan, but has different items.
+            NotSupported: ``"ftp"`` was requested, but the vehicle does not support it.
+            FileError, FileTimeout: the vehicle refused or did not answer an operation on a file, with ``"ftp"``.
             OperationTimeout: not done within ``timeout``.
         """
         self._loop.run(
@@ -1964,8 +1966,8 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
             MissionRejected: the vehicle refused.
-            MissionTimeout: it stopped answering.
-            VerificationFailed: it confirmed, but still holds items.
+            MissionTimeout: the vehicle stopped answering.
+            VerificationFailed: the vehicle confirmed the command, but still has items.
             OperationTimeout: not done within ``timeout``.
         """
         self._loop.run(self.aio.clear, idle_timeout_s=idle_timeout_s, timeout=timeout)
@@ -1995,9 +1997,10 @@ class PhotoInterval(PhotoIntervalTwin):
 class Camera(TwinOf["AsyncCamera"]):
     """One camera: photos, video, lens, tracking, storage, streams (https://mavlink.io/en/services/camera.html).
 
-    ``vehicle.camera`` is the first camera, ``vehicle.camera_at(number)`` any: one with its own component id (100 to
-    105), or one attached to the autopilot (1 to 6), e.g. ArduPilot's drivers and PX4's trigger. Calls outside its
-    reported capabilities are refused before anything is sent. Cells are polled only while your program uses them.
+    ``vehicle.camera`` is the first camera; ``vehicle.camera_at(number)`` is any camera: one with its own component id
+    (100 to 105), or one attached to the autopilot (1 to 6), e.g. ArduPilot's drivers and PX4's trigger. Calls outside
+    the camera's reported capabilities are refused before anything is sent. Cells are polled only while your program
+    uses them.
     """
 
     @cached_property
@@ -2034,8 +2037,8 @@ class Camera(TwinOf["AsyncCamera"]):
         Raises:
             NotSupported: the camera has no modes. Nothing was sent.
             CommandRejected: the camera refused: it is busy, or does not support this mode.
-            CommandTimeout: it did not answer.
-            OperationTimeout: it accepted, but reports another mode; or no camera was found.
+            CommandTimeout: the camera did not answer.
+            OperationTimeout: the camera accepted the command but reports another mode, or no camera was found.
         """
         self._loop.run(self.aio.set_mode, mode, timeout=timeout)
 
@@ -2064,7 +2067,7 @@ class Camera(TwinOf["AsyncCamera"]):
         Raises:
             InvalidArgument: ``number`` is out of range. Nothing was sent.
             CommandRejected: the camera refused: it is busy, or there is no such medium.
-            CommandTimeout: it did not answer; it may be formatting.
+            CommandTimeout: the camera did not answer; it may be formatting.
             OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.format_storage, number, timeout=timeout, on_progress=on_progress)
@@ -2074,7 +2077,7 @@ class Camera(TwinOf["AsyncCamera"]):
 
         Raises:
             CommandRejected: the camera refused.
-            CommandTimeout: it did not answer.
+            CommandTimeout: the camera did not answer.
             OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.reset_settings)
@@ -2104,7 +2107,7 @@ class Camera(TwinOf["AsyncCamera"]):
             InvalidArgument: an argument is out of range. Nothing was sent.
             NotSupported: the camera cannot track a point. Nothing was sent.
             CommandRejected: the camera refused.
-            CommandTimeout: it did not answer.
+            CommandTimeout: the camera did not answer.
             OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.track_point, x, y, radius=radius, status_hz=status_hz)
@@ -2123,7 +2126,7 @@ class Camera(TwinOf["AsyncCamera"]):
             InvalidArgument: an argument is out of range, or the rectangle is empty. Nothing was sent.
             NotSupported: the camera cannot track a rectangle. Nothing was sent.
             CommandRejected: the camera refused.
-            CommandTimeout: it did not answer.
+            CommandTimeout: the camera did not answer.
             OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.track_rectangle, left, top, right, bottom, status_hz=status_hz)
@@ -2134,7 +2137,7 @@ class Camera(TwinOf["AsyncCamera"]):
         Raises:
             NotSupported: the camera cannot track. Nothing was sent.
             CommandRejected: the camera refused.
-            CommandTimeout: it did not answer.
+            CommandTimeout: the camera did not answer.
             OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.stop_tracking)
@@ -2151,7 +2154,7 @@ class Camera(TwinOf["AsyncCamera"]):
             InvalidArgument: ``steps`` is out of range. Nothing was sent.
             NotSupported: the camera has no zoom. Nothing was sent.
             CommandRejected: the camera refused.
-            CommandTimeout: it did not answer; it may have zoomed.
+            CommandTimeout: the camera did not answer; it may have zoomed.
             OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.zoom_step, steps)
@@ -2189,7 +2192,7 @@ class Camera(TwinOf["AsyncCamera"]):
             InvalidArgument: ``steps`` is out of range. Nothing was sent.
             NotSupported: the camera cannot be focused. Nothing was sent.
             CommandRejected: the camera refused.
-            CommandTimeout: it did not answer; it may have moved.
+            CommandTimeout: the camera did not answer; it may have moved.
             OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.focus_step, steps)
@@ -2208,7 +2211,7 @@ class Camera(TwinOf["AsyncCamera"]):
         Raises:
             NotSupported: the camera cannot be focused. Nothing was sent.
             CommandRejected: the camera refused.
-            CommandTimeout: it did not answer.
+            CommandTimeout: the camera did not answer.
             OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.auto_focus, kind)
@@ -2256,8 +2259,8 @@ class Camera(TwinOf["AsyncCamera"]):
             InvalidArgument: ``status_hz`` is out of range. Nothing was sent.
             NotSupported: the camera records no video. Nothing was sent.
             CommandRejected: the camera refused: it is busy, or in the wrong mode.
-            CommandTimeout: it did not answer; it may be recording.
-            OperationTimeout: it accepted but does not record, or no camera was found.
+            CommandTimeout: the camera did not answer; it may be recording.
+            OperationTimeout: the camera accepted the command but does not record, or no camera was found.
         """
         self._loop.run(self.aio.start_video, status_hz=status_hz, timeout=timeout)
 
@@ -2267,8 +2270,8 @@ class Camera(TwinOf["AsyncCamera"]):
         Raises:
             NotSupported: the camera records no video. Nothing was sent.
             CommandRejected: the camera refused.
-            CommandTimeout: it did not answer.
-            OperationTimeout: it accepted but still records, or no camera was found.
+            CommandTimeout: the camera did not answer.
+            OperationTimeout: the camera accepted the command but still records, or no camera was found.
         """
         self._loop.run(self.aio.stop_video, timeout=timeout)
 
@@ -2301,7 +2304,7 @@ class Camera(TwinOf["AsyncCamera"]):
             InvalidArgument: the number is out of range. Nothing was sent.
             NotSupported: the camera has no streams. Nothing was sent.
             CommandRejected: the camera refused, or has no such stream.
-            CommandTimeout: it did not answer.
+            CommandTimeout: the camera did not answer.
             OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.start_streaming, stream)
@@ -2327,7 +2330,7 @@ class Camera(TwinOf["AsyncCamera"]):
 
         Raises:
             CommandRejected: the camera refused, or has no such sensor.
-            CommandTimeout: it did not answer.
+            CommandTimeout: the camera did not answer.
             OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.select_source, primary, secondary)
@@ -2348,7 +2351,7 @@ class Camera(TwinOf["AsyncCamera"]):
         return self.aio.number
 
     def wait_found(self, *, timeout: float = 10.0) -> CameraInformation:
-        """Wait until the camera is found and has identified itself; other calls do so by themselves.
+        """Wait until the camera is found and has identified itself; other calls wait for that by themselves.
 
         Raises:
             CommandRejected: the camera refused to identify itself.
@@ -2361,8 +2364,8 @@ class Camera(TwinOf["AsyncCamera"]):
 
         Sends MAV_CMD_IMAGE_START_CAPTURE (https://mavlink.io/en/services/camera.html), or MAV_CMD_DO_DIGICAM_CONTROL
         to PX4's trigger and to cameras that do not support the former. The order is sent again only if the camera
-        then reports that it is not taking a picture and has taken none. A lost CAMERA_IMAGE_CAPTURED is requested. If
-        you cancel the call, the camera may still take the picture.
+        reports afterwards that it has taken no picture and is taking none. A lost CAMERA_IMAGE_CAPTURED is requested.
+        If you cancel the call, the camera may still take the picture.
 
         Args:
             timeout: seconds to wait for the report.
@@ -2370,9 +2373,9 @@ class Camera(TwinOf["AsyncCamera"]):
         Raises:
             NotSupported: the camera takes no pictures. Nothing was sent.
             CommandRejected: the camera refused: it is busy, or in the wrong mode.
-            CommandTimeout: it did not answer; it may have taken the picture.
-            OperationRejected: it failed to take the picture.
-            OperationTimeout: it reported no picture, or no camera was found.
+            CommandTimeout: the camera did not answer; it may have taken the picture.
+            OperationRejected: the camera failed to take the picture.
+            OperationTimeout: the camera reported no picture, or no camera was found.
         """
         return self._loop.run(self.aio.take_photo, timeout=timeout)
 
@@ -2429,7 +2432,7 @@ class Settings(TwinOf["AsyncSettings"]):
 
     A camera definition file explains the settings: :meth:`fetch_definition` reads it from the camera, :meth:`load`
     from a local file. From then on you can use the names of options, and values that are out of range or excluded by
-    other settings are refused before anything is sent. Without it, values are sent unchanged.
+    other settings are refused before anything is sent. Without a definition, values are sent unchanged.
 
     All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
     total; then OperationTimeout), if they send anything. You can cancel any call.
@@ -2490,7 +2493,7 @@ class Settings(TwinOf["AsyncSettings"]):
 
         Raises:
             NotSupported: the camera names no definition file.
-            CommandRejected, OperationTimeout: it did not send CAMERA_INFORMATION.
+            CommandRejected, OperationTimeout: the camera did not send CAMERA_INFORMATION.
             InvalidArgument: the address has another scheme.
             FileFormatError: the file is invalid, or has more than 16 MB.
             FileError, FileTimeout, RemoteProtocolError: as for :meth:`aerokit.vehicle.files.files.Files.read`.
@@ -2526,7 +2529,8 @@ class Settings(TwinOf["AsyncSettings"]):
         """Return all settings by name, in the component's order; immediately if they were downloaded before.
 
         Raises:
-            ParameterTimeout: the list is incomplete, or the component has none; ``table`` has what has arrived.
+            ParameterTimeout: the list is incomplete, or the component has none; ``table`` has the settings that
+                arrived.
         """
         return self._loop.run(
             self.aio.download,
@@ -2541,7 +2545,7 @@ class Settings(TwinOf["AsyncSettings"]):
         return self._loop.run(self.aio.get, name, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
     def read(self, name: str, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None) -> Setting:
-        """Request one setting from the component; ``table[name]`` has the local copy.
+        """Request one setting from the component, bypassing the local copy in ``table``.
 
         Raises:
             InvalidArgument: the name is empty, or longer than 16 characters.
@@ -2596,40 +2600,40 @@ class Component(TwinOf["AsyncComponent"]):
 
     @property
     def age(self) -> float:
-        """Seconds since its last HEARTBEAT; inf before the first."""
+        """Seconds since the last HEARTBEAT of the component; inf before the first."""
         return self.aio.age
 
     @property
     def is_silent(self) -> bool:
-        """True if its last HEARTBEAT is older than 3.5 seconds, or none was received."""
+        """True if the component's last HEARTBEAT is older than 3.5 seconds, or none was received."""
         return self.aio.is_silent
 
     def information(self, *, timeout: float = 3.0) -> ComponentInformation:
-        """Request its identity and capabilities (COMPONENT_INFORMATION_BASIC).
+        """Request identity and capabilities of the component (COMPONENT_INFORMATION_BASIC).
 
         Raises:
-            CommandRejected: it does not support the message.
-            OperationTimeout: it did not answer within ``timeout`` seconds.
+            CommandRejected: the component does not support the message.
+            OperationTimeout: the component did not answer within ``timeout`` seconds.
         """
         return self._loop.run(self.aio.information, timeout=timeout)
 
     def metadata(self, kind: MetadataKind = "general", *, timeout: float = 3.0) -> dict[str, Any]:
-        """Read one of its metadata files (COMPONENT_METADATA) by MAVFTP and return the JSON object.
+        """Read a metadata file of the component (COMPONENT_METADATA) by MAVFTP and return its JSON object.
 
         Args:
-            kind: ``"general"`` lists the others: ``"parameter"``, ``"commands"``, ``"peripherals"``, ``"events"``,
+            kind: ``"general"`` lists the other files: ``"parameter"``, ``"commands"``, ``"peripherals"``, ``"events"``,
                 ``"actuators"``. PX4 has general, parameter, events and actuators.
             timeout: seconds to wait for the address of the file.
 
         Raises:
-            NotSupported: it has no such file, or the file is not on the vehicle.
+            NotSupported: the component has no such file, or the file is not on the vehicle.
             FileFormatError: the file is damaged.
-            FileError, FileTimeout: it cannot be read.
+            FileError, FileTimeout: the file cannot be read.
         """
         return self._loop.run(self.aio.metadata, kind, timeout=timeout)
 
     def fetch(self, uri: str, *, idle_timeout_s: float = 10.0) -> bytes:
-        """Return the content of a file by the address that a component has reported, at most 16 MB.
+        """Return the content of a file, at most 16 MB, by an address that a component has reported.
 
         Args:
             uri: ``mftp://path`` is on this component, ``mftp://[;comp=1]path`` on another component of the vehicle;
@@ -2675,11 +2679,11 @@ class Component(TwinOf["AsyncComponent"]):
         Args:
             message_type: class of the message.
             params: param2 to param6, e.g. the number of a camera, stream or storage.
-            timeout: seconds to wait; it is requested up to three times.
+            timeout: seconds to wait; the message is requested up to three times.
             where: predicate to select one of several messages.
 
         Raises:
-            CommandRejected: it refused.
+            CommandRejected: the component refused.
             OperationTimeout: the message did not arrive.
         """
         return self._loop.run(self.aio.request, message_type, *params, timeout=timeout, where=where)
@@ -2701,7 +2705,7 @@ class Component(TwinOf["AsyncComponent"]):
         )
 
     def message(self, message_type: type[MessageT], *, rate_hz: float | None = None) -> StateCell[MessageT]:
-        """Return a cell with its latest message of a type; as :meth:`aerokit.Vehicle.message`."""
+        """Return a cell with the component's latest message of a type; as :meth:`aerokit.Vehicle.message`."""
         return StateCell(self._loop, self._loop.call(self.aio.message, message_type, rate_hz=rate_hz))
 
     def rate(self, message_type: type[Message], rate_hz: float) -> AbstractContextManager[None]:
@@ -2710,17 +2714,17 @@ class Component(TwinOf["AsyncComponent"]):
 
     @cached_property
     def files(self) -> Files:
-        """Its files, by MAVFTP."""
+        """The component's files, by MAVFTP."""
         return Files(self._loop, self._loop.call(lambda: self.aio.files))
 
     @cached_property
     def parameters(self) -> Parameters:
-        """Its parameters (PARAM_VALUE)."""
+        """The component's parameters (PARAM_VALUE)."""
         return Parameters(self._loop, self._loop.call(lambda: self.aio.parameters))
 
     @cached_property
     def settings(self) -> Settings:
-        """Its settings (PARAM_EXT), which may be texts; for cameras explained by the camera definition file."""
+        """The component's settings (PARAM_EXT). A camera definition file explains those of a camera."""
         return Settings(self._loop, self._loop.call(lambda: self.aio.settings))
 
 
@@ -3164,7 +3168,7 @@ class Vehicle(VehicleTwin):
             InvalidArgument: this vehicle has no such mode; the text lists its modes. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             OperationRejected: a pilot or a failsafe has chosen another mode meanwhile.
-            OperationTimeout: it accepted and stayed in another mode, or did not acknowledge.
+            OperationTimeout: the vehicle did not acknowledge, or accepted the mode but stayed in another one.
         """
         self._loop.run(self.aio.set_mode, mode, timeout=timeout)
 
@@ -3177,7 +3181,7 @@ class Vehicle(VehicleTwin):
             NotSupported: this vehicle has no mode for it. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             OperationRejected: a pilot or a failsafe has chosen another mode meanwhile.
-            OperationTimeout: it accepted and stayed in another mode, or did not acknowledge.
+            OperationTimeout: the vehicle did not acknowledge, or accepted the mode but stayed in another one.
         """
         self._loop.run(self.aio.hold)
 
@@ -3260,10 +3264,10 @@ class Vehicle(VehicleTwin):
                 estimates. Where the vehicle can run its checks on request, they are run again for this.
             CommandTimeout: there was no acknowledgement, and the vehicle did not arm; the text says whether it may
                 still arm.
-            OperationRejected: it is armed already in a mode other than ``mode`` (nothing was sent), or another party
-                disarmed it or changed its mode meanwhile.
+            OperationRejected: the vehicle is armed already in a mode other than ``mode`` (nothing was sent), or another
+                party disarmed it or changed its mode meanwhile.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
-            OperationTimeout: it accepted the command and did not arm.
+            OperationTimeout: the vehicle accepted the command but did not arm.
         """
         self._loop.run(self.aio.arm, mode=mode, force=force, timeout=timeout, max_silence_s=max_silence_s)
 
@@ -3285,7 +3289,7 @@ class Vehicle(VehicleTwin):
             CommandRejected: the vehicle refused, usually because it is flying.
             CommandTimeout: there was no acknowledgement.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
-            OperationTimeout: it accepted the command and did not disarm.
+            OperationTimeout: the vehicle accepted the command but did not disarm.
         """
         self._loop.run(self.aio.disarm, force=force, timeout=timeout, max_silence_s=max_silence_s)
 
@@ -3297,11 +3301,11 @@ class Vehicle(VehicleTwin):
             timeout: seconds until the vehicle has restarted.
 
         Raises:
-            OperationRejected: it is armed, or not known to be disarmed. Nothing was sent.
-            CommandRejected: it refused.
+            OperationRejected: the vehicle is armed, or not known to be disarmed. Nothing was sent.
+            CommandRejected: the vehicle refused.
             CommandTimeout: there was no acknowledgement, and it did not reboot.
             LinkLost: the link went down with the vehicle (USB, TCP); connect again.
-            OperationTimeout: it did not restart in time.
+            OperationTimeout: the vehicle did not restart in time.
         """
         self._loop.run(self.aio.reboot, force=force, timeout=timeout)
 
@@ -3366,7 +3370,7 @@ class Vehicle(VehicleTwin):
             OperationRejected: the mode changed (a pilot, a failsafe) or the vehicle disarmed on the way.
             CommandTimeout: there was no acknowledgement.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
-            OperationTimeout: it did not arrive in time, or does not move.
+            OperationTimeout: the vehicle did not arrive in time, or does not move.
         """
         self._loop.run(
             self.aio.go_to,
@@ -3402,8 +3406,8 @@ class Vehicle(VehicleTwin):
     ) -> None:
         """Turn on the spot and return when the vehicle has this heading.
 
-        ArduPilot: changes to GUIDED and sends MAV_CMD_CONDITION_YAW. PX4 has no such command: the vehicle stops and
-            turns by MAV_CMD_DO_REPOSITION.
+        An ArduPilot vehicle changes to GUIDED and gets MAV_CMD_CONDITION_YAW. PX4 does not support this command, so the
+        vehicle stops and turns by MAV_CMD_DO_REPOSITION.
 
         Args:
             heading_deg: −360 to 360, clockwise from north; with ``relative`` an angle to turn by, negative to the
@@ -3419,7 +3423,7 @@ class Vehicle(VehicleTwin):
             CommandRejected: the vehicle refused.
             OperationRejected: the mode changed or it disarmed meanwhile.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
-            OperationTimeout: it did not reach the heading in time.
+            OperationTimeout: the vehicle did not reach the heading in time.
         """
         self._loop.run(
             self.aio.set_heading,
@@ -3446,7 +3450,7 @@ class Vehicle(VehicleTwin):
             InvalidArgument: the place has no altitude above mean sea level. Nothing was sent.
             CommandRejected: the vehicle refused: it has no position, or the place is invalid.
             CommandTimeout: there was no acknowledgement.
-            OperationTimeout: it accepted, and HOME_POSITION did not report it.
+            OperationTimeout: the vehicle accepted the command, but HOME_POSITION does not report the new place.
         """
         self._loop.run(self.aio.set_home, place, timeout=timeout)
 
@@ -3477,11 +3481,11 @@ class Vehicle(VehicleTwin):
         Raises:
             InvalidArgument: the altitude is out of range. Nothing was sent.
             NotSupported: this type of vehicle cannot take off.
-            OperationRejected: it is not armed or is flying already, or its mode changed or it disarmed meanwhile.
+            OperationRejected: the vehicle is not armed, is flying already, or changed its mode or disarmed meanwhile.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
-            OperationTimeout: it did not reach the altitude in time, or does not move.
+            OperationTimeout: the vehicle did not reach the altitude in time, or does not move.
             ValueUnknownError: home is not known, and PX4 needs its altitude.
         """
         self._loop.run(self.aio.take_off, altitude_m, timeout=timeout, max_silence_s=max_silence_s)
@@ -3501,7 +3505,7 @@ class Vehicle(VehicleTwin):
             CommandTimeout: there was no acknowledgement.
             OperationRejected: the mode changed meanwhile.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
-            OperationTimeout: it was not on the ground in time.
+            OperationTimeout: the vehicle was not on the ground in time.
         """
         self._loop.run(self.aio.land, timeout=timeout, max_silence_s=max_silence_s)
 

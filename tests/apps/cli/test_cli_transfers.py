@@ -115,6 +115,7 @@ def test_params_list_filters_by_pattern_and_changed(run: Run) -> None:
     assert out == "WPNAV_RADIUS     333           (default 200)\n"
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("format_", ["missionplanner", "mavproxy", "qgroundcontrol"])
 def test_params_save_diff_and_load_round_trip(format_: str, run: Run) -> None:
     assert run("params", "save", "mine.param", "--format", format_)[0] == 0

@@ -186,6 +186,7 @@ async def in_the_air(copter: SimulatedCopter) -> None:
     await anyio.sleep(8)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("wanted", "text", "mode", "is_armed"),
     [

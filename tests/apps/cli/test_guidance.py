@@ -89,6 +89,7 @@ def test_logs_and_photos_make_their_directory(capsys: pytest.CaptureFixture[str]
     assert len(list(Path("flights/logs").iterdir())) == len(list(Path("pictures").iterdir())) == 1
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(
     ("command", "line"),
     [
@@ -209,6 +210,7 @@ def shell_environment(tmp_path: Path) -> dict[str, str]:
     return {**os.environ, "PATH": f"{program.parent}:{os.environ['PATH']}", "TERM": "dumb"}
 
 
+@pytest.mark.exhaustive
 @pytest.mark.skipif(shutil.which("fish") is None, reason="fish is not installed")
 def test_completion_in_fish_offers_matches(shell_environment: dict[str, str]) -> None:
     lines = ("aerokit params l", "aerokit st", "aerokit status tcp")
@@ -218,6 +220,7 @@ def test_completion_in_fish_offers_matches(shell_environment: dict[str, str]) ->
     assert words == ["list", "load", "status", "tcp:127.0.0.1:5760"]
 
 
+@pytest.mark.exhaustive
 @pytest.mark.skipif(shutil.which("zsh") is None, reason="zsh is not installed")
 def test_completion_in_zsh_completes_line(shell_environment: dict[str, str], tmp_path: Path) -> None:
     (tmp_path / ".zshrc").write_text(

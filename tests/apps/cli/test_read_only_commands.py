@@ -19,6 +19,7 @@ from aerokit.testing import run_virtual
 from aerokit.transport.link import memory_link_pair
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("command", "mode"),
     [

@@ -105,6 +105,7 @@ def completions(line: str, tmp_path: Path) -> list[str]:
     return out.read_text().split()
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(
     ("line", "some"),
     [

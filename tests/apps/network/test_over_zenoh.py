@@ -71,6 +71,7 @@ async def test_zenoh_link_supports_whole_api() -> None:
         assert link.dropped_writes == 0
 
 
+@pytest.mark.exhaustive
 @pytest.mark.usefixtures("any_delay")
 async def test_zenoh_client_without_control_is_refused() -> None:
     port = free_port()

@@ -50,6 +50,7 @@ def item_int(number: int, target: int, command: int = 16) -> Message:
     return m.MissionItemInt(target, 1, number, 6, command, 0, 1, 0.0, 0.0, 0.0, 0.0, 470_000_000, 80_000_000, 10.0)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(
     ("suffix", "write"), [(".bin", log_files.write_bin), (".ulg", log_files.write_ulog)], ids=["bin", "ulg"]
 )
@@ -175,6 +176,7 @@ def test_recording_of_fast_simulation_says_so(tmp_path: Path) -> None:
     assert "simulation" not in notes([second * 1000 + second % 3 * 300 for second in range(60)])
 
 
+@pytest.mark.exhaustive
 def test_progress_begins_before_first_record(tmp_path: Path) -> None:
     """Also for a log that takes long to index, a bar is on the screen at once."""
     log = write_tlog(tmp_path / "log.tlog", [(1, place()) for _ in range(40_000)])

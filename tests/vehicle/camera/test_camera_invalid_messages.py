@@ -318,6 +318,7 @@ async def test_camera_after_silence_is_identified_again() -> None:
 # --------------------------------------------------------------------------------------------- bounded resources
 
 
+@pytest.mark.exhaustive
 async def test_unread_series_has_bounded_queue() -> None:
     camera = SimulatedCamera()
     async with open_flight(SimulatedCopter(boot_time_s=0.0, components=(camera,))) as flight:

@@ -420,6 +420,7 @@ async def test_camera_named_before_discovery_publishes_once() -> None:
 # ------------------------------------------------------------------------------------------------ a bad radio
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("seed", range(8))
 async def test_bad_radio_neither_repeats_nor_misses_photos(seed: int) -> None:
     camera = SimulatedCamera()

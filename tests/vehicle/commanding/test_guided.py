@@ -266,7 +266,7 @@ async def test_setpoint_stream_fly_raises_when_stopped(flying: Flight) -> None:
 
 
 async def test_setpoint_stream_loop_blocked_stops(flying: Flight) -> None:
-    with pytest.raises(SetpointStreamStopped, match=r"event loop was blocked for 1\.\d s; .* a hold was ordered"):
+    with pytest.raises(SetpointStreamStopped, match=r"event loop was blocked for 1\.\d s; a hold was ordered"):
         async with flying.vehicle.guided.velocity(valid_for_s=60.0, max_lag_s=0.5) as stream:
             stream.set(NORTH)
             await anyio.sleep(2.0)
@@ -337,7 +337,7 @@ async def test_setpoint_stream_survives_disarm_and_arm(grounded: Flight) -> None
 
 
 async def test_setpoint_stream_connection_lost_raises(flying: Flight) -> None:
-    with pytest.raises(SetpointStreamStopped, match="cable was pulled out") as caught:
+    with pytest.raises(SetpointStreamStopped, match="cable was unplugged") as caught:
         async with flying.vehicle.guided.velocity() as stream:
             await stream.fly(NORTH, 1.0)
             flying.wire.lose()
@@ -512,7 +512,7 @@ async def test_px4_stream_stopped_during_offboard_request_raises() -> None:
     async with open_px4() as flight:
         await flight.take_off()
         asyncio.get_running_loop().call_later(1.005, block_loop, 1.5)
-        with pytest.raises(SetpointStreamStopped, match=r"event loop was blocked for 1\.\d s; .* a hold was ordered"):
+        with pytest.raises(SetpointStreamStopped, match=r"event loop was blocked for 1\.\d s; a hold was ordered"):
             async with flight.vehicle.guided.velocity(NORTH, valid_for_s=5):
                 raise AssertionError("entered")
 

@@ -406,6 +406,7 @@ def frame_of(message: m.FileTransferProtocol) -> bytes:
 # ------------------------------------------------------------------------------------ bad radio
 
 
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize("make", [SimulatedCopter, SimulatedPx4])
 @pytest.mark.parametrize("loss", [0.05, 0.3])
 @pytest.mark.parametrize("seed", range(3))

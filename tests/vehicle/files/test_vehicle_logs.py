@@ -146,6 +146,7 @@ async def test_missing_log_is_file_error(bench: Bench) -> None:
 MORE = 30_001
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("clock_s", [-100, 0, 100])
 @pytest.mark.parametrize(
     ("kind", "method"),
@@ -293,6 +294,7 @@ def names_in(directory: Path) -> list[str]:
     return sorted(path.name for path in directory.iterdir())
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("make", [SimulatedCopter, SimulatedPx4])
 @pytest.mark.parametrize("loss", [0.05, 0.3])
 @pytest.mark.parametrize("seed", range(2))

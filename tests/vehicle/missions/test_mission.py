@@ -61,6 +61,7 @@ async def reaches(flight: AnyFlight, item: int) -> None:
 # ------------------------------------------------------------------------------------ completion
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(
     ("opened", "end"),
     [(open_flight, None), (open_flight, landing()), (open_px4, None), (open_px4, return_to_launch())],

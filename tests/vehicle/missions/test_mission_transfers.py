@@ -297,6 +297,7 @@ async def test_transfers_are_serialized() -> None:
         assert holds(other, long_mission(7))
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("opened", [open_flight, open_px4])
 @pytest.mark.parametrize("after_s", [0.0, 0.05, 0.13, 0.2])
 async def test_upload_cancelled_half_way(opened: Any, after_s: float) -> None:

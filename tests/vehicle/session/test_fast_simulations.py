@@ -28,6 +28,7 @@ async def served(vehicle: SimulatedVehicle, speedup: float) -> AsyncIterator[Veh
         yield client
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("speedup", [1.0, 10.0, 40.0])
 async def test_fast_simulation_reboot_is_detected(kind: str, speedup: float) -> None:

@@ -43,6 +43,7 @@ async def fly(name: str, max_silence_s: float | None) -> None:
         assert not flight.copter.faults.silent
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("name", CALLS)
 async def test_call_without_silence_limit_survives_silence(name: str) -> None:
     await fly(name, None)

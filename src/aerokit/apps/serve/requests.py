@@ -26,7 +26,7 @@ from aerokit.errors import (
 if TYPE_CHECKING:
     from starlette.requests import Request
 
-# Error class to HTTP status; the first match counts.
+# Maps error classes to HTTP statuses. The first matching class counts.
 _STATUS: tuple[tuple[type[Exception], int], ...] = (
     (InvalidArgument, 400),
     (FileFormatError, 400),

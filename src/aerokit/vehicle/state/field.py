@@ -225,7 +225,7 @@ class StreamedMessage:
                     waiting.append((came, None))
                 elif came.received_frame is not None:
                     waiting.append((came.received_frame, came))
-            waiting.sort(key=lambda each: each[0].received_at)
+            waiting.sort(key=lambda entry: entry[0].received_at)
             for frame, message in waiting:
                 self._apply(frame, message)
 

@@ -43,6 +43,7 @@ OVER_TWO, SEEDS_OVER_TWO = (ALL_ROWS, SEEDS) if IS_SESSION else (sampled(ALL_ROW
 """Few of them in the tests, all of them in the session."""
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("seed", range(SEEDS_OVER_TWO))
 @pytest.mark.parametrize(("row", "autopilot"), OVER_TWO)
 def test_order_table_two_links_no_rule_is_broken(row: Row, autopilot: str, seed: int) -> None:
@@ -51,6 +52,7 @@ def test_order_table_two_links_no_rule_is_broken(row: Row, autopilot: str, seed:
     assert faults(fly(case)) == [], case
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("seed", sampled(range(SEEDS), 2))
 @pytest.mark.parametrize(("row", "autopilot"), DEFAULT_ROWS)
 def test_order_table_no_rule_is_broken(row: Row, autopilot: str, seed: int) -> None:
@@ -91,6 +93,7 @@ def test_arm_is_not_repeated_against_other_station(autopilot: str) -> None:
     assert not flown.is_armed_at_end
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("until", [10.3, 11.0, 12.0, 13.0])
 @pytest.mark.parametrize("name", ["go_to", "guided.velocity"])
 def test_failsafe_during_outage_keeps_vehicle(name: str, until: float) -> None:

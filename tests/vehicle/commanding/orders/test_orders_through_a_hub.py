@@ -18,6 +18,7 @@ ROWS, SEEDS_EACH = (ALL_ROWS, SEEDS) if IS_SESSION else (sampled(ALL_ROWS[::3], 
 """Few of them in the tests, all of them in the session."""
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("seed", range(SEEDS_EACH))
 @pytest.mark.parametrize(("row", "autopilot"), ROWS)
 def test_order_table_no_rule_is_broken(row: Row, autopilot: str, seed: int) -> None:

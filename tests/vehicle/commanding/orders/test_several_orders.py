@@ -175,6 +175,7 @@ def _judge(
     assert kind == "set-point" or not is_against_the_pilot, f"after the pilot had taken over: {about}"
 
 
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize("is_px4", [False, True], ids=["ardupilot", "px4"])
 @pytest.mark.parametrize("seed", sampled(range(4 * SEEDS), 3))
 def test_posted_orders_only_newest_is_sent(seed: int, is_px4: bool) -> None:
