@@ -11,9 +11,7 @@
    each interpreter has its own module state. An interpreter with its own GIL refuses the module, because declaring
    support needs the API of 3.12; free-threaded Python has no limited API. Both use the Python wire. */
 
-#define PY_SSIZE_T_CLEAN
 #include <Python.h>
-
 #include <float.h>
 #include <stdint.h>
 #include <string.h>
@@ -824,7 +822,8 @@ static PyObject *wire_tlog_records(PyObject *module, PyObject *args) {
         uint64_t microseconds = 0;
         for (int i = 0; i < 8; i++)
             microseconds = microseconds << 8 | data[begin + i];
-        PyObject *record = Py_BuildValue("dy#", (double)microseconds / 1e6, data + begin + 8, end - begin - 8);
+        PyObject *frame = PyBytes_FromStringAndSize((const char *)data + begin + 8, end - begin - 8);
+        PyObject *record = Py_BuildValue("dN", (double)microseconds / 1e6, frame); /* "#" depends on the headers */
         if (record == NULL || PyList_Append(records, record) < 0) {
             Py_XDECREF(record);
             Py_DECREF(records);
