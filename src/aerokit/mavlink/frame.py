@@ -103,7 +103,7 @@ class Frame(FrameFields):
 
 
 if wire is not None:
-    wire.register_frame(Frame)
+    wire.register(0, Frame)
 
 
 def is_whole_frame(data: bytes) -> bool:

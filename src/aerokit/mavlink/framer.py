@@ -351,4 +351,4 @@ else:
             self._sort_out(frames, out_of_order)
 
         def _clear_out_of_order(self) -> None:
-            self.late, self.foreign = [], []
+            self.late, self.foreign, self._out_of_order = [], [], []

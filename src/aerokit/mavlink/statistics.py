@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from aerokit._internal.wire import CounterFields, SourceFields
+from aerokit._internal.wire import CounterFields, SourceFields, wire
 
 _SILENCE_S = 10.0
 
@@ -311,3 +311,8 @@ class FramerStatistics(CounterFields):
     def __repr__(self) -> str:
         names = ("bytes", "frames", "bad_bytes", "bad_crcs", "unknown_ids")
         return f"<FramerStatistics {', '.join(f'{name}={getattr(self, name)}' for name in names)}>"
+
+
+if wire is not None:
+    wire.register(1, SourceStatistics)
+    wire.register(2, FramerStatistics)
