@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
 from pathlib import Path
 
 import nox
@@ -149,8 +150,13 @@ def wheels(session: nox.Session) -> None:
             session.run(str(empty / "bin" / "python"), "-c", check, external=True)
             session.run(str(empty / "bin" / "aerokit"), "demo", "--speedup", "20", external=True)
         for version in PYTHONS if implementation == "c" else ():
-            if shutil.which(f"python{version}"):
+            if is_runnable(f"python{version}"):
                 run_wheel_tests(session, wheel, version)
+
+
+def is_runnable(python: str) -> bool:
+    """Return True if a command of this name is an interpreter; pyenv's may only report that none is selected."""
+    return bool(shutil.which(python)) and subprocess.run([python, "-c", ""], capture_output=True).returncode == 0
 
 
 def run_wheel_tests(session: nox.Session, wheel: Path, version: str) -> None:

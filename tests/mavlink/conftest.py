@@ -17,7 +17,7 @@ WITH_BOTH = ("test_framer", "test_hostile_bytes", "test_encoder", "test_tlog", "
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    name = metafunc.module.__name__
+    name = getattr(metafunc.module, "__name__", "")
     if name in WITH_BOTH:
         metafunc.fixturenames.append("wire")
         python = exhaustive("python") if name == "test_recorded_traffic" else "python"

@@ -161,8 +161,8 @@ def test_frames_and_counters_can_be_copied() -> None:
 def test_framer_and_dialect_are_freed() -> None:
     dialect = Dialect("own", [messages.Heartbeat])
     framer = Framer(dialect)
-    for frame in framer.receive(FrameEncoder(1, 1).encode(messages.Heartbeat(2, 3, 81, 4, 3))):
-        dialect.decode(frame)
+    (frame,) = framer.receive(FrameEncoder(1, 1).encode(messages.Heartbeat(2, 3, 81, 4, 3)))
+    dialect.decode(frame)
     framer.wanted = [framer]  # type: ignore[list-item]
     gone = weakref.ref(framer), weakref.ref(dialect)
     del framer, dialect, frame
@@ -175,9 +175,10 @@ def test_uninitialized_compiled_objects_raise() -> None:
     framer = Framer.__new__(Framer)
     with pytest.raises(RuntimeError, match="not initialized"):
         framer.receive(b"")
+    receive: Any = Framer().receive
     for arguments in ((), (b"", 0.0, 1)):
         with pytest.raises(TypeError):
-            Framer().receive(*arguments)
+            receive(*arguments)
     with pytest.raises(TypeError):
         type(layout_of(messages.Heartbeat))()
 
@@ -185,7 +186,7 @@ def test_uninitialized_compiled_objects_raise() -> None:
 @compiled
 def test_exceptions_within_framer_are_passed_on() -> None:
     class Broken(Framer):
-        def _search(self, *_: object) -> Any:
+        def _search(self, data: bytes, begin: int, scan: object) -> Any:
             raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
