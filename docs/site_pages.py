@@ -21,8 +21,9 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).parent.parent
 HOW_TO = (
     "connecting", "state", "waiting", "actions", "errors", "parameters", "missions", "set-points", "files-and-logs",
-    "cameras", "gimbals", "components", "messages", "events", "links", "several-links", "bad-radio", "signing",
-    "several-vehicles", "own-loop", "sync", "recording", "dialects", "testing", "logging",
+    "cameras", "gimbals", "corrections", "calibration", "outputs-and-devices", "px4-tools", "components", "messages",
+    "events", "links", "several-links", "bad-radio", "signing", "several-vehicles", "own-loop", "sync", "recording",
+    "dialects", "testing", "logging",
 )  # fmt: skip
 NAVIGATION: dict[str, list[str]] = {
     "Tutorial": ["tutorial.md"],

@@ -11,6 +11,7 @@ import aerokit
 from aerokit.connection.bus import Subscription
 from aerokit.connection.cells import Changes, StateCell
 from aerokit.connection.connection import Connection
+from aerokit.vehicle.calibration.calibration import Calibration, CalibrationControl
 from aerokit.vehicle.camera.cameras import Camera
 from aerokit.vehicle.camera.link import CameraBlock
 from aerokit.vehicle.camera.photos import PhotoInterval
@@ -18,7 +19,12 @@ from aerokit.vehicle.commanding.guided import Guided, SetpointStream
 from aerokit.vehicle.commanding.posted import PostedOrder
 from aerokit.vehicle.components.component import Component
 from aerokit.vehicle.components.settings import Settings
+from aerokit.vehicle.devices.actuators import Actuators
+from aerokit.vehicle.devices.gripper import Gripper
+from aerokit.vehicle.devices.shell import Shell
+from aerokit.vehicle.devices.winch import Winch
 from aerokit.vehicle.files.files import Files
+from aerokit.vehicle.files.log_stream import LogStream
 from aerokit.vehicle.files.logs import Logs
 from aerokit.vehicle.gimbal.control import GimbalControl
 from aerokit.vehicle.gimbal.gimbal import Gimbal, Gimbals
@@ -27,6 +33,8 @@ from aerokit.vehicle.missions.mission import MissionControl
 from aerokit.vehicle.missions.plans import FenceControl, RallyControl
 from aerokit.vehicle.parameters.parameters import Parameters
 from aerokit.vehicle.parameters.transaction import TemporaryParameters, Transaction
+from aerokit.vehicle.rtk.ntrip import NtripClient
+from aerokit.vehicle.rtk.rtk import Rtk
 
 __all__ = ["CLASSES", "FUNCTIONS", "Member", "awaited", "members", "own_classes_in"]
 
@@ -50,8 +58,17 @@ CLASSES: tuple[type, ...] = (
     MissionControl,
     FenceControl,
     RallyControl,
+    CalibrationControl,
+    Calibration,
+    Rtk,
+    NtripClient,
     Files,
     Logs,
+    LogStream,
+    Actuators,
+    Gripper,
+    Winch,
+    Shell,
     StateCell,
     Changes,
     Subscription,

@@ -148,11 +148,13 @@ async def grounded(stage: Stage) -> None:
     """Disarmed and ready, on the ground, in a mode that can be armed."""
     vehicle = stage.vehicle
     await anywhere(stage)
-    if vehicle.is_armed:
-        with anyio.fail_after(60):
+    with anyio.fail_after(60):
+        if vehicle.is_armed:
             await vehicle.disarm(force=True)
-            while not stage.simulated.motion.is_on_ground:  # noqa: ASYNC110
-                await anyio.sleep(0.1)
+        was_falling = not stage.simulated.motion.is_on_ground
+        while not stage.simulated.motion.is_on_ground:  # noqa: ASYNC110
+            await anyio.sleep(0.1)
+        if was_falling:
             await vehicle.landed_state.wait_until(lambda state: state == 1)
     with contextlib.suppress(AerokitError):  # the vehicle may be rebooting after a cancelled reboot command
         await vehicle.set_mode("LOITER" if stage.is_px4 else "GUIDED")

@@ -25,8 +25,12 @@ def without_loop_warnings(stderr: str) -> str:
 
 @contextmanager
 def served_copter(*addresses: str, speedup: float = SPEEDUP, **options: Any) -> Iterator[str]:
-    """Serve a copter that is ready at power-on. Yield the address to connect to."""
+    """Serve a copter that is ready at power-on. Yield the address to connect to.
+
+    Its battery lasts ``speedup`` times as long, because the machine that runs the client may be busy.
+    """
     options.setdefault("boot_time_s", 0.0)
+    options.setdefault("battery_capacity_mah", 3300.0 * max(speedup, 1.0))
     with served([SimulatedCopter(**options)], *addresses, speedup=speedup) as address:
         yield address
 

@@ -193,6 +193,21 @@ def test_exceptions_within_framer_are_passed_on() -> None:
         Broken().receive(b"noise")
 
 
+@compiled
+@pytest.mark.parametrize(("kind", "wire"), [("legacy", "c"), ("isolated", "python")])
+def test_subinterpreter_has_wire(kind: str, wire: str) -> None:
+    interpreters: Any = pytest.importorskip("_interpreters", reason="needs Python 3.13")
+    interpreter = interpreters.create(kind)
+    program = (
+        "import aerokit; from aerokit.mavlink import *\n"
+        "raw = FrameEncoder(1, 1).encode(messages.Heartbeat(2, 3, 81, 4, 3))\n"
+        "assert STANDARD.decode(*Framer().receive(raw)).custom_mode == 4\n"
+        f"assert aerokit.wire_implementation == {wire!r}"
+    )
+    assert interpreters.exec(interpreter, program) is None
+    interpreters.destroy(interpreter)
+
+
 def test_environment_forces_python_wire() -> None:
     program = (
         "import aerokit, aerokit.mavlink.framer as f; print(aerokit.wire_implementation, f.Framer is f.PythonFramer)"

@@ -14,6 +14,7 @@ from aerokit.vehicle.connect import warn_if_left_flying
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterator
     from contextlib import AbstractAsyncContextManager, AbstractContextManager
+    from typing import TypeAlias
 
     from typing_extensions import Self
 
@@ -22,16 +23,33 @@ if TYPE_CHECKING:
     from aerokit.connection.connection import Connection
     from aerokit.events import VehicleFound
     from aerokit.fleets.formation import Following
+    from aerokit.vehicle.calibration.calibration import Calibration  # noqa: F401
+    from aerokit.vehicle.calibration.values import CalibrationStep
     from aerokit.vehicle.camera.capture import Capture
     from aerokit.vehicle.camera.link import CameraBlock
     from aerokit.vehicle.camera.photos import PhotoInterval
     from aerokit.vehicle.commanding.guided import SetpointStream
+    from aerokit.vehicle.devices.shell import Shell
+    from aerokit.vehicle.files.log_stream import LogStream
     from aerokit.vehicle.gimbal.control import GimbalControl
     from aerokit.vehicle.gimbal.gimbal import Gimbals  # noqa: F401
     from aerokit.vehicle.gimbal.rates import GimbalRates
     from aerokit.vehicle.parameters.transaction import TemporaryParameters, Transaction
     from aerokit.vehicle.parameters.writing import ParameterWrite
+    from aerokit.vehicle.rtk.ntrip import NtripClient
     from aerokit.vehicle.vehicle import Vehicle
+
+    Block: TypeAlias = (
+        CameraBlock
+        | Following
+        | GimbalControl
+        | GimbalRates
+        | LogStream
+        | NtripClient
+        | PhotoInterval
+        | SetpointStream[Any]
+        | Shell
+    )
 
 
 class BlockingContext:
@@ -78,10 +96,7 @@ T = TypeVar("T")
 
 EnteredT = TypeVar("EnteredT")
 
-BlockT = TypeVar(
-    "BlockT",
-    bound="CameraBlock | Following | GimbalControl | GimbalRates | PhotoInterval | SetpointStream[Any]",
-)
+BlockT = TypeVar("BlockT", bound="Block")
 
 ShieldedT = TypeVar("ShieldedT", bound="TemporaryParameters | Transaction")
 
@@ -214,6 +229,16 @@ class GimbalsTwin(TwinOf["Gimbals"], Generic[T]):
         return len(self.ids)
 
 
+class CalibrationTwin(TwinOf["Calibration"]):
+    """Iterator over the steps of a calibration. Leaving the loop cancels it on the vehicle."""
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> CalibrationStep:
+        return _next_of(self._loop, self.aio)
+
+
 class PhotoIntervalTwin(BlockTwin["PhotoInterval"]):
     """Takes pictures while its ``with`` block runs; an iterator over them."""
 
@@ -221,6 +246,16 @@ class PhotoIntervalTwin(BlockTwin["PhotoInterval"]):
         return self
 
     def __next__(self) -> Capture:
+        return _next_of(self._loop, self.aio)
+
+
+class LogStreamTwin(BlockTwin["LogStream"]):
+    """A flight log while PX4 writes it; an iterator over its bytes."""
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> bytes:
         return _next_of(self._loop, self.aio)
 
 

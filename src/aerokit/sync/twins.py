@@ -20,10 +20,12 @@ from aerokit.mavlink.enums import MavComponent
 from aerokit.protocols.exchange import IDLE_TIMEOUT_S
 from aerokit.sync.blocks import (
     BlockTwin,
+    CalibrationTwin,
     CellTwin,
     ChangesTwin,
     ConnectionTwin,
     GimbalsTwin,
+    LogStreamTwin,
     PhotoIntervalTwin,
     StreamTwin,
     SubscriptionTwin,
@@ -37,6 +39,8 @@ from aerokit.vehicle.camera.controls import FORMAT_TIMEOUT_S
 from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M, MAX_SILENCE_S
 from aerokit.vehicle.commanding.setpoints import AccelerationSetpoint, BodyVelocitySetpoint, VelocitySetpoint
 from aerokit.vehicle.connect import connect as connect_async
+from aerokit.vehicle.devices.actuators import ILLUMINATOR
+from aerokit.vehicle.devices.winch import ACTION_TIMEOUT_S
 from aerokit.vehicle.files.logs import ERASE_PATIENCE_S
 
 if TYPE_CHECKING:
@@ -66,10 +70,12 @@ if TYPE_CHECKING:
         Setting,
         SettingValue,
     )
-    from aerokit.position import Position
+    from aerokit.position import Home, Position
     from aerokit.protocols.exchange import OnProgress
     from aerokit.transport.link import Link
     from aerokit.transport.sockets import PeerFilter
+    from aerokit.vehicle.calibration.calibration import CalibrationControl as AsyncCalibrationControl
+    from aerokit.vehicle.calibration.calibration import EscIntent
     from aerokit.vehicle.camera.cameras import Camera as AsyncCamera
     from aerokit.vehicle.camera.capture import Capture
     from aerokit.vehicle.camera.controls import AutoFocus
@@ -92,6 +98,12 @@ if TYPE_CHECKING:
     from aerokit.vehicle.components.component import Component as AsyncComponent
     from aerokit.vehicle.components.component import ComponentInformation, ComponentStatus, MetadataKind
     from aerokit.vehicle.components.settings import Settings as AsyncSettings
+    from aerokit.vehicle.devices.actions import FailingUnit, FailureIntent, FailureKind, Severity
+    from aerokit.vehicle.devices.actuators import Actuators as AsyncActuators
+    from aerokit.vehicle.devices.actuators import ReleaseIntent, SpinIntent
+    from aerokit.vehicle.devices.gripper import Gripper as AsyncGripper
+    from aerokit.vehicle.devices.shell import Shell as AsyncShell
+    from aerokit.vehicle.devices.winch import Winch as AsyncWinch
     from aerokit.vehicle.files.files import FileEntry
     from aerokit.vehicle.files.files import Files as AsyncFiles
     from aerokit.vehicle.files.logs import LogEntry, LogMethod
@@ -108,6 +120,9 @@ if TYPE_CHECKING:
     from aerokit.vehicle.parameters.parameters import Parameters as AsyncParameters
     from aerokit.vehicle.parameters.parameters import ParameterSource
     from aerokit.vehicle.parameters.writing import ParameterWrite
+    from aerokit.vehicle.rtk.ntrip import NtripClient as AsyncNtripClient
+    from aerokit.vehicle.rtk.rtk import Corrections
+    from aerokit.vehicle.rtk.rtk import Rtk as AsyncRtk
     from aerokit.vehicle.state.condition import EstimatorHealth, MissionProgress, SensorHealth, StatusText, SystemTime
     from aerokit.vehicle.state.equipment import (
         Battery,
@@ -119,9 +134,22 @@ if TYPE_CHECKING:
         ServoOutputs,
         Vibration,
     )
-    from aerokit.vehicle.state.movement import Attitude, Home, LocalPosition, Velocity, Wind
+    from aerokit.vehicle.state.measurements import (
+        ActuatorControls,
+        Aircraft,
+        AirPressure,
+        Altitude,
+        Imu,
+        Odometry,
+        RawImu,
+        WinchStatus,
+    )
+    from aerokit.vehicle.state.movement import Attitude, LocalPosition, Velocity, Wind
 
 __all__ = [
+    "Actuators",
+    "Calibration",
+    "CalibrationControl",
     "Camera",
     "CameraBlock",
     "Changes",
@@ -133,20 +161,26 @@ __all__ = [
     "GimbalControl",
     "GimbalRates",
     "Gimbals",
+    "Gripper",
     "Guided",
+    "LogStream",
     "Logs",
     "MissionControl",
+    "NtripClient",
     "Parameters",
     "PhotoInterval",
     "PostedOrder",
     "RallyControl",
+    "Rtk",
     "SetpointStream",
     "Settings",
+    "Shell",
     "StateCell",
     "Subscription",
     "TemporaryParameters",
     "Transaction",
     "Vehicle",
+    "Winch",
     "connect",
     "open_connection",
 ]
@@ -656,7 +690,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
 
     def look_at(
         self,
-        target: Position,
+        target: Position | Home,
         *,
         wait: bool = True,
         tolerance_deg: float = 5.0,
@@ -1186,6 +1220,24 @@ class Files(TwinOf["AsyncFiles"]):
         self._loop.run(self.aio.rename, path, new_path, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
 
+class LogStream(LogStreamTwin):
+    """The flight log that PX4 sends while its ``async with`` block runs (LOGGING_DATA): an async iterator over bytes.
+
+    Written to a file one after the other, the bytes are a valid ULog file at any time. Lost messages are marked there
+    as dropouts; ``lost`` counts them. The iterator ends with the connection. PX4 sends one such log at a time.
+
+    Entering raises:
+        NotSupported: ArduPilot. Nothing was sent.
+        CommandRejected: PX4 streams to another station, or the port is too slow (below 5 kB/s).
+        CommandTimeout: there was no acknowledgement; the stream that may have begun is stopped.
+    """
+
+    @property
+    def lost(self) -> int:
+        """Number of LOGGING_DATA messages that were not received, or that the reader was too slow for."""
+        return self.aio.lost
+
+
 class Logs(TwinOf["AsyncLogs"]):
     """Lists, downloads and erases flight logs. Operations run one at a time, in the order of their calls.
 
@@ -1282,6 +1334,386 @@ class Logs(TwinOf["AsyncLogs"]):
             FileTimeout: some of the old logs still exist.
         """
         self._loop.run(self.aio.erase, idle_timeout_s=idle_timeout_s, timeout=timeout)
+
+    def stream(self, *, idle_timeout_s: float = IDLE_TIMEOUT_S) -> LogStream:
+        """Receive the log that PX4 writes, for the duration of an ``async with`` block (MAV_CMD_LOGGING_START).
+
+        ``async with vehicle.logs.stream() as stream: async for data in stream: file.write(data)``
+
+        Args:
+            idle_timeout_s: reading fails after this many seconds without data; above 0, at most 3600.
+
+        Raises:
+            InvalidArgument: the time is out of range. Nothing was sent.
+        """
+        return LogStream(self._loop, self._loop.call(self.aio.stream, idle_timeout_s=idle_timeout_s))
+
+
+class Actuators(TwinOf["AsyncActuators"]):
+    """Outputs of the vehicle besides its flight controls: ``vehicle.actuators``.
+
+    ArduPilot has servos, relays, landing gear and a parachute; PX4 has actuators. After a cancellation the vehicle may
+    have executed the order.
+    """
+
+    def set_servo(self, number: int, pulse_us: int) -> None:
+        """Set the pulse width of a servo output, and return when SERVO_OUTPUT_RAW reports it (MAV_CMD_DO_SET_SERVO).
+
+        ArduPilot only. The output must have no function, or follow a stick (SERVOn_FUNCTION 0, 1, 51 to 66).
+
+        Args:
+            number: output, 1 to 32.
+            pulse_us: pulse width in microseconds, 500 to 2500.
+
+        Raises:
+            InvalidArgument: a value is out of range. Nothing was sent.
+            NotSupported: the firmware does not have the command. Nothing was sent.
+            CommandRejected: the vehicle refused, for example because the output has another function.
+            CommandTimeout: there was no acknowledgement.
+            OperationRejected: a newer order for this output was given.
+            OperationTimeout: the vehicle reports another state.
+        """
+        self._loop.run(self.aio.set_servo, number, pulse_us)
+
+    def repeat_servo(self, number: int, pulse_us: int, *, count: int, period_s: float) -> None:
+        """Move a servo ``count`` times to a pulse width and back to its trim (MAV_CMD_DO_REPEAT_SERVO).
+
+        Returns when ArduPilot has acknowledged and begins; no message reports the end. It has one cycle at a time: the
+        next order of this kind replaces it. Never sent twice, because each copy starts a new cycle. ArduPilot only.
+
+        Args:
+            number: output, 1 to 32, as for :meth:`set_servo`.
+            pulse_us: pulse width in microseconds, 500 to 2500.
+            count: number of cycles, 1 to 1000.
+            period_s: seconds from one pulse to the next, above 0, at most 60.
+
+        Raises:
+            InvalidArgument, NotSupported, CommandRejected, CommandTimeout: as for ``set_servo``.
+        """
+        self._loop.run(self.aio.repeat_servo, number, pulse_us, count=count, period_s=period_s)
+
+    def set_relay(self, number: int, on: bool) -> None:
+        """Switch a relay, and return when RELAY_STATUS reports it (MAV_CMD_DO_SET_RELAY).
+
+        Firmware without RELAY_STATUS (before ArduPilot 4.5) only acknowledges. ArduPilot only; it refuses a relay
+        without a pin. Raises as :meth:`set_servo`.
+
+        Args:
+            number: relay from 0 (RELAY1_PIN) to 15.
+            on: the new state.
+        """
+        self._loop.run(self.aio.set_relay, number, on)
+
+    def repeat_relay(self, number: int, *, count: int, period_s: float) -> None:
+        """Switch a relay over and back ``count`` times (MAV_CMD_DO_REPEAT_RELAY).
+
+        Returns when ArduPilot has acknowledged and begins. Never sent twice. ArduPilot only.
+
+        Args:
+            number: relay from 0 to 15.
+            count: number of cycles, 1 to 1000.
+            period_s: seconds of one cycle, above 0, at most 60.
+
+        Raises:
+            InvalidArgument, NotSupported, CommandRejected, CommandTimeout: as for ``set_servo``.
+        """
+        self._loop.run(self.aio.repeat_relay, number, count=count, period_s=period_s)
+
+    def set_actuator(self, number: int, value: float) -> None:
+        """Set one actuator (1 to 6) to a value from −1 to 1. Raises as :meth:`set_actuators`."""
+        self._loop.run(self.aio.set_actuator, number, value)
+
+    def set_actuators(self, *values: float | None) -> None:
+        """Set actuators by number: the first value is for "Peripheral via Actuator Set 1" (MAV_CMD_DO_SET_ACTUATOR).
+
+        Returns when PX4 has acknowledged, because no message reports the values. It acknowledges also if no output has
+        this function (PWM_MAIN_FUNCn 301 to 306). PX4 only.
+
+        Args:
+            values: up to six values, −1 to 1; None leaves an actuator as it is.
+
+        Raises:
+            InvalidArgument: none or more than six values, or one is out of range. Nothing was sent.
+            NotSupported: ArduPilot, which has :meth:`set_servo`. Nothing was sent.
+            CommandRejected: the vehicle refused.
+            CommandTimeout: there was no acknowledgement.
+        """
+        self._loop.run(self.aio.set_actuators, *values)
+
+    def raise_landing_gear(self) -> None:
+        """Retract the landing gear (MAV_CMD_AIRFRAME_CONFIGURATION); returns at the acknowledgement.
+
+        ArduCopter and ArduPlane only. They report the gear by no message, and accept the order also if there is no
+        landing gear (LGR_ENABLE), or while they stand on it.
+
+        Raises:
+            NotSupported: PX4, Rover and Sub. Nothing was sent.
+            OperationRejected: the vehicle is disarmed, or on the ground. Nothing was sent.
+            CommandRejected: the vehicle refused.
+            CommandTimeout: there was no acknowledgement.
+        """
+        self._loop.run(self.aio.raise_landing_gear)
+
+    def lower_landing_gear(self) -> None:
+        """Deploy the landing gear; returns at the acknowledgement.
+
+        Raises:
+            NotSupported, CommandRejected, CommandTimeout: as for ``raise_landing_gear``.
+        """
+        self._loop.run(self.aio.lower_landing_gear)
+
+    def set_lights(self, on: bool, *, component_id: int = ILLUMINATOR) -> None:
+        """Switch an illuminator, and return when ILLUMINATOR_STATUS reports it (MAV_CMD_ILLUMINATOR_ON_OFF).
+
+        For lights that are a MAVLink component. ArduPilot and PX4 do not have the command; lights on an output of
+        ArduPilot are servos or relays. Raises as :meth:`set_servo`.
+
+        Args:
+            on: the new state.
+            component_id: the light, 1 to 255; MAV_COMP_ID_ILLUMINATOR is 243.
+        """
+        self._loop.run(self.aio.set_lights, on, component_id=component_id)
+
+    def test_motor(self, number: int, *, throttle_percent: float, duration_s: float, intent: SpinIntent) -> None:
+        """Spin one motor of a disarmed vehicle, and return when it has stopped; remove the propellers.
+
+        Sent once: a copy would spin it again. If the call is cancelled or fails, aerokit orders the motor to stop at
+        once; without that, it stops after ``duration_s``. ArduCopter reports armed during the test, and the call
+        returns when it reports disarmed. PX4 acknowledges only, so the call returns after ``duration_s``.
+
+        ArduPilot: MAV_CMD_DO_MOTOR_TEST. PX4: MAV_CMD_ACTUATOR_TEST, if COM_MOT_TEST_EN is 1.
+
+        Args:
+            number: 1 to 12. ArduCopter counts clockwise from the front, PX4 by output function (Motor 1).
+            throttle_percent: 0 to 100.
+            duration_s: seconds, above 0, at most 3.
+            intent: must be ``"spin motor"``, so that no other call can be mistaken for it.
+
+        Raises:
+            InvalidArgument: a value is out of range, or the intent is another one. Nothing was sent.
+            OperationRejected: the vehicle is armed, or not known to be disarmed: nothing was sent. Or a newer order
+                for its motors was given.
+            CommandRejected: it refused (not landed, safety switch, COM_MOT_TEST_EN).
+            CommandTimeout: there was no acknowledgement; the motor may have turned.
+            OperationTimeout: the vehicle still reports armed four seconds after the end.
+        """
+        self._loop.run(
+            self.aio.test_motor,
+            number,
+            throttle_percent=throttle_percent,
+            duration_s=duration_s,
+            intent=intent,
+        )
+
+    def release_parachute(self, *, intent: ReleaseIntent) -> None:
+        """Release the parachute and stop the motors; return when ArduPilot reports that it was released.
+
+        MAV_CMD_DO_PARACHUTE. ArduPilot accepts the command also where it then refuses to release: on the ground, below
+        CHUTE_ALT_MIN, or if the parachute is disabled. ArduCopter and ArduPlane only. **The vehicle falls.**
+
+        Args:
+            intent: must be ``"release parachute"``, so that no other call can be mistaken for it.
+
+        Raises:
+            InvalidArgument: the intent is another one. Nothing was sent.
+            NotSupported: PX4, Rover and Sub. Nothing was sent.
+            OperationRejected: the vehicle refused after the acknowledgement; ``reasons`` has its status texts.
+            CommandRejected: the vehicle refused.
+            CommandTimeout: there was no acknowledgement.
+            OperationTimeout: no status text reported the release.
+        """
+        self._loop.run(self.aio.release_parachute, intent=intent)
+
+    def enable_parachute(self, enabled: bool = True) -> None:
+        """Allow or forbid the release of the parachute until the next reboot; returns at the acknowledgement.
+
+        MAV_CMD_DO_PARACHUTE. ArduCopter and ArduPlane only.
+
+        Args:
+            enabled: False forbids it, also for failsafes.
+
+        Raises:
+            NotSupported, CommandRejected, CommandTimeout: as for ``release_parachute``.
+        """
+        self._loop.run(self.aio.enable_parachute, enabled)
+
+
+class Gripper(TwinOf["AsyncGripper"]):
+    """One gripper: ``vehicle.gripper()`` (MAV_CMD_DO_GRIPPER).
+
+    PX4 acknowledges when the gripper has moved (PD_GRIPPER_EN). ArduPilot acknowledges at once and reports the end by
+    status text (GRIP_ENABLE); an electro-permanent gripper reports only its beginning, and the call returns three
+    seconds later. Orders are sent once. After a cancellation the gripper may have moved.
+    """
+
+    def grab(self) -> None:
+        """Close the gripper, and return when it has closed.
+
+        Raises:
+            CommandRejected: there is no gripper, or it refused.
+            CommandTimeout: there was no acknowledgement.
+            OperationRejected: a newer order for this gripper was given.
+            OperationTimeout: the end was not reported within ten seconds.
+        """
+        self._loop.run(self.aio.grab)
+
+    def release(self) -> None:
+        """Open the gripper, and return when it has opened. Raises as :meth:`grab`."""
+        self._loop.run(self.aio.release)
+
+
+class Winch(TwinOf["AsyncWinch"]):
+    """One winch: ``vehicle.winch()`` (MAV_CMD_DO_WINCH).
+
+    ArduCopter has :meth:`relax`, :meth:`pay_out` and :meth:`set_rate`; the other orders are for winches that are
+    MAVLink components: ``vehicle.winch(component_id=169)``. PX4 has none of them and forwards the command to such a
+    component. An order that may pay out line twice is sent once. A newer order ends the wait for the previous one.
+    A cancelled call does not stop the winch: call ``set_rate(0)``.
+    """
+
+    @cached_property
+    def status(self) -> StateCell[WinchStatus]:
+        """Length, speed, tension and state of the autopilot's winch (WINCH_STATUS); ``vehicle.winch_status``."""
+        return StateCell(self._loop, self.aio.status)
+
+    def relax(self) -> None:
+        """Let the line run freely; returns at the acknowledgement, which is all that ArduCopter reports.
+
+        Raises:
+            NotSupported: the autopilot has no such order. Nothing was sent.
+            CommandRejected: there is no winch (WINCH_TYPE).
+            CommandTimeout: there was no acknowledgement.
+        """
+        self._loop.run(self.aio.relax)
+
+    def pay_out(self, length_m: float, *, rate_m_s: float = 0.5, timeout: float = ACTION_TIMEOUT_S) -> None:
+        """Pay out a length of line, and return when WINCH_STATUS reports it within 0.1 m.
+
+        Without WINCH_STATUS it returns at the acknowledgement. Sent once, because a copy would pay out more.
+
+        Args:
+            length_m: metres, −1000 to 1000; negative values wind it up.
+            rate_m_s: speed, above 0, at most 20 m/s; ArduCopter uses WINCH_MAX_RATE instead.
+            timeout: seconds until the length is out.
+
+        Raises:
+            InvalidArgument: a value is out of range. Nothing was sent.
+            NotSupported: the autopilot has no such order. Nothing was sent.
+            CommandRejected: there is no winch (WINCH_TYPE).
+            CommandTimeout: there was no acknowledgement; the winch may run.
+            OperationRejected: a newer order for this winch was given.
+            HeartbeatTimeout: the vehicle was silent for ten seconds.
+            OperationTimeout: the length was not reported in time.
+        """
+        self._loop.run(self.aio.pay_out, length_m, rate_m_s=rate_m_s, timeout=timeout)
+
+    def set_rate(self, rate_m_s: float) -> None:
+        """Pay out line at this speed until the next order, and return when WINCH_STATUS reports the speed.
+
+        Args:
+            rate_m_s: −20 to 20 m/s; negative values wind it up, 0 stops. ArduCopter limits it to WINCH_MAX_RATE, and
+                this call then times out.
+
+        Raises:
+            InvalidArgument, NotSupported, CommandRejected, CommandTimeout, OperationRejected, OperationTimeout: as for
+                ``pay_out``.
+        """
+        self._loop.run(self.aio.set_rate, rate_m_s)
+
+    def lock(self) -> None:
+        """Engage the brake, and return when WINCH_STATUS reports it locked. Raises as :meth:`retract`."""
+        self._loop.run(self.aio.lock)
+
+    def deliver(self) -> None:
+        """Start the winch's own delivery: lower, release, retract. Returns at the acknowledgement.
+
+        Raises as :meth:`relax`.
+        """
+        self._loop.run(self.aio.deliver)
+
+    def hold(self) -> None:
+        """Hold the line by the motor, without the brake. Returns at the acknowledgement. Raises as :meth:`relax`."""
+        self._loop.run(self.aio.hold)
+
+    def retract(self, *, timeout: float = ACTION_TIMEOUT_S) -> None:
+        """Wind up all line, and return when WINCH_STATUS reports it fully retracted.
+
+        Args:
+            timeout: seconds until it is retracted.
+
+        Raises:
+            NotSupported: the autopilot has no such order. Nothing was sent.
+            CommandRejected: the winch refused.
+            CommandTimeout: there was no acknowledgement; the winch may run.
+            OperationRejected: a newer order for this winch was given.
+            HeartbeatTimeout: the vehicle was silent for ten seconds.
+            OperationTimeout: the end was not reported in time.
+        """
+        self._loop.run(self.aio.retract, timeout=timeout)
+
+    def load_line(self) -> None:
+        """Load new line: the motor turns slowly. Returns when WINCH_STATUS reports it. Raises as :meth:`retract`."""
+        self._loop.run(self.aio.load_line)
+
+    def abandon_line(self) -> None:
+        """Spool out all line and release it. Returns when WINCH_STATUS reports it. Raises as :meth:`retract`."""
+        self._loop.run(self.aio.abandon_line)
+
+    def load_payload(self) -> None:
+        """Run slowly until a payload is attached. Returns when WINCH_STATUS reports it. Raises as :meth:`retract`."""
+        self._loop.run(self.aio.load_payload)
+
+
+class Shell(BlockTwin["AsyncShell"]):
+    """PX4's system shell, open for the duration of an ``async with`` block: ``vehicle.shell()`` (SERIAL_CONTROL).
+
+    PX4 has one shell for each of its ports, which all stations on that port share. aerokit sends each line once, and
+    does not know what it does: a command of the shell is no order. The messages have neither numbers nor answers, so a
+    bad link loses parts of the text.
+
+    Entering raises:
+        NotSupported: ArduPilot, which has no shell. Nothing was sent.
+        BusyError: this shell was entered before; call ``vehicle.shell()`` again.
+        OperationTimeout: there was no prompt within five seconds.
+    """
+
+    def write(self, line: str) -> None:
+        """Send one line without waiting for its output; :meth:`read` returns that.
+
+        Args:
+            line: at most 1000 bytes, without a line break.
+
+        Raises:
+            InvalidArgument: it is too long or has a line break, or the block is not open. Nothing was sent.
+        """
+        self._loop.call(self.aio.write, line)
+
+    def read(self, *, timeout: float | None = None) -> str:
+        """Return the next piece of output, up to 70 bytes, with echoes and prompts.
+
+        Args:
+            timeout: seconds; None waits without a limit.
+
+        Raises:
+            InvalidArgument: the timeout is out of range, or the block is not open.
+            OperationTimeout: there was no output in time.
+        """
+        return self._loop.run(self.aio.read, timeout=timeout)
+
+    def run(self, command: str, *, timeout: float = 10.0) -> str:
+        """Run a command and return its output, when the shell shows its prompt again.
+
+        A cancelled or timed out call does not end the command. Output that was not read before is discarded.
+
+        Args:
+            command: at most 1000 bytes, without a line break.
+            timeout: seconds until the prompt, above 0.
+
+        Raises:
+            InvalidArgument: as for :meth:`write`.
+            OperationTimeout: there was no prompt in time; the text has the output so far.
+        """
+        return self._loop.run(self.aio.run, command, timeout=timeout)
 
 
 class TemporaryParameters(TemporarilyTwin):
@@ -1577,6 +2009,97 @@ class Parameters(TwinOf["AsyncParameters"]):
             timeout=timeout,
             on_progress=on_progress,
         )
+
+
+class Calibration(CalibrationTwin):
+    """The steps of a calibration: iterate with ``async for``. The last step has the ``result``.
+
+    The calibration starts with the first step. Leaving the loop, in any way, cancels it on the vehicle, as does the end
+    of the vehicle's block. ArduPilot cannot cancel ``accelerometer``; a warning says so. Others that no vehicle cancels
+    (level, barometer, ArduPilot's gyroscope and airspeed, PX4's ESCs) end in seconds.
+
+    Iterating raises:
+        OperationRejected: the calibration failed, or was cancelled by another party, with the vehicle's texts as
+            reasons; or the vehicle is armed, or not known to be disarmed.
+        NotSupported: the vehicle has no such sensor or calibration. Nothing was sent.
+        CommandRejected: the vehicle refused to start.
+        CommandTimeout: the vehicle did not answer.
+        OperationTimeout: the vehicle reported nothing for two minutes, or its result was lost.
+        HeartbeatTimeout: the vehicle was silent for 10 s.
+        BusyError: another calibration of this vehicle is in progress. Nothing was sent.
+        ConnectionClosed, LinkLost: the connection has ended.
+    """
+
+    def cancel(self) -> None:
+        """Cancel the calibration; returns when the vehicle has confirmed it.
+
+        Does nothing if the calibration has not started or has ended.
+
+        Raises:
+            NotSupported: the vehicle cannot cancel it.
+            OperationTimeout: the vehicle did not confirm it.
+        """
+        self._loop.run(self.aio.cancel)
+
+
+class CalibrationControl(TwinOf["AsyncCalibrationControl"]):
+    """Calibrates the vehicle's sensors: ``async for step in vehicle.calibrate.compass(): …``.
+
+    Each method returns the steps. Print ``step.instruction``, show ``step.pose``; where ``step.needs_confirmation`` is
+    true, the calibration waits until the loop continues. See docs/how-to/calibration.md. Only one calibration runs at a
+    time, on a disarmed vehicle.
+    """
+
+    def compass(self) -> Calibration:
+        """Calibrate all compasses, while the vehicle is turned about all axes.
+
+        ArduPilot reports progress and fitness of each compass, and must reboot afterwards. PX4 wants up to six poses,
+        turned about the vertical in each.
+        """
+        return Calibration(self._loop, self._loop.call(self.aio.compass))
+
+    def accelerometer(self) -> Calibration:
+        """Calibrate the accelerometers in six poses.
+
+        ArduPilot waits for a confirmation in each pose, and must reboot afterwards. PX4 detects poses, in any order.
+        """
+        return Calibration(self._loop, self._loop.call(self.aio.accelerometer))
+
+    def gyroscope(self) -> Calibration:
+        """Calibrate the gyroscopes, while the vehicle stands still."""
+        return Calibration(self._loop, self._loop.call(self.aio.gyroscope))
+
+    def level(self) -> Calibration:
+        """Calibrate which attitude is level, while the vehicle stands level and still."""
+        return Calibration(self._loop, self._loop.call(self.aio.level))
+
+    def barometer(self) -> Calibration:
+        """Calibrate the barometer: ArduPilot by the present pressure, PX4 by the altitude of the GPS."""
+        return Calibration(self._loop, self._loop.call(self.aio.barometer))
+
+    def airspeed(self) -> Calibration:
+        """Calibrate the airspeed sensors: sheltered from wind first; on PX4, blow into the front afterwards."""
+        return Calibration(self._loop, self._loop.call(self.aio.airspeed))
+
+    def radio(self) -> Calibration:
+        """Calibrate the remote control: writes RCn_MIN, RCn_MAX and RCn_TRIM of each channel that was moved.
+
+        Both confirmations are needed: when all sticks and switches were at their ends, and when the sticks are centred.
+        """
+        return Calibration(self._loop, self._loop.call(self.aio.radio))
+
+    def escs(self, *, intent: EscIntent) -> Calibration:
+        """Calibrate the ESCs. **Remove the propellers**, because the motors get full throttle.
+
+        PX4 does it at once, while you connect the battery. ArduCopter does it at the next boot: the last step says so.
+
+        Args:
+            intent: ``"propellers are removed"``.
+
+        Raises:
+            InvalidArgument: the intent is another text. Nothing was sent.
+        """
+        return Calibration(self._loop, self._loop.call(self.aio.escs, intent=intent))
 
 
 class MissionControl(TwinOf["AsyncMissionControl"]):
@@ -1971,6 +2494,87 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
             OperationTimeout: not done within ``timeout``.
         """
         self._loop.run(self.aio.clear, idle_timeout_s=idle_timeout_s, timeout=timeout)
+
+
+class NtripClient(BlockTwin["AsyncNtripClient"]):
+    """Fetches corrections from an NTRIP caster while its ``async with`` block runs, and sends them to the vehicle.
+
+    Entering returns when the caster has accepted the request. A connection that ends, or is silent for 30 s, is opened
+    again, after 1 to 30 s, as often as necessary; the logger ``aerokit`` reports it. Messages that GPS_RTCM_DATA cannot
+    carry (above 720 bytes) are left out. Leaving the block closes the connection.
+
+    Entering raises:
+        OperationRejected: the caster refused: user or password, or no such mount point (the text lists others).
+        LinkOpenError: the caster could not be reached.
+        OperationTimeout: the caster did not answer in time.
+        BusyError: the client was entered before.
+    """
+
+    @property
+    def is_connected(self) -> bool:
+        """True while the caster's connection is open."""
+        return self.aio.is_connected
+
+    @property
+    def problem(self) -> str:
+        """Why the caster is not connected now; empty while it is."""
+        return self.aio.problem
+
+    @property
+    def reconnects(self) -> int:
+        """How often the connection was opened again."""
+        return self.aio.reconnects
+
+    @property
+    def oversized(self) -> int:
+        """Number of messages that were left out because they have more than 720 bytes."""
+        return self.aio.oversized
+
+
+class Rtk(TwinOf["AsyncRtk"]):
+    """RTCM corrections for the vehicle's satellite receivers (GPS_RTCM_DATA).
+
+    ``vehicle.gps`` reports the effect: fix types 5 (RTK float) and 6 (RTK fixed).
+    """
+
+    @cached_property
+    def corrections(self) -> StateCell[Corrections]:
+        """Number, bytes and bandwidth of the corrections; its age is that of the last one."""
+        return StateCell(self._loop, self.aio.corrections)
+
+    def send(self, rtcm: bytes) -> None:
+        """Send RTCM 3 messages to the vehicle; never blocks.
+
+        Each message is split as GPS_RTCM_DATA requires. That message has no target, so it is sent once on each link,
+        even if several vehicles of the connection send the same message within 0.9 s. There is no acknowledgement:
+        ``vehicle.gps`` shows whether the receiver uses the corrections.
+
+        Args:
+            rtcm: one or more whole messages, each of 720 bytes at most.
+
+        Raises:
+            InvalidArgument: ``rtcm`` is empty, or a message is incomplete, damaged or longer. Nothing was sent.
+            ConnectionClosed, LinkLost: the connection has ended, or the block of this vehicle was left.
+        """
+        self._loop.call(self.aio.send, rtcm)
+
+    def ntrip(self, url: str, *, send_position: bool | None = None, timeout: float = 10.0) -> NtripClient:
+        """Fetch corrections from an NTRIP caster while the ``async with`` block runs, and send them to the vehicle.
+
+        Args:
+            url: ``"ntrip://user:password@host:2101/MOUNT"``; ``ntrips://`` for TLS. Characters such as ``@`` in the
+                password are written as ``%40``. The password appears in no log, error or repr.
+            send_position: send the vehicle's position to the caster (GGA, every 10 s), which a virtual reference
+                station needs. None: if the caster's source table asks for it.
+            timeout: seconds to wait for the caster's answer.
+
+        Raises:
+            InvalidArgument: the URL is invalid. Nothing was opened.
+        """
+        return NtripClient(
+            self._loop,
+            self._loop.call(self.aio.ntrip, url, send_position=send_position, timeout=timeout),
+        )
 
 
 class CameraBlock(BlockTwin["AsyncCameraBlock"]):
@@ -2898,6 +3502,56 @@ class Vehicle(VehicleTwin):
         return StateCell(self._loop, self.aio.status_text)
 
     @cached_property
+    def imu(self) -> StateCell[Imu]:
+        """Accelerations, turn rates, magnetic field, pressures and temperature in SI units (HIGHRES_IMU)."""
+        return StateCell(self._loop, self.aio.imu)
+
+    @cached_property
+    def scaled_imu(self) -> StateCell[Imu]:
+        """Accelerations, turn rates and magnetic field of the first sensor (SCALED_IMU)."""
+        return StateCell(self._loop, self.aio.scaled_imu)
+
+    @cached_property
+    def raw_imu(self) -> StateCell[RawImu]:
+        """Readings of the first inertial sensor, without units (RAW_IMU)."""
+        return StateCell(self._loop, self.aio.raw_imu)
+
+    @cached_property
+    def odometry(self) -> StateCell[Odometry]:
+        """Pose and velocity with covariances, as the estimator reports them (ODOMETRY)."""
+        return StateCell(self._loop, self.aio.odometry)
+
+    @cached_property
+    def scaled_pressure(self) -> StateCell[AirPressure]:
+        """Absolute and differential pressure and temperature (SCALED_PRESSURE)."""
+        return StateCell(self._loop, self.aio.scaled_pressure)
+
+    @cached_property
+    def ground_truth(self) -> StateCell[Position]:
+        """True position in a simulation (HIL_STATE_QUATERNION, SIM_STATE)."""
+        return StateCell(self._loop, self.aio.ground_truth)
+
+    @cached_property
+    def altitude(self) -> StateCell[Altitude]:
+        """Altitudes above sea, home, terrain and ground (ALTITUDE)."""
+        return StateCell(self._loop, self.aio.altitude)
+
+    @cached_property
+    def actuator_control_target(self) -> StateCell[ActuatorControls]:
+        """Control outputs before mixing, of PX4 before 1.14 (ACTUATOR_CONTROL_TARGET)."""
+        return StateCell(self._loop, self.aio.actuator_control_target)
+
+    @cached_property
+    def transponder(self) -> StateCell[tuple[Aircraft, ...]]:
+        """Other aircraft that an ADS-B receiver on board has reported, the latest last (ADSB_VEHICLE)."""
+        return StateCell(self._loop, self.aio.transponder)
+
+    @cached_property
+    def winch_status(self) -> StateCell[WinchStatus]:
+        """Line length and speed, tension and state of a winch (WINCH_STATUS)."""
+        return StateCell(self._loop, self.aio.winch_status)
+
+    @cached_property
     def connection(self) -> Connection:
         """The connection of the vehicle."""
         return Connection(self._loop, self.aio.connection)
@@ -2926,6 +3580,89 @@ class Vehicle(VehicleTwin):
     def link_quality(self) -> StateCell[LinkReport]:
         """Packet loss, delay and data rates of the last second."""
         return StateCell(self._loop, self.aio.link_quality)
+
+    @property
+    def actuators(self) -> Actuators:
+        """Servos, relays, actuators, landing gear, lights, motor test, parachute."""
+        return self._part("actuators", Actuators)
+
+    def gripper(self, number: int = 1) -> Gripper:
+        """Return a gripper: ``await vehicle.gripper().release()``.
+
+        Args:
+            number: 1 to 8; ArduPilot and PX4 have one, and ignore the number.
+
+        Raises:
+            InvalidArgument: the number is out of range.
+        """
+        return Gripper(self._loop, self._loop.call(self.aio.gripper, number))
+
+    def winch(self, number: int = 1, *, component_id: int | None = None) -> Winch:
+        """Return a winch: ``await vehicle.winch().pay_out(5)``.
+
+        Args:
+            number: 1 to 255; ArduCopter has one, and ignores the number.
+            component_id: a winch that is a MAVLink component, 1 to 255 (MAV_COMP_ID_WINCH is 169); None: the
+                autopilot's.
+
+        Raises:
+            InvalidArgument: a number is out of range.
+        """
+        return Winch(self._loop, self._loop.call(self.aio.winch, number, component_id=component_id))
+
+    def shell(self) -> Shell:
+        """Open PX4's system shell for the duration of an ``async with`` block (SERIAL_CONTROL)."""
+        return Shell(self._loop, self._loop.call(self.aio.shell))
+
+    def play_tune(self, tune: str) -> None:
+        """Play a tune on the vehicle's buzzer, such as ``"T200 L8 CEGO5C"`` (PLAY_TUNE); returns at once.
+
+        The message has no acknowledgement, and vehicles without a buzzer ignore it.
+
+        Args:
+            tune: notes in the format of QBASIC 1.1's PLAY statement, 1 to 230 characters: T tempo, L length, O octave,
+                A to G notes, P pause.
+
+        Raises:
+            InvalidArgument: it is empty, too long, or has other characters. Nothing was sent.
+        """
+        self._loop.call(self.aio.play_tune, tune)
+
+    def send_status_text(self, text: str, *, severity: Severity = "info") -> None:
+        """Send a status text of your program to the vehicle and to other stations (STATUSTEXT); returns at once.
+
+        ArduPilot writes it to its flight log; it has no acknowledgement. A text of more than 50 bytes is sent in
+        chunks. ``connection.send`` of a message without ``vehicle`` reaches stations only.
+
+        Args:
+            text: 1 to 1000 bytes in UTF-8.
+            severity: name of a MAV_SEVERITY.
+
+        Raises:
+            InvalidArgument: the text is empty or too long, or the severity is unknown. Nothing was sent.
+        """
+        self._loop.call(self.aio.send_status_text, text, severity=severity)
+
+    def inject_failure(self, unit: FailingUnit, kind: FailureKind, *, instance: int = 0, intent: FailureIntent) -> None:
+        """Make a part of the vehicle fail, to test how the vehicle reacts (MAV_CMD_INJECT_FAILURE).
+
+        PX4 only, if SYS_FAILURE_EN is 1. Returns when PX4 has acknowledged; it reports the failure by status texts and
+        by the health of its sensors. **The vehicle may crash.** ``kind="ok"`` ends the failure. Sent once.
+
+        Args:
+            unit: the part that fails, as FAILURE_UNIT.
+            kind: how it fails, as FAILURE_TYPE.
+            instance: number of the part from 1 to 16; 0 for all.
+            intent: must be ``"inject failure"``, so that no other call can be mistaken for it.
+
+        Raises:
+            InvalidArgument: an argument is not allowed. Nothing was sent.
+            NotSupported: ArduPilot, whose simulation has SIM_ parameters instead. Nothing was sent.
+            CommandRejected: SYS_FAILURE_EN is 0, or PX4 cannot let this part fail in this way.
+            CommandTimeout: there was no acknowledgement. PX4 sends none for a part that nothing there can let fail; the
+                part may have failed nevertheless.
+        """
+        self._loop.run(self.aio.inject_failure, unit, kind, instance=instance, intent=intent)
 
     def command(
         self,
@@ -3309,7 +4046,7 @@ class Vehicle(VehicleTwin):
         """
         self._loop.run(self.aio.reboot, force=force, timeout=timeout)
 
-    def look_at(self, target: Position) -> None:
+    def look_at(self, target: Position | Home) -> None:
         """Point nose or gimbal at a place until :meth:`stop_looking`; without an altitude, at the vehicle's altitude.
 
         Sends MAV_CMD_DO_SET_ROI_LOCATION (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_ROI_LOCATION), or
@@ -3335,7 +4072,7 @@ class Vehicle(VehicleTwin):
 
     def go_to(
         self,
-        target: Position,
+        target: Position | Home,
         *,
         speed_m_s: float | None = None,
         heading_deg: float | None = None,
@@ -3354,7 +4091,7 @@ class Vehicle(VehicleTwin):
 
         Args:
             target: latitude and longitude, and an altitude above home or above mean sea level; without an altitude
-                the present one is kept.
+                the present one is kept, also for ``vehicle.home.value``.
             speed_m_s: ground speed from now on, above 0; None keeps the present one.
             heading_deg: heading on arrival, 0–360 clockwise from north; None leaves it to the autopilot.
             tolerance_m: arrival radius in metres; None: the default of the type of vehicle.
@@ -3435,7 +4172,7 @@ class Vehicle(VehicleTwin):
             max_silence_s=max_silence_s,
         )
 
-    def set_home(self, place: Position | None = None, *, timeout: float = 5.0) -> None:
+    def set_home(self, place: Position | Home | None = None, *, timeout: float = 5.0) -> None:
         """Move the home position, to a place or to the vehicle's present position, and wait until HOME_POSITION
         reports it.
 
@@ -3454,7 +4191,7 @@ class Vehicle(VehicleTwin):
         """
         self._loop.run(self.aio.set_home, place, timeout=timeout)
 
-    def distance_to(self, target: Position) -> float:
+    def distance_to(self, target: Position | Home) -> float:
         """Return the distance to ``target`` in metres, three-dimensional if ``target`` has an altitude.
 
         Infinite while the position is unknown.
@@ -3607,13 +4344,22 @@ class Vehicle(VehicleTwin):
         """The vehicle's rally points."""
         return self._part("rally", RallyControl)
 
+    @property
+    def calibrate(self) -> CalibrationControl:
+        """CalibrationControl of sensors, radio and ESCs, step by step."""
+        return self._part("calibrate", CalibrationControl)
+
+    @property
+    def rtk(self) -> Rtk:
+        """RTCM corrections for the satellite receivers, from your program or from an NTRIP caster."""
+        return self._part("rtk", Rtk)
+
     def setup_signing(self, signing: Signing | None, *, timeout: float = 5.0) -> None:
         """Install a signing key on the vehicle and sign all traffic with it from then on; None removes the key.
 
-        **The key is sent unencrypted**: do this over a cable or a private link. Returns when the vehicle's frames
-        active. Every other vehicle on this connection needs the key too, or ``signing.allow_unsigned``. The vehicle may
-        accept the key even if the call is cancelled. See docs/signing.md.
-        cancellation the vehicle may have accepted the key nevertheless. See docs/signing.md.
+        **The key is sent unencrypted**: do this over a cable or a private link. Returns when the vehicle's frames are
+        signed with the key. Every other vehicle on this connection needs the key too, or ``signing.allow_unsigned``.
+        After a cancellation the vehicle may have accepted the key nevertheless. See docs/signing.md.
 
         Args:
             signing: the key, as for ``connect(signing=…)``.

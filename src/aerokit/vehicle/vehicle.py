@@ -12,12 +12,14 @@ from aerokit.vehicle.commanding.arming import ArmingActions
 from aerokit.vehicle.commanding.flight import FlightActions, ModeActions
 from aerokit.vehicle.commanding.messaging import MessagingActions
 from aerokit.vehicle.commanding.travel import LookActions, TravelActions
+from aerokit.vehicle.devices.actions import DeviceActions
 from aerokit.vehicle.missions.context import PlanContext
 from aerokit.vehicle.state.field import MESSAGE_IDS
 
 if TYPE_CHECKING:
     from aerokit.connection.cells import StateCell
     from aerokit.mavlink.signing import Signing
+    from aerokit.vehicle.calibration.calibration import CalibrationControl
     from aerokit.vehicle.camera.cameras import Camera, Cameras
     from aerokit.vehicle.commanding.context import VehicleContext
     from aerokit.vehicle.commanding.guided import Guided
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.missions.mission import MissionControl
     from aerokit.vehicle.missions.plans import FenceControl, RallyControl
     from aerokit.vehicle.parameters.parameters import Parameters
+    from aerokit.vehicle.rtk.rtk import Rtk
 
 __all__ = ["Vehicle", "overview"]
 
@@ -41,7 +44,16 @@ PICTURE_MESSAGE_IDS = tuple(MESSAGE_IDS[name] for name in ("CameraImageCaptured"
 
 
 @checks_arguments
-class Vehicle(ReadOnly, FlightActions, TravelActions, LookActions, ArmingActions, ModeActions, MessagingActions):
+class Vehicle(
+    ReadOnly,
+    FlightActions,
+    TravelActions,
+    LookActions,
+    ArmingActions,
+    ModeActions,
+    MessagingActions,
+    DeviceActions,
+):
     """One remote vehicle. Coroutines send commands to it; properties only read. Every call can be cancelled.
 
     Create it with :func:`aerokit.connect`. State is held in cells (``vehicle.position.value``, ``.age``,
@@ -152,7 +164,7 @@ class Vehicle(ReadOnly, FlightActions, TravelActions, LookActions, ArmingActions
         """The vehicle's flight logs."""
         from aerokit.vehicle.files.logs import Logs
 
-        return Logs(self._session.transfers, self.files)
+        return Logs(self._session.transfers, self.files, self._context)
 
     @cached_property
     def parameters(self) -> Parameters:
@@ -182,16 +194,29 @@ class Vehicle(ReadOnly, FlightActions, TravelActions, LookActions, ArmingActions
 
         return RallyControl(self._plans)
 
+    @cached_property
+    def calibrate(self) -> CalibrationControl:
+        """CalibrationControl of sensors, radio and ESCs, step by step."""
+        from aerokit.vehicle.calibration.calibration import CalibrationControl
+
+        return CalibrationControl(self._context, lambda: self.parameters)
+
+    @cached_property
+    def rtk(self) -> Rtk:
+        """RTCM corrections for the satellite receivers, from your program or from an NTRIP caster."""
+        from aerokit.vehicle.rtk.rtk import Rtk
+
+        return Rtk(self._context)
+
     def __repr__(self) -> str:
         return f"<Vehicle {self.system_id}/{self.component_id} {self.autopilot.firmware}, {self.describe_link()}>"
 
     async def setup_signing(self, signing: Signing | None, *, timeout: float = 5.0) -> None:
         """Install a signing key on the vehicle and sign all traffic with it from then on; None removes the key.
 
-        **The key is sent unencrypted**: do this over a cable or a private link. Returns when the vehicle's frames
-        active. Every other vehicle on this connection needs the key too, or ``signing.allow_unsigned``. The vehicle may
-        accept the key even if the call is cancelled. See docs/signing.md.
-        cancellation the vehicle may have accepted the key nevertheless. See docs/signing.md.
+        **The key is sent unencrypted**: do this over a cable or a private link. Returns when the vehicle's frames are
+        signed with the key. Every other vehicle on this connection needs the key too, or ``signing.allow_unsigned``.
+        After a cancellation the vehicle may have accepted the key nevertheless. See docs/signing.md.
 
         Args:
             signing: the key, as for ``connect(signing=…)``.

@@ -166,5 +166,5 @@ def system_id_of(request: Request) -> int:
     """Return the system id in the path; raise HttpProblem 404 if it is invalid."""
     text = request.path_params["system_id"]
     if not (text.isascii() and text.isdigit() and len(text) <= 3 and 1 <= int(text) <= 255):
-        raise HttpProblem(404, "NotHeard", "a system id is a number from 1 to 255; nothing was sent")
+        raise HttpProblem(404, "UnknownVehicle", "a system id is a number from 1 to 255; nothing was sent")
     return int(text)

@@ -83,7 +83,7 @@ class ServedVehicles:
         if found is None:
             known = ", ".join(map(str, self.vehicles)) or "none"
             raise HttpProblem(
-                404, "NotHeard", f"no vehicle has system id {system_id} (vehicles: {known}); nothing was sent"
+                404, "UnknownVehicle", f"no vehicle has system id {system_id} (vehicles: {known}); nothing was sent"
             )
         return found
 
