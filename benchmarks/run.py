@@ -20,6 +20,7 @@ import command_rtt
 import decode
 import deliver
 import import_time
+import jitter
 import logs
 import table
 from table import Row
@@ -43,6 +44,9 @@ MEASURES: dict[tuple[str, ...], Measure] = {
     LOGS: lambda quick: logs.rows(1, SHORT) if quick else logs.rows(),
     ("command_rtt_pymavlink", "command_rtt_mavsdk"): lambda quick: (
         command_rtt.rows(1, 20) if quick else command_rtt.rows()
+    ),
+    tuple(f"jitter_{rate_hz}" for rate_hz in jitter.RATES_HZ): lambda quick: (
+        jitter.rows(1, 0.3) if quick else jitter.rows()
     ),
     ("import", "import_ready"): lambda quick: (
         import_time.rows(1, fresh_byte_code=False) if quick else import_time.rows()

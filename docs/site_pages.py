@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 
 ROOT = Path(__file__).parent.parent
 HOW_TO = (
-    "connecting", "state", "waiting", "actions", "errors", "parameters", "missions", "set-points", "files-and-logs",
-    "cameras", "gimbals", "corrections", "calibration", "outputs-and-devices", "px4-tools", "components", "messages",
-    "events", "links", "several-links", "bad-radio", "signing", "several-vehicles", "own-loop", "sync", "recording",
-    "dialects", "testing", "logging",
+    "connecting", "state", "waiting", "actions", "maneuvers", "errors", "parameters", "missions", "set-points",
+    "sticks", "external", "precision-landing", "files-and-logs", "cameras", "gimbals", "corrections", "calibration",
+    "outputs-and-devices", "px4-tools", "components", "messages", "events", "links", "several-links", "bad-radio",
+    "signing", "several-vehicles", "own-loop", "sync", "recording", "dialects", "testing", "logging",
 )  # fmt: skip
 NAVIGATION: dict[str, list[str]] = {
     "Tutorial": ["tutorial.md"],

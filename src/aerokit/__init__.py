@@ -48,12 +48,26 @@ if TYPE_CHECKING:
     from aerokit.mavlink.signing import SigningKey as SigningKey
     from aerokit.position import Position as Position
     from aerokit.vehicle.commanding.setpoints import AccelerationSetpoint as AccelerationSetpoint
+    from aerokit.vehicle.commanding.setpoints import ActuatorSetpoint as ActuatorSetpoint
+    from aerokit.vehicle.commanding.setpoints import AttitudeRateSetpoint as AttitudeRateSetpoint
     from aerokit.vehicle.commanding.setpoints import AttitudeSetpoint as AttitudeSetpoint
     from aerokit.vehicle.commanding.setpoints import BodyVelocitySetpoint as BodyVelocitySetpoint
     from aerokit.vehicle.commanding.setpoints import LocalPositionSetpoint as LocalPositionSetpoint
     from aerokit.vehicle.commanding.setpoints import PositionSetpoint as PositionSetpoint
+    from aerokit.vehicle.commanding.setpoints import TrajectorySetpoint as TrajectorySetpoint
     from aerokit.vehicle.commanding.setpoints import VelocitySetpoint as VelocitySetpoint
+    from aerokit.vehicle.commanding.sticks import StickInput as StickInput
     from aerokit.vehicle.connect import connect as connect
+    from aerokit.vehicle.external.values import FlowMeasurement as FlowMeasurement
+    from aerokit.vehicle.external.values import GpsMeasurement as GpsMeasurement
+    from aerokit.vehicle.external.values import ObstaclePoints as ObstaclePoints
+    from aerokit.vehicle.external.values import ObstacleSectors as ObstacleSectors
+    from aerokit.vehicle.external.values import OdometryMeasurement as OdometryMeasurement
+    from aerokit.vehicle.external.values import PoseMeasurement as PoseMeasurement
+    from aerokit.vehicle.external.values import RangeMeasurement as RangeMeasurement
+    from aerokit.vehicle.external.values import SpeedMeasurement as SpeedMeasurement
+    from aerokit.vehicle.external.values import TargetMeasurement as TargetMeasurement
+    from aerokit.vehicle.state.movement import Attitude as Attitude
     from aerokit.vehicle.vehicle import Vehicle as Vehicle
 
 __version__ = "0.1.0"
@@ -91,13 +105,29 @@ __getattr__, __dir__, __all__ = lazy_exports(
         "aerokit.position": ("Position",),
         "aerokit.vehicle.commanding.setpoints": (
             "AccelerationSetpoint",
+            "ActuatorSetpoint",
+            "AttitudeRateSetpoint",
             "AttitudeSetpoint",
             "BodyVelocitySetpoint",
             "LocalPositionSetpoint",
             "PositionSetpoint",
+            "TrajectorySetpoint",
             "VelocitySetpoint",
         ),
+        "aerokit.vehicle.commanding.sticks": ("StickInput",),
         "aerokit.vehicle.connect": ("connect",),
+        "aerokit.vehicle.external.values": (
+            "FlowMeasurement",
+            "GpsMeasurement",
+            "ObstaclePoints",
+            "ObstacleSectors",
+            "OdometryMeasurement",
+            "PoseMeasurement",
+            "RangeMeasurement",
+            "SpeedMeasurement",
+            "TargetMeasurement",
+        ),
+        "aerokit.vehicle.state.movement": ("Attitude",),
         "aerokit.vehicle.vehicle": ("Vehicle",),
     },
 )

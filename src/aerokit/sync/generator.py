@@ -255,6 +255,7 @@ TYPE_VARIABLES = {
     "ItemT": '"Message | Event"',
     "MessageT": '"Message"',
     "SetpointT": "",
+    "MeasurementT": "",
     "T": "",
 }
 
