@@ -97,8 +97,9 @@ if TYPE_CHECKING:
     )
     from aerokit.vehicle.camera.videos import SourceName
     from aerokit.vehicle.commanding.follow import FollowStream as AsyncFollowStream
+    from aerokit.vehicle.commanding.follow_target import FollowTarget
     from aerokit.vehicle.commanding.guided import Guided as AsyncGuided
-    from aerokit.vehicle.commanding.maneuvers import Facing, FlightState, FollowTarget
+    from aerokit.vehicle.commanding.maneuvers import Facing, FlightState
     from aerokit.vehicle.commanding.order import Subject
     from aerokit.vehicle.commanding.posted import PostedOrder as AsyncPostedOrder
     from aerokit.vehicle.commanding.setpoints import (
