@@ -1001,7 +1001,7 @@ class GimbalRates(BlockTwin["AsyncGimbalRates"]):
 
     @property
     def is_running(self) -> bool:
-        """True while rates are being sent."""
+        """True while values are being sent."""
         return self.aio.is_running
 
     def set(self, pitch_deg_s: float = 0.0, yaw_deg_s: float = 0.0) -> None:
@@ -1019,18 +1019,7 @@ class GimbalRates(BlockTwin["AsyncGimbalRates"]):
         self._loop.call(self.aio.set, pitch_deg_s, yaw_deg_s)
 
     def turn(self, pitch_deg_s: float, yaw_deg_s: float, duration_s: float) -> None:
-        """Feed one pair of rates for a time.
-
-        Args:
-            pitch_deg_s: degrees per second, −720 to 720; positive is up.
-            yaw_deg_s: degrees per second, −720 to 720; positive is to the right.
-            duration_s: time in seconds.
-
-        Raises:
-            InvalidArgument: a rate is out of range.
-            SetpointStreamStopped: the stream has stopped.
-            GimbalTaken: your program had control and lost it.
-        """
+        """Feed one pair of rates for ``duration_s`` seconds. Rates are as for :meth:`set`. Raises as :meth:`set`."""
         self._loop.run(self.aio.turn, pitch_deg_s, yaw_deg_s, duration_s)
 
 

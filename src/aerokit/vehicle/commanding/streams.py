@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 import anyio
 
 from aerokit._internal.arguments import check_range, checks_arguments
-from aerokit.errors import BusyError, OperationRejected, ParameterTimeout, SetpointStreamStopped
+from aerokit.errors import AerokitError, BusyError, OperationRejected, ParameterTimeout, SetpointStreamStopped
 from aerokit.parameters import Parameter
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ class ValueStream(Generic[ValueT]):
         self._message: Message | None = None
         self._set_at = -math.inf
         self._timer: asyncio.TimerHandle | None = None
-        self._stopped: SetpointStreamStopped | None = None
+        self._stopped: AerokitError | None = None
         self._is_reported = self._was_entered = False
         self._is_entering = False
 
