@@ -339,7 +339,6 @@ class FtpPacket(FtpMessage):
         return FileTransferProtocol(0, *self.client, self.encode())
 
     def acknowledge(self, data: bytes = b"", *, offset: int = 0, session: int | None = None) -> FtpPacket:
-        """Return the ACK of this request."""
         session = self.session if session is None else session
         sequence, opcode = self.sequence + 1 & 0xFFFF, MavFtpOpcode.ACK
         return FtpPacket(
@@ -354,7 +353,6 @@ class FtpPacket(FtpMessage):
         )
 
     def refuse(self, code: int, errno: int | None = None) -> FtpPacket:
-        """Return the NAK of this request."""
         data = bytes([code]) if errno is None else bytes([code, errno])
         return self.acknowledge(data).replace(opcode=MavFtpOpcode.NAK)
 

@@ -35,7 +35,6 @@ class ArduPilotExternal:
         self.wind: tuple[float, float] | None = None  # Speed in m/s, and direction in degrees that it comes from.
 
     def listen(self) -> None:
-        """Register the handlers."""
         vehicle = self._vehicle
         for kind in _EXTERNAL_NAVIGATION:
             vehicle.on(kind, self._on_navigation)

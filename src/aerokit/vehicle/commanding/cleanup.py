@@ -124,7 +124,7 @@ class FlightCleanup:
     async def stop_in(self, mode: Mode, order: Order) -> None:
         """Order the vehicle to hold even if it is in the hold mode: PX4 in LOITER may be flying to a place."""
         if self._holds_by_reposition:
-            await self._sender.follow_up_command(order, *STOP_HERE)
+            await self._sender.send_long(order, *STOP_HERE)
             await self._sender.ensure_mode(mode, order)
         else:
             await self._sender.change_mode(mode, order, reported_since=order.given_at)
@@ -133,9 +133,8 @@ class FlightCleanup:
         """Wait for the acknowledgement of :meth:`_send_hold`; resend the hold if none arrives."""
         by_mode = (MavCmd.DO_SET_MODE, *self._session.autopilot.mode_order(mode).params)
         command, *params = STOP_HERE if self._holds_by_reposition else by_mode
-        await self._sender.run_command(
+        await self._sender.send_long(
             order,
-            self._session.commands.send_long,
             int(command),
             *params,
             modes=() if self._holds_by_reposition else (mode,),

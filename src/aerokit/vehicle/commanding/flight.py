@@ -130,14 +130,7 @@ class FlightActions(VehicleBase):
         if plan.command is not None:
             is_rising = self._rises_from_here()
             with self._session.streaming("position", "landed_state"):
-                await self._sender.run_command(
-                    order,
-                    self._session.commands.send_long,
-                    plan.command,
-                    *plan.params,
-                    modes=order.modes,
-                    is_done=is_rising,
-                )
+                await self._sender.send_long(order, plan.command, *plan.params, modes=order.modes, is_done=is_rising)
 
     def _rises_from_here(self) -> Callable[[], bool]:
         """Return a function that is true once new messages show a climb; earlier ones may describe the last flight."""

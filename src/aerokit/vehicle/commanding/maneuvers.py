@@ -306,9 +306,7 @@ class ManeuverActions(VehicleBase):
         wanted, cell = VTOL_STATES[state], self.telemetry.vtol_state
         with self._arbiter.auxiliary_order() as order:
             started = self.connection.now()
-            await self._sender.run_command(
-                order, self._session.commands.send_long, MavCmd.DO_VTOL_TRANSITION, float(wanted)
-            )
+            await self._sender.send_long(order, MavCmd.DO_VTOL_TRANSITION, float(wanted))
             with self._session.streaming("vtol_state"):
                 await await_progress(
                     self._session,

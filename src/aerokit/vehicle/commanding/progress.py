@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from aerokit._internal import geo
 from aerokit._internal.arguments import check_range
 from aerokit.errors import HeartbeatTimeout, InvalidArgument, OperationRejected, OperationTimeout
-from aerokit.mavlink.enums import MavLandedState
+from aerokit.mavlink.enums import MavFrame, MavLandedState
 from aerokit.position import Position
 
 if TYPE_CHECKING:
@@ -270,6 +270,12 @@ class VehiclePosition:
         if is_relative and not self.takes_relative_altitude:
             altitude, is_relative = altitude + self.home_altitude(), False
         return round(target.latitude_deg * 1e7), round(target.longitude_deg * 1e7), altitude, is_relative
+
+    def command_place(self, target: Position) -> dict[str, Any]:
+        """Return the place as arguments of a COMMAND_INT; see :meth:`global_target`."""
+        latitude, longitude, altitude, is_relative = self.global_target(target)
+        frame = MavFrame.GLOBAL_RELATIVE_ALT_INT if is_relative else MavFrame.GLOBAL_INT
+        return {"frame": frame, "x": latitude, "y": longitude, "z": altitude}
 
     def is_on_ground(self) -> bool:
         """Return True if a vehicle that can fly was recently reported on the ground."""

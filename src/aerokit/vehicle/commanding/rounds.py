@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import anyio
 
 from aerokit._internal import geo
 from aerokit.errors import HeartbeatTimeout, OperationRejected, OperationTimeout, SetpointStreamStopped
-from aerokit.mavlink.enums import MavFrame
 from aerokit.mavlink.messages import OrbitExecutionStatus
 from aerokit.vehicle.commanding.closed_paths import PathFlight
 from aerokit.vehicle.commanding.guided import Guided
@@ -58,11 +57,9 @@ class RoundFlight:
         max_distance_m, self._timeout, self._max_silence_s = limits
         self._wrong_circle = ""
         position = context.vehicle_position
-        latitude, longitude, altitude, is_relative = position.global_target(center)
+        self._place = position.command_place(center)
         position.check_reach("center", [center], max_distance_m)
         position.check_flying(what)
-        frame = MavFrame.GLOBAL_RELATIVE_ALT_INT if is_relative else MavFrame.GLOBAL_INT
-        self._place: dict[str, Any] = {"frame": frame, "x": latitude, "y": longitude, "z": altitude}
 
     @property
     def bearing_rad(self) -> float:
@@ -91,9 +88,8 @@ class RoundFlight:
         order = context.arbiter.order(mode, hold)
         try:
             with context.arbiter.changing_mode():
-                await context.sender.run_command(
-                    order, self._session.commands.send_int, command, *params, modes=(mode,), **self._place
-                )
+                send = self._session.commands.send_int
+                await context.sender.run_command(order, send, command, *params, modes=(mode,), **self._place)
             with cleanup.flying(order), self._session.streaming("position"):
                 await self._await_rounds(order, mode, stay_s, circle_m)
             if is_held:

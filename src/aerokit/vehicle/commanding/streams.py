@@ -218,13 +218,10 @@ class SteeringStream(ValueStream[ValueT]):
         order.may_move = order.may_move or self._session.telemetry.is_in(mode)
         try:
             await self._enter(mode, order)
-        except OperationRejected:  # The pilot or failsafe that took over keeps control.
+        except BaseException as error:
             self._end()
-            self._release()
-            raise
-        except BaseException:
-            self._end()
-            self._hold()
+            if not isinstance(error, OperationRejected):  # The pilot or failsafe that took over keeps control.
+                self._hold()
             self._release()
             raise
         return self

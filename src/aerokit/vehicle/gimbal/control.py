@@ -95,9 +95,8 @@ class ReleaseCommand:
 
     async def _confirm(self) -> None:
         with self._orders.context.arbiter.auxiliary_order() as order:
-            await self._orders.context.sender.run_command(
+            await self._orders.context.sender.send_long(
                 order,
-                self._session.commands.send_long,
                 self._command,
                 *self._params,
                 component_id=self._target,

@@ -10,7 +10,7 @@ import anyio
 from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit._internal.async_block import ReadOnly
 from aerokit.errors import BusyError, CommandRejected, CommandTimeout, InvalidArgument
-from aerokit.mavlink.enums import MavCmd, MavFrame
+from aerokit.mavlink.enums import MavCmd
 from aerokit.mavlink.messages import GimbalDeviceInformation, GimbalManagerInformation, GlobalPositionInt
 from aerokit.position import Home, Position, point_at
 from aerokit.vehicle.gimbal.control import GimbalControl
@@ -101,8 +101,7 @@ class RoiMixin(GimbalMixin):
         orders = self._orders
         orders.check_roi()
         target = point_at(target)
-        x, y, z, is_relative = self._context.vehicle_position.global_target(target)
-        frame = MavFrame.GLOBAL_RELATIVE_ALT_INT if is_relative else MavFrame.GLOBAL_INT
+        place = self._context.vehicle_position.command_place(target)
         order = orders.begin_order()
         aim = AngleTarget(
             lambda: direction_to(self._context, target),
@@ -111,7 +110,6 @@ class RoiMixin(GimbalMixin):
         )
         with attitude_stream(orders), self._session.streaming("position"):
             since = self._now()
-            place = {"frame": frame, "x": x, "y": y, "z": z}
             await orders.send_roi(order, MavCmd.DO_SET_ROI_LOCATION, orders.roi_parameter, **place)
             if wait:
                 await wait_until_there(orders, order, f"{orders.name}: look_at", aim, since=since, timeout=timeout)
