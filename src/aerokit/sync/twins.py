@@ -3077,11 +3077,7 @@ class Camera(TwinOf["AsyncCamera"]):
     def stop_tracking(self) -> None:
         """Stop tracking (MAV_CMD_CAMERA_STOP_TRACKING).
 
-        Raises:
-            NotSupported: the camera cannot track. Nothing was sent.
-            CommandRejected: the camera refused.
-            CommandTimeout: the camera did not answer.
-            OperationTimeout: no camera was found.
+        Raises as :meth:`reset_settings`, and NotSupported if the camera cannot track.
         """
         self._loop.run(self.aio.stop_tracking)
 
@@ -3144,11 +3140,7 @@ class Camera(TwinOf["AsyncCamera"]):
     def auto_focus(self, kind: AutoFocus = "auto") -> None:
         """Start the camera's auto focus: ``"auto"`` by its own rules, ``"single"`` once, ``"continuous"`` from now on.
 
-        Raises:
-            NotSupported: the camera cannot be focused. Nothing was sent.
-            CommandRejected: the camera refused.
-            CommandTimeout: the camera did not answer.
-            OperationTimeout: no camera was found.
+        Raises as :meth:`reset_settings`, and NotSupported if the camera cannot be focused.
         """
         self._loop.run(self.aio.auto_focus, kind)
 

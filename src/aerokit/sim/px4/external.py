@@ -66,11 +66,9 @@ class Px4External:
         return MavResult.ACCEPTED
 
     def _on_vision(self, message: Message, _: Channel) -> None:
-        if isinstance(message, m.Odometry) and not math.isfinite(message.x):
-            self.latest[type(message)] = message
-            return
         self.latest[type(message)] = message
-        self._vision_at = self._px4.now
+        if not isinstance(message, m.Odometry) or math.isfinite(message.x):
+            self._vision_at = self._px4.now
 
     def _on_sensor(self, message: Message, _: Channel) -> None:
         self.latest[type(message)] = message

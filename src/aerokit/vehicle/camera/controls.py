@@ -116,11 +116,7 @@ class LensMixin(CameraMixin):
     async def auto_focus(self, kind: AutoFocus = "auto") -> None:
         """Start the camera's auto focus: ``"auto"`` by its own rules, ``"single"`` once, ``"continuous"`` from now on.
 
-        Raises:
-            NotSupported: the camera cannot be focused. Nothing was sent.
-            CommandRejected: the camera refused.
-            CommandTimeout: the camera did not answer.
-            OperationTimeout: no camera was found.
+        Raises as :meth:`reset_settings`, and NotSupported if the camera cannot be focused.
         """
         await self._set("auto_focus", HAS_FOCUS, FOCUS, AUTO_FOCUS_TYPES[kind], 0)
 
@@ -235,11 +231,7 @@ class TrackingMixin(CameraMixin):
     async def stop_tracking(self) -> None:
         """Stop tracking (MAV_CMD_CAMERA_STOP_TRACKING).
 
-        Raises:
-            NotSupported: the camera cannot track. Nothing was sent.
-            CommandRejected: the camera refused.
-            CommandTimeout: the camera did not answer.
-            OperationTimeout: no camera was found.
+        Raises as :meth:`reset_settings`, and NotSupported if the camera cannot track.
         """
         await self._link.require_capability("stop_tracking", "has_tracking_point", "has_tracking_rectangle")
         try:

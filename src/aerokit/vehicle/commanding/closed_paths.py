@@ -100,9 +100,9 @@ class PathFlight:
         if self._flown_m >= length:
             self.is_on_path, self._speed, self._flown_m = True, 0.0, length
         share = self._flown_m / length if length else 1.0
-        place = tuple(begin + share * part for begin, part in zip(self._from, way, strict=True))
-        velocity = tuple(self._speed * part / length if length else 0.0 for part in way)
-        return self._setpoint((place[0], place[1]), place[2], (velocity[0], velocity[1], velocity[2]), (0.0, 0.0))
+        north, east, down = (begin + share * part for begin, part in zip(self._from, way, strict=True))
+        north_m_s, east_m_s, down_m_s = (self._speed * part / length if length else 0.0 for part in way)
+        return self._setpoint((north, east), down, (north_m_s, east_m_s, down_m_s), (0.0, 0.0))
 
     def _advance_on_path(self, seconds: float) -> TrajectorySetpoint:
         _, tangent, _ = self._path.at(self._phase)
@@ -119,20 +119,14 @@ class PathFlight:
 
     def _accelerate(self, seconds: float, left_m: float) -> None:
         braking = math.sqrt(2 * ACCELERATION_M_S2 * max(0.0, left_m))
-        wanted = min(self._speed + ACCELERATION_M_S2 * seconds, self._speed_m_s, max(braking, MIN_SPEED_M_S))
-        self._speed = wanted
+        self._speed = min(self._speed + ACCELERATION_M_S2 * seconds, self._speed_m_s, max(braking, MIN_SPEED_M_S))
 
     def _setpoint(
         self, place: Vector, down: float, velocity: tuple[float, float, float], acceleration: Vector
     ) -> TrajectorySetpoint:
-        return TrajectorySetpoint(
-            self._centre[0] + place[0],
-            self._centre[1] + place[1],
-            self._centre[2] + down,
-            *velocity,
-            *acceleration,
-            yaw_deg=self._heading(place, velocity[:2]),
-        )
+        north, east, centre_down = self._centre
+        where, yaw_deg = (north + place[0], east + place[1], centre_down + down), self._heading(place, velocity[:2])
+        return TrajectorySetpoint(*where, *velocity, *acceleration, yaw_deg=yaw_deg)
 
 
 class TurnCounter:

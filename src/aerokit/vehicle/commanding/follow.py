@@ -46,8 +46,7 @@ class FollowPlace(Snapshot):
     height_m: float | None
     face_target: bool
 
-    def check(self) -> None:
-        """Raise InvalidArgument if a value is out of range."""
+    def _check(self) -> None:
         check_range("distance_m", self.distance_m, 0, MAX_DISTANCE_M)
         if self.bearing_deg is not None:
             check_range("bearing_deg", self.bearing_deg, 0, 360)
@@ -127,7 +126,6 @@ class FollowStream(SteeringStream[TargetState]):
         valid_for_s: float,
         max_distance_m: float,
     ) -> None:
-        place.check()
         check_range("max_distance_m", max_distance_m, place.distance_m, math.inf)
         autopilot = context.session.autopilot
         if not (autopilot.setpoints.global_position and autopilot.setpoints.velocity):

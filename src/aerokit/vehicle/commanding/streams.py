@@ -68,8 +68,7 @@ class ValueStream(Generic[ValueT]):
         self._set_at = -math.inf
         self._timer: asyncio.TimerHandle | None = None
         self._stopped: AerokitError | None = None
-        self._is_reported = self._was_entered = False
-        self._is_entering = False
+        self._is_reported = self._was_entered = self._is_entering = False
 
     @property
     def is_running(self) -> bool:
