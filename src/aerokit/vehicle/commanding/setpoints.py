@@ -182,15 +182,15 @@ class SetpointEncoder:
     def local(self, s: LocalSetpoint, frame: int = MavFrame.LOCAL_NED) -> Message:
         """Return SET_POSITION_TARGET_LOCAL_NED with the vectors that the set-point has."""
         mask, yaw, yaw_rate = _yaw(s.yaw_deg, s.yaw_rate_deg_s)
-        values: list[float] = []
-        for ignored, names in VECTORS.items():
-            if hasattr(s, names[0]):
-                values += (getattr(s, name) for name in names)
-            else:
-                mask |= ignored
-                values += ZERO
-        check_finite("set-point", *values)
-        return SetPositionTargetLocalNed(self._time_ms(), *self._address, frame, mask, *values, yaw, yaw_rate)
+        vectors: list[tuple[float, float, float]] = []
+        for ignored, (north, east, down) in VECTORS.items():
+            is_given = hasattr(s, north)
+            vectors.append((getattr(s, north), getattr(s, east), getattr(s, down)) if is_given else ZERO)
+            mask |= 0 if is_given else ignored
+        position, velocity, acceleration = vectors
+        parts = (*position, *velocity, *acceleration)
+        check_finite("set-point", *parts)
+        return SetPositionTargetLocalNed(self._time_ms(), *self._address, frame, mask, *parts, yaw, yaw_rate)
 
     def body_velocity(self, s: BodyVelocitySetpoint) -> Message:
         """Return SET_POSITION_TARGET_LOCAL_NED with a velocity in MAV_FRAME_BODY_NED.
@@ -217,8 +217,10 @@ class SetpointEncoder:
         mask |= IGNORE_ACCELERATION | (IGNORE_VELOCITY if velocity is None else 0)
         latitude, longitude, altitude, is_relative = self._position.global_target(s.position)
         frame = MavFrame.GLOBAL_RELATIVE_ALT_INT if is_relative else MavFrame.GLOBAL_INT
-        place = (latitude, longitude, altitude, *(velocity or ZERO))
-        return SetPositionTargetGlobalInt(self._time_ms(), *self._address, frame, mask, *place, *ZERO, yaw, yaw_rate)
+        now, speeds = self._time_ms(), velocity or ZERO
+        return SetPositionTargetGlobalInt(
+            now, *self._address, frame, mask, latitude, longitude, altitude, *speeds, *ZERO, yaw, yaw_rate
+        )
 
     def attitude(self, s: AttitudeSetpoint) -> Message:
         """Return SET_ATTITUDE_TARGET with attitude and thrust."""
