@@ -130,7 +130,7 @@ class MeasurementStream(Generic[MeasurementT]):
         source. "not used": it has none. "unknown" in all other cases, such as with a GPS beside, for sensors that are
         not a position, or without a recent report.
         """
-        rule = self._session.autopilot.external.find(self._kind)
+        rule = self._session.autopilot.external.kinds.get(self._kind)
         estimator = self._session.telemetry.estimator
         health = estimator.latest
         if rule is None or not rule.sole_source or not self._parameters or health is None:
@@ -213,7 +213,7 @@ class MeasurementStream(Generic[MeasurementT]):
 
     async def _check_support(self) -> dict[str, float]:
         """Raise unless the vehicle reads these measurements; return the parameters that decide about them."""
-        firmware, rule = self._session.autopilot.firmware, self._session.autopilot.external.find(self._kind)
+        firmware, rule = self._session.autopilot.firmware, self._session.autopilot.external.kinds.get(self._kind)
         what = self._kind.replace("_", " ")
         if rule is None:
             raise NotSupported(f"{what}: {firmware} does not read such measurements by MAVLink")
