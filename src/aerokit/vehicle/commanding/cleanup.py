@@ -185,7 +185,7 @@ class FlightCleanup:
                 if is_sent:
                     await self._confirm_hold(mode, order)
                     return
-                await self._wait_for_heartbeat()
+                await self._session.wait_for_heartbeat()
                 if not order.end and not self._session.telemetry.is_confirmed_disarmed:
                     with self._task.spared():  # This task gives the newer order itself.
                         order = self._arbiter.order(*order.modes, mode)
@@ -198,11 +198,6 @@ class FlightCleanup:
                 if not order.end:
                     logger.warning("the vehicle does not hold after an abandoned flight: %s", error)
                 return
-
-    async def _wait_for_heartbeat(self) -> None:
-        """Wait for a HEARTBEAT that describes the vehicle's state."""
-        armed, since = self._session.telemetry.armed, self._session.connection.now()
-        await armed.wait_until(lambda _: armed.updated_at > since, description="the next HEARTBEAT")
 
     @property
     def is_hold_pending(self) -> bool:

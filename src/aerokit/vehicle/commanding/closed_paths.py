@@ -15,6 +15,9 @@ ACCELERATION_M_S2 = 1.0
 MIN_SPEED_M_S = 0.1
 """Speed to which a vehicle slows down, so that it arrives."""
 
+MIN_TOLERANCE_M, TOLERANCE_SHARE = 5.0, 0.3
+"""A vehicle is on its circle within this part of the radius, and at least within this many metres."""
+
 Vector = tuple[float, float]
 """Metres north and east."""
 
@@ -132,8 +135,9 @@ class PathFlight:
 class TurnCounter:
     """Counts turns around a centre, while the vehicle is reported near the circle and flies it in the right sense."""
 
-    def __init__(self, radius_m: float, tolerance_m: float, *, clockwise: bool) -> None:
-        self._radius_m, self._tolerance_m, self._way = radius_m, tolerance_m, 1 if clockwise else -1
+    def __init__(self, radius_m: float, *, clockwise: bool) -> None:
+        self._radius_m, self._way = radius_m, 1 if clockwise else -1
+        self._tolerance_m = max(MIN_TOLERANCE_M, TOLERANCE_SHARE * radius_m)
         self._bearing: float | None = None
         self.rounds: float = 0.0
         self.is_there: bool = False

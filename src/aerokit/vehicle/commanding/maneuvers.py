@@ -16,9 +16,7 @@ from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M, MAX_SILENCE_S, a
 if TYPE_CHECKING:
     from aerokit.autopilots import Mode
     from aerokit.position import Home, Position
-    from aerokit.vehicle.commanding.closed_paths import TurnCounter
     from aerokit.vehicle.commanding.follow import FollowStream
-
 
 Facing = Literal["center", "ahead", "initial", "free"]
 FlightState = Literal["fixed_wing", "multicopter"]
@@ -33,14 +31,6 @@ YAW_BEHAVIOURS: dict[str, OrbitYawBehaviour] = {
 VTOL_STATES: dict[str, MavVtolState] = {"fixed_wing": MavVtolState.FW, "multicopter": MavVtolState.MC}
 MAX_RADIUS_M, MAX_SPEED_M_S, MAX_ROUNDS = 10_000, 50, 1000
 MAX_SET_SPEED_M_S, KEEP_THROTTLE = 1000, -1.0
-MIN_TOLERANCE_M, TOLERANCE_SHARE = 5.0, 0.3
-"""A vehicle is on its circle within this part of the radius, at least within so many metres."""
-
-
-def _turn_counter(radius_m: float, *, clockwise: bool) -> TurnCounter:
-    from aerokit.vehicle.commanding.closed_paths import TurnCounter
-
-    return TurnCounter(radius_m, max(MIN_TOLERANCE_M, TOLERANCE_SHARE * radius_m), clockwise=clockwise)
 
 
 @checks_arguments
@@ -87,14 +77,14 @@ class ManeuverActions(VehicleBase):
 
         Otherwise raises as :meth:`go_to`.
         """
-        from aerokit.vehicle.commanding.closed_paths import Circle
+        from aerokit.vehicle.commanding.closed_paths import Circle, TurnCounter
         from aerokit.vehicle.commanding.rounds import RoundFlight
 
         check_range("radius_m", radius_m, 0, MAX_RADIUS_M, above=True)
         check_range("speed_m_s", speed_m_s, 0, MAX_SPEED_M_S, above=True)
         if turns is not None:
             check_range("turns", turns, 0, MAX_ROUNDS, above=True)
-        place, counter = travel_target(center), _turn_counter(radius_m, clockwise=clockwise)
+        place, counter = travel_target(center), TurnCounter(radius_m, clockwise=clockwise)
         limits = (max_distance_m, timeout, max_silence_s)
         if self.autopilot.circles_by == "setpoints":
             flight = RoundFlight(self._context, "orbit", place, counter, turns, limits)
@@ -194,6 +184,7 @@ class ManeuverActions(VehicleBase):
         All else is as for :meth:`orbit`. NotSupported is raised for a radius if the vehicle hovers, InvalidArgument for
         ``turns`` without one.
         """
+        from aerokit.vehicle.commanding.closed_paths import TurnCounter
         from aerokit.vehicle.commanding.rounds import RoundFlight
 
         if turns is not None:
@@ -212,7 +203,7 @@ class ManeuverActions(VehicleBase):
             params: tuple[float, ...] = (-1.0, float(MavDoRepositionFlags.CHANGE_MODE), 0.0, math.nan)
             mode = self._sender.mode_for("loiter", self.autopilot.reposition_purpose)
         else:
-            counter = _turn_counter(radius_m, clockwise=clockwise)
+            counter = TurnCounter(radius_m, clockwise=clockwise)
             command, params, mode = self._circling("loiter", radius_m, math.nan, "free", clockwise=clockwise)
         limits = (max_distance_m, timeout, max_silence_s)
         flight = RoundFlight(self._context, "loiter", center, counter, turns or 0.0, limits)

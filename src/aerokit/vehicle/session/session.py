@@ -226,6 +226,11 @@ class VehicleSession:
             for release in releases:
                 release()
 
+    async def wait_for_heartbeat(self) -> None:
+        """Wait for the next HEARTBEAT, which describes the vehicle's state."""
+        armed, since = self.telemetry.armed, self.connection.now()
+        await armed.wait_until(lambda _: armed.updated_at > since, description="the next HEARTBEAT")
+
     @contextmanager
     def refusals_of(self, command: int) -> Iterator[list[CommandAck]]:
         """Collect acks that refuse a command after an earlier ack accepted it (PX4 acks some commands twice)."""
