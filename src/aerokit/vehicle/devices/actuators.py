@@ -13,7 +13,6 @@ from aerokit.errors import CommandRejected, InvalidArgument, OperationRejected
 from aerokit.mavlink.enums import MavCmd, MavComponent, MotorTestThrottleType, ParachuteAction
 from aerokit.vehicle.commanding.progress import await_progress
 from aerokit.vehicle.commanding.simple_orders import Argument, Effect, SimpleOrder
-from aerokit.vehicle.devices.text_effect import await_text, collected_texts
 
 if TYPE_CHECKING:
     from aerokit.mavlink.messages import IlluminatorStatus, RelayStatus, ServoOutputRaw
@@ -34,27 +33,25 @@ ALL_GEARS = -1
 OUTPUTS_PER_MESSAGE = 16
 
 
-def _has_pulse(message: ServoOutputRaw, number: float, pulse_us: float) -> bool:
-    port, index = divmod(int(number) - 1, OUTPUTS_PER_MESSAGE)
-    return message.port == port and getattr(message, f"servo{index + 1}_raw") == int(pulse_us)
+def _has_pulse(message: ServoOutputRaw, number: int, pulse_us: int) -> bool:
+    port, index = divmod(number - 1, OUTPUTS_PER_MESSAGE)
+    return message.port == port and getattr(message, f"servo{index + 1}_raw") == pulse_us
 
 
-def _is_switched(message: RelayStatus, number: float, on: float) -> bool:
-    return bool(message.on >> int(number) & 1) == bool(on)
+def _is_switched(message: RelayStatus, number: int, on: bool) -> bool:
+    return bool(message.on >> number & 1) == on
 
 
-def _is_lit(message: IlluminatorStatus, on: float) -> bool:
-    return bool(message.enable) == bool(on)
+def _is_lit(message: IlluminatorStatus, on: bool) -> bool:
+    return bool(message.enable) == on
 
 
-SERVO = Argument("number", 1, 32, whole=True)
-RELAY = Argument("number", 0, 15, whole=True)
-PULSE = Argument("pulse_us", 500, 2500, whole=True)
-COUNT = Argument("count", 1, 1000, whole=True)
+SERVO = Argument("number", 1, 32)
+RELAY = Argument("number", 0, 15)
+PULSE = Argument("pulse_us", 500, 2500)
+COUNT = Argument("count", 1, 1000)
 PERIOD = Argument("period_s", 0, 60, above=True)
 ON = Argument("on", 0, 1)
-MOTOR = Argument("number", 1, 12, whole=True)
-DURATION = Argument("duration_s", 0, MAX_MOTOR_TEST_S, above=True)
 SET_SERVO = SimpleOrder("set_servo", MavCmd.DO_SET_SERVO, (SERVO, PULSE), Effect("ServoOutputRaw", _has_pulse))
 REPEAT_SERVO = SimpleOrder("repeat_servo", MavCmd.DO_REPEAT_SERVO, (SERVO, PULSE, COUNT, PERIOD))
 SET_RELAY = SimpleOrder("set_relay", MavCmd.DO_SET_RELAY, (RELAY, ON), Effect("RelayStatus", _is_switched))
@@ -63,14 +60,6 @@ LANDING_GEAR = SimpleOrder("landing_gear", MavCmd.AIRFRAME_CONFIGURATION, (ALL_G
 LIGHTS = SimpleOrder("set_lights", MavCmd.ILLUMINATOR_ON_OFF, (ON,), Effect("IlluminatorStatus", _is_lit))
 PARACHUTE = SimpleOrder("parachute", MavCmd.DO_PARACHUTE, (Argument("action", 0, 2),))
 PERCENT = MotorTestThrottleType.THROTTLE_PERCENT
-TEST_BY_SEQUENCE = SimpleOrder(
-    "test_motor", MavCmd.DO_MOTOR_TEST, (MOTOR, PERCENT, Argument("throttle_percent", 0, 100), DURATION, 1)
-)
-TEST_BY_FUNCTION = SimpleOrder(
-    "test_motor",
-    MavCmd.ACTUATOR_TEST,
-    (Argument("throttle_percent", 0, 100, scale=0.01), DURATION, 0, 0, MOTOR),
-)
 
 
 @checks_arguments
@@ -239,19 +228,25 @@ class Actuators(ReadOnly):
             CommandTimeout: there was no acknowledgement; the motor may have turned.
             OperationTimeout: the vehicle still reports armed four seconds after the end.
         """
-        by_sequence = MavCmd.DO_MOTOR_TEST not in self._context.session.autopilot.unsupported_commands
-        row = TEST_BY_SEQUENCE if by_sequence else TEST_BY_FUNCTION
-        values: tuple[float, ...] = (number, throttle_percent, duration_s)
-        if not by_sequence:
-            values = (throttle_percent, duration_s, number)
-        row.wire_params(*values)
+        check_range("number", number, 1, 12)
+        check_range("throttle_percent", throttle_percent, 0, 100)
+        check_range("duration_s", duration_s, 0, MAX_MOTOR_TEST_S, above=True)
         session, arbiter = self._context.session, self._context.arbiter
+        start: tuple[float, ...]
+        stop: tuple[float, ...]
+        # Throttle 0 for 0 s ends a test on ArduPilot; PX4 releases the output after 0 s.
+        if MavCmd.DO_MOTOR_TEST in session.autopilot.unsupported_commands:
+            command, start = MavCmd.ACTUATOR_TEST, (throttle_percent / 100, duration_s, 0, 0, number)
+            stop = (math.nan, 0, 0, 0, number)
+        else:
+            command, start = MavCmd.DO_MOTOR_TEST, (number, PERCENT, throttle_percent, duration_s, 1)
+            stop = (number, PERCENT, 0, 0, 1)
         if not session.telemetry.is_confirmed_disarmed or not arbiter.is_known:
             state = "armed" if session.telemetry.is_armed else "not known to be disarmed"
             raise OperationRejected(f"test_motor: the vehicle is {state}; nothing was sent")
         order, spins_until = arbiter.of_device("motor test"), math.inf
         try:
-            await row.send(self._context, *values, of=order)
+            await SimpleOrder("test_motor", command, start).send(self._context, of=order)
             spins_until = session.connection.now() + duration_s
             await anyio.sleep(duration_s)
             await self._await_test_end(order)
@@ -261,9 +256,7 @@ class Actuators(ReadOnly):
             # After its end, the stop would be another test, which arms the motors.
             is_spinning = session.connection.now() < spins_until
             if is_spinning and order.is_newest and arbiter.is_known and session.connection.is_open:
-                # Throttle 0 for 0 s ends a test on ArduPilot; PX4 releases the output after 0 s.
-                stop = (number, PERCENT, 0, 0, 1) if by_sequence else (math.nan, 0, 0, 0, number)
-                session.commands.send_unconfirmed(row.command, *stop)
+                session.commands.send_unconfirmed(command, *stop)
             raise
 
     async def _await_test_end(self, order: Order) -> None:
@@ -295,18 +288,14 @@ class Actuators(ReadOnly):
             CommandTimeout: there was no acknowledgement.
             OperationTimeout: no status text reported the release.
         """
-        order = self._context.arbiter.of_device("parachute")
-        with collected_texts(self._context) as texts:
-            await PARACHUTE.send(self._context, ParachuteAction.RELEASE, of=order)
-            await await_text(
-                self._context,
-                "release_parachute",
-                texts,
-                lambda text, _: text.startswith("Parachute: Released"),
-                is_refusal=lambda text: text.startswith("Parachute: "),
-                order=order,
-                timeout=PARACHUTE_TIMEOUT_S,
-            )
+        await PARACHUTE.send_until_text(
+            self._context,
+            ParachuteAction.RELEASE,
+            topic="parachute",
+            is_done=lambda text, _: text.startswith("Parachute: Released"),
+            is_refusal=lambda text: text.startswith("Parachute: "),
+            timeout=PARACHUTE_TIMEOUT_S,
+        )
 
     async def enable_parachute(self, enabled: bool = True) -> None:
         """Allow or forbid the release of the parachute until the next reboot; returns at the acknowledgement.
