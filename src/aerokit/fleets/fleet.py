@@ -16,7 +16,7 @@ from aerokit.fleets.formation import Formations
 from aerokit.fleets.show_flight import Shows
 from aerokit.fleets.travel import Missions
 from aerokit.protocols.rtcm import rtcm_messages
-from aerokit.vehicle.rtk.output import output_of
+from aerokit.vehicle.rtk.rtk import output_of
 
 if TYPE_CHECKING:
     from aerokit.connection.bus import Detach, Sink

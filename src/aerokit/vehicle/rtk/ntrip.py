@@ -5,9 +5,12 @@ from __future__ import annotations
 import asyncio
 import logging
 import ssl
+import time
 from asyncio import open_connection
 from base64 import b64encode
 from contextlib import suppress
+from functools import reduce
+from operator import xor
 from typing import TYPE_CHECKING
 from urllib.parse import unquote, urlsplit
 
@@ -25,7 +28,6 @@ from aerokit.errors import (
     OperationTimeout,
 )
 from aerokit.protocols.rtcm import MAX_MESSAGE_SIZE, RtcmReader
-from aerokit.vehicle.rtk.position_report import gga_sentence
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
@@ -34,6 +36,7 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
     from aerokit.vehicle.session.session import VehicleSession
+    from aerokit.vehicle.state.telemetry import Telemetry
 
 __all__ = ["Caster", "NtripClient"]
 
@@ -45,6 +48,9 @@ MAX_SILENCE_S = 30.0
 """Seconds without data after which the caster is connected to again; base stations send every second or two."""
 POSITION_INTERVAL_S = 10.0
 POSITION_POLL_INTERVAL_S = 1.0
+POSITION_MAX_AGE_S = 10.0
+# GPS_FIX_TYPE → quality of GGA: 1 autonomous, 2 differential, 4 RTK fixed, 5 RTK float.
+QUALITIES = {4: 2, 5: 5, 6: 4}
 MAX_HEADER_LINES, MAX_CHUNK_SIZE, MAX_TABLE_SIZE = 100, 1 << 20, 4 << 20
 CLOSE_TIMEOUT_S = 1.0
 
@@ -347,3 +353,28 @@ class NtripClient:
         writer, self._writer = self._writer, None
         if writer is not None:
             writer.close()
+
+
+def gga_sentence(telemetry: Telemetry, unix_time: float) -> bytes | None:
+    """Return the position as ``$GPGGA,…``; None while no recent position is known."""
+    cell = telemetry.position
+    place = cell.latest
+    if place is None or cell.age > POSITION_MAX_AGE_S or place.altitude_amsl_m is None:
+        return None
+    receiver = next(iter(telemetry.cells["gps"].latest or ()), None)
+    quality = QUALITIES.get(receiver.fix_type, 1) if receiver is not None else 1
+    satellites = (receiver.satellites if receiver is not None else None) or 4
+    clock = time.strftime("%H%M%S", time.gmtime(unix_time))
+    fields = (
+        f"GPGGA,{clock}.00,{_angle(place.latitude_deg, 2)},{'NS'[place.latitude_deg < 0]},"
+        f"{_angle(place.longitude_deg, 3)},{'EW'[place.longitude_deg < 0]},{quality},{satellites:02d},1.0,"
+        f"{place.altitude_amsl_m:.1f},M,0.0,M,,"
+    )
+    return f"${fields}*{reduce(xor, fields.encode()):02X}\r\n".encode()
+
+
+def _angle(degrees: float, digits: int) -> str:
+    """Return degrees and minutes without a separator: 4723.86456."""
+    units = round(abs(degrees) * 60 * 100_000)
+    whole, rest = divmod(units, 60 * 100_000)
+    return f"{whole:0{digits}d}{rest // 100_000:02d}.{rest % 100_000:05d}"
