@@ -31,7 +31,6 @@ from aerokit.protocols.rtcm import MAX_MESSAGE_SIZE, RtcmReader
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
-    from types import TracebackType
 
     from typing_extensions import Self
 
@@ -205,9 +204,7 @@ class NtripClient:
         self._session.background.start(lambda: self._run(response), "aerokit ntrip")
         return self
 
-    async def __aexit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         self._work.cancel()
         writer = self._writer
         self._close()
