@@ -161,8 +161,9 @@ class NtripClient:
     ) -> None:
         self._session, self._send, self._caster, self._timeout = session, send, caster, timeout
         self._sends_position = send_position
-        self._work = Cancellation()
-        self._ended: asyncio.Event | None = None
+        self._name = f"NTRIP {caster!r}"
+        self._work, self._ended = Cancellation(), asyncio.Event()
+        self._was_entered = False
         self._writer: asyncio.StreamWriter | None = None
         self._problem = ""
         self._oversized = self._reconnects = 0
@@ -191,9 +192,9 @@ class NtripClient:
         return f"<NtripClient {self._caster!r}, {'connected' if self.is_connected else 'not connected'}>"
 
     async def __aenter__(self) -> Self:
-        if self._ended is not None:
+        if self._was_entered:
             raise BusyError("NtripClient can be entered only once: call ntrip() again")
-        self._ended = asyncio.Event()
+        self._was_entered = True
         try:
             if self._sends_position is None:
                 self._sends_position = await self._asks_for_position()
@@ -211,7 +212,6 @@ class NtripClient:
         await run_shielded(self._wait_closed(writer))
 
     async def _wait_closed(self, writer: asyncio.StreamWriter | None) -> None:
-        assert self._ended is not None
         with anyio.move_on_after(CLOSE_TIMEOUT_S):
             if not self._session.is_closed:
                 await self._ended.wait()
@@ -221,7 +221,6 @@ class NtripClient:
 
     async def _run(self, response: _Response) -> None:
         """Forward corrections, and connect again, until the block ends."""
-        assert self._ended is not None
         try:
             with self._work:
                 await self._forward(response)
@@ -236,7 +235,7 @@ class NtripClient:
                         self._report(str(error))
                         continue
                     self._reconnects += 1
-                    logger.info("NTRIP %r: connected again", self._caster)
+                    logger.info("%s: connected again", self._name)
                     if await self._forward(response):
                         pause_s = MIN_RETRY_S
         except (ConnectionClosed, LinkLost) as error:
@@ -249,7 +248,6 @@ class NtripClient:
         """Send the corrections of one connection to the vehicle; return their number."""
         reader, count = RtcmReader(), 0
         reason = "the caster closed the connection"
-        writer = self._writer
         reports = asyncio.ensure_future(self._report_position()) if self._sends_position else None
         body = response.body()
         try:
@@ -271,9 +269,8 @@ class NtripClient:
             if reports is not None:
                 reports.cancel()
                 await asyncio.gather(reports, return_exceptions=True)
-            if self._writer is writer:
-                self._close()
-        self._report(f"NTRIP {self._caster!r}: {reason} after {count} messages")
+            self._close()
+        self._report(f"{self._name}: {reason} after {count} messages")
         return count
 
     def _report(self, problem: str) -> None:
@@ -290,16 +287,16 @@ class NtripClient:
         names = await self._table(response) if response.is_table else {}
         self._close()
         status = printable(response.status[:80]) or "an empty answer"
-        what = f"NTRIP {self._caster!r}"
+        reason = f"the caster answered {status!r}"
         if response.is_table or response.code == "404":
             known = f"; it has {', '.join(sorted(names)[:20])}" if names else ""
-            raise OperationRejected(f"{what}: the caster has no mount point {mount!r}{known}")
-        if response.code in ("401", "403") or "password" in status.lower():
-            raise OperationRejected(f"{what}: the caster refused the user or the password ({status})")
-        raise OperationRejected(f"{what}: the caster answered {status!r}")
+            reason = f"the caster has no mount point {mount!r}{known}"
+        elif response.code in ("401", "403") or "password" in status.lower():
+            reason = f"the caster refused the user or the password ({status})"
+        raise OperationRejected(f"{self._name}: {reason}")
 
     async def _request(self, mount: str) -> _Response:
-        caster, what = self._caster, f"NTRIP {self._caster!r}"
+        caster = self._caster
         context = ssl.create_default_context() if caster.is_encrypted else None
 
         async def exchange() -> _Response:
@@ -311,11 +308,11 @@ class NtripClient:
             return await asyncio.wait_for(exchange(), self._timeout)
         except asyncio.TimeoutError:
             self._close()
-            raise OperationTimeout(f"{what}: the caster did not answer within {self._timeout:g} s") from None
+            raise OperationTimeout(f"{self._name}: the caster did not answer within {self._timeout:g} s") from None
         except (OSError, ValueError) as error:
             self._close()
             reason = getattr(error, "strerror", None) or type(error).__name__
-            raise LinkOpenError(f"{what}: the caster could not be reached: {reason}") from None
+            raise LinkOpenError(f"{self._name}: the caster could not be reached: {reason}") from None
 
     async def _asks_for_position(self) -> bool:
         """Return True if the source table says that the mount point needs GGA; False if it does not say."""
