@@ -225,9 +225,9 @@ async def _has_message(context: VehicleContext, message_id: int, component_id: i
 
 
 async def receive_once(
-    context: VehicleContext, message_type: type[MessageT], component_id: int | None = None, *, timeout: float = 1.0
+    context: VehicleContext, message_type: type[MessageT], component_id: int | None = None
 ) -> MessageT | None:
-    """Request one message and return it; None if the vehicle refuses or does not send it within ``timeout`` seconds."""
+    """Request one message and return it; None if the vehicle refuses or does not send it within a second."""
     session = context.session
     target = session.component_id if component_id is None else component_id
     with (
@@ -235,10 +235,10 @@ async def receive_once(
         suppress(CommandRejected, CommandTimeout, OperationTimeout),
     ):
         await session.commands.send_long(
-            MavCmd.REQUEST_MESSAGE, message_type.ID, component_id=target, attempts=1, attempt_timeout=timeout
+            MavCmd.REQUEST_MESSAGE, message_type.ID, component_id=target, attempts=1, attempt_timeout=1.0
         )
         while True:
-            message = await messages.get(timeout)
+            message = await messages.get(1.0)
             if message.received_frame is None or message.received_frame.component_id == target:
                 return message
     return None

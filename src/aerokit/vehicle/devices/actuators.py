@@ -17,7 +17,6 @@ from aerokit.vehicle.commanding.simple_orders import Argument, Effect, SimpleOrd
 if TYPE_CHECKING:
     from aerokit.mavlink.messages import IlluminatorStatus, RelayStatus, ServoOutputRaw
     from aerokit.vehicle.commanding.context import VehicleContext
-    from aerokit.vehicle.commanding.order import Order
 
 __all__ = ["Actuators"]
 
@@ -249,7 +248,15 @@ class Actuators(ReadOnly):
             await SimpleOrder("test_motor", command, start).send(self._context, of=order)
             spins_until = session.connection.now() + duration_s
             await anyio.sleep(duration_s)
-            await self._await_test_end(order)
+            armed, ended_at = session.telemetry.armed, session.connection.now()
+            await await_progress(
+                session,
+                "test_motor",
+                is_done=lambda: armed.latest is False and armed.updated_at > ended_at,
+                trouble=lambda: None if order.is_newest else "another motor test was started",
+                describe=lambda: "the vehicle still reports armed",
+                timeout=TEST_END_TIMEOUT_S,
+            )
         except CommandRejected:
             raise
         except BaseException:
@@ -258,18 +265,6 @@ class Actuators(ReadOnly):
             if is_spinning and order.is_newest and arbiter.is_known and session.connection.is_open:
                 session.commands.send_unconfirmed(command, *stop)
             raise
-
-    async def _await_test_end(self, order: Order) -> None:
-        session = self._context.session
-        armed, ended_at = session.telemetry.armed, session.connection.now()
-        await await_progress(
-            session,
-            "test_motor",
-            is_done=lambda: armed.latest is False and armed.updated_at > ended_at,
-            trouble=lambda: None if order.is_newest else "another motor test was started",
-            describe=lambda: "the vehicle still reports armed",
-            timeout=TEST_END_TIMEOUT_S,
-        )
 
     async def release_parachute(self, *, intent: ReleaseIntent) -> None:
         """Release the parachute and stop the motors; return when ArduPilot reports that it was released.

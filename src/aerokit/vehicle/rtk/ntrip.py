@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
     from aerokit.vehicle.session.session import VehicleSession
-    from aerokit.vehicle.state.telemetry import Telemetry
 
 __all__ = ["Caster", "NtripClient"]
 
@@ -301,7 +300,9 @@ class NtripClient:
 
         async def exchange() -> _Response:
             reader, self._writer = await open_connection(caster.host, caster.port, ssl=context)
-            self._writer.write(caster.request(mount, self._position() if mount and self._sends_position else None))
+            self._writer.write(
+                caster.request(mount, gga_sentence(self._session) if mount and self._sends_position else None)
+            )
             return await _Response.read(reader)
 
         try:
@@ -336,12 +337,9 @@ class NtripClient:
     async def _report_position(self) -> None:
         with self._session.streaming("position", "gps"):
             while (writer := self._writer) is not None:
-                if sentence := self._position():
+                if sentence := gga_sentence(self._session):
                     writer.write(sentence)
                 await anyio.sleep(POSITION_INTERVAL_S if sentence else POSITION_POLL_INTERVAL_S)
-
-    def _position(self) -> bytes | None:
-        return gga_sentence(self._session.telemetry, self._session.connection.unix_time())
 
     def _close(self) -> None:
         writer, self._writer = self._writer, None
@@ -349,16 +347,16 @@ class NtripClient:
             writer.close()
 
 
-def gga_sentence(telemetry: Telemetry, unix_time: float) -> bytes | None:
-    """Return the position as ``$GPGGA,…``; None while no recent position is known."""
-    cell = telemetry.position
+def gga_sentence(session: VehicleSession) -> bytes | None:
+    """Return the vehicle's position as ``$GPGGA,…`` (NMEA); None while no recent position is known."""
+    cell = session.telemetry.position
     place = cell.latest
     if place is None or cell.age > POSITION_MAX_AGE_S or place.altitude_amsl_m is None:
         return None
-    receiver = next(iter(telemetry.cells["gps"].latest or ()), None)
+    receiver = next(iter(session.telemetry.cells["gps"].latest or ()), None)
     quality = QUALITIES.get(receiver.fix_type, 1) if receiver is not None else 1
     satellites = (receiver.satellites if receiver is not None else None) or 4
-    clock = time.strftime("%H%M%S", time.gmtime(unix_time))
+    clock = time.strftime("%H%M%S", time.gmtime(session.connection.unix_time()))
     fields = (
         f"GPGGA,{clock}.00,{_angle(place.latitude_deg, 2)},{'NS'[place.latitude_deg < 0]},"
         f"{_angle(place.longitude_deg, 3)},{'EW'[place.longitude_deg < 0]},{quality},{satellites:02d},1.0,"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from typing import TYPE_CHECKING
-from weakref import WeakKeyDictionary, ref
+from weakref import WeakKeyDictionary
 
 from aerokit._internal.arguments import checks_arguments
 from aerokit._internal.values import Snapshot
@@ -26,42 +26,37 @@ REPEAT_WINDOW_S = 0.9
 MAX_RECENT = 64
 
 
-class RtcmOutput:
-    """Numbers RTCM messages and sends them as GPS_RTCM_DATA, which has no target and so reaches every vehicle."""
+class _SentMessages:
+    """RTCM messages that were sent on one connection, however many vehicles use it."""
 
-    def __init__(self, connection: Connection) -> None:
-        # A strong reference would keep the entry of the connection in the table for ever.
-        self._connection = ref(connection)
-        self._sequence = 0
-        self._recent: dict[bytes, tuple[float, set[int]]] = {}
-
-    def send(self, message: bytes, sender: object) -> int:
-        """Send one RTCM message unless another sender has just sent it; return the number of MAVLink messages."""
-        connection = self._connection()
-        assert connection is not None
-        now, (at, senders) = connection.now(), self._recent.get(message, (0.0, {id(sender)}))
-        if id(sender) not in senders and now - at < REPEAT_WINDOW_S:
-            senders.add(id(sender))
-            return 0
-        pieces = fragments(message, self._sequence)
-        for piece in pieces:
-            connection.send(piece)
-        self._sequence += 1
-        self._recent.pop(message, None)
-        self._recent[message] = (now, {id(sender)})
-        if len(self._recent) > MAX_RECENT:
-            del self._recent[next(iter(self._recent))]
-        return len(pieces)
+    def __init__(self) -> None:
+        self.sequence = 0
+        self.recent: dict[bytes, tuple[float, set[int]]] = {}
+        """Message → time of the transmission, and the senders that have passed it."""
 
 
-_OUTPUTS: WeakKeyDictionary[Connection, RtcmOutput] = WeakKeyDictionary()
+_SENT: WeakKeyDictionary[Connection, _SentMessages] = WeakKeyDictionary()
 
 
-def output_of(connection: Connection) -> RtcmOutput:
-    """Return the output of this connection, shared by all its vehicles."""
-    if connection not in _OUTPUTS:
-        _OUTPUTS[connection] = RtcmOutput(connection)
-    return _OUTPUTS[connection]
+def send_rtcm(connection: Connection, message: bytes, sender: object) -> int:
+    """Send one RTCM message as GPS_RTCM_DATA, which has no target and so reaches every vehicle of the connection.
+
+    Sends nothing if another sender has just sent it. Returns the number of MAVLink messages.
+    """
+    sent = _SENT.setdefault(connection, _SentMessages())
+    now, (at, senders) = connection.now(), sent.recent.get(message, (0.0, {id(sender)}))
+    if id(sender) not in senders and now - at < REPEAT_WINDOW_S:
+        senders.add(id(sender))
+        return 0
+    pieces = fragments(message, sent.sequence)
+    for piece in pieces:
+        connection.send(piece)
+    sent.sequence += 1
+    sent.recent.pop(message, None)
+    sent.recent[message] = (now, {id(sender)})
+    if len(sent.recent) > MAX_RECENT:
+        del sent.recent[next(iter(sent.recent))]
+    return len(pieces)
 
 
 class Corrections(Snapshot):
@@ -86,7 +81,6 @@ class Rtk:
 
     def __init__(self, context: VehicleContext) -> None:
         self._session = context.session
-        self._output = output_of(context.session.connection)
         self._corrections: StateCell[Corrections] = StateCell(
             "rtk.corrections", context.session.connection.now, "corrections by rtk.send or rtk.ntrip"
         )
@@ -136,7 +130,7 @@ class Rtk:
     def _send(self, message: bytes) -> None:
         if self._session.is_closed:
             raise ConnectionClosed("the block of this vehicle was left; nothing was sent")
-        self._output.send(message, self)
+        send_rtcm(self._session.connection, message, self)
         now = self._session.connection.now()
         self._messages += 1
         self._bytes += len(message)
