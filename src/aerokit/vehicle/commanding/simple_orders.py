@@ -99,7 +99,7 @@ class SimpleOrder(Snapshot):
 
         Args:
             context: the vehicle.
-            values: one for each `Argument`, in order; a message that reports the effect is compared with them.
+            values: one for each `Argument`, in order. `Effect.is_reported` gets them, too.
             of: the order to a device of which this is a further command.
             topic: the device that the command is for. A newer order with the same topic ends the wait for this one.
             component_id: the target component; None: the autopilot.
