@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
     from aerokit import errors as errors
     from aerokit import events as events
+    from aerokit._internal.wire import wire_implementation as wire_implementation
     from aerokit.connection.connection import Connection as Connection
     from aerokit.connection.heartbeats import OwnHeartbeat as OwnHeartbeat
     from aerokit.connection.opening import open_connection as open_connection
@@ -82,6 +83,7 @@ __dir__: Callable[[], list[str]]
 __getattr__, __dir__, __all__ = lazy_exports(
     __name__,
     {
+        "aerokit._internal.wire": ("wire_implementation",),
         "aerokit.connection.connection": ("Connection",),
         "aerokit.connection.opening": ("open_connection",),
         "aerokit.connection.heartbeats": ("OwnHeartbeat",),

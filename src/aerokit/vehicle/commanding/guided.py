@@ -134,8 +134,8 @@ class Guided:
     ) -> SetpointStream[AttitudeRateSetpoint]:
         """Stream body rates with thrust (SET_ATTITUDE_TARGET without an attitude).
 
-        ArduCopter and PX4 obey them. Nothing levels the vehicle: without a new set-point it is told to hold after
-        ``valid_for_s``, and turns on until it does.
+        ArduCopter and PX4 obey them. Nothing levels the vehicle: it keeps turning until the next set-point, or until it
+        holds, which is ordered after ``valid_for_s`` without one.
         """
         return self._stream("attitude rate", self._encode.attitude_rate, initial, rate_hz, valid_for_s, max_lag_s)
 
