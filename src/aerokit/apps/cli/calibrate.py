@@ -149,11 +149,9 @@ class Display:
             return
         record = step.to_dict()
         del record["result"]
-        pose, instruction = self._shown
-        self._shown = (step.pose, step.instruction)
-        lines = lines_of(step) if step.pose is not pose else [f"  {step.instruction[:76]}"]
-        is_new = self._shown != (pose, instruction)
-        emit(self._options, "calibration_step", record, "\n".join(lines) if is_new else None)
+        shown, self._shown = self._shown, (step.pose, step.instruction)
+        lines = lines_of(step if step.pose is not shown[0] else step.replace(pose=None))
+        emit(self._options, "calibration_step", record, "\n".join(lines) if self._shown != shown else None)
         if not self._options.json and step.progress is not None and sys.stdout.isatty():
             print(f"{CLEAR_LINE}{bar(step.progress)}", end="\r", flush=True)
 
