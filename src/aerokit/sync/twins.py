@@ -1752,14 +1752,12 @@ class Actuators(TwinOf["AsyncActuators"]):
         """Switch a relay over and back ``count`` times (MAV_CMD_DO_REPEAT_RELAY).
 
         Returns when ArduPilot has acknowledged and begins. Never sent twice. ArduPilot only.
+        Raises as :meth:`repeat_servo`.
 
         Args:
             number: relay from 0 to 15.
             count: number of cycles, 1 to 1000.
             period_s: seconds of one cycle, above 0, at most 60.
-
-        Raises:
-            InvalidArgument, NotSupported, CommandRejected, CommandTimeout: as for ``set_servo``.
         """
         self._loop.run(self.aio.repeat_relay, number, count=count, period_s=period_s)
 
@@ -1771,16 +1769,10 @@ class Actuators(TwinOf["AsyncActuators"]):
         """Set actuators by number: the first value is for "Peripheral via Actuator Set 1" (MAV_CMD_DO_SET_ACTUATOR).
 
         Returns when PX4 has acknowledged, because no message reports the values. It acknowledges also if no output has
-        this function (PWM_MAIN_FUNCn 301 to 306). PX4 only.
+        this function (PWM_MAIN_FUNCn 301 to 306). PX4 only; ArduPilot has servos. Raises as :meth:`repeat_servo`.
 
         Args:
-            values: up to six values, −1 to 1; None leaves an actuator as it is.
-
-        Raises:
-            InvalidArgument: none or more than six values, or one is out of range. Nothing was sent.
-            NotSupported: ArduPilot, which has :meth:`set_servo`. Nothing was sent.
-            CommandRejected: the vehicle refused.
-            CommandTimeout: there was no acknowledgement.
+            values: one to six values, −1 to 1; None leaves an actuator as it is.
         """
         self._loop.run(self.aio.set_actuators, *values)
 

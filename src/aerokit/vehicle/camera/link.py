@@ -342,6 +342,6 @@ class CameraBlock:
             raise
         operation.commit()
 
-    async def __aexit__(self, exc_type: object, exc: BaseException | None, traceback: object) -> None:
+    async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         if self._operation is not None:
-            await self._operation.stop(is_awaited=exc is None)
+            await self._operation.stop(is_awaited=error is None)

@@ -129,10 +129,10 @@ class LogStream(ReadOnly):
         session = self._context.session
         session.send(LoggingAck(session.system_id, session.component_id, message.sequence))
 
-    async def __aexit__(self, exc_type: object, exc: BaseException | None, traceback: object) -> None:
+    async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         is_stopped = False
         try:
-            if exc is None:  # PX4 acknowledges when its last message was acknowledged (logger.cpp, stop_log_mavlink).
+            if error is None:  # PX4 acknowledges when its last message was acknowledged (logger.cpp, stop_log_mavlink).
                 await STOP.send(self._context)
                 is_stopped = True
         finally:

@@ -107,18 +107,18 @@ class GimbalRates(ValueStream[tuple[float, float]]):
             raise
         return self
 
-    async def __aexit__(self, exc_type: object, exc: BaseException | None, traceback: object) -> None:
+    async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         if self._stopped is None and (reason := self._takeover()):
             self._stop(reason, hold=False)
         if self._stopped is None:
             zero = self._zero()
             self._end()
             self._stopped = SetpointStreamStopped("the block of these rates has ended")
-            if exc is None:
+            if error is None:
                 await zero.send_and_wait(f"{self._orders.name}: rates of zero")
             else:
                 zero.send_soon()
-        elif exc is None and not self._is_reported:
+        elif error is None and not self._is_reported:
             raise self._stopped
 
     def _send(self) -> None:
