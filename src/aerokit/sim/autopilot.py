@@ -11,9 +11,9 @@ from aerokit.mavlink.enums import MavProtocolCapability
 from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.messages import SetupSigning
 from aerokit.mavlink.signing import LAST_TIMESTAMP, Signing, SigningKey, timestamp_at
+from aerokit.protocols.servers.files import FileTree
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandHandler, CommandServer, ReceivedCommand
-from aerokit.sim.ftp import FileTree
 from aerokit.sim.vehicle import AttachableComponent, SimulatedVehicle
 
 

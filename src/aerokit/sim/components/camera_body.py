@@ -20,6 +20,7 @@ from aerokit.mavlink.enums import (
 from aerokit.mavlink.messages import CameraImageCaptured
 from aerokit.parameters import parse_definition
 from aerokit.parameters.definition import CameraDefinition
+from aerokit.protocols.servers.files import FileTree
 from aerokit.sim.commands import ReceivedCommand, whole
 from aerokit.sim.components.captures import (
     FOCAL_LENGTH_MM,
@@ -32,7 +33,6 @@ from aerokit.sim.components.captures import (
 )
 from aerokit.sim.components.component import Builder, ExtendedParameters, pose_of
 from aerokit.sim.components.gimbal import SimulatedGimbal
-from aerokit.sim.ftp import FileTree
 
 DEFINITION_PATH = "/camera_definition.xml"
 """MAVFTP path of the camera definition."""

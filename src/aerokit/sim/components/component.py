@@ -12,10 +12,11 @@ from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import CommandInt, CommandLong, Heartbeat, MessageInterval, Statustext
 from aerokit.parameters import CameraDefinition, SettingValue
 from aerokit.parameters.parameter import setting_bytes, setting_value, settings_equal
+from aerokit.protocols.servers.files import FileTree
+from aerokit.protocols.servers.ftp import SessionFtpServer
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandHandler, CommandServer, ReceivedCommand, whole
 from aerokit.sim.faults import Faults
-from aerokit.sim.ftp import FileTree, FtpServer
 from aerokit.sim.motion import GlobalPoint, true_place
 from aerokit.sim.vehicle import SimulatedVehicle
 
@@ -42,7 +43,7 @@ def pose_of(vehicle: SimulatedVehicle) -> Pose | None:
     return Pose(place, height, motion.roll, motion.pitch, motion.yaw)
 
 
-def serve_files(component: SimulatedComponent, files: FileTree) -> FtpServer:
+def serve_files(component: SimulatedComponent, files: FileTree) -> SessionFtpServer[FileTree]:
     """Serve files by MAVFTP under the component's address, as PX4 does; call it in ``listen()``.
 
     The files may change at any time, see `FileTree.put`. Power-off ends sessions and keeps files. The component's
