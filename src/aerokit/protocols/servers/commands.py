@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from aerokit.mavlink.enums import MavFrame, MavResult
 from aerokit.mavlink.messages import CommandAck, CommandCancel, CommandInt, CommandLong
@@ -134,10 +135,10 @@ class CommandServer:
 
         self._host.call_later(max(1, len(progress.percents)) * progress.interval_s, finish)
 
-    def answer(self, command: ReceivedCommand, result: int, progress: int = 0) -> None:
-        """Send an acknowledgement."""
+    def answer(self, command: ReceivedCommand, result: int, progress: int = 0, detail: int = 0) -> None:
+        """Send an acknowledgement; ``detail`` is its ``result_param2``."""
         system, component = command.sender
-        ack = CommandAck(command.command, result, progress, 0, system, component)
+        ack = CommandAck(command.command, result, progress, detail, system, component)
         self._host.send(ack, command.channel)
 
 
@@ -149,72 +150,95 @@ PROGRESS_INTERVAL_S = 0.5
 UNKNOWN_PROGRESS = 255
 
 
-class RunningCommand:
-    """A command that takes time. Call `finish` once; ``cancel`` is called by COMMAND_CANCEL."""
+RESULT_MAX_AGE_S = 5.0
+"""Seconds for which a result is sent again instead of executing a repeated command."""
 
-    def __init__(self, server: RunningCommands, command: ReceivedCommand, cancel: Callable[[], None]) -> None:
+
+class Outcome(NamedTuple):
+    """Result of a command: fields of COMMAND_ACK."""
+
+    result: int
+    progress: int = 0
+    detail: int = 0
+
+
+class RunningCommand:
+    """A command that is being executed; ``cancel`` is called by COMMAND_CANCEL."""
+
+    def __init__(self, command: ReceivedCommand, cancel: Callable[[], None]) -> None:
         self.command = command
         self.progress: int = UNKNOWN_PROGRESS
         """Percent; 255 if unknown."""
         self.cancel = cancel
-        self._server = server
-
-    def finish(self, result: int) -> None:
-        """Send the result."""
-        self._server.finish(self, result)
 
 
 class RunningCommands:
     """Commands that take time: IN_PROGRESS while they run, COMMAND_CANCEL, and at most one of each MAV_CMD.
 
-    A repeated transmission of a running command is answered by IN_PROGRESS and does not start it twice. Another
-    command with the same MAV_CMD is TEMPORARILY_REJECTED, as is every command above ``MAX_RUNNING_COMMANDS``.
+    A repeated transmission (COMMAND_LONG with a confirmation) never executes a command twice: it is answered by
+    IN_PROGRESS, or by the result if the command ended at most five seconds ago. Another command with the same MAV_CMD
+    is TEMPORARILY_REJECTED while the first one runs, as is every command above ``MAX_RUNNING_COMMANDS``.
     """
 
     def __init__(self, host: ServerHost, server: CommandServer) -> None:
         self._host = host
         self._server = server
         self._running: dict[int, RunningCommand] = {}
+        self._ended: dict[int, tuple[ReceivedCommand, Outcome, float]] = {}
         host.on(CommandCancel, self._on_cancel)
 
     def __len__(self) -> int:
         return len(self._running)
 
-    def refusal(self, command: ReceivedCommand) -> int | None:
-        """Return the answer to a command that must not start now, else None."""
+    def start(self, command: ReceivedCommand, cancel: Callable[[], None]) -> RunningCommand | None:
+        """Register a command. None if it must not be executed; it has been answered then."""
         running = self._running.get(command.command)
-        if running is not None:
-            first = running.command
-            is_same = (command.sender, command.params) == (first.sender, first.params)
-            if is_same and command.confirmation > 0:
-                self._server.answer(command, MavResult.IN_PROGRESS, running.progress)
-                return None
-            return MavResult.TEMPORARILY_REJECTED
-        return MavResult.TEMPORARILY_REJECTED if len(self._running) >= MAX_RUNNING_COMMANDS else None
-
-    def is_running(self, command: int) -> bool:
-        return command in self._running
-
-    def start(self, command: ReceivedCommand, cancel: Callable[[], None]) -> RunningCommand:
-        """Register a command that `refusal` has not refused."""
-        running = self._running[command.command] = RunningCommand(self, command, cancel)
-        self._host.call_later(PROGRESS_DELAY_S, lambda: self._report(running))
+        if running is not None and _is_repeated(command, running.command):
+            self._server.answer(command, MavResult.IN_PROGRESS, running.progress)
+            return None
+        ended = self._ended.get(command.command)
+        if ended is not None and _is_repeated(command, ended[0]) and self._host.now - ended[2] <= RESULT_MAX_AGE_S:
+            self._server.answer(command, *ended[1])
+            return None
+        if running is not None or len(self._running) >= MAX_RUNNING_COMMANDS:
+            self._server.answer(command, MavResult.TEMPORARILY_REJECTED)
+            return None
+        running = self._running[command.command] = RunningCommand(command, cancel)
+        self._host.call_later(PROGRESS_DELAY_S, lambda: self._report_repeatedly(running))
         return running
 
-    def _report(self, running: RunningCommand) -> None:
+    def report(self, running: RunningCommand, percent: int) -> None:
+        """Send IN_PROGRESS with this percentage now."""
+        running.progress = percent
+        if self._running.get(running.command.command) is running:
+            self._server.answer(running.command, MavResult.IN_PROGRESS, percent)
+
+    def _report_repeatedly(self, running: RunningCommand) -> None:
         if self._running.get(running.command.command) is running:
             self._server.answer(running.command, MavResult.IN_PROGRESS, running.progress)
-            self._host.call_later(PROGRESS_INTERVAL_S, lambda: self._report(running))
+            self._host.call_later(PROGRESS_INTERVAL_S, lambda: self._report_repeatedly(running))
 
-    def finish(self, running: RunningCommand, result: int) -> None:
-        if self._running.get(running.command.command) is running:
-            del self._running[running.command.command]
-            self._server.answer(running.command, result)
+    def finish(self, running: RunningCommand, outcome: Outcome) -> None:
+        """Send the result."""
+        command = running.command
+        if self._running.get(command.command) is running:
+            del self._running[command.command]
+            self._ended[command.command] = (command, outcome, self._host.now)
+            self._server.answer(command, *outcome)
+
+    def cancel_all(self) -> None:
+        """Cancel everything that runs, at the end of the component."""
+        for running in tuple(self._running.values()):
+            running.cancel()
 
     def _on_cancel(self, message: CommandCancel, _: Channel) -> None:
         running = self._running.get(message.command)
         if running is not None:
             running.cancel()
+
+
+def _is_repeated(command: ReceivedCommand, first: ReceivedCommand) -> bool:
+    return command.confirmation > 0 and (command.sender, command.params) == (first.sender, first.params)
 
 
 def whole(value: float) -> int:

@@ -6,7 +6,7 @@ import zlib
 from collections.abc import Callable, Hashable
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
 from aerokit.mavlink.messages import FileTransferProtocol
@@ -445,7 +445,7 @@ def _line(entry: tuple[str, int | None]) -> bytes:
     return (f"D{name}" if size is None else f"F{name}\t{size}").encode()
 
 
-_HANDLERS: dict[int, Callable[[SessionFtpServer[FileSystem], FtpPeer, FtpPacket], FtpPacket | None]] = {
+_HANDLERS: dict[int, Callable[[SessionFtpServer[Any], FtpPeer, FtpPacket], FtpPacket | None]] = {
     Op.NONE: lambda server, peer, request: server._none(peer, request),
     Op.TERMINATESESSION: lambda server, peer, request: server._terminate(peer, request),
     Op.RESETSESSION: lambda server, peer, request: server._reset(peer, request),

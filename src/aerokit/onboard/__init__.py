@@ -1,0 +1,35 @@
+"""This program as a MAVLink component: `aerokit.component`, and ready-made parts for it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from aerokit._internal.imports import lazy_exports
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from aerokit.onboard.arguments import Param as Param
+    from aerokit.onboard.arguments import Range as Range
+    from aerokit.onboard.commands import CommandRequest as CommandRequest
+    from aerokit.onboard.commands import CommandResult as CommandResult
+    from aerokit.onboard.component import OnboardComponent as OnboardComponent
+    from aerokit.onboard.identity import Identity as Identity
+    from aerokit.onboard.missions import ComponentMissions as ComponentMissions
+    from aerokit.onboard.opening import component as component
+    from aerokit.onboard.parameters import ComponentParameters as ComponentParameters
+
+__getattr__: Callable[[str], Any]
+__dir__: Callable[[], list[str]]
+__getattr__, __dir__, __all__ = lazy_exports(
+    __name__,
+    {
+        "aerokit.onboard.arguments": ("Param", "Range"),
+        "aerokit.onboard.commands": ("CommandRequest", "CommandResult"),
+        "aerokit.onboard.component": ("OnboardComponent",),
+        "aerokit.onboard.identity": ("Identity",),
+        "aerokit.onboard.missions": ("ComponentMissions",),
+        "aerokit.onboard.opening": ("component",),
+        "aerokit.onboard.parameters": ("ComponentParameters",),
+    },
+)
