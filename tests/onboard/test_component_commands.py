@@ -146,8 +146,8 @@ async def test_position_of_command_int_is_in_degrees() -> None:
         def look(request: CommandRequest) -> None:
             found.append(request)
 
-        frame, place = MavFrame.GLOBAL_RELATIVE_ALT, (473977420, 85455940, 30.0)
-        command = m.CommandInt(*station.target, frame, MavCmd.DO_SET_ROI_LOCATION, 0, 0, 0, 0, 0, 0, *place)
+        head = (*station.target, MavFrame.GLOBAL_RELATIVE_ALT, MavCmd.DO_SET_ROI_LOCATION, 0, 0)
+        command = m.CommandInt(*head, 0.0, 0.0, 0.0, 0.0, 473977420, 85455940, 30.0)
         await station.ask(command, m.CommandAck)
     position = found[0].position
     assert (position.latitude_deg, position.altitude_relative_m) == (47.397742, 30.0)

@@ -11,9 +11,14 @@ if TYPE_CHECKING:
 
     from aerokit.onboard.arguments import Param as Param
     from aerokit.onboard.arguments import Range as Range
+    from aerokit.onboard.camera import Camera as Camera
+    from aerokit.onboard.camera import Photo as Photo
+    from aerokit.onboard.camera import Storage as Storage
     from aerokit.onboard.commands import CommandRequest as CommandRequest
     from aerokit.onboard.commands import CommandResult as CommandResult
     from aerokit.onboard.component import OnboardComponent as OnboardComponent
+    from aerokit.onboard.gimbal import Gimbal as Gimbal
+    from aerokit.onboard.gimbal import GimbalTarget as GimbalTarget
     from aerokit.onboard.identity import Identity as Identity
     from aerokit.onboard.missions import ComponentMissions as ComponentMissions
     from aerokit.onboard.opening import component as component
@@ -25,8 +30,10 @@ __getattr__, __dir__, __all__ = lazy_exports(
     __name__,
     {
         "aerokit.onboard.arguments": ("Param", "Range"),
+        "aerokit.onboard.camera": ("Camera", "Photo", "Storage"),
         "aerokit.onboard.commands": ("CommandRequest", "CommandResult"),
         "aerokit.onboard.component": ("OnboardComponent",),
+        "aerokit.onboard.gimbal": ("Gimbal", "GimbalTarget"),
         "aerokit.onboard.identity": ("Identity",),
         "aerokit.onboard.missions": ("ComponentMissions",),
         "aerokit.onboard.opening": ("component",),

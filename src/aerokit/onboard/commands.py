@@ -138,6 +138,10 @@ class ComponentCommands:
             raise InvalidArgument(f"{command_name(command)} already has a handler")
         self.handlers[command] = partial(self._execute, function, arguments_of(function))
 
+    def add_raw(self, command: int, function: Callable[[ReceivedCommand], Awaitable[int]]) -> None:
+        """Register a coroutine function of a protocol server, which checks the parameters itself."""
+        self.handlers[command] = lambda received: self._execute(lambda _: function(received), (), received)
+
     def cancel_all(self) -> None:
         self._running.cancel_all()
 
@@ -183,7 +187,8 @@ class ComponentCommands:
 
     def _fail(self, running: RunningCommand, function: Callable[..., Any], error: Exception) -> None:
         """Answer with the result for an error, and explain it in a status text."""
-        name = getattr(function, "__name__", command_name(running.command.command))
+        name = getattr(function, "__name__", "<lambda>")
+        name = command_name(running.command.command) if name == "<lambda>" else name
         if not isinstance(error, AerokitError):
             logger.error("the handler %s of a command failed", name, exc_info=error)
         self._host.send_text(MavSeverity.WARNING, f"{name}: {error or type(error).__name__}")

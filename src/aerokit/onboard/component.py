@@ -34,6 +34,8 @@ from aerokit.protocols.servers.intervals import MessageStreams
 
 if TYPE_CHECKING:
     from aerokit.connection.connection import Connection
+    from aerokit.onboard.camera import Camera
+    from aerokit.onboard.gimbal import Gimbal
 
 HEARTBEAT_INTERVAL_S = 1.0
 MAX_STREAMS = 64
@@ -284,6 +286,39 @@ class OnboardComponent:
             self._streams.builders[m.MissionCurrent.ID] = self._missions.build_current
             self._identity.capabilities |= Can.MISSION_INT | Can.MISSION_FENCE | Can.MISSION_RALLY
         return self._missions
+
+    # ---------------------------------------------------------------------------- ready-made parts
+
+    def add_camera(self, camera: Camera) -> None:
+        """Serve the camera protocol: photos, series, videos, storage, streams, zoom, focus, tracking, settings.
+
+        https://mavlink.io/en/services/camera.html
+
+        Args:
+            camera: an instance of the program's class, see :class:`~aerokit.onboard.Camera`.
+
+        Raises:
+            InvalidArgument: the component has a camera, or its definition file and parameters exclude each other.
+            FileFormatError: the definition file is damaged.
+        """
+        from aerokit.onboard.parts import add_camera  # Imported here because few components have one.
+
+        add_camera(self, camera)
+
+    def add_gimbal(self, gimbal: Gimbal) -> None:
+        """Serve the gimbal protocol v2, as gimbal device and gimbal manager in one component.
+
+        https://mavlink.io/en/services/gimbal_v2.html
+
+        Args:
+            gimbal: an instance of the program's class, see :class:`~aerokit.onboard.Gimbal`.
+
+        Raises:
+            InvalidArgument: the component has a gimbal.
+        """
+        from aerokit.onboard.parts import add_gimbal  # Imported here because few components have one.
+
+        add_gimbal(self, gimbal)
 
     async def serve_forever(self) -> None:
         """Wait until the connection ends, and raise its error.

@@ -58,7 +58,8 @@ class EventSender:
             self._host.send(event, channel)
         if not found:
             oldest = self._sent[0].sequence if self._sent else 0
-            error = m.ResponseEventError(*channel, request.first_sequence, oldest, _UNAVAILABLE)
+            system, component = channel
+            error = m.ResponseEventError(system, component, request.first_sequence, oldest, _UNAVAILABLE)
             self._host.send(error, channel)
 
 

@@ -57,7 +57,8 @@ class ComponentParameters(Mapping[str, ParameterValue]):
         self._is_dirty = False
         self._saving: asyncio.Task[None] | None = None
         self._classic = TypedParameterServer(host, _Store(self), bytewise=bytewise, list_rate_hz=LIST_RATE_HZ)
-        self._extended = TypedExtendedServer(host, _Store(self))
+        self._extended: TypedExtendedServer | None = None
+        self._is_excluded = False
 
     def add(
         self,
@@ -92,6 +93,8 @@ class ComponentParameters(Mapping[str, ParameterValue]):
             InvalidArgument: the name is invalid or taken, the default is not allowed, or there are 1000 parameters.
         """
         check_name(name)
+        if self._is_excluded:
+            raise InvalidArgument("a component has either parameters or the settings of a camera definition")
         if name in self._rows:
             raise InvalidArgument(f"parameter {name} was added twice")
         if len(self._rows) >= MAX_COMPONENT_PARAMETERS:
@@ -118,6 +121,14 @@ class ComponentParameters(Mapping[str, ParameterValue]):
             except InvalidArgument as error:
                 logger.warning("%s: the default is used: %s", self._path, error)
         self._rows[name] = row
+        if self._extended is None:  # not before, because a camera may serve its own settings by PARAM_EXT
+            self._extended = TypedExtendedServer(self._host, _Store(self))
+
+    def _give_way(self) -> None:
+        """Leave PARAM_EXT to the settings of a camera definition."""
+        if self._rows:
+            raise InvalidArgument("a component has either parameters or the settings of a camera definition")
+        self._is_excluded = True
 
     def set(self, name: str, value: int | float | str) -> None:
         """Change a value from this program, and announce it. ``on_set`` is not called.

@@ -75,7 +75,7 @@ class _Pictures:
         in_wrong_mode = _has_wrong_mode(camera, CameraMode.VIDEO, _CAN_ALWAYS_CAPTURE)
         if not camera.can(CameraCapFlags.CAPTURE_IMAGE):
             return MavResult.UNSUPPORTED
-        if command.param1 not in (0.0, 1.0) or interval < 0 or count < 0 or in_wrong_mode:
+        if not _is_own(command.param1) or interval < 0 or count < 0 or in_wrong_mode:
             return MavResult.DENIED
         if count == 1 and number > 0 and number == self._last_number:
             return MavResult.ACCEPTED
@@ -88,7 +88,7 @@ class _Pictures:
         return MavResult.ACCEPTED
 
     async def stop(self, command: ReceivedCommand) -> int:
-        if command.param1 not in (0.0, 1.0):
+        if not _is_own(command.param1):
             return MavResult.DENIED
         self._camera.captures.stop()
         return MavResult.ACCEPTED
@@ -102,7 +102,7 @@ class _Pictures:
     async def format(self, command: ReceivedCommand) -> int:
         """Param 2 is 1 to format, param 3 is 1 to reset the image log."""
         camera, captures = self._camera, self._camera.captures
-        if command.param1 not in (0.0, 1.0):
+        if not _is_own(command.param1):
             return MavResult.DENIED
         if captures.is_busy or captures.is_recording:
             return MavResult.TEMPORARILY_REJECTED
@@ -210,6 +210,11 @@ class _Settings:
     def _send_settings(self) -> int:
         self._camera.host.send(camera_settings(self._camera))
         return MavResult.ACCEPTED
+
+
+def _is_own(device: float) -> bool:
+    """Return True if param 1 selects this camera: 0 (all), 1 (the only one), or NaN, which MAVSDK sends."""
+    return math.isnan(device) or device in (0.0, 1.0)
 
 
 def _has_wrong_mode(camera: CameraDevice, wrong: int, unless: int) -> bool:
