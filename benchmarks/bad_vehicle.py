@@ -1,10 +1,11 @@
-"""A simulated copter behind a lossy link, in a process of its own: the vehicle of ``transfers.py``.
+"""A simulated copter behind a lossy link, in a separate process: the vehicle of ``transfers.py``.
 
     python benchmarks/bad_vehicle.py TASK PORT LOSS SEED DELAY_S SIZE
 
-It sends to this UDP port of this machine. Each frame is lost with the same probability in both directions. It prints
-``ready``, and on a line ``dump FOLDER`` it writes its contents: ``vehicle-parameters.json``, ``vehicle.json`` (its
-mission, without home) and ``vehicle.bin`` (the uploaded file). It ends when it is terminated.
+The vehicle sends to this UDP port of this machine. Each frame is lost with the probability LOSS, in both directions.
+The process prints ``ready``. When it reads a line ``dump FOLDER``, it writes the content of the vehicle to this folder:
+``vehicle-parameters.json``, ``vehicle.json`` (the mission without home) and ``vehicle.bin`` (the uploaded file). It
+runs until it is terminated.
 """
 
 from __future__ import annotations
@@ -24,11 +25,11 @@ from aerokit.transport import create_link
 __all__ = ["main"]
 
 QUICK_PARAMETERS = 100
-"""DroneKit fetches all of them before it does anything else."""
+"""Number of parameters in a quick run, and for missions and files: DroneKit downloads all of them at first."""
 
 
 def main(arguments: list[str]) -> None:
-    """Serve until the process is ended."""
+    """Serve until the process is terminated."""
     task, port, loss, seed, delay_s, size = arguments
     bad = FaultModel(loss=float(loss), delay_s=float(delay_s))
     radio = FaultyLink(create_link(f"udpout:127.0.0.1:{port}"), bad, seed=int(seed))

@@ -1,9 +1,9 @@
-"""Shared code of the clients of ``transfers.py``: one task from the command line, timed, its result as JSON.
+"""Shared code of the clients of ``transfers.py``: runs and times one task, and prints the result as JSON.
 
     python benchmarks/client_….py TASK WAY PORT SIZE FOLDER
 
-``WAY`` selects one of the methods that a library has. Downloads are written to FOLDER (``out.json``, ``out.bin``);
-uploads are read from there (``in.bin``).
+``WAY`` selects a transfer method of the library. Downloads are written to FOLDER (``out.json``, ``out.bin``); uploads
+are read from there (``in.bin``).
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ class Task:
 
     @property
     def seconds(self) -> float:
-        """Seconds from `begin` to `end`; until now while it has not ended."""
+        """Seconds from `begin` to `end`, or to now if the task has not ended."""
         return time.perf_counter() - self._began_at if self._seconds is None else self._seconds
 
     def begin(self) -> None:
-        """Connected: time counts from here."""
+        """Start the time, when the client is connected."""
         self._began_at = time.perf_counter()
 
     def end(self) -> None:
-        """Transferred; what follows is taking leave."""
+        """Stop the time, when the transfer is complete. Disconnecting is not measured."""
         self._seconds = self.seconds
 
 
 def run(perform: Callable[[Task], Any]) -> None:
-    """Run the task of the command line with one library; the last line of standard output is the result."""
+    """Run the task of the command line with one library. The last line of standard output is the result."""
     name, way, port, size, folder = sys.argv[1:]
     task = Task(name, way, int(port), int(size), Path(folder))
     outcome: dict[str, Any] = {}
@@ -56,4 +56,4 @@ def run(perform: Callable[[Task], Any]) -> None:
         task.end()
         outcome["error"] = f"{type(error).__name__}: {error}".partition("\n")[0][:200]
     print("\n" + json.dumps({"seconds": task.seconds, **outcome}), flush=True)
-    os._exit(0)  # some libraries leave threads behind that do not end
+    os._exit(0)  # threads of some libraries would keep the process alive

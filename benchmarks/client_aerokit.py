@@ -1,6 +1,6 @@
-"""aerokit's side of ``transfers.py``: its public interface.
+"""The aerokit client of ``transfers.py``, which uses the public API.
 
-``auto`` lets it choose MAVFTP, ``list`` and ``items`` do not.
+The way ``auto`` uses MAVFTP if possible; ``list`` and ``items`` never do.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from aerokit.missions import Mission, MissionItem
 
 
 def perform(task: Task) -> Any:
-    """Connect, then transfer; only the latter is timed."""
+    """Connect, then transfer. Only the transfer is timed."""
     return asyncio.run(_perform(task))
 
 

@@ -2,8 +2,8 @@
 
     python benchmarks/client_classic.py MODULE '{"task": "cpu", "address": "udpin:127.0.0.1:14550"}'
 
-MODULE is ``dronekit`` or ``aerokit.dronekit``. It prints ``connecting`` and ``connected``; its last line is the
-result as JSON.
+MODULE is ``dronekit`` or ``aerokit.dronekit``. The script prints ``connecting`` and ``connected``, and on its last line
+the result as JSON.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ READS = (
     "location.global_frame", "location.global_relative_frame", "location.global_relative_frame.alt",
     "location.local_frame", "is_armable", "ekf_ok", "last_heartbeat", "rangefinder", "channels", "gimbal",
 )  # fmt: skip
-"""The attributes that are read."""
-# Attributes that the usual program listens to, besides the message HEARTBEAT.
+"""Attributes whose read time is measured."""
+# Attributes that a typical program listens to, besides the message HEARTBEAT.
 USUAL = (
     "mode", "armed", "attitude", "location.global_relative_frame", "heading", "battery", "gps_0",
 )  # fmt: skip
@@ -40,7 +40,7 @@ Found = dict[str, Any]
 
 
 def main(arguments: list[str]) -> None:
-    """Do one task and print what came of it."""
+    """Run one task and print its result."""
     module, options = arguments[0], json.loads(arguments[1])
     began_at = time.perf_counter()
     collections.MutableMapping = collections.abc.MutableMapping  # type: ignore[attr-defined]  # for DroneKit
@@ -49,14 +49,14 @@ def main(arguments: list[str]) -> None:
     logging.disable(logging.CRITICAL)
     found = TASKS[options.pop("task")](dronekit, **options)
     print(json.dumps({**found, "import_s": imported_s}), flush=True)
-    os._exit(0)  # DroneKit may leave threads behind that do not end
+    os._exit(0)  # threads of DroneKit would keep the process alive
 
 
 # --------------------------------------------------------------------------------------- the tasks
 
 
 def connect_ready(dronekit: Any, address: str) -> Found:
-    """``connect(wait_ready=True)``: how long it takes."""
+    """Measure the duration of ``connect(wait_ready=True)``."""
     print("connecting", flush=True)
     cpu, began_at = time.process_time(), time.perf_counter()
     vehicle = dronekit.connect(address, wait_ready=True, timeout=120)
@@ -65,10 +65,10 @@ def connect_ready(dronekit: Any, address: str) -> Found:
 
 
 def cpu(dronekit: Any, address: str, listeners: str, settle_s: float, window_s: float) -> Found:
-    """Processor time of this process, all its threads, while messages come in, and how many came."""
+    """Measure the processor time of this process with all threads, and count the messages received meanwhile."""
     vehicle = _connected(dronekit, address)
     calls = LISTENERS[listeners](vehicle)
-    _say_connected()
+    _report_connected()
     time.sleep(settle_s)
     received, called, used, began_at = (
         _received(vehicle),
@@ -84,29 +84,29 @@ def cpu(dronekit: Any, address: str, listeners: str, settle_s: float, window_s: 
 
 
 def latency(dronekit: Any, address: str, settle_s: float, window_s: float) -> Found:
-    """Record when listeners were called, by the system's monotonic clock in ns, and the round number of the value."""
+    """Record the time of each call of a listener, in ns of the monotonic clock, with the round number of the value."""
     from dronekit_traffic import keys_of
 
     vehicle = _connected(dronekit, address)
-    noted: list[tuple[int, str, Any]] = []
+    calls: list[tuple[int, str, Any]] = []
     clock = time.monotonic_ns
 
-    def note(_: Any, name: str, value: Any) -> None:
-        noted.append((clock(), name, value))
+    def record(_: Any, name: str, value: Any) -> None:
+        calls.append((clock(), name, value))
 
-    _listen_as_usual(vehicle, note, note)
-    _say_connected()
+    _add_typical_listeners(vehicle, record, record)
+    _report_connected()
     time.sleep(settle_s)
-    began_at = len(noted)
+    first = len(calls)
     time.sleep(window_s)
-    keyed = [(at, name, keys_of(name, value)) for at, name, value in noted[began_at:]]
-    return {"noted": [each for each in keyed if each[2] is not None]}
+    keyed = [(at, name, keys_of(name, value)) for at, name, value in calls[first:]]
+    return {"calls": [entry for entry in keyed if entry[2] is not None]}
 
 
 def reads(dronekit: Any, address: str, names: list[str], settle_s: float) -> Found:
-    """Nanoseconds that reading each attribute takes while messages come in."""
+    """Measure the nanoseconds that reading each attribute takes while messages arrive."""
     vehicle = _connected(dronekit, address)
-    _say_connected()
+    _report_connected()
     vehicle.wait_ready("gps_0", "armed", "mode", "attitude", timeout=30)
     time.sleep(settle_s)
     return {"ns": {name: _nanoseconds(f"vehicle.{name}", vehicle) for name in names}}
@@ -135,7 +135,7 @@ def _usual_listeners(vehicle: Any) -> list[None]:
     def note(_: Any, name: str, value: Any) -> None:
         calls.append(None)
 
-    _listen_as_usual(vehicle, note, note)
+    _add_typical_listeners(vehicle, note, note)
     return calls
 
 
@@ -154,7 +154,7 @@ LISTENERS: dict[str, Callable[[Any], list[None]]] = {
 }  # fmt: skip
 
 
-def _listen_as_usual(
+def _add_typical_listeners(
     vehicle: Any, on_attribute: Callable[[Any, str, Any], None], on_message: Callable[[Any, str, Any], None]
 ) -> None:
     vehicle.on_message("HEARTBEAT")(on_message)
@@ -170,12 +170,12 @@ def _connected(dronekit: Any, address: str) -> Any:
     return dronekit.connect(address, wait_ready=["mode"], rate=None)
 
 
-def _say_connected() -> None:
+def _report_connected() -> None:
     print("connected", flush=True)
 
 
 def _received(vehicle: Any) -> int:
-    """Frames received so far: counted by the libraries themselves, since not all of them make messages of all."""
+    """Return the number of received frames, from the counters of the library, which does not decode all frames."""
     if hasattr(vehicle, "aio"):
         return sum(
             source.received

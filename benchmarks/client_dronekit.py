@@ -1,7 +1,7 @@
 """The DroneKit 2.9.2 client of ``transfers.py``, with the alias that it needs since Python 3.10.
 
-DroneKit has no files. It downloads parameters in its ``connect``: their time counts from its request, not from the
-first wait for a heartbeat. Missions start when it reports that it is ready, as its guide describes.
+DroneKit cannot transfer files. It downloads the parameters in ``connect``; their time counts from the request, without
+the wait for a heartbeat. Missions are transferred when the vehicle object is ready, as DroneKit's guide describes.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ collections.MutableMapping = collections.abc.MutableMapping  # type: ignore[attr
 
 
 def perform(task: Task) -> Any:
-    """Connect, then transfer; only the latter is timed."""
+    """Connect, then transfer. Only the transfer is timed."""
     dronekit: Any = importlib.import_module("dronekit")
     logging.disable(logging.CRITICAL)
     vehicle = dronekit.connect(task.address, _initialize=False)
@@ -58,9 +58,9 @@ def _download(vehicle: Any) -> list[Any]:
     commands.download()
     commands.wait_ready(timeout=LIMIT_S)
     return [
-        (each.command, each.frame, each.param1, each.param2, each.param3, each.param4,
-         round(each.x * 1e7), round(each.y * 1e7), each.z)
-        for each in commands
+        (command.command, command.frame, command.param1, command.param2, command.param3, command.param4,
+         round(command.x * 1e7), round(command.y * 1e7), command.z)
+        for command in commands
     ]  # fmt: skip
 
 

@@ -1,9 +1,10 @@
-"""MAVSDK's side of ``transfers.py``: its asyncio API, plugins ``param``, ``mission_raw`` (the one that works with
-ArduPilot) and ``ftp`` with burst reads.
+"""The MAVSDK client of ``transfers.py``, which uses the asyncio API.
+
+The plugins are ``param``, ``mission_raw`` (``mission`` does not work with ArduPilot) and ``ftp`` with burst reads.
 """
 
 # pyright: reportMissingImports=false
-# MAVSDK is installed by the bench session only.
+# MAVSDK is installed only by the nox session ``bench``.
 from __future__ import annotations
 
 import asyncio
@@ -17,7 +18,7 @@ from mavsdk.asyncio import ComponentType, Configuration, Mavsdk
 
 
 def perform(task: Task) -> Any:
-    """Connect, then transfer; only the latter is timed."""
+    """Connect, then transfer. Only the transfer is timed."""
     return asyncio.run(_perform(task))
 
 
@@ -42,7 +43,7 @@ async def _parameters(system: Any, task: Task) -> dict[str, float]:
     plugin = ParamAsync(system)
     task.begin()
     found = await plugin.get_all_params()
-    return {each.name: each.value for each in (*found.int_params, *found.float_params)}
+    return {parameter.name: parameter.value for parameter in (*found.int_params, *found.float_params)}
 
 
 async def _mission_upload(system: Any, task: Task) -> None:

@@ -1,9 +1,8 @@
 """The pymavlink client of ``transfers.py``: ``mavparm``-like list, ``mavftp``, and ``mavwp`` with an item loop.
 
-Code that the library leaves to its user follows MAVProxy, with shorter delays: after half a second of silence all
-missing parameters are requested, after a second an item is requested again. ``mavftp`` uses blocks of 239 bytes; its
-default is
-80. While items are uploaded the vehicle repeats its requests.
+Code that pymavlink does not provide follows MAVProxy, with shorter delays: missing parameters are requested after half
+a second of silence, and an item is requested again after a second. ``mavftp`` uses blocks of 239 bytes instead of 80.
+During an upload the vehicle repeats its requests.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ SETTINGS = [
 
 
 def perform(task: Task) -> Any:
-    """Connect, then transfer; only the latter is timed."""
+    """Connect, then transfer. Only the transfer is timed."""
     master: Any = mavutil.mavlink_connection(task.address, source_system=254)
     master.wait_heartbeat(timeout=30)
     if task.way == "mavftp":

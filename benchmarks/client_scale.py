@@ -1,11 +1,11 @@
-"""Cost of each further vehicle for a client: processor time and memory with 1 to 500 of them.
+"""Cost of each vehicle for a client: processor time and memory with 1 to 500 vehicles.
 
     python benchmarks/client_scale.py
 
 Every vehicle sends the states that a client observes at 4 Hz, from a recorded flight, in real time. The frames are
-prepared in advance and passed to the connections in this process, so that only clients and loop are measured. System
-ids end at 255: more vehicles are on several connections. ``fleet_…``: the same clients as one fleet, whose events are
-read; they are disarmed, so that the distance monitor has nothing to compare.
+encoded in advance and passed to the connections in this process, so that only the clients and the loop are measured.
+System ids are limited to 255, so more vehicles need several connections. ``fleet_…`` measures the same clients as one
+fleet whose events are read. The vehicles are disarmed, so that the distance monitor compares no positions.
 """
 
 from __future__ import annotations
@@ -37,62 +37,63 @@ __all__ = ["COUNTS", "rows"]
 COUNTS = (1, 10, 50, 100, 200, 500)
 ON_A_LINK = 250
 LINEAR = 0.8
-"""One of many takes at most 1/0.8 of what one of ten takes."""
+"""Minimum ratio of the cost of one vehicle among 10 to that of one vehicle among more than 10."""
 MAX_MIB = 0.15
-# Seconds in which every vehicle sends once.
+# Interval at which every vehicle sends all messages.
 TURN_S = 0.25
 HEARTBEAT = messages.Heartbeat(2, 3, 81, 4, 4, 3)
 
 Turn = list[list[bytes]]
-"""For each link what comes on it."""
+"""The datagrams that each link receives in one interval."""
 
 
 def rows(counts: Sequence[int] = COUNTS, turns: int = 16, rounds: int = 3) -> list[Row]:
-    """Return for each count the share of a core per vehicle, compared with one of ten, and the memory of one."""
+    """Measure the share of a core per vehicle for each count, compared with 10 vehicles, and the memory per vehicle."""
     found = {
         count: statistics.median(asyncio.run(_share_of_each(count, turns)) for _ in range(rounds))
         for count in sorted({10, *counts})
     }
     table: list[Row] = []
     for count in counts:
-        each, of_ten = 100 * found[count], 100 * found[10]
+        percent, percent_of_ten = 100 * found[count], 100 * found[10]
         shown = row(
-            f"clients_{count}", each, of_ten, "one of ten",
-            unit="% of a core each", ratio=of_ten / each, aim=LINEAR if count >= 10 else 0.0,
+            f"clients_{count}", percent, percent_of_ten, "one of ten",
+            unit="% of a core each", ratio=percent_of_ten / percent, aim=LINEAR if count >= 10 else 0.0,
         )  # fmt: skip
-        table.append({**shown, "note": f"{each:.3f} % of a core each, {each * count:.1f} % together"})
+        table.append({**shown, "note": f"{percent:.3f} % of a core each, {percent * count:.1f} % together"})
     table += _fleet_rows(counts, turns, rounds)
     mib = asyncio.run(_mebibytes_of_each(max(counts)))
-    shown = row("client_memory", mib, MAX_MIB, "the most allowed", unit="MiB", ratio=MAX_MIB / mib, aim=1.0)
+    shown = row("client_memory", mib, MAX_MIB, "maximum", unit="MiB", ratio=MAX_MIB / mib, aim=1.0)
     return [
         *table,
-        {**shown, "note": f"{mib:.3f} MiB for each of {max(counts)} clients, heard of for a turn"},
+        {**shown, "note": f"{mib:.3f} MiB for each of {max(counts)} clients after one turn of messages"},
     ]
 
 
 def _fleet_rows(counts: Sequence[int], turns: int, rounds: int) -> list[Row]:
-    """Return for each count the share of a core per fleet member, compared with one of ten."""
+    """Measure the share of a core per fleet member for each count, compared with 10 members."""
     found = {
         count: statistics.median(asyncio.run(_share_of_each(count, turns, is_fleet=True)) for _ in range(rounds))
         for count in sorted({10, *counts})
     }
     table: list[Row] = []
     for count in counts:
-        each, of_ten = 100 * found[count], 100 * found[10]
+        percent, percent_of_ten = 100 * found[count], 100 * found[10]
         shown = row(
-            f"fleet_{count}", each, of_ten, "one of ten",
-            unit="% of a core each", ratio=of_ten / each, aim=LINEAR if count >= 10 else 0.0,
+            f"fleet_{count}", percent, percent_of_ten, "one of ten",
+            unit="% of a core each", ratio=percent_of_ten / percent, aim=LINEAR if count >= 10 else 0.0,
         )  # fmt: skip
-        table.append({**shown, "note": f"as one fleet: {each:.3f} % of a core each, {each * count:.1f} % together"})
+        note = f"as one fleet: {percent:.3f} % of a core each, {percent * count:.1f} % together"
+        table.append({**shown, "note": note})
     return table
 
 
 async def _share_of_each(count: int, turns: int, *, is_fleet: bool = False) -> float:
-    """Share of a core that each vehicle takes."""
+    """Return the share of a core that each vehicle takes."""
     async with AsyncExitStack() as stack:
         fleet = await _connected(stack, count, turns)
         if is_fleet:
-            names = {f"member {number}": each for number, each in enumerate(fleet.vehicles)}
+            names = {f"member {number}": vehicle for number, vehicle in enumerate(fleet.vehicles)}
             one = await stack.enter_async_context(aerokit.fleet(names, min_distance_m=5.0, on_too_close="report"))
             stack.enter_context(one.events(capacity=10_000))
         fleet.feed_turn()
@@ -119,7 +120,7 @@ async def _mebibytes_of_each(count: int) -> float:
 
 
 class _Fleet:
-    """Clients that are connected, and what their vehicles will send."""
+    """Connected clients, and the messages that their vehicles will send."""
 
     def __init__(self, vehicles: list[Vehicle], connections: list[Connection], turns: list[Turn]) -> None:
         self.vehicles = vehicles
@@ -131,12 +132,12 @@ class _Fleet:
                 connection.bytes_received(datagram, None)
 
     def forget(self) -> None:
-        """Exclude memory that was not used."""
+        """Release the messages that were not sent, to exclude them from the measured memory."""
         self._turns.clear()
 
     def check(self) -> None:
         if not all(vehicle.attitude.is_known for vehicle in self.vehicles):
-            raise AssertionError("not every client was told of its vehicle")
+            raise AssertionError("a client received no messages of its vehicle")
 
 
 async def _connected(stack: AsyncExitStack, count: int, turns: int) -> _Fleet:
@@ -148,7 +149,7 @@ async def _connected(stack: AsyncExitStack, count: int, turns: int) -> _Fleet:
     vehicles = []
     for number, encoder in enumerate(encoders):
         connection = connections[number // ON_A_LINK]
-        for _ in range(5):  # Read repeatedly, so that it counts as having waited.
+        for _ in range(5):  # let the loop run, so that the connection does not report a blocked loop
             await asyncio.sleep(0)
         connection.bytes_received(encoder.encode(HEARTBEAT), None)
         system_id = 1 + number % ON_A_LINK
@@ -157,20 +158,23 @@ async def _connected(stack: AsyncExitStack, count: int, turns: int) -> _Fleet:
 
 
 def _made(encoders: Sequence[FrameEncoder], turns: int) -> list[Turn]:
-    """Turn by turn a message of each kind from every vehicle, one in a datagram, and heartbeats with every fourth."""
+    """Return the messages of all turns: one of each kind from every vehicle, and a heartbeat in every fourth turn.
+
+    Each message is a datagram.
+    """
     kinds = _kinds()
     made: list[Turn] = []
     for number in range(turns):
         turn: Turn = [[] for _ in range(-(-len(encoders) // ON_A_LINK))]
         for which, encoder in enumerate(encoders):
             sent = [HEARTBEAT, *kinds] if number % 4 == 0 else kinds
-            turn[which // ON_A_LINK] += [encoder.encode(each) for each in sent]
+            turn[which // ON_A_LINK] += [encoder.encode(message) for message in sent]
         made.append(turn)
     return made
 
 
 def _kinds() -> list[Message]:
-    """The last of each kind that a client watches, out of the recorded flight."""
+    """Return the last message in the recorded flight of each kind that a client observes."""
     wanted = {getattr(messages, name) for name in DEFAULT_RATES_HZ}
     found: dict[type[Message], Message] = {}
     for raw in decode.frames_of(next(iter(decode.RECORDINGS.values()))):

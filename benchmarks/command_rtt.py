@@ -7,7 +7,7 @@ process, sixty round trips at a time, with the same responder in another process
 """
 
 # pyright: reportMissingImports=false
-# MAVSDK is installed by the bench session only.
+# MAVSDK is installed only by the nox session ``bench``.
 from __future__ import annotations
 
 import json
@@ -21,7 +21,7 @@ from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
 from pathlib import Path
 from typing import Any
 
-os.environ["MAVLINK20"] = "1"  # pymavlink: the same frames as the others send
+os.environ["MAVLINK20"] = "1"  # pymavlink reads this variable; with it, all libraries send the same frames
 
 import anyio
 from pymavlink import mavutil
@@ -77,7 +77,7 @@ def _rows(taken: dict[str, list[float]]) -> list[Row]:
 
 
 async def _in_turns(blocks: dict[str, Block], rounds: int, trips: int) -> dict[str, list[float]]:
-    """Return the durations; turns are short, so that other load on the machine affects all alike."""
+    """Return the durations. Turns are short, so that other load on the machine affects all libraries equally."""
     for block in blocks.values():
         await block(TRIPS_BEFORE)
     taken: dict[str, list[float]] = {name: [] for name in blocks}
@@ -175,12 +175,12 @@ def _responder(ports: list[int]) -> Iterator[None]:
 def _free_ports(count: int) -> list[int]:
     sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(count)]
     try:
-        for each in sockets:
-            each.bind(("127.0.0.1", 0))
-        return [each.getsockname()[1] for each in sockets]
+        for sock in sockets:
+            sock.bind(("127.0.0.1", 0))
+        return [sock.getsockname()[1] for sock in sockets]
     finally:
-        for each in sockets:
-            each.close()
+        for sock in sockets:
+            sock.close()
 
 
 if __name__ == "__main__":

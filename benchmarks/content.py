@@ -27,7 +27,7 @@ LIMIT_S = 120.0
 WAYPOINT, GLOBAL_RELATIVE_ALT = 16, 3
 
 Item = tuple[int, int, float, float, float, float, int, int, float]
-"""command, frame, param1 to param4, latitude and longitude in 1e-7 degrees, altitude."""
+"""A mission item: command, frame, param1 to param4, latitude and longitude in 1e-7 degrees, altitude."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ QUICK = Sizes(items=10, file_bytes=20_000)
 
 
 def mission_items(count: int) -> list[Item]:
-    """Waypoints, without a home item."""
+    """Create waypoints without a home item."""
     return [
         (WAYPOINT, GLOBAL_RELATIVE_ALT, 0.0, 0.0, 0.0, 0.0,
          -353632610 + 1000 * n, 1491652299 + 700 * n, 20.0 + n % 50)
@@ -52,11 +52,11 @@ def mission_items(count: int) -> list[Item]:
 
 
 def as_numbers(item: Any) -> Item:
-    """The same of a MissionItem."""
+    """Convert an aerokit MissionItem."""
     numbers = (item.param1, item.param2, item.param3, item.param4, item.x, item.y, item.z)
     return (int(item.command), int(item.frame), *numbers)
 
 
 def file_content(size: int) -> bytes:
-    """Bytes that cannot be guessed: what a download fills a hole with is not what belongs there."""
+    """Create random bytes, so that a missing block cannot equal the expected one by chance."""
     return random.Random(size).randbytes(size)

@@ -1,9 +1,9 @@
-"""Frames per second, side by side with pymavlink's parser in one process, on a recorded flight.
+"""Decoded frames per second of a recorded flight, compared with pymavlink's parser.
 
     python benchmarks/decode.py
 
-The recording is taken in parts of some 20 ms, and all take their turn at each part: what else the machine does hits
-them alike. Figures and ratios are the medians over all parts; only the ratios mean something on another machine.
+Both run in one process and take turns after every 20 ms, so that other load on the machine affects them equally.
+Figures and ratios are medians over all parts of the recording. Only the ratios are comparable between machines.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ RECORDINGS = {
     for name in ("ardupilot-copter", "ardupilot-plane", "ardupilot-rover", "px4-quad")
     if (folder / f"{name}.tlog").exists()
 }
-"""Flights by name: whole ones where they are at hand, and the short ones that the project carries. What PX4 sends is
-signed, with a key or without.
+"""Recordings by name: the complete flights if they are available, and the short ones in the repository. Frames of PX4
+are signed, with or without a key.
 """
 _HEADER = Struct("<BBBxBHI").unpack_from
 _CHECKSUM = Struct("<H").unpack_from
@@ -44,10 +44,10 @@ def rows(rounds: int = 7, recordings: Sequence[str] = tuple(RECORDINGS)) -> list
     """Measure frames without a subscriber (``decode_skip``) and frames delivered as typed messages
     (``decode_typed``).
 
-    These are fed frame by frame, as recorded and as UDP delivers them; ``…_stream`` are fed the same bytes in pieces
-    of 1 kB, as TCP and serial ports deliver them. The first recording has the plain names, the others have their own
-    suffix. ``decode_floor`` compares ``decode_skip`` with the minimum in pure Python: parse the header and compare
-    the checksum; ``decode_floor_typed`` the same with the payload unpacked.
+    Each call has one frame, as with UDP. The rows ``…_stream`` have pieces of 1 kB, as with TCP and serial ports. Rows
+    of the first recording have no suffix; those of the others end with the name of the recording. ``decode_floor``
+    compares ``decode_skip`` with the minimum in pure Python, which is parsing the header and comparing the checksum;
+    ``decode_floor_typed`` does the same for ``decode_typed``, with an unpacked payload.
     """
     table: list[dict[str, Any]] = []
     for which, name in enumerate(recordings):
@@ -70,7 +70,7 @@ def rows(rounds: int = 7, recordings: Sequence[str] = tuple(RECORDINGS)) -> list
 
 
 def frames_of(path: Path) -> list[bytes]:
-    """Return the frames of a recording whose messages both sides know; others cannot be compared."""
+    """Return the frames of a recording whose messages both libraries know. Other frames cannot be compared."""
     frames = [raw for _, raw in read_tlog(path)]
     ids = [int.from_bytes(raw[7:10], "little") if raw[0] == MAGIC_V2 else raw[5] for raw in frames]
     known = STANDARD.rows.keys() & ardupilotmega.mavlink_map.keys()
@@ -78,7 +78,7 @@ def frames_of(path: Path) -> list[bytes]:
 
 
 def in_pieces(frames: list[bytes]) -> list[bytes]:
-    """The same bytes in pieces of 1 kB."""
+    """Split the bytes of the frames into pieces of 1 kB."""
     stream = b"".join(frames)
     return [stream[begin : begin + CHUNK] for begin in range(0, len(stream), CHUNK)]
 

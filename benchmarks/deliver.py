@@ -1,4 +1,4 @@
-"""A recorded flight through a whole connection: frames per second of processor time.
+"""Frames of a recorded flight that a connection processes per second of processor time.
 
     python benchmarks/deliver.py
 
@@ -36,7 +36,7 @@ FLIGHT = next(iter(decode.RECORDINGS))
 
 
 def rows(rounds: int = 7, recording: str = FLIGHT) -> list[Row]:
-    """Both rows; ``recording`` is another one than the copter's flight."""
+    """Measure both rows, by default with the recorded flight of the copter."""
     frames = decode.frames_of(decode.RECORDINGS[recording])
     pieces = decode.in_pieces(frames)
     peer_name = "pymavlink parse_buffer + post_message"
@@ -106,7 +106,7 @@ async def _telemetry(frames: list[bytes], pieces: list[bytes]) -> float:
         async with aerokit.connect(connection, rates={}) as vehicle:
             rate = _rate(len(frames), pieces, lambda raw: connection.bytes_received(raw, None))
             if not vehicle.attitude.is_known:
-                raise AssertionError("the telemetry saw nothing")
+                raise AssertionError("the telemetry received no messages")
     return rate
 
 

@@ -1,11 +1,11 @@
-"""DroneKit programs on aerokit, DroneKit 2.9.2 and dronekit2 3.0: one script, one vehicle, in turns.
+"""Compares aerokit, DroneKit 2.9.2 and dronekit2 3.0 with the same DroneKit script and the same vehicle, in turns.
 
     python benchmarks/dronekit_compare.py                    # everything, half an hour; writes bench-dronekit.json
     python benchmarks/dronekit_compare.py cpu latency        # these parts only: cpu, reads, latency, connect, import
     python benchmarks/dronekit_compare.py --quick            # a short check that it runs; the figures mean little
 
-Each measurement has a client process (``client_classic.py``) and a vehicle process (``dronekit_vehicle.py``) of its
-own. AEROKIT_DRONEKIT_PYTHON and AEROKIT_DRONEKIT2_PYTHON name the interpreters with the peers, which cannot be
+Each measurement has a new client process (``client_classic.py``) and a new vehicle process (``dronekit_vehicle.py``).
+AEROKIT_DRONEKIT_PYTHON and AEROKIT_DRONEKIT2_PYTHON name the interpreters with the peers, which cannot be
 installed together; a peer that is not installed is omitted.
 """
 
@@ -37,24 +37,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("parts", nargs="*", metavar="PART", help=", ".join(PARTS))
     parser.add_argument("--only", default="", metavar="TEXT", help="only cases with this in their name")
-    parser.add_argument("--rounds", type=int, default=5, help="so many turns of each")
+    parser.add_argument("--rounds", type=int, default=5, help="number of turns of each library (5)")
     parser.add_argument("--peer", action="append", metavar="NAME", help="dronekit, dronekit2; both by default")
-    parser.add_argument("--quick", action="store_true", help="a moment of each: does it run?")
+    parser.add_argument("--quick", action="store_true", help="measure briefly, to check that everything runs")
     parser.add_argument("--output", type=Path, default=Path("bench-dronekit.json"))
     options = parser.parse_args(arguments)
     if not set(options.parts) <= set(PARTS):
         parser.error(f"the parts are {', '.join(PARTS)}")
     wanted = ["aerokit", *(options.peer or ("dronekit", "dronekit2"))]
-    libraries = [each for each in LIBRARIES if each.name in wanted and installed(each)]
+    libraries = [library for library in LIBRARIES if library.name in wanted and installed(library)]
     plan = Plan(1 if options.quick else options.rounds, options.quick, options.only)
     rows: list[Row] = []
     compile_aerokit()
     for part in options.parts or PARTS:
         rows += PARTS[part](libraries, plan)
     print(table.printed(rows))
-    for name in sorted(set(wanted) - {each.name for each in libraries}):
-        print(f"{name}: left out, it is not installed")
-    missed = [each["name"] for each in rows if table.is_missed(each)]
+    for name in sorted(set(wanted) - {library.name for library in libraries}):
+        print(f"{name}: omitted, because it is not installed")
+    missed = [row["name"] for row in rows if table.is_missed(row)]
     print(f"MISSED: {', '.join(missed)}" if missed else "every aim is met")
     table.write(rows, options.output)
     return 0

@@ -1,4 +1,4 @@
-"""The socket of the scripted vehicle: datagrams or a stream, with a delay each way and a limit of bandwidth."""
+"""The link of the scripted vehicle: UDP or TCP, with a delay in each direction and a bandwidth limit."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MAX_UNSENT = 65536
 
 
 class Link:
-    """Bytes out, messages in."""
+    """Base class of links that send bytes and receive pymavlink messages."""
 
     is_stream = False
 
@@ -40,14 +40,14 @@ class Link:
 
     @property
     def wants_to_write(self) -> bool:
-        """Return True while bytes wait for the other side."""
+        """Return True if bytes are queued because the socket accepts no more."""
         return False
 
     def wait_for_peer(self) -> None:
         """Wait until there is a peer to send to."""
 
     def send(self, data: bytes) -> None:
-        """Send it, when the link lets it through."""
+        """Send bytes after the delay, within the bandwidth."""
         if not self._delay and not self._bandwidth:
             self._write(data)
             return
@@ -56,7 +56,7 @@ class Link:
         self._leaving.append((self._free_at + self._delay, data))
 
     def release_due(self) -> float:
-        """Send delayed bytes that are due; return when the next ones are."""
+        """Send the delayed bytes that are due. Return the time at which more bytes or messages are due."""
         now = time.monotonic()
         while self._leaving and self._leaving[0][0] <= now:
             self._write(self._leaving.popleft()[1])
@@ -66,13 +66,13 @@ class Link:
         )
 
     def read(self) -> None:
-        """Read what has arrived; it counts as received after its delay."""
+        """Read the socket. Messages are received after their delay."""
         data = self._read()
         for message in self._parser.parse_buffer(data) or ():
             self._coming.append((time.monotonic() + self._delay, message))
 
     def received(self) -> Iterator[Any]:
-        """The messages that have arrived by now (pymavlink's)."""
+        """Yield the pymavlink messages whose delay has passed."""
         while self._coming and self._coming[0][0] <= time.monotonic():
             yield self._coming.popleft()[1]
 
@@ -84,7 +84,7 @@ class Link:
 
 
 class UdpLink(Link):
-    """Sends to a port of this machine, from one of its own."""
+    """Sends UDP datagrams to a port of this machine."""
 
     def __init__(self, port: int, delay: float, bandwidth: float) -> None:
         super().__init__(delay, bandwidth)
@@ -105,7 +105,7 @@ class UdpLink(Link):
 
 
 class TcpLink(Link):
-    """Serves one client."""
+    """Serves one TCP client."""
 
     is_stream = True
 
@@ -154,5 +154,5 @@ class TcpLink(Link):
 
 
 def make_link(transport: str, port: int, delay: float, bandwidth: float) -> Link:
-    """``udp`` sends to the port, ``tcp`` serves it."""
+    """Create a link: ``udp`` sends to the port, ``tcp`` listens on it."""
     return UdpLink(port, delay, bandwidth) if transport == "udp" else TcpLink(port, delay, bandwidth)

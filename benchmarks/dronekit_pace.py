@@ -1,4 +1,4 @@
-"""Timing of a vehicle's streams: like ArduCopter, or evenly."""
+"""Timing of a vehicle's streams: in bursts like ArduCopter, or evenly spaced."""
 
 from __future__ import annotations
 
@@ -8,18 +8,17 @@ from itertools import cycle
 
 __all__ = ["bursts", "wait_until"]
 
+# Observed in ArduCopter 4.7 over UDP, where each message is a datagram: it sends messages that are due in bursts of 10,
+# 5.5 ms apart. Within a burst, the median distance of messages is 31 to 40 µs, and a tenth of them exceed 130 µs.
 BURST = 10
-"""ArduCopter 4.7 sends all that is due in bursts of this size over UDP, a message a datagram,"""
 BURST_INTERVAL_S = 0.0055
-"""so far from one to the next,"""
 SPACING_US = (31, 12, 82, 15, 40, 10, 69, 22, 133, 16, 37, 9, 60, 14, 100, 25)
-"""with so much from one message to the next in a burst (observed: median 31 to 40, a tenth above 130)."""
 
 ROUND = 25
 
 
 def bursts(rate: float, *, evenly: bool) -> Iterator[tuple[float, list[float]]]:
-    """Return the seconds between bursts, and the time of each message in a burst."""
+    """Yield for each burst the seconds until the next one, and the time offset of each message in it."""
     if evenly:
         while True:
             yield 1 / rate, [0.0]
@@ -38,6 +37,6 @@ def bursts(rate: float, *, evenly: bool) -> Iterator[tuple[float, list[float]]]:
 
 
 def wait_until(when: float) -> None:
-    """Wait until this time of ``time.monotonic``; too short to sleep."""
+    """Wait until this time of ``time.monotonic`` in a busy loop, because the time is too short to sleep."""
     while time.monotonic() < when:
         pass

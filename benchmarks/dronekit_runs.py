@@ -22,7 +22,7 @@ LIMIT_S = 180.0
 
 @dataclass(frozen=True)
 class Library:
-    """A library to measure: its name, the module to import, its interpreter."""
+    """A library to measure: its name, the module to import, and the interpreter that has it."""
 
     name: str
     title: str
@@ -38,16 +38,14 @@ LIBRARIES = (
 
 
 def compile_aerokit() -> None:
-    """Compile aerokit as the peers' installer has compiled them; otherwise an edited source is compiled in the
-    measurement.
-    """
+    """Compile aerokit to byte code, as installers do for the other libraries, so that no measurement includes this."""
     import aerokit
 
     compileall.compile_dir(Path(aerokit.__file__).parent, quiet=1)
 
 
 def installed(library: Library) -> bool:
-    """Return True if its interpreter has it: both peers have the same import name."""
+    """Return True if the distribution is installed. Both peers have the same import name, so importing is no test."""
     if library.name == "aerokit":
         return True
     code = f"import importlib.metadata; importlib.metadata.version({library.name!r})"
@@ -61,9 +59,10 @@ def run(
     *,
     rate: str | None = None,
 ) -> dict[str, Any]:
-    """Run a task with a library, against such a vehicle; ``rate`` is its message rate once the client is connected.
+    """Run a task with a library and a vehicle with these options.
 
-    Returns the client's result, and ``stamps`` of the vehicle if it streamed. Raises RuntimeError if it failed.
+    ``rate`` is the message rate of the vehicle once the client is connected. Returns the client's result, with the
+    ``stamps`` of the vehicle if it streamed. Raises RuntimeError if the client failed.
     """
     if vehicle is None:
         with _client(library, task) as client:
@@ -80,7 +79,7 @@ def run(
 
 
 def _found(client: subprocess.Popen[str], server: subprocess.Popen[str] | None, rate: str | None) -> dict[str, Any]:
-    """Return the client's result; inform the vehicle about its progress."""
+    """Return the client's result. Meanwhile, inform the vehicle about the progress of the client."""
     while True:
         line = _line(client).strip()
         if line == "connecting" and server is not None:

@@ -17,7 +17,7 @@ __all__ = ["Services", "parameter_names"]
 REAL32 = 9
 UNCOUNTED = 65535
 BEAT_S = 0.0025
-"""ArduCopter sends parameters in its loop of 400 Hz."""
+"""Period of ArduCopter's main loop (400 Hz), in which it sends parameters."""
 CAPABILITIES_WITHOUT_FTP = 64495 & ~32
 FTP = 32
 REQUEST_MESSAGE, REQUEST_CAPABILITIES, AUTOPILOT_VERSION = 512, 520, 148
@@ -32,12 +32,12 @@ GROUPS = ("ATC", "BATT", "EK3", "INS", "RC", "SERVO", "PSC", "WPNAV")
 
 
 def parameter_names(count: int) -> list[str]:
-    """The names of its parameters, in the order of their indices; as long as ArduPilot's are."""
+    """Return parameter names with the typical length of ArduPilot's, in the order of their indices."""
     return [f"{GROUPS[n % len(GROUPS)]}_BENCH{n}" for n in range(count)]
 
 
 class Services:
-    """Answers at the pace of a real vehicle."""
+    """Answers requests with the timing of a real vehicle."""
 
     def __init__(self, vehicle: Vehicle) -> None:
         self._vehicle, self._options = vehicle, vehicle.options
@@ -55,7 +55,7 @@ class Services:
         }
 
     def receive(self, message: Any) -> None:
-        """Take a message of the client (pymavlink's)."""
+        """Process a pymavlink message of the client."""
         answer = self._answers.get(message.get_type())
         if answer is not None:
             answer(message)
@@ -66,12 +66,15 @@ class Services:
     # --------------------------------------------------------------------------- parameters
 
     def _on_list(self, request: Any) -> None:
-        """Restart the list if it is requested again."""
+        """Start the list, or restart it if it is requested again."""
         self._list += 1
         self._send_parameters(time.monotonic(), self._list, 0.0)
 
     def _send_parameters(self, when: float, number: int, sent: float) -> None:
-        """Those of one turn of the vehicle's loop; ArduPilot leaves most of a slow link to others."""
+        """Send the parameters of one period of the main loop.
+
+        On a slow link ArduPilot uses only 30 % of the bandwidth for parameters.
+        """
         if number != self._list:
             return
         rate = self._options.list_rate
@@ -140,7 +143,8 @@ class Services:
             reply.send(NAK, 0, bytes([NOT_FOUND]))
             return
         self._file = _packed_parameters(self._parameters, with_defaults="withdefaults=1" in query)
-        reply.send(ACK, 0, struct.pack("<I", 1 << 20))  # ArduPilot does not know the size in advance.
+        # ArduPilot generates this file while it is read, and reports this size.
+        reply.send(ACK, 0, struct.pack("<I", 1 << 20))
 
     def _send_burst(self, when: float, number: int, reply: _Reply, offset: int, size: int) -> None:
         if number != self._burst:
@@ -182,7 +186,9 @@ class _Reply:
 
 
 def _packed_parameters(parameters: list[tuple[str, float]], *, with_defaults: bool) -> bytes:
-    """``param.pck``: names share beginnings, no value lies across two blocks; nothing differs from its default."""
+    """Create ``param.pck``. Names omit the beginning that they share with the previous one, and padding keeps values
+    within one block. All values equal their defaults.
+    """
     file, last = (
         bytearray(struct.pack("<HHH", 0x671C if with_defaults else 0x671B, *[len(parameters)] * 2)),
         "",

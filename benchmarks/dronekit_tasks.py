@@ -16,18 +16,18 @@ from table import Row
 __all__ = ["Plan", "connect_rows", "cpu_rows", "import_rows", "latency_rows", "read_rows"]
 
 MIN_NS = 1000.0
-"""An attribute is to be read in less."""
-# A vehicle sends heartbeats each second, so the time to connect depends on the phase.
+"""Target for the time to read an attribute."""
+# Delays of the first heartbeat. Vehicles send heartbeats each second, so the time to connect depends on their phase.
 CONNECT_PHASES_S = (0.1, 0.3, 0.5, 0.7, 0.9)
 SLOW_LINK = 5760.0
-"""Bytes a second of a radio of 57,600 baud."""
+"""Bytes per second of a radio with 57,600 baud."""
 RATES = ("100", "500", "2000", "max")
-"""Messages a second; 100 is what ArduCopter sends when it is asked for all streams at 4 Hz, 500 at 20 Hz."""
+"""Messages per second. ArduCopter sends 100 if all streams are requested at 4 Hz, and 500 at 20 Hz."""
 WINDOW_S = {"100": 8.0, "500": 5.0, "2000": 4.0, "max": 4.0}
 QUICK_S = 0.3
 SETTLE_S = 1.0
 BEFORE_IT_RUNS = 100.0
-"""Messages a second while clients connect."""
+"""Messages per second while clients connect."""
 ATTRIBUTE_OF = {
     "ATTITUDE": "attitude",
     "GLOBAL_POSITION_INT": "location.global_relative_frame",
@@ -35,7 +35,7 @@ ATTRIBUTE_OF = {
     "SYS_STATUS": "battery",
 }
 
-# Name of the library → measured values, turn by turn.
+# Maps the name of a library to its measured values, one for each turn.
 Values = dict[str, list[float]]
 
 
@@ -60,7 +60,7 @@ class Plan:
 
 
 def cpu_rows(libraries: Sequence[Library], plan: Plan) -> list[Row]:
-    """Microseconds of processor time a message, which are milliseconds for 1,000: a quarter is aimed at."""
+    """Measure the processor time per message in microseconds. The target is a quarter of DroneKit's."""
     cases = [
         ("usual", transport, version, rate) for transport in ("udp", "tcp") for version in (2, 1) for rate in RATES
     ]
@@ -97,11 +97,11 @@ def _microseconds(found: dict[str, Any]) -> float:
 
 
 def read_rows(libraries: Sequence[Library], plan: Plan) -> list[Row]:
-    """Nanoseconds to read each attribute while 50 messages a second come in; less than a microsecond is aimed at."""
+    """Measure the nanoseconds to read each attribute at 50 messages per second. The target is a microsecond."""
     names = [name for name in READS if plan.wants(f"dronekit_read_{name}")]
     if not names:
         return []
-    taken: dict[str, Values] = {name: {each.name: [] for each in libraries} for name in names}
+    taken: dict[str, Values] = {name: {library.name: [] for library in libraries} for name in names}
 
     def read(library: Library, _: int) -> float:
         found = run(library, {"rate": 50.0}, {"task": "reads", "names": names, "settle_s": plan.window(SETTLE_S)})
@@ -121,7 +121,10 @@ def read_rows(libraries: Sequence[Library], plan: Plan) -> list[Row]:
 
 
 def latency_rows(libraries: Sequence[Library], plan: Plan) -> list[Row]:
-    """Microseconds from the vehicle's sending to the attribute's listener: median and 99th percentile of all turns."""
+    """Measure the microseconds from sending a message to calling the listener of its attribute.
+
+    The rows are the median and the 99th percentile of all turns.
+    """
     rows: list[Row] = []
     for version in (2, 1):
         for rate, window_s in (("50", 30.0), ("500", 10.0), ("500 evenly", 10.0)):
@@ -130,7 +133,7 @@ def latency_rows(libraries: Sequence[Library], plan: Plan) -> list[Row]:
                 continue
             vehicle = {"rate": BEFORE_IT_RUNS, "version": version}
             task = {"task": "latency", "settle_s": plan.window(SETTLE_S), "window_s": plan.window(window_s)}
-            samples: Values = {each.name: [] for each in libraries}
+            samples: Values = {library.name: [] for library in libraries}
 
             def measure(
                 library: Library,
@@ -153,7 +156,7 @@ def latency_rows(libraries: Sequence[Library], plan: Plan) -> list[Row]:
 
 def _delays(found: dict[str, Any]) -> list[float]:
     sent = {(ATTRIBUTE_OF[kind], number): at for kind, number, at in found["stamps"] if kind in ATTRIBUTE_OF}
-    delays = [(at - sent[name, number]) / 1000 for at, name, number in found["noted"] if (name, number) in sent]
+    delays = [(at - sent[name, number]) / 1000 for at, name, number in found["calls"] if (name, number) in sent]
     if not delays:
         raise RuntimeError("no listener was called")
     return delays
@@ -168,9 +171,9 @@ def _quantile(values: list[float], share: float) -> float:
 
 
 def connect_rows(libraries: Sequence[Library], plan: Plan) -> list[Row]:
-    """Seconds that ``connect(wait_ready=True)`` takes with 1,350 parameters: a third is aimed at.
+    """Measure the seconds of ``connect(wait_ready=True)`` with 1,350 parameters. The target is a third of DroneKit's.
 
-    The vehicle's first heartbeat comes 0.1 to 0.9 s after the client's call, for all alike.
+    The vehicle sends its first heartbeat 0.1 to 0.9 s after the call, with the same delays for all libraries.
     """
     cases: list[tuple[str, dict[str, Any]]] = [
         (f"{'mavftp' if has_ftp else 'list'}_{delay_ms}ms", {"has_ftp": has_ftp, "delay": delay_ms / 1000})
@@ -205,7 +208,7 @@ def connect_rows(libraries: Sequence[Library], plan: Plan) -> list[Row]:
 
 
 def import_rows(libraries: Sequence[Library], plan: Plan) -> list[Row]:
-    """Milliseconds that the import takes, inside the process."""
+    """Measure the milliseconds that the import takes, without the start of the interpreter."""
     if not plan.wants("dronekit_import"):
         return []
     values = _in_turns(
@@ -221,21 +224,21 @@ def import_rows(libraries: Sequence[Library], plan: Plan) -> list[Row]:
 
 
 def _in_turns(libraries: Sequence[Library], plan: Plan, case: str, measure: Callable[[Library, int], float]) -> Values:
-    values: Values = {each.name: [] for each in libraries}
+    values: Values = {library.name: [] for library in libraries}
     order = list(libraries)
     for turn in range(plan.rounds):
         for library in order:
             values[library.name].append(measure(library, turn))
         order.append(order.pop(0))
-    told = ", ".join(f"{name} {statistics.median(found):.4g}" for name, found in values.items())
-    print(f"{case}: {told}", file=sys.stderr, flush=True)
+    medians = ", ".join(f"{name} {statistics.median(found):.4g}" for name, found in values.items())
+    print(f"{case}: {medians}", file=sys.stderr, flush=True)
     return values
 
 
 def _rows(
     libraries: Sequence[Library], case: str, values: Values, *, unit: str, aim: float, scale: float = 1.0
 ) -> list[Row]:
-    """One for each peer."""
+    """Return a row for each peer."""
     own = statistics.median(values["aerokit"])
     rows = []
     for library in libraries:

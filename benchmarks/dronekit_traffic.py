@@ -1,9 +1,9 @@
-"""Messages of ``dronekit_vehicle.py``: those of ArduCopter's streams in their proportions.
+"""Messages of ``dronekit_vehicle.py``, in the proportions of ArduCopter's streams.
 
-With all streams requested at one rate, ArduCopter 4.7 sends each of these messages at that rate, in this order, and a
-HEARTBEAT each second, which is each fourth round at the usual 4 Hz (in a recorded flight: 24 kinds, 1,206 of each,
-127 heartbeats at 10 Hz). Fields have non-zero numbers, so that MAVLink 2 truncates nothing. Every round has a number,
-which attribute listeners can read from attitude, position, GPS and battery.
+If all streams are requested at one rate, ArduCopter 4.7 sends each of these messages at that rate, in this order. It
+also sends a HEARTBEAT each second, which is every fourth round at the usual 4 Hz. (A recorded flight at 10 Hz has 1,206
+messages of each of the 24 kinds, and 127 heartbeats.) Fields are not zero, so that MAVLink 2 does not truncate them.
+Every round has a number, which attribute listeners can read from attitude, position, GPS and battery.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ ANGLE_STEP = 2.0**-12
 FULL_MV, CURRENT_CA, LEVEL = 10000, 1500, 87
 
 Frame = tuple[bytes, str, int]
-"""Its bytes (numbered later), the name of its message, the number of its round."""
+"""A frame without sequence number, the name of its message, and the number of its round."""
 
 
 def rounds(version: int) -> list[Frame]:
-    """Everything once; MAVLink 1 or 2."""
+    """Return the frames of all rounds, in version 1 or 2 of MAVLink."""
     kinds = KINDS + ONLY_IN_VERSION[version]
     frames: list[Frame] = []
     for number in range(ROUNDS):
@@ -66,12 +66,12 @@ def keys_of(name: str, value: Any) -> int | None:
 
 
 def heartbeat(version: int) -> bytes:
-    """A quadrotor of ArduPilot, armed, in GUIDED."""
+    """Create the HEARTBEAT of an armed quadrotor of ArduPilot in GUIDED."""
     return packed("HEARTBEAT", version, **ARMED_IN_GUIDED)
 
 
 def packed(kind: str, version: int, **values: Any) -> bytes:
-    """A message of system 1, component 1; fields that are not given have some number."""
+    """Create a frame of system 1, component 1. Fields that are not given get an arbitrary number."""
     names: Any = dialect
     message_class = getattr(names, f"MAVLink_{kind.lower()}_message")
     lengths = dict(zip(message_class.ordered_fieldnames, message_class.array_lengths, strict=True))
@@ -84,13 +84,13 @@ def packed(kind: str, version: int, **values: Any) -> bytes:
 
 
 class Numbering:
-    """Gives frames their sequence numbers, and so their checksums, when they are sent."""
+    """Adds the sequence numbers and checksums to frames when they are sent."""
 
     def __init__(self) -> None:
         self._next = 0
 
     def numbered(self, frame: bytes) -> bytes:
-        """The frame with the next number."""
+        """Return the frame with the next sequence number."""
         raw = bytearray(frame)
         is_second = raw[0] == 0xFD
         raw[4 if is_second else 2] = self._next

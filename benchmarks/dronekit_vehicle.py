@@ -1,12 +1,16 @@
-"""A scripted vehicle in a process of its own, for all three libraries of ``dronekit_compare.py``.
+"""A scripted vehicle in a separate process, for all three libraries of ``dronekit_compare.py``.
 
     python benchmarks/dronekit_vehicle.py '{"transport": "udp", "port": 14550, "version": 2}'
 
-It belongs to none of them: frames are packed and parsed by pymavlink, and sent from a blocking loop. It prints
-``ready``, and starts when a client has connected, over UDP when it receives a line ``go``. Further lines: ``rate
-500`` (messages a second; ``rate 500 evenly``: not in bursts; ``rate max``: as fast as possible) and ``stamps``,
-answered by a line of JSON: name of the message, number of its round, CLOCK_MONOTONIC in ns when it was sent. It ends
-when it is terminated.
+The vehicle uses none of these libraries: it packs and parses frames by pymavlink, and sends them from a blocking loop.
+It prints ``ready``, and starts when a client has connected, or for UDP when it reads a line ``go``. Further lines on
+standard input are commands:
+
+- ``rate 500``: messages per second, in bursts; ``rate 500 evenly`` without bursts; ``rate max`` as fast as possible.
+- ``stamps``: print a line of JSON with the name, the round number and the time of each sent message (CLOCK_MONOTONIC in
+  ns).
+
+The process runs until it is terminated.
 """
 
 from __future__ import annotations
@@ -31,7 +35,7 @@ __all__ = ["Options", "Vehicle"]
 
 STREAM_KINDS_AT_ONCE = 25
 PIECE = 1400
-"""Bytes in one go where a stream of bytes is sent as fast as possible."""
+"""Bytes of one write on TCP at the maximum rate."""
 # Number of datagrams sent in a row before other work.
 AT_ONCE = 16
 
@@ -44,23 +48,23 @@ class Options:
     port: int = 14550
     version: int = 2
     rate: float = 0.0
-    """Messages a second that it streams by itself; 0: as requested by REQUEST_DATA_STREAM."""
+    """Streamed messages per second; 0: as requested by REQUEST_DATA_STREAM."""
     parameters: int = 20
     list_rate: float = 1400.0
-    """Parameters a second."""
+    """Parameters per second."""
     has_ftp: bool = False
     file_rate: float = 46_000.0
-    """Bytes a second of a file that is read by MAVFTP."""
+    """Bytes per second of a file that is read by MAVFTP."""
     heartbeat_after: float = 0.0
-    """Seconds from its beginning to its first heartbeat; the next ones come each second."""
+    """Seconds from the start of the vehicle to its first heartbeat. The others follow each second."""
     bandwidth: float = 0.0
-    """Bytes a second of the link; 0: no limit."""
+    """Bytes per second of the link; 0: no limit."""
     delay: float = 0.0
-    """Seconds each way."""
+    """Delay in each direction in seconds."""
 
 
 class Vehicle:
-    """Heartbeats, streams and answers, each at its time."""
+    """Sends heartbeats, streams and answers at their scheduled times."""
 
     def __init__(self, options: Options) -> None:
         self.options = options
@@ -77,10 +81,10 @@ class Vehicle:
         self._lines = open(0, "rb", buffering=0)  # noqa: SIM115 - select sees nothing that a buffer has
 
     def run(self) -> None:
-        """Run until the process is ended; prints a line when it has started."""
+        """Print ``ready``, then run until the process is terminated."""
         print("ready", flush=True)
         if not self.link.is_stream:
-            self._lines.readline()  # "go": a client listens now.
+            self._lines.readline()  # The line "go" means that a client listens.
         self.link.wait_for_peer()
         self.at(time.monotonic() + self.options.heartbeat_after, self._send_heartbeats)
         self.set_rate(self._rate)
@@ -90,14 +94,14 @@ class Vehicle:
                 self._send_much()
             self._wait()
 
-    # ------------------------------------------------------------------------- for its services
+    # ------------------------------------------------------------------------- used by Services
 
     def at(self, when: float, function: Callable[[], None]) -> None:
-        """Have a function called at a time of ``time.monotonic``."""
+        """Call a function at a time of ``time.monotonic``."""
         heapq.heappush(self._due, (when, next(self._order), function))
 
     def send(self, frame: bytes) -> None:
-        """Number it and send it."""
+        """Send a frame with the next sequence number."""
         self.link.send(self._numbering.numbered(frame))
 
     def stream(self, hertz: float) -> None:
@@ -106,7 +110,7 @@ class Vehicle:
             self.set_rate(hertz * STREAM_KINDS_AT_ONCE)
 
     def set_rate(self, rate: float, *, evenly: bool = False) -> None:
-        """Stream this many messages a second from now on, in ArduCopter's bursts or evenly."""
+        """Stream this many messages per second from now on, in bursts like ArduCopter or evenly."""
         self._rate = rate
         self._streams += 1
         if 0 < rate < math.inf:
@@ -127,14 +131,14 @@ class Vehicle:
         raw, kind, number = self._frames[self._position]
         self._position = (self._position + 1) % len(self._frames)
         if kind == "HEARTBEAT" and self.options.rate == 0:
-            return  # They are sent each second, whatever the streams.
+            return  # Heartbeats are sent each second, independently of streams.
         numbered = self._numbering.numbered(raw)
         if self._rate < math.inf:
             self.stamps.append((kind, number, time.monotonic_ns()))
         self.link.send(numbered)
 
     def _send_much(self) -> None:
-        """Send as much as possible now."""
+        """Send as many messages as the link accepts now."""
         if not self.link.is_stream:
             for _ in range(AT_ONCE):
                 self._send_next()
@@ -156,7 +160,7 @@ class Vehicle:
             heapq.heappop(self._due)[2]()
 
     def _wait(self) -> None:
-        """Wait until something is due or arrives; not at all at the maximum rate."""
+        """Wait until a message arrives or an action is due. At the maximum rate, do not wait."""
         until = self.link.release_due()
         if self._due:
             until = min(until, self._due[0][0])
@@ -183,7 +187,7 @@ class Vehicle:
 
 
 def main(arguments: list[str]) -> None:
-    """Serve until the process is ended."""
+    """Serve until the process is terminated."""
     options: dict[str, Any] = json.loads(arguments[0])
     Vehicle(Options(**options)).run()
 

@@ -1,11 +1,11 @@
-"""Many simulated vehicles in real time, in several processes, and one fleet that flies them by UDP.
+"""Measures one fleet of many vehicles, which several processes simulate in real time, over UDP.
 
     python benchmarks/fleet_scale.py                                  # 500 vehicles in 10 networks, 5 processes; 30 s
-    python benchmarks/fleet_scale.py --vehicles 20 --processes 2 --networks 2 --seconds 3   # does it run?
+    python benchmarks/fleet_scale.py --vehicles 20 --processes 2 --networks 2 --seconds 3   # a short check
 
-Each process simulates its share of the networks: copters that hover, what a client watches at 4 Hz. The fleet takes
-all of them; measured are the processor time of everybody, how far each simulation was behind real time, and how old
-positions were when they were looked at. Writes bench-fleet.json.
+Each process simulates some of the networks, with hovering copters that send the states of a client at 4 Hz. The figures
+are the processor time of all processes, the delay of each simulation behind real time, and the age of positions. They
+are written to bench-fleet.json.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from aerokit.transport import create_link
 
 FIRST_PORT = 14700
 LATE_S = 0.1
-"""A simulation that is farther behind than this does not keep up."""
+"""Maximum delay of a simulation behind real time."""
 WARM_UP_S = 3.0
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure, print, write; or be one of the simulating processes."""
+    """Measure, print and write the results; with ``--serve``, run one of the simulating processes."""
     options = _parser().parse_args(arguments)
     if options.serve:
         print(json.dumps(asyncio.run(_serve(options.serve, options.vehicles, options.seconds))))
@@ -50,10 +50,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 async def _serve(ports: Sequence[int], on_each: int, seconds: float) -> Mapping[str, float]:
-    """Vehicles on each of these ports; their processor time as a share, and how late their timers were."""
+    """Simulate vehicles on each of these ports. Return their share of a core, and the delays of timers and time."""
     networks = [[_hovering("copter", number) for number in range(1, on_each + 1)] for _ in ports]
     links = [create_link(f"udpout:127.0.0.1:{port}") for port in ports]
-    vehicles = [each for network in networks for each in network]
+    vehicles = [vehicle for network in networks for vehicle in network]
     late: list[float] = []
     async with SimulatorServer(vehicles, links, vehicles_on=networks) as server:
         loop = asyncio.get_running_loop()
@@ -72,14 +72,14 @@ async def _serve(ports: Sequence[int], on_each: int, seconds: float) -> Mapping[
 
 
 async def _measure(count: int, processes: int, networks: int, seconds: float) -> dict[str, Any]:
-    """Start the simulators, make one fleet of their vehicles, and look for a while."""
+    """Start the simulating processes, and measure one fleet of their vehicles."""
     on_each = count // networks
     ports = [FIRST_PORT + number for number in range(networks)]
-    lasts = WARM_UP_S + seconds + 5.0 + 0.02 * count  # opening takes its time
+    lasts = WARM_UP_S + seconds + 5.0 + 0.02 * count  # opening the fleet takes longer with more vehicles
     children = [_started(ports[number::processes], on_each, lasts) for number in range(processes)]
     try:
-        found = await _look(ports, on_each, seconds)
-        told = [json.loads(await asyncio.to_thread(_told, each)) for each in children]
+        found = await _measure_fleet(ports, on_each, seconds)
+        reports = [json.loads(await asyncio.to_thread(_output_of, child)) for child in children]
     finally:
         for child in children:
             child.kill()
@@ -88,9 +88,9 @@ async def _measure(count: int, processes: int, networks: int, seconds: float) ->
         "vehicles": on_each * networks,
         "processes": processes,
         **found,
-        "simulators_share": [round(each["share"], 3) for each in told],
-        "simulators_behind_s": round(max(each["behind_s"] for each in told), 3),
-        "in_real_time": all(each["behind_s"] < LATE_S for each in told),
+        "simulators_share": [round(report["share"], 3) for report in reports],
+        "simulators_behind_s": round(max(report["behind_s"] for report in reports), 3),
+        "in_real_time": all(report["behind_s"] < LATE_S for report in reports),
     }
 
 
@@ -99,11 +99,11 @@ def _started(ports: Sequence[int], on_each: int, seconds: float) -> subprocess.P
     return subprocess.Popen([sys.executable, __file__, *options], stdout=subprocess.PIPE, text=True)
 
 
-def _told(child: subprocess.Popen[str]) -> str:
+def _output_of(child: subprocess.Popen[str]) -> str:
     return child.communicate()[0]
 
 
-async def _look(ports: Sequence[int], on_each: int, seconds: float) -> dict[str, Any]:
+async def _measure_fleet(ports: Sequence[int], on_each: int, seconds: float) -> dict[str, Any]:
     addresses = {f"network{port - FIRST_PORT}": f"udpin:127.0.0.1:{port}" for port in ports}
     started = time.perf_counter()
     async with aerokit.fleet(
@@ -129,10 +129,10 @@ async def _look(ports: Sequence[int], on_each: int, seconds: float) -> dict[str,
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--vehicles", type=int, default=500, help="in all (500)")
-    parser.add_argument("--processes", type=int, default=5, help="that simulate (5)")
-    parser.add_argument("--networks", type=int, default=10, help="each with a UDP port of its own (10)")
-    parser.add_argument("--seconds", type=float, default=30.0, help="how long is looked (30)")
+    parser.add_argument("--vehicles", type=int, default=500, help="number of vehicles (500)")
+    parser.add_argument("--processes", type=int, default=5, help="number of simulating processes (5)")
+    parser.add_argument("--networks", type=int, default=10, help="number of networks, each with a UDP port (10)")
+    parser.add_argument("--seconds", type=float, default=30.0, help="duration of the measurement (30)")
     parser.add_argument("--serve", type=int, nargs="+", metavar="PORT", help=argparse.SUPPRESS)
     parser.add_argument("--output", type=Path, default=Path("bench-fleet.json"), help="default: bench-fleet.json")
     return parser

@@ -4,14 +4,16 @@
     python benchmarks/hub.py out_4 # these only
     python benchmarks/hub.py --quick                  # a short check that it runs; the figures mean little
 
-A vehicle sends over UDP on 127.0.0.1 to a process of its own, ``aerokit hub udpin:… udpout:… …`` or ``mavproxy.py
---master udpin:… --out udpout:… …``, which passes every frame on to 1, 4 or 16 others. ``out_N``: frames received, and
-passed to all of them, per second of its processor time, while a recorded ArduCopter is sent at 600 frames a second,
-in pieces of ten; both take turns, neither may lose any, and MAVProxy has no modules and no log. ``latency_…``: time
-from sending to receiving at the first of four, of single frames, 100 a second: median and 99th percentile.
+The measured process, ``aerokit hub udpin:… udpout:… …`` or ``mavproxy.py --master udpin:… --out udpout:… …``, receives
+frames over UDP on 127.0.0.1 and forwards each to 1, 4 or 16 receivers.
 
-MAVProxy is taken from ``$AEROKIT_MAVPROXY_PYTHON``'s environment, else from this one; without it there are no rows.
-If ``$AEROKIT_MAVLINK_ROUTERD`` names a mavlink-routerd (C++), there is another row for it, without a target.
+- ``out_N``: frames forwarded to N receivers per second of processor time. Frames of a recorded ArduCopter are sent at
+  600 Hz, ten at a time. The hubs take turns, and neither may lose frames. MAVProxy runs without modules and log.
+- ``latency_…``: median and 99th percentile of the time from sending a frame to receiving it at the first of four
+  receivers, at 100 Hz.
+
+``$AEROKIT_MAVPROXY_PYTHON`` names the interpreter with MAVProxy, by default this one; without MAVProxy there are no
+rows. If ``$AEROKIT_MAVLINK_ROUTERD`` names a mavlink-routerd (C++), it gets another row, without a target.
 """
 
 from __future__ import annotations
@@ -56,7 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Measure the requested parts, print and write the results."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(NAMES))
-    parser.add_argument("--quick", action="store_true", help="few frames: does it run?")
+    parser.add_argument("--quick", action="store_true", help="few frames, to check that everything runs")
     parser.add_argument("--output", type=Path, default=Path("bench-hub.json"), help="default: bench-hub.json")
     options = parser.parse_args(arguments)
     wanted = options.names or NAMES
@@ -67,9 +69,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if f"out_{count}" in wanted:
             rows += _throughput(count, options.quick)
     if any(name.startswith("latency") for name in wanted):
-        rows += [each for each in _latencies(options.quick) if each["name"] in wanted]
+        rows += [row for row in _latencies(options.quick) if row["name"] in wanted]
     print(table.printed(rows))
-    missed = [each["name"] for each in rows if table.is_missed(each)]
+    missed = [row["name"] for row in rows if table.is_missed(row)]
     print(f"MISSED: {', '.join(missed)}" if missed else "every aim is met")
     table.write(rows, options.output)
     return 0
@@ -90,7 +92,7 @@ def _throughput(count: int, quick: bool) -> list[Row]:
                 file=sys.stderr,
                 flush=True,
             )
-    medians = {name: statistics.median(each) for name, each in figures.items()}
+    medians = {name: statistics.median(values) for name, values in figures.items()}
     own, rows = medians.pop("aerokit"), []
     for name, peer in medians.items():
         what, text, aim = _PEERS[name]
@@ -98,7 +100,7 @@ def _throughput(count: int, quick: bool) -> list[Row]:
     return rows
 
 
-# Suffix of a row's name, name of the peer, and target.
+# For each peer: suffix of the row's name, name of the peer, and target.
 _PEERS = {"mavproxy": ("", "MAVProxy --out", 10.0), "routerd": ("_routerd", "mavlink-router", 0.0)}
 
 
@@ -110,7 +112,7 @@ def _present(*, with_routerd: bool = True) -> list[str]:
 def _frames_per_second(
     process: subprocess.Popen[bytes], sender: socket.socket, receivers: list[socket.socket], frames: int
 ) -> float:
-    """Frames for which there was a second of processor time; RuntimeError when some were lost."""
+    """Return the number of frames per second of processor time. RuntimeError if more than 0.5 % were lost."""
     recorded = _recorded(WARM_UP + frames)
     counts = [0] * len(receivers)
     _send(recorded[:WARM_UP], sender, receivers, counts)
@@ -123,7 +125,7 @@ def _frames_per_second(
 
 
 def _send(frames: Sequence[bytes], sender: socket.socket, receivers: list[socket.socket], counts: list[int]) -> None:
-    """Send frames in pieces, and count those received, until all or no more arrive."""
+    """Send frames in pieces, and count the received ones, until all have arrived or none arrives for a second."""
     began = time.perf_counter()
     for sent in range(0, len(frames), PIECE):
         for raw in frames[sent : sent + PIECE]:
@@ -139,11 +141,11 @@ def _send(frames: Sequence[bytes], sender: socket.socket, receivers: list[socket
 
 
 def _recorded(count: int) -> list[bytes]:
-    """Yield the broadcast frames of a recorded copter, renumbered each time the flight is repeated."""
+    """Return broadcast frames of a recorded copter. The recording is repeated with continuous sequence numbers."""
     path = ROOT / "tests" / "recordings" / "ardupilot-copter.tlog"
     targets = TargetFields(STANDARD)
     frames = [Frame.parse(raw) for _, raw in read_tlog(path) if raw[0] == MAGIC_V2 and raw[5:7] == b"\1\1"]
-    bodies = [each.body for each in frames if targets.target_of(each) == (0, 0) and not each.body[1]]
+    bodies = [frame.body for frame in frames if targets.target_of(frame) == (0, 0) and not frame.body[1]]
     numbered = []
     for number in range(count):
         body = bodies[number % len(bodies)]
@@ -154,7 +156,7 @@ def _recorded(count: int) -> list[bytes]:
 
 
 def _count(receivers: list[socket.socket], counts: list[int]) -> None:
-    """Count whole frames: several may come in a datagram."""
+    """Count frames; a datagram may contain several."""
     for place, receiver in enumerate(receivers):
         while True:
             try:
@@ -180,7 +182,7 @@ def _latencies(quick: bool) -> list[Row]:
     if len(series) < 2:
         return rows
     for what, share in (("median", 0.5), ("p99", 0.99)):
-        own, peer = (1e6 * sorted(each)[int(share * len(each))] for each in series.values())
+        own, peer = (1e6 * sorted(delays)[int(share * len(delays))] for delays in series.values())
         rows.append(row(f"latency_{what}", own, peer, "MAVProxy --out", unit="µs", ratio=peer / own, aim=1.0))
     return rows
 
@@ -205,11 +207,11 @@ def _delays(sender: socket.socket, receiver: socket.socket, count: int) -> list[
 
 @contextmanager
 def _hub(name: str, count: int) -> Iterator[tuple[subprocess.Popen[bytes], socket.socket, list[socket.socket]]]:
-    """A process that passes frames on, a socket to send to it, and those it sends to."""
+    """Run a forwarding process. Yield it, a socket to send to it, and the sockets that it sends to."""
     receivers = [_bound() for _ in range(count)]
     with _bound() as probe:
         port = probe.getsockname()[1]
-    outs = [f"127.0.0.1:{each.getsockname()[1]}" for each in receivers]
+    outs = [f"127.0.0.1:{receiver.getsockname()[1]}" for receiver in receivers]
     with tempfile.TemporaryDirectory() as folder:
         command = _command(name, port, outs, folder)
         process = subprocess.Popen(
@@ -231,8 +233,8 @@ def _hub(name: str, count: int) -> Iterator[tuple[subprocess.Popen[bytes], socke
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
-            for each in receivers:
-                each.close()
+            for receiver in receivers:
+                receiver.close()
 
 
 def _command(name: str, port: int, outs: Sequence[str], folder: str) -> list[str]:
@@ -261,21 +263,21 @@ def _wait_until_it_works(
     until, silent = time.monotonic() + 30.0, set(receivers)
     while silent:
         if time.monotonic() > until or process.poll() is not None:
-            raise RuntimeError(f"nothing comes through {process.args!r}")
+            raise RuntimeError(f"no frames are forwarded by {process.args!r}")
         with suppress(ConnectionRefusedError):
             sender.send(HEARTBEAT)
         time.sleep(0.1)
-        for each in tuple(silent):
+        for receiver in tuple(silent):
             try:
-                each.recv(65535)
-                silent.discard(each)
+                receiver.recv(65535)
+                silent.discard(receiver)
             except BlockingIOError:
                 pass
     time.sleep(1.0)
-    for each in receivers:
+    for receiver in receivers:
         try:
             while True:
-                each.recv(65535)
+                receiver.recv(65535)
         except BlockingIOError:
             pass
 
@@ -289,7 +291,7 @@ def _bound() -> socket.socket:
 
 
 def _cpu_s(pid: int) -> float:
-    """Processor time of a process, in user and system mode."""
+    """Return the processor time of a process, in user and system mode."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) * TICKS_S
 

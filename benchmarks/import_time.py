@@ -1,9 +1,9 @@
-"""Import time, each import in a process of its own, in turns.
+"""Import time, with each import in a new process, in turns.
 
     python benchmarks/import_time.py
 
-Measures the time inside the process, in milliseconds, without the start of the interpreter; byte code is on disk, as
-on every machine from the second run on.
+The time in milliseconds does not include the start of the interpreter. Byte code is on disk, as in every run of a
+program but the first.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ STATEMENTS = (AEROKIT, DIALECT, AEROKIT_READY, MAVUTIL)
 
 
 def rows(rounds: int = 25, *, fresh_byte_code: bool = True) -> list[Row]:
-    """``import``, and ``import_ready``: with everything that is needed to connect, asyncio and mavutil included."""
+    """Measure ``import``, and ``import_ready`` with all modules needed to connect, including asyncio and mavutil."""
     taken: dict[str, list[float]] = {statement: [] for statement in STATEMENTS}
     with TemporaryDirectory() as folder:
         byte_code = folder if fresh_byte_code else None
@@ -48,7 +48,7 @@ def _row(name: str, own: list[float], peer: list[float], statement: str, *, aim:
 
 def _import_ms(statement: str, byte_code: str | None) -> float:
     program = f"from time import perf_counter as now; began = now(); {statement}; print(now() - began)"
-    environment = {**os.environ, "MAVLINK20": "1"}  # mavutil: the same dialect, not that of MAVLink 1
+    environment = {**os.environ, "MAVLINK20": "1"}  # makes mavutil import the dialect of MAVLink 2
     if byte_code:
         environment["PYTHONPYCACHEPREFIX"] = byte_code
         environment.pop("PYTHONDONTWRITEBYTECODE", None)

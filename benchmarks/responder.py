@@ -1,4 +1,4 @@
-"""A vehicle that only answers commands, in a process of its own, so that it is not measured.
+"""A vehicle that only answers commands, in a separate process, so that it is not measured.
 
     python benchmarks/responder.py PORT ...
 
@@ -33,14 +33,14 @@ SENT_ON_REQUEST: dict[int, Callable[[], Message]] = {
 
 
 class Peer:
-    """One program at the other end; the sequence numbers it sees have no gaps."""
+    """One client, with continuous sequence numbers."""
 
     def __init__(self) -> None:
         self._sequence = -1
         self._made: dict[Hashable, list[bytes]] = {}
 
     def next_frame(self, key: Hashable, make: Callable[[], Message]) -> bytes:
-        """A message with the next sequence number; its 256 frames are made when it is first needed."""
+        """Return a message with the next sequence number. Its 256 frames are encoded on first use."""
         self._sequence = (self._sequence + 1) & 0xFF
         if key not in self._made:
             encoder, message = FrameEncoder(SYSTEM_ID, COMPONENT_ID), make()
@@ -49,7 +49,7 @@ class Peer:
 
 
 class Responder:
-    """Heartbeats and acks on one blocking socket."""
+    """Sends heartbeats and acknowledgements on blocking sockets."""
 
     def __init__(self, ports: list[int]) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -58,7 +58,7 @@ class Responder:
         self._peers: dict[Address, Peer] = {("127.0.0.1", port): Peer() for port in ports}
 
     def run(self) -> None:
-        """Answer until the process is ended; prints a line when it has started."""
+        """Print a line, then answer until the process is terminated."""
         print("ready", flush=True)
         due = time.monotonic()
         while True:
@@ -67,7 +67,7 @@ class Responder:
                 self._send_heartbeats()
             try:
                 data, address = self._socket.recvfrom(4096)
-            except (TimeoutError, ConnectionError):  # There is no request, or no peer yet.
+            except (TimeoutError, ConnectionError):  # no request has arrived, or the client does not listen yet
                 continue
             self._answer(data, address)
 
@@ -86,12 +86,12 @@ class Responder:
         ack = partial(messages.CommandAck, command, 0, 0, 0, *sender)
         self._socket.sendto(peer.next_frame((command, *sender), ack), address)
         if command == REQUEST_MESSAGE:
-            self._tell(int(struct.unpack_from("<f", data, 10)[0]), peer, address)
+            self._send_requested(int(struct.unpack_from("<f", data, 10)[0]), peer, address)
 
-    def _tell(self, message_id: int, peer: Peer, address: Address) -> None:
+    def _send_requested(self, message_id: int, peer: Peer, address: Address) -> None:
         make = SENT_ON_REQUEST.get(message_id)
         if make is not None:
-            self._socket.sendto(peer.next_frame(("told", message_id), make), address)
+            self._socket.sendto(peer.next_frame(("requested", message_id), make), address)
 
 
 def _heartbeat() -> Message:

@@ -1,11 +1,11 @@
-"""The whole table, side by side with pymavlink and MAVSDK; writes ``bench.json``.
+"""The complete table of benchmarks, compared with pymavlink and MAVSDK; writes ``bench.json``.
 
     python benchmarks/run.py                          # everything, about a minute
     python benchmarks/run.py import decode_skip       # these rows only
     python benchmarks/run.py --quick                  # a short check that it runs; the figures mean little
 
-Figures are medians of interleaved rounds; only the ratios are comparable between machines. A missed target is printed
-prominently, but is no failure: the exit code is 0.
+Figures are medians of interleaved rounds. Only the ratios are comparable between machines. A missed target is marked in
+the table, but the exit code is 0.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import table
 from table import Row
 
 Measure = Callable[[bool], list[Row]]
-"""Gives rows; with True in few rounds."""
+"""Function that measures rows; the argument True selects few rounds."""
 
 SHORT = "copter_short"
 DECODE = tuple(decode.RECORDINGS)
@@ -52,11 +52,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     wanted = options.names or NAMES
     if not set(wanted) <= set(NAMES):
         parser.error(f"the names are {', '.join(NAMES)}")
-    rows = [each for each in _measured(wanted, options.quick) if each["name"] in wanted]
+    rows = [row for row in _measured(wanted, options.quick) if row["name"] in wanted]
     print(table.printed(rows))
-    for name in sorted(set(wanted) - {each["name"] for each in rows}):
-        print(f"{name}: left out, its peer is not installed")
-    missed = [each["name"] for each in rows if table.is_missed(each)]
+    for name in sorted(set(wanted) - {row["name"] for row in rows}):
+        print(f"{name}: omitted, because its peer is not installed")
+    missed = [row["name"] for row in rows if table.is_missed(row)]
     print(f"MISSED: {', '.join(missed)}" if missed else "every aim is met")
     table.write(rows, options.output)
     return 0
@@ -74,7 +74,7 @@ def _measured(wanted: Sequence[str], quick: bool) -> list[Row]:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(NAMES))
-    parser.add_argument("--quick", action="store_true", help="few rounds: does it run?")
+    parser.add_argument("--quick", action="store_true", help="few rounds, to check that everything runs")
     parser.add_argument("--output", type=Path, default=Path("bench.json"), help="default: bench.json")
     return parser
 

@@ -4,10 +4,10 @@
     python benchmarks/scale.py copter_hundred         # these only
     python benchmarks/scale.py --quick                # a short check that it runs; the figures mean little
 
-``…_hundred``: 100 hovering vehicles and a client of each, all on one link in memory in one process, in real time,
-with the states that a client observes at 4 Hz; processor time as a share of one core, and the vehicles' part of it.
-``…_flight``: wall time of ten minutes on virtual time, client included: arming, take-off, a mission, the ground.
-``clients``: 1 to 500 clients without simulated vehicles, see ``client_scale.py``.
+- ``…_hundred``: processor time of 100 hovering vehicles and their clients as a share of one core, and the part of the
+  vehicles. All are in one process and on one link in memory, in real time, with the states of a client at 4 Hz.
+- ``…_flight``: wall time of a flight of ten virtual minutes, including the client: arming, take-off, mission, landing.
+- ``clients``: 1 to 500 clients without simulated vehicles, see ``client_scale.py``.
 """
 
 from __future__ import annotations
@@ -51,11 +51,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     wanted = options.names or NAMES
     if not set(wanted) <= set(NAMES):
         parser.error(f"the names are {', '.join(NAMES)}")
-    rows = [each for name in wanted for each in _measured(name, options.quick)]
+    rows = [measured_row for name in wanted for measured_row in _measured(name, options.quick)]
     print(table.printed(rows))
-    for each in rows:
-        print(f"{each['name']}: {each['note']}")
-    missed = [each["name"] for each in rows if table.is_missed(each)]
+    for measured_row in rows:
+        print(f"{measured_row['name']}: {measured_row['note']}")
+    missed = [measured_row["name"] for measured_row in rows if table.is_missed(measured_row)]
     print(f"MISSED: {', '.join(missed)}" if missed else "every aim is met")
     table.write(rows, options.output)
     return 0
@@ -86,7 +86,7 @@ def _hundred(name: str, kind: str, count: int, rounds: int) -> Row:
 async def _shares(kind: str, count: int, rounds: int, window_s: float) -> list[tuple[float, float]]:
     """Return processor time per second, in total and of the vehicles, for several windows of time."""
     near, far = memory_link_pair()
-    server = _Watched([_hovering(kind, number) for number in range(1, count + 1)], far)
+    server = _MeasuredServer([_hovering(kind, number) for number in range(1, count + 1)], far)
     async with AsyncExitStack() as stack:
         await stack.enter_async_context(server)
         connection = await stack.enter_async_context(aerokit.open_connection(near))
@@ -97,19 +97,19 @@ async def _shares(kind: str, count: int, rounds: int, window_s: float) -> list[t
         await asyncio.sleep(window_s)
         shares = [await _share(server, window_s) for _ in range(rounds)]
         if not all(client.position.is_known and client.armed.value for client in clients):
-            raise AssertionError("not every client knows where its vehicle flies")
+            raise AssertionError("a client does not know the position of its vehicle, or the vehicle is disarmed")
     return shares
 
 
-async def _share(server: _Watched, window_s: float) -> tuple[float, float]:
+async def _share(server: _MeasuredServer, window_s: float) -> tuple[float, float]:
     wall, both, vehicles = time.perf_counter(), time.process_time(), server.spent_s
     await asyncio.sleep(window_s)
     wall, both = time.perf_counter() - wall, time.process_time() - both
     return both / wall, (server.spent_s - vehicles) / wall
 
 
-class _Watched(SimulatorServer):
-    """Adds up the processor time that the vehicles take."""
+class _MeasuredServer(SimulatorServer):
+    """Measures the processor time of the vehicles."""
 
     spent_s = 0.0
 
@@ -125,11 +125,11 @@ class _Watched(SimulatorServer):
 
 
 def _hovering(kind: str, system_id: int) -> SimulatedVehicle:
-    """A vehicle that has taken off before anybody looks."""
+    """Create a vehicle that has already taken off."""
     vehicle = _made(kind, system_id)
     target = (system_id, 1)
     encoder = FrameEncoder(255, 190)
-    # PX4 takes altitudes above mean sea level; home is at 489 m.
+    # PX4 expects altitudes above mean sea level; home is at 489 m.
     height_m = 10.0 if kind == "copter" else 500.0
 
     def order(command: int, *params: float) -> None:
@@ -165,11 +165,11 @@ def _flight(name: str, kind: str, flight_s: float, rounds: int) -> Row:
         took.append(1000 * (time.perf_counter() - started) * flight_s / flown)
     wall = statistics.median(took)
     found = row(name, wall, 1000.0, "one second", unit="ms", ratio=1000.0 / wall, aim=1.0)
-    return {**found, "note": f"{flown:.0f} s were flown each time, the figure is for {flight_s:.0f}"}
+    return {**found, "note": f"{flown:.0f} s were flown each time; the figure is for {flight_s:.0f} s"}
 
 
 async def _fly(kind: str, flight_s: float) -> float:
-    """Back and forth until it is time to land; simulated seconds of everything."""
+    """Fly back and forth, and land. Return the simulated duration in seconds."""
     loop = asyncio.get_running_loop()
     async with simulated_link(_made(kind)) as link, aerokit.connect(link) as vehicle:
         await vehicle.wait_ready()
@@ -195,7 +195,7 @@ def _mission(start: aerokit.Position, kind: str, flight_s: float) -> Mission:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(NAMES))
-    parser.add_argument("--quick", action="store_true", help="few and short: does it run?")
+    parser.add_argument("--quick", action="store_true", help="short measurements, to check that everything runs")
     parser.add_argument("--output", type=Path, default=Path("bench-scale.json"), help="default: bench-scale.json")
     return parser
 

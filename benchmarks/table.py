@@ -1,4 +1,4 @@
-"""Rows of the table, and how figures become one: side by side in one process, in turns, by their medians."""
+"""Rows of the table of benchmarks: creation from measured figures, formatting and writing."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ HEADINGS = ("name", "aerokit", "peer", "unit", "ratio", "aim", "", "against")
 def faster_is_better(
     name: str, aerokit: Sequence[float], peer: Sequence[float], peer_name: str, *, unit: str, aim: float
 ) -> Row:
-    """A row of two series of durations: the medians, and how many times as long the peer takes."""
+    """Create a row from two series of durations: their medians, and the ratio of the peer's to aerokit's."""
     own, other = statistics.median(aerokit), statistics.median(peer)
     return row(name, own, other, peer_name, unit=unit, ratio=other / own, aim=aim)
 
 
 def row(name: str, aerokit: float, peer: float, peer_name: str, *, unit: str, ratio: float, aim: float) -> Row:
-    """One row, rounded for people."""
+    """Create a row with rounded figures."""
     return {
         "name": name,
         "aerokit": _rounded(aerokit),
@@ -43,8 +43,8 @@ def is_missed(row: Row) -> bool:
 
 
 def printed(rows: Sequence[Row]) -> str:
-    """The table as text."""
-    lines = [HEADINGS, *(_cells(each) for each in rows)]
+    """Return the table as text."""
+    lines = [HEADINGS, *(_cells(row) for row in rows)]
     widths = [max(len(line[i]) for line in lines) for i in range(len(HEADINGS))]
     return "\n".join(
         "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines
@@ -52,7 +52,7 @@ def printed(rows: Sequence[Row]) -> str:
 
 
 def write(rows: Sequence[Row], path: Path) -> None:
-    """The rows as JSON."""
+    """Write the rows as JSON."""
     path.write_text(json.dumps(list(rows), indent=2) + "\n")
 
 

@@ -4,9 +4,9 @@
     python benchmarks/transfers.py parameters --loss 0.2  # these tasks, this loss
     python benchmarks/transfers.py --quick                # small and without loss: a check that it runs
 
-Each transfer has a client process and a vehicle process of its own (``bad_vehicle.py``), so that nothing is
-inherited; the same seed loses the same frames for every library, counted from the first. Time counts from the call of
-a connected client to its return, and the transferred content is compared with the expected one. Medians over the
+Each transfer has a new client process and a new vehicle process (``bad_vehicle.py``), so that transfers are
+independent. A seed determines the numbers of the lost frames for every library. The time is that of the transfer call
+of a connected client, and the transferred content is compared with the expected one. Figures are medians over the
 seeds.
 """
 
@@ -38,12 +38,12 @@ DELAY_S = 0.01
 LOSSES = (0.0, 0.05, 0.2)
 SEEDS = (1, 2, 3)
 DRONEKIT = os.environ.get("AEROKIT_DRONEKIT_PYTHON", sys.executable)
-"""The interpreter that has DroneKit, where it is not this one."""
+"""Interpreter that has DroneKit, by default this one."""
 
 
 @dataclass(frozen=True)
 class Contender:
-    """A library and one of its ways to do something."""
+    """A library and one of its transfer methods."""
 
     name: str
     library: str
@@ -104,7 +104,7 @@ class Outcome:
 
 
 def rows(quick: bool = False) -> list[Row]:
-    """One row for each task, loss and peer: ``transfer_parameters_loss_5_mavsdk``."""
+    """Measure a row for each task, loss and peer: ``transfer_parameters_loss_5_mavsdk``."""
     if quick:
         outcomes = measure(TASKS, (0.0,), (1,), QUICK, libraries=("aerokit", "pymavlink"))
     else:
@@ -136,7 +136,7 @@ def measure(
 
 
 def as_rows(outcomes: Sequence[Outcome]) -> list[Row]:
-    """Return aerokit compared with each of the others; a failure counts as the maximum time."""
+    """Return rows that compare aerokit with each other library. A failure counts as the maximum time."""
     found = []
     for own in outcomes:
         if own.contender is not AEROKIT:
@@ -148,13 +148,14 @@ def as_rows(outcomes: Sequence[Outcome]) -> list[Row]:
 
 
 def printed(outcomes: Sequence[Outcome]) -> str:
-    """A table in Markdown, one line for each task and loss."""
+    """Return a Markdown table with a line for each task and loss."""
     lines = []
-    for task in dict.fromkeys(each.task for each in outcomes):
+    for task in dict.fromkeys(outcome.task for outcome in outcomes):
         names = [contender.name for contender in CONTENDERS[task]]
         lines += ["", f"| {task.replace('_', ' ')} | {' | '.join(names)} |", "|---" * (len(names) + 1) + "|"]
-        for loss in dict.fromkeys(each.loss for each in outcomes):
-            cells = {str(each.contender.name): str(each) for each in outcomes if (each.task, each.loss) == (task, loss)}
+        for loss in dict.fromkeys(outcome.loss for outcome in outcomes):
+            of_row = [outcome for outcome in outcomes if (outcome.task, outcome.loss) == (task, loss)]
+            cells = {outcome.contender.name: str(outcome) for outcome in of_row}
             if cells:
                 lines.append(f"| {loss:.0%} loss | {' | '.join(cells.get(name, '–') for name in names)} |")
     return "\n".join(lines)
@@ -190,7 +191,7 @@ def _outcome(
 
 
 class _FailedError(Exception):
-    """The transfer did not end, or its content is wrong."""
+    """The transfer did not end, or the transferred content is wrong."""
 
 
 def _transfer(
@@ -216,7 +217,7 @@ def _run_client(command: list[str], folder: Path) -> float:
     try:
         outcome = json.loads(done.stdout.splitlines()[-1])
     except (IndexError, ValueError):
-        raise _FailedError((done.stderr.strip().splitlines() or ["ended without a word"])[-1][:200]) from None
+        raise _FailedError((done.stderr.strip().splitlines() or ["ended without a result"])[-1][:200]) from None
     if "error" in outcome:
         raise _FailedError(f"{outcome['error']} (after {outcome['seconds']:.1f} s)")
     if outcome["seconds"] > LIMIT_S:
@@ -235,7 +236,7 @@ def _check(task: str, contender: Contender, sizes: Sizes, folder: Path) -> None:
     else:
         path = folder / ("vehicle.bin" if task == "file_upload" else "out.bin")
         if not path.exists() or path.read_bytes() != file_content(sizes.file_bytes):
-            raise _FailedError("the file is not what it should be")
+            raise _FailedError("the content of the file is wrong")
 
 
 def _check_parameters(found: dict[str, float], expected: dict[str, float]) -> None:
@@ -252,7 +253,7 @@ def _check_mission(found: list[list[float]], count: int, contender: Contender) -
     expected = mission_items(count)
     if len(found) != len(expected):
         raise _FailedError(f"{len(found)} items instead of {len(expected)}")
-    # DroneKit has the form of the messages with 32-bit floats: a metre and a half.
+    # DroneKit uses MISSION_ITEM, whose coordinates are 32-bit floats with errors of up to 1.5 m.
     slack = 200 if contender.library == "dronekit" else 0
     for number, (one, other) in enumerate(zip(found, expected, strict=True)):
         same = [one[0], *one[2:6], one[8]] == [other[0], *other[2:6], other[8]]
@@ -304,11 +305,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Measure the requested parts, print and write the results."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("tasks", nargs="*", metavar="TASK", help=", ".join(TASKS))
-    parser.add_argument("--loss", type=float, action="append", help="share of frames lost each way, 0 to 1")
-    parser.add_argument("--seeds", type=int, default=len(SEEDS), help="so many runs of each")
-    parser.add_argument("--delay", type=float, default=DELAY_S, help="seconds each way")
-    parser.add_argument("--library", action="append", help="only these: aerokit, pymavlink, mavsdk, dronekit")
-    parser.add_argument("--quick", action="store_true", help="small and without loss: does it run?")
+    parser.add_argument("--loss", type=float, action="append", help="share of frames lost in each direction, 0 to 1")
+    parser.add_argument("--seeds", type=int, default=len(SEEDS), help="number of runs of each transfer")
+    parser.add_argument("--delay", type=float, default=DELAY_S, help="delay in each direction in seconds")
+    parser.add_argument("--library", action="append", help="aerokit, pymavlink, mavsdk or dronekit (all)")
+    parser.add_argument("--quick", action="store_true", help="small and without loss, to check that everything runs")
     parser.add_argument("--output", type=Path, default=Path("bench-transfers.json"))
     options = parser.parse_args(arguments)
     if not set(options.tasks) <= set(TASKS):
@@ -324,7 +325,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     found = as_rows(outcomes)
     print(printed(outcomes))
-    missed = [each["name"] for each in found if table.is_missed(each)]
+    missed = [row["name"] for row in found if table.is_missed(row)]
     print(f"\nMISSED: {', '.join(missed)}" if missed else "\naerokit is the fastest in every row")
     table.write(found, options.output)
     return 0

@@ -3,9 +3,10 @@
     python benchmarks/zenoh_hop.py            # a minute; writes bench-zenoh.json
     python benchmarks/zenoh_hop.py --quick    # a short check that it runs; the figures mean little
 
-``udp``: ``udpout:`` to ``udpin:``. ``zenoh``: a client connected to a vehicle side. ``zenoh_router``: both are
-clients of a router, a third process. Each frame is sent, echoed and awaited: a PING of MAVLink, 50 times a second,
-and then 1000 in a burst, of which the returned ones are counted. Processor time is that of the requesting program.
+``udp`` is ``udpout:`` to ``udpin:``. ``zenoh`` is a client that is connected to the side of the vehicle. In
+``zenoh_router`` both are clients of a router, which is a third process. A PING is sent 50 times a second, and its echo
+is awaited. Then a burst of 1000 is sent, and the returned frames are counted. The processor time is that of the
+requesting program.
 """
 
 from __future__ import annotations
@@ -73,7 +74,7 @@ class EchoReceiver:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure, print, write."""
+    """Measure, print and write the results."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--output", type=Path, default=Path("bench-zenoh.json"))
@@ -144,7 +145,7 @@ def _process(program: str, argument: str) -> Iterator[None]:
         try:
             assert running.stdout is not None
             if running.stdout.readline() != "up\n":
-                sys.exit(f"{argument} did not begin")
+                sys.exit(f"{argument} did not start")
             yield
         finally:
             running.kill()

@@ -26,7 +26,7 @@ from aerokit.testing.track import Track, record_track
 ROOT = Path(__file__).parent.parent
 IMAGES = ROOT / "docs" / "images"
 MAX_POINTS = 400
-"""Points of a track in a picture; more would not be visible."""
+"""Maximum number of points of a track in a picture; more would not be visible."""
 SPEEDUP = 20.0
 
 ON_VIRTUAL_TIME: dict[str, list[Any]] = {
@@ -37,7 +37,7 @@ ON_VIRTUAL_TIME: dict[str, list[Any]] = {
     "survey_photos": [],
     "two_vehicles": [],
 }
-"""Example name: arguments of ``main`` after the address."""
+"""Maps the name of an example to the arguments of ``main`` after the address."""
 ON_A_SOCKET: dict[str, list[str]] = {
     "blocking_hello": ["{address}"],
     "blocking_messages": ["{address}"],
@@ -45,7 +45,7 @@ ON_A_SOCKET: dict[str, list[str]] = {
     "dronekit/basic_mission": ["--connect", "{address}"],
     "dronekit/guided_velocity_and_yaw": ["--seconds", "0.2", "--altitude", "5", "--connect", "{address}"],
 }
-"""Example name: arguments of the program."""
+"""Maps the name of an example to the arguments of the program."""
 
 
 def main(names: list[str]) -> None:
@@ -107,7 +107,7 @@ def run(command: list[str], folder: str) -> str:
 
 
 def draw(tracks: list[Track], name: str) -> None:
-    """Save a picture of tracks, from above and in height."""
+    """Save a picture of tracks, from above and with their altitudes over time."""
     thin = []
     for track in tracks:
         points = list(track)

@@ -1,8 +1,8 @@
-"""Griffe extension: completes what mkdocstrings shows of the sources.
+"""Griffe extension that completes the data of mkdocstrings.
 
 - Defaults are shown as values: ``timeout: float = 10.0`` instead of the name of a constant.
-- Constructors that only the library calls are left out: `Vehicle` is created by `connect`.
-- The examples of `EXAMPLES` are added to the entries that they are for, and these come first in their class.
+- Constructors that only the library calls are omitted: `Vehicle` is created by `connect`.
+- The examples of `EXAMPLES` are added to their entries, and entries with an example come first in their class.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ SECTION = re.compile(r"^(Args|Raises|Returns|Yields|Attributes|Example|Examples|
 """A heading of a Google-style docstring."""
 PLAIN = {int, float, str, bool}
 MAX_VALUE = 60
-"""Longer values are shown by their names."""
+"""Maximum length of a default value; a longer one is shown as the name of its constant."""
 INTERNAL_PACKAGES = ("aerokit.mavlink.messages", "aerokit.mavlink.enums", "aerokit.messages", "aerokit.enums")
-"""Generated code, which has no constants in its signatures."""
+"""Packages of generated code, whose signatures contain no constants."""
 
 
 class ReferenceExtension(griffe.Extension):
-    """Changes signatures and docstrings of the package for the reference."""
+    """Completes signatures and docstrings of the package for the reference."""
 
     @cached_property
     def listing(self) -> Listing:
@@ -147,7 +147,7 @@ def _add_example(item: griffe.Object, code: str) -> None:
 
 
 def _show_values(function: griffe.Function) -> None:
-    """Replace names of constants among the defaults by their values."""
+    """Replace constants in the defaults of a function by their values."""
     for parameter in function.parameters:
         if isinstance(parameter.default, (griffe.ExprName, griffe.ExprAttribute)):
             parameter.default = _value_of(parameter.default) or parameter.default

@@ -1,4 +1,4 @@
-"""MkDocs hook: navigation, generated pages, and links that leave docs/.
+"""MkDocs hook: navigation, generated pages, and links to files outside docs/.
 
 See https://www.mkdocs.org/user-guide/configuration/#hooks. The files in docs/ also work on GitHub.
 """
@@ -21,8 +21,9 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).parent.parent
 HOW_TO = (
     "connecting", "state", "waiting", "actions", "errors", "parameters", "missions", "set-points", "files-and-logs",
-    "cameras", "gimbals", "components", "messages", "events", "links", "several-links", "bad-radio", "signing",
-    "several-vehicles", "own-loop", "sync", "recording", "dialects", "testing", "logging",
+    "cameras", "gimbals", "outputs-and-devices", "px4-tools", "components", "messages", "events", "links",
+    "several-links", "bad-radio", "signing", "several-vehicles", "own-loop", "sync", "recording", "dialects",
+    "testing", "logging",
 )  # fmt: skip
 NAVIGATION: dict[str, list[str]] = {
     "Tutorial": ["tutorial.md"],
@@ -41,13 +42,14 @@ NAVIGATION: dict[str, list[str]] = {
         "features.md", "states.md", "addresses.md", "signing.md", "simulator.md", "testing.md", "about/*.md",
     ],
 }  # fmt: skip
-"""Tab title: pages and patterns, in order. Missing pages are skipped; an unlisted page fails the build."""
+"""Maps the title of a tab to its pages and patterns, in order. Missing pages are skipped; an unlisted page fails the
+build."""
 ROOT_PAGES = {
     "CHANGELOG.md": "about/changelog.md",
     "CONTRIBUTING.md": "about/contributing.md",
     "SECURITY.md": "about/security.md",
 }
-"""File above docs/: its page on the site."""
+"""Maps a file outside docs/ to its page on the site."""
 INSTALL = """
 ??? info "Install aerokit"
 
@@ -87,7 +89,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
 
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Remove Sphinx roles of docstrings (``:class:`…```), which MkDocs shows as text, and link exceptions."""
+    """Remove Sphinx roles (``:class:`…```), which MkDocs would show as text, and add links to exceptions."""
     return RAISED.sub(r'\1<autoref identifier="aerokit.errors.\2" optional>\2</autoref>\3', ROLE.sub("", html))
 
 
@@ -95,7 +97,7 @@ def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -
 
 
 def generated_pages() -> Iterator[tuple[str, str]]:
-    """Yield path on the site and text of each page."""
+    """Yield the path on the site and the text of each generated page."""
     for source, page_path in ROOT_PAGES.items():
         yield page_path, (ROOT / source).read_text(encoding="utf-8")
     for path in example_files():
@@ -145,7 +147,7 @@ def outside_code(markdown: str, change: Any) -> str:
 
 
 def converted_link(link: re.Match[str], source: str, page: str) -> str:
-    """Return a link to a file of the repository as a link to its page, or only the text if it has none."""
+    """Convert a link to a file of the repository to a link to its page; without a page, return only its text."""
     picture, label, target, anchor = link[1], link[2], link[3], link[4] or ""
     if not target or "://" in target or target.startswith("mailto:"):
         return link[0]

@@ -26,11 +26,11 @@ class Page:
     title: str
     about: str
     imports: tuple[str, ...] = ()
-    """Modules that users import: the page has every exported name."""
+    """Modules that users import. The page lists all their exported names."""
     holders: tuple[str, ...] = ()
-    """Other modules: the page has their value classes, and the classes that the public API returns or accepts."""
+    """Other modules. The page lists their value classes, and their classes that the public API returns or accepts."""
     names: tuple[str, ...] = ()
-    """Full names of functions of these modules that users import."""
+    """Full names of functions in ``holders`` that users import."""
     search_boost: float = 1.0
 
     @property
@@ -47,7 +47,7 @@ GROUPS: dict[str, tuple[Page, ...]] = {
              holders=("aerokit.connection.cells", "aerokit.connection.bus"), search_boost=2.5),
         Page("state", "Values of the state", "What `vehicle.attitude.value`, `vehicle.batteries.value` … return",
              holders=("aerokit.vehicle.state.movement", "aerokit.vehicle.state.condition",
-                      "aerokit.vehicle.state.equipment"), search_boost=1.5),
+                      "aerokit.vehicle.state.equipment", "aerokit.vehicle.state.measurements"), search_boost=1.5),
         Page("guided", "vehicle.guided and vehicle.posted", "Set-point streams, and orders without waiting",
              holders=("aerokit.vehicle.commanding.guided", "aerokit.vehicle.commanding.setpoints",
                       "aerokit.vehicle.commanding.posted"), search_boost=2),
@@ -57,7 +57,7 @@ GROUPS: dict[str, tuple[Page, ...]] = {
              holders=("aerokit.vehicle.parameters.parameters", "aerokit.vehicle.parameters.writing",
                       "aerokit.vehicle.parameters.transaction"), search_boost=2),
         Page("files", "vehicle.files and vehicle.logs", "Files and flight logs on board",
-             holders=("aerokit.vehicle.files.files", "aerokit.vehicle.files.logs", "aerokit.vehicle.files.logs"),
+             holders=("aerokit.vehicle.files.files", "aerokit.vehicle.files.logs", "aerokit.vehicle.files.log_stream"),
              search_boost=2),
         Page("camera", "vehicle.camera", "Photos, video, zoom, settings",
              holders=("aerokit.vehicle.camera.cameras", "aerokit.vehicle.camera.values",
@@ -68,6 +68,9 @@ GROUPS: dict[str, tuple[Page, ...]] = {
         Page("gimbal", "vehicle.gimbal", "Gimbals and control over them",
              holders=("aerokit.vehicle.gimbal.gimbal", "aerokit.vehicle.gimbal.control",
                       "aerokit.vehicle.gimbal.rates", "aerokit.vehicle.gimbal.device"), search_boost=1.75),
+        Page("devices", "vehicle.actuators, .gripper(), .winch(), .shell()", "Outputs and devices; PX4's shell",
+             holders=("aerokit.vehicle.devices.actuators", "aerokit.vehicle.devices.gripper",
+                      "aerokit.vehicle.devices.winch", "aerokit.vehicle.devices.shell"), search_boost=1.75),
         Page("components", "vehicle.component()", "Any component on board",
              holders=("aerokit.vehicle.components.component", "aerokit.vehicle.components.settings"),
              search_boost=1.5),
@@ -118,19 +121,19 @@ GROUPS: dict[str, tuple[Page, ...]] = {
              search_boost=0),
     ),
 }  # fmt: skip
-"""Section of the reference: its pages. Pages with a `search_boost` of 0 are not in the search index."""
+"""Maps a section of the reference to its pages. Pages with a `search_boost` of 0 are not in the search index."""
 GENERATED_PAGES = {
     "messages": ("Modules", "aerokit.messages", "Every message of the standard dialect"),
     "enums": ("Modules", "aerokit.enums", "Every enum of the standard dialect"),
     "cli": ("Applications", "aerokit on the command line", "Every command and option"),
 }
-"""Page that is generated without mkdocstrings: its section, title and description."""
+"""Maps a page that is generated without mkdocstrings to its section, title and description."""
 REFERENCE_PAGES = tuple(page for pages in GROUPS.values() for page in pages)
 EXAMPLES = Path(__file__).parent / "reference-examples.md"
 EXAMPLE = re.compile(r"^## (?P<name>\S+)\n\n```python[^\n]*\n(?P<code>.*?)^```$", re.DOTALL | re.MULTILINE)
 WORD = re.compile(r"[A-Za-z_]\w*")
 ASSIGNED = re.compile(r"^ +self\.[a-z]\w*(?:: (.+))? = ([A-Z]\w+)?", re.MULTILINE)
-"""A public attribute that a method sets: its annotation, and the class that it creates."""
+"""Matches the assignment of a public attribute in a method: its annotation, and the class that is called."""
 
 
 def example_names() -> list[str]:
@@ -139,7 +142,7 @@ def example_names() -> list[str]:
 
 
 def navigation() -> list[Any]:
-    """Return the pages of the tab, in their sections."""
+    """Return the pages of the tab "Reference", in their sections."""
     sections = {group: [f"reference/{page.name}.md" for page in pages] for group, pages in GROUPS.items()}
     for name, (group, _, _) in GENERATED_PAGES.items():
         sections[group].append(f"reference/{name}.md")
@@ -147,7 +150,7 @@ def navigation() -> list[Any]:
 
 
 def reference_pages(listing: Listing | None = None) -> Iterator[tuple[str, str]]:
-    """Yield path on the site and text of each page."""
+    """Yield the path on the site and the text of each reference page."""
     yield "reference/index.md", _index()
     listing = listing or Listing()
     for page in REFERENCE_PAGES:
@@ -165,7 +168,7 @@ class Entry:
     """One public object."""
 
     path: str
-    """Where users import it from, e.g. ``aerokit.Vehicle``; else where it is defined."""
+    """Path from which users import the object, such as ``aerokit.Vehicle``; otherwise the path of its definition."""
     item: Any
     page: Page
 
@@ -175,13 +178,13 @@ class Entry:
 
     @property
     def is_imported(self) -> bool:
-        """False for what only the library creates: classes that users do not import, except values."""
+        """True for objects that users import, and for value classes. Other classes are created only by the library."""
         module = self.path.rpartition(".")[0]
         return module not in self.page.holders or bool(getattr(self.item, "__match_args__", ()))
 
 
 class Listing:
-    """Every public object, and its page."""
+    """Index of all public objects, with their pages."""
 
     def __init__(self) -> None:
         self.exports = {module: dict(_exports(module)) for page in REFERENCE_PAGES for module in page.imports}
@@ -208,7 +211,7 @@ class Listing:
         self._ranks = {path: rank for rank, path in enumerate(with_example)}
 
     def _home(self, name: str, item: Any) -> Page | None:
-        """Return the page of the module that defines an object, or of the package around it that exports it, too."""
+        """Return the page of the module that defines an object, or of a parent package that exports it."""
         module = str(getattr(item, "__module__", ""))
         while module.count("."):
             page = self._pages_of_modules.get(module)
@@ -218,7 +221,7 @@ class Listing:
         return None
 
     def _add_held_classes(self) -> None:
-        """Add values, and the classes that annotations of listed objects name, until there are no more."""
+        """Add value classes and classes in annotations of listed objects, until no more are found."""
         words = {name for _, _, name, item in self._held if getattr(item, "__match_args__", ())}
         words |= {word for entry in self.entries.values() for word in _annotated(entry.item)}
         while found := [row for row in self._held if row[2] in words and _key(*row[1:]) not in self.entries]:
@@ -227,7 +230,7 @@ class Listing:
                 words |= _annotated(item)
 
     def find(self, name: str) -> tuple[Entry, str]:
-        """Return the entry of ``connect``, ``Vehicle.arm``, ``StateCell.age`` or ``missions.waypoint``, and the member.
+        """Return the entry and the member for a name like ``connect``, ``Vehicle.arm`` or ``missions.waypoint``.
 
         Raises:
             KeyError: there is no such entry.
@@ -247,18 +250,18 @@ class Listing:
         return sorted((here[key] for key in ordered), key=lambda entry: self._ranks.get(entry.path, math.inf))
 
     def elsewhere(self, page: Page) -> list[Entry]:
-        """Return the entries that the modules of a page export, and that are on other pages."""
+        """Return the entries that are exported by the modules of a page but belong to other pages."""
         exported = {_key(module, *export) for module in page.imports for export in self.exports[module].items()}
         entries = [self.entries[key] for key in exported if self.entries[key].page is not page]
         return sorted(entries, key=lambda entry: entry.name)
 
     def classes(self) -> set[str]:
-        """Return where the listed classes are defined."""
+        """Return the full names of the listed classes."""
         items = [entry.item for entry in self.entries.values() if inspect.isclass(entry.item)]
         return {f"{item.__module__}.{item.__qualname__}" for item in items}
 
     def inherited(self, entry: Entry) -> list[str]:
-        """Return the public inherited members that no other listed class describes."""
+        """Return the public inherited members that are not described at another listed class."""
         listed = {id(other.item) for other in self.entries.values()}
         bases = entry.item.__mro__[1:-1]
         described = {base for other in bases if id(other) in listed for base in other.__mro__}
@@ -268,7 +271,7 @@ class Listing:
 
 
 def _key(module: str, name: str, item: Any) -> str:
-    """Return where an object is defined, or where it is exported if it does not say."""
+    """Return the path of an object's definition, or for constants the path of its export."""
     if inspect.isclass(item) or inspect.isroutine(item):
         return f"{item.__module__}.{item.__qualname__}"
     return f"{module}.{name}"
@@ -285,7 +288,7 @@ def _exports(module_name: str) -> Iterator[tuple[str, Any]]:
 
 
 def _annotated(item: Any) -> set[str]:
-    """Return the words of the annotations of a function, or of a class and its members."""
+    """Return all words in the annotations of a function, or of a class and its members."""
     members = [item]
     if inspect.isclass(item):
         members += [member for base in item.__mro__ for name, member in vars(base).items() if name[:1] != "_"]
@@ -297,7 +300,7 @@ def _annotated(item: Any) -> set[str]:
         own = getattr(inspect.unwrap(member) if callable(member) else member, "__annotations__", None)
         annotations += own.values() if isinstance(own, dict) else ()
     if inspect.isclass(item):
-        with suppress(OSError, TypeError):  # classes that are made at run time have no source
+        with suppress(OSError, TypeError):  # classes that are created at run time have no source
             source = _class_sources(inspect.getsourcefile(item)).get(item.__qualname__, "")
             annotations += [" ".join(found) for found in ASSIGNED.findall(source)]
     return {word for annotation in annotations for word in WORD.findall(str(annotation))}
@@ -305,7 +308,7 @@ def _annotated(item: Any) -> set[str]:
 
 @functools.cache
 def _class_sources(path: str) -> dict[str, str]:
-    """Return the source of each class of a file by qualified name: `inspect` would parse the file for each class."""
+    """Return the source of each class in a file by qualified name. `inspect` would parse the file for every class."""
     text = Path(path).read_text(encoding="utf-8")
     lines, found = text.splitlines(keepends=True), dict[str, str]()
 
@@ -431,4 +434,4 @@ SOURCE_PAGES = {
     "src/aerokit/testing/clock.py": "reference/testing.md",
     "src/aerokit/vehicle/state/states.py": "reference/vehicle.md",
 }
-"""Source files that pages link to: their reference pages."""
+"""Maps source files that pages link to to their reference pages."""

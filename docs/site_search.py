@@ -1,7 +1,7 @@
-"""MkDocs hook: what the search of the site finds, and how fast.
+"""MkDocs hook that shortens the search index of the site and ranks its entries.
 
-The index has every section by its title, but only the beginning of its text. Entries of the reference rank by the
-`search_boost` of their page (`site_reference.py`). Those with an example (`reference-examples.md`) rank higher.
+The index contains the title of every section, but only the beginning of its text. The `search_boost` of a page of the
+reference (`site_reference.py`) ranks its entries. Entries with an example (`reference-examples.md`) rank higher.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ if TYPE_CHECKING:
     from mkdocs.config.defaults import MkDocsConfig
 
 EXAMPLE_BOOST = 1.75
-"""Entries with an example are searched for most."""
+"""Factor for entries with an example, which users search for most."""
 CLASS_BOOST = 2
-"""A class comes before its members, whose titles begin with its name."""
+"""Factor that ranks a class before its members, whose titles begin with its name."""
 BREVITY_BOOST = 8
-"""Short titles come first, because a query matches all words that begin with it."""
+"""Weight of short titles. They rank higher, because a query matches all words that begin with it."""
 STANDARD = ("reference/messages", "reference/enums")
-"""Pages whose titles differ in their last words only: ``GLOBAL_POSITION_INT``, ``GLOBAL_POSITION_INT_COV``."""
+"""Pages whose titles often differ only in the last word: ``GLOBAL_POSITION_INT``, ``GLOBAL_POSITION_INT_COV``."""
 MAX_TEXT = 300
-"""Characters of a section's text."""
+"""Maximum number of characters of a section's text."""
 MAX_REFERENCE_TEXT = 120
 TITLES_ONLY = ("reference/sync", "reference/fleets", "reference/enums", "about/changelog")
-"""Beginnings of pages that have much text, and titles that say enough."""
+"""Prefixes of pages whose titles are indexed without text."""
 WITHOUT_MEMBERS = (
     "reference/sim.",
     "reference/transport",
@@ -36,9 +36,9 @@ WITHOUT_MEMBERS = (
     "reference/flights",
     "reference/testing",
 )
-"""Pages whose classes are in the index, but not the members of these."""
+"""Prefixes of pages whose classes are indexed without their members."""
 COMMON_MEMBERS = (".replace", ".to_dict")
-"""Members of every value."""
+"""Members that all value classes have, which are not indexed."""
 BOOST = {
     "how-to/": 2,
     "from-dronekit": 0.3,
@@ -53,7 +53,7 @@ BOOST = {
     "examples/": 0.5,
     "about/": 0.1,
 }
-"""Beginning of a page's address: how its sections rank (1: as they are)."""
+"""Maps the prefix of a page to the factor of its rank; the default is 1."""
 CODE_BLOCK = re.compile(r"<pre>.*?</pre>", re.DOTALL)
 SECTION = re.compile(r"<p>(Parameters|Raises|Returns|Yields|Attributes|Methods|Functions|Classes|Bases):.*", re.DOTALL)
 CLASS_NAME = re.compile(r"[A-Z]\w+")
@@ -75,7 +75,7 @@ def _is_found(entry: dict[str, Any]) -> bool:
 
 
 def _shortened(entry: dict[str, Any]) -> dict[str, Any]:
-    """Return an entry with less text, and with its rank."""
+    """Return an entry with shortened text and its rank."""
     location = entry["location"]
     is_reference = location.startswith("reference/")
     text = CODE_BLOCK.sub(" ", entry["text"])
@@ -95,7 +95,7 @@ def _boost(location: str) -> float:
 
 
 def _cut(text: str, limit: int) -> str:
-    """Return the words of a text that fit; escaped characters stay whole."""
+    """Shorten a text to whole words within the limit."""
     return text if len(text) <= limit else text[:limit].rpartition(" ")[0]
 
 

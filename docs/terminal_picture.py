@@ -12,7 +12,7 @@ __all__ = ["draw_terminal"]
 
 WIDTH, LINE_HEIGHT, LEFT, TOP = 800, 19, 18, 52
 PAUSE_S, MAX_DURATION_S = 0.35, 14.0
-"""Delay before a line without a time; limit of the whole animation."""
+"""Delay before a line without a time, and maximum duration of the animation, in seconds."""
 STYLE = """
 text { font: 13px ui-monospace, SFMono-Regular, Menlo, Consolas, monospace; fill: #d5dbe3; white-space: pre }
 .message { fill: #8a96a6 } .command { fill: #ffffff } .prompt { fill: #7ee787 } .time { fill: #79c0ff }

@@ -12,7 +12,7 @@ from aerokit import errors
 
 
 def main(address: str) -> None:
-    """Fly up and down; every call returns when the vehicle has done it, and Ctrl-C ends any call."""
+    """Fly up and down. Every call returns when the action is complete; Ctrl-C ends any call."""
     with aerokit.sync.connect(address) as vehicle:
         vehicle.wait_ready()
         print(f"{vehicle.autopilot.firmware} {vehicle.version.value} at {vehicle.position.value}")

@@ -12,7 +12,7 @@ import aerokit
 
 
 async def main(address: str, side_m: float = 20.0) -> None:
-    """Fly the square; every action returns when the vehicle has done it."""
+    """Fly the square. Every call returns when the action is complete."""
     async with aerokit.connect(address) as vehicle:
         await vehicle.wait_ready()
         await vehicle.arm()

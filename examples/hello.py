@@ -1,4 +1,4 @@
-"""Connect, and print the state of the vehicle and what it still needs to fly; nothing moves.
+"""Connect, and print the state of the vehicle and the missing requirements for flight. Nothing moves.
 
 python examples/hello.py udpin:0.0.0.0:14550
 """

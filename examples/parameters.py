@@ -13,7 +13,7 @@ from aerokit import errors
 
 
 async def main(address: str, name: str = "LAND_SPEED", value: float = 40) -> None:
-    """Download by MAVFTP, which brings the defaults, or by list, which does not."""
+    """Print parameters that differ from their defaults, which are known only if the vehicle supports MAVFTP."""
     async with aerokit.connect(address) as vehicle:
         table = await vehicle.parameters.download()
         print(f"{len(table)} parameters")

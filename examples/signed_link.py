@@ -1,4 +1,4 @@
-"""Give a vehicle a signing key over a cable. A file keeps the time stamp for the next program.
+"""Give a vehicle a signing key over a cable. A file stores the timestamp for the next program.
 
     python signed_link.py /dev/ttyACM0 "a long passphrase"
 
@@ -24,7 +24,7 @@ async def main(address: str, passphrase: str, stamp: Path = STAMP) -> None:
     signing = Signing(SigningKey.from_passphrase(passphrase), keep=stamp)
     async with aerokit.connect(address) as vehicle:
         await vehicle.wait_ready()
-        await vehicle.setup_signing(signing)  # sends the key in clear, only here
+        await vehicle.setup_signing(signing)  # the only message that contains the key, unencrypted
         print("the vehicle signs with", signing.key)
         await vehicle.parameters.get("MAV_SYSID")  # request and answer are signed
         print(signing.frames_refused, "frames were refused")

@@ -55,7 +55,7 @@ def test_benchmark_table_shows_all_rows(quick: tuple[list[dict[str, Any]], str])
     for row in rows:
         (line,) = [line for line in lines if line.split()[0] == row["name"]]
         assert ("MISSED" in line) == (row["ratio"] < row["aim"])
-    assert ("command_rtt_mavsdk: left out, its peer is not installed" in lines) == (not HAS_MAVSDK)
+    assert ("command_rtt_mavsdk: omitted, because its peer is not installed" in lines) == (not HAS_MAVSDK)
 
 
 @pytest.mark.exhaustive

@@ -1,10 +1,11 @@
-"""docs/features.md has an equivalent, or a reason, for each MAVSDK call about components."""
+"""docs/features.md has an equivalent, or a reason, for each client call of MAVSDK."""
 
 from __future__ import annotations
 
 import ast
 import importlib.util
 import re
+from functools import partial
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -13,36 +14,108 @@ import pytest
 from for_each import for_each
 
 import aerokit
+from aerokit import missions
 from aerokit.sim import SimulatedCamera, SimulatedCopter, simulated_link
 from aerokit.testing import run_virtual
 
 PAGE = Path(__file__).parent.parent / "docs" / "features.md"
 ROW = re.compile(r"^\| `(\w+)\.(\w+)` \| (.*) \|$", re.M)
 CALLS = {
+    "action": """
+        arm arm_force disarm takeoff land reboot shutdown terminate kill return_to_launch goto_location
+        goto_location_fixedwing do_orbit hold set_actuator set_relay transition_to_fixedwing
+        transition_to_multicopter get_takeoff_altitude set_takeoff_altitude get_return_to_launch_altitude
+        set_return_to_launch_altitude set_current_speed set_gps_global_origin set_home
+    """,
+    "calibration": """
+        calibrate_gyro calibrate_accelerometer calibrate_magnetometer calibrate_level_horizon
+        calibrate_gimbal_accelerometer cancel
+    """,
     "camera": """
         take_photo start_photo_interval stop_photo_interval start_video stop_video start_video_streaming
-        stop_video_streaming set_mode list_photos camera_list get_mode get_video_stream_info subscribe_capture_info
-        get_storage get_current_settings get_possible_setting_options set_setting get_setting format_storage
-        reset_settings zoom_in_start zoom_out_start zoom_stop zoom_range track_point track_rectangle track_stop
-        focus_in_step focus_out_step focus_in_start focus_out_start focus_stop focus_range focus_meters focus_auto
-        focus_auto_single focus_auto_continuous
+        stop_video_streaming set_mode list_photos camera_list get_mode get_video_stream_info
+        subscribe_capture_info get_storage get_current_settings get_possible_setting_options set_setting
+        get_setting format_storage reset_settings zoom_in_start zoom_out_start zoom_stop zoom_range track_point
+        track_rectangle track_stop focus_in_step focus_out_step focus_in_start focus_out_start focus_stop
+        focus_range focus_meters focus_auto focus_auto_single focus_auto_continuous
     """,
-    "gimbal": """
-        set_angles set_angular_rates set_roi_location take_control release_control gimbal_list get_control_status
-        get_attitude
-    """,
-    "info": "get_identification get_product get_version get_speed_factor subscribe_flight_information",
-    "param": """
-        get_param_int set_param_int get_param_float set_param_float get_param_custom set_param_custom get_all_params
-        select_component
-    """,
+    "component_metadata": "request_component request_autopilot_component subscribe_metadata_available get_metadata",
+    "core": "subscribe_connection_state set_mavlink_timeout",
+    "events": "subscribe_events subscribe_health_and_arming_checks get_health_and_arming_checks_report",
+    "failure": "inject",
+    "follow_me": "get_config set_config is_active set_target_location get_last_location start stop",
     "ftp": """
         download upload list_directory create_directory remove_directory remove_file rename are_files_identical
         set_target_compid
     """,
-    "component_metadata": "request_component request_autopilot_component subscribe_metadata_available get_metadata",
+    "geofence": "upload_geofence download_geofence clear_geofence",
+    "gimbal": """
+        set_angles set_angular_rates set_roi_location take_control release_control gimbal_list
+        get_control_status get_attitude
+    """,
+    "gripper": "grab release",
+    "info": "get_identification get_product get_version get_speed_factor subscribe_flight_information",
+    "log_files": "get_entries download_log_file cancel_download_log_file erase_all_log_files",
+    "log_streaming": "start_log_streaming stop_log_streaming subscribe_log_streaming_raw",
+    "manual_control": "start_position_control start_altitude_control set_manual_control_input",
+    "mavlink_direct": "send_message subscribe_message load_custom_xml send_command",
+    "mission": """
+        upload_mission upload_mission_with_progress cancel_mission_upload download_mission
+        download_mission_with_progress cancel_mission_download start_mission pause_mission clear_mission
+        set_current_mission_item is_mission_finished mission_progress get_return_to_launch_after_mission
+        set_return_to_launch_after_mission
+    """,
+    "mission_raw": """
+        upload_mission upload_mission_with_progress upload_geofence upload_rally_points cancel_mission_upload
+        download_mission download_geofence download_rallypoints cancel_mission_download start_mission
+        pause_mission clear_mission set_current_mission_item mission_progress subscribe_mission_changed
+        import_qgroundcontrol_mission import_qgroundcontrol_mission_from_string import_mission_planner_mission
+        import_mission_planner_mission_from_string is_mission_finished
+    """,
+    "mocap": """
+        set_vision_position_estimate set_vision_speed_estimate set_attitude_position_mocap set_odometry
+    """,
+    "offboard": """
+        start stop is_active set_attitude set_actuator_control set_attitude_rate set_position_ned
+        set_position_global set_velocity_body set_velocity_ned set_position_velocity_ned
+        set_position_velocity_acceleration_ned set_acceleration_ned
+    """,
+    "param": """
+        get_param_int set_param_int get_param_float set_param_float get_param_custom set_param_custom
+        get_all_params select_component
+    """,
+    "rtk": "send_rtcm_data",
+    "shell": "send subscribe_receive",
+    "telemetry": """
+        position home in_air landed_state armed vtol_state attitude_quaternion attitude_euler
+        attitude_angular_velocity_body velocity_ned gps_info raw_gps battery flight_mode health rc_status
+        status_text actuator_control_target actuator_output_status odometry position_velocity_ned ground_truth
+        fixedwing_metrics imu scaled_imu raw_imu health_all_ok unix_epoch_time distance_sensor scaled_pressure
+        heading altitude wind set_rate_position set_rate_home set_rate_in_air set_rate_landed_state
+        set_rate_vtol_state set_rate_attitude_quaternion set_rate_attitude_euler set_rate_velocity_ned
+        set_rate_gps_info set_rate_raw_gps set_rate_battery set_rate_rc_status set_rate_actuator_control_target
+        set_rate_actuator_output_status set_rate_odometry set_rate_position_velocity_ned set_rate_ground_truth
+        set_rate_fixedwing_metrics set_rate_imu set_rate_scaled_imu set_rate_raw_imu set_rate_unix_epoch_time
+        set_rate_distance_sensor set_rate_altitude set_rate_health get_gps_global_origin
+    """,
+    "transponder": "transponder set_rate_transponder",
+    "tune": "play_tune",
+    "winch": """
+        status relax relative_length_control rate_control lock deliver hold retract load_line abandon_line
+        load_payload
+    """,
 }
-"""Calls of MAVSDK 4.1 by plugin; ``get_`` and ``subscribe_`` of one thing are one call."""
+"""Calls of MAVSDK 4.1 by plugin; ``get_`` and ``subscribe_`` of one thing are one call. The wheel lacks ``core``."""
+PENDING = {
+    *("vehicle.orbit", "vehicle.follow", "vehicle.loiter", "vehicle.transition_to"),
+    *("vehicle.return_altitude", "vehicle.set_return_altitude", "vehicle.terminate", "vehicle.shutdown"),
+    *(f"vehicle.calibrate.{sensor}" for sensor in ("compass", "accelerometer", "gyroscope", "level")),
+    *(f"vehicle.guided.{stream}" for stream in ("attitude_rate", "actuators", "trajectory")),
+    *(f"vehicle.external.{name}" for name in ("odometry", "vision_position", "vision_speed", "motion_capture")),
+    *("vehicle.external.set_origin", "vehicle.sticks", "vehicle.rtk.send", "vehicle.rtk.ntrip"),
+}
+"""Names on the page that are not built yet. Remove a name when it exists; a test fails otherwise."""
+MIN_FULL = 235
 
 
 def rows() -> list[tuple[str, str, str]]:
@@ -72,6 +145,11 @@ def missing() -> set[str]:
                 "component": vehicle.component(100),
                 "connection": vehicle.connection,
                 "gimbal": vehicle.gimbal,
+                "gripper": vehicle.gripper(),
+                "winch": vehicle.winch(),
+                "shell": vehicle.shell(),
+                "missions": missions,
+                "aerokit": aerokit,
             }
             named = {name for *_, answer in rows() for name in names_in(answer)}
             return {name for name in named if not exists(roots, name)}
@@ -92,7 +170,16 @@ def exists(roots: dict[str, Any], name: str) -> bool:
 def test_row_names_existing_attribute_or_gives_reason(plugin: str, call: str, answer: str, missing: set[str]) -> None:
     names = names_in(answer)
     assert names or answer.startswith("no: "), f"{plugin}.{call} has no name and no reason"
-    assert not missing.intersection(names), f"{plugin}.{call} names a missing attribute"
+    assert not missing.intersection(names) - PENDING, f"{plugin}.{call} names a missing attribute"
+
+
+def test_pending_names_are_missing(missing: set[str]) -> None:
+    assert PENDING - missing == set(), "built: remove them from PENDING"
+
+
+def test_most_calls_have_full_equivalent() -> None:
+    limited = [answer for *_, answer in rows() if answer.startswith(("no: ", "partly: "))]
+    assert len(rows()) - len(limited) >= MIN_FULL
 
 
 @pytest.mark.skipif(importlib.util.find_spec("mavsdk") is None, reason="MAVSDK is not installed")
@@ -101,9 +188,19 @@ def test_calls_are_those_of_installed_mavsdk() -> None:
     assert spec is not None
     assert spec.origin is not None
     plugins = Path(spec.origin).parent / "asyncio" / "plugins"
-    for plugin, calls in CALLS.items():
+    for plugin in (path.name for path in plugins.iterdir() if (path / f"{path.name}.py").is_file()):
         tree = ast.parse((plugins / plugin / f"{plugin}.py").read_text())
         classes = [node for node in tree.body if isinstance(node, ast.ClassDef) and node.name.endswith("Async")]
-        methods = {node.name for node in ast.walk(classes[0]) if isinstance(node, ast.AsyncFunctionDef)}
-        for call in calls.split():
-            assert call in methods or call.removeprefix("subscribe_") in methods or f"subscribe_{call}" in methods
+        methods = {
+            node.name
+            for node in classes[0].body
+            if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)) and not node.name.startswith("_")
+        }
+        if not plugin.endswith("_server") and plugin != "server_utility":
+            assert set(CALLS[plugin].split()) == {*map(partial(one_name, methods), methods)} - {"destroy"}
+
+
+def one_name(methods: set[str], method: str) -> str:
+    """Return the name of the row of a method: ``position`` for ``subscribe_position``, if there are both."""
+    plain = method.removeprefix("subscribe_")
+    return next((name for name in (plain, f"get_{plain}") if name in methods), method)

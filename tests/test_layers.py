@@ -33,7 +33,7 @@ ROOMS = {
         {"state"},
         {"session"},
         {"commanding"},
-        {"gimbal"},
+        {"devices", "gimbal"},
         {"files"},
         {"parameters", "missions"},
         {"components"},

@@ -212,7 +212,7 @@ class _Reader(threading.Thread):
                     time = None if picture.time is None else float(picture.time)
                     self._call_on_loop(self._stream._on_frame, picture, time)
             except errors as error:
-                raise LinkLost(f"the video of {self._uri} broke off: {error}") from None
+                raise LinkLost(f"the video of {self._uri} was interrupted: {error}") from None
 
     def _call_on_loop(self, function: Callable[..., object], *args: Any) -> None:
         with suppress(RuntimeError):  # the loop is closed

@@ -11,6 +11,7 @@ from call_stage import Stage
 from call_table import CALLS, KEY
 from camera_calls import BLOCKING
 from component_calls import COMPONENTS_BLOCKING
+from device_calls import BLOCKING_DEVICES
 
 import aerokit.sync
 from aerokit import (
@@ -49,6 +50,10 @@ CLASSES: tuple[type, ...] = (
     twins.RallyControl,
     twins.Files,
     twins.Logs,
+    twins.Actuators,
+    twins.Gripper,
+    twins.Winch,
+    twins.Shell,
     twins.StateCell,
     twins.Subscription,
     twins.Connection,
@@ -263,4 +268,4 @@ WRITTEN: dict[str, Do] = {
 def blocking_calls() -> dict[str, Do]:
     """Return the calls by name; coroutine functions of the other table have no twin."""
     shared = {name: call.do for name, call in CALLS.items() if not inspect.iscoroutinefunction(call.do)}
-    return {**shared, **WRITTEN, **BLOCKING, **COMPONENTS_BLOCKING}
+    return {**shared, **WRITTEN, **BLOCKING, **COMPONENTS_BLOCKING, **BLOCKING_DEVICES}

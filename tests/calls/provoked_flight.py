@@ -134,7 +134,7 @@ def _actions() -> Table:
         ("Vehicle.reboot", "OperationRejected"): P(_method("reboot"), armed),
         ("Vehicle.reboot", "OperationTimeout"): P(_method("reboot", timeout=2), grounded, accepted(reboot)),
         ("Vehicle.reboot", "LinkLost"): later(_method("reboot"), lost, 0.05, grounded, alone=True),
-        ("Vehicle.wait_ready", "OperationTimeout"): P(_method("wait_ready", timeout=1), before=_clear_state("home")),
+        ("Vehicle.wait_ready", "OperationTimeout"): P(_method("wait_ready", timeout=0.05), before=_clear_state("home")),
         ("Vehicle.send", "InvalidArgument"): P(_now(lambda s: s.vehicle.send(messages.Ping(0, 0, 999, 0)))),
         ("Vehicle.send", "ConnectionClosed"): _ended(lambda s: s.vehicle.send(messages.Ping(0, 0, 0, 0))),
         ("Vehicle.send", "LinkLost"): _ended(lambda s: s.vehicle.send(messages.Ping(0, 0, 0, 0)), lost),

@@ -18,7 +18,12 @@ from aerokit.vehicle.commanding.guided import Guided, SetpointStream
 from aerokit.vehicle.commanding.posted import PostedOrder
 from aerokit.vehicle.components.component import Component
 from aerokit.vehicle.components.settings import Settings
+from aerokit.vehicle.devices.actuators import Actuators
+from aerokit.vehicle.devices.gripper import Gripper
+from aerokit.vehicle.devices.shell import Shell
+from aerokit.vehicle.devices.winch import Winch
 from aerokit.vehicle.files.files import Files
+from aerokit.vehicle.files.log_stream import LogStream
 from aerokit.vehicle.files.logs import Logs
 from aerokit.vehicle.gimbal.control import GimbalControl
 from aerokit.vehicle.gimbal.gimbal import Gimbal, Gimbals
@@ -52,6 +57,11 @@ CLASSES: tuple[type, ...] = (
     RallyControl,
     Files,
     Logs,
+    LogStream,
+    Actuators,
+    Gripper,
+    Winch,
+    Shell,
     StateCell,
     Changes,
     Subscription,

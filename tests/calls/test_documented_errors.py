@@ -13,6 +13,7 @@ from call_stage import Stage, open_stage
 from call_table import provocations
 from camera_calls import CAMERA
 from component_calls import COMPONENTS
+from device_calls import DEVICE_ERRORS
 from documented_errors import NAMES, documented
 from exhaustive import exhaustive
 from provoked import Provocation
@@ -25,7 +26,7 @@ from aerokit import errors
 from aerokit.sim.faults import Faults
 from aerokit.testing import run_virtual
 
-PROVOCATIONS = provocations() | FLIGHT | GIMBALS | TRANSFERS | SETTINGS | CAMERA | COMPONENTS
+PROVOCATIONS = provocations() | FLIGHT | GIMBALS | TRANSFERS | SETTINGS | CAMERA | COMPONENTS | DEVICE_ERRORS
 PROMISED = documented()
 MAX_WAIT_S = 200.0
 BY_DEFAULT = ("Vehicle", "Guided", "Parameters", "MissionControl", "Files", "Gimbal")

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from exhaustive import sampled
 from pymavlink import mavutil
-from served_copter import complaints, served_copter
+from served_copter import served_copter, without_loop_warnings
 
 from aerokit.dronekit.runner import run_script, uninstall
 
@@ -36,7 +36,7 @@ def pymavlink_as_before(monkeypatch: pytest.MonkeyPatch) -> None:
 EXPECTED: dict[str, tuple[float, list[str], list[str]]] = {
     "hello": (20, [], ["firmware: APM:Copter-4.7.0", "mode: STABILIZE", "can be armed: True"]),
     "vehicle_state": (
-        50,
+        20,
         ["--seconds", "0.2"],
         [
             "LocationGlobal:lat=-35.363261",
@@ -45,9 +45,9 @@ EXPECTED: dict[str, tuple[float, list[str], list[str]]] = {
             "was 5000.0, is 5001.0",
         ],
     ),
-    "simple_goto": (50, ["--altitude", "5"], ["at 5 m", "there\n", "landed"]),
+    "simple_goto": (20, ["--altitude", "5"], ["at 5 m", "there\n", "landed"]),
     "basic_mission": (
-        50,
+        20,
         ["--altitude", "5", "--side", "20"],
         ["6: command 20", "flies command 6 of 6", "landed"],
     ),
@@ -56,15 +56,15 @@ EXPECTED: dict[str, tuple[float, list[str], list[str]]] = {
         ["--seconds", "0.2", "--altitude", "5"],
         [" at [2.0, ", "heading ", "landed"],
     ),
-    "channel_overrides": (50, [], ["'3': 1100", "overrides: {'1': 1600, '2': 1400}"]),
-    "create_attribute": (50, [], ["first: Vibration: x=", "\nvibration: Vibration: x="]),
-    "gimbal": (50, ["--seconds", "0.05"], ["Gimbal: pitch=-", "pitch -45, yaw 90", "released"]),
+    "channel_overrides": (20, [], ["'3': 1100", "overrides: {'1': 1600, '2': 1400}"]),
+    "create_attribute": (20, [], ["first: Vibration: x=", "\nvibration: Vibration: x="]),
+    "gimbal": (20, ["--seconds", "0.05"], ["Gimbal: pitch=-", "pitch -45, yaw 90", "released"]),
     "follow_me": (
         25,
         ["--seconds", "0.6", "--walking-speed", "20", "--altitude", "5"],
         ["m behind", "followed for ", "landed"],
     ),
-    "flight_replay": (50, [str(RECORDING)], ["4 waypoints", "to waypoint ", "at the end of the track"]),
+    "flight_replay": (20, [str(RECORDING)], ["4 waypoints", "to waypoint ", "at the end of the track"]),
 }
 """Example: speed-up, additional arguments, expected output."""
 
@@ -121,7 +121,7 @@ def test_example_as_program() -> None:
             timeout=200,
             check=False,
         )
-    assert (done.returncode, complaints(done.stderr)) == (0, "")
+    assert (done.returncode, without_loop_warnings(done.stderr)) == (0, "")
     assert "mode: STABILIZE" in done.stdout
 
 
@@ -129,7 +129,7 @@ def test_from_dronekit_page_blocks() -> None:
     """The blocks of docs/from-dronekit.md; the second one continues the first."""
     names: dict[str, Any] = {}
     assert len(BLOCKS) == 2
-    with served_copter(speedup=50) as address:
+    with served_copter(speedup=20) as address:
         try:
             for block in BLOCKS:
                 code = block.replace("udpin:0.0.0.0:14550", address)

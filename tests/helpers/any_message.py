@@ -14,7 +14,7 @@ PLAUSIBLE = {
 
 
 def value_of(field: Field, dice: random.Random) -> Any:
-    """Strategy for a field: any value, including "unknown", but plausible where that hides other fields."""
+    """Return a random value of a field, or a plausible one for fields whose odd values would hide other fields."""
     if field.name in PLAUSIBLE and dice.random() < 0.7:
         return PLAUSIBLE[field.name]
     count = field.array_length or 1

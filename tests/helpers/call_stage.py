@@ -38,7 +38,7 @@ DATA = bytes(range(256)) * 20
 
 @dataclass
 class Stage:
-    """The surroundings of a call."""
+    """A simulated vehicle, the program's `Vehicle`, and arguments for calls."""
 
     simulated: SimulatedCopter | SimulatedPx4
     vehicle: aerokit.Vehicle
@@ -46,7 +46,7 @@ class Stage:
     folder: Path
     """Directory for files of the program."""
     camera: SimulatedCamera
-    """Id of the first camera; a second one supports nothing."""
+    """The first camera. The second one refuses all commands."""
     counter: int = field(default=0)
 
     @property
@@ -55,11 +55,11 @@ class Stage:
 
     @property
     def parameter(self) -> str:
-        """A mode that changes nothing in flight."""
+        """Name of a parameter that does not affect the flight."""
         return "NAV_ACC_RAD" if self.is_px4 else "WP_YAW_BEHAVIOR"
 
     def other_value(self) -> float:
-        """A mode other than the current one."""
+        """Return a value of this parameter other than the previous one."""
         self.counter += 1
         return float(self.counter % 2 + 1)
 
@@ -71,13 +71,13 @@ class Stage:
         return Position(home.latitude_deg, home.longitude_deg)
 
     def target(self) -> Position:
-        """A place at some distance from home."""
+        """Return a target 25 m to the north, or home if that is far away."""
         here = self.vehicle.position.value.replace(altitude_amsl_m=None)
         is_far = self.vehicle.distance_to(self.home) > 60
         return self.home.replace(altitude_relative_m=here.altitude_relative_m) if is_far else here.offset(north_m=25)
 
     def mission(self) -> Mission:
-        """A new place to the north for each call."""
+        """Return a mission to the north, different for each call."""
         self.counter += 1
         places = [self.home.offset(north_m=100.0 * n, east_m=self.counter % 7) for n in range(1, 6)]
         return Mission([waypoint(place.latitude_deg, place.longitude_deg, altitude_relative_m=20) for place in places])
@@ -148,20 +148,22 @@ async def grounded(stage: Stage) -> None:
     """Disarmed and ready, on the ground, in a mode that can be armed."""
     vehicle = stage.vehicle
     await anywhere(stage)
-    if vehicle.is_armed:
-        with anyio.fail_after(60):
+    with anyio.fail_after(60):
+        if vehicle.is_armed:
             await vehicle.disarm(force=True)
-            while not stage.simulated.motion.is_on_ground:  # noqa: ASYNC110
-                await anyio.sleep(0.1)
+        was_falling = not stage.simulated.motion.is_on_ground
+        while not stage.simulated.motion.is_on_ground:  # noqa: ASYNC110
+            await anyio.sleep(0.1)
+        if was_falling:
             await vehicle.landed_state.wait_until(lambda state: state == 1)
-    with contextlib.suppress(AerokitError):  # an abandoned reboot command may be executed just now
+    with contextlib.suppress(AerokitError):  # the vehicle may be rebooting after a cancelled reboot command
         await vehicle.set_mode("LOITER" if stage.is_px4 else "GUIDED")
     await vehicle.wait_ready()
     await vehicle.set_mode("LOITER" if stage.is_px4 else "GUIDED")
 
 
 async def armed(stage: Stage) -> None:
-    """Just armed, on the ground: both autopilots disarm after a while without take-off."""
+    """Armed a moment ago, on the ground, because both autopilots disarm after a while without take-off."""
     await grounded(stage)
     await stage.vehicle.arm()
 
@@ -192,7 +194,7 @@ def _altitude(stage: Stage) -> float:
 
 
 def stage_cameras() -> list[SimulatedCamera]:
-    """Two cameras: one supports everything at any time, the other one nothing."""
+    """Create two cameras: one supports all commands at any time, the other one none."""
     both = CameraCapFlags.CAN_CAPTURE_IMAGE_IN_VIDEO_MODE | CameraCapFlags.CAN_CAPTURE_VIDEO_IN_IMAGE_MODE
     able = SimulatedCamera(capabilities=SimulatedCamera.ALL_CAPABILITIES | both, streams=["rtsp://127.0.0.1/a"])
     able.files.put("/DCIM/GIVEN.JPG", DATA)

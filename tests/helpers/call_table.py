@@ -11,6 +11,7 @@ from call_stage import DATA, Place, Stage, airborne, anywhere, armed, grounded, 
 from camera_beside import camera_of, settings_of
 from camera_calls import AWAITED
 from component_calls import COMPONENTS_AWAITED
+from device_calls import BLOCKS, DEVICE_CALLS, DEVICES, DeviceCall, components_of, fit
 from provoked import Do, Provocation, Table, ignored, refused
 
 import aerokit
@@ -46,9 +47,10 @@ def _nothing(_: Stage) -> None:
 class Row:
     """One order in docs/reliability.md.
 
-    ``modes`` are those that it may lead to, on ArduCopter and on PX4. ``steers``: it determines where the vehicle goes;
-    when it is abandoned, the vehicle must hold if ``holds``. ``command`` is the one whose answers and copies are lost.
-    ``place`` is the state of the vehicle before it. ``ends_later``: it is completed even when it is abandoned.
+    ``place`` is the state of the vehicle before the order. ``modes`` are the modes that the order may lead to, on
+    ArduCopter and on PX4. ``command`` is the MAV_CMD whose transmissions and answers are lost. ``steers`` is True if
+    the order determines the path of the vehicle, ``holds`` if the vehicle must hold after the order is cancelled, and
+    ``ends_later`` if the vehicle completes the order even then.
     """
 
     name: str
@@ -64,11 +66,11 @@ class Row:
 
 @dataclass(frozen=True)
 class Call:
-    """One successful call, with all that tests need.
+    """One successful call, with the data for tests of its errors.
 
-    ``before`` and ``after`` act on the simulated vehicle, around each call. ``command`` is the MAV_CMD that it sends:
-    if it is refused, the call raises CommandRejected; if it is not answered, CommandTimeout. ``wrong`` has an invalid
-    argument. ``order`` is its row in the table of orders (`order_table`).
+    ``before`` and ``after`` act on the simulated vehicle before and after each call. ``command`` is the MAV_CMD of the
+    call: a refusal raises CommandRejected, a missing answer CommandTimeout. ``wrong`` is the same call with an invalid
+    argument. ``order`` is the row of the call in the table of orders (`order_table`).
     """
 
     do: Callable[[Stage], Awaitable[object]]
@@ -81,7 +83,7 @@ class Call:
     order: Row | None = None
 
     def provocations(self, name: str) -> Table:
-        """Provocations of the errors that most calls document."""
+        """Return the provocations of the errors that most calls document."""
         rows: Table = {}
         for error, trouble in (("CommandRejected", refused), ("CommandTimeout", ignored)):
             if self.command is not None:
@@ -104,7 +106,7 @@ def _action(
     on: tuple[str, ...] = BOTH,
     **order: Any,
 ) -> dict[str, Call]:
-    """Create the row of an action that sends this command, for all tests of calls and for the table of orders."""
+    """Create the call of an action that sends this command, with its row in the table of orders."""
     call = Call(
         lambda stage: give(stage.vehicle),
         place,
@@ -116,8 +118,22 @@ def _action(
     return {f"Vehicle.{name}": call}
 
 
+def _device(call: DeviceCall) -> Call:
+    """Create the row of an order to a device of the autopilot."""
+    give, wrong = call.give, call.wrong
+    return Call(
+        lambda stage: give(stage.vehicle),
+        call.place,
+        call.on,
+        before=fit,
+        command=call.command,
+        wrong=None if wrong is None else lambda stage: wrong(stage.vehicle),
+        order=Row(call.order, give, call.command, PLACES.get(call.place, "air"), on=call.on, steers=False),
+    )
+
+
 def provocations() -> Table:
-    """The rows of all calls."""
+    """Return the provocations of all calls."""
     return {key: row for name, call in CALLS.items() for key, row in call.provocations(name).items()}
 
 
@@ -165,7 +181,7 @@ async def _get(stage: Stage) -> None:
 async def _changes(stage: Stage) -> None:
     changes = stage.vehicle.mode.changes()
     await changes.__anext__()
-    with anyio.move_on_after(1.0):  # there is no next one
+    with anyio.move_on_after(1.0):  # the mode does not change again
         await changes.__anext__()
 
 
@@ -230,7 +246,7 @@ async def _mission_again(stage: Stage) -> None:
 
 
 async def _fly_mission(stage: Stage) -> None:
-    """A single nearby place."""
+    """Fly a mission to a single nearby place."""
     vehicle = stage.vehicle
     await vehicle.mission.upload(aerokit_mission(stage))
     await vehicle.mission.start()
@@ -238,7 +254,7 @@ async def _fly_mission(stage: Stage) -> None:
 
 
 def aerokit_mission(stage: Stage) -> Any:
-    """A mission to a single nearby place."""
+    """Return a mission to a single nearby place."""
     place = stage.vehicle.position.value.offset(north_m=6)
     from aerokit.missions import Mission, waypoint
 
@@ -246,10 +262,10 @@ def aerokit_mission(stage: Stage) -> Any:
 
 
 async def _twice(stage: Stage, name: str) -> None:
-    """One item, then an empty mission."""
-    held = getattr(stage.vehicle, name)
-    await held.upload(getattr(stage, name)())
-    await held.clear()
+    """Upload a plan, then clear it."""
+    plan = getattr(stage.vehicle, name)
+    await plan.upload(getattr(stage, name)())
+    await plan.clear()
 
 
 def _no_key(stage: Stage) -> None:
@@ -365,6 +381,10 @@ CALLS: dict[str, Call] = {
     "SetpointStream.fly": Call(_fly, airborne),
     # ------------------------------------------------------------------------------------- Camera
     **{name: Call(do) for name, do in AWAITED.items()},
+    # ------------------------------------------------------------------------------------ devices
+    **{call.name: _device(call) for call in DEVICE_CALLS},
+    **{name: Call(do, place, before=components_of) for name, (do, place) in DEVICES.items()},
+    **{name: Call(do, place, on, before=fit) for name, (do, place, on) in BLOCKS.items()},
     # --------------------------------------------------------------------------------- components
     **{name: Call(do, before=_with_camera) for name, do in COMPONENTS_AWAITED.items()},
     # ------------------------------------------------------------------------------------- Gimbal

@@ -1,4 +1,4 @@
-"""Adds a simulated camera to a vehicle in flight, when a call about cameras needs it."""
+"""Adds a simulated camera to a running simulated vehicle."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["camera_of", "settings_of"]
 
 
 def camera_of(stage: Stage) -> SimulatedCamera:
-    """Reset the camera, except for its uptime."""
+    """Return the camera of the vehicle, reset except for its uptime. Add it on first use."""
     simulated: Any = stage.simulated
     camera = next((component for component in simulated.components if isinstance(component, SimulatedCamera)), None)
     if camera is None:
@@ -32,5 +32,5 @@ def camera_of(stage: Stage) -> SimulatedCamera:
 
 
 def settings_of(stage: Stage) -> Settings:
-    """The program's view of the cameras."""
+    """Return the settings of the camera."""
     return stage.vehicle.component(100).settings

@@ -1,4 +1,4 @@
-"""Calls of cameras, and how to provoke their errors."""
+"""Calls of cameras, and provocations of their errors."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["AWAITED", "BLOCKING", "BLOCKS", "CAMERA", "camera_block"]
 
 Cmd, P = MavCmd, Provocation
 UNABLE, NOWHERE = 101, 103
-"""Ids of a camera that supports nothing, and of one that does not exist."""
+"""Ids of a camera that refuses all commands, and of one that does not exist."""
 PICTURE = Capture(100, 0, True, 0.0, None, None, None, None, None, None, "mftp:///DCIM/GIVEN.JPG")
 
 ARGUMENTS: dict[str, tuple[Any, ...]] = {
@@ -71,7 +71,7 @@ COMMANDS: dict[str, int] = {
     "format_storage": Cmd.STORAGE_FORMAT,
     "reset_settings": Cmd.RESET_CAMERA_SETTINGS,
 }
-"""The command that is refused, or not answered, for each call."""
+"""For each call, the command that the camera refuses or does not answer."""
 IMPOSSIBLE: dict[str, tuple[Any, ...]] = {
     "start_streaming": (999,),
     "stop_streaming": (999,),
@@ -118,7 +118,7 @@ def _blocking_block(name: str) -> Callable[[Any], None]:
 
 
 def _track_blocking(name: str) -> Callable[[Any], None]:
-    """A tracking target is requested until tracking ends."""
+    """Track a target, then stop tracking."""
 
     def do(stage: Any) -> None:
         try:
@@ -219,4 +219,4 @@ CAMERA: Table = {
         call("read_picture", PICTURE.replace(file_url="mftp:///DCIM/NONE.JPG"))
     ),
 }  # fmt: skip
-"""Only public errors count."""
+"""Provocations of the documented errors of cameras."""

@@ -44,7 +44,7 @@ async def _subscribed(stage: Stage) -> None:
 
 
 async def _refused(call: Awaitable[object]) -> None:
-    """The simulated camera does not support it."""
+    """Await a call that the simulated camera refuses."""
     with suppress(OperationRejected):
         await call
 

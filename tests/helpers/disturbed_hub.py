@@ -24,7 +24,7 @@ from aerokit.transport import Link, memory_link_pair
 Side = Literal["vehicle", "program"]
 Ways = Literal["one", "vehicle twice", "program twice", "program copied"]
 FULL = 1 << 20
-"""More bytes than any link of a hub may queue."""
+"""Number of unsent bytes that exceeds the queue limit of every link of a hub."""
 
 
 NEVER = Silence(0.0, 0.0)
@@ -32,11 +32,15 @@ NEVER = Silence(0.0, 0.0)
 
 @dataclass(frozen=True)
 class ThroughHub:
-    """Disturbances of the hub; times are (from, until), in seconds since the order was given.
+    """Disturbances of the hub. Times are (begin, end), in seconds since the order was given.
 
-    The bad ``side`` has the disturbances. Its endpoint accepts nothing during ``jam`` and is closed during ``away``.
-    ``ways``: the vehicle is reachable over two endpoints, of which the first fails during ``silence``; or the program
-    has two links to the hub, of which the selected one fails; or a router copies its traffic to two endpoints.
+    ``side`` is the disturbed side of the hub. Its endpoint accepts no data during ``jam`` and is closed during
+    ``away``. ``ways`` selects the paths through the hub:
+
+    - "one": one endpoint on each side.
+    - "vehicle twice": the vehicle is reachable over two endpoints. The first one fails during ``silence``.
+    - "program twice": the program has two links to the hub. The selected one fails during ``silence``.
+    - "program copied": a router copies the program's traffic to two endpoints.
     """
 
     side: Side
@@ -47,10 +51,10 @@ class ThroughHub:
 
     @property
     def quiet_until(self) -> float:
-        """Time at which the vehicle can be received, and reached, again."""
+        """Time at which the program and the vehicle can reach each other again."""
         ends = [pair[1] for pair in (self.jam, self.away) if pair is not None]
-        dumb = min(self.silence.end_s, self.silence.begin_s + ROUTE_TIMEOUT_S + 1.0)
-        return max([0.0, *ends, dumb if "twice" in self.ways else 0.0])
+        rerouted = min(self.silence.end_s, self.silence.begin_s + ROUTE_TIMEOUT_S + 1.0)
+        return max([0.0, *ends, rerouted if "twice" in self.ways else 0.0])
 
 
 @dataclass
@@ -65,7 +69,7 @@ class HubSideLink(DisturbedLink):
         super().begin()
         if self.away is not None:
             loop, (begin, end) = asyncio.get_running_loop(), self.away
-            loop.call_later(begin, self._attachment.link_interrupted, LinkLost("the cable was pulled out"))
+            loop.call_later(begin, self._attachment.link_interrupted, LinkLost("the cable was unplugged"))
             loop.call_later(end, self._attachment.link_restored, end - begin)
 
     @property
@@ -90,9 +94,10 @@ class HubSideLink(DisturbedLink):
 
 
 class DisturbedHubPath:
-    """A disturbed path through a hub; ``sent`` and ``heartbeats`` are the program's.
+    """A disturbed path through a hub.
 
-    ``at_vehicle`` is the traffic between hub and vehicle, over any endpoint.
+    ``sent`` and ``heartbeats`` are the traffic of the program, ``at_vehicle`` the traffic between hub and vehicle over
+    all endpoints.
     """
 
     def __init__(self, near: DisturbedLink | DisturbedLinkPair, through: ThroughHub) -> None:
@@ -125,7 +130,7 @@ class DisturbedHubPath:
             end.begin()
 
     def end(self) -> None:
-        """Mark the program's messages that never reached the vehicle as lost."""
+        """Mark messages of the program as lost if they never reached the vehicle."""
         arrived = {message.raw for message in self.at_vehicle.sent if not message.is_lost}
         for message in self.sent:
             message.is_lost |= message.raw not in arrived
@@ -143,7 +148,7 @@ class DisturbedHubPath:
 async def through_hub(
     vehicle: SimulatedVehicle, through: ThroughHub
 ) -> AsyncIterator[tuple[DisturbedHubPath, Link | aerokit.Connection]]:
-    """The links of a vehicle, and a record of their traffic."""
+    """Open a path from the program to simulated vehicles through a hub, with a record of the traffic."""
     async with AsyncExitStack() as stack:
         near, fars = await _programs_side(stack, through)
         path = DisturbedHubPath(near, through)
@@ -163,7 +168,7 @@ async def through_hub(
 async def _programs_side(
     stack: AsyncExitStack, through: ThroughHub
 ) -> tuple[DisturbedLink | DisturbedLinkPair, list[Link]]:
-    """The ends of the program and the hub."""
+    """Create the links between the program and the hub."""
     pairs = [memory_link_pair() for _ in range(1 if through.ways in ("one", "vehicle twice") else 2)]
     fars: list[Link] = [far for _, far in pairs]
     if through.ways == "program copied":
@@ -178,7 +183,7 @@ async def _programs_side(
 async def _vehicles_side(
     stack: AsyncExitStack, vehicle: SimulatedVehicle, through: ThroughHub, traffic_log: TrafficLog
 ) -> list[HubSideLink]:
-    """The hub's ends."""
+    """Create the links between the hub and the vehicles."""
     pairs = [memory_link_pair() for _ in range(2 if through.ways == "vehicle twice" else 1)]
     ports: list[Link] = [far for _, far in pairs]
     if len(pairs) > 1:

@@ -24,7 +24,7 @@ class Disturbances:
     """Disturbances, in seconds since the order was given.
 
     The first ``lost_commands`` transmissions of ``command`` and its first ``lost_acks`` answers are lost. During
-    ``outage`` (from, until) all messages are lost. Messages sent during ``stall`` arrive at its end, in order.
+    ``outage`` (begin, end) all messages are lost. Messages sent during ``stall`` arrive at its end, in order.
     """
 
     command: int = 0
@@ -37,14 +37,14 @@ class Disturbances:
 
 @dataclass
 class TrafficEntry:
-    """One message sent or received by the program, even if it was lost; ``number`` counts both, in order."""
+    """A message to or from the program, which may have been lost. ``number`` counts both directions, in order."""
 
     number: int
     at: float
     message: Message
     is_lost: bool = False
     is_believed: bool = True
-    """True if the program accepted it; over a link that is not selected it does not."""
+    """True if the program accepted the message. It ignores messages over a link that is not selected."""
     raw: bytes = b""
     """The frame of the message."""
     arrives_at: float = 0.0
@@ -52,7 +52,7 @@ class TrafficEntry:
 
 
 class RecordedTraffic(Protocol):
-    """Recorded traffic at the program's end, as the judge reads it."""
+    """Recorded traffic at the program's end, on which tests make their assertions."""
 
     @property
     def sent(self) -> list[TrafficEntry]:
@@ -70,7 +70,7 @@ class DisturbedPath(RecordedTraffic, Protocol):
 
     @property
     def disturbances(self) -> Disturbances:
-        """The disturbances."""
+        """The current disturbances; may be replaced before :meth:`begin`."""
         ...
 
     @disturbances.setter
@@ -82,7 +82,7 @@ class DisturbedPath(RecordedTraffic, Protocol):
 
 @dataclass(frozen=True)
 class Silence:
-    """One of two links fails, in seconds since the order was given: in both directions, or for answers only."""
+    """Failure of one of two links, in both directions or for answers only. Times count from the order, in seconds."""
 
     begin_s: float
     end_s: float = float("inf")
@@ -90,7 +90,7 @@ class Silence:
 
 
 class TrafficLog:
-    """All traffic, over any link."""
+    """Record of the traffic over all links."""
 
     def __init__(self) -> None:
         self.sent: list[TrafficEntry] = []
@@ -103,7 +103,7 @@ class TrafficLog:
         return into[-1]
 
     def begin(self) -> None:
-        """Drop all but the last HEARTBEAT."""
+        """Clear the record, except for the last HEARTBEAT."""
         self.sent.clear()
         self.received[:] = self.heartbeats[-1:]
 
@@ -196,7 +196,7 @@ class DisturbedLink(Link):
 
     @staticmethod
     def _later(queue: deque[Callable[[], object]], delay_s: float, act: Callable[[], object]) -> None:
-        """Deliver in order, because the loop does not keep the order of timers for the same time."""
+        """Call actions later in their order, which the loop does not keep for timers with the same time."""
         queue.append(act)
         asyncio.get_running_loop().call_later(delay_s, lambda: queue.popleft()())
 

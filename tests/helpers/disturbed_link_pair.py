@@ -1,4 +1,4 @@
-"""Two links between a program and a vehicle, of which the selected one fails after an order."""
+"""Two links between a program and a vehicle. The selected one fails after an order."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from aerokit.transport import Link, MultiLink, memory_link_pair
 
 @dataclass(frozen=True)
 class TwoLinks:
-    """The failure of the selected link. ``is_copied``: both carry the same stream, so answers arrive over both."""
+    """Failure of the selected link. With ``is_copied``, both links carry the same stream, so answers arrive twice."""
 
     silence: Silence
     is_copied: bool = False
@@ -77,7 +77,7 @@ class _SelectedLinkLog(TrafficLog):
 async def over_two(
     vehicle: SimulatedVehicle, two: TwoLinks
 ) -> AsyncIterator[tuple[DisturbedLinkPair, aerokit.Connection]]:
-    """A connection over two links, and a record of their traffic."""
+    """Open a path over two links, with a record of their traffic."""
     pairs = [memory_link_pair() for _ in range(2)]
     paths = unopened_paths([near for near, _ in pairs], two)
     async with AsyncExitStack() as stack:

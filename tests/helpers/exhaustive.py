@@ -1,4 +1,4 @@
-"""Sampling of long tables: the default run takes some rows, `nox -s exhaustive` the others.
+"""Sampling of long tables: the default run tests some rows, `nox -s exhaustive` the others.
 
 The marker ``exhaustive`` is deselected in pyproject.toml; ``pytest -m ""`` runs everything.
 """
@@ -20,5 +20,5 @@ def exhaustive(row: Any) -> Any:
 
 
 def sampled(rows: Iterable[Any], every: int) -> list[Any]:
-    """Create rows for ``parametrize``, of which the default run takes every ``every``-th."""
+    """Create rows for ``parametrize``. The default run tests one of ``every`` rows."""
     return [exhaustive(row) if place % every else row for place, row in enumerate(rows)]

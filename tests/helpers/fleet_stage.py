@@ -1,4 +1,4 @@
-"""A fleet of simulated copters on one or several networks, on virtual time, with recorders of what each receives."""
+"""A fleet of simulated copters on one or several networks, on virtual time, with recorders of received messages."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class Stage:
         return [event for event in found if isinstance(event, kind)]
 
     async def take_off(self, altitude_m: float = 10.0) -> None:
-        """Get all members ready, armed and airborne, and clear the recorders."""
+        """Wait until all members are ready, arm them, take off, and clear the recorders."""
         (await self.fleet.wait_ready()).raise_for_errors()
         (await self.fleet.arm()).raise_for_errors()
         (await self.fleet.take_off(altitude_m)).raise_for_errors()
@@ -74,7 +74,7 @@ class Stage:
         self.clear()
 
     def pilot_takes(self, name: str, mode: int = CopterMode.LOITER) -> None:
-        """Turn the mode switch of the remote control, with the throttle stick in the middle."""
+        """Change the mode by the remote control, with the throttle stick in the middle."""
         copter = self.copters[name]
         copter.rc[2] = 1500
         assert copter.set_mode(mode)

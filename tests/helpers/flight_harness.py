@@ -57,7 +57,7 @@ class Wire(Link):
         """Lose the link, as when the cable is unplugged."""
         assert self._receiver is not None
         self._link.close()
-        self._receiver.link_lost(LinkLost("the cable was pulled out"))
+        self._receiver.link_lost(LinkLost("the cable was unplugged"))
 
     def deliver(self, data: bytes) -> None:
         """Deliver bytes to the program."""
@@ -102,7 +102,7 @@ class Flight:
     wire: Wire
 
     async def take_off(self, altitude_m: float = 10.0) -> None:
-        """Get the copter ready, armed, in GUIDED, at this altitude, and clear the recorder."""
+        """Wait until the copter is ready, arm it, take off in GUIDED, and clear the recorder."""
         await self.vehicle.wait_ready()
         await self.vehicle.set_mode("GUIDED")
         await self.vehicle.arm()
@@ -111,7 +111,7 @@ class Flight:
         self.wire.clear()
 
     def pilot_takes_over(self, mode: int = CopterMode.LOITER) -> None:
-        """Turn the mode switch of the remote control, with the throttle stick in the middle."""
+        """Change the mode by the remote control, with the throttle stick in the middle."""
         self.copter.rc[2] = 1500
         assert self.copter.set_mode(mode)
 
@@ -124,7 +124,7 @@ async def open_flight(
     others: Iterable[SimulatedVehicle] = (),
     **options: Any,
 ) -> AsyncIterator[Flight]:
-    """A copter that is ready at power-on, and a vehicle connected to it; ``options`` are those of `connect`."""
+    """Connect to a copter that is ready at power-on. ``options`` are those of `connect`."""
     copter = SimulatedCopter(boot_time_s=0.0) if copter is None else copter
     options.setdefault("system_id", copter.system_id)
     async with simulated_link([copter, *others], latency_s=latency_s) as link:
@@ -135,7 +135,7 @@ async def open_flight(
 
 @asynccontextmanager
 async def in_the_air(altitude_m: float = 10.0, **options: Any) -> AsyncIterator[Flight]:
-    """The same, hovering in GUIDED."""
+    """Like `open_flight`, with the copter hovering in GUIDED."""
     async with open_flight(**options) as flight:
         await flight.take_off(altitude_m)
         yield flight
@@ -146,7 +146,7 @@ def now() -> float:
 
 
 def block_loop(seconds: float) -> None:
-    """Block the event loop, as a program that calls time.sleep: the clock advances, the loop does not."""
+    """Block the event loop, as time.sleep does in a program: the clock advances, but the loop does not run."""
     loop = asyncio.get_running_loop()
     assert isinstance(loop, VirtualClockLoop)
     loop._now += seconds
@@ -158,7 +158,7 @@ def speed_of(copter: SimulatedCopter) -> float:
 
 
 def make_parts(vehicle: aerokit.Vehicle) -> None:
-    """Create the parts that subscribe on first use and live as long as the vehicle, so that leak checks ignore them."""
+    """Create the components that are created on first use and kept, so that leak checks do not count them."""
     for name in ("parameters", "gimbal", "mission"):
         getattr(vehicle, name)
 
@@ -184,7 +184,7 @@ class Px4Flight:
     wire: Wire
 
     async def take_off(self, altitude_m: float = 10.0) -> None:
-        """Get the vehicle ready, armed, at this altitude, in LOITER, and clear the recorder."""
+        """Wait until the vehicle is ready, arm it, take off, wait for LOITER, and clear the recorder."""
         await self.vehicle.wait_ready()
         await self.vehicle.arm()
         await self.vehicle.take_off(altitude_m)
@@ -196,7 +196,7 @@ class Px4Flight:
 async def open_px4(
     px4: SimulatedPx4 | None = None, *, latency_s: float = 0.0, **options: Any
 ) -> AsyncIterator[Px4Flight]:
-    """A PX4 that is ready soon, and a vehicle connected to it; ``options`` are those of `connect`."""
+    """Connect to a PX4 that is soon ready. ``options`` are those of `connect`."""
     px4 = SimulatedPx4(boot_time_s=1.0) if px4 is None else px4
     async with simulated_link(px4, latency_s=latency_s) as link:
         wire = Wire(link)

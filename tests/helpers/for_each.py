@@ -1,4 +1,4 @@
-"""`for_each`: a single test that checks many rows and names all that fail."""
+"""`for_each`: a single test that checks many rows and reports every failed one."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Check = Callable[..., None]
 
 
 def for_each(names: str, rows: Iterable[Any]) -> Callable[[Check], Check]:
-    """Run the decorated check once for each row, as one test. It fails once, with every row that failed and why.
+    """Run the decorated check for each row, as one test. Its failure lists all failed rows with their errors.
 
     Args:
         names: the argument, or the arguments separated by commas, that a row fills; others are fixtures.

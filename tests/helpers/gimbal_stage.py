@@ -17,11 +17,11 @@ from aerokit.sim import SimulatedCopter, SimulatedGimbal
 PITCHYAW, MOUNT = MavCmd.DO_GIMBAL_MANAGER_PITCHYAW, MavCmd.DO_MOUNT_CONTROL
 CONFIGURE, REQUEST = MavCmd.DO_GIMBAL_MANAGER_CONFIGURE, MavCmd.REQUEST_MESSAGE
 OTHER = (254, 190)
-"""Another ground station."""
+"""System and component id of another ground station."""
 
 
 def copter_with_mount(**options: Any) -> SimulatedCopter:
-    """A vehicle whose autopilot manages gimbal 1."""
+    """Create a copter whose autopilot manages gimbal 1."""
     copter = SimulatedCopter(boot_time_s=0.0, **options)
     copter.parameters["MNT1_TYPE"] = 1.0
     return copter
@@ -29,7 +29,7 @@ def copter_with_mount(**options: Any) -> SimulatedCopter:
 
 @asynccontextmanager
 async def mounted() -> AsyncIterator[Flight]:
-    """A copter on the ground with a gimbal that its autopilot manages."""
+    """Connect to a copter on the ground with a gimbal that the autopilot manages."""
     async with open_flight(copter_with_mount()) as flight:
         await flight.vehicle.wait_ready()
         flight.wire.clear()
@@ -38,7 +38,7 @@ async def mounted() -> AsyncIterator[Flight]:
 
 @asynccontextmanager
 async def with_gimbals(*gimbals: SimulatedGimbal, copter: SimulatedCopter | None = None) -> AsyncIterator[Flight]:
-    """A copter on the ground with gimbals that have their own ids and managers, which it has discovered."""
+    """Connect to a copter on the ground with these gimbals, each with its manager, and discover them."""
     copter = copter or SimulatedCopter(boot_time_s=0.0, components=gimbals)
     async with open_flight(copter) as flight:
         await flight.vehicle.wait_ready()

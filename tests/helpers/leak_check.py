@@ -1,4 +1,4 @@
-"""Leak checks: interferes with a program at one iteration of the event loop, then counts its remaining resources."""
+"""Leak checks: run an action at one iteration of a program's event loop, then count the remaining resources."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class _Counting:
         super()._run_once()  # type: ignore[misc]
 
     def run_in(self, turns: int, action: Callable[[], object]) -> None:
-        """Call ``action`` before the iteration after the next one, for 1, and so on."""
+        """Call ``action`` before a later iteration: 0 is the next one."""
         self.action = action
         self.do_at = self.turns + 1 + turns
 
@@ -88,9 +88,9 @@ def run_and_do(
     action: Callable[[asyncio.Task[object]], object],
     loop_class: type[Any] = CountingLoop,
 ) -> asyncio.Task[object]:
-    """Run a program to its end, interfering at one iteration of the loop, and check that nothing is left of it.
+    """Run a program to its end, run ``action`` at one iteration of the loop, and check that no resources remain.
 
-    Return its finished task.
+    Returns the finished task of the program.
     """
     loop: Any = loop_class()
 

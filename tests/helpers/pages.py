@@ -33,11 +33,12 @@ from unittest.mock import patch
 import av
 import pytest
 import uvicorn
+from device_calls import FITTED
 from served_copter import served_copter
 
 import aerokit
 from aerokit import SigningKey
-from aerokit.sim import SimulatedCamera, SimulatedComponent, SimulatedCopter, SimulatorServer
+from aerokit.sim import SimulatedCamera, SimulatedComponent, SimulatedCopter, SimulatedPx4, SimulatorServer
 from aerokit.testing import run_virtual
 from aerokit.transport import Link, create, create_link, memory_link_pair
 from aerokit.transport.address import LinkAddress
@@ -235,14 +236,18 @@ async def _with_simulation(main: Coroutine[Any, Any, Any], chain: Chain) -> Any:
             return await main
 
 
-def _simulated_vehicles(text: str) -> list[SimulatedCopter]:
-    """Return the vehicles that a text uses, with camera and gimbal if it names them."""
+def _simulated_vehicles(text: str) -> list[SimulatedCopter] | list[SimulatedPx4]:
+    """Return the vehicles that a text uses, with camera, gimbal and devices if it names them."""
+    if any(name in text for name in (".shell()", "logs.stream", "inject_failure")):
+        return [SimulatedPx4(boot_time_s=0.0)]
     components: list[SimulatedComponent] = []
     if "camera" in text or "component(100)" in text:
         components.append(SimulatedCamera(streams=[VIDEO], capabilities=SimulatedCamera.ALL_CAPABILITIES))
     first = SimulatedCopter(boot_time_s=0.0, components=components)
     if "signing=" in text:
         first = SimulatedCopter(boot_time_s=0.0, signing_key=SigningKey.from_passphrase(PASSPHRASE))
+    for name, value in FITTED.items() if "actuators" in text or "winch" in text else ():
+        first.parameters[name] = value
     if "gimbal" in text:
         first.parameters["MNT1_TYPE"] = 1.0
     if "system_id=2" not in text:

@@ -43,7 +43,7 @@ def short_mission(flight: Flight | Px4Flight, *ends: MissionItem) -> Mission:
 
 
 def changed(mission: Mission, *indices: int) -> Mission:
-    """The same place at another altitude."""
+    """Return the mission with other altitudes of these items."""
     items = [item.replace(z=33.0) if i in indices else item for i, item in enumerate(mission)]
     return Mission(items)
 

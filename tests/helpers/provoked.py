@@ -36,7 +36,11 @@ Trouble = Callable[[Stage], object]
 
 @dataclass(frozen=True)
 class Provocation:
-    """``before`` runs when the vehicle is in its state. ``alone``: the vehicle cannot be used afterwards."""
+    """A call that must raise an error.
+
+    ``place`` brings the vehicle to the required state; then ``before`` prepares the error. ``alone`` is True if the
+    vehicle cannot be used afterwards.
+    """
 
     do: Do
     place: Place = anywhere
@@ -46,37 +50,37 @@ class Provocation:
 
 
 Table = dict[tuple[str, str], Provocation]
-"""(call, error) → how to provoke it."""
+"""Maps (call, error) to the provocation of the error."""
 
 
 def refused(command: int, result: int = MavResult.FAILED) -> Trouble:
-    """The vehicle refuses the command."""
+    """Make the vehicle refuse the command."""
     return lambda stage: stage.simulated.faults.refuse(command, result)
 
 
 def ignored(command: int) -> Trouble:
-    """The vehicle neither executes nor answers the command."""
+    """Make the vehicle ignore the command: it neither executes nor answers it."""
     return lambda stage: stage.simulated.faults.ignore(command)
 
 
 def stops_sending(stage: Stage) -> None:
-    """The link loses everything."""
+    """Lose all messages in both directions."""
     stage.simulated.faults.silent = True
 
 
 def lost(stage: Stage) -> None:
-    """The link is lost, as when the cable is unplugged."""
+    """Lose the link, as when the cable is unplugged."""
     stage.wire.lose()
 
 
 def pilot(stage: Stage) -> None:
-    """The pilot turns the mode switch."""
+    """Change the mode by the remote control."""
     stage.simulated.rc[2] = 1500  # type: ignore[union-attr]
     assert stage.simulated.set_mode(2)  # type: ignore[union-attr]
 
 
 def later(do: Do, trouble: Trouble, after_s: float = 1.0, place: Place = airborne, **options: Any) -> Provocation:
-    """The disturbance happens during the call."""
+    """Create a provocation whose disturbance happens during the call."""
 
     async def disturbed(stage: Stage) -> object:
         asyncio.get_running_loop().call_later(after_s, trouble, stage)
@@ -86,19 +90,19 @@ def later(do: Do, trouble: Trouble, after_s: float = 1.0, place: Place = airborn
 
 
 def no_modes(stage: Stage) -> None:
-    """A vehicle type without modes for any purpose."""
+    """Make the vehicle a type without modes for any purpose."""
     autopilot: Any = stage.vehicle.autopilot
     autopilot.mode_for = lambda purpose, **_: None
     autopilot.take_off = lambda *_, **__: None
 
 
 def accepted(command: int) -> Trouble:
-    """The vehicle answers ACCEPTED without doing anything."""
+    """Make the vehicle answer ACCEPTED without executing the command."""
     return refused(command, MavResult.ACCEPTED)
 
 
 def file_server(answers: dict[int, bytes | int]) -> Trouble:
-    """A file server that answers all requests with an ACK and these data; a number is the code of a NAK."""
+    """Replace the file server by one with fixed answers by opcode: the data of an ACK, or the code of a NAK."""
 
     def trouble(stage: Stage) -> None:
         def handle(message: m.FileTransferProtocol, channel: Any) -> None:

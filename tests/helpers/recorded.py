@@ -1,4 +1,4 @@
-"""Recorded traffic of real firmware: long recordings outside the project if they are available, else its own."""
+"""Recorded traffic of real firmware: long recordings outside the repository if available, else short ones in it."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ __all__ = ["LONG", "SHORT", "headline", "path_of", "recording"]
 
 ROOT = Path(__file__).parents[2]
 LONG = ROOT.parent / "shared" / "traces"
-"""Whole flights, which are not part of the project."""
+"""Complete flights, which are not part of the repository."""
 SHORT = ROOT / "tests" / "recordings"
-"""Excerpts of two of them, and of a serial port at boot; see ``cut.py`` there."""
+"""Excerpts of two of these flights, and of a serial port at boot; see ``cut.py`` in this folder."""
 
 
 def path_of(file: str) -> Path | None:
-    """Return the path of a recording, the long one if available; None if there is neither."""
+    """Return the path of a recording, the long one if available; None if there is no such recording."""
     return next((folder / file for folder in (LONG, SHORT) if (folder / file).is_file()), None)
 
 
@@ -29,7 +29,7 @@ def recording(file: str) -> Path:
 
 
 def headline() -> str:
-    """Return which recordings the tests use."""
-    folder, what = (LONG, "whole flights") if LONG.is_dir() else (SHORT, "the project's own short ones")
+    """Return a line about the recordings that the tests use."""
+    folder, what = (LONG, "complete flights") if LONG.is_dir() else (SHORT, "short excerpts")
     files = sorted(path.name for path in folder.iterdir() if path.suffix in (".tlog", ".raw"))
     return f"recordings: {what} in {folder}: {', '.join(files)}"

@@ -1,4 +1,4 @@
-"""A simulated copter on a real socket, in a thread of its own, for blocking programs."""
+"""A simulated copter on a real socket, in a separate thread, for blocking programs."""
 
 from __future__ import annotations
 
@@ -18,15 +18,19 @@ if TYPE_CHECKING:
 SPEEDUP = 20.0
 
 
-def complaints(stderr: str) -> str:
-    """Return what a program wrote to standard error, without the warning about a blocked event loop on this machine."""
+def without_loop_warnings(stderr: str) -> str:
+    """Remove warnings about a blocked event loop, which depend on the load of the machine, from standard error."""
     return re.sub(r"the event loop was blocked for .*\n", "", stderr)
 
 
 @contextmanager
 def served_copter(*addresses: str, speedup: float = SPEEDUP, **options: Any) -> Iterator[str]:
-    """A copter that is ready at power-on. Yield the address to connect to."""
+    """Serve a copter that is ready at power-on. Yield the address to connect to.
+
+    Its battery lasts ``speedup`` times as long, because the machine that runs the client may be busy.
+    """
     options.setdefault("boot_time_s", 0.0)
+    options.setdefault("battery_capacity_mah", 3300.0 * max(speedup, 1.0))
     with served([SimulatedCopter(**options)], *addresses, speedup=speedup) as address:
         yield address
 
@@ -35,7 +39,7 @@ def served_copter(*addresses: str, speedup: float = SPEEDUP, **options: Any) -> 
 def served(copters: Sequence[SimulatedCopter], *addresses: str, speedup: float = SPEEDUP) -> Iterator[str]:
     """Serve copters on addresses, by default one TCP port. Yield the first address, as a client writes it.
 
-    The copters measure time-outs by our clock, because their ten seconds pass quickly, and this machine may be busy.
+    Time-outs of the copters are multiplied by ``speedup``, because the machine that runs the client may be busy.
     """
     scale_timeouts(copters, speedup)
 

@@ -34,15 +34,15 @@ class Radios:
         ]
 
     def together(self, **options: Any) -> MultiLink:
-        """Open them as one link."""
+        """Combine the links to one `MultiLink`."""
         return MultiLink([partial(_itself, link) for link in self.links], **options)
 
     def cut(self, index: int) -> None:
-        """Lose everything in both directions, without an error."""
+        """Lose all messages of a link in both directions, without an error."""
         self.links[index].incoming.model = self.links[index].outgoing.model = DEAD
 
     def mend(self, index: int) -> None:
-        """Repair the link."""
+        """End the loss of messages of a link."""
         self.links[index].incoming.model = self.links[index].outgoing.model = GOOD
 
 
@@ -51,7 +51,7 @@ def _itself(link: Link) -> Link:
 
 
 class ReceivedMessages:
-    """Messages received on the vehicle's side, and by which radio, in the order of sending."""
+    """Messages received on the vehicle's side, in the order of sending, each with the index of its radio."""
 
     def __init__(self, radios: Radios) -> None:
         self.messages: list[tuple[int, float, Message]] = []
@@ -66,7 +66,7 @@ class ReceivedMessages:
         write(data, peer)
 
     def of(self, *types: type[Message]) -> list[tuple[int, Message]]:
-        """Messages of these types, with the radio over which each arrived."""
+        """Return the messages of these types, each with the index of its radio."""
         return [(index, message) for index, _, message in self.messages if isinstance(message, types)]
 
 
@@ -80,7 +80,7 @@ async def over(
     links: dict[str, Any] | None = None,
     **options: Any,
 ) -> AsyncIterator[Connection]:
-    """A connection over these radios to simulated vehicles."""
+    """Open a connection over these radios to simulated vehicles."""
     async with AsyncExitStack() as stack:
         ports: list[Link] = list(radios.far)
         if copied:
@@ -93,7 +93,7 @@ async def over(
 
 
 class EventLog:
-    """Collect the events of a connection."""
+    """Collects the events of a connection."""
 
     def __init__(self, connection: Connection, *types: type[events.Event]) -> None:
         self.all: list[events.Event] = []

@@ -1,4 +1,4 @@
-"""An onboard router that copies one stream of the autopilot to several radios."""
+"""Simulation of an onboard router that copies one stream of the autopilot to several radios."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from aerokit.transport import MemoryLink, Peer, memory_link_pair
 
 
 class Splitter:
-    """One stream of the autopilot, copied to several radios as by an onboard router."""
+    """Copies one stream of the autopilot to several radios."""
 
     def __init__(self, far: Sequence[MemoryLink]) -> None:
         self.port, self._inside = memory_link_pair()
@@ -18,7 +18,7 @@ class Splitter:
         self.keeps_peers = False
 
     async def open(self, stack: AsyncExitStack) -> None:
-        """Start copying. The exit stack closes everything."""
+        """Start copying. The exit stack closes all links."""
         splitter = self
 
         class FromRadio:

@@ -92,7 +92,7 @@ WRONG: dict[str, tuple[object, ...]] = {
     ),
     "str | Link | Connection": (*NOTHING, *STRANGE, *NUMBER, b"udpin:0.0.0.0:14550"),
 }
-"""Annotation → values that it does not allow."""
+"""Maps an annotation to values that it does not allow."""
 WRONG["type[ItemT]"] = WRONG["type[MessageT]"] = WRONG["type[Message]"]
 for _setpoint in ("Velocity", "BodyVelocity", "Acceleration", "LocalPosition", "Position", "Attitude"):
     WRONG[f"{_setpoint}Setpoint"] = (*NOTHING, *STRANGE, *TEXT, *NUMBER, PLACE)
@@ -108,6 +108,12 @@ for _literal in (
     "LogMethod",
     "Overflow",
     "Subject",
+    "SpinIntent",
+    "ReleaseIntent",
+    "FailureIntent",
+    "FailingUnit",
+    "FailureKind",
+    "Severity",
 ):
     WRONG[_literal] = (*STRANGE, *NUMBER, "quick")
 
@@ -142,12 +148,17 @@ RIGHT: dict[str, object] = {
     "PlanT": Mission(),
     "SourceName": "rgb",
     "ModeName": "photo",
+    "SpinIntent": "spin motor",
+    "ReleaseIntent": "release parachute",
+    "FailureIntent": "inject failure",
+    "FailingUnit": "gps",
+    "FailureKind": "off",
     "SetpointT": VelocitySetpoint(),
     "PositionSetpoint": PositionSetpoint(PLACE),
     "LocalPositionSetpoint": LocalPositionSetpoint(0, 0, -5),
     "AttitudeSetpoint": AttitudeSetpoint(0, 0, 0, thrust=0.5),
 }
-"""Annotation → a value for a required parameter while another one is wrong."""
+"""Maps an annotation to a valid value, for required parameters in a call whose wrong value is another parameter."""
 
 
 class Misuse(NamedTuple):
@@ -163,14 +174,14 @@ class Misuse(NamedTuple):
 
 
 def misuses(owner: object, *, leave_out: frozenset[str] = frozenset()) -> Iterator[Misuse]:
-    """Yield each public method of an object with each parameter wrong in each way."""
+    """Yield calls of each public method of an object, with one wrong value in each."""
     for name, _ in inspect.getmembers(type(owner), inspect.isfunction):
         if not name.startswith("_") and name not in leave_out:
             yield from misuses_of(getattr(owner, name), f"{type(owner).__name__}.{name}")
 
 
 def misuses_of(function: Callable[..., Any], name: str) -> Iterator[Misuse]:
-    """Yield one function with each parameter wrong in each way."""
+    """Yield calls of a function, with one wrong value in each."""
     parameters = inspect.signature(function).parameters
     needed = [
         parameter
@@ -185,7 +196,7 @@ def misuses_of(function: Callable[..., Any], name: str) -> Iterator[Misuse]:
 
 
 def _impossible(method: str, parameter: inspect.Parameter) -> tuple[object, ...]:
-    """Values of the right type that are no valid time to wait. Cells and subscriptions allow not to wait."""
+    """Return invalid values of the right type for a time. Cells and subscriptions allow 0, which does not wait."""
     name = parameter.name
     is_time = name == "timeout" or (name.endswith("_s") and not name.endswith(("m_s", "deg_s")))
     is_for_vehicles = not method.startswith(("StateCell.", "Subscription."))
@@ -195,7 +206,7 @@ def _impossible(method: str, parameter: inspect.Parameter) -> tuple[object, ...]
 def _arguments(
     wrong: inspect.Parameter, value: object, others: list[inspect.Parameter]
 ) -> tuple[list[object], dict[str, object]]:
-    """Pass by name; positional-only parameters, and those before them, by position."""
+    """Return positional and keyword arguments. Arguments are passed by name, except before a wrong ``*args``."""
     if wrong.kind is wrong.VAR_POSITIONAL:
         first = [RIGHT[str(other.annotation)] for other in others if other.kind is other.POSITIONAL_OR_KEYWORD]
         rest = {other.name: RIGHT[str(other.annotation)] for other in others if other.kind is other.KEYWORD_ONLY}
@@ -204,7 +215,7 @@ def _arguments(
 
 
 def refusal_of(misuse: Misuse, error: BaseException | None) -> str | None:
-    """Describe the fault of the error; None if it is as documented."""
+    """Describe the problem with an error; None if the error is as documented."""
     if not isinstance(error, InvalidArgument):
         return f"{misuse!r}: {error!r}"
-    return None if misuse.parameter in str(error) else f"{misuse!r} is not named: {error}"
+    return None if misuse.parameter in str(error) else f"{misuse!r}: the error does not name the parameter: {error}"

@@ -45,7 +45,7 @@ asyncio.run(main())
 
 
 async def eventually(condition: Callable[[], bool]) -> None:
-    """Wait until a condition holds. Threads and other processes are involved; only hung tests take 100 s."""
+    """Wait until a condition holds, which may depend on threads and other processes. Fail after 100 s."""
     with anyio.fail_after(100):
         while not condition():  # noqa: ASYNC110
             await asyncio.sleep(0.005)
@@ -82,7 +82,7 @@ def router(port: int, config: str = "") -> contextlib.AbstractContextManager[sub
 
 
 class HoldingProxy:
-    """A relay to a port that can delay its traffic."""
+    """A TCP proxy that can hold back its traffic."""
 
     def __init__(self, port: int) -> None:
         self.port = free_port()
@@ -109,11 +109,11 @@ class HoldingProxy:
         await asyncio.gather(*(writer.wait_closed() for writer in self._writers), return_exceptions=True)
 
     def hold(self) -> None:
-        """Hold everything back from now on."""
+        """Hold all traffic back from now on."""
         self._flows.clear()
 
     def release(self) -> None:
-        """Deliver everything that was held back."""
+        """Deliver the traffic that was held back."""
         self._flows.set()
 
     async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

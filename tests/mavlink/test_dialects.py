@@ -204,7 +204,7 @@ def one_message(id: object, name: str, type: str) -> str:  # noqa: A002
         (one_message(1, "X", "int"), "unknown field type 'int'"),
         (one_message(1, "import os", "float"), "'import os' is not a name"),
         (one_message(1 << 24, "X", "float"), "message id 16777216 is not in 0..16777215"),
-        (one_message(1, "X", "double[32]"), "a payload of 256 bytes, at most 255 fit in a frame"),
+        (one_message(1, "X", "double[32]"), "the payload has 256 bytes, but at most 255 fit in a frame"),
         ("<mavlink><include>nowhere.xml</include></mavlink>", "includes nowhere.xml, which is in none of"),
     ],
 )

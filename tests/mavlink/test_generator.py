@@ -21,7 +21,7 @@ PACKAGES = {"messages": messages, "enums": enums}
 
 def test_generated_modules_are_up_to_date() -> None:
     if generator.fingerprint() != generator.generated_fingerprint():
-        pytest.skip("the installed pymavlink has other XML than the committed modules were made from")
+        pytest.skip("the XML of the installed pymavlink differs from that of the committed modules")
     assert generator.differences() == []
 
 
@@ -64,7 +64,7 @@ def test_generator_check(other: bool, monkeypatch: pytest.MonkeyPatch, capsys: p
     if other:
         monkeypatch.setattr(generator, "fingerprint", lambda folder=None: "other")
         assert generator.main(["--check"]) == 0
-        assert capsys.readouterr().out.startswith("skipped: the installed pymavlink has other XML")
+        assert capsys.readouterr().out.startswith("skipped: the XML of the installed pymavlink differs")
     elif generator.fingerprint() == generator.generated_fingerprint():
         monkeypatch.setattr(generator, "generate", lambda folder=None: {"messages/minimal.py": "changed"})
         assert generator.main(["--check"]) == 1
@@ -94,7 +94,7 @@ def test_mavlink_import_loads_no_messages() -> None:
 def test_additions_do_not_repeat_pymavlink() -> None:
     """An addition that pymavlink has meanwhile must be removed."""
     if generator.fingerprint() != generator.generated_fingerprint():
-        pytest.skip("the installed pymavlink has other XML than the additions were made for")
+        pytest.skip("the additions were written for the XML of another pymavlink")
     folder = generator.xml_folder()
     dialects = [read_xml(folder / f"{stem}.xml") for stems in generator.MODULES.values() for stem in stems]
     theirs, their_enums = [m for dialect in dialects for m in dialect.messages], merged_enums(dialects)

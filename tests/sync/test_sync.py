@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 from ctrl_c import interrupt_soon
 from for_each import for_each
-from served_copter import complaints, served, served_copter
+from served_copter import served, served_copter, without_loop_warnings
 
 import aerokit
 import aerokit.sync
@@ -375,7 +375,7 @@ def test_program_without_close_exits() -> None:
             timeout=200,
             check=False,
         )
-    assert (done.returncode, done.stdout, complaints(done.stderr)) == (0, "7\n", "")
+    assert (done.returncode, done.stdout, without_loop_warnings(done.stderr)) == (0, "7\n", "")
 
 
 # --------------------------------------------------------------------------------- missions

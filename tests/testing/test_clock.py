@@ -93,7 +93,7 @@ def test_virtual_hour_takes_no_real_time() -> None:
 
 
 def test_run_virtual_refuses_a_function() -> None:
-    with pytest.raises(TypeError, match=r"takes a coroutine, as main\(\) gives one"):
+    with pytest.raises(TypeError, match=r"requires a coroutine, such as main\(\)"):
         run_virtual(test_run_virtual_refuses_a_function)  # type: ignore[arg-type]
 
 

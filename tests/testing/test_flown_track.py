@@ -86,23 +86,23 @@ WRONG: dict[str, Callable[[Track], None]] = {
         lambda track: track.assert_reached_altitude(30)
     ),
     "rose above 19 m: at 5.0 s": lambda track: track.assert_stayed_below(19),
-    r"within 5 m of .*: the nearest was 100\.0 m, at 15\.0 s": (
+    r"within 5 m of .*: the minimum distance was 100\.0 m, at 15\.0 s": (
         lambda track: track.assert_passed(HOME.offset(north_m=200), within_m=5)
     ),
     r"left the 50 m around home: 100\.0 m away at 15\.0 s": lambda track: track.assert_stayed_within(50),
-    r"1 of 5 points are outside; first at 15\.0 s": lambda track: track.assert_stayed_inside(SQUARE),
+    r"1 of 5 points are outside, the first at 15\.0 s": lambda track: track.assert_stayed_inside(SQUARE),
     r"landed 5\.0 m from home, not within 2 m": lambda track: track.assert_landed_near(),
     r"faster than 9 m/s: 10\.0 m/s at 15\.0 s": lambda track: track.assert_stayed_slower_than(9),
-    "ended disarmed, at 40.0 s": lambda track: track.assert_armed_at_end(),
+    "is disarmed at the end, at 40.0 s": lambda track: track.assert_armed_at_end(),
     "AUTO is missing in RTL → AUTO → RTL: the modes were STABILIZE → AUTO → RTL": (
         lambda track: track.assert_modes("RTL", "AUTO", "RTL")
     ),
-    "not on the ground: it ended at 25.0 s": (
+    "not on the ground: the track ends at 25.0 s": (
         lambda track: Track(track.home, track[:-1]).assert_landed_near(within_m=9)
     ),
     "never took off": lambda track: Track(track.home, track[:1]).assert_landed_near(),
     "nothing was recorded": lambda track: Track(track.home).assert_stayed_below(10),
-    "three places": lambda track: track.assert_stayed_inside(SQUARE[:2]),
+    "at least three positions, not 2": lambda track: track.assert_stayed_inside(SQUARE[:2]),
 }
 
 

@@ -126,7 +126,7 @@ def test_pytest_asyncio_tests_run_on_virtual_time(pytester: pytest.Pytester, mod
     options = ("-p", "pytest_asyncio", "-o", "asyncio_default_fixture_loop_scope=function")
     result = run(pytester, PYTEST_ASYNCIO, *options, f"--asyncio-mode={mode}")
     result.assert_outcomes(passed=4, failed=1)
-    assert "it did not reach 5 m" in result.stdout.str()
+    assert "the vehicle did not reach 5 m" in result.stdout.str()
 
 
 def test_failed_test_describes_the_flight(pytester: pytest.Pytester) -> None:
@@ -148,7 +148,7 @@ def test_failed_test_describes_the_flight(pytester: pytest.Pytester) -> None:
     result.assert_outcomes(failed=3)
     result.stdout.fnmatch_lines(
         [
-            "*- what was flown -*",
+            "*- simulated flights -*",
             "system 1: STABILIZE, armed for 0.0 s, up to 0.0 m high and 0.0 m away",
             "  ended at *, disarmed, STABILIZE",
             "  text at * INFO 'EKF3 IMU0 is using GPS'",

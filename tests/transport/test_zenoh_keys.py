@@ -67,7 +67,7 @@ json_values = st.recursive(
     max_leaves=5,
 )
 fields = st.dictionaries(
-    st.sampled_from(["version", "epoch", "number", "clock_s", "helm", "told", "message", "answer", "count"]),
+    st.sampled_from(["version", "epoch", "number", "clock_s", "holder", "refused", "message", "answer", "count"]),
     json_values | st.just(1) | st.just("order_refused"),
 )
 

@@ -115,6 +115,7 @@ class Program:
 
 def test_unplugged_cable(machines: tuple[str, str]) -> None:
     one, two = machines
+    late = 0
     with Program(one, VEHICLE) as vehicle, Program(two, CLIENT) as client:
 
         def received() -> int:
@@ -126,7 +127,7 @@ def test_unplugged_cable(machines: tuple[str, str]) -> None:
             late = int(line.split()[1])
             return count
 
-        late = sent = arrived = 0
+        sent = arrived = 0
         while not arrived:  # a busy machine may delay one for longer than two seconds
             assert client.ask("until sent") == "done"
             sent += 1

@@ -99,7 +99,7 @@ class ReadOnly:
     """Base class of public objects whose attributes report the state of the vehicle.
 
     Assigning to a cell, a property or a part raises AttributeError, which names the method to call: ``set_mode`` for
-    ``vehicle.mode = "GUIDED"``. A program may add attributes of its own.
+    ``vehicle.mode = "GUIDED"``. A program may add attributes.
     """
 
     def __setattr__(self, name: str, value: object) -> None:

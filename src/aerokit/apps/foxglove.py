@@ -34,9 +34,9 @@ if TYPE_CHECKING:
 __all__ = ["FoxgloveBridge", "foxglove_bridge"]
 
 MAX_RATE_HZ = 100.0
-# For each viewer. The SDK drops the oldest messages, so a slow viewer gets the newest and delays nothing.
+# Maximum number of queued messages for each viewer. If the queue is full, the SDK drops the oldest message.
 _MAX_BACKLOG = 512
-# Wait for the SDK to close the port.
+# Maximum time to wait until the SDK has closed the port.
 _PORT_CLOSE_TIMEOUT_S = 2.0
 _LINK_INTERVAL_S = 1.0
 
@@ -47,9 +47,9 @@ class FoxgloveBridge:
     def __init__(self, server: Any, vehicles: Mapping[int, Vehicle], host: str) -> None:
         self._server = server
         self.vehicles = vehicles
-        """System id → vehicle, of all vehicles that are shown."""
+        """Maps system ids to the vehicles that are shown."""
         self.port: int = server.port
-        """TCP port on which it listens."""
+        """TCP port on which the server listens."""
         self.url: str = f"ws://{f'[{host}]' if ':' in host else host}:{self.port}"
         """URL to enter in Foxglove, under "Open connection"."""
 
@@ -66,14 +66,14 @@ async def foxglove_bridge(
     rates: Mapping[type[Message], float] | None = None,
     on_found: Callable[[Vehicle], object] | None = None,
 ) -> AsyncIterator[FoxgloveBridge]:
-    """Serve the vehicles of a connection to Foxglove, while the block lasts.
+    """Serve the vehicles of a connection to Foxglove while the block lasts.
 
-    Viewers cannot send anything to a vehicle. Each topic sends its newest value, at most ``rate_hz`` times a
-    second, and only while a viewer subscribes to it; docs/convert.md lists the topics. There is no password:
-    every client that can reach the port can see everything.
+    Viewers cannot send anything to a vehicle. The newest value of a topic is sent at most ``rate_hz`` times a second,
+    and only while a viewer subscribes to the topic; docs/convert.md lists the topics. There is no password: every
+    client that can reach the port can see all data.
 
-    The server is foxglove-sdk's. It runs on two threads of its own, which start with the first bridge of a
-    process. The server and its sockets end with the block; the idle threads end with the process.
+    foxglove-sdk runs the server on two threads, which start with the first bridge of a process. The server and its
+    sockets end with the block; the idle threads end with the process.
 
     Args:
         connection: a connection from :func:`aerokit.open_connection`.
@@ -81,13 +81,13 @@ async def foxglove_bridge(
         port: TCP port, 0 to 65535; 0 for any free port.
         rate_hz: maximum rate of each topic, above 0, at most 100.
         messages: names of MAVLink messages to show unconverted; ``*`` and ``?`` are wildcards: ``["GPS_*"]``.
-        rates: message class → Hz, requested from each vehicle, as in :func:`aerokit.connect`; ``{}`` requests
-            nothing.
+        rates: maps message classes to the rates in Hz that are requested from each vehicle, as in
+            :func:`aerokit.connect`; ``{}`` requests nothing.
         on_found: called with each new vehicle, in the event loop.
 
     Raises:
         InvalidArgument: an argument is invalid, or no message has such a name.
-        LinkOpenError: cannot listen on the port.
+        LinkOpenError: the server cannot listen on the port.
         ConnectionClosed, LinkLost: the connection has ended.
         ModuleNotFoundError: foxglove-sdk is not installed.
     """
@@ -159,7 +159,7 @@ class _Listener:
         self._loop, self._channels = loop, channels
 
     def on_subscribe(self, client: Any, channel: Any) -> None:
-        # A new viewer needs the current value.
+        # Send the current value to the new viewer. `publish` sends new values only.
         if not self._loop.is_closed():
             self._loop.call_soon_threadsafe(self._channels.send_again, channel.topic)
 
@@ -168,7 +168,7 @@ class _Listener:
 
 
 class _TopicChannels:
-    """The channels of all topics, and the time of the value that each has sent."""
+    """The channels of all topics, and the time of the last value sent on each."""
 
     def __init__(self, connection: Connection) -> None:
         self._sdk = import_module("foxglove")
@@ -181,7 +181,7 @@ class _TopicChannels:
         self._messages: dict[tuple[int, int, int], Message] = {}
 
     def send_again(self, topic: str) -> None:
-        """Send the current value of a topic again, for a new viewer. Texts are always read from the buffer."""
+        """Send the current value of a topic again, for a new viewer. Texts are sent from the buffer."""
         if not topic.endswith("/log"):
             self._sent_at.pop(topic, None)
 

@@ -17,6 +17,13 @@ from aerokit.mavlink.enums import EkfStatusFlags, MavCmd, MavLandedState, MavSta
 if TYPE_CHECKING:
     from aerokit.mavlink.messages import Heartbeat
 
+_C = MavCmd
+NOT_ON_ARDUPILOT = frozenset(
+    (_C.DO_SET_ACTUATOR, _C.ACTUATOR_TEST, _C.INJECT_FAILURE, _C.ILLUMINATOR_ON_OFF, _C.LOGGING_START)
+)
+NOT_ON_PLANE = NOT_ON_ARDUPILOT | {_C.DO_WINCH}
+NOT_ON_GROUND_OR_WATER = NOT_ON_PLANE | {_C.DO_PARACHUTE, _C.AIRFRAME_CONFIGURATION}
+
 COPTER = ModeTable(
     {
         0: "STABILIZE",
@@ -185,7 +192,16 @@ class ArduPilot(Autopilot):
     prefers_log_messages = True
     stream_groups = ARDUPILOT_GROUPS
     # ATTITUDE_QUATERNION is sent on request, and so not listed.
-    unsupported_messages: frozenset[str] = frozenset(("ESTIMATOR_STATUS", "WIND_COV", "ALTITUDE", "CURRENT_MODE"))
+    unsupported_messages: frozenset[str] = frozenset(
+        (
+            *("ESTIMATOR_STATUS", "WIND_COV", "ALTITUDE", "CURRENT_MODE"),
+            *("ODOMETRY", "HIL_STATE_QUATERNION", "ACTUATOR_CONTROL_TARGET"),
+        )
+    )
+    highres_imu_field_ut = 1e-4
+    unsupported_commands: frozenset[int] = NOT_ON_ARDUPILOT
+    reports_gripper_by_text = True
+    winch_actions: frozenset[int] = frozenset((0, 1, 2))
 
     def missing_estimates(self, flags: int) -> tuple[str, ...]:
         return (
@@ -257,6 +273,7 @@ class ArduPlane(ArduPilot):
     """ArduPlane: planes, and VTOL planes, which ArduPilot calls QuadPlanes."""
 
     firmware = "ArduPlane"
+    unsupported_commands: frozenset[int] = NOT_ON_PLANE
     modes: ModeTable = PLANE
     purposes: ClassVar[Mapping[str, str]] = {
         "hold": "LOITER",
@@ -300,6 +317,7 @@ class ArduRover(ArduPilot):
     """ArduRover: rovers and boats."""
 
     firmware = "Rover"
+    unsupported_commands: frozenset[int] = NOT_ON_GROUND_OR_WATER
     is_surface_vehicle = True
     modes: ModeTable = ROVER
     purposes: ClassVar[Mapping[str, str]] = {
@@ -324,6 +342,7 @@ class ArduSub(ArduPilot):
     """ArduSub: remotely operated and autonomous underwater vehicles."""
 
     firmware = "ArduSub"
+    unsupported_commands: frozenset[int] = NOT_ON_GROUND_OR_WATER
     modes: ModeTable = SUB
     purposes: ClassVar[Mapping[str, str]] = {
         "hold": "POSHOLD",

@@ -22,7 +22,7 @@ from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import EstimatorStatusFlags, MavCmd, MavType
 
 MAIN_POSCTL, MAIN_AUTO, SUB_MISSION = 3, 4, 4
-_E = EstimatorStatusFlags
+_E, _C = EstimatorStatusFlags, MavCmd
 ESTIMATES_REQUIRED = ATTITUDE_AND_HEIGHT | _E.VELOCITY_HORIZ.value | _E.VELOCITY_VERT.value
 ESTIMATOR_PROBLEMS: Mapping[int, str] = {
     _E.GPS_GLITCH.value: "GPS without glitches",
@@ -123,6 +123,15 @@ class Px4(Autopilot):
     repeats_item_reached = True
     unsupported_messages: frozenset[str] = frozenset(
         ("EKF_STATUS_REPORT", "WIND", "RANGEFINDER", "AHRS", "AHRS2", "MEMINFO", "POWER_STATUS", "RAW_IMU")
+    )
+
+    has_shell = True
+    # DO_WINCH is passed on to the system, where no module handles it.
+    unsupported_commands: frozenset[int] = frozenset(
+        (
+            *(_C.DO_SET_SERVO, _C.DO_REPEAT_SERVO, _C.DO_SET_RELAY, _C.DO_REPEAT_RELAY, _C.DO_MOTOR_TEST),
+            *(_C.DO_PARACHUTE, _C.AIRFRAME_CONFIGURATION, _C.DO_WINCH, _C.ILLUMINATOR_ON_OFF),
+        )
     )
 
     def __init__(self, vehicle_type: int) -> None:

@@ -394,7 +394,7 @@ class Connection:
     def fail(self, error: Exception) -> None:
         """Close the connection because of an internal error of aerokit. Waiters get it as the cause of their error."""
         if not self.is_open and isinstance(error, AerokitError):
-            return  # a background task got the connection's own error
+            return  # a background task failed because the connection was closed before
         logger.error("the connection is closed because of an internal error of aerokit", exc_info=error)
         closed = ConnectionClosed(f"an internal error of aerokit closed the connection: {error!r}")
         closed.__cause__ = error
@@ -490,7 +490,7 @@ class Connection:
             if self._heartbeat is not None and self._heartbeat.should_send():
                 self.send(self._heartbeat.message)
             self._gate.log_storage_errors()
-            self._state_watch.update(self._clock(), sum(each.frames for each in self.statistics()))
+            self._state_watch.update(self._clock(), sum(counters.frames for counters in self.statistics()))
             self._observers.flush()
             await anyio.sleep(HEARTBEAT_INTERVAL_S)
 

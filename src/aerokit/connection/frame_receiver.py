@@ -172,7 +172,7 @@ class FrameReceiver:
         else:
             framer, frames = self._peers.receive_unverified(peer, data, now)
         for frame in frames:
-            if self._is_closed:  # by a sink of an earlier frame
+            if self._is_closed:  # a sink closed the receiver while processing an earlier frame
                 return
             if multilink is not None and multilink.is_copy(frame, peer):
                 continue

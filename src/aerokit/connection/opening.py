@@ -143,7 +143,8 @@ def _several(addresses: Sequence[str | Link], baud: int, reconnect: bool, peers:
         return _link(addresses[0], baud, reconnect, peers)
     from aerokit.transport import MultiLink, parse_address  # imported here because few programs need them
 
-    _check_distinct(addresses, [each if isinstance(each, Link) else parse_address(each) for each in addresses])
+    targets = [address if isinstance(address, Link) else parse_address(address) for address in addresses]
+    _check_distinct(addresses, targets)
     factories: list[Callable[[], Link]] = []
     costly: set[int] = set()
     for index, address in enumerate(addresses):
@@ -182,7 +183,7 @@ def _target_key(target: Link | LinkAddress) -> object:
     is_new = (target.kind in ("udpin", "tcpin") and not target.port) or (target.kind == "pty" and not target.path)
     if is_new:
         return None
-    endpoints = [option for option in target.options if option[0] in ("connect", "listen")]  # of zenoh
+    endpoints = [option for option in target.options if option[0] in ("connect", "listen")]  # options of zenoh
     return target.kind, target.host, target.port, target.device, target.path, tuple(endpoints)
 
 
@@ -207,13 +208,13 @@ class _Diagnosis:
         self._heartbeats = connection.heartbeats
         self._signature_problems = connection.describe_signature_problems()
         statistics = list(connection.statistics())
-        self._bytes = sum(each.bytes for each in statistics)
-        self._frames = sum(each.frames for each in statistics)
-        self._bad_crcs = sum(each.bad_crcs for each in statistics)
-        self._bad_bytes = sum(each.bad_bytes for each in statistics)
-        self._unknown = sum(each.unknown_ids for each in statistics)
-        self._unknown_messages = {number for each in statistics for number in each.unknown_messages}
-        self._systems = {system for each in statistics for system, _ in each.sources}
+        self._bytes = sum(counters.bytes for counters in statistics)
+        self._frames = sum(counters.frames for counters in statistics)
+        self._bad_crcs = sum(counters.bad_crcs for counters in statistics)
+        self._bad_bytes = sum(counters.bad_bytes for counters in statistics)
+        self._unknown = sum(counters.unknown_ids for counters in statistics)
+        self._unknown_messages = {number for counters in statistics for number in counters.unknown_messages}
+        self._systems = {system for counters in statistics for system, _ in counters.sources}
 
     def text(self) -> str:
         if not self._bytes:

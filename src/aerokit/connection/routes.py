@@ -109,7 +109,7 @@ class _Route:
 
     peer: Peer
     heartbeat_at: float
-    sequence: int  # of the last heartbeat
+    sequence: int  # sequence number of the last heartbeat
     expected: int  # value of `counters.expected` at the last heartbeat
 
     def __init__(self) -> None:
@@ -311,7 +311,7 @@ _SAME_PEER = object()  # key of claims of a second sender behind the owner's own
 
 
 def _name(peer: Peer) -> str:
-    peer = getattr(peer, "peer", peer)  # of a MultiLink: the peer of the member link
+    peer = getattr(peer, "peer", peer)  # with a MultiLink, use the peer of the member link
     if isinstance(peer, tuple) and len(peer) >= 2:
         host, port = peer[:2]
         return f"[{host}]:{port}" if ":" in str(host) else f"{host}:{port}"

@@ -349,8 +349,8 @@ def _command_from(cmd: Any) -> Command:
 def _values_of(commands: Iterable[Command]) -> tuple[tuple[Any, ...], ...]:
     """Return the content of commands for comparison; NaN equals NaN."""
     return tuple(
-        tuple("NaN" if value != value else value for value in (getattr(each, name) for name in CONTENT))
-        for each in commands
+        tuple("NaN" if value != value else value for value in (getattr(command, name) for name in CONTENT))
+        for command in commands
     )
 
 
@@ -379,7 +379,7 @@ def _is_at(cmd: Command, home: LocationGlobal | None) -> bool:
 
 def _mission_of(commands: Sequence[Command], vehicle: AsyncVehicle) -> Mission:
     """Convert commands to a mission for this vehicle; InvalidArgument names a field that is not a number."""
-    items: Iterable[MissionItem] = [_item(each, index) for index, each in enumerate(commands)]
+    items: Iterable[MissionItem] = [_item(command, index) for index, command in enumerate(commands)]
     if not vehicle.autopilot.home_is_item_0:
         here = vehicle.telemetry.position.latest or vehicle.telemetry.home.latest
         items = convert_from_ardupilot(items, None if here is None else (here.latitude_deg, here.longitude_deg))

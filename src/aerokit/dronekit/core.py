@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 # Attributes that `wait_ready(True)` waits for.
 DEFAULT_ATTRIBUTES = ("parameters", "gps_0", "armed", "mode", "attitude")
 
-MAX_WAIT_S = 0.2  # of a single wait, so that Ctrl-C and a lost link are noticed
+MAX_WAIT_S = 0.2  # longer waits are split, so that Ctrl-C and a lost link are noticed
 SILENCE_WARNING_S = 5
 TICK_INTERVAL_S = 0.05
 IDLE_TICK_INTERVAL_S = 1.0
@@ -138,8 +138,8 @@ class LatestMessage(Generic[MessageT]):
         names = self._names
         if not names or not names <= self._ready:
             return True
-        for each in self._listeners:
-            listened = each.by_name
+        for listeners in self._listeners:
+            listened = listeners.by_name
             if listened and (EVERY_NAME in listened or not names.isdisjoint(listened)):
                 return True
         return False

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 MAX_MESSAGES = 1000
 MESSAGE_MAX_AGE_S = 5.0  # a program that rarely reads gets recent messages
 FIRST_LOOKUP_TIMEOUT_S = 1.0  # nothing was stored before the first access
-SIGNAL_CHECK_INTERVAL_S = 0.2  # of a single wait, so that Ctrl-C and a closed connection are noticed
+SIGNAL_CHECK_INTERVAL_S = 0.2  # longer waits are split, so that Ctrl-C and a closed connection are noticed
 
 
 class Master:
@@ -295,7 +295,7 @@ class Inbox(Mapping[str, Any]):
             if loop.is_current:
                 tap(weak_callback(self._take))
             else:
-                loop.call(tap, weak_callback(self._take))  # blocks: later messages are not lost
+                loop.call(tap, weak_callback(self._take))  # blocks until attached, so that no later message is missed
 
     def _waits(self) -> bool:
         is_young = self._started is not None and time.monotonic() < self._started + FIRST_LOOKUP_TIMEOUT_S

@@ -43,7 +43,7 @@ ATTEMPTS, RETRY_INTERVAL_S = 3, 1.0
 
 
 class MAVConnection(ClassicConnection):
-    """A link that is open until it is closed, with an event loop on a thread of its own.
+    """A link that is open until it is closed, with an event loop on a separate thread.
 
     ``ip`` is a connection string of DroneKit, pymavlink (a bare ``host:port`` and ``udp:`` listen) or aerokit. A lost
     link is reopened. ``use_native`` is ignored.

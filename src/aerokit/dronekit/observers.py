@@ -68,7 +68,7 @@ class Listeners:
                 return
             if listener not in present:
                 raise ValueError(f"{listener!r} does not listen to {name!r}")
-            left = tuple(each for each in present if each != listener)
+            left = tuple(other for other in present if other != listener)
             if left:
                 self.by_name[name] = left
             else:
@@ -126,8 +126,8 @@ def listener_decorator(
     """Return a decorator that adds a listener for one or several names."""
 
     def decorate(listener: ListenerT) -> ListenerT:
-        for each in (name,) if isinstance(name, str) else name:
-            add(each, listener)
+        for attribute in (name,) if isinstance(name, str) else name:
+            add(attribute, listener)
         return listener
 
     return decorate
@@ -152,7 +152,7 @@ class HasObservers:
 
         Listeners of sensor values are called with every message, those of states (``mode``, ``armed``,
         ``system_status``, ``ekf_ok``) on changes. ``'*'`` is every name. A registered listener is not added again.
-        Names are not checked, because programs may have attributes of their own.
+        Names are not checked, because programs may define more attributes.
         """
         self._dk_listeners.add(self._dk_normalized(attr_name), observer)
 

@@ -42,7 +42,7 @@ MIN_ATTEMPT_S = 1.0  # longer on slow links
 LAST_ATTEMPT_SHARE = 0.5
 ROUND_TRIPS = 3
 
-ROUNDING = 0.01  # ArduPilot adds it before it cuts off a fraction
+ROUNDING = 0.01  # ArduPilot adds this before it truncates a value to an integer
 
 
 class ParameterDownload:
@@ -113,8 +113,8 @@ class ParameterDownload:
             answers = (await self._core.aio.parameters.probe(*names, idle_timeout_s=READ_TIMEOUT_S)).values()
         except AerokitError:
             return False
-        return any(isinstance(each, Parameter) for each in answers) or all(
-            isinstance(each, ParameterRejected) and each.code is not None for each in answers
+        return any(isinstance(answer, Parameter) for answer in answers) or all(
+            isinstance(answer, ParameterRejected) and answer.code is not None for answer in answers
         )
 
 
@@ -156,7 +156,7 @@ class ParameterValues:
 
     def copy(self) -> dict[str, float]:
         """Return a new dict of name → value, in the vehicle's spelling and units."""
-        return {name: float(each.value) for name, each in self._known.copy().items()}
+        return {name: float(parameter.value) for name, parameter in self._known.copy().items()}
 
     def find(self, name: str) -> ResolvedParameter | None:
         """Look up an upper-case name, also under its other names."""
@@ -229,7 +229,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
         core = self._core
         HasObservers.__init__(self, core.handler.listener_thread)
         self._values = ParameterValues()
-        self._count = 0  # by the last PARAM_VALUE
+        self._count = 0  # number of parameters according to the last PARAM_VALUE
         self._reading = ParameterDownload(core, self._take_all)
         core.on(ParamValue, self._on_value)
         core.on_connected.append(self._start)

@@ -31,7 +31,7 @@ _for_program: ServedVehicle | None = None
 
 
 class ServedVehicle:
-    """A simulated vehicle on addresses, in a thread of its own, until :meth:`stop` or process exit."""
+    """A simulated vehicle on addresses, in a separate thread, until :meth:`stop` or process exit."""
 
     def __init__(
         self,
@@ -95,7 +95,7 @@ class ServedVehicle:
 
 
 def serve_for_program(kind: str, home: tuple[float, float, float], speedup: float) -> ServedVehicle:
-    """Serve a vehicle on the usual addresses, until the program starts a vehicle of its own.
+    """Serve a vehicle on the usual addresses, until the program starts another vehicle.
 
     Raises:
         InvalidArgument: the kind is unknown.

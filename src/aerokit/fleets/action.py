@@ -195,7 +195,7 @@ class FleetAction:
         orders: dict[str, PolicyOrder]
         try:
             orders = self._context.rules.decide(failure)
-        except Exception as program_error:  # of the policy function: hold as the safe default
+        except Exception as program_error:  # raised by the policy function; hold as the safe default
             self.program_error = self.program_error or program_error
             orders = dict.fromkeys(failure.others, "hold")
         if not orders:
@@ -301,7 +301,7 @@ class FleetContext:
         self.bus: Bus = Bus()
         self.background: BackgroundTasks = BackgroundTasks(on_error)
         self.actions: list[FleetAction] = []
-        self.missions: dict[str, Mission] = {}  # of the last upload, once every member has accepted its mission
+        self.missions: dict[str, Mission] = {}  # last upload, once every member has accepted its mission
         self.is_closed: bool = False
 
     def start(self) -> None:

@@ -43,7 +43,7 @@ class Actions(SelectionBase):
             action: the name of a method of :class:`aerokit.Vehicle` (``"set_speed"``, ``"mission.resume"``), or a
                 coroutine function that is called with each :class:`Member`.
             *arguments: positional arguments of the method.
-            timeout: seconds for each member; None: the action's own limit.
+            timeout: seconds for each member; None: the default of the action.
             stagger_s: delay in seconds between the starts of consecutive members; None: all at once.
             **options: keyword arguments of the method.
 

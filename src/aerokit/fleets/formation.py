@@ -271,8 +271,8 @@ class Following:
         )
         offset = self._formation.offset_of(member.name, leader.heading_deg.latest)
         to_go = [
-            points["there"][i] - points["here"][i] + each
-            for i, each in enumerate((offset.north_m, offset.east_m, offset.up_m))
+            points["there"][i] - points["here"][i] + metres
+            for i, metres in enumerate((offset.north_m, offset.east_m, offset.up_m))
         ]
         for source, sign in ((leader, 1.0), (vehicle, -1.0)):
             moving = source.velocity.latest

@@ -138,12 +138,12 @@ def _named_sources(sources: tuple[Source | Mapping[str, Source], ...]) -> dict[s
     named: dict[str, Source] = {}
     for number, source in enumerate(sources, 1):
         entries = source if isinstance(source, Mapping) else {str(number): source}
-        for name, each in entries.items():
+        for name, entry in entries.items():
             if not isinstance(name, str) or not name:
                 raise InvalidArgument(f"sources: {short_repr(name)} is not a name: a non-empty string is needed")
             if name in named:
                 raise InvalidArgument(f"sources: two are named {name!r}")
-            named[name] = each
+            named[name] = entry
     if not named:
         raise InvalidArgument("sources: a fleet needs an address, a connection or a vehicle")
     return named
@@ -298,7 +298,7 @@ class _BlockFailed(Exception):
 
 
 class MemberConnections:
-    """Connects vehicles, each in a task of its own, so that closing the fleet closes all of them at once."""
+    """Connects vehicles, each in a separate task, so that closing the fleet closes all of them at once."""
 
     def __init__(self, timeout: float, rates: Mapping[type[Message], float] | None) -> None:
         self._timeout, self._rates = timeout, rates

@@ -292,9 +292,9 @@ def to_local_points(places: Mapping[str, tuple[float, float, float]]) -> dict[st
     east = METRES_PER_DEGREE * math.cos(math.radians(latitude))
     return {
         name: (
-            (each[0] - latitude) * METRES_PER_DEGREE,
-            math.remainder(each[1] - longitude, 360.0) * east,
-            each[2],
+            (place[0] - latitude) * METRES_PER_DEGREE,
+            math.remainder(place[1] - longitude, 360.0) * east,
+            place[2],
         )
-        for name, each in places.items()
+        for name, place in places.items()
     }

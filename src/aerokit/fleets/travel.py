@@ -98,7 +98,7 @@ class Travel(SelectionBase):
 
         Args:
             targets: as for :meth:`go_to`.
-            min_distance_m: minimum distance between any two members in metres; None: the fleet's own.
+            min_distance_m: minimum distance between any two members in metres; None: that of the fleet.
             by: ``"layers"``: separate crossing paths by altitude; ``"corridors"``: by time, which needs ``speed_m_s``;
                 ``"refuse"``: refuse crossing paths.
             speed_m_s: ground speed of all members.
@@ -111,7 +111,7 @@ class Travel(SelectionBase):
         """
         min_m = self._context.min_distance_m if min_distance_m is None else min_distance_m
         if min_m is None:
-            raise InvalidArgument("min_distance_m is needed: this fleet has none")
+            raise InvalidArgument("min_distance_m is required: this fleet was created without one")
         routes, stationary = self._routes(self._resolve_targets(targets))
         if by == "corridors":
             if speed_m_s is None:
@@ -344,7 +344,7 @@ class Missions(SelectionBase):
 
         Args:
             missions: member's name → mission.
-            min_distance_m: minimum distance between any two paths in metres; None: the fleet's own.
+            min_distance_m: minimum distance between any two paths in metres; None: that of the fleet.
 
         Raises:
             InvalidArgument: a name is unknown, or an argument is missing.
@@ -352,7 +352,7 @@ class Missions(SelectionBase):
         """
         min_m = self._context.min_distance_m if min_distance_m is None else min_distance_m
         if min_m is None:
-            raise InvalidArgument("min_distance_m is needed: this fleet has none")
+            raise InvalidArgument("min_distance_m is required: this fleet was created without one")
         members = self._require_available(missions)
         first = next(iter(members.values()), None)
         origin = None if first is None else LocalOrigin(position_of(first, math.inf))

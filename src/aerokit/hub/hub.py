@@ -44,7 +44,7 @@ _INFO_KINDS = ("opened", "removed", "client_joined", "client_left", "drained", "
 
 @checks_arguments
 class Hub:
-    """Forwards MAVLink frames between endpoints by MAVLink's routing rules. It sends no messages of its own.
+    """Forwards MAVLink frames between endpoints by MAVLink's routing rules. It does not originate messages.
 
     ```python
     async with aerokit.Hub(["serial:///dev/ttyACM0:115200", "tcpin:0.0.0.0:5760", "udpout:10.0.0.7:14550"]) as hub:

@@ -76,7 +76,7 @@ class Endpoint(Snapshot):
 
 
 def _are_texts(values: object) -> bool:
-    return isinstance(values, Iterable) and all(isinstance(each, str) for each in values)
+    return isinstance(values, Iterable) and all(isinstance(value, str) for value in values)
 
 
 def _not_allowed(field: str, value: object, allowed: str) -> InvalidArgument:

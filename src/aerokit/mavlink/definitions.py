@@ -49,11 +49,11 @@ class FieldDefinition:
     description: str = ""
     extension: bool = False
     default: int | None = None  # only for mavlink_version
-    carries_bytes: bool = False  # of a char array: see BYTES_IN_CHARS
+    carries_bytes: bool = False  # True for a char array that holds bytes, see BYTES_IN_CHARS
 
     @property
     def attribute(self) -> str:
-        """Name in Python: that in the standard, with a trailing underscore if it is a keyword."""
+        """Name in Python: the standard's name, with a trailing underscore if that is a keyword."""
         reserved = keyword.iskeyword(self.name) or self.name in _RESERVED
         return self.name + "_" if reserved else self.name
 
@@ -107,7 +107,7 @@ class MessageDefinition:
 
     @property
     def crc_extra(self) -> int:
-        """The byte that makes the checksum fail for frames of a different definition."""
+        """Byte derived from the definition; the checksum of a frame fails if the sender has another definition."""
         text = self.name + " "
         for f in self.wire_fields:
             if not f.extension:
@@ -129,7 +129,7 @@ class EntryDefinition:
 
 @dataclass(frozen=True)
 class EnumDefinition:
-    """One enum of one file, or of all files after `merged_enums`."""
+    """One enum, with the entries of one file, or of all files after `merged_enums`."""
 
     name: str
     entries: tuple[EntryDefinition, ...]
@@ -177,7 +177,7 @@ def read_dialect(path: Path, search: Sequence[Path] = ()) -> list[DialectDefinit
     Includes are searched beside the file, then in the folders of ``search``.
 
     Raises:
-        InvalidArgument: a file is missing, has more than 16 MB, or is not MAVLink XML.
+        InvalidArgument: a file is missing, is larger than 16 MB, or is not MAVLink XML.
     """
     found: dict[str, DialectDefinition] = {}
     pending: set[str] = set()
@@ -267,7 +267,7 @@ def _message(node: Element, origin: str) -> MessageDefinition:
     if duplicates:
         raise ValueError(f"{message.name}: the field {duplicates[0]} is defined twice")
     if message.length > 255:
-        raise ValueError(f"{message.name}: a payload of {message.length} bytes, at most 255 fit in a frame")
+        raise ValueError(f"{message.name}: the payload has {message.length} bytes, but at most 255 fit in a frame")
     return message
 
 

@@ -27,14 +27,14 @@ Row = tuple[int, int, int]
 
 
 class Dialect:
-    """Message ids, their classes, and enums. Immutable."""
+    """Maps message ids to message classes, and names to enums. Immutable."""
 
     def __init__(
         self, name: str, classes: Iterable[type[Message]], enum_types: Mapping[str, type[Any]] | None = None
     ) -> None:
         """Create a dialect. ``enum_types`` maps names in the standard, such as ``"MAV_CMD"``, to enums."""
         self.name = name
-        """Name of the dialect, for example that of its XML file."""
+        """Name of the dialect, for example the name of its XML file."""
         self._classes = {cls.ID: cls for cls in classes}
         self._enums = dict(enum_types or {})
         self._set_rows({cls.ID: (cls.CRC_EXTRA, cls.BASE_LENGTH, cls.LENGTH) for cls in self._classes.values()})
@@ -104,7 +104,7 @@ class Dialect:
         return f"<Dialect {self.name!r}: {len(self)} messages>"
 
     def decode(self, frame: Frame) -> Message:
-        """Decode a frame. The message has it as its ``received_frame``. KeyError if the dialect lacks the id."""
+        """Decode a frame, which becomes the message's ``received_frame``. KeyError if the dialect lacks the id."""
         return self._decoders[frame.message_id](frame.body, frame)
 
     def _decode_first(self, message_id: int, body: bytes, frame: Frame | None) -> Message:
@@ -113,7 +113,7 @@ class Dialect:
         return decoder(body, frame)
 
     def extended_by(self, other: Dialect) -> Dialect:
-        """Return a dialect with the messages of both. InvalidArgument if an id has different messages in them."""
+        """Return a dialect with the messages of both. InvalidArgument if they define an id differently."""
         for message_id in self.rows.keys() & other.rows.keys():
             if self.rows[message_id] != other.rows[message_id]:
                 raise InvalidArgument(
@@ -180,4 +180,4 @@ def _cap_words(name: str) -> str:
 
 
 STANDARD: Dialect = _Standard()
-"""All messages of aerokit. Its creation imports none of them."""
+"""All generated messages. Their modules are imported on first use."""

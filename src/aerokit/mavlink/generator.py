@@ -1,11 +1,13 @@
 """Generates the modules of messages and enums from pymavlink's XML and additions.
 
-pymavlink has ArduPilot's fork of the standard. The folder ``additions`` has what the standard defines beyond it, as
-XML. Where they differ in units, enums, values or deprecation, the standard takes precedence; descriptions are
-pymavlink's if it has any. ArduPilot's own definitions are kept.
+pymavlink contains ArduPilot's fork of the standard. The XML files in the folder ``additions`` contain the definitions
+of the standard that are missing in the fork. Where the two differ in units, enums, values or deprecation, the additions
+take precedence. Descriptions are taken from pymavlink if it has them. ArduPilot's own definitions are kept.
 
     python -m aerokit.mavlink.generator            # write the modules
-    python -m aerokit.mavlink.generator --check    # compare: 0 same, or skipped for other XML; 1 different
+    python -m aerokit.mavlink.generator --check    # compare only; exit code 1 if the modules differ
+
+The check is skipped if the installed pymavlink has different XML from that of the committed modules.
 
 The output depends only on the XML, so a difference is a change of the standard, the additions or the generator.
 """
@@ -63,7 +65,7 @@ def with_added_messages(
 def with_added_enums(enums: Sequence[EnumDefinition], additions: Sequence[DialectDefinition]) -> list[EnumDefinition]:
     """Return pymavlink's enums with the additions, in order, then new ones. A value's standard name comes first.
 
-    New entries do not change the names that the others have in Python.
+    New entries do not change the Python names of the existing ones.
     """
     merged = {enum.name: enum for enum in enums}
     for added in (enum for dialect in additions for enum in dialect.enums):
@@ -110,7 +112,7 @@ def _entry(known: EntryDefinition, added: EntryDefinition) -> EntryDefinition:
     )
 
 
-# Module → XML files whose definitions it has.
+# Maps each module to the XML files whose definitions it contains.
 MODULES: dict[str, tuple[str, ...]] = {
     "minimal": ("minimal",),
     "standard": ("standard",),
@@ -119,8 +121,8 @@ MODULES: dict[str, tuple[str, ...]] = {
     "development": ("development",),
 }
 
-# Messages of ``common.xml`` that every flight uses, in ``common.py``. Two hundred others, which would take most of the
-# time of an import, are in ``common_more.py``.
+# Messages of ``common.xml`` that every flight uses; they are in ``common.py``. The other two hundred are in
+# ``common_more.py``, because importing them takes several times as long.
 EVERYDAY = """
     Attitude AttitudeQuaternion AvailableModes BatteryStatus CommandAck CommandInt CommandLong CurrentMode
     DistanceSensor EstimatorStatus ExtendedSysState FileTransferProtocol Gps2Raw GpsGlobalOrigin GpsRawInt
@@ -259,7 +261,7 @@ def xml_folder() -> Path:
     """Return the folder with the XML files of the installed pymavlink."""
     spec = importlib.util.find_spec("pymavlink")
     if spec is None or not spec.submodule_search_locations:
-        raise InvalidArgument("pymavlink is not installed, and the XML is in its package")
+        raise InvalidArgument("pymavlink is not installed; its package contains the XML files")
     return Path(spec.submodule_search_locations[0]) / "dialects" / "v20"
 
 
@@ -331,7 +333,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             (FOLDER / path).write_text(text, encoding="utf-8", newline="\n")
         return 0
     if fingerprint() != generated_fingerprint():
-        sys.stdout.write("skipped: the installed pymavlink has other XML than the modules were generated from\n")
+        sys.stdout.write("skipped: the XML of the installed pymavlink differs from that of the committed modules\n")
         return 0
     wrong = differences()
     texts = [f"differs: {path}\n" for path in wrong] or ["the committed modules are up to date\n"]

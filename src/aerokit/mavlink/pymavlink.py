@@ -27,15 +27,15 @@ REAL_TYPES = ("float", "double")
 
 
 def from_pymavlink(message: Any, target_system: int | None = None) -> Message:
-    """Convert a message to one of aerokit, for ``vehicle.send``. The result is a checked copy.
+    """Convert a message to one of aerokit, for ``vehicle.send``. The result is a validated copy.
 
     Args:
-        message: a message of any pymavlink dialect, for MAVLink 1 or 2, or of a subclass; any object with
-        ``get_type()``
-            and the fields of a standard message as attributes; or a message of aerokit. Numbers for integer fields are
-            rounded; strings may be ``str`` (sent as UTF-8) or bytes; missing extension fields are 0.
-        target_system: assigned to ``message.target_system`` if there is such a field; for messages of aerokit, only in
-            the copy. None and 0 leave it unchanged. ``target_component`` is never changed.
+        message: a pymavlink message of any dialect, for MAVLink 1 or 2; any object with ``get_type()`` and the fields
+            of a standard message as attributes; or a message of aerokit. Numbers in integer fields are rounded; strings
+            may be ``str`` (sent as UTF-8) or bytes; missing extension fields are 0.
+        target_system: new value of the field ``target_system``, if the message has this field. It is also assigned to
+            ``message`` itself, unless that is a message of aerokit. None and 0 leave the field unchanged.
+            ``target_component`` is never changed.
 
     Raises:
         InvalidArgument: a value does not fit its field, or the object is not a message.
@@ -132,7 +132,7 @@ def _is_byte(value: Any) -> bool:
 
 
 def _integer(value: Any) -> Any:
-    # Values that are not numbers are rejected by `Message.encode`.
+    # `Message.encode` rejects values that are not numbers.
     try:
         return operator.index(value)
     except TypeError:
@@ -141,7 +141,7 @@ def _integer(value: Any) -> Any:
 
 
 def _real(value: Any) -> Any:
-    # Also numbers of numpy and decimals. Values that are not numbers are rejected by `Message.encode`.
+    # This includes numbers of numpy and decimal. `Message.encode` rejects values that are not numbers.
     if isinstance(value, (int, float)) or not hasattr(value, "__float__"):
         return value
     try:
@@ -189,7 +189,7 @@ class _RawText(str):
         return self._data
 
 
-# Sources of pymavlink's classes if the program's own dialect has none. Together they cover all of STANDARD.
+# Searched for pymavlink's class of a message if the program's dialect has none. Together they cover all of STANDARD.
 DIALECTS = ("ardupilotmega", "development")
 
 CHECKSUM_LENGTH = 2
@@ -265,9 +265,9 @@ class _Layout:
 
     def __init__(self, message_class: Any) -> None:
         zeros = message_class.unpacker.unpack(bytes(message_class.unpacker.size))
-        self.names: list[str] = []  # in wire order; texts are first stored under the name of their bytes
-        self.arrays: list[tuple[int, int]] = []  # position and width of each field; empty without arrays
-        self.texts: list[tuple[str, str]] = []  # names of texts and of their bytes
+        self.names: list[str] = []  # in wire order; a text field has the name of its raw bytes
+        self.arrays: list[tuple[int, int]] = []  # position and width of each field; empty if no field is an array
+        self.texts: list[tuple[str, str]] = []  # name of each text field, and the name of its raw bytes
         at = 0
         for name, width in zip(message_class.ordered_fieldnames, message_class.lengths):  # noqa: B905
             if isinstance(zeros[at], bytes):
@@ -297,7 +297,7 @@ class _Received:
         return value
 
     def __reduce_ex__(self, protocol: Any) -> Any:
-        """Pickles and copies are objects of pymavlink's own class."""
+        """Pickle and copy the message as an object of pymavlink's class."""
         names = (*LAZY_ATTRIBUTES, "_type", "_fieldnames", "_instance_field", "_instance_offset")
         state = {name: getattr(self, name) for name in (*names, "_signed", "_link_id", "_instances")}
         state.update((name, value) for name, value in self.__dict__.items() if name != "_frame")
@@ -312,7 +312,7 @@ class _Received:
         return bytearray(self._frame.raw)
 
     def create_payload(self) -> bytearray:
-        # In pymavlink it begins at offset 6 for MAVLink 2, too.
+        # pymavlink's payload begins at offset 6 even for MAVLink 2, where the header has ten bytes.
         return bytearray(self._frame.raw)[6 : -_length_after_payload(self._frame)]
 
     def create_crc(self) -> int:
@@ -324,7 +324,7 @@ def _length_after_payload(frame: Frame) -> int:
 
 
 def _received_class(message_class: Any) -> Any:
-    """Create a subclass that has the name and attributes of the class itself."""
+    """Create a subclass that has the same name and attributes as the class."""
     return type(
         message_class.__name__,
         (_Received, message_class),

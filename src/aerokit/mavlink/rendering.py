@@ -142,7 +142,7 @@ def _docstring(paragraphs: Iterable[str], indent: str) -> list[str]:
 
 
 def _quoted(text: str) -> str:
-    return json.dumps(text, ensure_ascii=False)  # the same rules, control characters included
+    return json.dumps(text, ensure_ascii=False)  # JSON strings are valid Python strings
 
 
 def _tuple(name: str, items: list[str]) -> list[str]:

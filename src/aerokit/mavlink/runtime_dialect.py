@@ -28,12 +28,12 @@ from aerokit.mavlink.generator import xml_folder
 from aerokit.mavlink.message import Message, make_enum
 from aerokit.mavlink.rendering import render_message
 
-# Name, classes, and enums by their names in the standard.
+# Name of the dialect, message classes, and enums by their MAVLink names (``MAV_CMD``).
 LoadedDialect = tuple[str, list[type[Message]], dict[str, type[Any]]]
 
 
 class Standard(Protocol):
-    """The generated messages, which are reused where definitions are the same."""
+    """Interface of the dialect with the generated messages, which are reused where definitions are the same."""
 
     rows: dict[int, tuple[int, int, int]]
 
@@ -65,7 +65,7 @@ def class_from_pymavlink(message_class: Any, standard: Standard) -> type[Message
     """Return the class for one of pymavlink's message classes: the generated one, if the wire formats are the same.
 
     Raises:
-        InvalidArgument: pymavlink's class does not match its own CRC_EXTRA.
+        InvalidArgument: the fields of pymavlink's class do not match its CRC_EXTRA.
     """
     definition = _message(message_class)
     return _standard_class(definition, standard) or compile_message(definition)
@@ -121,7 +121,7 @@ def _enum_type(dialect: str, enum: EnumDefinition) -> type[Any]:
 
 
 def _standard_class(definition: MessageDefinition, standard: Standard) -> type[Message] | None:
-    """Return the generated class if it has the same wire format, perhaps with further extension fields."""
+    """Return the generated class if it has the same wire format; it may have more extension fields."""
     row = standard.rows.get(definition.id)
     if row is None or row[:2] != (definition.crc_extra, definition.base_length):
         return None

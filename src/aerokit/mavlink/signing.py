@@ -30,10 +30,10 @@ LAST_TIMESTAMP = (1 << 48) - 1
 
 ONE_MINUTE = 60 * TICKS_PER_S
 
-# Limit of remembered (system id, component id, link id). Only senders with the key can create them.
+# Limit of stored streams, each a (system id, component id, link id). Only senders with the key can create one.
 MAX_STREAMS = 1024
 
-# RADIO_STATUS and RADIO: telemetry radios insert them, and have no key.
+# RADIO_STATUS and RADIO are inserted by telemetry radios, which have no key.
 ALWAYS_UNSIGNED = frozenset((109, 166))
 
 _HASH_LENGTH = 6
@@ -49,7 +49,7 @@ def timestamp_at(unix_time_s: float) -> int:
 
 
 def is_signed_with_a_key(frame: Frame) -> bool:
-    """Return True if a frame has a meaningful signature. PX4 without a key signs with zeros, as anyone could."""
+    """Return True unless a frame is unsigned, or signed with a key of zeros, as by a PX4 without a key."""
     raw = frame.raw
     return bool(frame.incompat_flags & SIGNED) and (
         sha256(_NO_KEY + raw[:-_HASH_LENGTH]).digest()[:_HASH_LENGTH] != raw[-_HASH_LENGTH:]
@@ -57,16 +57,16 @@ def is_signed_with_a_key(frame: Frame) -> bool:
 
 
 class SigningKey:
-    """The shared secret of 32 bytes. Its ``repr`` is a short fingerprint, so that it does not leak."""
+    """The shared secret of 32 bytes. ``repr`` shows only a short fingerprint, so that logs do not reveal the key."""
 
     __slots__ = ("_secret",)
 
     def __init__(self, secret: bytes) -> None:
-        """Create a key. InvalidArgument if it is not 32 bytes, or all zero, which means "no signing" in MAVLink."""
+        """Create a key. InvalidArgument if ``secret`` is not 32 bytes, or is all zeros ("no signing" in MAVLink)."""
         if not isinstance(secret, (bytes, bytearray)) or len(secret) != KEY_LENGTH:
             raise InvalidArgument("a signing key must be 32 bytes; use SigningKey.from_passphrase for a text")
         if not any(secret):
-            raise InvalidArgument("a signing key must not be all zeros, which turn signing off")
+            raise InvalidArgument("a signing key must not be all zeros, because such a key turns signing off")
         self._secret = bytes(secret)
 
     @classmethod
@@ -122,8 +122,8 @@ class Refusal(Enum):
 class Signing:
     """Signs the frames sent on one link, verifies those received on it, and counts those refused.
 
-    It keeps timestamps, so use one for each link, and :meth:`for_link` for another link with the same key. It can be
-    reused for a new link after the old one is closed.
+    Each link needs a separate object, because the object stores timestamps. Create those of further links with the same
+    key by :meth:`for_link`. An object can be reused after its link is closed.
     """
 
     def __init__(
@@ -138,19 +138,18 @@ class Signing:
         """Create signing for one link.
 
         Args:
-            key: the key, which the other side must have, too.
+            key: the key; the other side must have the same one.
             link_id: distinguishes the links of one sender, 0–255. Programs with the same system and component id need
                 different ones.
-            timestamp: the last value of :attr:`timestamp` with this key (10 µs since 2015). It is needed if the clock
-            may
-                be behind; otherwise the clock's time is later and is used.
-            allow_unsigned: ``allow_unsigned(frame)`` returns True for frames to accept without a valid signature, for
-                example of a camera without a key. Anyone can send such frames. None accepts only RADIO_STATUS, which
+            timestamp: the last value of :attr:`timestamp` with this key (10 µs since 2015), for computers whose clock
+                may be wrong. A later time of the clock takes precedence.
+            allow_unsigned: a function that returns True for a frame to accept it without a valid signature, for example
+                from a camera without a key. Anyone can send such frames. None accepts only RADIO_STATUS, which
                 telemetry radios send.
-            keep: a file in which to store the timestamp, so that no frame from before a restart is accepted after it.
-                Use one for each key, and never for two programs at once. It contains a timestamp up to half a minute
-                ahead, so that it is written at most twice a minute. Writing is atomic, and precedes the use of
-                timestamps.
+            keep: a file that stores the timestamp, so that frames from before a restart of the program are refused
+                after it. Each key needs a separate file, and two programs must not use one file at the same time. The
+                file is replaced atomically, at most twice a minute, because it contains a timestamp up to half a minute
+                in the future.
 
         Raises:
             InvalidArgument: a number is out of range, or ``key`` is not a SigningKey.
@@ -166,8 +165,8 @@ class Signing:
         self.key = key
         self.link_id: int = int(link_id)
         self.timestamp: int = int(timestamp)
-        """The earliest timestamp of the next frame, in 10 µs since 2015. It is later than all timestamps sent, and not
-        earlier than any received. Store it across restarts if the clock may be wrong after them."""
+        """Minimum timestamp of the next frame, in 10 µs since 2015: later than all timestamps sent, and not earlier
+        than any received. Programs on computers without a reliable clock store it across restarts."""
         self.allow_unsigned = allow_unsigned
         self.refused: dict[Refusal, int] = dict.fromkeys(Refusal, 0)
         """Number of frames refused, for each reason."""
@@ -177,7 +176,7 @@ class Signing:
             self.timestamp = max(self.timestamp, self._timestamp_file.timestamp)
         self._keyed = sha256(key.secret)
         self.streams: dict[tuple[int, int, int], int] = {}
-        """Last timestamp of each (system id, component id, link id). All links with the key share it."""
+        """Last timestamp of each (system id, component id, link id), shared by all links with the same key."""
 
     def for_link(self, link_id: int) -> Signing:
         """Create signing for another link (0–255) with the same key. Replays across these links are detected."""
@@ -218,7 +217,7 @@ class Signing:
 
     @property
     def keep_error(self) -> OSError | None:
-        """The error of the last write of the ``keep`` file, or None. Writing is tried again."""
+        """Error of the last write of the ``keep`` file; None if it succeeded. The next write retries."""
         return None if self._timestamp_file is None else self._timestamp_file.error
 
     @property
@@ -262,14 +261,14 @@ class Signing:
         return None
 
     def _store_stream(self, stream: tuple[int, int, int], stamp: int) -> None:
-        # Timestamps of a forgotten sender are compared with ours, like those of a new one.
+        # A sender that is removed here counts as new at its next frame, whose timestamp is then compared with ours.
         if stream not in self.streams and len(self.streams) >= MAX_STREAMS:
             del self.streams[min(self.streams, key=self.streams.__getitem__)]
         self.streams[stream] = stamp
         self._advance(max(self.timestamp, stamp))
 
     def _advance(self, timestamp: int) -> None:
-        # Stored before it is used, so that the next program starts later even after a crash.
+        # Store the timestamp before using it, so that the next program starts with a later one even after a crash.
         if self._timestamp_file is not None:
             self._timestamp_file.reserve(timestamp, ONE_MINUTE // 2)  # a sender may be a minute behind
         self.timestamp = timestamp
@@ -293,22 +292,22 @@ _MAX_LENGTH = 64
 
 
 class TimestampFile:
-    """A file with a timestamp above all that were used.
+    """A file with a timestamp that is later than all timestamps used.
 
-    The constructor raises FileFormatError for other contents, and OSError. Later errors, which must not end a flight,
-    are in ``error`` until writing succeeds.
+    The constructor raises FileFormatError for other contents, and OSError. A later error is stored in ``error`` until
+    writing succeeds, because it must not end a flight.
     """
 
     def __init__(self, path: str | PathLike[str], maximum: int) -> None:
         self._path, self._maximum = Path(path), maximum
         self.timestamp: int = self._read()
-        """The number in the file; 0 if there is no file."""
+        """Timestamp in the file; 0 if there is no file."""
         self.error: OSError | None = None
-        """Error of the last write, or None."""
+        """Error of the last write; None if it succeeded."""
         self._write(self.timestamp)
 
     def reserve(self, timestamp: int, ahead: int) -> None:
-        """Ensure that the number in the file is above ``timestamp``. If it must be written, add ``ahead``."""
+        """Ensure that the file has a later timestamp. If it must be written, write ``timestamp + ahead``."""
         if timestamp < self.timestamp:
             return
         self.timestamp = min(timestamp + ahead, self._maximum)

@@ -7,11 +7,11 @@ import math
 _SILENCE_S = 10.0
 
 _MAX_UNKNOWN_IDS = 64
-_HALF = 128  # a sequence number further behind than this is ahead
+_HALF = 128  # sequence numbers wrap at 256, so a number up to 127 further on is ahead, any other is behind
 _WINDOW = (1 << _HALF) - 1
-_MAX_STEP = 4  # consecutive frames of one stream rarely differ by more
-_MAX_GAP = 16  # after a larger gap, the frame may be of another stream
-_MIN_ALTERNATIONS = 10  # streams that alternated this often are two senders
+_MAX_STEP = 4  # sequence numbers of consecutive frames of one stream rarely differ by more
+_MAX_GAP = 16  # a frame after a larger gap may belong to another stream
+_MIN_ALTERNATIONS = 10  # two streams that alternate this often have different senders
 _EXPIRY_S = 5.0
 _STREAM_TIMEOUT_S = 1.5  # no autopilot is silent for this long
 _MIN_RETURNS = 3
@@ -52,33 +52,34 @@ class SourceStatistics:
         "system_id",
     )
 
-    _late_run: int  # consecutive repeated frames
-    # Set once there is another stream with the same ids:
-    _other_count: int  # frames of it
+    _late_run: int  # number of consecutive repeated frames
+    # The following are set when a second stream with the same ids begins.
+    _other_count: int  # number of frames of the second stream
     _other_at: float
-    _skipped_over: int  # counted as lost when the present stream began
-    _returns: int  # frames that continue the previous stream
+    _skipped_over: int  # number of frames counted as lost when the current stream began
+    _returns: int  # number of frames that continue the previous stream
 
     def __init__(self, system_id: int, component_id: int, sequence: int) -> None:
         self.system_id: int = system_id
         self.component_id: int = component_id
         self.lost: int = 0
-        """Number of missing frames. A frame that arrives late is subtracted again."""
+        """Number of lost frames. A frame that arrives late is no longer counted."""
         self.expected = sequence
-        """Sequence number of the next frame. Its low byte is the one on the wire; it does not wrap at 255."""
-        # How far `expected` has advanced without frames. A frame then costs a single addition.
+        """Sequence number of the next frame. It does not wrap at 255; its low byte is the number on the wire."""
+        # How far `expected` has advanced without a received frame. `received` is derived from the two, so that counting
+        # a frame needs a single addition.
         self._without = sequence
-        self._missing = 0  # bit n: the frame n + 1 before `_missing_at` is missing
+        self._missing = 0  # bit n is set if the frame n + 1 before `_missing_at` is missing
         self._missing_at = sequence
         self._late_sequence = self._late_at = -1
         self._other = -1  # next sequence number of another stream with the same ids; -1 if there is none
-        self._since = 0  # value of `received` at the beginning of the present stream
+        self._since = 0  # value of `received` at the beginning of the current stream
         self._turns, self._double_at = 0, 0.0
         self._seen, self._moved_at = sequence, 0.0
 
     @property
     def received(self) -> int:
-        """Number of frames received, wanted or not."""
+        """Number of frames received, including those that the framer does not pass on."""
         return self.expected - self._without
 
     @property
@@ -92,10 +93,10 @@ class SourceStatistics:
         return self._turns >= _MIN_ALTERNATIONS and now - self._double_at < _EXPIRY_S
 
     def out_of_order(self, sequence: int, now: float) -> int:
-        """Process a frame whose number is not `expected`: after a gap or reboot, late, repeated, of another sender.
+        """Process a frame whose sequence number is not `expected`.
 
-        Return `IN_ORDER` if it is nevertheless the newest of its sender, `LATE` if it was overtaken or repeated, or
-        `OTHERS` if it belongs to another stream.
+        Return `IN_ORDER` if the frame is the newest of its sender (after lost frames or a reboot), `LATE` if it was
+        overtaken or repeated, `OTHERS` if it belongs to another stream.
         """
         if self.expected != self._seen:
             self._seen, self._moved_at = self.expected, now
@@ -129,7 +130,7 @@ class SourceStatistics:
         self._missing_at = self.expected
 
     def _begin_stream(self, now: float) -> None:
-        # The previous position is kept for a while, in case its stream continues.
+        # Keep the position of the previous stream for a while, in case that stream continues.
         self._other, self._other_count = self.expected & 0xFF, self.received - self._since
         self._other_at = now
         self._since, self._returns, self._skipped_over = self.received, 0, 0
@@ -146,7 +147,7 @@ class SourceStatistics:
         return was_missing
 
     def _on_repeated(self, sequence: int, now: float) -> int:
-        # A repeated frame, or, if several in a row are repeated with nothing between them, a reboot.
+        # One such frame is a repetition; several in direct succession mean that the sender rebooted.
         follows = sequence == (self._late_sequence + 1) & 0xFF
         self._late_run = self._late_run + 1 if follows and self._late_at == self.received else 0
         is_near = (self.expected - sequence) & 0xFF <= _MAX_GAP
@@ -165,7 +166,7 @@ class SourceStatistics:
         self._missing, self._missing_at, self._skipped_over = 0, self.expected, 0
 
     def _continue_other(self, sequence: int, now: float) -> int:
-        # The other stream counts as the sender if it has more frames, or if the present one has timed out.
+        # The other stream counts as the sender if it has more frames, or if the current one has timed out.
         count, was_first = self.received - self._since, self._other_count > self.received - self._since
         is_over = now - self._moved_at > _STREAM_TIMEOUT_S
         self._take_turns(now, 1)
@@ -183,7 +184,7 @@ class SourceStatistics:
         return LATE if was_first else OTHERS
 
     def _swap(self, sequence: int, now: float, count: int, other_count: int) -> None:
-        self.lost = max(0, self.lost - self._skipped_over)  # some of those skipped may have arrived late
+        self.lost = max(0, self.lost - self._skipped_over)  # below 0 if skipped frames arrived late
         self._other, self._other_count, self._other_at = self.expected & 0xFF, count, now
         self._since, self._returns = self.received - other_count, 0
         self._continue_at(sequence)
@@ -201,7 +202,7 @@ class SourceStatistics:
 class SourceLimit:
     """Limits the number of senders with separate counters, for all framers that share it.
 
-    When it is reached, senders that were silent for at least 10 s are dropped.
+    When the limit is reached, senders that were silent for at least 10 s are dropped.
     """
 
     free: int
@@ -224,7 +225,7 @@ class SourceLimit:
         self.free += len(statistics.sources)
 
     def make_room(self, now: float) -> bool:
-        """Reserve a place for one more sender, and return True if there is one."""
+        """Reserve a place for one more sender. Return False if none is free."""
         if not self.free and now - self._swept_at >= _SILENCE_S:
             self._swept_at = now
             for statistics in self._statistics:
@@ -236,7 +237,10 @@ class SourceLimit:
 
 
 class FramerStatistics:
-    """Counters of one framer. Every byte is in a frame, in a frame of an unknown message, bad, or waiting."""
+    """Counters of one framer.
+
+    Every byte is part of a valid frame or of a frame of an unknown message, bad, or still in the buffer.
+    """
 
     unknown_ids: int
 
@@ -271,7 +275,7 @@ class FramerStatistics:
 
     @property
     def frames(self) -> int:
-        """Frames with a valid checksum, wanted or not."""
+        """Frames with a valid checksum, including those that the framer does not pass on."""
         return self._others + sum(source.received for source in self.sources.values())
 
     @property
@@ -280,7 +284,7 @@ class FramerStatistics:
         return self._by_key
 
     def add_source(self, key: int, sequence: int, may_stay: bool) -> SourceStatistics:
-        """Add a sender. One that may not stay is only counted among the others."""
+        """Create the counters of a new sender. With ``may_stay`` False, they are not kept, but the frame is counted."""
         source = SourceStatistics(key & 0xFF, key >> 8, sequence)
         if may_stay:
             self._by_key[key] = self.sources[source.system_id, source.component_id] = source

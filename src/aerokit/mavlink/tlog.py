@@ -18,11 +18,11 @@ _TIME = Struct(">Q")
 _MAGICS = (MAGIC_V1, MAGIC_V2)
 _BLOCK = 1 << 16
 _MAX_RECORD = 8 + 280
-# While searching for the next record after garbage, earlier times are ignored, because the zeros in a frame's header
-# look like one. Where a record is expected, any time is accepted, because the clock may never have been set.
+# The search for the next record after garbage ignores times before the year 2000, because zeros in the header of a
+# frame look like such a time. Where a record is expected, these times are accepted: the clock may never have been set.
 _FIRST_TIME = 946_684_800_000_000  # the year 2000
-_LAST_TIME = 4_102_444_800_000_000  # the year 2100; later ones are not timestamps
-_LAST = (_LAST_TIME - (1 << 48)).to_bytes(8, "big")[:2]  # the first bytes of times that are certainly earlier
+_LAST_TIME = 4_102_444_800_000_000  # the year 2100; a larger number is not a timestamp
+_LAST = (_LAST_TIME - (1 << 48)).to_bytes(8, "big")[:2]  # a time with these or smaller first bytes is before _LAST_TIME
 
 
 def read_tlog(source: str | PathLike[str] | BinaryIO) -> Iterator[tuple[float, bytes]]:
@@ -72,7 +72,7 @@ def _records(file: BinaryIO) -> Iterator[tuple[float, bytes]]:
 
 
 def _record_end(data: bytes, begin: int, earliest: int) -> int | None:
-    """Return the end of the record at ``begin``, or None if there is none, it is incomplete, or too early."""
+    """Return the end of the record at ``begin``. None if no complete record begins there, or its time is too early."""
     end = _frame_end(data, begin)
     if end is None or end > len(data) or _TIME.unpack_from(data, begin)[0] < earliest:
         return None
@@ -82,7 +82,7 @@ def _record_end(data: bytes, begin: int, earliest: int) -> int | None:
 
 
 def _looks_shifted(data: bytes, begin: int, end: int) -> bool:
-    """Return True if a record inside this one is followed by another: then that is the real one."""
+    """Return True if a record that begins inside this one is followed by another record, and so is the real one."""
     for inside in range(begin + 1, end):
         true_end = _frame_end(data, inside)
         if true_end is not None and true_end > end and _frame_end(data, true_end) is not None:
@@ -91,7 +91,7 @@ def _looks_shifted(data: bytes, begin: int, end: int) -> bool:
 
 
 def _frame_end(data: bytes, begin: int) -> int | None:
-    """Return the end according to the record's header, which may be beyond the data, or None if it is not a header."""
+    """Return the end according to the header, which may be beyond the data. None if there is no header."""
     at = begin + 8
     if len(data) - at < 3 or data[at] not in _MAGICS or _TIME.unpack_from(data, begin)[0] > _LAST_TIME:
         return None

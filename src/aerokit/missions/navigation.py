@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from aerokit.position import Position
 
 _MAX_DURATION_S = 65_535.0  # ArduPilot stores seconds in 16 bits
-_MAX_RADIUS_M = 65_535.0  # and metres, too
+_MAX_RADIUS_M = 65_535.0  # ArduPilot stores metres in 16 bits
 
 
 @overload

@@ -76,10 +76,10 @@ def format_plan(plan: Plan) -> str:
     try:
         return json.dumps(_document(plan), indent=4, allow_nan=False) + "\n"
     except RecursionError:
-        raise InvalidArgument("the plan was read from a file that is nested too deeply to be written") from None
+        raise InvalidArgument("the plan cannot be written: it was read from a file that is nested too deeply") from None
     except InvalidArgument:
         raise
-    except FileFormatError as error:  # in the text that the plan was read from
+    except FileFormatError as error:  # the error is in the text from which the plan was read
         raise InvalidArgument(f"the plan cannot be written: {error}") from error
     except ValueError as error:
         raise InvalidArgument("a number of the plan is not finite, and a .plan file cannot store it") from error

@@ -178,6 +178,6 @@ def parse_number(text: str) -> int | float:
     if not _DECIMAL.fullmatch(text):
         raise ValueError(text)
     number = float(text)
-    if math.isinf(number):  # 1e999
+    if math.isinf(number):  # for example of the text "1e999"
         raise ValueError(text)
     return number

@@ -110,7 +110,7 @@ GROUPS: tuple[tuple[tuple[str, ...], int, str], ...] = (
 
 INVERTED = frozenset({"ARMING_CHECK"})
 
-# Version 4.7.0 had other new names for these than 4.7.1.
+# Parameters whose new names in version 4.7.0 differ from those in 4.7.1.
 OTHER_NEW_NAMES: dict[str, tuple[str, ...]] = dict(
     chain.from_iterable(
         ((f"{prefix}NE_JERK", (f"{prefix}JERK_NE",)), (f"{prefix}D_JERK", (f"{prefix}JERK_D",)))
@@ -234,7 +234,8 @@ OLDER: tuple[tuple[str, tuple[str, ...], int, str], ...] = (
     ("4.6", _OLDER_ALL, 1, "GPS_CAN_NODEID1>GPS1_CAN_NODEID GPS_CAN_NODEID2>GPS2_CAN_NODEID"),
 )
 
-# The same, from old to new only, because another vehicle type still has the old name, with another meaning.
+# Renames that are applied only from old to new names, in the same format. The old name still exists on another vehicle
+# type, where it has another meaning.
 ONE_WAY: tuple[tuple[str, tuple[str, ...], int, str], ...] = (
     ("3.4", _OLDER_COPTER, 1000, "THR_MIN>MOT_SPIN_MIN"),
     ("3.3", _ROVER, 1, "THR_MIN>MOT_THR_MIN THR_MAX>MOT_THR_MAX"),

@@ -186,9 +186,9 @@ class SettingWrite(Transfer[Setting]):
 
     A PARAM_EXT_ACK with the requested value, or a refusal, completes the write. IN_PROGRESS extends the wait. If no
     answer arrives, the value is read; PARAM_EXT_SET is never simply repeated. It is sent again only if the component
-    reports the value from ``before``. Any other value is the component's own (it rounds or clamps) or another
-    station's, and is the result once it is reported twice. So retries are bounded, and a later change by another
-    station is not undone.
+    reports the value from ``before``. Any other value was rounded or clamped by the component, or set by another
+    station. It is the result once it is reported twice. So retries are bounded, and a later change by another station
+    is not undone.
 
     Raises from ``result()``:
         ParameterRejected: the component refused (``code`` is the PARAM_ACK), or keeps the previous value.
@@ -214,7 +214,7 @@ class SettingWrite(Transfer[Setting]):
         self._stale_answers = StaleAnswerFilter(self.round_trip)
         self._is_writing = False
         self._sent_at = 0.0
-        self._attempts = 0  # of the current request
+        self._attempts = 0  # number of transmissions of the current request
         self._writes = 0
 
     def start(self, now: float) -> None:
@@ -257,7 +257,7 @@ class SettingWrite(Transfer[Setting]):
             self._is_writing = True
             self.deadline = now + min(PROGRESS_TIMEOUT_S, self._idle_timeout_s)
         elif result == ParamAck.ACCEPTED:
-            self._read(now)  # with another value: the component's own, or another station's
+            self._read(now)  # the component has another value: it changed the value, or another station did
         else:
             reason = REFUSALS.get(result, f"PARAM_ACK {result}")  # type: ignore[call-overload]
             self._fail(ParameterRejected(f"{self._name} was refused: {reason}", name=self._name, code=result))

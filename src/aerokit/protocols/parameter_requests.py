@@ -191,7 +191,7 @@ class ParameterWrites(ParameterRequests):
 
     An answer with the requested value and type completes a write. If none arrives, the value is read; PARAM_SET is
     never simply repeated. It is sent again only if the vehicle reports the value from ``before``, the last known one.
-    Any other value is the vehicle's own (it rounds or clamps) or another station's, and is the result once it is
+    Any other value was rounded or clamped by the vehicle, or set by another station. It is the result once it is
     reported twice. So retries are bounded, and a later change by another station is not undone.
 
     ``recent`` has names that were written a moment ago. Because echoes of that write may still arrive, the first

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from aerokit.vehicle.camera.link import CameraBlock
     from aerokit.vehicle.camera.photos import PhotoInterval
     from aerokit.vehicle.commanding.guided import SetpointStream
+    from aerokit.vehicle.devices.shell import Shell
+    from aerokit.vehicle.files.log_stream import LogStream
     from aerokit.vehicle.gimbal.control import GimbalControl
     from aerokit.vehicle.gimbal.gimbal import Gimbals  # noqa: F401
     from aerokit.vehicle.gimbal.rates import GimbalRates
@@ -80,7 +82,8 @@ EnteredT = TypeVar("EnteredT")
 
 BlockT = TypeVar(
     "BlockT",
-    bound="CameraBlock | Following | GimbalControl | GimbalRates | PhotoInterval | SetpointStream[Any]",
+    bound="CameraBlock | Following | GimbalControl | GimbalRates | LogStream | PhotoInterval | SetpointStream[Any]"
+    " | Shell",
 )
 
 ShieldedT = TypeVar("ShieldedT", bound="TemporaryParameters | Transaction")
@@ -208,7 +211,7 @@ class GimbalsTwin(TwinOf["Gimbals"], Generic[T]):
         return self.get(device_id)
 
     def __iter__(self) -> Iterator[T]:
-        return iter([self.get(each) for each in self.ids])
+        return iter([self.get(device_id) for device_id in self.ids])
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -221,6 +224,16 @@ class PhotoIntervalTwin(BlockTwin["PhotoInterval"]):
         return self
 
     def __next__(self) -> Capture:
+        return _next_of(self._loop, self.aio)
+
+
+class LogStreamTwin(BlockTwin["LogStream"]):
+    """A flight log while PX4 writes it; an iterator over its bytes."""
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> bytes:
         return _next_of(self._loop, self.aio)
 
 

@@ -40,7 +40,7 @@ class SelectionTwin(TwinOf[SelectionT]):
     @cached_property
     def vehicles(self) -> Mapping[str, Vehicle]:
         """Name → vehicle."""
-        return {name: _vehicle(self._loop, each) for name, each in self.aio.vehicles.items()}
+        return {name: _vehicle(self._loop, vehicle) for name, vehicle in self.aio.vehicles.items()}
 
     def __len__(self) -> int:
         return len(self.aio)
@@ -81,11 +81,11 @@ class FleetTwin(TwinOf["AsyncFleet"], BlockingContext):
                 self._loop.close()
 
     def __exit__(self, exc_type: Any, exc: Any, traceback: Any) -> None:
-        left = [each for each in self.aio.vehicles.values() if not each.is_hold_pending]
+        left = [vehicle for vehicle in self.aio.vehicles.values() if not vehicle.is_hold_pending]
         self.close()
         if exc is not None:  # the asynchronous side did not see the exception
-            for each in left:
-                warn_if_left_flying(each)
+            for vehicle in left:
+                warn_if_left_flying(vehicle)
 
 
 def opened_fleet(
@@ -95,8 +95,8 @@ def opened_fleet(
     **options: Any,
 ) -> FleetT:
     """Open a fleet on a new loop thread, or on that of the connections and vehicles passed as sources."""
-    given = [each for source in sources for each in (source.values() if isinstance(source, Mapping) else (source,))]
-    loops = {each._loop for each in given if isinstance(each, (ConnectionTwin, VehicleTwin))}
+    given = [entry for source in sources for entry in (source.values() if isinstance(source, Mapping) else (source,))]
+    loops = {entry._loop for entry in given if isinstance(entry, (ConnectionTwin, VehicleTwin))}
     if len(loops) > 1:
         raise InvalidArgument(
             "sources: these connections run on different loops; pass addresses, or open all vehicles on one connection"
@@ -115,5 +115,5 @@ def opened_fleet(
 
 def _original(source: Any) -> Any:
     if isinstance(source, Mapping):
-        return {name: _original(each) for name, each in source.items()}
+        return {name: _original(entry) for name, entry in source.items()}
     return source.aio if isinstance(source, TwinOf) else source

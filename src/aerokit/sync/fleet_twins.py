@@ -152,7 +152,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
 
         Args:
             targets: as for :meth:`go_to`.
-            min_distance_m: minimum distance between any two members in metres; None: the fleet's own.
+            min_distance_m: minimum distance between any two members in metres; None: that of the fleet.
             by: ``"layers"``: separate crossing paths by altitude; ``"corridors"``: by time, which needs ``speed_m_s``;
                 ``"refuse"``: refuse crossing paths.
             speed_m_s: ground speed of all members.
@@ -344,7 +344,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
 
         Args:
             missions: member's name → mission.
-            min_distance_m: minimum distance between any two paths in metres; None: the fleet's own.
+            min_distance_m: minimum distance between any two paths in metres; None: that of the fleet.
 
         Raises:
             InvalidArgument: a name is unknown, or an argument is missing.
@@ -366,7 +366,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
             action: the name of a method of :class:`aerokit.Vehicle` (``"set_speed"``, ``"mission.resume"``), or a
                 coroutine function that is called with each :class:`Member`.
             *arguments: positional arguments of the method.
-            timeout: seconds for each member; None: the action's own limit.
+            timeout: seconds for each member; None: the default of the action.
             stagger_s: delay in seconds between the starts of consecutive members; None: all at once.
             **options: keyword arguments of the method.
 

@@ -55,11 +55,11 @@ def optional(annotation: ast.expr | None) -> ast.expr | None:
 
 def forwarded(node: ast.FunctionDef | ast.AsyncFunctionDef) -> list[str]:
     """Return the arguments of a forwarding call, without ``self``."""
-    positional = [each.arg for each in (*node.args.posonlyargs, *node.args.args)]
-    positional = [each for each in positional if each != "self"]
+    positional = [argument.arg for argument in (*node.args.posonlyargs, *node.args.args)]
+    positional = [argument for argument in positional if argument != "self"]
     star = [f"*{node.args.vararg.arg}"] if node.args.vararg else []
     rest = [f"**{node.args.kwarg.arg}"] if node.args.kwarg else []
-    return positional + star + [f"{each.arg}={each.arg}" for each in node.args.kwonlyargs] + rest
+    return positional + star + [f"{argument.arg}={argument.arg}" for argument in node.args.kwonlyargs] + rest
 
 
 def source(node: ast.expr) -> str:
@@ -72,7 +72,7 @@ def call(function: str, arguments: Sequence[str], indent: str = "        ") -> s
     line = f"{function}({', '.join(arguments)})"
     if len(indent) + len(line) < WIDTH:  # a comma may follow
         return line
-    return f"{function}(\n" + "".join(f"{indent}    {each},\n" for each in arguments) + f"{indent})"
+    return f"{function}(\n" + "".join(f"{indent}    {argument},\n" for argument in arguments) + f"{indent})"
 
 
 def function(
@@ -89,30 +89,30 @@ def function(
 def arguments_of(arguments: ast.arguments) -> list[str]:
     positional = [*arguments.posonlyargs, *arguments.args]
     lacking: list[ast.expr | None] = [None] * (len(positional) - len(arguments.defaults))
-    found = [_argument(*each) for each in zip(positional, [*lacking, *arguments.defaults])]  # noqa: B905
+    found = [_argument(*pair) for pair in zip(positional, [*lacking, *arguments.defaults])]  # noqa: B905
     if arguments.vararg is not None:
         found.append("*" + _argument(arguments.vararg, None))
     elif arguments.kwonlyargs:
         found.append("*")
-    found += [_argument(*each) for each in zip(arguments.kwonlyargs, arguments.kw_defaults)]  # noqa: B905
+    found += [_argument(*pair) for pair in zip(arguments.kwonlyargs, arguments.kw_defaults)]  # noqa: B905
     return found + (["**" + _argument(arguments.kwarg, None)] if arguments.kwarg else [])
 
 
 def _lines(arguments: Iterable[str], indent: str) -> str:
     """Return one argument per line; a longer one is wrapped before its ``| None``."""
     lines = ""
-    for each in arguments:
-        if len(indent) + len(each) + 1 > WIDTH:
-            head, none, tail = each.rpartition(" | None")
-            each = f"{head}\n{indent}{none.lstrip()}{tail}"
-        lines += f"{indent}{each},\n"
+    for argument in arguments:
+        if len(indent) + len(argument) + 1 > WIDTH:
+            head, none, tail = argument.rpartition(" | None")
+            argument = f"{head}\n{indent}{none.lstrip()}{tail}"
+        lines += f"{indent}{argument},\n"
     return lines
 
 
-def _argument(each: ast.arg, default: ast.expr | None) -> str:
-    kind = "" if each.annotation is None else f": {source(each.annotation)}"
+def _argument(argument: ast.arg, default: ast.expr | None) -> str:
+    kind = "" if argument.annotation is None else f": {source(argument.annotation)}"
     value = "" if default is None else f"{' = ' if kind else '='}{source(default)}"
-    return f"{each.arg}{kind}{value}"
+    return f"{argument.arg}{kind}{value}"
 
 
 def docstring(text: str | None, indent: str = "        ") -> str:
@@ -168,15 +168,15 @@ class Page:
 
     def __post_init__(self) -> None:
         self._homes: dict[str, tuple[str, str]] = {}
-        self._twins = {each.name for each in TWINS}
-        self._elsewhere = {each.name: each.page for each in TWINS if each.page != self.name}
+        self._twins = {twin.name for twin in TWINS}
+        self._elsewhere = {twin.name: twin.page for twin in TWINS if twin.page != self.name}
 
     def need(self, node: ast.AST | None, modules: tuple[str, ...], *, at_run_time: bool = False) -> None:
         """Import the names in an expression that comes from these modules."""
-        for each in ast.walk(node) if node is not None else ():
-            text = each.value if isinstance(each, ast.Constant) and isinstance(each.value, str) else None
-            if isinstance(each, ast.Name):
-                self._need_name(each.id, modules, at_run_time)
+        for part in ast.walk(node) if node is not None else ():
+            text = part.value if isinstance(part, ast.Constant) and isinstance(part.value, str) else None
+            if isinstance(part, ast.Name):
+                self._need_name(part.id, modules, at_run_time)
             elif text is not None and text.isidentifier() and not at_run_time:
                 self._need_name(text, modules, at_run_time)
 
@@ -192,8 +192,8 @@ class Page:
 
     def need_literals(self, node: ast.AST | None, module: str) -> None:
         """Import Literals at run time: ``checked`` knows classes by their names, but needs the values of a Literal."""
-        for each in ast.walk(node) if node is not None else ():
-            where = imports_of(module).get(each.id, (module, each.id)) if isinstance(each, ast.Name) else ("", "")
+        for part in ast.walk(node) if node is not None else ():
+            where = imports_of(module).get(part.id, (module, part.id)) if isinstance(part, ast.Name) else ("", "")
             if where[0].startswith("aerokit."):
                 found = getattr(importlib.import_module(where[0]), where[1], None)
                 if get_origin(found) is Literal:
@@ -260,7 +260,7 @@ TYPE_VARIABLES = {
 
 
 def generate(name: str = "twins") -> str:
-    page, twins = Page(name), [each for each in TWINS if each.page == name]
+    page, twins = Page(name), [twin for twin in TWINS if twin.page == name]
     classes = [_class(page, twin) for twin in twins]
     functions = [_opener(page, path) for path in FUNCTIONS[name]]
     names = sorted((*(twin.name for twin in twins), *(path.rpartition(".")[2] for path in FUNCTIONS[name])))
@@ -268,7 +268,7 @@ def generate(name: str = "twins") -> str:
     opener = ("aerokit.sync.blocks", "opened") if name == "twins" else ("aerokit.sync.fleet_blocks", "opened_fleet")
     page.at_run_time |= {opener, ("aerokit._internal.arguments", "checked")}
     page.for_types |= {
-        (each.module, f"{each.name} as Async{each.name}") for each in twins if each.base in GENERIC_BASES
+        (twin.module, f"{twin.name} as Async{twin.name}") for twin in twins if twin.base in GENERIC_BASES
     }
     variables = TYPE_VARIABLES if name == "twins" else {}
     page.for_types |= {("aerokit.mavlink.message", "Message"), ("aerokit.events", "Event")}
@@ -281,9 +281,9 @@ def generate(name: str = "twins") -> str:
         text = text.replace("from functools import cached_property\n", "")
     head = text + _import_lines(page.at_run_time, "") + "\nif TYPE_CHECKING:\n"
     head += _import_lines(page.for_types, "    ") + "\n"
-    head += "__all__ = [\n" + "".join(f'    "{each}",\n' for each in names) + "]\n" + "\n" * bool(variables)
-    for each, bound in variables.items():
-        head += f'{each} = TypeVar("{each}"{f", bound={bound}" if bound else ""})\n'
+    head += "__all__ = [\n" + "".join(f'    "{name}",\n' for name in names) + "]\n" + "\n" * bool(variables)
+    for variable, bound in variables.items():
+        head += f'{variable} = TypeVar("{variable}"{f", bound={bound}" if bound else ""})\n'
     return head + "\n\n" + "\n\n".join([*classes, *functions])
 
 
@@ -295,7 +295,7 @@ def _class(page: Page, twin: Twin) -> str:
     if twin.inherits:
         base += f", {twin.inherits}"
     text = docstring(inspect.getdoc(original), "    ")
-    members = "\n".join(page.member(twin, each) for each in members_of(twin))
+    members = "\n".join(page.member(twin, member) for member in members_of(twin))
     return "\n".join([f"class {twin.name}({base}):\n{text}", *([members] if members else [])])
 
 
@@ -310,7 +310,7 @@ def _opener(page: Page, path: str) -> str:
     assert isinstance(node.returns, ast.Subscript)
     kind = ast.unparse(node.returns.slice)
     lines = _lines(arguments_of(node.args), "    ")
-    given = "".join(f"        {each.lstrip('*')},\n" for each in forwarded(node))
+    given = "".join(f"        {argument.lstrip('*')},\n" for argument in forwarded(node))
     opens = "opened" if page.name == "twins" else "opened_fleet"
     text = (ast.get_docstring(node) or "").replace("``async with``", "``with``")
     return (

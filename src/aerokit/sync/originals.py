@@ -84,7 +84,12 @@ TWINS = (
     Twin("aerokit.vehicle.gimbal.gimbal.Gimbals", "GimbalsTwin", called=_names("ids"), parameter='"Gimbal"'),
     Twin("aerokit.vehicle.commanding.posted.PostedOrder"),
     Twin("aerokit.vehicle.files.files.Files"),
+    Twin("aerokit.vehicle.files.log_stream.LogStream", "LogStreamTwin"),
     Twin("aerokit.vehicle.files.logs.Logs"),
+    Twin("aerokit.vehicle.devices.actuators.Actuators"),
+    Twin("aerokit.vehicle.devices.gripper.Gripper"),
+    Twin("aerokit.vehicle.devices.winch.Winch"),
+    Twin("aerokit.vehicle.devices.shell.Shell", "BlockTwin"),
     Twin("aerokit.vehicle.parameters.transaction.TemporaryParameters", "TemporarilyTwin"),
     Twin("aerokit.vehicle.parameters.transaction.Transaction", "TransactionTwin"),
     Twin("aerokit.vehicle.parameters.parameters.Parameters", direct=_names("load_metadata known")),
@@ -101,7 +106,9 @@ TWINS = (
         "VehicleTwin",
         without=_names("telemetry"),
         direct=_names("distance_to describe_now"),
-        parts=_names("camera cameras components guided gimbal gimbals files logs parameters mission fence rally"),
+        parts=_names(
+            "actuators camera cameras components guided gimbal gimbals files logs parameters mission fence rally"
+        ),
     ),
     Twin("aerokit.fleets.formation.Following", "BlockTwin", direct=_names("error_m"), page="fleet_twins"),
     Twin(
@@ -127,9 +134,9 @@ def imports_of(module: str) -> dict[str, tuple[str, str]]:
     found: dict[str, tuple[str, str]] = {}
     for node in ast.walk(tree(module)):
         if isinstance(node, ast.ImportFrom) and node.module:
-            found |= {each.asname or each.name: (node.module, each.name) for each in node.names}
+            found |= {alias.asname or alias.name: (node.module, alias.name) for alias in node.names}
         elif isinstance(node, ast.Import):
-            found |= {each.asname or each.name: (each.name, "") for each in node.names}
+            found |= {alias.asname or alias.name: (alias.name, "") for alias in node.names}
     return found
 
 
@@ -158,14 +165,14 @@ class ClassMember:
 def members_of(twin: Twin) -> list[ClassMember]:
     """Return the members to generate, inherited ones included, in the order of their first definition."""
     cls = _class_of(twin)
-    inherited = next((_class_of(each).__mro__ for each in TWINS if each.name == twin.inherits), ())
+    inherited = next((_class_of(other).__mro__ for other in TWINS if other.name == twin.inherits), ())
     found: dict[str, ClassMember] = {}
     fill = _type_argument_filler(cls)
-    for each in reversed(cls.__mro__):
-        if each.__module__.startswith("aerokit.") and each not in inherited:
-            found |= {member.name: fill(member) for member in _own(each)}
+    for base in reversed(cls.__mro__):
+        if base.__module__.startswith("aerokit.") and base not in inherited:
+            found |= {member.name: fill(member) for member in _own(base)}
     wanted = twin.only or {name for name in found if not name.startswith("_")} | twin.special
-    return [each for name, each in found.items() if name in wanted and name not in twin.without]
+    return [member for name, member in found.items() if name in wanted and name not in twin.without]
 
 
 def _class_of(twin: Twin) -> type:
@@ -177,8 +184,8 @@ def _type_argument_filler(cls: type) -> Callable[[ClassMember], ClassMember]:
     """Return a function that replaces the type variables of generic bases by their arguments."""
     arguments: dict[str, str] = {}
     for base in getattr(cls, "__orig_bases__", ()):
-        names = [each.__name__ for each in getattr(get_origin(base), "__parameters__", ())]
-        values = [each.__forward_arg__ for each in get_args(base) if isinstance(each, ForwardRef)]
+        names = [parameter.__name__ for parameter in getattr(get_origin(base), "__parameters__", ())]
+        values = [argument.__forward_arg__ for argument in get_args(base) if isinstance(argument, ForwardRef)]
         arguments |= dict(zip(names, values))  # noqa: B905 - other arguments are no forward references
 
     class Fill(ast.NodeTransformer):
@@ -241,8 +248,8 @@ def _is_state(annotation: ast.expr) -> bool:
 
 
 def decorators_of(node: ast.FunctionDef | ast.AsyncFunctionDef) -> set[str]:
-    return {ast.unparse(each) for each in node.decorator_list}
+    return {ast.unparse(decorator) for decorator in node.decorator_list}
 
 
 def _is_setter(node: ast.FunctionDef | ast.AsyncFunctionDef) -> bool:
-    return any(each.endswith(".setter") for each in decorators_of(node))
+    return any(decorator.endswith(".setter") for decorator in decorators_of(node))

@@ -24,6 +24,7 @@ from aerokit.sync.blocks import (
     ChangesTwin,
     ConnectionTwin,
     GimbalsTwin,
+    LogStreamTwin,
     PhotoIntervalTwin,
     StreamTwin,
     SubscriptionTwin,
@@ -37,6 +38,8 @@ from aerokit.vehicle.camera.controls import FORMAT_TIMEOUT_S
 from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M, MAX_SILENCE_S
 from aerokit.vehicle.commanding.setpoints import AccelerationSetpoint, BodyVelocitySetpoint, VelocitySetpoint
 from aerokit.vehicle.connect import connect as connect_async
+from aerokit.vehicle.devices.actuators import ILLUMINATOR
+from aerokit.vehicle.devices.winch import ACTION_TIMEOUT_S
 from aerokit.vehicle.files.logs import ERASE_PATIENCE_S
 
 if TYPE_CHECKING:
@@ -92,6 +95,12 @@ if TYPE_CHECKING:
     from aerokit.vehicle.components.component import Component as AsyncComponent
     from aerokit.vehicle.components.component import ComponentInformation, ComponentStatus, MetadataKind
     from aerokit.vehicle.components.settings import Settings as AsyncSettings
+    from aerokit.vehicle.devices.actions import FailingUnit, FailureIntent, FailureKind, Severity
+    from aerokit.vehicle.devices.actuators import Actuators as AsyncActuators
+    from aerokit.vehicle.devices.actuators import ReleaseIntent, SpinIntent
+    from aerokit.vehicle.devices.gripper import Gripper as AsyncGripper
+    from aerokit.vehicle.devices.shell import Shell as AsyncShell
+    from aerokit.vehicle.devices.winch import Winch as AsyncWinch
     from aerokit.vehicle.files.files import FileEntry
     from aerokit.vehicle.files.files import Files as AsyncFiles
     from aerokit.vehicle.files.logs import LogEntry, LogMethod
@@ -119,9 +128,20 @@ if TYPE_CHECKING:
         ServoOutputs,
         Vibration,
     )
+    from aerokit.vehicle.state.measurements import (
+        ActuatorControls,
+        Aircraft,
+        AirPressure,
+        Altitude,
+        Imu,
+        Odometry,
+        RawImu,
+        WinchStatus,
+    )
     from aerokit.vehicle.state.movement import Attitude, Home, LocalPosition, Velocity, Wind
 
 __all__ = [
+    "Actuators",
     "Camera",
     "CameraBlock",
     "Changes",
@@ -133,7 +153,9 @@ __all__ = [
     "GimbalControl",
     "GimbalRates",
     "Gimbals",
+    "Gripper",
     "Guided",
+    "LogStream",
     "Logs",
     "MissionControl",
     "Parameters",
@@ -142,11 +164,13 @@ __all__ = [
     "RallyControl",
     "SetpointStream",
     "Settings",
+    "Shell",
     "StateCell",
     "Subscription",
     "TemporaryParameters",
     "Transaction",
     "Vehicle",
+    "Winch",
     "connect",
     "open_connection",
 ]
@@ -386,8 +410,9 @@ class SetpointStream(StreamTwin[SetpointT]):
     """Sends the latest set-point at a fixed rate while the ``async with`` block supplies set-points.
 
     Entering the block changes to the set-point mode (GUIDED, OFFBOARD) with the initial set-point. Leaving it in any
-    way makes the vehicle hold. The stream stops by itself for the reasons above, and if the vehicle should move but
-    stays in place for twelve seconds; then ``set`` and leaving the block raise :class:`SetpointStreamStopped`. After a
+    way makes the vehicle hold. The stream stops by itself without a new set-point for ``valid_for_s``, if the event
+    loop is late by ``max_lag_s``, if the vehicle leaves the mode, disarms or falls silent, and if it should move but
+    stays in place for twelve seconds. Then ``set`` and leaving the block raise :class:`SetpointStreamStopped`. After a
     pilot or a failsafe has changed the mode, nothing more is sent to the vehicle.
     """
 
@@ -633,8 +658,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
 
     ``vehicle.gimbal`` is the first one, ``vehicle.gimbals`` has all. An order returns when the gimbal reports the
     ordered direction, and ends when another order is given. The gimbal keeps the direction while the vehicle moves. If
-    the
-    manager requires control, an order outside a block of :meth:`control` claims it until :meth:`release`.
+    the manager requires control, an order outside a block of :meth:`control` claims it until :meth:`release`.
     """
 
     @cached_property
@@ -681,7 +705,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
             CommandTimeout: there was no answer.
             GimbalTaken: your program had control and lost it.
             OperationRejected: another order was given meanwhile, or the vehicle rebooted.
-            OperationTimeout: it did not get there in time; the text has the last attitude.
+            OperationTimeout: the gimbal did not reach the direction in time; the text has the last attitude.
             HeartbeatTimeout: the vehicle fell silent.
         """
         self._loop.run(self.aio.look_at, target, wait=wait, tolerance_deg=tolerance_deg, timeout=timeout)
@@ -711,7 +735,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
             CommandTimeout: there was no answer.
             GimbalTaken: your program had control and lost it.
             OperationRejected: another order was given meanwhile, or the vehicle rebooted.
-            OperationTimeout: it did not get there in time; the text has the last attitude.
+            OperationTimeout: the gimbal did not reach the direction in time; the text has the last attitude.
             HeartbeatTimeout: the vehicle fell silent.
         """
         self._loop.run(self.aio.look_at_system, system_id, wait=wait, tolerance_deg=tolerance_deg, timeout=timeout)
@@ -760,7 +784,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
             CommandTimeout: there was no answer.
             GimbalTaken: your program had control and lost it.
             OperationRejected: another order was given meanwhile, or the vehicle rebooted.
-            OperationTimeout: it did not get there in time; the text has the last attitude.
+            OperationTimeout: the gimbal did not reach the direction in time; the text has the last attitude.
             HeartbeatTimeout: the vehicle fell silent.
         """
         self._loop.run(
@@ -786,7 +810,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
             CommandTimeout: there was no answer.
             GimbalTaken: your program had control and lost it.
             OperationRejected: another order was given meanwhile, or the vehicle rebooted.
-            OperationTimeout: it did not get there in time; the text has the last attitude.
+            OperationTimeout: the gimbal did not reach the direction in time; the text has the last attitude.
             HeartbeatTimeout: the vehicle fell silent.
         """
         self._loop.run(self.aio.neutral, wait=wait, timeout=timeout)
@@ -799,12 +823,12 @@ class Gimbal(TwinOf["AsyncGimbal"]):
             timeout: seconds to wait.
 
         Raises:
-            NotSupported: its manager accepts the order but does nothing (PX4). Nothing was sent.
+            NotSupported: the manager would accept the order but not execute it (PX4). Nothing was sent.
             CommandRejected: the manager refused.
             CommandTimeout: there was no answer.
             GimbalTaken: your program had control and lost it.
             OperationRejected: another order was given meanwhile, or the vehicle rebooted.
-            OperationTimeout: it did not get there in time; the text has the last attitude.
+            OperationTimeout: the gimbal did not reach the direction in time; the text has the last attitude.
             HeartbeatTimeout: the vehicle fell silent.
         """
         self._loop.run(self.aio.retract, wait=wait, timeout=timeout)
@@ -920,7 +944,7 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
 
     @property
     def end(self) -> str:
-        """The reason why none of its commands is sent again, as a clause; empty while they may be."""
+        """Reason why no command of the order is sent again, as a clause; empty while commands may be sent."""
         return self.aio.end
 
     def command(self, command: int, *params: float, component_id: int | None = None) -> None:
@@ -971,10 +995,10 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
             component_id: as for :meth:`command`.
 
         Raises:
-            InvalidArgument: the mode is not one of the order's, or the block was left. Nothing was sent.
+            InvalidArgument: the mode is not one of the modes of the order, or the block was left. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement.
-            OperationTimeout: it accepted and stayed in another mode.
+            OperationTimeout: the vehicle accepted the mode but stayed in another one.
         """
         self._loop.run(self.aio.set_mode, mode, timeout=timeout, component_id=component_id)
 
@@ -1186,6 +1210,24 @@ class Files(TwinOf["AsyncFiles"]):
         self._loop.run(self.aio.rename, path, new_path, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
 
+class LogStream(LogStreamTwin):
+    """The flight log that PX4 sends while its ``async with`` block runs (LOGGING_DATA): an async iterator over bytes.
+
+    Written to a file one after the other, the bytes are a valid ULog file at any time. Lost messages are marked there
+    as dropouts; ``lost`` counts them. The iterator ends with the connection. PX4 sends one such log at a time.
+
+    Entering raises:
+        NotSupported: ArduPilot. Nothing was sent.
+        CommandRejected: PX4 streams to another station, or the port is too slow (below 5 kB/s).
+        CommandTimeout: there was no acknowledgement; the stream that may have begun is stopped.
+    """
+
+    @property
+    def lost(self) -> int:
+        """Number of LOGGING_DATA messages that were not received, or that the reader was too slow for."""
+        return self.aio.lost
+
+
 class Logs(TwinOf["AsyncLogs"]):
     """Lists, downloads and erases flight logs. Operations run one at a time, in the order of their calls.
 
@@ -1283,6 +1325,386 @@ class Logs(TwinOf["AsyncLogs"]):
         """
         self._loop.run(self.aio.erase, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
+    def stream(self, *, idle_timeout_s: float = IDLE_TIMEOUT_S) -> LogStream:
+        """Receive the log that PX4 writes, for the duration of an ``async with`` block (MAV_CMD_LOGGING_START).
+
+        ``async with vehicle.logs.stream() as stream: async for data in stream: file.write(data)``
+
+        Args:
+            idle_timeout_s: reading fails after this many seconds without data; above 0, at most 3600.
+
+        Raises:
+            InvalidArgument: the time is out of range. Nothing was sent.
+        """
+        return LogStream(self._loop, self._loop.call(self.aio.stream, idle_timeout_s=idle_timeout_s))
+
+
+class Actuators(TwinOf["AsyncActuators"]):
+    """Outputs of the vehicle besides its flight controls: ``vehicle.actuators``.
+
+    ArduPilot has servos, relays, landing gear and a parachute; PX4 has actuators. After a cancellation the vehicle may
+    have executed the order.
+    """
+
+    def set_servo(self, number: int, pulse_us: int) -> None:
+        """Set the pulse width of a servo output, and return when SERVO_OUTPUT_RAW reports it (MAV_CMD_DO_SET_SERVO).
+
+        ArduPilot only. The output must have no function, or follow a stick (SERVOn_FUNCTION 0, 1, 51 to 66).
+
+        Args:
+            number: output, 1 to 32.
+            pulse_us: pulse width in microseconds, 500 to 2500.
+
+        Raises:
+            InvalidArgument: a value is out of range. Nothing was sent.
+            NotSupported: the firmware does not have the command. Nothing was sent.
+            CommandRejected: the vehicle refused, for example because the output has another function.
+            CommandTimeout: there was no acknowledgement.
+            OperationRejected: a newer order for this output was given.
+            OperationTimeout: the vehicle reports another state.
+        """
+        self._loop.run(self.aio.set_servo, number, pulse_us)
+
+    def repeat_servo(self, number: int, pulse_us: int, *, count: int, period_s: float) -> None:
+        """Move a servo ``count`` times to a pulse width and back to its trim (MAV_CMD_DO_REPEAT_SERVO).
+
+        Returns when ArduPilot has acknowledged and begins; no message reports the end. It has one cycle at a time: the
+        next order of this kind replaces it. Never sent twice, because each copy starts a new cycle. ArduPilot only.
+
+        Args:
+            number: output, 1 to 32, as for :meth:`set_servo`.
+            pulse_us: pulse width in microseconds, 500 to 2500.
+            count: number of cycles, 1 to 1000.
+            period_s: seconds from one pulse to the next, above 0, at most 60.
+
+        Raises:
+            InvalidArgument, NotSupported, CommandRejected, CommandTimeout: as for ``set_servo``.
+        """
+        self._loop.run(self.aio.repeat_servo, number, pulse_us, count=count, period_s=period_s)
+
+    def set_relay(self, number: int, on: bool) -> None:
+        """Switch a relay, and return when RELAY_STATUS reports it (MAV_CMD_DO_SET_RELAY).
+
+        Firmware without RELAY_STATUS (before ArduPilot 4.5) only acknowledges. ArduPilot only; it refuses a relay
+        without a pin. Raises as :meth:`set_servo`.
+
+        Args:
+            number: relay from 0 (RELAY1_PIN) to 15.
+            on: the new state.
+        """
+        self._loop.run(self.aio.set_relay, number, on)
+
+    def repeat_relay(self, number: int, *, count: int, period_s: float) -> None:
+        """Switch a relay over and back ``count`` times (MAV_CMD_DO_REPEAT_RELAY).
+
+        Returns when ArduPilot has acknowledged and begins. Never sent twice. ArduPilot only.
+
+        Args:
+            number: relay from 0 to 15.
+            count: number of cycles, 1 to 1000.
+            period_s: seconds of one cycle, above 0, at most 60.
+
+        Raises:
+            InvalidArgument, NotSupported, CommandRejected, CommandTimeout: as for ``set_servo``.
+        """
+        self._loop.run(self.aio.repeat_relay, number, count=count, period_s=period_s)
+
+    def set_actuator(self, number: int, value: float) -> None:
+        """Set one actuator (1 to 6) to a value from −1 to 1. Raises as :meth:`set_actuators`."""
+        self._loop.run(self.aio.set_actuator, number, value)
+
+    def set_actuators(self, *values: float | None) -> None:
+        """Set actuators by number: the first value is for "Peripheral via Actuator Set 1" (MAV_CMD_DO_SET_ACTUATOR).
+
+        Returns when PX4 has acknowledged, because no message reports the values. It acknowledges also if no output has
+        this function (PWM_MAIN_FUNCn 301 to 306). PX4 only.
+
+        Args:
+            values: up to six values, −1 to 1; None leaves an actuator as it is.
+
+        Raises:
+            InvalidArgument: none or more than six values, or one is out of range. Nothing was sent.
+            NotSupported: ArduPilot, which has :meth:`set_servo`. Nothing was sent.
+            CommandRejected: the vehicle refused.
+            CommandTimeout: there was no acknowledgement.
+        """
+        self._loop.run(self.aio.set_actuators, *values)
+
+    def raise_landing_gear(self) -> None:
+        """Retract the landing gear (MAV_CMD_AIRFRAME_CONFIGURATION); returns at the acknowledgement.
+
+        ArduCopter and ArduPlane only. They report the gear by no message, and accept the order also if there is no
+        landing gear (LGR_ENABLE), or while they stand on it.
+
+        Raises:
+            NotSupported: PX4, Rover and Sub. Nothing was sent.
+            OperationRejected: the vehicle is disarmed, or on the ground. Nothing was sent.
+            CommandRejected: the vehicle refused.
+            CommandTimeout: there was no acknowledgement.
+        """
+        self._loop.run(self.aio.raise_landing_gear)
+
+    def lower_landing_gear(self) -> None:
+        """Deploy the landing gear; returns at the acknowledgement.
+
+        Raises:
+            NotSupported, CommandRejected, CommandTimeout: as for ``raise_landing_gear``.
+        """
+        self._loop.run(self.aio.lower_landing_gear)
+
+    def set_lights(self, on: bool, *, component_id: int = ILLUMINATOR) -> None:
+        """Switch an illuminator, and return when ILLUMINATOR_STATUS reports it (MAV_CMD_ILLUMINATOR_ON_OFF).
+
+        For lights that are a MAVLink component. ArduPilot and PX4 do not have the command; lights on an output of
+        ArduPilot are servos or relays. Raises as :meth:`set_servo`.
+
+        Args:
+            on: the new state.
+            component_id: the light, 1 to 255; MAV_COMP_ID_ILLUMINATOR is 243.
+        """
+        self._loop.run(self.aio.set_lights, on, component_id=component_id)
+
+    def test_motor(self, number: int, *, throttle_percent: float, duration_s: float, intent: SpinIntent) -> None:
+        """Spin one motor of a disarmed vehicle, and return when it has stopped; remove the propellers.
+
+        Sent once: a copy would spin it again. If the call is cancelled or fails, aerokit orders the motor to stop at
+        once; without that, it stops after ``duration_s``. ArduCopter reports armed during the test, and the call
+        returns when it reports disarmed. PX4 acknowledges only, so the call returns after ``duration_s``.
+
+        ArduPilot: MAV_CMD_DO_MOTOR_TEST. PX4: MAV_CMD_ACTUATOR_TEST, if COM_MOT_TEST_EN is 1.
+
+        Args:
+            number: 1 to 12. ArduCopter counts clockwise from the front, PX4 by output function (Motor 1).
+            throttle_percent: 0 to 100.
+            duration_s: seconds, above 0, at most 3.
+            intent: must be ``"spin motor"``, so that no other call can be mistaken for it.
+
+        Raises:
+            InvalidArgument: a value is out of range, or the intent is another one. Nothing was sent.
+            OperationRejected: the vehicle is armed, or not known to be disarmed: nothing was sent. Or a newer order
+                for its motors was given.
+            CommandRejected: it refused (not landed, safety switch, COM_MOT_TEST_EN).
+            CommandTimeout: there was no acknowledgement; the motor may have turned.
+            OperationTimeout: the vehicle still reports armed four seconds after the end.
+        """
+        self._loop.run(
+            self.aio.test_motor,
+            number,
+            throttle_percent=throttle_percent,
+            duration_s=duration_s,
+            intent=intent,
+        )
+
+    def release_parachute(self, *, intent: ReleaseIntent) -> None:
+        """Release the parachute and stop the motors; return when ArduPilot reports that it was released.
+
+        MAV_CMD_DO_PARACHUTE. ArduPilot accepts the command also where it then refuses to release: on the ground, below
+        CHUTE_ALT_MIN, or if the parachute is disabled. ArduCopter and ArduPlane only. **The vehicle falls.**
+
+        Args:
+            intent: must be ``"release parachute"``, so that no other call can be mistaken for it.
+
+        Raises:
+            InvalidArgument: the intent is another one. Nothing was sent.
+            NotSupported: PX4, Rover and Sub. Nothing was sent.
+            OperationRejected: the vehicle refused after the acknowledgement; ``reasons`` has its status texts.
+            CommandRejected: the vehicle refused.
+            CommandTimeout: there was no acknowledgement.
+            OperationTimeout: no status text reported the release.
+        """
+        self._loop.run(self.aio.release_parachute, intent=intent)
+
+    def enable_parachute(self, enabled: bool = True) -> None:
+        """Allow or forbid the release of the parachute until the next reboot; returns at the acknowledgement.
+
+        MAV_CMD_DO_PARACHUTE. ArduCopter and ArduPlane only.
+
+        Args:
+            enabled: False forbids it, also for failsafes.
+
+        Raises:
+            NotSupported, CommandRejected, CommandTimeout: as for ``release_parachute``.
+        """
+        self._loop.run(self.aio.enable_parachute, enabled)
+
+
+class Gripper(TwinOf["AsyncGripper"]):
+    """One gripper: ``vehicle.gripper()`` (MAV_CMD_DO_GRIPPER).
+
+    PX4 acknowledges when the gripper has moved (PD_GRIPPER_EN). ArduPilot acknowledges at once and reports the end by
+    status text (GRIP_ENABLE); an electro-permanent gripper reports only its beginning, and the call returns three
+    seconds later. Orders are sent once. After a cancellation the gripper may have moved.
+    """
+
+    def grab(self) -> None:
+        """Close the gripper, and return when it has closed.
+
+        Raises:
+            CommandRejected: there is no gripper, or it refused.
+            CommandTimeout: there was no acknowledgement.
+            OperationRejected: a newer order for this gripper was given.
+            OperationTimeout: the end was not reported within ten seconds.
+        """
+        self._loop.run(self.aio.grab)
+
+    def release(self) -> None:
+        """Open the gripper, and return when it has opened. Raises as :meth:`grab`."""
+        self._loop.run(self.aio.release)
+
+
+class Winch(TwinOf["AsyncWinch"]):
+    """One winch: ``vehicle.winch()`` (MAV_CMD_DO_WINCH).
+
+    ArduCopter has :meth:`relax`, :meth:`pay_out` and :meth:`set_rate`; the other orders are for winches that are
+    MAVLink components: ``vehicle.winch(component_id=169)``. PX4 has none of them and forwards the command to such a
+    component. An order that may pay out line twice is sent once. A newer order ends the wait for the previous one.
+    A cancelled call does not stop the winch: call ``set_rate(0)``.
+    """
+
+    @cached_property
+    def status(self) -> StateCell[WinchStatus]:
+        """Length, speed, tension and state of the autopilot's winch (WINCH_STATUS); ``vehicle.winch_status``."""
+        return StateCell(self._loop, self.aio.status)
+
+    def relax(self) -> None:
+        """Let the line run freely; returns at the acknowledgement, which is all that ArduCopter reports.
+
+        Raises:
+            NotSupported: the autopilot has no such order. Nothing was sent.
+            CommandRejected: there is no winch (WINCH_TYPE).
+            CommandTimeout: there was no acknowledgement.
+        """
+        self._loop.run(self.aio.relax)
+
+    def pay_out(self, length_m: float, *, rate_m_s: float = 0.5, timeout: float = ACTION_TIMEOUT_S) -> None:
+        """Pay out a length of line, and return when WINCH_STATUS reports it within 0.1 m.
+
+        Without WINCH_STATUS it returns at the acknowledgement. Sent once, because a copy would pay out more.
+
+        Args:
+            length_m: metres, −1000 to 1000; negative values wind it up.
+            rate_m_s: speed, above 0, at most 20 m/s; ArduCopter uses WINCH_MAX_RATE instead.
+            timeout: seconds until the length is out.
+
+        Raises:
+            InvalidArgument: a value is out of range. Nothing was sent.
+            NotSupported: the autopilot has no such order. Nothing was sent.
+            CommandRejected: there is no winch (WINCH_TYPE).
+            CommandTimeout: there was no acknowledgement; the winch may run.
+            OperationRejected: a newer order for this winch was given.
+            HeartbeatTimeout: the vehicle was silent for ten seconds.
+            OperationTimeout: the length was not reported in time.
+        """
+        self._loop.run(self.aio.pay_out, length_m, rate_m_s=rate_m_s, timeout=timeout)
+
+    def set_rate(self, rate_m_s: float) -> None:
+        """Pay out line at this speed until the next order, and return when WINCH_STATUS reports the speed.
+
+        Args:
+            rate_m_s: −20 to 20 m/s; negative values wind it up, 0 stops. ArduCopter limits it to WINCH_MAX_RATE, and
+                this call then times out.
+
+        Raises:
+            InvalidArgument, NotSupported, CommandRejected, CommandTimeout, OperationRejected, OperationTimeout: as for
+                ``pay_out``.
+        """
+        self._loop.run(self.aio.set_rate, rate_m_s)
+
+    def lock(self) -> None:
+        """Engage the brake, and return when WINCH_STATUS reports it locked. Raises as :meth:`retract`."""
+        self._loop.run(self.aio.lock)
+
+    def deliver(self) -> None:
+        """Start the winch's own delivery: lower, release, retract. Returns at the acknowledgement.
+
+        Raises as :meth:`relax`.
+        """
+        self._loop.run(self.aio.deliver)
+
+    def hold(self) -> None:
+        """Hold the line by the motor, without the brake. Returns at the acknowledgement. Raises as :meth:`relax`."""
+        self._loop.run(self.aio.hold)
+
+    def retract(self, *, timeout: float = ACTION_TIMEOUT_S) -> None:
+        """Wind up all line, and return when WINCH_STATUS reports it fully retracted.
+
+        Args:
+            timeout: seconds until it is retracted.
+
+        Raises:
+            NotSupported: the autopilot has no such order. Nothing was sent.
+            CommandRejected: the winch refused.
+            CommandTimeout: there was no acknowledgement; the winch may run.
+            OperationRejected: a newer order for this winch was given.
+            HeartbeatTimeout: the vehicle was silent for ten seconds.
+            OperationTimeout: the end was not reported in time.
+        """
+        self._loop.run(self.aio.retract, timeout=timeout)
+
+    def load_line(self) -> None:
+        """Load new line: the motor turns slowly. Returns when WINCH_STATUS reports it. Raises as :meth:`retract`."""
+        self._loop.run(self.aio.load_line)
+
+    def abandon_line(self) -> None:
+        """Spool out all line and release it. Returns when WINCH_STATUS reports it. Raises as :meth:`retract`."""
+        self._loop.run(self.aio.abandon_line)
+
+    def load_payload(self) -> None:
+        """Run slowly until a payload is attached. Returns when WINCH_STATUS reports it. Raises as :meth:`retract`."""
+        self._loop.run(self.aio.load_payload)
+
+
+class Shell(BlockTwin["AsyncShell"]):
+    """PX4's system shell, open for the duration of an ``async with`` block: ``vehicle.shell()`` (SERIAL_CONTROL).
+
+    PX4 has one shell for each of its ports, which all stations on that port share. aerokit sends each line once, and
+    does not know what it does: a command of the shell is no order. The messages have neither numbers nor answers, so a
+    bad link loses parts of the text.
+
+    Entering raises:
+        NotSupported: ArduPilot, which has no shell. Nothing was sent.
+        BusyError: this shell was entered before; call ``vehicle.shell()`` again.
+        OperationTimeout: there was no prompt within five seconds.
+    """
+
+    def write(self, line: str) -> None:
+        """Send one line without waiting for its output; :meth:`read` returns that.
+
+        Args:
+            line: at most 1000 bytes, without a line break.
+
+        Raises:
+            InvalidArgument: it is too long or has a line break, or the block is not open. Nothing was sent.
+        """
+        self._loop.call(self.aio.write, line)
+
+    def read(self, *, timeout: float | None = None) -> str:
+        """Return the next piece of output, up to 70 bytes, with echoes and prompts.
+
+        Args:
+            timeout: seconds; None waits without a limit.
+
+        Raises:
+            InvalidArgument: the timeout is out of range, or the block is not open.
+            OperationTimeout: there was no output in time.
+        """
+        return self._loop.run(self.aio.read, timeout=timeout)
+
+    def run(self, command: str, *, timeout: float = 10.0) -> str:
+        """Run a command and return its output, when the shell shows its prompt again.
+
+        A cancelled or timed out call does not end the command. Output that was not read before is discarded.
+
+        Args:
+            command: at most 1000 bytes, without a line break.
+            timeout: seconds until the prompt, above 0.
+
+        Raises:
+            InvalidArgument: as for :meth:`write`.
+            OperationTimeout: there was no prompt in time; the text has the output so far.
+        """
+        return self._loop.run(self.aio.run, command, timeout=timeout)
+
 
 class TemporaryParameters(TemporarilyTwin):
     """Other values for the duration of a block, which yields the results; see :meth:`Parameters.temporarily`."""
@@ -1360,8 +1782,8 @@ class Parameters(TwinOf["AsyncParameters"]):
         """Read ArduPilot's ``apm.pdef.xml`` or ``apm.pdef.json``, or PX4's ``parameters.xml`` or ``parameters.json``.
 
         Metadata does not restrict writes: a value outside the documented range is set, and its result has a ``note``.
-            Only values that the type cannot represent are refused. Metadata also identifies changes that need a reboot.
-            PX4's has the defaults.
+        Only values that the type cannot represent are refused. Metadata also identifies changes that need a reboot.
+        The metadata of PX4 contains the defaults.
 
         Raises:
             FileFormatError: the file is damaged, or of another kind.
@@ -1620,10 +2042,10 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         Raises:
             InvalidArgument: the plan is invalid, or has a position that is too far away. Nothing was sent.
             MissionRejected: the vehicle refused; see ``item``, ``result`` and ``reasons``.
-            MissionTimeout: it stopped answering; ``missing`` has the items that it did not confirm.
-            VerificationFailed: it confirmed the plan, but has other items.
-            NotSupported: ``"ftp"`` was requested, but it has none.
-            FileError, FileTimeout: the same for a file, with ``"ftp"``.
+            MissionTimeout: the vehicle stopped answering; ``missing`` has the items that it did not confirm.
+            VerificationFailed: the vehicle confirmed the plan, but has different items.
+            NotSupported: ``"ftp"`` was requested, but the vehicle does not support it.
+            FileError, FileTimeout: the vehicle refused or did not answer an operation on a file, with ``"ftp"``.
             OperationTimeout: not done within ``timeout``.
         """
         self._loop.run(
@@ -1670,8 +2092,8 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
             MissionRejected: the vehicle refused.
-            MissionTimeout: it stopped answering.
-            VerificationFailed: it confirmed, but still has items.
+            MissionTimeout: the vehicle stopped answering.
+            VerificationFailed: the vehicle confirmed the command, but still has items.
             OperationTimeout: not done within ``timeout``.
         """
         self._loop.run(self.aio.clear, idle_timeout_s=idle_timeout_s, timeout=timeout)
@@ -1720,9 +2142,9 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
 
         Raises:
             InvalidArgument: there is no such item. Nothing was sent.
-            OperationRejected: it is not armed, or its mode changed meanwhile.
+            OperationRejected: the vehicle is not armed, or its mode changed meanwhile.
             CommandRejected: the vehicle refused: it has no mission, no position, …; see ``reasons``.
-            OperationTimeout: it accepted but stayed in another mode.
+            OperationTimeout: the vehicle accepted the command but stayed in another mode.
             NotSupported: this type of vehicle has no mission mode.
         """
         self._loop.run(self.aio.start, item, timeout=timeout)
@@ -1808,10 +2230,10 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
         Raises:
             InvalidArgument: the plan is invalid, or has a position that is too far away. Nothing was sent.
             MissionRejected: the vehicle refused; see ``item``, ``result`` and ``reasons``.
-            MissionTimeout: it stopped answering; ``missing`` has the items that it did not confirm.
-            VerificationFailed: it confirmed the plan, but has other items.
-            NotSupported: ``"ftp"`` was requested, but it has none.
-            FileError, FileTimeout: the same for a file, with ``"ftp"``.
+            MissionTimeout: the vehicle stopped answering; ``missing`` has the items that it did not confirm.
+            VerificationFailed: the vehicle confirmed the plan, but has different items.
+            NotSupported: ``"ftp"`` was requested, but the vehicle does not support it.
+            FileError, FileTimeout: the vehicle refused or did not answer an operation on a file, with ``"ftp"``.
             OperationTimeout: not done within ``timeout``.
         """
         self._loop.run(
@@ -1858,8 +2280,8 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
             MissionRejected: the vehicle refused.
-            MissionTimeout: it stopped answering.
-            VerificationFailed: it confirmed, but still has items.
+            MissionTimeout: the vehicle stopped answering.
+            VerificationFailed: the vehicle confirmed the command, but still has items.
             OperationTimeout: not done within ``timeout``.
         """
         self._loop.run(self.aio.clear, idle_timeout_s=idle_timeout_s, timeout=timeout)
@@ -1871,7 +2293,7 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
 
         Raises:
             CommandRejected: the vehicle refused; PX4 does not support the command.
-            CommandTimeout: it did not answer.
+            CommandTimeout: the vehicle did not answer.
         """
         self._loop.run(self.aio.enable, on)
 
@@ -1916,10 +2338,10 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
         Raises:
             InvalidArgument: the plan is invalid, or has a position that is too far away. Nothing was sent.
             MissionRejected: the vehicle refused; see ``item``, ``result`` and ``reasons``.
-            MissionTimeout: it stopped answering; ``missing`` has the items that it did not confirm.
-            VerificationFailed: it confirmed the plan, but has other items.
-            NotSupported: ``"ftp"`` was requested, but it has none.
-            FileError, FileTimeout: the same for a file, with ``"ftp"``.
+            MissionTimeout: the vehicle stopped answering; ``missing`` has the items that it did not confirm.
+            VerificationFailed: the vehicle confirmed the plan, but has different items.
+            NotSupported: ``"ftp"`` was requested, but the vehicle does not support it.
+            FileError, FileTimeout: the vehicle refused or did not answer an operation on a file, with ``"ftp"``.
             OperationTimeout: not done within ``timeout``.
         """
         self._loop.run(
@@ -1966,8 +2388,8 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
             MissionRejected: the vehicle refused.
-            MissionTimeout: it stopped answering.
-            VerificationFailed: it confirmed, but still has items.
+            MissionTimeout: the vehicle stopped answering.
+            VerificationFailed: the vehicle confirmed the command, but still has items.
             OperationTimeout: not done within ``timeout``.
         """
         self._loop.run(self.aio.clear, idle_timeout_s=idle_timeout_s, timeout=timeout)
@@ -2037,8 +2459,8 @@ class Camera(TwinOf["AsyncCamera"]):
         Raises:
             NotSupported: the camera has no modes. Nothing was sent.
             CommandRejected: the camera refused: it is busy, or does not support this mode.
-            CommandTimeout: it did not answer.
-            OperationTimeout: it accepted, but reports another mode; or no camera was found.
+            CommandTimeout: the camera did not answer.
+            OperationTimeout: the camera accepted the command but reports another mode, or no camera was found.
         """
         self._loop.run(self.aio.set_mode, mode, timeout=timeout)
 
@@ -2067,7 +2489,7 @@ class Camera(TwinOf["AsyncCamera"]):
         Raises:
             InvalidArgument: ``number`` is out of range. Nothing was sent.
             CommandRejected: the camera refused: it is busy, or there is no such medium.
-            CommandTimeout: it did not answer; it may be formatting.
+            CommandTimeout: the camera did not answer; it may be formatting.
             OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.format_storage, number, timeout=timeout, on_progress=on_progress)
@@ -2077,7 +2499,7 @@ class Camera(TwinOf["AsyncCamera"]):
 
         Raises:
             CommandRejected: the camera refused.
-            CommandTimeout: it did not answer.
+            CommandTimeout: the camera did not answer.
             OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.reset_settings)
@@ -2107,7 +2529,7 @@ class Camera(TwinOf["AsyncCamera"]):
             InvalidArgument: an argument is out of range. Nothing was sent.
             NotSupported: the camera cannot track a point. Nothing was sent.
             CommandRejected: the camera refused.
-            CommandTimeout: it did not answer.
+            CommandTimeout: the camera did not answer.
             OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.track_point, x, y, radius=radius, status_hz=status_hz)
@@ -2126,7 +2548,7 @@ class Camera(TwinOf["AsyncCamera"]):
             InvalidArgument: an argument is out of range, or the rectangle is empty. Nothing was sent.
             NotSupported: the camera cannot track a rectangle. Nothing was sent.
             CommandRejected: the camera refused.
-            CommandTimeout: it did not answer.
+            CommandTimeout: the camera did not answer.
             OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.track_rectangle, left, top, right, bottom, status_hz=status_hz)
@@ -2137,7 +2559,7 @@ class Camera(TwinOf["AsyncCamera"]):
         Raises:
             NotSupported: the camera cannot track. Nothing was sent.
             CommandRejected: the camera refused.
-            CommandTimeout: it did not answer.
+            CommandTimeout: the camera did not answer.
             OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.stop_tracking)
@@ -2154,7 +2576,7 @@ class Camera(TwinOf["AsyncCamera"]):
             InvalidArgument: ``steps`` is out of range. Nothing was sent.
             NotSupported: the camera has no zoom. Nothing was sent.
             CommandRejected: the camera refused.
-            CommandTimeout: it did not answer; it may have zoomed.
+            CommandTimeout: the camera did not answer; it may have zoomed.
             OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.zoom_step, steps)
@@ -2192,7 +2614,7 @@ class Camera(TwinOf["AsyncCamera"]):
             InvalidArgument: ``steps`` is out of range. Nothing was sent.
             NotSupported: the camera cannot be focused. Nothing was sent.
             CommandRejected: the camera refused.
-            CommandTimeout: it did not answer; it may have moved.
+            CommandTimeout: the camera did not answer; it may have moved.
             OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.focus_step, steps)
@@ -2211,7 +2633,7 @@ class Camera(TwinOf["AsyncCamera"]):
         Raises:
             NotSupported: the camera cannot be focused. Nothing was sent.
             CommandRejected: the camera refused.
-            CommandTimeout: it did not answer.
+            CommandTimeout: the camera did not answer.
             OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.auto_focus, kind)
@@ -2259,8 +2681,8 @@ class Camera(TwinOf["AsyncCamera"]):
             InvalidArgument: ``status_hz`` is out of range. Nothing was sent.
             NotSupported: the camera records no video. Nothing was sent.
             CommandRejected: the camera refused: it is busy, or in the wrong mode.
-            CommandTimeout: it did not answer; it may be recording.
-            OperationTimeout: it accepted but does not record, or no camera was found.
+            CommandTimeout: the camera did not answer; it may be recording.
+            OperationTimeout: the camera accepted the command but does not record, or no camera was found.
         """
         self._loop.run(self.aio.start_video, status_hz=status_hz, timeout=timeout)
 
@@ -2270,8 +2692,8 @@ class Camera(TwinOf["AsyncCamera"]):
         Raises:
             NotSupported: the camera records no video. Nothing was sent.
             CommandRejected: the camera refused.
-            CommandTimeout: it did not answer.
-            OperationTimeout: it accepted but still records, or no camera was found.
+            CommandTimeout: the camera did not answer.
+            OperationTimeout: the camera accepted the command but still records, or no camera was found.
         """
         self._loop.run(self.aio.stop_video, timeout=timeout)
 
@@ -2304,7 +2726,7 @@ class Camera(TwinOf["AsyncCamera"]):
             InvalidArgument: the number is out of range. Nothing was sent.
             NotSupported: the camera has no streams. Nothing was sent.
             CommandRejected: the camera refused, or has no such stream.
-            CommandTimeout: it did not answer.
+            CommandTimeout: the camera did not answer.
             OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.start_streaming, stream)
@@ -2330,7 +2752,7 @@ class Camera(TwinOf["AsyncCamera"]):
 
         Raises:
             CommandRejected: the camera refused, or has no such sensor.
-            CommandTimeout: it did not answer.
+            CommandTimeout: the camera did not answer.
             OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.select_source, primary, secondary)
@@ -2373,9 +2795,9 @@ class Camera(TwinOf["AsyncCamera"]):
         Raises:
             NotSupported: the camera takes no pictures. Nothing was sent.
             CommandRejected: the camera refused: it is busy, or in the wrong mode.
-            CommandTimeout: it did not answer; it may have taken the picture.
-            OperationRejected: it failed to take the picture.
-            OperationTimeout: it reported no picture, or no camera was found.
+            CommandTimeout: the camera did not answer; it may have taken the picture.
+            OperationRejected: the camera failed to take the picture.
+            OperationTimeout: the camera reported no picture, or no camera was found.
         """
         return self._loop.run(self.aio.take_photo, timeout=timeout)
 
@@ -2493,7 +2915,7 @@ class Settings(TwinOf["AsyncSettings"]):
 
         Raises:
             NotSupported: the camera names no definition file.
-            CommandRejected, OperationTimeout: it did not send CAMERA_INFORMATION.
+            CommandRejected, OperationTimeout: the camera did not send CAMERA_INFORMATION.
             InvalidArgument: the address has another scheme.
             FileFormatError: the file is invalid, or has more than 16 MB.
             FileError, FileTimeout, RemoteProtocolError: as for :meth:`aerokit.vehicle.files.files.Files.read`.
@@ -2612,8 +3034,8 @@ class Component(TwinOf["AsyncComponent"]):
         """Request identity and capabilities of the component (COMPONENT_INFORMATION_BASIC).
 
         Raises:
-            CommandRejected: it does not support the message.
-            OperationTimeout: it did not answer within ``timeout`` seconds.
+            CommandRejected: the component does not support the message.
+            OperationTimeout: the component did not answer within ``timeout`` seconds.
         """
         return self._loop.run(self.aio.information, timeout=timeout)
 
@@ -2626,9 +3048,9 @@ class Component(TwinOf["AsyncComponent"]):
             timeout: seconds to wait for the address of the file.
 
         Raises:
-            NotSupported: it has no such file, or the file is not on the vehicle.
+            NotSupported: the component has no such file, or the file is not on the vehicle.
             FileFormatError: the file is damaged.
-            FileError, FileTimeout: it cannot be read.
+            FileError, FileTimeout: the file cannot be read.
         """
         return self._loop.run(self.aio.metadata, kind, timeout=timeout)
 
@@ -2683,7 +3105,7 @@ class Component(TwinOf["AsyncComponent"]):
             where: predicate to select one of several messages.
 
         Raises:
-            CommandRejected: it refused.
+            CommandRejected: the component refused.
             OperationTimeout: the message did not arrive.
         """
         return self._loop.run(self.aio.request, message_type, *params, timeout=timeout, where=where)
@@ -2898,6 +3320,56 @@ class Vehicle(VehicleTwin):
         return StateCell(self._loop, self.aio.status_text)
 
     @cached_property
+    def imu(self) -> StateCell[Imu]:
+        """Accelerations, turn rates, magnetic field, pressures and temperature in SI units (HIGHRES_IMU)."""
+        return StateCell(self._loop, self.aio.imu)
+
+    @cached_property
+    def scaled_imu(self) -> StateCell[Imu]:
+        """Accelerations, turn rates and magnetic field of the first sensor (SCALED_IMU)."""
+        return StateCell(self._loop, self.aio.scaled_imu)
+
+    @cached_property
+    def raw_imu(self) -> StateCell[RawImu]:
+        """Readings of the first inertial sensor, without units (RAW_IMU)."""
+        return StateCell(self._loop, self.aio.raw_imu)
+
+    @cached_property
+    def odometry(self) -> StateCell[Odometry]:
+        """Pose and velocity with covariances, as the estimator reports them (ODOMETRY)."""
+        return StateCell(self._loop, self.aio.odometry)
+
+    @cached_property
+    def scaled_pressure(self) -> StateCell[AirPressure]:
+        """Absolute and differential pressure and temperature (SCALED_PRESSURE)."""
+        return StateCell(self._loop, self.aio.scaled_pressure)
+
+    @cached_property
+    def ground_truth(self) -> StateCell[Position]:
+        """True position in a simulation (HIL_STATE_QUATERNION, SIM_STATE)."""
+        return StateCell(self._loop, self.aio.ground_truth)
+
+    @cached_property
+    def altitude(self) -> StateCell[Altitude]:
+        """Altitudes above sea, home, terrain and ground (ALTITUDE)."""
+        return StateCell(self._loop, self.aio.altitude)
+
+    @cached_property
+    def actuator_control_target(self) -> StateCell[ActuatorControls]:
+        """Control outputs before mixing, of PX4 before 1.14 (ACTUATOR_CONTROL_TARGET)."""
+        return StateCell(self._loop, self.aio.actuator_control_target)
+
+    @cached_property
+    def transponder(self) -> StateCell[tuple[Aircraft, ...]]:
+        """Other aircraft that an ADS-B receiver on board has reported, the latest last (ADSB_VEHICLE)."""
+        return StateCell(self._loop, self.aio.transponder)
+
+    @cached_property
+    def winch_status(self) -> StateCell[WinchStatus]:
+        """Line length and speed, tension and state of a winch (WINCH_STATUS)."""
+        return StateCell(self._loop, self.aio.winch_status)
+
+    @cached_property
     def connection(self) -> Connection:
         """The connection of the vehicle."""
         return Connection(self._loop, self.aio.connection)
@@ -2926,6 +3398,89 @@ class Vehicle(VehicleTwin):
     def link_quality(self) -> StateCell[LinkReport]:
         """Packet loss, delay and data rates of the last second."""
         return StateCell(self._loop, self.aio.link_quality)
+
+    @property
+    def actuators(self) -> Actuators:
+        """Servos, relays, actuators, landing gear, lights, motor test, parachute."""
+        return self._part("actuators", Actuators)
+
+    def gripper(self, number: int = 1) -> Gripper:
+        """Return a gripper: ``await vehicle.gripper().release()``.
+
+        Args:
+            number: 1 to 8; ArduPilot and PX4 have one, and ignore the number.
+
+        Raises:
+            InvalidArgument: the number is out of range.
+        """
+        return Gripper(self._loop, self._loop.call(self.aio.gripper, number))
+
+    def winch(self, number: int = 1, *, component_id: int | None = None) -> Winch:
+        """Return a winch: ``await vehicle.winch().pay_out(5)``.
+
+        Args:
+            number: 1 to 255; ArduCopter has one, and ignores the number.
+            component_id: a winch that is a MAVLink component, 1 to 255 (MAV_COMP_ID_WINCH is 169); None: the
+                autopilot's.
+
+        Raises:
+            InvalidArgument: a number is out of range.
+        """
+        return Winch(self._loop, self._loop.call(self.aio.winch, number, component_id=component_id))
+
+    def shell(self) -> Shell:
+        """Open PX4's system shell for the duration of an ``async with`` block (SERIAL_CONTROL)."""
+        return Shell(self._loop, self._loop.call(self.aio.shell))
+
+    def play_tune(self, tune: str) -> None:
+        """Play a tune on the vehicle's buzzer, such as ``"T200 L8 CEGO5C"`` (PLAY_TUNE); returns at once.
+
+        The message has no acknowledgement, and vehicles without a buzzer ignore it.
+
+        Args:
+            tune: notes in the format of QBASIC 1.1's PLAY statement, 1 to 230 characters: T tempo, L length, O octave,
+                A to G notes, P pause.
+
+        Raises:
+            InvalidArgument: it is empty, too long, or has other characters. Nothing was sent.
+        """
+        self._loop.call(self.aio.play_tune, tune)
+
+    def send_status_text(self, text: str, *, severity: Severity = "info") -> None:
+        """Send a status text of your program to the vehicle and to other stations (STATUSTEXT); returns at once.
+
+        ArduPilot writes it to its flight log; it has no acknowledgement. A text of more than 50 bytes is sent in
+        chunks. ``connection.send`` of a message without ``vehicle`` reaches stations only.
+
+        Args:
+            text: 1 to 1000 bytes in UTF-8.
+            severity: name of a MAV_SEVERITY.
+
+        Raises:
+            InvalidArgument: the text is empty or too long, or the severity is unknown. Nothing was sent.
+        """
+        self._loop.call(self.aio.send_status_text, text, severity=severity)
+
+    def inject_failure(self, unit: FailingUnit, kind: FailureKind, *, instance: int = 0, intent: FailureIntent) -> None:
+        """Make a part of the vehicle fail, to test how the vehicle reacts (MAV_CMD_INJECT_FAILURE).
+
+        PX4 only, if SYS_FAILURE_EN is 1. Returns when PX4 has acknowledged; it reports the failure by status texts and
+        by the health of its sensors. **The vehicle may crash.** ``kind="ok"`` ends the failure. Sent once.
+
+        Args:
+            unit: the part that fails, as FAILURE_UNIT.
+            kind: how it fails, as FAILURE_TYPE.
+            instance: number of the part from 1 to 16; 0 for all.
+            intent: must be ``"inject failure"``, so that no other call can be mistaken for it.
+
+        Raises:
+            InvalidArgument: an argument is not allowed. Nothing was sent.
+            NotSupported: ArduPilot, whose simulation has SIM_ parameters instead. Nothing was sent.
+            CommandRejected: SYS_FAILURE_EN is 0, or PX4 cannot let this part fail in this way.
+            CommandTimeout: there was no acknowledgement. PX4 sends none for a part that nothing there can let fail; the
+                part may have failed nevertheless.
+        """
+        self._loop.run(self.aio.inject_failure, unit, kind, instance=instance, intent=intent)
 
     def command(
         self,
@@ -3168,7 +3723,7 @@ class Vehicle(VehicleTwin):
             InvalidArgument: this vehicle has no such mode; the text lists its modes. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             OperationRejected: a pilot or a failsafe has chosen another mode meanwhile.
-            OperationTimeout: it accepted and stayed in another mode, or did not acknowledge.
+            OperationTimeout: the vehicle did not acknowledge, or accepted the mode but stayed in another one.
         """
         self._loop.run(self.aio.set_mode, mode, timeout=timeout)
 
@@ -3181,7 +3736,7 @@ class Vehicle(VehicleTwin):
             NotSupported: this vehicle has no mode for it. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             OperationRejected: a pilot or a failsafe has chosen another mode meanwhile.
-            OperationTimeout: it accepted and stayed in another mode, or did not acknowledge.
+            OperationTimeout: the vehicle did not acknowledge, or accepted the mode but stayed in another one.
         """
         self._loop.run(self.aio.hold)
 
@@ -3264,10 +3819,10 @@ class Vehicle(VehicleTwin):
                 estimates. Where the vehicle can run its checks on request, they are run again for this.
             CommandTimeout: there was no acknowledgement, and the vehicle did not arm; the text says whether it may
                 still arm.
-            OperationRejected: it is armed already in a mode other than ``mode`` (nothing was sent), or another party
-                disarmed it or changed its mode meanwhile.
+            OperationRejected: the vehicle is armed already in a mode other than ``mode`` (nothing was sent), or another
+                party disarmed it or changed its mode meanwhile.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
-            OperationTimeout: it accepted the command and did not arm.
+            OperationTimeout: the vehicle accepted the command but did not arm.
         """
         self._loop.run(self.aio.arm, mode=mode, force=force, timeout=timeout, max_silence_s=max_silence_s)
 
@@ -3289,7 +3844,7 @@ class Vehicle(VehicleTwin):
             CommandRejected: the vehicle refused, usually because it is flying.
             CommandTimeout: there was no acknowledgement.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
-            OperationTimeout: it accepted the command and did not disarm.
+            OperationTimeout: the vehicle accepted the command but did not disarm.
         """
         self._loop.run(self.aio.disarm, force=force, timeout=timeout, max_silence_s=max_silence_s)
 
@@ -3301,11 +3856,11 @@ class Vehicle(VehicleTwin):
             timeout: seconds until the vehicle has restarted.
 
         Raises:
-            OperationRejected: it is armed, or not known to be disarmed. Nothing was sent.
-            CommandRejected: it refused.
+            OperationRejected: the vehicle is armed, or not known to be disarmed. Nothing was sent.
+            CommandRejected: the vehicle refused.
             CommandTimeout: there was no acknowledgement, and it did not reboot.
             LinkLost: the link went down with the vehicle (USB, TCP); connect again.
-            OperationTimeout: it did not restart in time.
+            OperationTimeout: the vehicle did not restart in time.
         """
         self._loop.run(self.aio.reboot, force=force, timeout=timeout)
 
@@ -3370,7 +3925,7 @@ class Vehicle(VehicleTwin):
             OperationRejected: the mode changed (a pilot, a failsafe) or the vehicle disarmed on the way.
             CommandTimeout: there was no acknowledgement.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
-            OperationTimeout: it did not arrive in time, or does not move.
+            OperationTimeout: the vehicle did not arrive in time, or does not move.
         """
         self._loop.run(
             self.aio.go_to,
@@ -3406,8 +3961,8 @@ class Vehicle(VehicleTwin):
     ) -> None:
         """Turn on the spot and return when the vehicle has this heading.
 
-        ArduPilot: changes to GUIDED and sends MAV_CMD_CONDITION_YAW. PX4 has no such command: the vehicle stops and
-            turns by MAV_CMD_DO_REPOSITION.
+        An ArduPilot vehicle changes to GUIDED and gets MAV_CMD_CONDITION_YAW. PX4 does not support this command, so the
+        vehicle stops and turns by MAV_CMD_DO_REPOSITION.
 
         Args:
             heading_deg: −360 to 360, clockwise from north; with ``relative`` an angle to turn by, negative to the
@@ -3423,7 +3978,7 @@ class Vehicle(VehicleTwin):
             CommandRejected: the vehicle refused.
             OperationRejected: the mode changed or it disarmed meanwhile.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
-            OperationTimeout: it did not reach the heading in time.
+            OperationTimeout: the vehicle did not reach the heading in time.
         """
         self._loop.run(
             self.aio.set_heading,
@@ -3450,7 +4005,7 @@ class Vehicle(VehicleTwin):
             InvalidArgument: the place has no altitude above mean sea level. Nothing was sent.
             CommandRejected: the vehicle refused: it has no position, or the place is invalid.
             CommandTimeout: there was no acknowledgement.
-            OperationTimeout: it accepted, and HOME_POSITION did not report it.
+            OperationTimeout: the vehicle accepted the command, but HOME_POSITION does not report the new place.
         """
         self._loop.run(self.aio.set_home, place, timeout=timeout)
 
@@ -3481,11 +4036,11 @@ class Vehicle(VehicleTwin):
         Raises:
             InvalidArgument: the altitude is out of range. Nothing was sent.
             NotSupported: this type of vehicle cannot take off.
-            OperationRejected: it is not armed or is flying already, or its mode changed or it disarmed meanwhile.
+            OperationRejected: the vehicle is not armed, is flying already, or changed its mode or disarmed meanwhile.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
-            OperationTimeout: it did not reach the altitude in time, or does not move.
+            OperationTimeout: the vehicle did not reach the altitude in time, or does not move.
             ValueUnknownError: home is not known, and PX4 needs its altitude.
         """
         self._loop.run(self.aio.take_off, altitude_m, timeout=timeout, max_silence_s=max_silence_s)
@@ -3505,7 +4060,7 @@ class Vehicle(VehicleTwin):
             CommandTimeout: there was no acknowledgement.
             OperationRejected: the mode changed meanwhile.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
-            OperationTimeout: it was not on the ground in time.
+            OperationTimeout: the vehicle was not on the ground in time.
         """
         self._loop.run(self.aio.land, timeout=timeout, max_silence_s=max_silence_s)
 

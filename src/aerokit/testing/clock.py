@@ -21,7 +21,7 @@ async def test_an_hour_of_silence() -> None:
 
 Rules:
 
-- ``time()`` starts at 0.0 and advances only when no callback is ready and no socket has data.
+- ``time()`` starts at 0.0. It advances only when no callback is ready and no socket has data.
 - Real sockets are polled before every jump, but a jump does not wait for them. Use
   `aerokit.transport.memory_link_pair` in tests on virtual time.
 - The clock stands still during ``run_in_executor`` (``asyncio.to_thread``, name resolution). Other threads may wake
@@ -62,7 +62,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         self._now = 0.0
         self._outside_calls = 0
         self._deadlock_timeout_s = deadlock_timeout_s
-        self._own_sources: int | None = None  # Size of the selector map with the loop's self-pipe only.
+        self._own_sources: int | None = None  # Size of the selector map when only the loop's self-pipe is registered.
         super().__init__(_JumpingSelector(self))
         self._own_sources = len(self._selector_map())
         self._clock_resolution = 1e-9  # A rounding error in now + (when - now) must not miss a timer.
@@ -72,14 +72,14 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         return self._now
 
     def jump(self, when: float) -> bool:
-        """Advance the clock to ``when``, unless something else happens before; return True if it did.
+        """Advance the clock to ``when`` if nothing else is scheduled before; return True if the clock was advanced.
 
-        To be called in a callback. It saves a turn of the loop to a caller that would only set a timer for ``when``.
+        Call this in a callback instead of setting a timer for ``when``, to save an iteration of the loop.
         """
         if self._ready or self._stopping or self._outside_calls or self._debug:  # type: ignore[attr-defined]
             return False
         timers: list[asyncio.TimerHandle] = self._scheduled  # type: ignore[attr-defined]
-        while timers and timers[0].cancelled():  # As the loop itself does in its next turn.
+        while timers and timers[0].cancelled():  # asyncio does the same in the next iteration.
             self._timer_cancelled_count -= 1  # type: ignore[attr-defined]
             heappop(timers)._scheduled = False  # type: ignore[attr-defined]
         if timers and timers[0].when() <= when + self._clock_resolution:
@@ -142,10 +142,10 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
 def run_virtual(coroutine: Coroutine[Any, Any, T]) -> T:
     """Run a coroutine on a `VirtualClockLoop`, and cancel its remaining tasks, as asyncio.run does.
 
-    Raises TypeError for anything but a coroutine, such as a coroutine function.
+    Raises TypeError for a coroutine function, or any other object that is not a coroutine.
     """
     if not asyncio.iscoroutine(coroutine):
-        raise TypeError(f"run_virtual takes a coroutine, as main() gives one, not {coroutine!r}")
+        raise TypeError(f"run_virtual requires a coroutine, such as main(), not {coroutine!r}")
 
     async def main() -> T:
         return await coroutine
@@ -161,7 +161,7 @@ VIRTUAL_BACKEND: tuple[str, dict[str, object]] = ("asyncio", {"loop_factory": Vi
 
 
 class _JumpingSelector(selectors.DefaultSelector):
-    """Calls the loop instead of waiting."""
+    """Selector that calls ``wait_for_events`` of the loop instead of waiting in real time."""
 
     def __init__(self, loop: VirtualClockLoop) -> None:
         super().__init__()
@@ -177,7 +177,7 @@ class _JumpingSelector(selectors.DefaultSelector):
 
 
 def _where(task: asyncio.Task[Any]) -> str:
-    """Return the name of a waiting task and its innermost line."""
+    """Return the name of a task and the line at which it waits."""
     place = ""
     step: object = task.get_coro()
     while isinstance(step, CoroutineType):

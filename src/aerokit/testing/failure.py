@@ -42,7 +42,7 @@ def _flatten(flown: Iterable[SimulatedFleet | Flight | ServedFlight]) -> list[Fl
 def _describe(flight: Flight | ServedFlight) -> list[str]:
     try:
         return _describe_flight(flight)
-    except Exception as error:  # The vehicle itself raises, but the failed test must be reported.
+    except Exception as error:  # A failed simulation must not prevent the report.
         return [f"{flight.simulated!r} fails: {error!r}"]
 
 
@@ -71,7 +71,7 @@ def _picture(flights: Sequence[Flight | ServedFlight], test: str, directory: Pat
     try:
         directory.mkdir(parents=True, exist_ok=True)
         save_picture([flight.track for flight in flights], path)
-    except OSError as error:  # The failed test must be reported without a picture, too.
+    except OSError as error:  # A missing picture must not prevent the report.
         return f"no picture: {error}"
     return f"track in {path}"
 

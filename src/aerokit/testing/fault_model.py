@@ -59,17 +59,17 @@ class FaultModel(Snapshot):
 
 
 class Air:
-    """A transmission medium, busy until its last frame was sent. Two directions that share one are half duplex."""
+    """A transmission medium that carries one frame at a time. Two directions that share a medium are half duplex."""
 
     def __init__(self) -> None:
         self.busy_until: float = -math.inf
 
 
 class FaultyPath:
-    """One direction. Equal model, seed, frames and times produce equal results.
+    """Applies faults to one direction of a link. Equal model, seed, frames and times produce equal results.
 
-    Counters: ``frames`` and ``bytes`` that were passed in, and frames that were ``lost`` (including outages),
-    ``overflowed`` (queue full), ``duplicated``, ``reordered`` and ``corrupted``.
+    ``frames`` and ``bytes`` count the traffic passed in; ``lost`` (including outages), ``overflowed`` (queue full),
+    ``duplicated``, ``reordered`` and ``corrupted`` count frames.
     """
 
     frames: int
@@ -81,7 +81,7 @@ class FaultyPath:
 
     def __init__(self, model: FaultModel, seed: object = 0, air: Air | None = None) -> None:
         self.model = model
-        """May be replaced at any time."""
+        """Faults of this direction; may be replaced at any time."""
         self.frames = self.lost = self.overflowed = 0
         self.bytes: int = 0
         self.duplicated = self.reordered = self.corrupted = 0
@@ -92,7 +92,7 @@ class FaultyPath:
         self._latest_due = -math.inf
 
     def start(self, now: float) -> None:
-        """Start the time of the outages; by default the first frame does."""
+        """Start the clock of the outages. Without this call, the first frame starts it."""
         self._started_at = now
 
     def carry(self, data: bytes, now: float) -> list[tuple[float, bytes]]:
@@ -105,7 +105,8 @@ class FaultyPath:
         return arrivals
 
     def _carry_frame(self, frame: bytes, now: float) -> list[tuple[float, bytes]]:
-        # Always draw as many numbers, so that changing one share does not move the other faults.
+        # Each frame consumes the same number of random numbers, so that changing one share does not change which frames
+        # have the other faults.
         model, draws = self.model, [self._chance() for _ in range(5)]
         lost, doubled = draws[0] < model.loss, draws[1] < model.duplication
         held, bad, jitter = (
@@ -134,7 +135,7 @@ class FaultyPath:
         return [(due, frame)] * (1 + doubled)
 
     def _transmit(self, size: int, now: float) -> float | None:
-        """Return the time at which the last byte was sent; None if the queue is full."""
+        """Return the time at which the last byte is sent; None if the queue is full."""
         model, air = self.model, self._air
         begin = max(now, air.busy_until)
         if math.isinf(model.bandwidth):

@@ -14,12 +14,12 @@ from aerokit.testing.stage import FlightScheduler
 from aerokit.testing.track import true_point
 from aerokit.testing.track_points import TrackPoint
 
-# Calls a function with the scheduler of the flight.
+# Function that passes the scheduler of the flight to another function, possibly later.
 ScheduleWith = Callable[[Callable[[FlightScheduler], None]], None]
 
 
 class FaultInjector:
-    """Methods inject a fault at once, or ``after_s`` simulated seconds from now, and some for a duration ``for_s``.
+    """Injects faults at once or after ``after_s`` simulated seconds, permanently or for ``for_s`` simulated seconds.
 
     Before the flight is opened, times count from its opening. Scheduled faults survive a reboot of the vehicle.
     Raises InvalidArgument for times and shares out of range.
@@ -30,10 +30,10 @@ class FaultInjector:
         self._schedule_with = schedule_with
 
     def when(self, condition: Callable[[TrackPoint], bool]) -> FaultInjector:
-        """Return an injector whose faults start once this condition on the true state is met; times count from there.
+        """Return an injector whose faults start when a condition on the true state is first met.
 
-        The condition is checked ten times per simulated second: ``faults.when(lambda point: point.altitude_m >
-        15).lose_gps()``.
+        ``after_s`` counts from that time. The condition is checked ten times per simulated second:
+        ``faults.when(lambda point: point.altitude_m > 15).lose_gps()``.
         """
 
         def is_true() -> bool:
@@ -63,18 +63,18 @@ class FaultInjector:
         self._set("motor_failed", True, False, after_s, None)
 
     def drop_packets(self, share: float, *, after_s: float = 0.0, for_s: float | None = None) -> None:
-        """Lose this share of packets, 0 to 1, in both directions; determined by the seed."""
+        """Lose this share of packets, 0 to 1, in both directions. The seed of the vehicle determines which."""
         if not 0.0 <= share <= 1.0:
             raise InvalidArgument(f"share = {share!r} is not allowed: 0 to 1")
         self._set("loss", share, 0.0, after_s, for_s)
         self._set("loss_incoming", share, 0.0, after_s, for_s)
 
     def go_silent(self, for_s: float | None = None, *, after_s: float = 0.0) -> None:
-        """Interrupt the radio in both directions; the vehicle continues to fly. None is without an end."""
+        """Interrupt the radio in both directions, by default until :meth:`end`. The vehicle continues to fly."""
         self._set("silent", True, False, after_s, for_s)
 
     def hang(self, for_s: float | None = None, *, after_s: float = 0.0) -> None:
-        """Freeze the autopilot: it does not receive, move or send. None is without an end."""
+        """Freeze the autopilot, by default until :meth:`end`: it does not receive, move or send."""
         self._set("frozen", True, False, after_s, for_s)
 
     def fail_prearm(self, reason: str, *, after_s: float = 0.0, for_s: float | None = None) -> None:
@@ -91,12 +91,12 @@ class FaultInjector:
     def set_wind(
         self, *, north_m_s: float = 0.0, east_m_s: float = 0.0, gusts_m_s: float = 0.0, after_s: float = 0.0
     ) -> None:
-        """Set the wind in m/s, as the direction in which the air moves; gusts are a standard deviation."""
+        """Set the velocity of the air, in m/s. ``gusts_m_s`` is the standard deviation of gusts."""
         wind = SimulatedWind(north_m_s, east_m_s, gusts_m_s)
         self._plan(partial(setattr, self._vehicle.motion, "wind", wind), after_s)
 
     def set_battery(self, percent: float, *, after_s: float = 0.0) -> None:
-        """Set the remaining battery charge, 0 to 100; it drains from there."""
+        """Set the remaining battery charge in percent; the battery continues to drain."""
         if not 0.0 <= percent <= 100.0:
             raise InvalidArgument(f"percent = {percent!r} is not allowed: 0 to 100")
         self._plan(partial(setattr, self._vehicle.battery, "percent", percent), after_s)

@@ -38,7 +38,7 @@ LIMIT = 256 * 1024
 
 
 class StalledQueue:
-    """A stalled TCP connection: the operating system accepts ``system_bytes``, the rest is queued.
+    """Simulates a stalled TCP connection: the operating system accepts ``system_bytes``, further bytes are queued.
 
     ``carry(data, peer)`` sends bytes; ``dropped`` and ``stalled`` are callbacks of an `Outbox`.
     """
@@ -58,7 +58,7 @@ class StalledQueue:
 
     @property
     def unsent_bytes(self) -> int:
-        """Bytes in the queues and in the operating system."""
+        """Number of bytes in the queues and in the simulated operating system."""
         return sum(outbox.unsent_bytes for outbox in self._outboxes.values())
 
     def write(self, data: bytes, peer: Peer) -> None:
@@ -74,7 +74,7 @@ class StalledQueue:
             outbox.discard()
 
     def drain(self) -> None:
-        """Send the bytes of the operating system, and queued ones that have not expired."""
+        """Send the bytes that the operating system has accepted, and the queued bytes that have not expired."""
         self._is_stalled = False
         system, self._system = self._system, []
         for data, peer in system:
@@ -121,11 +121,10 @@ class FaultyLink(Link):
     """Loses, duplicates, delays and corrupts the traffic of another link, as `FaultModel` specifies.
 
     ``outgoing`` applies to what this program writes, ``incoming`` to what it receives; ``model`` is the default of
-    both. Each direction has random numbers of its own, derived from ``seed``, so that a program on virtual time gets
-    the same faults in every run. ``half_duplex`` makes both directions share the medium, each with its own
-    ``bandwidth``.
+    both. Each direction has a separate random generator, derived from ``seed``, so that a program on virtual time gets
+    the same faults in every run. With ``half_duplex``, only one direction transmits at a time.
 
-    The wrapped link must not be open, and belongs to this one from now on.
+    The wrapped link must not be open; this link opens and closes it.
     """
 
     def __init__(
@@ -182,8 +181,9 @@ class FaultyLink(Link):
     def stall(self, system_bytes: int = 0) -> None:
         """Stop sending until :meth:`drain`, like TCP over an interrupted network.
 
-        The operating system accepts ``system_bytes``, which arrive after :meth:`drain`. The rest is dropped after a
-        second unless it is sent before; :meth:`discard_unsent` discards it. The link must be open.
+        The simulated operating system accepts ``system_bytes``, which arrive after :meth:`drain`. Further bytes are
+        queued, and dropped if they wait for more than a second; :meth:`discard_unsent` drops them at once. The link
+        must be open.
         """
         if self._stalled_queue is not None:
             self._stalled_queue.close()
@@ -293,7 +293,7 @@ class FaultyLink(Link):
 
 
 class _IncomingPath:
-    """Receiver of the wrapped link."""
+    """Receiver of the wrapped link, which applies the faults of the incoming direction."""
 
     def __init__(self, path: FaultyPath, receiver: Receiver, when_lost: Callable[[], None]) -> None:
         self._path, self._receiver, self._when_lost = path, receiver, when_lost
@@ -304,12 +304,12 @@ class _IncomingPath:
     def bytes_received(self, data: bytes, peer: Peer) -> None:
         """See `Receiver`."""
         for due, piece in self._path.carry(data, self._in_flight.loop.time()):
-            if self._is_closed:  # Closed by the receiver.
+            if self._is_closed:  # The receiver closed the link while processing the previous piece.
                 return
             self._in_flight.put(due, lambda piece=piece: self._receiver.bytes_received(piece, peer))  # type: ignore[misc]
 
     def link_lost(self, error: LinkLost) -> None:
-        """See `Receiver`; frames in transit are delivered before."""
+        """See `Receiver`; frames in transit are delivered first."""
         self._when_lost()
         if not self._is_closed:
             self._in_flight.put(self._in_flight.latest_due, lambda: self._receiver.link_lost(error))
@@ -353,7 +353,7 @@ class _DeliveryQueue:
         self._waiting: list[tuple[float, int, Callable[[], None]]] = []
         self._count = 0
         self._timer: asyncio.TimerHandle | None = None
-        self._timer_at = 0.0  # uvloop's TimerHandle.when() fails for a time that has passed.
+        self._timer_at = 0.0  # Stored here because uvloop's TimerHandle.when() fails for a time that has passed.
 
     def __bool__(self) -> bool:
         return bool(self._waiting)
@@ -388,6 +388,6 @@ class _DeliveryQueue:
         try:
             while self._waiting and self._waiting[0][0] <= now:
                 heappop(self._waiting)[2]()
-        finally:  # The loop reports an exception of an action; the other actions still run.
+        finally:  # If an action raises, the loop reports the exception, and the other actions still run.
             if self._waiting:
                 self._schedule()

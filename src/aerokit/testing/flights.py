@@ -51,7 +51,7 @@ class Flight:
         self.track: Track = fleet._scheduler.tracks[number]
         """True track of the vehicle."""
         self.journal: Journal = fleet._scheduler.journals[number]
-        """Texts that it sent and messages that it received."""
+        """Texts that the vehicle sent and messages that it received."""
         self.faults: FaultInjector = FaultInjector(self.simulated, fleet._schedule_with)
         """Injects faults."""
         self._vehicle: aerokit.Vehicle | None = None
@@ -87,7 +87,7 @@ class Flight:
 class SimulatedFleet(Sequence[Flight]):
     """Simulated vehicles on one link, with system ids 1, 2, 3 …; a sequence of `Flight`. It can be opened once.
 
-    They stand in a row, ``spacing_m`` metres apart, to the east of the ``home`` of the first.
+    The vehicles stand in a row to the east of ``home``, ``spacing_m`` metres apart.
     """
 
     def __init__(
@@ -131,7 +131,7 @@ class SimulatedFleet(Sequence[Flight]):
         return self._nearest()[0]
 
     def assert_stayed_apart(self, distance_m: float) -> None:
-        """Assert that no two vehicles came nearer to each other than this, in space; they start 5 m apart."""
+        """Assert that no two vehicles came nearer to each other than this, in space. They start 5 m apart."""
         __tracebackhide__ = True
         nearest, time_s, names = self._nearest()
         assert nearest >= distance_m, f"{names} came nearer than {distance_m:g} m: {nearest:.1f} m at {time_s:.1f} s"
@@ -149,7 +149,7 @@ class SimulatedFleet(Sequence[Flight]):
 
     @property
     def link(self) -> Link:
-        """The program's end of the link, to be opened by it; needs ``connect=False``."""
+        """The program's end of the link, for programs that connect themselves; needs ``connect=False``."""
         self._check_open()
         if self._connect:
             raise RuntimeError("this link is in use: open the flight with connect=False to connect by yourself")
@@ -169,7 +169,7 @@ class SimulatedFleet(Sequence[Flight]):
     async def open(self) -> AsyncIterator[SimulatedFleet]:
         """Switch the vehicles on and connect; tracks and journals remain after the block.
 
-        Raises RuntimeError if it was opened before.
+        Raises RuntimeError if the fleet was opened before.
         """
         if self._was_opened:
             raise RuntimeError("this flight was opened before; create a new one")
@@ -252,7 +252,7 @@ async def open_flight(kind: str = "copter", **options: Any) -> AsyncIterator[Fli
 def open_fleet(*kinds: str, count: int | None = None, **options: Any) -> AbstractAsyncContextManager[SimulatedFleet]:
     """Open vehicles of these kinds, or ``count`` of one kind, on one link; options as of `open_flight`.
 
-    They stand ``spacing_m`` metres (5) apart, to the east of the ``home`` of the first.
+    The vehicles stand in a row to the east of ``home``, ``spacing_m`` metres (by default 5) apart.
     """
     return SimulatedFleet(*expand_kinds(kinds, count), **options).open()
 

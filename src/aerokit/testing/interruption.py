@@ -18,10 +18,10 @@ _CONTEXT_FILES = ("interruption.py", "served.py")
 
 
 class Interruption:
-    """Interrupts the main thread only within `allowed`; KeyboardInterrupt is raised out of that block.
+    """Raises KeyboardInterrupt in the main thread, but only within a block of `allowed`.
 
-    Python may run a signal handler long after the signal was sent, also while a block is entered or left, where
-    nothing would catch the exception. Such a signal is sent again, and none is pending when the block has ended.
+    Python may run a signal handler long after the signal was sent, even while the block is entered or left, where no
+    code would catch the exception. In that case the signal is sent again. No signal is pending after the block.
     """
 
     def __init__(self) -> None:
@@ -40,12 +40,11 @@ class Interruption:
         try:
             yield
         finally:
-            with self._lock:  # An interruption must not come between its check and its signal.
+            with self._lock:  # `_interrupts` must not send the signal after this block has ended.
                 self._is_allowed = False
             if signal.getsignal(signal.SIGINT) == self._on_signal:
-                signal.signal(
-                    signal.SIGINT, self._before
-                )  # Runs a pending handler before the previous one is restored.
+                # signal.signal() runs a pending handler first.
+                signal.signal(signal.SIGINT, self._before)
 
     @contextlib.contextmanager
     def at_an_error(self) -> Iterator[None]:
@@ -67,7 +66,7 @@ class Interruption:
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         if not self._is_sent:
-            if callable(self._before):  # SIG_IGN is not callable.
+            if callable(self._before):  # signal.SIG_IGN is not callable
                 self._before(number, frame)
         elif self._is_allowed and not self._is_delivered and not _is_in_context_code(frame):
             self._is_delivered = True
@@ -93,6 +92,6 @@ def _is_in_context_code(frame: FrameType | None) -> bool:
 def _interrupt_main() -> None:
     ident = threading.main_thread().ident
     if hasattr(signal, "pthread_kill") and ident is not None:
-        signal.pthread_kill(ident, signal.SIGINT)  # Wakes it from a sleep, too.
+        signal.pthread_kill(ident, signal.SIGINT)  # unlike interrupt_main, this ends a sleep
     else:
         _thread.interrupt_main()

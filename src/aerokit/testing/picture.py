@@ -30,7 +30,7 @@ _CORNERS = 90  # Corners of the polygon that draws a circle.
 
 
 class Drawable(Protocol):
-    """A track, as far as it is drawn."""
+    """Interface of a track that can be drawn."""
 
     home: Position
     name: str
@@ -41,7 +41,7 @@ class Drawable(Protocol):
     def __len__(self) -> int: ...
 
     def local(self, origin: Position | None = None) -> list[tuple[float, float, float]]:
-        """Return metres north and east of ``origin`` (default: home), and up from its own home."""
+        """Return metres north and east of ``origin`` (default: home), and metres above home."""
         ...
 
     def snapshot(self) -> Drawable:
@@ -52,7 +52,7 @@ class Drawable(Protocol):
 def check_picture(path: str | PathLike[str]) -> None:
     """Check a file name.
 
-    Raises InvalidArgument for another suffix than .svg and .png, AerokitError if .png needs Pillow.
+    Raises InvalidArgument if the suffix is neither .svg nor .png, AerokitError for .png if Pillow is not installed.
     """
     suffix = Path(path).suffix.lower()
     if suffix not in (".svg", ".png"):

@@ -32,12 +32,12 @@ _REPORTED_CLASSES = ("SimulatedFleet", "Flight", "ServedFlight")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add the option for pictures."""
+    """Add the option ``--flight-pictures``."""
     parser.getgroup("aerokit").addoption(
         _PICTURES,
         metavar="DIR",
-        help="draw what was flown in value test that fails, as an .svg in this directory, and put its recording"
-        " (.tlog) and report (.html) there",
+        help="for each failed test, write a picture of its flights (.svg), their recordings (.tlog) and reports (.html)"
+        " to this directory",
     )
 
 
@@ -48,10 +48,10 @@ def pytest_load_initial_conftests(early_config: pytest.Config) -> None:
     Rewriting is slow, and two threads that import at once can fail in Python 3.10 to 3.12.
     """
     rewriting = getattr(early_config.pluginmanager, "rewrite_hook", None)
-    marked = getattr(rewriting, "_must_rewrite", None)  # There is no public way to undo it.
+    marked = getattr(rewriting, "_must_rewrite", None)  # pytest has no public API to exclude a package.
     if rewriting is not None and isinstance(marked, set):
         marked -= {name for name in marked if name.partition(".")[0] == "aerokit"}
-        rewriting.mark_rewrite()  # Clears the cached decision for each name.
+        rewriting.mark_rewrite()  # clears the cached decisions
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -112,7 +112,7 @@ def dronekit_address(served_flight: ServedFlight) -> str:
 
 @pytest.fixture
 def dronekit() -> Iterator[ModuleType]:
-    """`aerokit.dronekit`; during the test ``import dronekit`` imports it, unless another one was imported before."""
+    """`aerokit.dronekit`. During the test, ``import dronekit`` imports it, unless DroneKit was imported before."""
     import sys
 
     import aerokit.dronekit as package
@@ -140,7 +140,7 @@ def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> Generator[None, object, object]:
     """Open ``flight`` and ``fleet`` around an ``async def`` test, and run it if there is no async plugin.
 
-    A test of a served vehicle fails as soon as the vehicle does.
+    A test with ``served_flight`` fails as soon as the simulated vehicle raises an exception.
     """
     with _replaced(pyfuncitem, _runnable(pyfuncitem)), _failing_at_once(pyfuncitem):
         return (yield)
@@ -155,7 +155,7 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
         from aerokit.testing.failure import failure_report
 
         directory = item.config.getoption(_PICTURES)
-        report.sections.append(("what was flown", failure_report(flown, item.nodeid, directory)))
+        report.sections.append(("simulated flights", failure_report(flown, item.nodeid, directory)))
     return report
 
 
@@ -167,7 +167,7 @@ def _requested(request: pytest.FixtureRequest) -> tuple[tuple[str, ...], dict[st
 
 
 def _flight_fixtures(item: pytest.Item) -> list[Any]:
-    """Return the flight fixtures of a test; a project may have other fixtures of these names."""
+    """Return the flight fixtures of a test, ignoring fixtures of the project with the same names."""
     funcargs = getattr(item, "funcargs", None) or {}
     found = [funcargs[name] for name in ("flight", "fleet", "served_flight") if name in funcargs]
     return [value for value in found if type(value).__module__.startswith("aerokit.testing.")]
@@ -194,7 +194,7 @@ def _runnable(item: pytest.Function) -> Callable[..., Any]:
     fleets = _fleets(item)
     test: Callable[..., Any] = item.obj
     opened = getattr(test, _OPENED, None)
-    if opened is not None:  # A wrapper of pytest-asyncio, which runs it on a loop of its own.
+    if opened is not None:  # The test is wrapped by pytest-asyncio, which runs it on another event loop.
         return _on_virtual_time(opened, instead_of=None if inspect.iscoroutinefunction(test) else test)
     if not fleets or not inspect.iscoroutinefunction(test):
         return test
@@ -230,7 +230,7 @@ def _only_on_virtual_time(opened: Callable[..., Any]) -> Callable[..., Any]:
             raise _NotVirtualTime
         await opened(**arguments)
 
-    setattr(run, _OPENED, opened)  # The attribute stays on the wrapper that pytest-asyncio creates.
+    setattr(run, _OPENED, opened)  # pytest-asyncio copies the attribute to its wrapper.
     return run
 
 

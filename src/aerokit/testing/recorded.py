@@ -37,7 +37,7 @@ class RecordedParameters:
         uncounted = [value.param_id for value in values if value.param_id not in counted]
         is_whole = bool(counted) and len(counted) == max(value.param_count for value in values)
         self.names = sorted(counted, key=lambda name: (counted[name], name))
-        """Names in the order of the list."""
+        """Names in the order in which the vehicle lists its parameters."""
         self.names += [name for name in dict.fromkeys(uncounted) if name != HASH_NAME]
         # The hash covers all parameters, so it is unknown if some were not recorded.
         self._hash = is_whole and HASH_NAME in uncounted
@@ -49,7 +49,7 @@ class RecordedParameters:
         return name in self.names or (name == HASH_NAME and self._hash)
 
     def value_message(self, name: str, index: int | None = None) -> m.ParamValue:
-        """Return the PARAM_VALUE that was written or recorded last, or else the first one to come."""
+        """Return the PARAM_VALUE as last written or recorded; before its first record, return that record."""
         position, recorded = self._vehicle.position_s, None
         for time, value in self._vehicle.recording.parameters:
             if value.param_id == name and (recorded is None or time <= position):
@@ -141,7 +141,7 @@ class RecordedMissions:
             vehicle.on(kind, handler)
 
     def items(self, mission_type: int) -> tuple[AnyItem, ...] | None:
-        """Return the current plan, or else the first one to come; None if the recording has none."""
+        """Return the current plan, or the first one if none was recorded yet; None if the recording has none."""
         if mission_type in self._written:
             return self._written[mission_type]
         position, found = self._vehicle.position_s, None
@@ -239,18 +239,21 @@ _MESSAGE_REQUESTS = (MavCmd.SET_MESSAGE_INTERVAL, MavCmd.REQUEST_MESSAGE)
 
 
 class RecordedVehicle(SimulatedVehicle):
-    """Plays a ``.tlog`` by the simulator's clock. Requests of clients do not change what is streamed.
+    """Plays a ``.tlog`` by the simulator's clock. Requests of clients do not change the streamed messages.
 
-    - Commands: the recorded acknowledgements of the same params, or else of any, with their recorded delay; the last
-      ones repeat. Commands that were not recorded are UNSUPPORTED. REQUEST_MESSAGE sends the latest recorded
-      message.
-    - Parameters: the recorded ones, renumbered without gaps. A parameter can be set if it was set in the recording;
-      else its value stays. Unknown names are not answered, or by PARAM_ERROR if the vehicle sent that.
-    - Missions: the recorded ones. Uploads and clearing get their recorded result, or UNSUPPORTED.
-    - Files are refused, there are no logs, and rates cannot be changed; TIMESYNC and PING are answered.
+    - Commands: a command gets the acknowledgements that were recorded for the same params, otherwise for any params,
+      with the recorded delay. The last acknowledgement repeats. Commands that were not recorded are UNSUPPORTED.
+      REQUEST_MESSAGE sends the latest recorded message.
+    - Parameters: the recorded parameters, renumbered without gaps. Only parameters that were set in the recording can
+      be set. A request for an unknown name gets PARAM_ERROR if the recorded vehicle sent that message, otherwise no
+      answer.
+    - Missions: the recorded missions. Uploads and clearing get their recorded result, or UNSUPPORTED.
+    - File operations are refused, the list of logs is empty, and rates cannot be changed. TIMESYNC and PING are
+      answered.
 
-    ``system_id`` selects a vehicle of the recording, None the first; ``start_s`` skips the beginning; ``repeat``
-    restarts at the end, where the vehicle is silent otherwise. Faults apply, except those of sensors and parameters.
+    ``system_id`` selects a vehicle of the recording, by default the first; ``start_s`` skips the beginning. At the end
+    the vehicle falls silent; with ``repeat`` the recording starts again. Faults apply, except those of sensors and
+    parameters.
 
     Raises InvalidArgument if there is no vehicle in the recording, OSError if it cannot be read.
     """
@@ -295,7 +298,7 @@ class RecordedVehicle(SimulatedVehicle):
 
     @property
     def has_ended(self) -> bool:
-        """True when everything was played and the vehicle is silent."""
+        """True if the whole recording was played and the vehicle is silent."""
         return not self._is_on and self._next >= len(self.recording.stream)
 
     def boot(self) -> None:
@@ -308,10 +311,10 @@ class RecordedVehicle(SimulatedVehicle):
         """Do nothing: all ports receive the recording."""
 
     def build(self, message_id: int) -> Message | None:
-        """Return None: there are no streams of its own."""
+        """Return None: only recorded messages are streamed."""
 
     def tick(self, dt: float) -> None:
-        """Do nothing: nothing moves."""
+        """Do nothing: motion is recorded, not simulated."""
 
     def _plan_next(self) -> None:
         stream = self.recording.stream
@@ -365,7 +368,7 @@ class RecordedVehicle(SimulatedVehicle):
         return self._on_command(command)
 
     def _latest_message(self, message_id: int) -> Message | None:
-        """Return the latest message of this id, or else the first one to come."""
+        """Return the latest message with this id, or the first one if none was played yet."""
         stream = self.recording.stream
         own = (self.system_id, self.component_id)
         for _, frame in (*reversed(stream[: self._next]), *stream[self._next :]):

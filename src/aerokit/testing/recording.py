@@ -17,11 +17,11 @@ from aerokit.mavlink.message import Message
 from aerokit.mavlink.tlog import read_tlog
 
 MAX_GAP_S = 60.0
-"""Longer gaps are cut to this: the recording was paused, or the clock was set."""
+"""Longer gaps are shortened to this: during them the recording was paused, or the clock was set."""
 
 _ITEMS = (m.MissionItemInt, m.MissionItem)
 _COMMANDS = (m.CommandLong, m.CommandInt)
-# Answers to a client of the recording; they are not streamed.
+# Answers to requests of the recorded client, which are not streamed.
 _ANSWERS = frozenset(
     kind.ID
     for kind in (
@@ -198,4 +198,4 @@ def _autopilot(frames: list[tuple[float, Frame]], system_id: int | None) -> tupl
         if heartbeat.autopilot != MavAutopilot.INVALID and heartbeat.type != MavType.GCS:
             return frame.system_id, frame.component_id
     which = "no vehicle" if system_id is None else f"no vehicle with system id {system_id}"
-    raise InvalidArgument(f"the recording has {which} in it: no heartbeat of an autopilot")
+    raise InvalidArgument(f"the recording contains {which}: it has no heartbeat of such an autopilot")

@@ -37,15 +37,15 @@ class ServedFlight:
         self.address: str = server.addresses[0].replace("tcpin:", "tcp:")
         """Address to connect to, such as "tcp:127.0.0.1:5760"."""
         self.simulated: Any = vehicle
-        """The simulated vehicle. It runs on another thread: read it, and change it by the methods of ``faults``."""
+        """The simulated vehicle, which runs on another thread: only read it, and change it by ``faults``."""
         self.track: Track = scheduler.tracks[0]
         """True track of the vehicle."""
         self.journal: Journal = scheduler.journals[0]
-        """Texts that it sent and messages that it received."""
+        """Texts that the vehicle sent and messages that it received."""
         self.faults: FaultInjector = FaultInjector(vehicle, lambda plan: portal.call(self._schedule_with, plan))
         """Injects faults."""
         self.recording: FlightRecording | None = recording
-        """Recording of its link; None without ``record=True``."""
+        """Recording of the vehicle's link; None without ``record=True``."""
         self._portal, self._server, self._scheduler, self._interruption = (
             portal,
             server,
@@ -57,9 +57,9 @@ class ServedFlight:
 
     @contextmanager
     def raising_vehicle_errors(self) -> Iterator[None]:
-        """Raise an exception of the simulated vehicle as soon as it occurs, in place of its consequences.
+        """Context manager that raises an exception of the simulated vehicle as soon as it occurs.
 
-        Its link is closed, which ends calls that wait for the vehicle, and the main thread is interrupted as by
+        The vehicle's link is closed, which ends calls that wait for the vehicle. The main thread is interrupted as by
         Ctrl-C, which ends programs that poll.
         """
         try:

@@ -42,7 +42,7 @@ class Track(Sequence[TrackPoint]):
 
     def __init__(self, home: Position, points: Sequence[TrackPoint] = (), *, name: str = "track") -> None:
         self.home = home
-        """Position where it was switched on."""
+        """Position where the vehicle was switched on."""
         self.name = name
         """Name in the legend of a picture."""
         self.failure: TrackFailure | None = None
@@ -70,7 +70,7 @@ class Track(Sequence[TrackPoint]):
         self._points.append(point)
 
     def refresh_with(self, refresh: Callable[[], None] | None) -> None:
-        """Call this function before each read of the track, to append what has happened since; None stops that."""
+        """Set a function that is called before each read of the track, to append recent points; None removes it."""
         self._refresh = refresh
 
     def _refreshed(self) -> list[TrackPoint]:
@@ -106,7 +106,7 @@ class Track(Sequence[TrackPoint]):
 
     @property
     def armed_s(self) -> float:
-        """Simulated seconds for which it was armed."""
+        """Simulated seconds for which the vehicle was armed."""
         return sum(after.time_s - before.time_s for before, after in pairwise(self) if before.armed)
 
     @property
@@ -116,7 +116,7 @@ class Track(Sequence[TrackPoint]):
 
     @property
     def battery_used_percent(self) -> float:
-        """Battery use in percent of a full battery; negative if it was charged."""
+        """Battery use in percent of a full battery; negative if the battery was charged."""
         return self[0].battery_percent - self.end.battery_percent if self else 0.0
 
     @property
@@ -125,7 +125,7 @@ class Track(Sequence[TrackPoint]):
         return sum(math.dist(one, other) for one, other in pairwise(self.local()))
 
     def local(self, origin: Position | None = None) -> list[tuple[float, float, float]]:
-        """Return metres north and east of ``origin`` (default: home), and up from its own home."""
+        """Return metres north and east of ``origin`` (default: home), and metres above home."""
         plane = metres_from(self.home if origin is None else origin)
         return [(*plane(point), point.altitude_m) for point in self]
 
@@ -136,7 +136,7 @@ class Track(Sequence[TrackPoint]):
         return track
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Draw it as .svg or .png; see `aerokit.testing.picture.save_picture`."""
+        """Draw the track as .svg or .png; see `aerokit.testing.picture.save_picture`."""
         save_picture([self], path)
 
     def nearest_m(self, place: Position) -> float:
@@ -144,85 +144,92 @@ class Track(Sequence[TrackPoint]):
         return self._nearest(place)[0]
 
     def assert_reached_altitude(self, altitude_m: float, *, within_m: float = 1.0) -> None:
-        """Assert that it was once at least ``altitude_m - within_m`` metres above home."""
+        """Assert that the vehicle was at least ``altitude_m - within_m`` metres above home at some time."""
         __tracebackhide__ = True
         highest = self._highest()
         reached = highest.altitude_m >= altitude_m - within_m
         self._record_failure(reached, TrackFailure(highest, altitude_m=altitude_m))
-        assert reached, f"it did not reach {altitude_m:g} m: the highest point was {highest}"
+        assert reached, f"the vehicle did not reach {altitude_m:g} m: the highest point was {highest}"
 
     def assert_stayed_below(self, altitude_m: float) -> None:
-        """Assert that it was never more than ``altitude_m`` metres above home."""
+        """Assert that the vehicle was never more than ``altitude_m`` metres above home."""
         __tracebackhide__ = True
         highest = self._highest()
         self._record_failure(highest.altitude_m <= altitude_m, TrackFailure(highest, altitude_m=altitude_m))
-        assert highest.altitude_m <= altitude_m, f"it rose above {altitude_m:g} m: {highest}"
+        assert highest.altitude_m <= altitude_m, f"the vehicle rose above {altitude_m:g} m: {highest}"
 
     def assert_passed(self, place: Position, *, within_m: float = 2.0) -> None:
-        """Assert that it came this near to a position; in space if that has an ``altitude_relative_m``."""
+        """Assert that the vehicle came this near to a position: along the ground, or in space if the position has an
+        ``altitude_relative_m``.
+        """
         __tracebackhide__ = True
         distance, point = self._nearest(place)
         self._record_failure(distance <= within_m, TrackFailure(point, (place, within_m)))
         assert distance <= within_m, (
-            f"it did not pass within {within_m:g} m of {_text(place)}: the nearest was {distance:.1f} m, {point}"
+            f"the vehicle did not pass within {within_m:g} m of {_text(place)}: the minimum distance was"
+            f" {distance:.1f} m, {point}"
         )
 
     def assert_stayed_within(self, radius_m: float, *, of: Position | None = None) -> None:
-        """Assert that it was never farther than this from home, or from a position, along the ground."""
+        """Assert that the vehicle was never farther than this from home, or from a position, along the ground."""
         __tracebackhide__ = True
         centre = self.home if of is None else of
         distance, point = self._farthest(centre)
         name = "home" if of is None else _text(of)
         self._record_failure(distance <= radius_m, TrackFailure(point, (centre, radius_m)))
-        assert distance <= radius_m, f"it left the {radius_m:g} m around {name}: {distance:.1f} m away {point}"
+        assert distance <= radius_m, f"the vehicle left the {radius_m:g} m around {name}: {distance:.1f} m away {point}"
 
     def assert_stayed_inside(self, polygon: Sequence[Position]) -> None:
-        """Assert that it never left a polygon of at least three corners."""
+        """Assert that the vehicle never left a polygon of at least three corners."""
         __tracebackhide__ = True
-        assert len(polygon) >= 3, f"a polygon has three places or more, not {len(polygon)}"
+        assert len(polygon) >= 3, f"a polygon needs at least three positions, not {len(polygon)}"
         _ = self.end
         plane = metres_from(self.home)
         border = PolygonZone([plane(corner) for corner in polygon])
         outside = [point for point in self if border.outside_m(plane(point)) > 0]
         self._record_failure(not outside, TrackFailure(outside[0] if outside else self.end, polygon=polygon))
-        assert not outside, f"it left the polygon, {len(outside)} of {len(self)} points are outside; first {outside[0]}"
+        assert not outside, (
+            f"the vehicle left the polygon: {len(outside)} of {len(self)} points are outside, the first {outside[0]}"
+        )
 
     def assert_stayed_slower_than(self, speed_m_s: float) -> None:
-        """Assert that its ground speed was never above this."""
+        """Assert that the ground speed was never above this, in m/s."""
         __tracebackhide__ = True
         fastest = self._fastest()
         self._record_failure(fastest.speed_m_s <= speed_m_s, TrackFailure(fastest))
         assert fastest.speed_m_s <= speed_m_s, (
-            f"it was faster than {speed_m_s:g} m/s: {fastest.speed_m_s:.1f} m/s {fastest}"
+            f"the vehicle was faster than {speed_m_s:g} m/s: {fastest.speed_m_s:.1f} m/s {fastest}"
         )
 
     def assert_landed_near(self, place: Position | None = None, *, within_m: float = 2.0) -> None:
-        """Assert that it flew and ended on the ground near home, or near a position."""
+        """Assert that the vehicle flew, and ended on the ground near home, or near a position."""
         __tracebackhide__ = True
         end, target = self.end, self.home if place is None else place
         self._record_failure(self.max_altitude_m > _ON_GROUND_M, TrackFailure(end))
-        assert self.max_altitude_m > _ON_GROUND_M, f"it never took off: it ended {end}"
+        assert self.max_altitude_m > _ON_GROUND_M, f"the vehicle never took off: the track ends {end}"
         self._record_failure(abs(end.altitude_m) <= _ON_GROUND_M, TrackFailure(end, (target, within_m)))
-        assert abs(end.altitude_m) <= _ON_GROUND_M, f"it is not on the ground: it ended {end}"
+        assert abs(end.altitude_m) <= _ON_GROUND_M, f"the vehicle is not on the ground: the track ends {end}"
         distance = target.distance_to(end.position)
         name = "home" if place is None else _text(place)
         self._record_failure(distance <= within_m, TrackFailure(end, (target, within_m)))
-        assert distance <= within_m, f"it landed {distance:.1f} m from {name}, not within {within_m:g} m: {end}"
+        assert distance <= within_m, (
+            f"the vehicle landed {distance:.1f} m from {name}, not within {within_m:g} m: {end}"
+        )
 
     def assert_armed_at_end(self) -> None:
-        """Assert that it ended armed."""
+        """Assert that the vehicle is armed at the end."""
         __tracebackhide__ = True
         self._record_failure(self.end.armed, TrackFailure(self.end))
-        assert self.end.armed, f"it ended disarmed, {self.end}"
+        assert self.end.armed, f"the vehicle is disarmed at the end, {self.end}"
 
     def assert_disarmed_at_end(self) -> None:
-        """Assert that it ended disarmed."""
+        """Assert that the vehicle is disarmed at the end."""
         __tracebackhide__ = True
         self._record_failure(not self.end.armed, TrackFailure(self.end))
-        assert not self.end.armed, f"it ended armed, {self.end}"
+        assert not self.end.armed, f"the vehicle is armed at the end, {self.end}"
 
     def assert_modes(self, *names: str) -> None:
-        """Assert that it was in these modes in this order; other modes in between are allowed."""
+        """Assert that the vehicle was in these modes in this order; other modes in between are allowed."""
         __tracebackhide__ = True
         modes = iter(self.modes)
         for name in names:
@@ -282,8 +289,8 @@ def true_point(vehicle: SimulatedVehicle) -> TrackPoint:
 def record_track(vehicle: SimulatedVehicle, *, interval_s: float = 0.1) -> Track:
     """Record the true position of a vehicle every ``interval_s`` simulated seconds, also after reboots.
 
-    It uses the vehicle's timers and changes neither its bytes nor its random numbers. Raises InvalidArgument for a
-    vehicle without a true position, and for an interval that is not positive.
+    Recording uses the vehicle's timers, and changes neither its messages nor its random numbers. Raises InvalidArgument
+    for a vehicle without a true position, and for an interval that is not positive.
     """
     if not interval_s > 0:
         raise InvalidArgument(f"interval_s = {interval_s!r} must be above 0")
@@ -304,8 +311,9 @@ def record_track(vehicle: SimulatedVehicle, *, interval_s: float = 0.1) -> Track
 
 
 def min_distance_m(one: Track, other: Track) -> tuple[float, float]:
-    """Return the minimum distance of two vehicles in space and its time; (infinity, 0) if they never ran at the same
-    time.
+    """Return the minimum distance between two vehicles in space, and its time.
+
+    Returns (infinity, 0) if the vehicles never ran at the same time.
     """
     ups = one.home.altitude_amsl_m or 0.0, other.home.altitude_amsl_m or 0.0
     way = [

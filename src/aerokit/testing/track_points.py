@@ -18,10 +18,10 @@ class TrackPoint:
     latitude_deg: float
     longitude_deg: float
     altitude_m: float
-    """Above home."""
+    """Altitude above home."""
     armed: bool
     mode: str
-    """Mode name, as clients have it."""
+    """Mode name, as in ``vehicle.mode``."""
     speed_m_s: float = 0.0
     """Ground speed."""
     battery_percent: float = 100.0
@@ -43,14 +43,14 @@ class TrackFailure:
 
     point: TrackPoint
     circle: tuple[Position, float] | None = None
-    """Centre, and radius in metres."""
+    """Centre and radius in metres of the allowed area."""
     polygon: Sequence[Position] | None = None
     altitude_m: float | None = None
-    """Above home."""
+    """Altitude above home."""
 
 
 def metres_from(origin: Position) -> Callable[[Position | TrackPoint], tuple[float, float]]:
-    """Return a function to metres north and east of ``origin``, on a plane that touches the ellipsoid there."""
+    """Return a function that converts to metres north and east of ``origin``, on the tangent plane of the ellipsoid."""
     latitude, longitude = origin.latitude_deg, origin.longitude_deg
     per_latitude = geo.distance_m(latitude - 0.005, longitude, latitude + 0.005, longitude) * 100
     per_longitude = geo.distance_m(latitude, longitude - 0.005, latitude, longitude + 0.005) * 100

@@ -12,6 +12,7 @@ from aerokit.vehicle.commanding.arming import ArmingActions
 from aerokit.vehicle.commanding.flight import FlightActions, ModeActions
 from aerokit.vehicle.commanding.messaging import MessagingActions
 from aerokit.vehicle.commanding.travel import LookActions, TravelActions
+from aerokit.vehicle.devices.actions import DeviceActions
 from aerokit.vehicle.missions.context import PlanContext
 from aerokit.vehicle.state.field import MESSAGE_IDS
 
@@ -41,7 +42,16 @@ PICTURE_MESSAGE_IDS = tuple(MESSAGE_IDS[name] for name in ("CameraImageCaptured"
 
 
 @checks_arguments
-class Vehicle(ReadOnly, FlightActions, TravelActions, LookActions, ArmingActions, ModeActions, MessagingActions):
+class Vehicle(
+    ReadOnly,
+    FlightActions,
+    TravelActions,
+    LookActions,
+    ArmingActions,
+    ModeActions,
+    MessagingActions,
+    DeviceActions,
+):
     """One remote vehicle. Coroutines send commands to it; properties only read. Every call can be cancelled.
 
     Create it with :func:`aerokit.connect`. State is held in cells (``vehicle.position.value``, ``.age``,
@@ -152,7 +162,7 @@ class Vehicle(ReadOnly, FlightActions, TravelActions, LookActions, ArmingActions
         """The vehicle's flight logs."""
         from aerokit.vehicle.files.logs import Logs
 
-        return Logs(self._session.transfers, self.files)
+        return Logs(self._session.transfers, self.files, self._context)
 
     @cached_property
     def parameters(self) -> Parameters:

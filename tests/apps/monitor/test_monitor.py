@@ -174,7 +174,7 @@ async def test_connection_end_ends_monitor(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(Monitor, "run_async", run)
     async with simulated_link(SimulatedCopter(boot_time_s=0.0)) as link:
         wire = Wire(link)
-        with pytest.raises(LinkLost, match="pulled out"):
+        with pytest.raises(LinkLost, match="unplugged"):
             await monitor.run_monitor(wire)
 
 

@@ -224,13 +224,13 @@ def test_raw_order_ends_with_any_mode_change() -> None:
     ],
 )
 def test_mode_is_in_doubt_until_result_is_known(error: Exception | None, in_doubt: bool, settles_at: float) -> None:
-    helm, observed = Stage().arbiter, list[bool]()
-    with nullcontext() if error is None else pytest.raises(type(error)), helm.changing_mode():
-        observed.append(helm.mode_is_in_doubt)
+    arbiter, observed = Stage().arbiter, list[bool]()
+    with nullcontext() if error is None else pytest.raises(type(error)), arbiter.changing_mode():
+        observed.append(arbiter.mode_is_in_doubt)
         if error is not None:
             raise error
-    assert [*observed, helm.mode_is_in_doubt] == [True, in_doubt]
-    assert helm.mode_settles_at == settles_at
+    assert [*observed, arbiter.mode_is_in_doubt] == [True, in_doubt]
+    assert arbiter.mode_settles_at == settles_at
 
 
 def test_refused_mode_keeps_previous_doubt() -> None:

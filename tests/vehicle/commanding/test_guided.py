@@ -337,7 +337,7 @@ async def test_setpoint_stream_survives_disarm_and_arm(grounded: Flight) -> None
 
 
 async def test_setpoint_stream_connection_lost_raises(flying: Flight) -> None:
-    with pytest.raises(SetpointStreamStopped, match="cable was pulled out") as caught:
+    with pytest.raises(SetpointStreamStopped, match="cable was unplugged") as caught:
         async with flying.vehicle.guided.velocity() as stream:
             await stream.fly(NORTH, 1.0)
             flying.wire.lose()

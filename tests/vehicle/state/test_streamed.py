@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from typing import Any
 
 import pytest
 
@@ -17,6 +18,8 @@ from aerokit.vehicle.state.telemetry import Telemetry
 
 HEARTBEAT = messages.Heartbeat(2, 3, 81, 4, 3)
 CHANNELS: dict[str, int] = {f"chan{number}_raw": 1500 for number in range(1, 19)}
+SIM_STATE: dict[str, Any] = {field.name: 0.0 for field in messages.SimState.FIELDS}
+SIM_STATE |= {"lat_int": 473977000, "lon_int": 85456000}
 ANYTHING: dict[str, Message] = {
     "SysStatus": messages.SysStatus(1, 1, 1, 100, 12000, 100, 90, 0, 0, 0, 0, 0, 0),
     "SystemTime": messages.SystemTime(1_700_000_000_000_000, 5),
@@ -38,6 +41,10 @@ ANYTHING: dict[str, Message] = {
     "PowerStatus": messages.PowerStatus(5012, 0, 1),
     "EkfStatusReport": messages.EkfStatusReport(831, 0.1, 0.1, 0.1, 0.1, 0.1),
     "EstimatorStatus": messages.EstimatorStatus(0, 831, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 1.0, 1.0),
+    "HilStateQuaternion": messages.HilStateQuaternion(
+        0, (1.0, 0.0, 0.0, 0.0), 0.0, 0.0, 0.0, 473977000, 85456000, 488000, *[0] * 8
+    ),
+    "SimState": messages.SimState(**SIM_STATE),
     "Vibration": messages.Vibration(0, 1.0, 1.0, 1.0, 0, 0, 0),
 }
 

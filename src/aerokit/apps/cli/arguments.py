@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 DEFAULT_SIM_ADDRESS = "tcpin:127.0.0.1:{5760+10n}"
-"""The ports of SITL instances: 5760, 5770, 5780, …"""
+"""Default address template of ``aerokit sim``, with the ports of SITL instances: 5760, 5770, 5780 …"""
 _TEMPLATE_FIELD = re.compile(r"\{(?:(\d{1,5})\+)?(\d{0,3})(n|id)\}")
 
 
 def is_address_template(address: str) -> bool:
-    """Return True if the address has placeholders, so that each vehicle gets a link of its own."""
+    """Return True if the address has placeholders, so that each vehicle gets a separate link."""
     return _TEMPLATE_FIELD.search(address) is not None
 
 
@@ -158,7 +158,7 @@ def writable_file(text: str) -> str:
     """Parse the path of a file to write, in an existing directory."""
     path = Path(text)
     if path.is_dir() or not path.parent.is_dir():
-        why = "it is a directory" if path.is_dir() else f"directory {str(path.parent)!r} does not exist"
+        why = "the path is a directory" if path.is_dir() else f"directory {str(path.parent)!r} does not exist"
         raise ArgumentTypeError(f"{text!r} cannot be written: {why}")
     return text
 
@@ -171,11 +171,11 @@ def log_file(text: str) -> str:
 
 
 def directory(text: str) -> Path:
-    """Parse the path of a directory, which the command makes if it does not exist."""
+    """Parse the path of a directory, which the command creates if it does not exist."""
     path = Path(text)
     for place in (path, *path.parents):
         if place.exists() and not place.is_dir():
-            raise ArgumentTypeError(f"{text!r} cannot be made: {str(place)!r} is a file")
+            raise ArgumentTypeError(f"{text!r} cannot be created: {str(place)!r} is a file")
     return path
 
 

@@ -38,7 +38,7 @@ async def run_completion(options: argparse.Namespace) -> int:
 
 
 def offer(action: argparse.Action, values: Callable[[], Iterable[str]]) -> None:
-    """Set the completion values of an argument; argcomplete filters them by what is typed."""
+    """Set the completion values of an argument; argcomplete filters them by the typed characters."""
     setattr(action, "completer", lambda **_: list(values()))  # noqa: B010 - not an attribute of argparse.Action
 
 

@@ -103,9 +103,9 @@ def add_address(
 
     Args:
         command: the parser or group.
-        name: of the argument; with leading dashes, an option.
+        name: name of the argument, or with leading dashes of the option.
         what: text before the examples in the help.
-        default: describes what happens without an address; None: the default address is used.
+        default: description of the default in the help; None if the usual default address is used.
     """
     options: dict[str, Any] = {} if name.startswith("-") else {"nargs": "?"}
     usual = f"${ADDRESS_VARIABLE}, or {_DEFAULT_ADDRESS}"
@@ -168,7 +168,7 @@ def add_action(
 
 
 def confirm_blocking(question: str) -> bool:
-    """Ask a yes/no question before connecting; no on stdin that is not a terminal."""
+    """Ask a yes/no question before connecting. The answer is no if stdin is not a terminal."""
     return sys.stdin.isatty() and input(f"{question} [y/N] ").strip().lower() in ("y", "yes")
 
 
@@ -178,13 +178,13 @@ def command_action(
     action: Callable[[Any, argparse.Namespace], Awaitable[object]],
     target: Callable[[argparse.Namespace], AbstractAsyncContextManager[Any]] | None = None,
 ) -> Callable[[argparse.Namespace], Awaitable[int]]:
-    """Return a ``run`` function that performs one action, and says so in one line.
+    """Return a ``run`` function that performs one action and prints one line.
 
     Args:
-        name: the name of the action in the record; may contain names of options in braces.
-        text: the line that is printed without ``--json``; likewise.
+        name: the name of the action in the ``done`` record; may contain names of options in braces.
+        text: the line that is printed without ``--json``; may also contain names of options in braces.
         action: called with the target and the options.
-        target: opens the target, by default the vehicle.
+        target: function that opens the target; None connects to the vehicle.
     """
 
     async def run(options: argparse.Namespace) -> int:
@@ -200,7 +200,8 @@ def command_action(
 async def connected(options: argparse.Namespace, *, changes: bool = False) -> AsyncIterator[Vehicle]:
     """Connect to the vehicle that the options name, without requesting message rates.
 
-    ``changes``: the action changes something, so the vehicle must be the only one or chosen by ``--system-id``.
+    With ``changes``, which is for actions that change something, the vehicle must be the only one on the link, or
+    chosen by ``--system-id``.
     """
     async with connect_to(
         options,
@@ -274,7 +275,7 @@ async def await_vehicle(connection: Connection, options: argparse.Namespace, pat
     """Wait for the first heartbeat of an autopilot.
 
     Raises:
-        ConnectFailed: no heartbeat arrived; the message says what was received instead.
+        ConnectFailed: no heartbeat arrived; the text describes what was received instead.
         ConnectionClosed, LinkLost: the connection ended.
     """
     from aerokit.connection.opening import explain_no_vehicle
@@ -293,7 +294,7 @@ async def await_vehicle(connection: Connection, options: argparse.Namespace, pat
 async def await_end(connection: Connection, seconds: float | None, work: asyncio.Task[None] | None = None) -> bool:
     """Wait for Ctrl-C or for ``seconds``. Return True after Ctrl-C.
 
-    Raises the error that ended the connection. ``work``: a background task whose end also ends the wait.
+    Raises the error that ended the connection. The end of the background task ``work`` also ends the wait.
     """
     ended = asyncio.Event()
     interrupted = False

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from aerokit.apps.cli.supervised_flight import Purpose
     from aerokit.vehicle.vehicle import Vehicle
 
-# Name, and offset from the start in sides: north, east.
+# Name of each corner, and its offset north and east from the start in multiples of the side.
 _CORNERS = (("north-west", 1, 0), ("north-east", 1, 1), ("south-east", 0, 1), ("south-west", 0, 0))
 _READY_TIMEOUT_S = 120.0
 _DEFAULT_LOG = "demo.tlog"
@@ -95,7 +95,7 @@ async def _connect_and_fly(options: argparse.Namespace, interrupts: InterruptSta
 
 @asynccontextmanager
 async def _address(options: argparse.Namespace) -> AsyncIterator[str]:
-    """Yield the address of the vehicle; without ``--connect``, of a simulated one that lives as long as the block."""
+    """Yield the address of the vehicle. Without ``--connect``, simulate a vehicle until the block ends."""
     if options.connect is not None:
         yield options.connect
         return
@@ -113,11 +113,11 @@ async def _address(options: argparse.Namespace) -> AsyncIterator[str]:
 
 
 class _SquareFlight(SupervisedFlight):
-    """A flight along a square. It always ends with landing, also after an interrupt or a failure."""
+    """A flight along a square. It always ends with a landing, even after an interrupt or a failure."""
 
     def __init__(self, vehicle: Vehicle, report: FlightReport, interrupts: InterruptStack) -> None:
         super().__init__(vehicle, report, interrupts, "land")
-        self._was_overruled = False  # a mode change by another party ended our action
+        self._was_overruled = False  # True if a mode change by another party ended the flight along the square
 
     async def fly_square(self, altitude_m: float, side_m: float) -> int:
         """Fly the square, land in any case, and return the exit code."""
@@ -150,12 +150,12 @@ class _SquareFlight(SupervisedFlight):
         self._print(f"ready, home is {home.latitude_deg:.6f}, {home.longitude_deg:.6f}; arming")
         await self._arm()
         self._print(f"armed; taking off to {altitude_m:g} m")
-        self._has_started = True  # from now on, a mode change by a pilot or another station ends our control
+        self._has_started = True  # from here on, a mode change by another party ends this program's control
         await vehicle.take_off(altitude_m)
         self._print("at altitude; flying the square")
 
     def _our_purposes(self) -> tuple[Purpose, ...]:
-        # Hold and land may be results of our own action, unless a mode change by another party ended it.
+        # The modes for hold and land may come from this program, unless another party has changed the mode.
         return ("take_off", "setpoint") if self._was_overruled else ("take_off", "setpoint", "hold", "land")
 
     async def _after_failure(self, error: Exception) -> int:

@@ -47,7 +47,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         "--to",
         type=directory,
         metavar="DIRECTORY",
-        help="download the pictures to this directory, which is made if needed",
+        help="download the pictures to this directory, which is created if needed",
     )
     record = command_action("camera video {what}", "video {what}: done", _record_video, _camera)
     video = add_action(actions, "video", record, "Start or stop video recording.")

@@ -49,7 +49,7 @@ _COMMON_PORTS = (
     (14540, "PX4's simulator sends to it", True),
     (5760, "ArduPilot's simulator listens on it", False),
 )
-# Long enough for two heartbeats.
+# This is long enough to receive two heartbeats.
 BAUD_RATE_TIMEOUT_S = 2.5
 
 
@@ -97,10 +97,10 @@ def check_serial_port(device: str, description: str = "") -> Finding:
 
 
 def _users_of(device: str) -> list[str]:
-    """Return the names of other programs that have the port open. Linux shows other users' programs to root only."""
+    """Return the names of other programs that have the port open. Linux shows programs of other users only to root."""
     users: list[str] = []
     if sys.platform != "linux" or os.path.realpath(device).startswith("/dev/pts/"):
-        return users  # the creator of a pseudo-terminal keeps it open
+        return users  # ignore the creator of a pseudo-terminal, which keeps it open
     for process in glob("/proc/[0-9]*"):
         number = int(process.rpartition("/")[2])
         if number == os.getpid():
@@ -174,8 +174,8 @@ def _check_computer(found: Callable[[Finding], None]) -> None:
         found(check_serial_port(port.device, port.description))
     if not ports:
         do = (
-            "check that the device is plugged in; some USB cables only charge; virtual machines and containers need"
-            " the port passed through"
+            "check that the device is plugged in, and that the USB cable has data lines; pass the port through to a"
+            " virtual machine or container"
         )
         found(Finding("note", "serial ports", "none found", do))
     for number, meaning, udp in _COMMON_PORTS:

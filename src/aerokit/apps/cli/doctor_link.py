@@ -34,7 +34,7 @@ BAUD_RATES = (57600, 115200, 921600, 460800, 230400, 500000, 38400, 19200, 9600)
 _MIN_FRAMES = 2
 _MARKS: dict[str, str] = {"ok": "ok  ", "note": "note", "problem": "BAD "}
 _MAX_LOSS = 0.02
-# Default ids of programs. doctor uses a system id of its own.
+# Default ids of programs that use aerokit. The command doctor uses another system id.
 _PROGRAM_IDS = (255, 190)
 # With fewer frames, the loss is not meaningful.
 _MIN_FRAMES_FOR_LOSS = 20
@@ -119,7 +119,7 @@ def emit_finding(options: argparse.Namespace, finding: Finding) -> None:
 
 
 class LinkExamination:
-    """Collects everything a connection receives, and derives findings."""
+    """Collects all frames that a connection receives, and derives findings."""
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection

@@ -114,7 +114,7 @@ def add_logs_arguments(command: argparse.ArgumentParser) -> None:
         type=directory,
         default=Path(),
         metavar="DIRECTORY",
-        help="directory to write them to, which is made if needed (this directory)",
+        help="directory to write them to, which is created if needed (this directory)",
     )
     get.add_argument("--method", choices=("auto", "ftp", "log"), default="auto", help="download method (auto)")
     erase = add_action(actions, "erase", _erase, "Erase all flight logs.")

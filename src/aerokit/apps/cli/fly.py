@@ -55,14 +55,14 @@ class PlanFlight(SupervisedFlight):
         self._check_vehicle()
         await upload_parts(vehicle, self._plan, self._options)
         confirmed_mission = await self._download_mission() if self._needs_confirmation else ()
-        self._print("waiting until it is ready")
+        self._print("waiting until the vehicle is ready")
         await vehicle.wait_ready(timeout=self._options.ready)
         for warning in self._warnings():
             self._print(f"  ! {warning}")
         if not await self._is_confirmed():
             self._print("not confirmed; nothing was started")
             return FAILED
-        self._check_disarmed()  # again, because the question may have been open for long
+        self._check_disarmed()  # check again, because the user may have taken long to answer
         if self._needs_confirmation and await self._download_mission() != confirmed_mission:
             raise OperationRejected(
                 "the mission on the vehicle changed after the question was asked; nothing was started"
@@ -147,7 +147,7 @@ class PlanFlight(SupervisedFlight):
         return DONE
 
     def _our_purposes(self) -> tuple[Purpose, ...]:
-        # Land and return are not ours: they may be a failsafe's. A cancelled mission start ends in hold.
+        # Land and return modes may come from a failsafe, so they do not count. A cancelled mission start ends in hold.
         return ("mission",) if self._has_started else ("mission", "hold")
 
 

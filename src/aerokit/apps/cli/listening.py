@@ -45,10 +45,10 @@ if TYPE_CHECKING:
     from aerokit.mavlink.frame import Frame
     from aerokit.transport.link import Peer
 
-# When the terminal is too slow, the oldest events are dropped and counted.
+# If the terminal is too slow to print more events, the oldest are dropped and counted.
 _MAX_WAITING_EVENTS = 1000
 _SEVERITIES = ("EMERGENCY", "ALERT", "CRITICAL", "ERROR", "WARNING", "NOTICE", "INFO", "DEBUG")
-# After this time the command continues to wait, without a countdown.
+# After this time the command continues to wait, but the countdown ends.
 _COUNTDOWN_S = 30.0
 EXIT_TIMEOUT_S = 3.0
 """Seconds from a signal to the end of the process, in case Textual does not exit and keeps the port open."""
@@ -238,8 +238,7 @@ async def run_monitor(options: argparse.Namespace) -> int:
 def _detach_terminal() -> None:
     """Redirect the output to the null device.
 
-    Textual's output thread ends at a write to a terminal that is gone; after that, its writes block the event
-    loop.
+    Textual's output thread ends when it writes to a terminal that was closed. Later writes would block the event loop.
     """
     with open(os.devnull, "w") as nothing:
         for stream in (1, 2):

@@ -90,7 +90,7 @@ COMMANDS = (
         "hub",
         "hub",
         "Join links into one MAVLink network, until Ctrl-C. Forwards messages between serial, UDP and TCP"
-        " links by MAVLink's routing rules, and sends none of its own.",
+        " links by MAVLink's routing rules, and sends no other messages.",
     ),
     CliCommand(
         "monitor",

@@ -27,7 +27,7 @@ def read_plan(path: str) -> Plan:
 
     Raises:
         OSError: the file cannot be read.
-        FileFormatError: the file has neither format; the message says where.
+        FileFormatError: the file has neither format; the text names the position of the error.
         InvalidArgument: an item cannot be sent.
     """
     from aerokit.missions import Plan, read_plan_file, read_waypoint_file
@@ -61,7 +61,7 @@ def emit_items(options: argparse.Namespace, part: str, items: Sequence[MissionIt
 
 
 async def upload_parts(vehicle: Vehicle, plan: Plan, options: argparse.Namespace) -> None:
-    """Upload the parts that the file has. Other parts on the vehicle stay unchanged."""
+    """Upload the parts that the plan contains. Other parts on the vehicle stay unchanged."""
     for part in PARTS:
         content = getattr(plan, part)
         count = len(content.to_items())
@@ -94,7 +94,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         actions,
         "upload",
         _upload,
-        "Upload the mission, fence and rally points in a file. Parts that it does not have stay unchanged.",
+        "Upload the mission, fence and rally points in a file. Parts that are not in the file stay unchanged.",
     )
     upload.add_argument("file", help=".plan (QGroundControl), or a file that begins with QGC WPL 110")
     check = add_action(actions, "check", _check, "Check a file without a vehicle.", connects=False)

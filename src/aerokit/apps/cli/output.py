@@ -58,7 +58,7 @@ def emit(options: argparse.Namespace, kind: str, record: Mapping[str, object], t
 def _print(text: str) -> None:
     try:
         print(text, flush=True)
-    except UnicodeEncodeError:  # the terminal's encoding lacks a character
+    except UnicodeEncodeError:  # the encoding of the terminal does not support a character
         print(text.encode("ascii", "replace").decode(), flush=True)
 
 
@@ -84,8 +84,8 @@ def _text(error: BaseException) -> str:
 
 DONE, FAILED, WRONG_ARGUMENTS, NO_VEHICLE, TIMED_OUT, REFUSED, UNREADABLE, NOT_INSTALLED = range(8)
 INTERRUPTED = 130
-# Of two names, by difflib: one wrong letter of four.
-_MIN_LIKENESS = 0.75
+# Minimum SequenceMatcher.ratio() of two names; it allows one wrong letter in a name of four.
+_MIN_SIMILARITY = 0.75
 
 _MEANINGS = {
     DONE: "done",
@@ -104,7 +104,7 @@ class NotInstalled(AerokitError):
     """A command needs an optional dependency. The message names the extra to install."""
 
 
-# Error class to exit code; the first match counts.
+# Maps error classes to exit codes. The first matching class counts.
 _CODES: tuple[tuple[type[BaseException], int], ...] = (
     (KeyboardInterrupt, INTERRUPTED),
     (NotInstalled, NOT_INSTALLED),
@@ -131,7 +131,7 @@ def import_extra(module: str, extra: str) -> Any:
     """Import a module that an extra provides.
 
     Raises:
-        NotInstalled: a package is missing; the message says what to install.
+        NotInstalled: a package is missing; the text has the command that installs it.
     """
     try:
         return import_module(module)
@@ -142,7 +142,7 @@ def import_extra(module: str, extra: str) -> Any:
 
 
 def near_names(name: str, known: Iterable[str], count: int = 1) -> list[str]:
-    """Return the known names that ``name`` begins, or that differ from it by a letter or two, the nearest first."""
+    """Return known names that begin with ``name`` or are similar to it, the most similar first."""
     from difflib import SequenceMatcher
 
     bare, ratios = name.strip("-").upper(), dict[str, float]()
@@ -150,14 +150,14 @@ def near_names(name: str, known: Iterable[str], count: int = 1) -> list[str]:
         plain_other = other.strip("-").upper()
         is_beginning = len(bare) >= 3 and plain_other.startswith(bare)
         matcher = SequenceMatcher(None, bare, plain_other)
-        if is_beginning or (matcher.real_quick_ratio() >= _MIN_LIKENESS and matcher.quick_ratio() >= _MIN_LIKENESS):
+        if is_beginning or (matcher.real_quick_ratio() >= _MIN_SIMILARITY and matcher.quick_ratio() >= _MIN_SIMILARITY):
             ratios[other] = 1.0 if is_beginning else matcher.ratio()
-    near = (other for other in ratios if ratios[other] >= _MIN_LIKENESS)
+    near = (other for other in ratios if ratios[other] >= _MIN_SIMILARITY)
     return sorted(near, key=lambda other: (-ratios[other], len(other), other))[:count]
 
 
 def suggestion(name: str, known: Iterable[str], count: int = 1) -> str:
-    """Return ``" (did you mean 'status'?)"``, or "" if no known name is near."""
+    """Return ``" (did you mean 'status'?)"``, or "" if no known name is similar."""
     names = " or ".join(map(repr, near_names(name, known, count)))
     return f" (did you mean {names}?)" if names else ""
 

@@ -46,7 +46,7 @@ def _add_reading(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -
 
 
 def _add_writing(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    set_ = add_action(actions, "set", _set, "Set parameters. The vehicle confirms each.")
+    set_ = add_action(actions, "set", _set, "Set parameters. The vehicle confirms each value.")
     offer(set_.add_argument("values", nargs="+", type=assignment, metavar="NAME=VALUE"), assignments)
     load = add_action(actions, "load", _load, "Set all parameters in a file that differ on the vehicle.")
     load.add_argument("file")
@@ -136,7 +136,7 @@ async def _read(vehicle: Vehicle, name: str, options: argparse.Namespace) -> Par
 
 
 def _hint(name: str, error: Exception, vehicle: Vehicle) -> str:
-    """Suggest names of the simulated vehicles' parameters, or how to find one, unless the error does so already."""
+    """Suggest similar parameter names, or the command that lists them. Empty if the error contains a suggestion."""
     names = parameter_names(vehicle.autopilot.name)
     if "did you mean" in str(error) or name.upper() in names:
         return ""
@@ -152,7 +152,7 @@ def _emit_parameters(options: argparse.Namespace, parameters: Iterable[Parameter
 
 
 def _emit_results(options: argparse.Namespace, results: Iterable[ParameterWrite], vehicle: Vehicle) -> int:
-    """Print a line for each. Return FAILED if a value differs from the requested one by more than rounding."""
+    """Print a line for each result. Return FAILED if a value differs from the requested one by more than rounding."""
     code = DONE
     for result in results:
         if result.error is None:
@@ -166,7 +166,7 @@ def _emit_results(options: argparse.Namespace, results: Iterable[ParameterWrite]
 
 
 def _record(parameter: Parameter | ParameterWrite) -> dict[str, object]:
-    # "type" is the type of the record.
+    # the key "type" is reserved for the type of the record
     fields = parameter.to_dict()
     return {("value_type" if name == "type" else name): value for name, value in fields.items()}
 

@@ -91,7 +91,7 @@ def simulated_fleet(
     """Create ``count`` vehicles in a row eastwards from ``home`` (`aerokit.sim.HOME`), with consecutive system ids
     and seeds. ``components`` makes the components of one vehicle.
 
-    With the name of a .tlog file, return the one vehicle of that recording; other options do not apply.
+    If ``name`` is a .tlog file, return the single vehicle of that recording; other options do not apply.
     """
     from aerokit.sim.motion import HOME, GlobalPoint, LocalFrame
 
@@ -304,7 +304,7 @@ def _tracks(vehicles: Sequence[SimulatedVehicle], picture: str | None) -> list[T
 
 
 def _server(vehicles: Sequence[SimulatedVehicle], addresses: Sequence[str], speedup: float) -> SimulatorServer:
-    """An address template creates one link for each vehicle; any other address, one link for all."""
+    """Create the server. An address template becomes one link for each vehicle, any other address one link for all."""
     links, vehicles_on = [], []
     for address in addresses:
         groups = [[vehicle] for vehicle in vehicles] if is_address_template(address) else [list(vehicles)]
@@ -348,7 +348,7 @@ def _client_address(address: str, as_given: str) -> str:
 
 
 def _zenoh_options(address: str) -> str:
-    """Return the query of a client's zenoh address: it connects to where the simulator listens or connects."""
+    """Return the query of a client's zenoh address, which connects to an endpoint of the simulator."""
     where = parse_address(expand_address(address, 0, 1))
     endpoints, config = where.option("listen") or where.option("connect"), where.option("config")
     options = [f"connect={endpoints.replace('0.0.0.0', '127.0.0.1')}"] if endpoints else []

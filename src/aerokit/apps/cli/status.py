@@ -36,9 +36,9 @@ _REQUESTED = (
     ("batteries", BatteryStatus),
     ("position", GlobalPositionInt),
 )
-# Leaves time to restore the streams that were changed; otherwise the vehicle keeps their rates.
+# Time to restore the rates of the changed streams before the connection is closed.
 _RELEASE_TIME_S = 0.5
-# Wait for a requested message after the vehicle has accepted the request.
+# Time to wait for a requested message after the vehicle has accepted the request.
 _MESSAGE_TIMEOUT_S = 0.3
 
 
@@ -233,7 +233,7 @@ def _emit_link(connection: Connection, options: argparse.Namespace, seconds: flo
 
 
 def _emit_components(connection: Connection, options: argparse.Namespace, vehicles: dict[int, Vehicle]) -> None:
-    """Print everything except the vehicles: their other components, and ground stations."""
+    """Print the other components of vehicles, and ground stations."""
     for source, heartbeat in sorted(connection.heartbeats.items()):
         system_id, component_id = source
         if system_id in vehicles and vehicles[system_id].component_id == component_id:

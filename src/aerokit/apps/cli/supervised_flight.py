@@ -45,12 +45,12 @@ INTERRUPT_ACTIONS: dict[str, str] = {
     "hold": "holding here",
     "nothing": "no command is sent",
 }
-"""Choices of ``--on-interrupt``, and the text that is printed."""
+"""Maps the choices of ``--on-interrupt`` to the texts that are printed."""
 _AUTO_DISARM_TIMEOUT_S = 30.0
 _WARNING = 4
 # ArduPilot announces each mission item in texts that repeat what the commands print.
 _MISSION_TEXT = re.compile(r"Mission: \d+ |Reached command #\d+")
-# After this time without output, print a status line.
+# A status line is printed after this time without output.
 _STATUS_INTERVAL_S = 5.0
 
 
@@ -65,16 +65,16 @@ class SupervisedFlight(ABC):
         self._on_interrupt = on_interrupt
         self.armed_by_us: bool = False
         """True once this program has sent an arm command."""
-        self._may_arm_late = False  # an arm command was sent, and its result is unknown
+        self._may_arm_late = False  # True if an arm command was sent and its result is unknown
         self._modes_armed_in: set[str] = set()
-        self._has_started = False  # our command has changed the mode in which it was armed
+        self._has_started = False  # True once a command of this program has changed the mode after arming
 
     async def fly(self) -> int:
         """Fly to the end, and return the exit code. On failure, make the vehicle safe and re-raise the error."""
         try:
             code = await self._interrupts.run(self._fly)
         except Exception as error:
-            # Any error: a vehicle that this program has armed must not stay armed on the ground.
+            # After any error, a vehicle that this program has armed must not stay armed on the ground.
             self._print(f"failed: {error}")
             if self.armed_by_us:
                 await self._make_safe(partial(self._after_failure, error))
@@ -149,7 +149,7 @@ class SupervisedFlight(ABC):
         if self._is_armed_on_ground and wanted != "nothing":
             try:
                 await self._disarm()
-            except CommandRejected as error:  # it has taken off since its last landed state
+            except CommandRejected as error:  # the vehicle has taken off since it last reported its landed state
                 self._print(f"disarming failed: {error}")
             if vehicle.is_confirmed_disarmed or not self._check_control():
                 return DONE
@@ -207,7 +207,7 @@ class SupervisedFlight(ABC):
 class FlightReport:
     """Prints the progress of a flight and the vehicle's texts, and measures the track.
 
-    ``speedup``: of the simulation; 1.0 for a real vehicle. Durations are those of a real flight.
+    ``speedup`` is that of the simulation, 1.0 for a real vehicle. Durations are in simulated time.
     """
 
     def __init__(self, vehicle: Vehicle, options: argparse.Namespace, speedup: float) -> None:
@@ -218,7 +218,7 @@ class FlightReport:
         self._highest_m = self._fastest_m_s = self._flown_m = 0.0
         self._before: Position | None = None
         self.prints_status: bool = True
-        """Print status lines while nothing else is printed; set to False while a question is open."""
+        """True if status lines are printed when there is no other output. Set it to False during a question."""
 
     def print_line(self, text: str) -> None:
         """Print a line with time and altitude. A closed pipe or a full disk does not end the flight."""

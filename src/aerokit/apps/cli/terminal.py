@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from aerokit.protocols.exchange import OnProgress, TransferProgress
 
-# Usually a vehicle answers sooner, and no countdown is needed.
+# The countdown begins after this time, because a vehicle usually answers sooner.
 COUNTDOWN_DELAY_S = 1.0
 CLEAR_LINE = "\r\x1b[K"
 
@@ -33,7 +33,7 @@ def is_interactive() -> bool:
 
 
 async def confirm(question: str) -> bool:
-    """Ask a yes/no question. Return True for "y" or "yes"; anything else, including end of input, is no."""
+    """Ask a yes/no question. Return True for "y" or "yes", False for any other input and at its end."""
     _discard_typed_input()
     print(f"{question} [y/N] ", end="", file=sys.stderr, flush=True)
     answer = await _read_line()
@@ -41,7 +41,7 @@ async def confirm(question: str) -> bool:
 
 
 def _discard_typed_input() -> None:
-    """Discard typed input: it cannot be an answer to a question that was not shown yet."""
+    """Discard earlier typed input, which cannot be an answer to a question that was not shown yet."""
     try:
         import termios
     except ImportError:  # Windows
@@ -84,11 +84,9 @@ def _signals() -> tuple[signal.Signals, ...]:
 def on_interrupt(
     callback: Callable[[], None], at_once: Callable[[int], object] = lambda number: None
 ) -> Iterator[None]:
-    """Within the block, call ``callback`` on the running loop for SIGINT, SIGTERM and SIGHUP; they have no other
-    effect.
+    """Within the block, replace the effect of SIGINT, SIGTERM and SIGHUP by a call of ``callback`` on the running loop.
 
-    ``at_once(number)`` is called first, in the signal handler itself, so it also runs while the loop is
-    blocked.
+    ``at_once(number)`` is called first, in the signal handler, and so even while the loop is blocked.
     """
     loop = asyncio.get_running_loop()
     signals = _signals()
@@ -138,9 +136,7 @@ class InterruptStack:
 async def waiting(
     options: argparse.Namespace, address: str, seconds: float, what: str = "a heartbeat"
 ) -> AsyncIterator[None]:
-    """Within the block, show on stderr how many of ``seconds`` remain. Only on a terminal, and not with
-    ``--json``.
-    """
+    """Show a countdown of ``seconds`` on stderr within the block, but only on a terminal and without ``--json``."""
     if options.json or not sys.stderr.isatty():
         yield
         return
@@ -166,13 +162,14 @@ async def _count_down(text: str, seconds: float) -> None:
 
 
 class _Bar(tqdm):  # type: ignore[misc]  # tqdm has no annotations
-    monitor_interval = 0  # otherwise tqdm leaves its monitor thread behind
+    monitor_interval = 0  # without this, tqdm starts a monitor thread that never ends
 
 
 @contextmanager
 def progress_bar(what: str, unit: str) -> Iterator[OnProgress]:
-    """Show a progress bar; yields the ``on_progress`` callback. ``unit`` is ``"B"`` for bytes, else the noun for
-    one item.
+    """Show a progress bar within the block, and yield the ``on_progress`` callback.
+
+    ``unit`` is ``"B"`` for bytes, otherwise the singular noun for an item.
     """
     is_bytes = unit == "B"
     with _Bar(

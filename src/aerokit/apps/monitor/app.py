@@ -38,12 +38,12 @@ __all__ = ["ConfirmScreen", "Monitor", "run_monitor"]
 
 REFRESH_INTERVAL_S = 0.5
 WIDE = 120, 30
-"""Columns and rows from which on more is shown."""
+"""Minimum columns and rows of a terminal that shows values of secondary importance."""
 ANSI_THEMES = ("ansi-dark", "textual-ansi", "textual-dark")
-"""Themes with the terminal's own colours, light or dark; their name depends on the version of Textual."""
+"""Themes that use the colours of the terminal; their name depends on the version of Textual."""
 TRACK_STYLES = ("green", "magenta", "red", "blue", "cyan", "yellow")
 KEY_COMMANDS = {"hold": "HOLD", "land": "LAND", "return_to_launch": "RETURN TO LAUNCH"}
-"""Vehicle methods that keys call, and their names in the question."""
+"""Maps the vehicle methods that keys call to their names in the confirmation."""
 
 
 class ConfirmScreen(ModalScreen[bool]):
@@ -90,7 +90,7 @@ class ConfirmScreen(ModalScreen[bool]):
 
 
 class Panel(Widget):
-    """A widget that shows a text or table. A new content is laid out again only if its height differs."""
+    """A widget that shows a text or table. New content causes a new layout only if its height differs."""
 
     def __init__(self, name: str) -> None:
         super().__init__(id=name)
@@ -98,7 +98,7 @@ class Panel(Widget):
         self._height = 0
 
     def show(self, content: Text | Table) -> None:
-        """Show a new content."""
+        """Replace the content."""
         height = content.plain.count("\n") if isinstance(content, Text) else content.row_count
         self._content = content
         self.refresh(layout=height != self._height)
@@ -154,7 +154,7 @@ class Monitor(App[None]):
         self.set_interval(REFRESH_INTERVAL_S, self.update_view)
 
     def on_resize(self, event: Resize) -> None:
-        """Use the width: the messages go below the state, and the texts below the map."""
+        """Adapt the layout to the width: on wide terminals, rates are below the state, and texts below the map."""
         is_wide = event.size.width >= WIDE[0] and event.size.height >= WIDE[1]
         if is_wide == self._is_wide:
             return
@@ -191,7 +191,7 @@ class Monitor(App[None]):
             texts.border_subtitle = self._model.slow_streams
 
     def _is_new(self, name: str, content: object) -> bool:
-        """Return True if the content differs from what is on the screen: drawing is expensive."""
+        """Return True if the content differs from that on the screen, because drawing is expensive."""
         if self._shown.get(name) == content:
             return False
         self._shown[name] = content
@@ -318,14 +318,14 @@ async def run_monitor(
     """Show the vehicles on a link until the user quits.
 
     Args:
-        address: of the link; a lost link is reopened.
+        address: address of the link; a lost link is reopened.
         baud: baud rate of a serial port whose address has none.
         signing: as in :func:`aerokit.open_connection`.
         record: a .tlog file for everything that is sent and received.
         on_start: called with the application before it runs.
 
     Returns:
-        Exit code: 0, or 1 after an internal error, which the application has shown.
+        The exit code: 0, or 1 after an internal error, which the application has shown.
 
     Raises:
         LinkOpenError: the link cannot be opened.

@@ -1,7 +1,7 @@
-"""Text of a vehicle's state for the terminal: old values are dimmed and show their age, unknown values are "—".
+"""Text of a vehicle's state for the terminal. Old values are dimmed and show their age; unknown values are "—".
 
-Colours are readable on light and dark terminals: those with a background name both, others are dark enough for white
-and light enough for black.
+Colours are readable on light and dark terminals. A style with a background colour also sets the foreground colour;
+the other colours have enough contrast to both white and black.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _MIN_SPAN_M = 20.0
 
 
 def number(value: float | None, digits: int = 1, unit: str = "", sign: str = "-") -> str:
-    """Format a number, without a sign for what rounds to 0; ``sign`` as in format specifications."""
+    """Format a number, without a sign if it rounds to 0. ``sign`` is that of format specifications."""
     if value is None:
         return UNKNOWN
     rounded = round(value, digits) + 0.0  # -0.0 + 0.0 is 0.0
@@ -44,7 +44,7 @@ def age(seconds: float) -> str:
 
 
 class VehicleText:
-    """Texts of one vehicle. While it is silent, its values are dimmed, and one line says since when."""
+    """Texts of one vehicle. While it is silent, its values are dimmed, and one line shows the time of silence."""
 
     def __init__(self, vehicle: Vehicle) -> None:
         self._vehicle = vehicle
@@ -61,7 +61,7 @@ class VehicleText:
         return Text(text, "dim" if self._silent_s else style)
 
     def rows(self, *, more: bool = False) -> list[tuple[str, Text]]:
-        """Return labels and values. ``more``: there is room for values of secondary importance."""
+        """Return labels and values. ``more`` includes values of secondary importance."""
         vehicle, cell = self._vehicle, self.cell
         rows = [
             ("mode", Text("  ").join([cell(vehicle.mode, _name, "bold"), self._armed()])),
@@ -102,7 +102,7 @@ class VehicleText:
             (12, cell(vehicle.mode, _name)),
             (9, self._armed()),
             (9, cell(vehicle.position, lambda place: number(place.altitude_relative_m, 1, " m"))),
-            (6, cell(vehicle.batteries, lambda each: number(each[0].remaining_percent, 0, " %"))),
+            (6, cell(vehicle.batteries, lambda batteries: number(batteries[0].remaining_percent, 0, " %"))),
         ]
         if more:
             columns += [
@@ -203,7 +203,7 @@ def _gps(receiver: Any) -> str:
 
 
 class Canvas:
-    """A map of ``columns`` by ``rows`` characters that fits all ``points`` (metres north, east).
+    """A map of ``columns`` by ``rows`` characters, scaled to contain all ``points`` (metres north, east).
 
     The last row has a scale bar and a north arrow.
     """

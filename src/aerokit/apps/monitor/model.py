@@ -28,10 +28,10 @@ MAX_LINES = 500
 MAX_TRACK_POINTS = 3000
 MIN_POINT_DISTANCE_M = 0.5
 MAX_MESSAGE_TYPES = 2000
-"""Limits memory, because senders can make up any number of ids."""
+"""Maximum number of counted message types. It limits memory, because a sender can use any number of ids."""
 RATE_WINDOW_S = 5.0
 SEVERITY_STYLES = (DANGER, DANGER, DANGER, "bold red", "bold magenta", "bold", "", "dim")
-"""Styles by MAV_SEVERITY, emergency first."""
+"""Text styles by MAV_SEVERITY, from 0 (emergency)."""
 
 
 class MonitorModel:
@@ -43,12 +43,12 @@ class MonitorModel:
         self.lines: deque[Text] = deque(maxlen=MAX_LINES)
         """Texts and events that are not displayed yet, the oldest first."""
         self.slow_streams: str = ""
-        """One line for all events of slow streams: how many, and the last; they do not push out other lines."""
+        """One line for all events of slow streams: their number and the last one. It keeps ``lines`` free of them."""
         self._slow_count = 0
         self.tracks: dict[int, deque[tuple[float, float]]] = defaultdict(lambda: deque(maxlen=MAX_TRACK_POINTS))
-        """System id → metres north and east of ``reference``."""
+        """Maps system ids to positions in metres north and east of ``reference``, the oldest first."""
         self.reference: tuple[float, float] | None = None
-        """The first known position, latitude and longitude in degrees."""
+        """Latitude and longitude of the first known position, in degrees."""
         self._counts: Counter[tuple[int, int]] = Counter()
         self._counted: deque[tuple[float, Counter[tuple[int, int]]]] = deque([(connection.now(), Counter())])
         self._detach: list[Detach] = [
@@ -86,7 +86,7 @@ class MonitorModel:
                 known = dialect.get(number)
                 name = f"message {number}" if known is None else known.NAME
                 rates.append((name, (count - before[system, number]) / (until - since)))
-        return sorted(rates, key=lambda each: (-each[1], each[0]))
+        return sorted(rates, key=lambda rate: (-rate[1], rate[0]))
 
     def metres(self, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
         """Convert to metres north and east of ``reference``; the first position becomes the reference."""

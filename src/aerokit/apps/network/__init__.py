@@ -1,6 +1,6 @@
 """Vehicle state as JSON over zenoh or MQTT, for programs in any language, and the names on a zenoh network.
 
-MAVLink itself, and with it the whole API, goes over the addresses ``zenoh:`` and ``zenohin:``; see
+Full control of vehicles on a zenoh network, with MAVLink, uses the addresses ``zenoh:`` and ``zenohin:`` instead; see
 docs/network.md.
 """
 

@@ -28,13 +28,13 @@ if TYPE_CHECKING:
     from aerokit.transport.link import Peer
 
 PORTS: dict[str, int] = {"mqtt": 1883, "mqtts": 8883}
-"""Scheme → default port."""
+"""Maps a scheme to its default port."""
 CONNECT_TIMEOUT_S = 5.0
 MAX_WAITING = 32_768
-"""Maximum number of names with an unsent value; enough for all states of 255 vehicles."""
+"""Maximum number of names with an unsent value, enough for all states of 255 vehicles."""
 KEEPALIVE_S = 5
-"""MQTT keep-alive. The connection is lost if the broker does not answer a ping within this time."""
-# Interval of loop_misc(), which sends pings and detects their loss.
+"""MQTT keep-alive in seconds. The connection is lost if the broker does not answer a ping within this time."""
+# Interval of calls to paho's loop_misc(), which sends pings and detects missing answers.
 _POLL_INTERVAL_S = 1.0
 
 
@@ -57,10 +57,10 @@ class BrokerAddress(Snapshot):
 
 
 def parse_broker(text: str, *schemes: str) -> BrokerAddress:
-    """Parse an address; ``schemes`` are those allowed, by default all.
+    """Parse an address with one of these schemes, by default any.
 
     Raises:
-        InvalidArgument: the address is invalid. The message omits it if it may contain a password.
+        InvalidArgument: the address is invalid. The text omits the address if it may contain a password.
     """
     allowed = schemes or tuple(PORTS)
 
@@ -97,8 +97,8 @@ def parse_broker(text: str, *schemes: str) -> BrokerAddress:
 class MqttLink(BaseLink):
     """One connection to an MQTT 3.1.1 broker. It publishes with QoS 0.
 
-    The ``peer`` of :meth:`write` is the name of a state. While the broker accepts no data, the newest value of
-    each name waits. Waiting values are discarded when the connection ends.
+    The ``peer`` of :meth:`write` is the name of a state. While the broker accepts no data, the newest value of each
+    name is kept. These values are discarded when the connection ends.
     """
 
     def __init__(self, where: BrokerAddress) -> None:
@@ -238,7 +238,7 @@ def _close_socket(client: Any) -> None:
 
 
 class _NullReceiver:
-    # `ReconnectingLink` logs what happens to the connection.
+    # `ReconnectingLink` logs that the connection is lost or restored.
     def bytes_received(self, data: bytes, peer: Peer) -> None:
         pass
 
@@ -260,12 +260,12 @@ class _LinkPublisher(Publisher):
 @checked
 @async_block
 async def mqtt_publisher(address: str) -> AsyncIterator[Publisher]:
-    """Connect to an MQTT broker, while the block lasts.
+    """Connect to an MQTT broker while the block lasts.
 
     States are published to the topics ``aerokit/FLEET/NAME/state/…``, with QoS 0, not retained.
-    ``aerokit/FLEET/NAME/alive`` is retained: "online", and "offline" after the block or when the broker loses
-    this program. A lost connection is reopened; values published meanwhile are dropped. The event loop must
-    support ``add_reader``: on Windows only ``asyncio.SelectorEventLoop`` does.
+    ``aerokit/FLEET/NAME/alive`` is retained: "online" within the block, "offline" after it or after the broker has lost
+    the connection. A lost connection is reopened; values published meanwhile are dropped. The event loop must support
+    ``add_reader``: on Windows only ``asyncio.SelectorEventLoop`` does.
 
     Args:
         address: ``"mqtt://10.0.0.5:1883/fleet/alpha"``, ``"mqtt://user:password@…"``; ``mqtts`` for TLS (port

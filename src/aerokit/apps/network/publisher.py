@@ -6,8 +6,8 @@ from abc import ABC, abstractmethod
 
 
 class Publisher(ABC):
-    """Publishes bytes under a name. Implement it for other networks than zenoh and MQTT."""
+    """Publishes bytes under a name. Subclass it for networks other than zenoh and MQTT."""
 
     @abstractmethod
     def put(self, name: str, data: bytes) -> None:
-        """Publish ``data`` under ``name`` ("1/position"), immediately or never. It must not block or raise."""
+        """Publish ``data`` under ``name`` ("1/position"), or drop it. The method must not block or raise."""

@@ -33,12 +33,12 @@ PUBLISHERS: dict[str, Callable[[str], AbstractAsyncContextManager[Publisher]]] =
     "zenoh": zenoh_publisher,
     "zenohin": zenoh_publisher,
 }
-"""Scheme of an address → function that opens the publisher."""
+"""Maps the scheme of an address to the function that opens its publisher."""
 VERSION = 1
 """Version of the message format; incremented only for incompatible changes."""
 MAX_RATE_HZ = 50.0
 REPEAT_INTERVAL_S = 2.0
-"""An unchanged state is published at this interval too, so that late subscribers receive it."""
+"""Interval in seconds at which an unchanged state is published again, for new subscribers."""
 _JSON = json.JSONEncoder(separators=(",", ":"), ensure_ascii=False, allow_nan=False)
 
 
@@ -67,7 +67,7 @@ class Publishing:
         """Number of messages published so far."""
         self._vehicle, self._publisher, self._states = vehicle, publisher, states
         self._has_logged_error = False
-        self._sent: dict[str, tuple[float, object]] = {}  # state → time and value of the last message
+        self._sent: dict[str, tuple[float, object]] = {}  # maps a state to the time and value of its last message
 
     def publish(self, now: float) -> None:
         """Publish states that have changed, or were last published `REPEAT_INTERVAL_S` ago; ``now`` in seconds."""
@@ -97,7 +97,7 @@ class Publishing:
         }
         try:
             self._publisher.put(f"{system_id}/{name}", _JSON.encode(message).encode())
-        except Exception:  # an error in a background task would close the connection, in mid-flight
+        except Exception:  # an error in a background task would close the connection during a flight
             if not self._has_logged_error:
                 self._has_logged_error = True
                 logger.exception("publisher %r raised an error; publishing continues", self._publisher)
@@ -112,9 +112,9 @@ async def publishing(
 ) -> AsyncIterator[Publishing]:
     """Publish the state of a vehicle on a network while the block lasts, as JSON, one message for each state.
 
-    A state is published when it has changed, at most ``rate_hz`` times a second with the newest value, and
-    every two seconds if it is unchanged. docs/state.schema.json has the schema of the messages. Requests
-    nothing from the vehicle; subscribers cannot send anything to it.
+    A changed state is published at most ``rate_hz`` times a second, an unchanged one every two seconds.
+    docs/state.schema.json has the schema of the messages. Nothing is requested from the vehicle, and subscribers
+    cannot send anything to it.
 
     Args:
         vehicle: a connected vehicle.

@@ -41,6 +41,9 @@ ENUMS: dict[str, type[Enum]] = {
     "Battery.charge_state": enums.MavBatteryChargeState,
     "MissionProgress.state": enums.MissionState,
     "Power.flags": enums.MavPowerStatus,
+    "Odometry.frame": enums.MavFrame,
+    "Odometry.child_frame": enums.MavFrame,
+    "Aircraft.emitter": enums.AdsbEmitterType,
 }
 """Integers that are published by their MAVLink enum names, if the number has one."""
 

@@ -43,9 +43,9 @@ class _ZenohPublisher(Publisher):
 @checked
 @async_block
 async def zenoh_publisher(address: str) -> AsyncIterator[Publisher]:
-    """Open a session on a zenoh network, while the block lasts.
+    """Open a session on a zenoh network while the block lasts.
 
-    Data is dropped if a queue is full, or keys is no network.
+    Data is dropped if a queue is full, or if there is no network.
 
     Args:
         address: ``"zenoh://fleet/alpha"``, with the options of :doc:`addresses </addresses>`.
@@ -55,7 +55,7 @@ async def zenoh_publisher(address: str) -> AsyncIterator[Publisher]:
 
     Raises:
         InvalidArgument: the address is invalid.
-        LinkOpenError: keys is no network, or eclipse-zenoh is not installed.
+        LinkOpenError: there is no network, or eclipse-zenoh is not installed.
     """
     where = parse_address(address)
     if where.kind not in ("zenoh", "zenohin"):
@@ -83,12 +83,12 @@ async def discover(
     config: str = "",
     wait: float = 1.0,
 ) -> list[str]:
-    """Return the names of a fleet that are on a zenoh network, and can be opened as ``zenoh://FLEET/NAME``.
+    """Return the names in a fleet that are on a zenoh network and can be opened as ``zenoh://FLEET/NAME``.
 
     Args:
         fleet: name of the fleet.
-        connect: endpoints of routers and peers, ``["tcp/10.0.0.5:7447"]``; without ``connect`` and ``listen``,
-            multicast.
+        connect: endpoints of routers and peers, ``["tcp/10.0.0.5:7447"]``. Multicast is used without ``connect`` and
+            ``listen``.
         listen: endpoints to listen on.
         config: path of a zenoh configuration file.
         wait: seconds to search, above 0; multicast discovery can take more than a second.
@@ -98,7 +98,7 @@ async def discover(
 
     Raises:
         InvalidArgument: an argument is invalid.
-        LinkOpenError: keys is no network, or eclipse-zenoh is not installed.
+        LinkOpenError: there is no network, or eclipse-zenoh is not installed.
     """
     check_name("fleet", fleet)
     keys: set[str] = set()

@@ -241,7 +241,7 @@ class Operation:
     order: OrderType | None = None
     query: tuple[str, ...] = ()
     is_open: bool = False
-    """True if it needs no token, because it reveals nothing about vehicles."""
+    """True if the operation needs no token, because it reveals nothing about vehicles."""
 
 
 class HttpApi:
@@ -267,12 +267,12 @@ class HttpApi:
             get("/api/openapi.json", "openapi", "This document", self._openapi, is_open=True),
             get("/api/vehicles", "vehicles", "All vehicles", self._list),
             get(one, "vehicle", "The state of a vehicle, with ages", self._vehicle),
-            get(f"{one}/texts", "texts", "Its status texts, the newest last", self._texts),
-            get(f"{one}/track", "track", "Where it was, the newest last; bounded", self._track),
-            get(f"{one}/mission", "mission", "Its mission", self._mission, query=("refresh",)),
-            get(f"{one}/fence", "fence", "Its fence", self._fence, query=("refresh",)),
-            get(f"{one}/rally", "rally", "Its rally points", self._rally, query=("refresh",)),
-            get(f"{one}/parameters", "parameters", "All its parameters", self._parameters, query=("refresh",)),
+            get(f"{one}/texts", "texts", "The status texts of a vehicle, the newest last", self._texts),
+            get(f"{one}/track", "track", "The recent track of a vehicle, the newest position last", self._track),
+            get(f"{one}/mission", "mission", "The mission of a vehicle", self._mission, query=("refresh",)),
+            get(f"{one}/fence", "fence", "The fence of a vehicle", self._fence, query=("refresh",)),
+            get(f"{one}/rally", "rally", "The rally points of a vehicle", self._rally, query=("refresh",)),
+            get(f"{one}/parameters", "parameters", "All parameters of a vehicle", self._parameters, query=("refresh",)),
             get(named, "parameter", "One parameter, read from the vehicle", self._parameter),
             get("/api/events", "events", "Recent events, the newest last", self._events),
             get(
@@ -352,7 +352,7 @@ class HttpApi:
         return known[0], to_jsonable(vehicle.connection.now() - known[1])
 
     def _on_message(self, message: dict[str, Any]) -> None:
-        # An upload changes the plans, even if it failed half-way.
+        # Even an upload that failed half-way may have changed the plans.
         if message["type"] == "order" and message["order"] == "mission/upload":
             for vehicle, kind in tuple(self._plans):
                 if vehicle.system_id == message["system_id"]:

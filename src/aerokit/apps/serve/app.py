@@ -47,7 +47,7 @@ class ServeApp:
         metadata: Metadata | None = None,
     ) -> None:
         self.token = token
-        """Token that orders need; also reading, unless ``open_reading``."""
+        """Token that orders require. Reading requires it too, unless ``open_reading`` is set."""
         self._access = access
         self._served, self._orders = served, OrderRunner(served)
         api = HttpApi(served, self._orders, access, settings, metadata)
@@ -112,7 +112,7 @@ def make_app(
         tiles: URL template of a tile server, ``https://tiles.example/{z}/{x}/{y}.png``; None: no tiles.
         attribution: attribution of the tiles, shown on the map.
         metadata: units, ranges and descriptions of parameters (:func:`aerokit.parameters.load_metadata`), for vehicles
-            that have no own ones.
+            that do not provide any.
 
     Raises:
         InvalidArgument: an argument is invalid.
@@ -131,7 +131,7 @@ def make_app(
 
 
 def _static_routes() -> list[Route]:
-    # Read once: no request can reach other files.
+    # Files are read once at the start, so that no request can reach other files.
     routes = []
     for path in sorted(STATIC.iterdir()):
         if path.suffix in KINDS:

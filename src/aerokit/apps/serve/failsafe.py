@@ -16,8 +16,8 @@ _RETURN, _SMART, _HOLD, _TERMINATE = (
     "holds",
     "stops its motors",
 )
-# For each firmware, parameters in the order in which they decide: a value that is not listed leaves it to the next
-# one. Values are those of the firmwares' Parameters.cpp and of PX4's navigator parameters.
+# For each firmware, the parameters that determine the action, the most important first. If the value of a parameter is
+# not listed, the next parameter decides. Sources: Parameters.cpp of ArduPilot's firmwares, navigator parameters of PX4.
 _ACTIONS: Mapping[str, Mapping[str, Mapping[float, str]]] = {
     "ArduCopter": {
         "FS_GCS_ENABLE": {
@@ -62,7 +62,7 @@ _ACTIONS: Mapping[str, Mapping[str, Mapping[float, str]]] = {
 def ground_station_failsafe(vehicle: Vehicle) -> dict[str, Any]:
     """Return ``action`` (a clause, None while unknown), ``because`` (the parameter) and ``unread`` (parameter names).
 
-    Uses parameters that have been read; requests nothing.
+    The function uses parameters that have been read, and requests nothing.
     """
     for name, actions in _ACTIONS.get(vehicle.autopilot.firmware, {}).items():
         parameter = vehicle.parameters.known(name)

@@ -26,8 +26,8 @@ _TOKEN_PREFIX = "bearer."
 MIN_TOKEN_LENGTH = 16
 _TOKEN_CHARACTERS = frozenset("ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789-._~")
 MAX_ANONYMOUS_CONNECTIONS = 64
-"""Limit for connections that have not shown the token. One more closes the oldest of the address with most of
-them.
+"""Maximum number of connections that have not sent the token. When it is exceeded, the server closes the oldest one of
+the address that has most of them.
 """
 REQUEST_TIMEOUT_S = 10.0
 """Seconds from the first byte of a request, or from the start of the connection, to the end of its headers."""
@@ -164,7 +164,7 @@ RawHeaders = list[tuple[bytes, bytes]]
 def http_protocol(has_token: Callable[[RawHeaders], bool]) -> type[H11Protocol]:
     """Return the ``http`` class for `uvicorn.Config`, which limits anonymous connections.
 
-    Connections whose requests contain the token are never closed for others, so that the owner always gets in.
+    Connections whose requests contain the token are never closed, so that anonymous clients cannot exclude the owner.
     """
     anonymous: dict[_HttpConnection, None] = {}
 
@@ -233,7 +233,7 @@ class _HttpConnection(H11Protocol):
 def _oldest_of_the_most_frequent(connections: Iterable[_HttpConnection]) -> _HttpConnection:
     connections = list(connections)
     counts = Counter(_host(connection) for connection in connections)
-    # max returns the first of equals, the oldest.
+    # max() returns the first of several maxima, which is the oldest.
     return max(connections, key=lambda connection: counts[_host(connection)])
 
 

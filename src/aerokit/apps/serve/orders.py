@@ -28,13 +28,13 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("aerokit")
 
 MAX_RUNNING = 16
-"""Maximum number of running orders for each vehicle; orders that make it safe are always accepted."""
+"""Maximum number of running orders for each vehicle. Orders with ``is_safe`` are accepted beyond it."""
 MAX_RESULTS = 500
 """Maximum number of orders whose results are stored."""
 MAX_USED_KEYS = 100_000
-"""Maximum number of older keys that are remembered, so that they are not used again."""
+"""Maximum number of older keys that are stored to detect their reuse."""
 STATE_MAX_AGE_S = 5.0
-"""An order is refused if the state that its client has seen is older."""
+"""Maximum age in seconds of the state that the client of an order has seen."""
 _KEY = re.compile(r"[A-Za-z0-9._~-]{8,64}")
 
 
@@ -51,8 +51,8 @@ class OrderArgument:
 class OrderType:
     """One type of order: its arguments, and the function that runs it.
 
-    ``is_safe``: it brings the vehicle to rest, and is therefore tried on a silent vehicle too. ``parse`` converts the
-    arguments to those that are recorded, and those that ``run`` gets.
+    ``is_safe`` marks an order that brings the vehicle to rest; it is sent even to a silent vehicle. ``parse`` converts
+    the arguments to a pair: the arguments that are recorded, and those that ``run`` receives.
     """
 
     name: str
@@ -70,7 +70,7 @@ class OrderType:
                 known = ", ".join(self.arguments) or "none"
                 raise InvalidArgument(f"{self.name}: unknown argument {name[:40]!r}; arguments: {known}")
         for name, argument in self.arguments.items():
-            if isinstance(values.get(name), bool):  # Python's True is 1, which is a valid flight mode number
+            if isinstance(values.get(name), bool):  # bool is a subclass of int, but True is not a mode number
                 raise InvalidArgument(f"{self.name}: {name} = {values[name]} is not of type {argument.type}")
             if argument.is_required and values.get(name) is None:
                 raise InvalidArgument(f"{self.name}: argument {name} is missing ({argument.text})")

@@ -26,7 +26,7 @@ from aerokit.errors import (
 if TYPE_CHECKING:
     from starlette.requests import Request
 
-# Error class to HTTP status; the first match counts.
+# Maps error classes to HTTP statuses. The first matching class counts.
 _STATUS: tuple[tuple[type[Exception], int], ...] = (
     (InvalidArgument, 400),
     (FileFormatError, 400),
@@ -166,5 +166,5 @@ def system_id_of(request: Request) -> int:
     """Return the system id in the path; raise HttpProblem 404 if it is invalid."""
     text = request.path_params["system_id"]
     if not (text.isascii() and text.isdigit() and len(text) <= 3 and 1 <= int(text) <= 255):
-        raise HttpProblem(404, "NotHeard", "a system id is a number from 1 to 255; nothing was sent")
+        raise HttpProblem(404, "UnknownVehicle", "a system id is a number from 1 to 255; nothing was sent")
     return int(text)

@@ -28,16 +28,17 @@ Listener = Callable[[dict[str, Any]], object]
 
 MAX_EVENTS = 500
 MAX_TEXTS = 200
-"""For each vehicle."""
+"""Maximum number of stored texts for each vehicle."""
 SNAPSHOT_MAX_AGE_S = 0.05
 """Requests within this time share one snapshot."""
 MAX_TRACK_POINTS = 2000
-"""For each vehicle. A full track loses every second point, so that it still covers the whole flight."""
+"""Maximum number of stored track points for each vehicle. A full track is thinned to every second point, so that it
+still covers the whole flight."""
 TRACK_INTERVAL_S = 0.2
 MIN_TRACK_STEP_M = 0.5
 TRACK_GAP_S = 3.0
 PREARM_TEXT_MAX_AGE_S = 35.0
-"""ArduPilot repeats every 30 s why it does not arm."""
+"""Maximum age in seconds of a text about a failed arming check. ArduPilot repeats these texts every 30 s."""
 
 
 class ServedVehicles:
@@ -55,7 +56,7 @@ class ServedVehicles:
         self._attached: dict[Connection, list[Detach]] = {}
         self._count = 0
         self._snapshot: tuple[float, str] | None = None
-        # The end of a connection is no error here: the states of its vehicles show it.
+        # The end of a connection is not an error here, because the states of its vehicles show it.
         self._background = BackgroundTasks(lambda error: None)
         self._vehicles: Mapping[int, Vehicle] = {}
         if isinstance(source, Connection):
@@ -82,7 +83,7 @@ class ServedVehicles:
         if found is None:
             known = ", ".join(map(str, self.vehicles)) or "none"
             raise HttpProblem(
-                404, "NotHeard", f"no vehicle has system id {system_id} (vehicles: {known}); nothing was sent"
+                404, "UnknownVehicle", f"no vehicle has system id {system_id} (vehicles: {known}); nothing was sent"
             )
         return found
 
@@ -90,7 +91,7 @@ class ServedVehicles:
         return list(self._texts.get(system_id, ()))
 
     def track(self, system_id: int) -> list[tuple[float, float, bool]]:
-        """Return where the vehicle was, the oldest first: latitude, longitude, True for the first one after a gap."""
+        """Return a track, the oldest position first: latitude, longitude, and True for the first one after a gap."""
         points = self._tracks.get(system_id, ())
         return [(at.latitude_deg, at.longitude_deg, is_after_gap) for at, is_after_gap in points]
 
@@ -163,9 +164,10 @@ class ServedVehicles:
             await anyio.sleep(TRACK_INTERVAL_S)
 
     def _state_of(self, vehicle: Vehicle) -> dict[str, Any]:
-        """Return the overview of a vehicle, with what it lacks for flight and mission items numbered like the mission.
+        """Return the overview of a vehicle, with the conditions missing for flight and the mission progress.
 
-        The state ``mission_current`` is numbered as on the wire, where ArduPilot counts home as item 0.
+        ``mission_item`` counts items without home, unlike the state ``mission_current``, which counts them as on the
+        wire, where ArduPilot's item 0 is home.
         """
         mission = vehicle.mission
         return {
@@ -181,6 +183,6 @@ class ServedVehicles:
         if not missing or vehicle.link_state.latest is not LinkState.CONNECTED:
             return missing
         since = vehicle.connection.unix_time() - PREARM_TEXT_MAX_AGE_S
-        recent = [each["text"] for each in self.texts(vehicle.system_id) if each["time_unix_s"] >= since]
-        said = (vehicle.autopilot.arming_reason(text) for text in recent)
-        return list(dict.fromkeys([*filter(None, said), *missing]))
+        recent = [entry["text"] for entry in self.texts(vehicle.system_id) if entry["time_unix_s"] >= since]
+        reasons = (vehicle.autopilot.arming_reason(text) for text in recent)
+        return list(dict.fromkeys([*filter(None, reasons), *missing]))

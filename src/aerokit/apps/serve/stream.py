@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
 MAX_SOCKETS = 32
 MAX_ANONYMOUS_SOCKETS = 16
-"""Limit for sockets without the token, if reading is open."""
+"""Maximum number of sockets without the token, if reading is open."""
 MAX_QUEUED_MESSAGES = 256
-"""For one client. When the queue is full, the oldest message is dropped and counted."""
+"""Maximum number of queued messages for one client. When the queue is full, the oldest is dropped and counted."""
 SEND_TIMEOUT_S = 10.0
 DEFAULT_RATE_HZ, MAX_RATE_HZ, MIN_RATE_HZ = 5.0, 20.0, 0.1
 

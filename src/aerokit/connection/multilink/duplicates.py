@@ -46,7 +46,7 @@ class Copies:
         self._counts: dict[int, int] = {}  # sender → frames that were not copies
         self._current: _Seen | None = None
         self.is_late: bool = False
-        """True if the last checked frame equals one that was accepted over another link seconds ago."""
+        """True if the last checked frame equals one that was accepted over another link some seconds ago."""
 
     def is_copy(self, frame: Frame, link: int) -> bool:
         """Return True if an equal frame arrived over another link within the last seconds, and not over this one."""

@@ -254,7 +254,7 @@ class LinkChoice:
     def choose(self, now: float) -> str | None:
         """Select the link to use. Return the reason if it changes."""
         alive = sorted(
-            (each for each in self.candidates.values() if self.may_be_used(each) and each.is_alive(now)),
+            (link for link in self.candidates.values() if self.may_be_used(link) and link.is_alive(now)),
             key=lambda candidate: (candidate.is_costly, candidate.cost_s),
         )
         if not alive:

@@ -75,8 +75,10 @@ class LinkStates:
             for system_id, choice in self._choices.items()
             if link in choice.candidates
         }
-        losses = [each.loss for each in candidates.values() if each.loss is not None]
-        round_trips = [each.round_trip_s for each in candidates.values() if each.round_trip_s is not None]
+        losses = [candidate.loss for candidate in candidates.values() if candidate.loss is not None]
+        round_trips = [
+            candidate.round_trip_s for candidate in candidates.values() if candidate.round_trip_s is not None
+        ]
         return LinkStatus(
             self._link.names[link],
             self._states[link],
@@ -264,7 +266,8 @@ class MultiLinkRoutes:
                     self._counters.pop((system_id, link), None)
                     continue
                 counters = self._counters.get((system_id, link), {}).values()
-                received, lost = sum(each.received for each in counters), sum(each.lost for each in counters)
+                received = sum(counter.received for counter in counters)
+                lost = sum(counter.lost for counter in counters)
                 candidate.record_counts(received, lost, now)
                 self._probe(system_id, choice, candidate, now)
             self._choose(system_id, choice, now)
@@ -294,9 +297,12 @@ class MultiLinkRoutes:
         for system_id, choice in self._choices.items():
             links_with_systems.update(choice.candidates)
             if choice.used is not None:
-                others = (each for each in choice.candidates.values() if each is not choice.used)
-                usable = (each for each in others if choice.may_be_used(each) and each.is_alive(now))
-                options.append([self._peers_on(each.link, system_id, 0) for each in (choice.used, *usable)])
+                usable = [
+                    candidate
+                    for candidate in choice.candidates.values()
+                    if candidate is not choice.used and choice.may_be_used(candidate) and candidate.is_alive(now)
+                ]
+                options.append([self._peers_on(candidate.link, system_id, 0) for candidate in (choice.used, *usable)])
         for of_system in sorted(options, key=len):
             if not any(peers.issuperset(option) for option in of_system):
                 peers.update(of_system[0])

@@ -18,7 +18,7 @@ MAX_SPEED_ERROR = 0.02  # simulations do not keep their nominal speed exactly
 MAX_DRIFT_S = 0.5  # otherwise any clock would match after a long enough silence
 REAL_TIME_TOLERANCE = 0.05  # a measured speed of 1 ± this is taken as 1, because its error adds up in a long silence
 MIN_SPAN_S = 1.0
-MAX_SPEED = 200.0  # of a simulation
+MAX_SPEED = 200.0  # maximum speed of a simulation, relative to real time
 MAX_PAUSE_S = 10.0  # a simulation that was paused for longer counts as rebooted
 SPEED_MAX_AGE_S = 5.0  # validity of the previous speed after a pause or reboot
 

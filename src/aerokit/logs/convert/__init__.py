@@ -63,8 +63,8 @@ class Conversion(Snapshot):
     entries: int
     """Number of records read from the log: messages or rows."""
     written: int
-    """Number of messages, rows or points written. An ``.mcap`` gets several messages for one record: itself, and
-    each state that it changes. A flight table or track gets rows or points for positions only.
+    """Number of messages, rows or points written. In an ``.mcap``, a record is one message, and each state that the
+    record changes is another. A flight table or track has rows or points for positions only.
     """
     bytes: int
     """Total size of the written files."""
@@ -84,9 +84,9 @@ def convert(
     force: bool = False,
     on_progress: OnProgress | None = None,
 ) -> Conversion:
-    """Convert a flight log; a damaged log, as far as it can be read.
+    """Convert a flight log. Of a damaged log, the readable part is converted.
 
-    The target appears when it is complete. Blocks; needs no event loop.
+    The target appears only when it is complete. The function blocks and needs no event loop.
 
     Args:
         log: a ``.tlog`` of a ground station, a ``.bin`` of ArduPilot, a ``.ulg`` of PX4.
@@ -111,7 +111,7 @@ def convert(
         raise InvalidArgument(f"{to} exists; use force (--force) to replace it")
     if to.exists() and to.is_dir() != (not to.suffix):
         kinds = ("folder", "file") if to.is_dir() else ("file", "folder")
-        raise InvalidArgument(f"{to} is a {kinds[0]}, and cannot be replaced by a {kinds[1]}")
+        raise InvalidArgument(f"{to} is a {kinds[0]} and cannot be replaced by a {kinds[1]}")
     on_bytes = _byte_callback(source, on_progress)
     # In the target's directory, so that it can be renamed.
     with tempfile.TemporaryDirectory(dir=to.parent, prefix=f".{to.name}.") as folder:
@@ -163,7 +163,7 @@ def _move(part: Path, to: Path) -> int:
     files = sorted(part.iterdir()) if part.is_dir() else [part]
     for file in files:
         with file.open("rb") as opened:
-            os.fsync(opened.fileno())  # otherwise a power cut could leave an empty file
+            os.fsync(opened.fileno())  # without fsync, a power failure could leave an empty file
     size = sum(file.stat().st_size for file in files)
     if not part.is_dir():
         part.replace(to)

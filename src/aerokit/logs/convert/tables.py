@@ -1,4 +1,4 @@
-"""Tables in CSV or Parquet: one table of the flight, or a folder with one for each message type."""
+"""Tables in CSV or Parquet: one table of the flight, or a folder with a table for each message type."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ FLIGHT = (
     TableColumn("mode", "mode.name", "str"),
     TableColumn("armed", "armed", "bool"),
 )
-"""Columns of the flight table after time and system id: the newest values at each position."""
+"""Columns of the flight table after time and system id. Each row has the newest values at one position."""
 
 
 class _UnixLines:
@@ -60,15 +60,15 @@ class _UnixLines:
         self._file.write(row[:-2] + "\n")
 
 
-# Where spreadsheets find a formula in a text (owasp.org/www-community/attacks/CSV_Injection): at its beginning, also
-# after white space, and after separators of other locales, for which quoting does not help.
+# Places in a text where spreadsheets recognise a formula (owasp.org/www-community/attacks/CSV_Injection): at the
+# beginning, even after white space, and after the separators of other locales, which quotes do not protect.
 _FORMULA = re.compile(r"(^|[;\t])(?=[\s\0]*[=+\-@\uff1d\uff0b\uff0d\uff20])|^(?=[\t\r\n\0])")
 
 
 def _csv_cell(value: Any) -> Any:
     if isinstance(value, str):
         return _FORMULA.sub(r"\1'", value)
-    return "" if value != value else value  # NaN
+    return "" if value != value else value  # NaN becomes an empty cell
 
 
 class CsvTable:
@@ -81,7 +81,7 @@ class CsvTable:
 
     def __init__(self, path: Path, columns: Sequence[TableColumn]) -> None:
         self._file = path.open("w", encoding="utf-8", newline="")
-        # With this line terminator, csv quotes values that contain "\r" or "\n".
+        # The csv module quotes values with "\r" and "\n" only if the line terminator contains both.
         self._writer = csv.writer(_UnixLines(self._file), lineterminator="\r\n")
         self._writer.writerow([_csv_cell(column.name) for column in columns])
 
@@ -141,7 +141,7 @@ Table = CsvTable | ParquetTable
 
 
 class FlightTableWriter:
-    """Writes one table, with a row for each position of each vehicle and the newest other values."""
+    """Writes one table, with a row for each position of each vehicle, which includes the newest other values."""
 
     def __init__(self, path: Path, log: LogReader, kind: type[Table]) -> None:
         self._table = kind(path, (*_SENDER[:2], *FLIGHT))
@@ -182,7 +182,7 @@ class MessageTablesWriter:
         found = self._tables.get(record.table)
         if found is None:
             columns = self._log.columns(record)
-            # Names come from the log, which is untrusted input.
+            # The log is untrusted input, and the name becomes a file name.
             name = re.sub(r"[^\w-]", "_", record.table) + self._kind.SUFFIX
             if (self._path / name).exists():
                 name = f"{len(self._tables)}_{name}"

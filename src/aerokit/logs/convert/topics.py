@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.state.movement import Attitude, Velocity
 
 MAP_FRAME = "map"
-"""Common frame of all vehicles: x east, y north, z up, in metres; the origin is the first known position."""
+"""Common frame of all vehicles: x is east, y north, z up, in metres. The origin is the first known position."""
 _JSON = json.JSONEncoder(separators=(",", ":"), ensure_ascii=False, allow_nan=False)
 _NUMBER, _TEXT = {"type": "number"}, {"type": "string"}
 _KINDS = {"float": "number", "int": "number", "str": "string", "bool": "boolean"}
@@ -117,7 +117,7 @@ class MapFrame:
 
 
 def height_above(origin_m: float, altitude_amsl_m: float | None, relative_m: float | None) -> float:
-    """Return metres above the origin, from the altitude above sea level, or above home if that is unknown."""
+    """Return the height above the origin in metres, from the altitude above sea level if known, else above home."""
     return (relative_m or 0.0) if altitude_amsl_m is None else altitude_amsl_m - origin_m
 
 
@@ -261,7 +261,10 @@ def _vector(x: float, y: float, z: float) -> dict[str, float]:
 
 
 def _rotation(attitude: Attitude | None) -> dict[str, float]:
-    """Convert from (forward, right, down) in (north, east, down) to (forward, left, up) in (east, north, up)."""
+    """Return the rotation of a body frame (forward, left, up) in the map frame (east, north, up) as a quaternion.
+
+    MAVLink uses forward, right, down in north, east, down.
+    """
     w, x, y, z = 1.0, 0.0, 0.0, 0.0
     if attitude is not None and all(map(math.isfinite, (attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg))):
         w, x, y, z = attitude.quaternion
@@ -270,7 +273,7 @@ def _rotation(attitude: Attitude | None) -> dict[str, float]:
 
 
 def _schema_of(value: object) -> dict[str, Any]:
-    """Return the JSON schema of a converted value. For None the field's annotation gives the type."""
+    """Return the JSON schema of a converted value. If a field is None, its annotation determines the type."""
     if isinstance(value, Snapshot):
         kinds = _annotations(type(value))
         fields = value.to_dict()

@@ -65,7 +65,7 @@ class _TrackWriter:
             self._add_item(record)
 
     def discard(self) -> None:
-        pass  # no file is open yet
+        pass  # the file is opened in `close`
 
     def close(self) -> None:
         if not self.written:
@@ -137,7 +137,8 @@ class KmlWriter(_TrackWriter):
         file = kml.Kml(name=self._log.path.name)
         for system_id, track in self._tracks.items():
             folder = file.newfolder(name=f"vehicle {system_id}")
-            # Above sea level if known, otherwise above home, which is closest to KML's "relative to ground".
+            # Use altitudes above sea level if all are known. Otherwise altitudes above home come closest to
+            # KML's "relativeToGround".
             is_absolute = all(place.altitude_amsl_m is not None for _, place in track.points)
             mode = kml.AltitudeMode.absolute if is_absolute else kml.AltitudeMode.relativetoground
             line = folder.newgxtrack(name="track", altitudemode=mode)

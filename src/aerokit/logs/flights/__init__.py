@@ -61,7 +61,9 @@ def check_log_name(path: Path) -> None:
 def read_flight(
     log: str | os.PathLike[str], *, system_id: int | None = None, on_progress: OnProgress | None = None
 ) -> FlightLog:
-    """Read a flight from a log; from a damaged log, as much as can be read. Blocks; needs no event loop.
+    """Read a flight from a log. Of a damaged log, the readable part is returned.
+
+    The function blocks and needs no event loop.
 
     Args:
         log: a ``.tlog`` of a ground station or of ``record=``, a ``.bin`` of ArduPilot, a ``.ulg`` of PX4.
@@ -69,7 +71,7 @@ def read_flight(
         on_progress: called from time to time with the bytes that were read.
 
     Raises:
-        FileFormatError: the file is not such a log, or nothing can be read.
+        FileFormatError: the file is not a flight log, or nothing can be read.
         OSError: the file cannot be read.
         ModuleNotFoundError: pyulog, of the extra ``report``, is not installed (``.ulg``).
     """
@@ -107,7 +109,7 @@ def _complete(flight: FlightLog) -> None:
 def _fill_relative(flight: FlightLog) -> None:
     """Derive heights above home from altitudes above sea level.
 
-    ArduPilot logs the same value for both until it knows home, or the altitude above sea level.
+    Until ArduPilot knows home, or the altitude above sea level, it logs the same value for both.
     """
     home = flight.home.altitude_amsl_m if flight.home is not None else None
     if home is None:

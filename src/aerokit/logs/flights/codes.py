@@ -116,8 +116,8 @@ _FENCES = {
     8: "below the minimum altitude",
 }
 _CONTROL = re.compile(
-    r"(?:\x1b\[|\x9b)[0-?]*[ -/]*[@-~]"  # colours and the like (ECMA-48, CSI)
-    r"|\x1b\][^\x07\x1b]*(?:\x07|\x1b\\)"  # titles of windows (OSC)
+    r"(?:\x1b\[|\x9b)[0-?]*[ -/]*[@-~]"  # CSI sequences of ECMA-48, such as colours
+    r"|\x1b\][^\x07\x1b]*(?:\x07|\x1b\\)"  # OSC sequences, such as window titles
     r"|[\x00-\x08\x0b-\x1f\x7f-\x9f]"  # other control characters, except tab and newline
 )
 

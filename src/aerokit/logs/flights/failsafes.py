@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 
     from aerokit.logs.flights.flight import FlightLog, LoggedText, ModeChange, TimeSeries
 
-# Evidence of one kind within this time is one failsafe.
+# Evidence of the same kind within this time belongs to one failsafe.
 _SAME_KIND_GAP_S = 8.0
-# General evidence within this time of specific evidence is the same failsafe.
+# Evidence of the kind "general" belongs to the same failsafe as specific evidence within this time.
 _GENERAL_GAP_S = 3.0
 _REACTION_TIMEOUT_S = 12.0
 _CONTEXT_S = 10.0
@@ -177,10 +177,10 @@ def _explain(flight: FlightLog, group: Sequence[FailsafeEvidence]) -> Failsafe:
 
 
 def _reaction(flight: FlightLog, time_s: float, group: Sequence[FailsafeEvidence]) -> tuple[str, bool]:
-    """Return the first mode change that was not commanded, or disarming, and True if the autopilot caused it.
+    """Return a description of the reaction, and True if the autopilot caused it.
 
-    If the log does not contain the cause, an immediate change is attributed to the autopilot; a later one may
-    be the pilot's.
+    The reaction is the first mode change that was not commanded, or disarming. If the log does not contain the cause
+    of a change, an immediate change is attributed to the autopilot; a later one may have been made by the pilot.
     """
     last = group[-1].time_s
     for change in flight.modes:

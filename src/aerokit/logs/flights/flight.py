@@ -20,9 +20,9 @@ _HOME_AFTER_ARMING_S = 2.0
 
 
 class TimeSeries:
-    """Columns of numbers with times, the oldest first. NaN is unknown.
+    """Table of numbers by time, the oldest row first. NaN means unknown.
 
-    ``series["roll_deg"]`` is a column; names contain the units. ``len(series)`` is the number of rows.
+    ``series["roll_deg"]`` returns a column. The names contain the units. ``len(series)`` is the number of rows.
     """
 
     def __init__(self, *names: str) -> None:
@@ -116,7 +116,7 @@ class TangentPlane:
 
 
 def battery_name(number: int) -> str:
-    """Return the name for people: they count batteries from 1, as ArduPilot's texts and parameters do."""
+    """Return the displayed name. Batteries are counted from 1, as in ArduPilot's texts and parameters."""
     return f"battery {number + 1}"
 
 
@@ -160,7 +160,7 @@ class Waypoint(Snapshot):
     longitude_deg: float
     altitude_m: float
     frame: int
-    """MAV_FRAME; defines the reference of the altitude."""
+    """MAV_FRAME, which defines the reference of the altitude."""
 
 
 class FailsafeEvidence(Snapshot):
@@ -177,14 +177,15 @@ class FailsafeEvidence(Snapshot):
 
 @dataclass(slots=True)
 class FlightLog:
-    """One flight: time series and lists. Times are seconds since ``begins_at``. What the log does not contain is
-    empty.
+    """One flight: time series and lists. Times are seconds since ``begins_at``.
+
+    Series, lists and texts that the log does not contain are empty.
     """
 
     path: Path
     """Path of the log."""
     begins_at: float = 0.0
-    """UTC of the first entry, in seconds since 1970; less than a year if no clock was set."""
+    """UTC of the first entry, in seconds since 1970. A value below one year means that no clock was set."""
     ends_at: float = 0.0
     """UTC of the last entry."""
     vehicle: str = ""
@@ -193,7 +194,7 @@ class FlightLog:
     """``"ArduPilot"``, ``"PX4"``."""
     system_id: int = 1
     home: Position | None = None
-    """Home of the first flight in the log; if not logged, the position where it was first armed."""
+    """Home of the first flight in the log. If home was not logged, the position of the first arming."""
     track: TimeSeries = field(
         default_factory=lambda: TimeSeries("latitude_deg", "longitude_deg", "altitude_amsl_m", "altitude_relative_m")
     )
@@ -221,7 +222,7 @@ class FlightLog:
     link: TimeSeries = field(default_factory=lambda: TimeSeries("lost_percent", "received_hz"))
     """For each second: the percentage of lost messages, and the rate of received ones."""
     radio: TimeSeries = field(default_factory=lambda: TimeSeries("rssi", "remote_rssi", "noise", "remote_noise"))
-    """In the radio's own units."""
+    """Signal values of a telemetry radio, in the units of the radio."""
     gcs_heartbeats: array[float] = field(default_factory=lambda: array("d"))
     """Times of ground station heartbeats; only in a ``.tlog`` that includes sent messages."""
     modes: list[ModeChange] = field(default_factory=list)
@@ -229,7 +230,7 @@ class FlightLog:
     """Start and end of each span in which the vehicle was armed."""
     texts: list[LoggedText] = field(default_factory=list)
     failsafe_evidence: list[FailsafeEvidence] = field(default_factory=list)
-    """Input of `aerokit.logs.flights.failsafes.failsafes`."""
+    """Evidence that `aerokit.logs.flights.failsafes.failsafes` evaluates."""
     parameters: dict[str, float] = field(default_factory=dict)
     """First logged value of each parameter."""
     parameter_changes: list[ParameterChange] = field(default_factory=list)
@@ -289,7 +290,7 @@ class FlightLog:
             self.armed[-1] = (self.armed[-1][0], time_s)
 
     def set_home(self, time_s: float, latitude_deg: float, longitude_deg: float, amsl_m: float) -> None:
-        """Record home. Only that of the first flight is kept: ArduPilot moves home along while disarmed."""
+        """Record home until the first flight. ArduPilot moves home with the vehicle while it is disarmed."""
         is_valid = abs(latitude_deg) <= 90 and abs(longitude_deg) <= 180 and (latitude_deg or longitude_deg)
         if not is_valid:  # also for NaN
             return

@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 _MAGIC = b"\xa3\x95"
-_TAIL = 4096  # at power-off the last rows are incomplete
-_NO_UTC = "no GNSS time in the log: times count from power-on, as if that were 1970"
+_TAIL = 4096  # after power-off, rows in the last bytes may be incomplete
+_NO_UTC = "no GNSS time in the log: times count from power-on, which is shown as 1970-01-01"
 _A_YEAR_S = 365 * 86_400.0
-_MAX_UNIX_S = 4_102_444_800.0  # the year 2100, as for a .tlog
+_MAX_UNIX_S = 4_102_444_800.0  # the year 2100; `aerokit.mavlink.tlog` has the same limit
 
 
 def opened_bin(path: Path, on_percent: Callable[[float], object] | None = None) -> Any:
@@ -39,11 +39,11 @@ def opened_bin(path: Path, on_percent: Callable[[float], object] | None = None) 
     """
     with path.open("rb") as file:
         if file.read(2) != _MAGIC:
-            raise FileFormatError(f"{path} is not an ArduPilot log: wrong first bytes")
+            raise FileFormatError(f"{path} is not an ArduPilot log: it does not begin with A3 95")
     kind = import_module("pymavlink.DFReader").DFReader_binary
-    reader = kind.__new__(kind)  # without __init__, so that its file can be closed if that raises
+    reader = kind.__new__(kind)  # call __init__ separately, so that the file can be closed if __init__ raises
     try:
-        with redirect_stdout(sys.stderr):  # pymavlink prints damage to stdout, which may carry our output
+        with redirect_stdout(sys.stderr):  # pymavlink reports damage on stdout, where aerokit may print JSON
             reader.__init__(str(path), progress_callback=on_percent)
     except Exception as error:  # pymavlink raises arbitrary errors
         close_bin(reader)
@@ -76,7 +76,7 @@ class _RowReader(LogReader):
     _skipped = 0
 
     def _is_plausible_time(self, unix_s: float) -> bool:
-        """Return False, and count the row, if a damaged row has an impossible time."""
+        """Return False and count the row as damaged if its time is impossible."""
         is_plausible = 0 <= unix_s < _MAX_UNIX_S
         self._skipped += not is_plausible
         return is_plausible
@@ -97,7 +97,7 @@ def _kind(value: object) -> str:
 
 
 def _position(latitude: float, longitude: float, amsl_m: float, relative_m: float | None) -> Position | None:
-    """Return None for positions of an estimator that has diverged, or not started."""
+    """Create a position. Return None if the estimator has diverged or has not started yet."""
     try:
         check_place(latitude, longitude)
         place = Position(latitude, longitude, float(amsl_m), relative_m)

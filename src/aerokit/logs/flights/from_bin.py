@@ -1,4 +1,4 @@
-"""Reads a `FlightLog` from a ``.bin`` of ArduPilot: pymavlink indexes the rows, needed columns are unpacked."""
+"""Reads a `FlightLog` from a ``.bin`` of ArduPilot. pymavlink indexes the rows; only needed columns are unpacked."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from aerokit.logs.flights.flight import FlightLog
 
 NAN = math.nan
-_CHUNK = 1 << 9  # more rows at once keep the garbage collector busy with their tuples
+_CHUNK = 1 << 9  # rows unpacked at once; with more, the garbage collector takes longer to traverse their tuples
 # Unknown charge: AP_BattMonitor_Logging.cpp writes -1 as a byte.
 _NO_PERCENT = 255
 _FIRMWARES = {
@@ -34,9 +34,9 @@ _FIRMWARES = {
 }
 _ARMED, _DISARMED = 10, 11  # events in old logs without ARM
 _HOME = 1
-# Closer to 0° N 0° E, the estimator has no position yet.
+# A position closer to 0° N 0° E means that the estimator has no position yet.
 _NULL_ISLAND_DEG = 0.01
-_INDEXING_SHARE = 0.3  # of the total time
+_INDEXING_SHARE = 0.3  # share of the total time, for the progress
 
 
 def read_bin_flight(flight: FlightLog, system_id: int | None, on_bytes: Callable[[int], object]) -> None:
@@ -81,7 +81,7 @@ class _Tables:
             yield from zip(*chunk, strict=True)
 
     def columns(self, table: str, *columns: str) -> list[list[Any]]:
-        """Return the same by columns."""
+        """Return the same data as a list for each column."""
         found: list[list[Any]] = [[] for _ in range(len(columns) + 1)]
         for chunk in self._chunks(table, columns):
             for whole, part in zip(found, chunk, strict=True):
@@ -110,7 +110,7 @@ class _Tables:
             yield chunk
 
     def _first_time(self) -> int:
-        """Return the time of the first row in the file. Tables start at different times."""
+        """Return the time of the first row in the file, which may be in any table."""
         self.began_us = 0
         reader, found = self._reader, []
         for number in reader.name_to_id.values():
@@ -126,7 +126,7 @@ class _Tables:
             raise FileFormatError(
                 f"{reader.filehandle.name} has no row with a time (TimeUS): it is empty, or from before 2015"
             )
-        return int(min(found)[1])  # not the smallest time: a damaged row can have any
+        return int(min(found)[1])  # not the minimum of all times, because a damaged row can have any time
 
 
 def _pattern(row_format: Any, indices: Sequence[int]) -> str:

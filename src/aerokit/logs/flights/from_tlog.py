@@ -28,14 +28,15 @@ if TYPE_CHECKING:
 
 NAN = math.nan
 _U16, _E7, _METRES_PER_DEGREE = 0xFFFF, 1e7, 111_319.5
-# Closer to 0° N 0° E, the estimator has no position yet.
+# A position closer to 0° N 0° E means that the estimator has no position yet.
 _NULL_ISLAND_E7 = 100_000
 _HEARTBEAT, _MAX_SEQUENCE_GAP = b"\0\0\0", 200
-# A mode change within this time of a command was commanded.
+# A mode change within this time after a command is attributed to the command.
 _COMMAND_MAX_AGE_S = 5.0
-# Clocks of vehicles and computers differ by less, and delays of a link average out in this time.
+# Clocks of vehicles and computers drift by less than this share, so a larger drift means a simulation faster or slower
+# than real time. Over the minimum time of comparison, delays of the link average out.
 _MAX_CLOCK_DRIFT, _MIN_CLOCK_COMPARISON_S, _MAX_CLOCK_GAP_S = 0.2, 1.0, 10.0
-# Bits of a type mask: these fields are ignored.
+# Bits of a type mask that mark position and velocity as ignored.
 _NO_POSITION, _NO_VELOCITY = 0x7, 0x38
 _MODE_COMMANDS = frozenset(
     (
@@ -52,10 +53,10 @@ _ALARM = {MavState.CRITICAL: "critical", MavState.EMERGENCY: "emergency"}
 
 
 def read_tlog_flight(flight: FlightLog, system_id: int | None, on_bytes: Callable[[int], object]) -> None:
-    """Fill a flight from its file, for this system id, or for the first autopilot.
+    """Fill a flight from its file, for this system id, or by default for the first autopilot.
 
     Raises:
-        FileFormatError: the log has no such autopilot.
+        FileFormatError: the log has no heartbeat of an autopilot with this system id.
     """
     heartbeat, frame = _first_autopilot(flight, system_id)
     flight.system_id = frame.system_id
@@ -356,7 +357,7 @@ class _Reader:
 
     def _navigation(self, time_s: float, message: m.NavControllerOutput) -> None:
         if self._autopilot.name == "ArduPilot":
-            bearing = message.nav_bearing  # the bearing for fixed wings; for copters it has no meaning
+            bearing = message.nav_bearing  # nav_bearing has a meaning for fixed wings only
             self._flight.attitude_target.add(time_s, message.nav_roll, message.nav_pitch, NAN)
             if -180 <= bearing <= 360 and self._relative_m == self._relative_m:
                 self._flight.position_target.add(time_s, NAN, NAN, NAN, self._relative_m + message.alt_error)
@@ -433,14 +434,14 @@ class _Reader:
 
 
 def _key(kind: type[Message]) -> bytes:
-    """Return a message id as in a frame."""
+    """Return the bytes of a message id in a frame."""
     return kind.ID.to_bytes(3, "little")
 
 
 def _decoded(raw: bytes, unix_s: float) -> Message | None:
     """Return the message of a record; None if its checksum is wrong."""
     if raw[0] == MAGIC_V2:
-        frame, end = Frame(), 10 + raw[1]  # same as `Frame.parse`, but faster; a signature may follow
+        frame, end = Frame(), 10 + raw[1]  # faster than `Frame.parse`; a signature may follow
         frame.body, frame.checksum = raw[1:end], raw[end] | raw[end + 1] << 8
         frame.system_id, frame.component_id = raw[5], raw[6]
         frame.message_id, frame.received_at = raw[7] | raw[8] << 8 | raw[9] << 16, unix_s
@@ -485,7 +486,7 @@ class _LinkCounter:
     def count(self, time_s: float, sequence: int, expected: int, received: int) -> float:
         """Count frames after a gap, or at the start of a second. Return the start of the next second."""
         missing = (sequence - expected) & 0xFF if expected >= 0 else 0
-        if missing > _MAX_SEQUENCE_GAP:  # a delayed frame, or one from a second link: nothing is lost
+        if missing > _MAX_SEQUENCE_GAP:  # a delayed frame, or a frame from a second link, is not a loss
             missing = 0
         if time_s >= self._second + 1:
             self._received += received - 1
@@ -504,7 +505,7 @@ class _LinkCounter:
     def _add_row(self, second: int) -> None:
         sent = self._received + self._lost
         self._series.add(self._second, 100 * self._lost / sent if sent else NAN, self._received)
-        if second - self._second > 1:  # nothing received for a while
+        if second - self._second > 1:  # add rows for the seconds without frames
             self._series.add(self._second + 1, 100.0, 0)
             self._series.add(second - 1, 100.0, 0)
         self._second, self._received, self._lost = second, 0, 0

@@ -71,7 +71,7 @@ _FLAGS = {
     "vtol_fixed_wing_system_failure": ("transition", "fixed-wing system failure"),
 }
 _WARNINGS = {1: "low", 2: "critical", 3: "emergency", 4: "failed"}
-_LOADING_SHARE = 0.9  # of the total time
+_LOADING_SHARE = 0.9  # share of the total time, for the progress
 _BUFFER = 1 << 20
 
 
@@ -84,7 +84,7 @@ def read_ulog_flight(flight: FlightLog, system_id: int | None, on_bytes: Callabl
     """
     core = import_module("pyulog")
     try:
-        # pyulog prints damage to stdout, which may carry our output.
+        # pyulog reports damage on stdout, where aerokit may print JSON.
         with (
             io.BufferedReader(_ProgressFile(flight.path, on_bytes), _BUFFER) as file,
             redirect_stdout(sys.stderr),
@@ -103,7 +103,7 @@ def read_ulog_flight(flight: FlightLog, system_id: int | None, on_bytes: Callabl
 
 
 class _ProgressFile(io.FileIO):
-    """A file that reports how far it was read, for a buffer around it."""
+    """An unbuffered file that reports how many bytes were read."""
 
     def __init__(self, path: Path, on_bytes: Callable[[int], object]) -> None:
         super().__init__(path)
@@ -180,7 +180,7 @@ class _Reader:
         return max((int(at_us) - self._began_us) / 1e6, 0.0)
 
     def _topics(self, *names: str) -> list[tuple[int, _Topic]]:
-        """Return the instances, with their numbers, of the first existing topic."""
+        """Return the numbered instances of the first of these topics that exists."""
         for name in names:
             found = [topic for topic in self._data if topic.name == name]
             if found:
@@ -212,7 +212,7 @@ class _Reader:
             self._flight.add_mode(time_s, name, reason, by_itself)
 
     def _failsafe_flags(self) -> None:
-        # Only while armed: on the ground many flags are set without meaning.
+        # Ignore the flags while disarmed: on the ground many are set without meaning.
         flight, flags = self._flight, self._topic("failsafe_flags")
         if flags is None:
             return
@@ -363,7 +363,7 @@ class _Reader:
         self._links()
 
     def _links(self) -> None:
-        # Of several links, use the one that received the most messages.
+        # If there are several links, use the one that received the most messages.
         links = [topic for _, topic in self._topics("telemetry_status") if "rx_message_lost_rate" in topic]
         if links:
             best = max(links, key=lambda topic: float(topic.array("rx_message_count")[-1]))

@@ -1,4 +1,4 @@
-"""Log records in sequence, each with the vehicle states that it changes; input of converters."""
+"""Log records in sequence, each with the vehicle states that the record changes; input of converters."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ class LogRecord(Snapshot):
     system_id: int
     component_id: int
     table: str
-    """``GPS_RAW_INT`` in a ``.tlog``, ``GPS`` in a ``.bin``, ``vehicle_gps_position`` in a ``.ulg``."""
+    """Record type: ``GPS_RAW_INT`` in a ``.tlog``, ``GPS`` in a ``.bin``, ``vehicle_gps_position`` in a ``.ulg``."""
     fields: Mapping[str, Any]
     states: tuple[tuple[str, Any], ...]
-    """Names and values of the states that it changes, as in docs/states.md."""
+    """Names and values of the states that the record changes, as in docs/states.md."""
     message: Message | None = None
 
 
@@ -133,7 +133,7 @@ class TlogReader(LogReader):
 
 
 class _VehicleStates:
-    """Decodes the states of one vehicle with the decoders of live vehicles."""
+    """Decodes the states of one vehicle with the same decoders as a live vehicle."""
 
     def __init__(self, system_id: int, component_id: int) -> None:
         self.component_id = component_id

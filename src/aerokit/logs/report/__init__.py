@@ -31,11 +31,11 @@ class Report(Snapshot):
     target: Path
     bytes: int
     summaries: tuple[tuple[str, ...], ...]
-    """Sentences of the summary, for each flight."""
+    """Sentences of the summary of each flight."""
     statistics: tuple[FlightStatistics, ...]
-    """For each flight."""
+    """Statistics of each flight."""
     failsafes: tuple[tuple[Failsafe, ...], ...]
-    """For each flight."""
+    """Failsafes of each flight."""
 
 
 def write_report(
@@ -49,7 +49,7 @@ def write_report(
 ) -> Report:
     """Write a report on a flight, or a comparison of two, as one HTML file that loads nothing.
 
-    The file appears when it is complete. Blocks; needs no event loop.
+    The file appears only when it is complete. The function blocks and needs no event loop.
 
     Args:
         log: a ``.tlog`` of a ground station or of ``record=``, a ``.bin`` of ArduPilot, a ``.ulg`` of PX4.
@@ -70,7 +70,7 @@ def write_report(
         raise InvalidArgument(f"target = {str(to)!r} is not allowed: the name of a report must end in .html")
     logs = [log] if compare_with is None else [log, compare_with]
     for path in logs:
-        check_log_name(Path(path))  # first, because the default target is derived from it
+        check_log_name(Path(path))  # checked first, because the default target is derived from this name
     if to.exists() and not force:
         raise InvalidArgument(f"{to} exists; use force (--force) to replace it")
     flights = [read_flight(path, system_id=system_id, on_progress=on_progress) for path in logs]

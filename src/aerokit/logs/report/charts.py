@@ -23,12 +23,12 @@ if TYPE_CHECKING:
 MAX_POINTS = 2000
 """Maximum number of points of a line over time."""
 MAX_TRACK_POINTS = 6000
-"""Number of points of a track above which its tolerance grows."""
+"""Maximum number of points of a drawn track. The line is simplified further to stay below it."""
 _TRACK_TOLERANCE_M = 0.1
 _ROUNDING_M = 0.01
 _MAX_FENCE_M = 1e6
 
-# Each palette has a contrast of 3:1 on its paper, and stays distinguishable without red, green or blue cones.
+# Each palette has a contrast of 3:1 to its background, and is distinguishable with each kind of colour blindness.
 _MODES = {
     "light": ("#4477aa", "#cb6471", "#4b7700", "#aa2f71", "#b8860b", "#0d9ba5", "#6a3d25", "#7a5add"),
     "dark": ("#77aadd", "#f98c53", "#00ce98", "#d262a1", "#eedd88", "#69ddee", "#b07d5c", "#9685ff"),
@@ -67,7 +67,7 @@ COLOURS = {
     }
     for theme, others in _OTHERS.items()
 }
-"""Theme → name → colour; in charts, a name follows ``colour:``."""
+"""Maps a theme to its colours by name. Charts refer to a colour as ``colour:NAME``."""
 _SETPOINT, _FAILSAFE = "colour:set-point", "colour:failsafe"
 
 
@@ -131,7 +131,7 @@ def setpoint_line(name: str, columns: TimeSeries, column: str, digits: int = 3) 
 def over_time(
     flight: FlightLog, name: str, unit: str, traces: Sequence[dict[str, Any] | None], **layout: Any
 ) -> Chart | None:
-    """Return a timeline of a flight; None without lines. Lines without a colour get those of series."""
+    """Return a timeline of a flight; None without lines. Lines without a colour get the colours of the palette."""
     drawn = [trace for trace in traces if trace is not None]
     if not drawn:
         return None
@@ -197,7 +197,7 @@ def track_parts(flight: FlightLog) -> list[Part]:
 
 
 def simplification_note(deviation_m: float) -> list[Part]:
-    """Return how far a drawn line is from the track; empty if it has all points."""
+    """Return a note on the deviation of a drawn line from the track; empty if the line has all points."""
     if not deviation_m:
         return []
     return [Paragraphs([f"The line is simplified: no recorded position is more than {deviation_m:.2f} m from it."])]
@@ -206,7 +206,7 @@ def simplification_note(deviation_m: float) -> list[Part]:
 def drawn_track(
     places: Sequence[tuple[float, float]], max_points: int = MAX_TRACK_POINTS, keep: Iterable[int] = ()
 ) -> tuple[list[int], float]:
-    """Select the rows of a track to draw. Return them, and the largest distance of any row from the drawn line."""
+    """Return the rows of a track to draw, and the largest distance of any row from the drawn line."""
     if len(places) <= MAX_POINTS:
         has_known = any(rounded(north) is not None and rounded(east) is not None for north, east in places)
         return list(range(len(places))) if has_known else [], 0.0
@@ -258,7 +258,7 @@ def _track_lines(flight: FlightLog, places: Sequence[tuple[float, float]]) -> tu
 
 
 def _coordinates(places: Iterable[tuple[float, float] | None]) -> dict[str, list[float | None]]:
-    """Return x and y of Plotly for metres north and east; None is a gap."""
+    """Convert metres north and east to x and y for Plotly; None is a gap."""
     pairs = [(math.nan, math.nan) if place is None else place for place in places]
     return {"x": [rounded(east) for _, east in pairs], "y": [rounded(north) for north, _ in pairs]}
 
@@ -268,7 +268,7 @@ def _here(time_s: float, height_m: float) -> str:
 
 
 def rounded(value: float) -> float | None:
-    """Return a coordinate for drawing; None, a gap, if it is unknown or damaged."""
+    """Round a coordinate for drawing. Return None, which is a gap, if it is unknown or damaged."""
     return round(value, 2) if abs(value) <= MAX_COORDINATE else None
 
 

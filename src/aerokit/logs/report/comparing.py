@@ -51,7 +51,7 @@ _STATISTICS = {
     "max_estimator_ratio": ("max estimator ratio", 2),
     "lost_percent": ("messages lost, %", 2),
 }
-# Title, unit, function that returns the time series, column.
+# Charts: title, unit, function that returns the time series, and column.
 _CHARTS: tuple[tuple[str, str, Callable[[FlightLog], TimeSeries | None], str], ...] = (
     ("Height", "metres above home", lambda flight: flight.track, "altitude_relative_m"),
     ("Roll", "degrees", lambda flight: flight.attitude, "roll_deg"),
@@ -164,7 +164,7 @@ def _modes(flights: Sequence[FlightLog]) -> Section:
 def _parameters(flights: Sequence[FlightLog]) -> Section:
     one, other = (flight.parameters for flight in flights)
     if not one or not other:
-        lacking = [name for name, each in zip(NAMES, (one, other), strict=True) if not each]
+        lacking = [name for name, parameters in zip(NAMES, (one, other), strict=True) if not parameters]
         return Section("Parameters that differ", missing=f"The log of {' and of '.join(lacking)} has no parameters.")
     rows = [
         (name, _value(one.get(name)), _value(other.get(name)))

@@ -34,12 +34,12 @@ class Table:
     title: str = ""
     """Title of the collapsed table; empty: the number of rows."""
     marks: Sequence[str] = ()
-    """Class of each row: "", "warning" or "bad"."""
+    """CSS class of each row: "", "warning" or "bad"."""
 
 
 @dataclass(frozen=True)
 class Collapsed:
-    """Parts that are shown on demand, and never printed."""
+    """Parts that the page shows on demand and never prints."""
 
     title: str
     parts: Sequence[Part]
@@ -49,8 +49,8 @@ class Collapsed:
 class Chart:
     """A Plotly chart.
 
-    Texts must not come from a log, because Plotly interprets some HTML in them. Colours are names of
-    `charts.COLOURS`, after ``colour:``.
+    Texts must not come from a log, because Plotly interprets some HTML in them. A colour is ``colour:NAME``, with a
+    name in `charts.COLOURS`.
     """
 
     name: str
@@ -61,7 +61,7 @@ class Chart:
     label: str = ""
     """Text alternative for screen readers."""
     is_timeline: bool = False
-    """True if the page's shapes are drawn behind it, and it zooms together with the other timelines."""
+    """True for a chart over time: it has the page's shapes as background, and zooms with the other timelines."""
 
 
 Part: TypeAlias = "Paragraphs | Table | Collapsed | Chart"
@@ -128,7 +128,7 @@ def _resource(name: str) -> str:
 
 
 def _hash(script: str) -> str:
-    """Hash a script as browsers do, with normalized line ends."""
+    """Hash a script for the Content-Security-Policy, with normalized line ends, as browsers do."""
     data = script.replace("\r\n", "\n").replace("\r", "\n").encode()
     return base64.b64encode(hashlib.sha256(data).digest()).decode()
 
@@ -139,7 +139,7 @@ def _escape(text: str) -> str:
 
 
 def _json(charts: Sequence[Chart], colours: Mapping[str, Mapping[str, str]], shapes: Sequence[dict[str, Any]]) -> str:
-    """Serialize the charts by name; no text can end the surrounding script element."""
+    """Serialize the charts by name. The result cannot contain the end tag of the surrounding script element."""
     by_name = {
         chart.name: {
             "traces": chart.traces,

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-# More points between two kept ones make the algorithm quadratic for spirals and repeated figures.
+# One point in this number is always kept: without a limit, the algorithm is quadratic for spirals and repeated figures.
 _MAX_SEGMENT = 1024
 MAX_COORDINATE = 1e9
-"""Farther places are damaged data; their squares could overflow."""
+"""Larger coordinates are damaged data and are ignored, because their squares could overflow."""
 
 
 def simplify(
@@ -23,8 +23,8 @@ def simplify(
 
     Args:
         places: coordinates; NaN interrupts the line.
-        max_points: the tolerance grows when more points would be needed. Ends of gaps, the points of ``keep``, and
-            one in about a thousand are selected in any case.
+        max_points: limit of the selected points, which takes precedence over ``tolerance``. Ends of gaps, the points of
+            ``keep``, and one point in about a thousand are selected regardless of it.
         tolerance: distance within which points may be omitted.
         keep: indices that are always selected.
 
@@ -43,7 +43,7 @@ def simplify(
             fixed.add(index)
         elif not is_known and index and known[index - 1]:
             gaps.append(index)
-    # Heap of (negative squared deviation, its index, first and last index of the segment).
+    # Heap of (negative square of the largest deviation, its index, first and last index of the segment).
     segments = [
         (*_deviation(places, first, last), first, last)
         for first, last in pairwise(sorted(fixed))

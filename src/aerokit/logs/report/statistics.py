@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from aerokit.logs.flights.flight import FlightLog, TimeSeries
 
-# Shorter steps are noise of a stationary vehicle.
+# Shorter steps are ignored, because they are noise of a stationary vehicle.
 _STEP_M = 1.0
 _A_YEAR_S = 365 * 86_400.0
 _MAX_LISTED = 5
@@ -30,11 +30,11 @@ class FlightStatistics(Snapshot):
     distance_m: float | None
     """Length of the track over ground."""
     max_height_m: float | None
-    """Above home."""
+    """Maximum height above home."""
     max_distance_m: float | None
-    """Horizontal distance from home."""
+    """Maximum horizontal distance from home."""
     max_speed_m_s: float | None
-    """Over ground."""
+    """Maximum ground speed."""
     max_climb_m_s: float | None
     max_descent_m_s: float | None
     max_tilt_deg: float | None
@@ -42,7 +42,7 @@ class FlightStatistics(Snapshot):
     end_distance_m: float | None
     """Distance from home at the end."""
     start_voltage_v: float | None
-    """First battery, as the following ones."""
+    """Voltage of the first battery at the start. The other battery values are also of the first battery."""
     end_voltage_v: float | None
     min_voltage_v: float | None
     start_remaining_percent: float | None
@@ -54,7 +54,7 @@ class FlightStatistics(Snapshot):
     clips: float | None
     """Count of accelerometer clipping."""
     max_estimator_ratio: float | None
-    """Above 1, the estimator rejects a measurement."""
+    """Maximum innovation test ratio. Above 1, the estimator rejects a measurement."""
     lost_percent: float | None
     """Percentage of lost messages."""
 
@@ -104,7 +104,7 @@ def statistics_of(flight: FlightLog) -> FlightStatistics:
 
 
 def metres_from_home(flight: FlightLog) -> list[tuple[float, float]]:
-    """Return metres north and east of home for each row of the track; empty without home or track."""
+    """Return metres north and east of home for each row of the track; empty if home or the track is unknown."""
     if flight.home is None or not len(flight.track):
         return []
     plane = TangentPlane(flight.home.latitude_deg, flight.home.longitude_deg)

@@ -9,6 +9,7 @@ import math
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavDoRepositionFlags, MavFrame, MavMountMode, MavResult, MavSeverity
+from aerokit.sim.ardupilot.devices import ArduPilotDevices
 from aerokit.sim.ardupilot.gimbal import ArduPilotGimbal
 from aerokit.sim.ardupilot.kinds import Kind, rows_of
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
@@ -42,6 +43,8 @@ def common_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
     }
     if vehicle.KIND != "sub":
         handlers[_C.DO_FOLLOW] = lambda c: _R.ACCEPTED if 0 < c.param1 <= 255 else _R.DENIED
+    for command in ArduPilotDevices(vehicle).commands():
+        handlers[command] = lambda c: vehicle.devices.commands()[c.command](c)
     return {
         **handlers,
         # A reboot replaces the devices, so they are looked up at each command.

@@ -223,7 +223,7 @@ class ArduPilotGimbal:
         return MavResult.ACCEPTED
 
     def warn(self) -> None:
-        """Send the text about invalid angles, which a client causes that sends hundredths of degrees."""
+        """Send the text about invalid angles. A client that sends hundredths of a degree causes it."""
         self._vehicle.send_text(MavSeverity.WARNING, "Mount: invalid angle targets")
 
     def attitude_status(self) -> m.GimbalDeviceAttitudeStatus | None:

@@ -368,7 +368,11 @@ def _without(*message_ids: int) -> Builders:
 
 
 BUILDERS_OF_KIND: dict[Kind, Builders] = {
-    "copter": {**_without(), m.ServoOutputRaw.ID: _copter_outputs},
+    "copter": {
+        **_without(),
+        m.ServoOutputRaw.ID: _copter_outputs,
+        m.WinchStatus.ID: lambda vehicle: vehicle.devices.winch_status(),
+    },
     "plane": {
         **_without(*_COPTER_TARGETS),
         m.ServoOutputRaw.ID: _plane_outputs,

@@ -17,6 +17,7 @@ from aerokit.parameters.encoding import UNKNOWN_INDEX
 from aerokit.protocols.servers.files import FileTree
 from aerokit.sim.ardupilot.calibration import Calibrations
 from aerokit.sim.ardupilot.camera import ArduPilotCamera
+from aerokit.sim.ardupilot.devices import ArduPilotDevices
 from aerokit.sim.ardupilot.failsafes import ArduPilotArming, ArduPilotFailsafes
 from aerokit.sim.ardupilot.fence import ArduPilotFence
 from aerokit.sim.ardupilot.ftp import ArduPilotFtp
@@ -146,6 +147,7 @@ class ArduPilotVehicle(ArduPilotHost):
         self.navigation: ArduPilotNavigation = ArduPilotNavigation(self, self.frame)
         self.arming: ArduPilotArming[Any] = self.ARMING(self)
         self.accessories: AuxiliaryOutputs = AuxiliaryOutputs(self)
+        self.devices: ArduPilotDevices = ArduPilotDevices(self)
         self.failsafes: ArduPilotFailsafes[Any] = self.FAILSAFES(self)
         self.fence: ArduPilotFence[Any] = self.FENCE(self)
         self.gimbal: ArduPilotGimbal = ArduPilotGimbal(self)

@@ -30,6 +30,7 @@ from aerokit.sim.motion import (
 from aerokit.sim.parameters import SimParameters
 from aerokit.sim.px4 import modes
 from aerokit.sim.px4.arming import Px4Arming, Px4Calibration
+from aerokit.sim.px4.console import Px4LogStream, Px4Shell
 from aerokit.sim.px4.failsafes import Px4Failsafes
 from aerokit.sim.px4.flight import Px4Flight
 from aerokit.sim.px4.ftp import Px4Ftp
@@ -165,6 +166,8 @@ class Px4Vehicle(Px4Host):
         self.sticks: Px4Sticks = Px4Sticks(self)
         self.gimbal: Px4Gimbal = Px4Gimbal(self)
         """Gimbal on the AUX outputs, enabled by MNT_MODE_IN."""
+        self.shell: Px4Shell = Px4Shell(self)
+        self.log_stream: Px4LogStream = Px4LogStream(self)
         self.commands: CommandServer = self.serve_commands(self.make_commands())
         self.on(m.Ping, self._on_ping)
         self.serve_timesync()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavCmd, MavFrame, MavModeFlag, MavResult, MavSeverity
+from aerokit.mavlink.enums import FailureType, FailureUnit, MavCmd, MavFrame, MavModeFlag, MavResult, MavSeverity
 from aerokit.sim.commands import CommandHandler, CommandProgress, ReceivedCommand, whole
 from aerokit.sim.px4 import modes
 from aerokit.sim.px4.base import Px4Vehicle
@@ -39,10 +39,30 @@ def other_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
     handlers |= dict.fromkeys(_UNANSWERED, lambda _: None)
     handlers[_C.DO_LAND_START] = lambda _: MavResult.CANCELLED
     handlers[_C.CONTROL_HIGH_LATENCY] = lambda _: _refuse_high_latency(px4)
+    handlers[_C.INJECT_FAILURE] = lambda command: _inject_failure(px4, command)
+    handlers[_C.LOGGING_START] = lambda command: px4.log_stream.start(command)
+    handlers[_C.LOGGING_STOP] = lambda command: px4.log_stream.stop(command)
     handlers[_C.DO_GRIPPER] = lambda _: CommandProgress((_UNKNOWN_PROGRESS,), _GRIP_DURATION_S)
     handlers[_C.ACTUATOR_TEST] = lambda command: _test_actuator(px4, command)
     handlers[_C.PREFLIGHT_STORAGE] = lambda command: _store(px4, command)
     return handlers
+
+
+# What of SIH can fail: the motors (FailureInjector.cpp) and the battery (BatterySimulator.cpp).
+_FAILURES = {
+    FailureUnit.SYSTEM_MOTOR: (FailureType.OK, FailureType.OFF, FailureType.STUCK, FailureType.WRONG),
+    FailureUnit.SYSTEM_BATTERY: (FailureType.OK, FailureType.OFF),
+}
+
+
+def _inject_failure(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
+    """Let a part fail; as in SIH, only the motors and the battery answer, and the failure has no effect."""
+    if not px4.parameters.get("SYS_FAILURE_EN", 0):
+        return MavResult.DENIED
+    unit, kind = whole(command.param1), whole(command.param2)
+    if unit not in _FAILURES:
+        return None
+    return MavResult.ACCEPTED if kind in _FAILURES[FailureUnit(unit)] else MavResult.UNSUPPORTED
 
 
 def _refuse_high_latency(px4: Px4Vehicle) -> int:

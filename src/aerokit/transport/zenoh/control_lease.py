@@ -70,7 +70,7 @@ _OPCODE_AT = 3  # https://mavlink.io/en/services/ftp.html#payload
 
 _TEXT_PREFIX = "network: "
 
-_MAX_TEXT_LENGTH = 50  # of STATUSTEXT
+_MAX_TEXT_LENGTH = 50  # length of the text in STATUSTEXT
 
 _MAX_KINDS = 64
 
@@ -151,7 +151,7 @@ class ClientFilter:
         """Time of the last data of the client; set by the owner."""
         self._client, self._lease = client, lease
         self._framer = _framer()
-        self._nonce: int | None = None  # of the program that uses this client name
+        self._nonce: int | None = None  # nonce of the program that uses this client name
         self._nonce_at = 0.0
         self._notices: dict[str, tuple[float, int]] = {}  # message → time of last notice, refusals since then
 

@@ -4,7 +4,7 @@
 aerokit/FLEET/NAME/from/all      frames of the vehicle side to all clients (read access)
 aerokit/FLEET/NAME/from/CLIENT   frames of the vehicle side to one client
 aerokit/FLEET/NAME/beacon        JSON, twice a second: the vehicle side's clock, and the client that has control
-aerokit/FLEET/NAME/told/CLIENT   JSON: a command of this client was refused
+aerokit/FLEET/NAME/refused/CLIENT   JSON: a command of this client was refused
 aerokit/FLEET/NAME/to/CLIENT     frames of one client to the vehicle side (write access)
 aerokit/FLEET/NAME/alive/EPOCH   liveliness token of a vehicle side
 aerokit/FLEET/NAME/client/CLIENT liveliness token of a client
@@ -81,7 +81,7 @@ class KeySpace(Snapshot):
         return f"{self.root}/to/{client}"
 
     def notices(self, client: str) -> str:
-        return f"{self.root}/told/{client}"
+        return f"{self.root}/refused/{client}"
 
     def alive(self, epoch: int | None = None) -> str:
         return f"{self.root}/alive/{'*' if epoch is None else format(epoch, '08x')}"
@@ -108,12 +108,12 @@ class Beacon(Snapshot):
 
     def encode(self) -> bytes:
         fields = {"version": VERSION, "epoch": self.epoch, "number": self.number, "clock_s": self.clock_s}
-        return json.dumps({**fields, "helm": self.lease_holder}, separators=(",", ":")).encode()
+        return json.dumps({**fields, "holder": self.lease_holder}, separators=(",", ":")).encode()
 
     @classmethod
     def decode(cls, data: bytes) -> Beacon | None:
         fields = _object(data)
-        epoch, number, holder = fields.get("epoch"), fields.get("number"), fields.get("helm")
+        epoch, number, holder = fields.get("epoch"), fields.get("number"), fields.get("holder")
         clock = fields.get("clock_s")
         if not (_is_u32(epoch) and _is_u32(number) and isinstance(clock, (int, float))):
             return None
@@ -162,16 +162,16 @@ class RefusalNotice(Snapshot):
     """Refused messages since the last notice."""
 
     def encode(self) -> bytes:
-        fields = {"version": VERSION, "told": "order_refused", "message": self.message, "reason": self.reason}
-        rest = {"helm": self.lease_holder, "answer": self.answer.hex(), "count": self.count}
+        fields = {"version": VERSION, "event": "order_refused", "message": self.message, "reason": self.reason}
+        rest = {"holder": self.lease_holder, "answer": self.answer.hex(), "count": self.count}
         return json.dumps({**fields, **rest}).encode()
 
     @classmethod
     def decode(cls, data: bytes) -> RefusalNotice | None:
         fields = _object(data)
-        if fields.get("told") != "order_refused":
+        if fields.get("event") != "order_refused":
             return None
-        message, reason, holder = fields.get("message"), fields.get("reason"), fields.get("helm")
+        message, reason, holder = fields.get("message"), fields.get("reason"), fields.get("holder")
         try:
             answer = bytes.fromhex(str(fields.get("answer", "")))
         except ValueError:

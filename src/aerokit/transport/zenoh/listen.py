@@ -67,7 +67,7 @@ class ZenohListen(NetworkLink):
         self._freshness = FreshnessChecker(random.getrandbits(32))
         self._lease = ControlLease()
         self._clients: dict[Peer, ClientFilter] = {}
-        self._refused = 0  # of former clients
+        self._refused = 0  # number of refused messages of former clients
         self._zenoh: Any = None
         self._publisher: Any = None
         self._has_others = self._is_serving = False

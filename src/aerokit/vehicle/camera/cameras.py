@@ -84,9 +84,9 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
         Raises:
             NotSupported: the camera takes no pictures. Nothing was sent.
             CommandRejected: the camera refused: it is busy, or in the wrong mode.
-            CommandTimeout: it did not answer; it may have taken the picture.
-            OperationRejected: it failed to take the picture.
-            OperationTimeout: it reported no picture, or no camera was found.
+            CommandTimeout: the camera did not answer; it may have taken the picture.
+            OperationRejected: the camera failed to take the picture.
+            OperationTimeout: the camera reported no picture, or no camera was found.
         """
         await self._link.require_capability("take_photo", "capture_image")
         return await self._shutter.take(timeout)

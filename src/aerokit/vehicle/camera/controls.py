@@ -62,7 +62,7 @@ class LensMixin(CameraMixin):
             InvalidArgument: ``steps`` is out of range. Nothing was sent.
             NotSupported: the camera has no zoom. Nothing was sent.
             CommandRejected: the camera refused.
-            CommandTimeout: it did not answer; it may have zoomed.
+            CommandTimeout: the camera did not answer; it may have zoomed.
             OperationTimeout: no camera was found.
         """
         check_range("steps", steps, -100, 100)
@@ -104,7 +104,7 @@ class LensMixin(CameraMixin):
             InvalidArgument: ``steps`` is out of range. Nothing was sent.
             NotSupported: the camera cannot be focused. Nothing was sent.
             CommandRejected: the camera refused.
-            CommandTimeout: it did not answer; it may have moved.
+            CommandTimeout: the camera did not answer; it may have moved.
             OperationTimeout: no camera was found.
         """
         check_range("steps", steps, -100, 100)
@@ -126,7 +126,7 @@ class LensMixin(CameraMixin):
         Raises:
             NotSupported: the camera cannot be focused. Nothing was sent.
             CommandRejected: the camera refused.
-            CommandTimeout: it did not answer.
+            CommandTimeout: the camera did not answer.
             OperationTimeout: no camera was found.
         """
         await self._set("auto_focus", HAS_FOCUS, FOCUS, AUTO_FOCUS_TYPES[kind], 0)
@@ -203,7 +203,7 @@ class TrackingMixin(CameraMixin):
             InvalidArgument: an argument is out of range. Nothing was sent.
             NotSupported: the camera cannot track a point. Nothing was sent.
             CommandRejected: the camera refused.
-            CommandTimeout: it did not answer.
+            CommandTimeout: the camera did not answer.
             OperationTimeout: no camera was found.
         """
         for name, value in (("x", x), ("y", y), ("radius", radius)):
@@ -229,7 +229,7 @@ class TrackingMixin(CameraMixin):
             InvalidArgument: an argument is out of range, or the rectangle is empty. Nothing was sent.
             NotSupported: the camera cannot track a rectangle. Nothing was sent.
             CommandRejected: the camera refused.
-            CommandTimeout: it did not answer.
+            CommandTimeout: the camera did not answer.
             OperationTimeout: no camera was found.
         """
         for name, value in zip(EDGE_NAMES, (left, top, right, bottom), strict=True):
@@ -250,7 +250,7 @@ class TrackingMixin(CameraMixin):
         Raises:
             NotSupported: the camera cannot track. Nothing was sent.
             CommandRejected: the camera refused.
-            CommandTimeout: it did not answer.
+            CommandTimeout: the camera did not answer.
             OperationTimeout: no camera was found.
         """
         await self._link.require_capability("stop_tracking", "has_tracking_point", "has_tracking_rectangle")
@@ -318,8 +318,8 @@ class StorageMixin(CameraMixin):
         Raises:
             NotSupported: the camera has no modes. Nothing was sent.
             CommandRejected: the camera refused: it is busy, or does not support this mode.
-            CommandTimeout: it did not answer.
-            OperationTimeout: it accepted, but reports another mode; or no camera was found.
+            CommandTimeout: the camera did not answer.
+            OperationTimeout: the camera accepted the command but reports another mode, or no camera was found.
         """
         await self._link.require_capability("set_mode", "has_modes")
         with self._link.new_order("mode") as order:
@@ -365,7 +365,7 @@ class StorageMixin(CameraMixin):
         Raises:
             InvalidArgument: ``number`` is out of range. Nothing was sent.
             CommandRejected: the camera refused: it is busy, or there is no such medium.
-            CommandTimeout: it did not answer; it may be formatting.
+            CommandTimeout: the camera did not answer; it may be formatting.
             OperationTimeout: no camera was found.
         """
         check_range("number", number, 1, 255)
@@ -382,7 +382,7 @@ class StorageMixin(CameraMixin):
 
         Raises:
             CommandRejected: the camera refused.
-            CommandTimeout: it did not answer.
+            CommandTimeout: the camera did not answer.
             OperationTimeout: no camera was found.
         """
         await self._link.identify()

@@ -68,7 +68,7 @@ class CameraLink(CameraOrders):
         self._identifying = anyio.Lock()
         self._is_bound = anyio.Event()
         self._heartbeat_at = -math.inf
-        # After a silence it may be another camera, or have other firmware.
+        # After a silence, another camera or other firmware may use this id.
         self._was_silent = False
         self._session.on_reboot.append(self._on_reboot)
         self.information: StateCell[CameraInformation] = self.new_cell("camera.information", "CAMERA_INFORMATION")

@@ -73,8 +73,8 @@ class VideoMixin(CameraMixin):
             InvalidArgument: ``status_hz`` is out of range. Nothing was sent.
             NotSupported: the camera records no video. Nothing was sent.
             CommandRejected: the camera refused: it is busy, or in the wrong mode.
-            CommandTimeout: it did not answer; it may be recording.
-            OperationTimeout: it accepted but does not record, or no camera was found.
+            CommandTimeout: the camera did not answer; it may be recording.
+            OperationTimeout: the camera accepted the command but does not record, or no camera was found.
         """
         check_range("status_hz", status_hz, 0, 10)
         await self._link.require_capability("start_video", "capture_video")
@@ -94,8 +94,8 @@ class VideoMixin(CameraMixin):
         Raises:
             NotSupported: the camera records no video. Nothing was sent.
             CommandRejected: the camera refused.
-            CommandTimeout: it did not answer.
-            OperationTimeout: it accepted but still records, or no camera was found.
+            CommandTimeout: the camera did not answer.
+            OperationTimeout: the camera accepted the command but still records, or no camera was found.
         """
         await self._link.require_capability("stop_video", "capture_video")
         command, *params = self._stop_command()
@@ -172,7 +172,7 @@ class VideoMixin(CameraMixin):
             InvalidArgument: the number is out of range. Nothing was sent.
             NotSupported: the camera has no streams. Nothing was sent.
             CommandRejected: the camera refused, or has no such stream.
-            CommandTimeout: it did not answer.
+            CommandTimeout: the camera did not answer.
             OperationTimeout: no camera was found.
         """
         await self._send_stream_command("start_streaming", MavCmd.VIDEO_START_STREAMING, stream)
@@ -209,7 +209,7 @@ class VideoMixin(CameraMixin):
 
         Raises:
             CommandRejected: the camera refused, or has no such sensor.
-            CommandTimeout: it did not answer.
+            CommandTimeout: the camera did not answer.
             OperationTimeout: no camera was found.
         """
         await self._link.identify()

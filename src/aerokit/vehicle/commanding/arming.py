@@ -116,10 +116,10 @@ class ArmingActions(VehicleBase):
                 estimates. Where the vehicle can run its checks on request, they are run again for this.
             CommandTimeout: there was no acknowledgement, and the vehicle did not arm; the text says whether it may
                 still arm.
-            OperationRejected: it is armed already in a mode other than ``mode`` (nothing was sent), or another party
-                disarmed it or changed its mode meanwhile.
+            OperationRejected: the vehicle is armed already in a mode other than ``mode`` (nothing was sent), or another
+                party disarmed it or changed its mode meanwhile.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
-            OperationTimeout: it accepted the command and did not arm.
+            OperationTimeout: the vehicle accepted the command but did not arm.
         """
         wanted = self._mode_to_arm_in(mode)
         if wanted is not None:
@@ -158,7 +158,7 @@ class ArmingActions(VehicleBase):
             CommandRejected: the vehicle refused, usually because it is flying.
             CommandTimeout: there was no acknowledgement.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
-            OperationTimeout: it accepted the command and did not disarm.
+            OperationTimeout: the vehicle accepted the command but did not disarm.
         """
         self._arm_cleanup.stop()
         started = self.connection.now()
@@ -237,11 +237,11 @@ class ArmingActions(VehicleBase):
             timeout: seconds until the vehicle has restarted.
 
         Raises:
-            OperationRejected: it is armed, or not known to be disarmed. Nothing was sent.
-            CommandRejected: it refused.
+            OperationRejected: the vehicle is armed, or not known to be disarmed. Nothing was sent.
+            CommandRejected: the vehicle refused.
             CommandTimeout: there was no acknowledgement, and it did not reboot.
             LinkLost: the link went down with the vehicle (USB, TCP); connect again.
-            OperationTimeout: it did not restart in time.
+            OperationTimeout: the vehicle did not restart in time.
         """
         if not force and not self.telemetry.is_confirmed_disarmed:
             state = "armed" if self.telemetry.is_armed else "not known to be disarmed"

@@ -332,7 +332,8 @@ class ArmCleanup:
         self._task.drop()
 
     async def finish(self) -> None:
-        """Wait briefly for the outcome of an abandoned arm order when the vehicle's block is left; log a warning
-        without one.
+        """Wait briefly for the outcome of a cancelled arm order when the vehicle's block is left.
+
+        Log a warning if the outcome stays unknown.
         """
         await self._task.finish(ARM_CLOSE_TIMEOUT_S)

@@ -69,11 +69,11 @@ class FlightActions(VehicleBase):
         Raises:
             InvalidArgument: the altitude is out of range. Nothing was sent.
             NotSupported: this type of vehicle cannot take off.
-            OperationRejected: it is not armed or is flying already, or its mode changed or it disarmed meanwhile.
+            OperationRejected: the vehicle is not armed, is flying already, or changed its mode or disarmed meanwhile.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
-            OperationTimeout: it did not reach the altitude in time, or does not move.
+            OperationTimeout: the vehicle did not reach the altitude in time, or does not move.
             ValueUnknownError: home is not known, and PX4 needs its altitude.
         """
         check_range("altitude_m", altitude_m, 0, 10_000, above=True)
@@ -192,7 +192,7 @@ class FlightActions(VehicleBase):
             CommandTimeout: there was no acknowledgement.
             OperationRejected: the mode changed meanwhile.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
-            OperationTimeout: it was not on the ground in time.
+            OperationTimeout: the vehicle was not on the ground in time.
         """
         mode = self._sender.mode_for("land", "land")
         if self.autopilot.mode_when_landed is None:
@@ -301,7 +301,7 @@ class ModeActions(VehicleBase):
             InvalidArgument: this vehicle has no such mode; the text lists its modes. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             OperationRejected: a pilot or a failsafe has chosen another mode meanwhile.
-            OperationTimeout: it accepted and stayed in another mode, or did not acknowledge.
+            OperationTimeout: the vehicle did not acknowledge, or accepted the mode but stayed in another one.
         """
         wanted = self.autopilot.find_mode(mode, self.telemetry.mode_names)
         await self._sender.change_mode(wanted, self._arbiter.order(wanted), timeout)
@@ -315,7 +315,7 @@ class ModeActions(VehicleBase):
             NotSupported: this vehicle has no mode for it. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             OperationRejected: a pilot or a failsafe has chosen another mode meanwhile.
-            OperationTimeout: it accepted and stayed in another mode, or did not acknowledge.
+            OperationTimeout: the vehicle did not acknowledge, or accepted the mode but stayed in another one.
         """
         await self._flight_cleanup.hold()
 

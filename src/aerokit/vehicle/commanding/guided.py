@@ -151,8 +151,9 @@ class SetpointStream(Generic[SetpointT]):
     """Sends the latest set-point at a fixed rate while the ``async with`` block supplies set-points.
 
     Entering the block changes to the set-point mode (GUIDED, OFFBOARD) with the initial set-point. Leaving it in any
-    way makes the vehicle hold. The stream stops by itself for the reasons above, and if the vehicle should move but
-    stays in place for twelve seconds; then ``set`` and leaving the block raise :class:`SetpointStreamStopped`. After a
+    way makes the vehicle hold. The stream stops by itself without a new set-point for ``valid_for_s``, if the event
+    loop is late by ``max_lag_s``, if the vehicle leaves the mode, disarms or falls silent, and if it should move but
+    stays in place for twelve seconds. Then ``set`` and leaving the block raise :class:`SetpointStreamStopped`. After a
     pilot or a failsafe has changed the mode, nothing more is sent to the vehicle.
     """
 
@@ -233,7 +234,7 @@ class SetpointStream(Generic[SetpointT]):
         order.may_move = order.may_move or self._session.telemetry.is_in(mode)
         try:
             await self._enter(mode, order)
-        except OperationRejected:  # The pilot or failsafe that took over keeps the vehicle.
+        except OperationRejected:  # The pilot or failsafe that took over keeps control.
             self._end()
             raise
         except BaseException:

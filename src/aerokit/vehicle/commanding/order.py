@@ -189,7 +189,7 @@ class Order:
 
     @property
     def end(self) -> str:
-        """The reason why none of its commands may be sent, as a clause; empty while they may."""
+        """Reason why no command of the order may be sent, as a clause; empty while commands may be sent."""
         if not self.is_newest:
             return SUPERSEDED
         return self.takeover_reason or ("" if self._ends_flight else self.failsafe)

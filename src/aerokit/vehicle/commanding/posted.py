@@ -50,7 +50,7 @@ class PostedOrder:
 
     @property
     def end(self) -> str:
-        """The reason why none of its commands is sent again, as a clause; empty while they may be."""
+        """Reason why no command of the order is sent again, as a clause; empty while commands may be sent."""
         return "its effect was reported" if self._order.is_confirmed else self._order.end or self._order.unexplained
 
     async def command(self, command: int, *params: float, component_id: int | None = None) -> None:
@@ -102,10 +102,10 @@ class PostedOrder:
             component_id: as for :meth:`command`.
 
         Raises:
-            InvalidArgument: the mode is not one of the order's, or the block was left. Nothing was sent.
+            InvalidArgument: the mode is not one of the modes of the order, or the block was left. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement.
-            OperationTimeout: it accepted and stayed in another mode.
+            OperationTimeout: the vehicle accepted the mode but stayed in another one.
         """
         if mode not in self._order.modes:
             raise InvalidArgument(f"mode = {mode} is not allowed: it is not a mode of this order")

@@ -76,7 +76,7 @@ class TravelActions(VehicleBase):
             OperationRejected: the mode changed (a pilot, a failsafe) or the vehicle disarmed on the way.
             CommandTimeout: there was no acknowledgement.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
-            OperationTimeout: it did not arrive in time, or does not move.
+            OperationTimeout: the vehicle did not arrive in time, or does not move.
         """
         latitude, longitude, altitude, is_relative = self._position.global_target(target)
         _check_travel(speed_m_s, heading_deg, tolerance_m, timeout)
@@ -213,8 +213,8 @@ class TravelActions(VehicleBase):
     ) -> None:
         """Turn on the spot and return when the vehicle has this heading.
 
-        ArduPilot: changes to GUIDED and sends MAV_CMD_CONDITION_YAW. PX4 has no such command: the vehicle stops and
-            turns by MAV_CMD_DO_REPOSITION.
+        An ArduPilot vehicle changes to GUIDED and gets MAV_CMD_CONDITION_YAW. PX4 does not support this command, so the
+        vehicle stops and turns by MAV_CMD_DO_REPOSITION.
 
         Args:
             heading_deg: −360 to 360, clockwise from north; with ``relative`` an angle to turn by, negative to the
@@ -230,7 +230,7 @@ class TravelActions(VehicleBase):
             CommandRejected: the vehicle refused.
             OperationRejected: the mode changed or it disarmed meanwhile.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
-            OperationTimeout: it did not reach the heading in time.
+            OperationTimeout: the vehicle did not reach the heading in time.
         """
         check_range("heading_deg", heading_deg, -360, 360)
         check_range("rate_deg_s", rate_deg_s, 0, 360)
@@ -293,7 +293,7 @@ class TravelActions(VehicleBase):
             InvalidArgument: the place has no altitude above mean sea level. Nothing was sent.
             CommandRejected: the vehicle refused: it has no position, or the place is invalid.
             CommandTimeout: there was no acknowledgement.
-            OperationTimeout: it accepted, and HOME_POSITION did not report it.
+            OperationTimeout: the vehicle accepted the command, but HOME_POSITION does not report the new place.
         """
         if place is not None and place.altitude_amsl_m is None:
             raise InvalidArgument("place has no altitude_amsl_m, which home requires")

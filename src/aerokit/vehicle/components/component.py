@@ -147,8 +147,8 @@ class Component(ReadOnly):
         """Request identity and capabilities of the component (COMPONENT_INFORMATION_BASIC).
 
         Raises:
-            CommandRejected: it does not support the message.
-            OperationTimeout: it did not answer within ``timeout`` seconds.
+            CommandRejected: the component does not support the message.
+            OperationTimeout: the component did not answer within ``timeout`` seconds.
         """
         message = await self.request(m.ComponentInformationBasic, timeout=timeout)
         return ComponentInformation(
@@ -170,9 +170,9 @@ class Component(ReadOnly):
             timeout: seconds to wait for the address of the file.
 
         Raises:
-            NotSupported: it has no such file, or the file is not on the vehicle.
+            NotSupported: the component has no such file, or the file is not on the vehicle.
             FileFormatError: the file is damaged.
-            FileError, FileTimeout: it cannot be read.
+            FileError, FileTimeout: the file cannot be read.
         """
         general = await _read_json(self, await _general_uri(self, timeout))
         if kind == "general":
@@ -242,7 +242,7 @@ class Component(ReadOnly):
             where: predicate to select one of several messages.
 
         Raises:
-            CommandRejected: it refused.
+            CommandRejected: the component refused.
             OperationTimeout: the message did not arrive.
         """
         with self._session.subscriber.subscribe((message_type,), 100, "drop_oldest", None) as answers:

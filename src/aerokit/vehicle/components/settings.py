@@ -128,7 +128,7 @@ class Settings:
 
         Raises:
             NotSupported: the camera names no definition file.
-            CommandRejected, OperationTimeout: it did not send CAMERA_INFORMATION.
+            CommandRejected, OperationTimeout: the camera did not send CAMERA_INFORMATION.
             InvalidArgument: the address has another scheme.
             FileFormatError: the file is invalid, or has more than 16 MB.
             FileError, FileTimeout, RemoteProtocolError: as for :meth:`aerokit.vehicle.files.files.Files.read`.
@@ -188,7 +188,7 @@ class Settings:
                         on_progress=on_progress,
                     )
                     found = await transfers.run(exchange)
-                    others = {name: each for name, each in self._known.items() if name not in found}
+                    others = {name: setting for name, setting in self._known.items() if name not in found}
                     self._known = {name: self._known.get(name, found[name]) for name in found} | others
                     self._is_complete = True
                 return self.table

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import anyio
 
-from aerokit._internal.arguments import checks_arguments
+from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit._internal.files import PartFile
 from aerokit._internal.values import Snapshot
 from aerokit.errors import FileError, FileTimeout, InvalidArgument
@@ -19,6 +19,7 @@ from aerokit.protocols.blocks import Reassembly
 from aerokit.protocols.exchange import IDLE_TIMEOUT_S, OnProgress
 from aerokit.protocols.logs import LOG_BLOCK
 from aerokit.vehicle.files.channel import LogChannel
+from aerokit.vehicle.files.log_stream import LogStream
 
 if TYPE_CHECKING:
     import os
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 
     from aerokit.mavlink.messages import LogEntry as LogMessage
     from aerokit.protocols.exchange import TransferProgress
+    from aerokit.vehicle.commanding.context import VehicleContext
     from aerokit.vehicle.files.files import FileEntry, Files
     from aerokit.vehicle.session.transfers import Transfers
 
@@ -90,8 +92,8 @@ class Logs:
     the size in the entry, logger "aerokit" reports it (INFO).
     """
 
-    def __init__(self, transfers: Transfers, files: Files) -> None:
-        self._transfers, self._files = transfers, files
+    def __init__(self, transfers: Transfers, files: Files, context: VehicleContext) -> None:
+        self._transfers, self._files, self._context = transfers, files, context
         self._channel = LogChannel(transfers)
         # The newest log in the last list may have been growing.
         self._newest: LogEntry | None = None
@@ -207,6 +209,20 @@ class Logs:
                 before &= now_there
                 if before and self._transfers.connection.now() >= until:
                     raise FileTimeout(f"erase logs: {len(before)} logs still exist after {idle_timeout_s:g} s")
+
+    def stream(self, *, idle_timeout_s: float = IDLE_TIMEOUT_S) -> LogStream:
+        """Receive the log that PX4 writes, for the duration of an ``async with`` block (MAV_CMD_LOGGING_START).
+
+        ``async with vehicle.logs.stream() as stream: async for data in stream: file.write(data)``
+
+        Args:
+            idle_timeout_s: reading fails after this many seconds without data; above 0, at most 3600.
+
+        Raises:
+            InvalidArgument: the time is out of range. Nothing was sent.
+        """
+        check_range("idle_timeout_s", idle_timeout_s, 0, 3600, above=True)
+        return LogStream(self._context, idle_timeout_s)
 
     async def _locate(
         self, log: LogEntry | int, method: LogMethod, idle_timeout_s: float, timeout: float | None

@@ -244,7 +244,7 @@ class GimbalControl:
             if exc is None and not self._was_raised:
                 self.raise_if_taken()
             return
-        if self._is_ended:  # with the block of the vehicle
+        if self._is_ended:  # the block of the vehicle has ended before
             return
         release = self._release_command()
         self._end()

@@ -192,7 +192,7 @@ class GimbalDevice:
         self.attitude: StateCell[GimbalAttitude] = context.session.connection.new_cell(
             f"{name}.attitude", ATTITUDE_MESSAGES
         )
-        if component_id in (0, context.session.component_id):  # Others send their attitude unrequested.
+        if component_id in (0, context.session.component_id):  # other gimbals send their attitude without a request
             self.attitude._feed_from(_AttitudeStream(self.attitude, context.session))
         self.controllers: StateCell[GimbalControllers] = context.session.connection.new_cell(
             f"{name}.controllers", "GIMBAL_MANAGER_STATUS"

@@ -98,7 +98,7 @@ class RoiMixin(GimbalMixin):
             CommandTimeout: there was no answer.
             GimbalTaken: your program had control and lost it.
             OperationRejected: another order was given meanwhile, or the vehicle rebooted.
-            OperationTimeout: it did not get there in time; the text has the last attitude.
+            OperationTimeout: the gimbal did not reach the direction in time; the text has the last attitude.
             HeartbeatTimeout: the vehicle fell silent.
         """
         check_range("tolerance_deg", tolerance_deg, 0, 45, above=True)
@@ -139,7 +139,7 @@ class RoiMixin(GimbalMixin):
             CommandTimeout: there was no answer.
             GimbalTaken: your program had control and lost it.
             OperationRejected: another order was given meanwhile, or the vehicle rebooted.
-            OperationTimeout: it did not get there in time; the text has the last attitude.
+            OperationTimeout: the gimbal did not reach the direction in time; the text has the last attitude.
             HeartbeatTimeout: the vehicle fell silent.
         """
         if isinstance(system_id, bool):
@@ -186,8 +186,7 @@ class Gimbal(ReadOnly, PointingMixin, RoiMixin):
 
     ``vehicle.gimbal`` is the first one, ``vehicle.gimbals`` has all. An order returns when the gimbal reports the
     ordered direction, and ends when another order is given. The gimbal keeps the direction while the vehicle moves. If
-    the
-    manager requires control, an order outside a block of :meth:`control` claims it until :meth:`release`.
+    the manager requires control, an order outside a block of :meth:`control` claims it until :meth:`release`.
     """
 
     async def information(self) -> GimbalInformation:

@@ -57,7 +57,7 @@ class GimbalOrders:
 
     @property
     def public_device(self) -> GimbalDevice:
-        """The device whose cells the program sees: for the first gimbal it stays the same object."""
+        """The device with the public cells. For the first gimbal it is always the same object."""
         return self.registry.placeholder if self._device is None else self._device
 
     @property

@@ -234,7 +234,7 @@ class PointingMixin(GimbalMixin):
             CommandTimeout: there was no answer.
             GimbalTaken: your program had control and lost it.
             OperationRejected: another order was given meanwhile, or the vehicle rebooted.
-            OperationTimeout: it did not get there in time; the text has the last attitude.
+            OperationTimeout: the gimbal did not reach the direction in time; the text has the last attitude.
             HeartbeatTimeout: the vehicle fell silent.
         """
         for name, value in (("pitch_deg", pitch_deg), ("yaw_deg", yaw_deg), ("roll_deg", roll_deg)):
@@ -273,7 +273,7 @@ class PointingMixin(GimbalMixin):
             CommandTimeout: there was no answer.
             GimbalTaken: your program had control and lost it.
             OperationRejected: another order was given meanwhile, or the vehicle rebooted.
-            OperationTimeout: it did not get there in time; the text has the last attitude.
+            OperationTimeout: the gimbal did not reach the direction in time; the text has the last attitude.
             HeartbeatTimeout: the vehicle fell silent.
         """
         await self._rest("neutral", NEUTRAL, MavMountMode.NEUTRAL, wait=wait, timeout=timeout)
@@ -286,12 +286,12 @@ class PointingMixin(GimbalMixin):
             timeout: seconds to wait.
 
         Raises:
-            NotSupported: its manager accepts the order but does nothing (PX4). Nothing was sent.
+            NotSupported: the manager would accept the order but not execute it (PX4). Nothing was sent.
             CommandRejected: the manager refused.
             CommandTimeout: there was no answer.
             GimbalTaken: your program had control and lost it.
             OperationRejected: another order was given meanwhile, or the vehicle rebooted.
-            OperationTimeout: it did not get there in time; the text has the last attitude.
+            OperationTimeout: the gimbal did not reach the direction in time; the text has the last attitude.
             HeartbeatTimeout: the vehicle fell silent.
         """
         if not self._orders.rules.supports_retract:

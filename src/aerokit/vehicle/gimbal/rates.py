@@ -67,7 +67,7 @@ class GimbalRates:
         self._period_s, self._valid_for_s, self._max_lag_s = 1 / rate_hz, valid_for_s, max_lag_s
         self._set_at = self._began_at = -math.inf
         self._order: Order | None = None
-        # Marks the gimbal as in use, so that the first one stays the first one.
+        # Marks the gimbal as in use, so that ``vehicle.gimbal`` does not change to another one.
         self._release = ExitStack()
         self._timer: asyncio.TimerHandle | None = None
         self._stopped: AerokitError | None = None

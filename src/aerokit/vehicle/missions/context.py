@@ -192,7 +192,7 @@ class MissionTracker:
     def _on_current(self, _: MissionProgress | None, reported: MissionProgress) -> None:
         before = self.current.latest
         current = None if reported.current is None else reported.current - self._offset
-        if current is not None and current < 0:  # ArduPilot's home
+        if current is not None and current < 0:  # item 0 of ArduPilot, which is home
             current = None
         if reported.total is None and reported.state == MissionState.NO_MISSION:
             current = None

@@ -197,9 +197,9 @@ class MissionControl(VehiclePlan["Mission"]):
 
         Raises:
             InvalidArgument: there is no such item. Nothing was sent.
-            OperationRejected: it is not armed, or its mode changed meanwhile.
+            OperationRejected: the vehicle is not armed, or its mode changed meanwhile.
             CommandRejected: the vehicle refused: it has no mission, no position, …; see ``reasons``.
-            OperationTimeout: it accepted but stayed in another mode.
+            OperationTimeout: the vehicle accepted the command but stayed in another mode.
             NotSupported: this type of vehicle has no mission mode.
         """
         self._check_item(item)
@@ -341,7 +341,7 @@ class MissionControl(VehiclePlan["Mission"]):
 
         transfers = self._context.transfers
         target = (transfers.system_id, transfers.component_id)
-        async with self._context.lock:  # PX4 ignores it during a transfer.
+        async with self._context.lock:  # PX4 ignores the command during a transfer.
             if order_status is not None:
                 self._vehicle_context.sender.raise_if_ended(order_status.order)
             await transfers.run(

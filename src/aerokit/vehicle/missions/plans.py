@@ -70,10 +70,10 @@ class VehiclePlan(ReadOnly, Generic[PlanT]):
         Raises:
             InvalidArgument: the plan is invalid, or has a position that is too far away. Nothing was sent.
             MissionRejected: the vehicle refused; see ``item``, ``result`` and ``reasons``.
-            MissionTimeout: it stopped answering; ``missing`` has the items that it did not confirm.
-            VerificationFailed: it confirmed the plan, but has other items.
-            NotSupported: ``"ftp"`` was requested, but it has none.
-            FileError, FileTimeout: the same for a file, with ``"ftp"``.
+            MissionTimeout: the vehicle stopped answering; ``missing`` has the items that it did not confirm.
+            VerificationFailed: the vehicle confirmed the plan, but has different items.
+            NotSupported: ``"ftp"`` was requested, but the vehicle does not support it.
+            FileError, FileTimeout: the vehicle refused or did not answer an operation on a file, with ``"ftp"``.
             OperationTimeout: not done within ``timeout``.
         """
         plan = self._checked(plan)
@@ -113,8 +113,8 @@ class VehiclePlan(ReadOnly, Generic[PlanT]):
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
             MissionRejected: the vehicle refused.
-            MissionTimeout: it stopped answering.
-            VerificationFailed: it confirmed, but still has items.
+            MissionTimeout: the vehicle stopped answering.
+            VerificationFailed: the vehicle confirmed the command, but still has items.
             OperationTimeout: not done within ``timeout``.
         """
         async with self._transfer(idle_timeout_s, timeout, None) as transfer:
@@ -162,7 +162,7 @@ class FenceControl(VehiclePlan["Fence"]):
 
         Raises:
             CommandRejected: the vehicle refused; PX4 does not support the command.
-            CommandTimeout: it did not answer.
+            CommandTimeout: the vehicle did not answer.
         """
         await self._context.vehicle_context.sender.auxiliary_command(MavCmd.DO_FENCE_ENABLE, float(on))
 

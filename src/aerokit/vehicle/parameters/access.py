@@ -67,7 +67,7 @@ class ParameterAccess:
 
     @property
     def _answer_time(self) -> RoundTrip:
-        # Longer than the round trip of the link: ArduPilot answers five reads, ten times a second.
+        # Answers take longer than the round trip of the link, because ArduPilot answers at most five reads every 0.1 s.
         if self._answers is None:
             link_s = self._transfers.round_trip.smoothed_s
             self._answers = RoundTrip(None if link_s is None else link_s + ANSWER_DELAY_S)

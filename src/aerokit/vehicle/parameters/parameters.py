@@ -90,8 +90,8 @@ class Parameters(ReadOnly):
         """Read ArduPilot's ``apm.pdef.xml`` or ``apm.pdef.json``, or PX4's ``parameters.xml`` or ``parameters.json``.
 
         Metadata does not restrict writes: a value outside the documented range is set, and its result has a ``note``.
-            Only values that the type cannot represent are refused. Metadata also identifies changes that need a reboot.
-            PX4's has the defaults.
+        Only values that the type cannot represent are refused. Metadata also identifies changes that need a reboot.
+        The metadata of PX4 contains the defaults.
 
         Raises:
             FileFormatError: the file is damaged, or of another kind.

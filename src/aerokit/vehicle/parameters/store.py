@@ -88,7 +88,7 @@ class ParameterStore:
         self._table, self.is_complete, self.count = None, False, None
 
     def replace(self, table: ParameterTable, *, since: int) -> None:
-        """Replace all by a list that was requested when ``updates`` was ``since``; newer messages take precedence."""
+        """Replace all parameters by a list requested when ``updates`` was ``since``. Newer messages take precedence."""
         newer = {name for name, at in self._updated_at.items() if at > since}
         before, self._known = self._known, {}
         for name, parameter in table.items():

@@ -116,7 +116,7 @@ class _Block:
             raise RollbackFailed(f"could not restore{reason}: {names}", not_restored=left) from cause
 
     async def _changed_by_others(self, wanted: list[Parameter]) -> dict[str, object]:
-        """Return parameters that another station has changed since, which is logged, or that cannot be read."""
+        """Return parameters that cannot be read, or that another station has changed since. Log these changes."""
         written = self._access.written
         own = [param.name for param in wanted if param.name in written]
         changed: dict[str, object] = {}

@@ -37,6 +37,9 @@ from aerokit.vehicle.session.commands import CommandSender
 from aerokit.vehicle.session.rates import ComponentSubscriber, MessageRates
 from aerokit.vehicle.session.transfers import Transfers
 from aerokit.vehicle.session.watch import LinkWatch, VehicleWatch
+from aerokit.vehicle.session.watched import WatchedStream
+from aerokit.vehicle.state.field import MESSAGE_IDS
+from aerokit.vehicle.state.states import STATES
 from aerokit.vehicle.state.telemetry import Telemetry
 
 if TYPE_CHECKING:
@@ -312,6 +315,7 @@ class VehicleSession:
                 detach = bus.attach(message_type, handler, system_id=self.system_id)
             self._detach.append(detach)
         telemetry, publish = self.telemetry, self.publish
+        self._request_watched()
         self.add_timeout_hint(*telemetry.cells.values(), self.link_quality, self.watch.link_state)
         self._detach += [
             telemetry.mode.observe(lambda old, new: publish(ModeChanged, old and old.name, new.name)),
@@ -325,6 +329,15 @@ class VehicleSession:
             bus.attach_event(ComputerSlept, self._on_computer_slept),
             self.connection.on_end(self._on_end),
         ]
+
+    def _request_watched(self) -> None:
+        """Request messages that have no default rate while one of their cells is watched."""
+        for name, state in STATES.items():
+            cell = self.telemetry.cells[name]
+            for source in state.sources:
+                kind = self.connection.bus.dialect.get(MESSAGE_IDS[source.message])
+                if source.watched_hz is not None and kind is not None and self.autopilot.sends(kind):
+                    cell._feed_from(*cell._feeds, WatchedStream(cell, self.rates, kind, source.watched_hz))
 
     def _on_link_chosen(self, event: LinkSelected) -> None:
         """Request all streams again, because an autopilot keeps separate rates for each of its ports."""

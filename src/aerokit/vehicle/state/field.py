@@ -44,6 +44,7 @@ class MessageSource(Generic[T]):
         fallback: the message is used only while no better message has reported the state recently.
         alternative: some autopilots send this message instead of the first one.
         instance_field: the field that distinguishes several instances, all of which are kept.
+        watched_hz: the rate to request while your program waits for the state or follows it, instead of ``hz``.
     """
 
     def __init__(
@@ -56,6 +57,7 @@ class MessageSource(Generic[T]):
         fallback: bool = False,
         alternative: bool = False,
         instance_field: str | None = None,
+        watched_hz: float | None = None,
     ) -> None:
         if message not in MESSAGE_IDS:
             raise ValueError(f"{message} is not a message class")
@@ -66,6 +68,7 @@ class MessageSource(Generic[T]):
         self.fallback: bool = fallback
         self.alternative: bool = alternative
         self.instance_field: str | None = instance_field
+        self.watched_hz: float | None = watched_hz
 
 
 class _HasCells(Protocol):
@@ -113,7 +116,10 @@ class StateField(Generic[T]):
 
     def waits_for(self, autopilot: Autopilot) -> str:
         """Return the messages that report the state, for error texts."""
-        return self._waits_for or " or ".join(kind.NAME for kind in self.requested_from(autopilot))
+        if self._waits_for:
+            return self._waits_for
+        sent = " or ".join(kind.NAME for kind in self.requested_from(autopilot))
+        return sent or f"{message_type(self.sources[0].message).NAME}, which {autopilot.firmware} does not send,"
 
 
 U8, U16 = 0xFF, 0xFFFF
@@ -225,7 +231,7 @@ class StreamedMessage:
                     waiting.append((came, None))
                 elif came.received_frame is not None:
                     waiting.append((came.received_frame, came))
-            waiting.sort(key=lambda each: each[0].received_at)
+            waiting.sort(key=lambda entry: entry[0].received_at)
             for frame, message in waiting:
                 self._apply(frame, message)
 

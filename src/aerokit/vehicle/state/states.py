@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from aerokit.autopilots.modes import Mode
 from aerokit.autopilots.telemetry import AutopilotVersion
 from aerokit.position import Position
-from aerokit.vehicle.state import condition, equipment, movement
+from aerokit.vehicle.state import condition, equipment, measurements, movement
 from aerokit.vehicle.state.condition import (
     EstimatorHealth,
     MissionProgress,
@@ -30,6 +30,16 @@ from aerokit.vehicle.state.equipment import (
     Vibration,
 )
 from aerokit.vehicle.state.field import MessageSource, StateField
+from aerokit.vehicle.state.measurements import (
+    ActuatorControls,
+    Aircraft,
+    AirPressure,
+    Altitude,
+    Imu,
+    Odometry,
+    RawImu,
+    WinchStatus,
+)
 from aerokit.vehicle.state.movement import Attitude, Home, LocalPosition, Velocity, Wind
 
 if TYPE_CHECKING:
@@ -194,6 +204,47 @@ class States:
 
     status_text: StateField[StatusText] = StateField(MessageSource("Statustext", None), eager=True)
     """The last status text (STATUSTEXT, chunks joined)."""
+
+    imu: StateField[Imu] = StateField(
+        MessageSource("HighresImu", measurements.highres_imu, needs_context=True, watched_hz=10.0)
+    )
+    """Accelerations, turn rates, magnetic field, pressures and temperature in SI units (HIGHRES_IMU)."""
+
+    scaled_imu: StateField[Imu] = StateField(MessageSource("ScaledImu", measurements.scaled_imu, watched_hz=10.0))
+    """Accelerations, turn rates and magnetic field of the first sensor (SCALED_IMU)."""
+
+    raw_imu: StateField[RawImu] = StateField(MessageSource("RawImu", measurements.raw_imu, watched_hz=10.0))
+    """Readings of the first inertial sensor, without units (RAW_IMU)."""
+
+    odometry: StateField[Odometry] = StateField(MessageSource("Odometry", measurements.odometry, watched_hz=10.0))
+    """Pose and velocity with covariances, as the estimator reports them (ODOMETRY)."""
+
+    scaled_pressure: StateField[AirPressure] = StateField(
+        MessageSource("ScaledPressure", measurements.air_pressure, watched_hz=5.0)
+    )
+    """Absolute and differential pressure and temperature (SCALED_PRESSURE)."""
+
+    ground_truth: StateField[Position] = StateField(
+        MessageSource("HilStateQuaternion", measurements.ground_truth, watched_hz=5.0),
+        MessageSource("SimState", measurements.simulation_state, watched_hz=5.0, alternative=True),
+    )
+    """True position in a simulation (HIL_STATE_QUATERNION, SIM_STATE)."""
+
+    altitude: StateField[Altitude] = StateField(MessageSource("Altitude", measurements.altitude, watched_hz=5.0))
+    """Altitudes above sea, home, terrain and ground (ALTITUDE)."""
+
+    actuator_control_target: StateField[ActuatorControls] = StateField(
+        MessageSource("ActuatorControlTarget", measurements.actuator_controls, watched_hz=5.0)
+    )
+    """Control outputs before mixing, of PX4 before 1.14 (ACTUATOR_CONTROL_TARGET)."""
+
+    transponder: StateField[tuple[Aircraft, ...]] = StateField(
+        MessageSource("AdsbVehicle", measurements.aircraft, needs_context=True, watched_hz=10.0), eager=True
+    )
+    """Other aircraft that an ADS-B receiver on board has reported, the latest last (ADSB_VEHICLE)."""
+
+    winch_status: StateField[WinchStatus] = StateField(MessageSource("WinchStatus", measurements.winch, watched_hz=2.0))
+    """Line length and speed, tension and state of a winch (WINCH_STATUS)."""
 
     def _cell_of(self, name: str) -> StateCell[Any]:
         raise NotImplementedError

@@ -12,14 +12,15 @@ from aerokit.vehicle.state import states
 from aerokit.vehicle.state.field import message_type
 
 if TYPE_CHECKING:
-    from aerokit.vehicle.state.field import StateField
+    from aerokit.vehicle.state.field import MessageSource, StateField
 
 HEAD = """# Vehicle state
 
 Every state is a cell of the vehicle: `vehicle.position.value`, `.latest`, `.age`, `.source`, `.fresh(within=1)`,
 `await vehicle.position.wait_until(…)`, `async for … in vehicle.position.changes()`. Values are in SI units and
 degrees; their classes are in [vehicle/state](../src/aerokit/vehicle/state). The last column lists the messages that
-report the state, the best source first, with the rates that aerokit requests unless you pass `connect(rates=…)`.
+report the state, the best source first, with the rates that aerokit requests unless you pass `connect(rates=…)`. "While
+watched": only while your program waits for the state or follows its changes; reading it requests nothing.
 
 | State | Type | What it is | Messages |
 |---|---|---|---|
@@ -50,10 +51,14 @@ def rendered() -> str:
 
 
 def _row(name: str, kind: str, text: str, field: StateField[Any]) -> str:
-    sources = ", ".join(
-        f"{message_type(source.message).NAME}{f' at {source.hz:g} Hz' if source.hz else ''}" for source in field.sources
-    )
+    sources = ", ".join(f"{message_type(source.message).NAME}{_rate(source)}" for source in field.sources)
     return f"| `{name}` | `{kind}` | {text.partition(' (')[0].rstrip('.')} | {sources} |\n"
+
+
+def _rate(source: MessageSource[Any]) -> str:
+    if source.watched_hz:
+        return f" at {source.watched_hz:g} Hz while watched"
+    return f" at {source.hz:g} Hz" if source.hz else ""
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
 
 import anyio
+from device_calls import FITTED
 from disturbed_hub import through_hub
 from disturbed_link import DisturbedLink, DisturbedPath, RecordedTraffic
 from disturbed_link_pair import over_two
@@ -157,6 +158,8 @@ def set_up(case: Case) -> Simulated:
     copter.parameters["DISARM_DELAY"] = 0.0
     if case.row.name.startswith("gimbal"):
         copter.parameters["MNT1_TYPE"] = 1.0
+    for name, value in FITTED.items():
+        copter.parameters[name] = value
     return copter
 
 

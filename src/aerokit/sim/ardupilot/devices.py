@@ -1,0 +1,113 @@
+"""Gripper, landing gear, parachute and winch of a simulated ArduPilot, fitted by the parameters of the firmware."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import GripperActions, MavCmd, MavResult, MavSeverity, ParachuteAction, WinchActions
+from aerokit.sim.commands import CommandHandler, ReceivedCommand, whole
+
+if TYPE_CHECKING:
+    from aerokit.sim.ardupilot.host import ArduPilotHost
+
+_C, _R = MavCmd, MavResult
+_GRIP_S = 0.7
+_WINCH_RATE_M_S, _WINCH_STEP_S = 1.0, 0.1
+_MIN_CHUTE_ALTITUDE_M = 10.0
+
+
+class ArduPilotDevices:
+    """Devices beside the outputs; a reboot resets them."""
+
+    def __init__(self, vehicle: ArduPilotHost) -> None:
+        self._vehicle = vehicle
+        self.is_gripped = False
+        self.gear_is_up = False
+        self.chute_is_released = False
+        self.line_m = self.line_rate_m_s = 0.0
+        self._goal_m: float | None = None
+
+    def commands(self) -> dict[int, CommandHandler]:
+        """Return the handlers of the commands that this kind of vehicle has."""
+        handlers: dict[int, CommandHandler] = {_C.DO_GRIPPER: self._grip}
+        if self._vehicle.KIND in ("copter", "plane"):
+            handlers |= {_C.AIRFRAME_CONFIGURATION: self._move_gear, _C.DO_PARACHUTE: self._handle_chute}
+        if self._vehicle.KIND == "copter":
+            handlers[_C.DO_WINCH] = self._wind
+        return handlers
+
+    def _is_set(self, name: str) -> bool:
+        return bool(self._vehicle.parameters.get(name, 0))
+
+    def _grip(self, command: ReceivedCommand) -> int:
+        """Move the servo gripper: acknowledged at once, its end is a status text (AP_Gripper_Servo.cpp)."""
+        is_known = command.param2 in (GripperActions.GRAB, GripperActions.RELEASE)
+        if not self._is_set("GRIP_ENABLE") or not is_known:
+            return _R.FAILED
+        grabs, done = command.param2 == GripperActions.GRAB, "grabbed" if command.param2 else "released"
+        if grabs is not self.is_gripped:
+            self._vehicle.info(f"Gripper load {'grabbing' if grabs else 'releasing'}")
+
+        def finish() -> None:
+            self._vehicle.info(f"Gripper load {done}")
+
+        self._vehicle.call_later(0.0 if grabs is self.is_gripped else _GRIP_S, finish)
+        self.is_gripped = grabs
+        return _R.ACCEPTED
+
+    def _move_gear(self, command: ReceivedCommand) -> int:
+        """Accept always, as the firmware does without a landing gear."""
+        up = command.param2 == 1
+        if self._is_set("LGR_ENABLE") and up is not self.gear_is_up:
+            self.gear_is_up = up
+            self._vehicle.info(f"LandingGear: {'RETRACT' if up else 'DEPLOY'}")
+        return _R.ACCEPTED
+
+    def _handle_chute(self, command: ReceivedCommand) -> int:
+        vehicle = self._vehicle
+        if command.param1 in (ParachuteAction.DISABLE, ParachuteAction.ENABLE):
+            if "CHUTE_ENABLED" in vehicle.parameters:
+                vehicle.parameters["CHUTE_ENABLED"] = command.param1
+        elif command.param1 != ParachuteAction.RELEASE:
+            return _R.FAILED
+        elif self._is_set("CHUTE_ENABLED"):
+            if vehicle.is_landed:
+                vehicle.info("Parachute: Landed")
+            elif -vehicle.motion.down < _MIN_CHUTE_ALTITUDE_M:
+                vehicle.send_text(MavSeverity.ALERT, "Parachute: Too low")
+            else:
+                self.chute_is_released = True
+                vehicle.info("Parachute: Released")
+                vehicle.arming.disarm(force=True)
+        return _R.ACCEPTED
+
+    def _wind(self, command: ReceivedCommand) -> int:
+        action = whole(command.param2)
+        if not self._is_set("WINCH_TYPE") or action > WinchActions.RATE_CONTROL:
+            return _R.FAILED
+        was_moving = self.line_rate_m_s != 0.0
+        self._goal_m, self.line_rate_m_s = None, 0.0
+        if action == WinchActions.RATE_CONTROL:
+            self.line_rate_m_s = max(-_WINCH_RATE_M_S, min(_WINCH_RATE_M_S, command.param4))
+        elif action == WinchActions.RELATIVE_LENGTH_CONTROL:
+            self._goal_m = self.line_m + command.param3
+            self.line_rate_m_s = _WINCH_RATE_M_S if command.param3 > 0 else -_WINCH_RATE_M_S
+        if not was_moving and self.line_rate_m_s:
+            self._vehicle.call_later(_WINCH_STEP_S, self._run)
+        return _R.ACCEPTED
+
+    def _run(self) -> None:
+        self.line_m += self.line_rate_m_s * _WINCH_STEP_S
+        if self._goal_m is not None and (self._goal_m - self.line_m) * self.line_rate_m_s <= 0:
+            self.line_rate_m_s = 0.0
+        if self.line_rate_m_s:
+            self._vehicle.call_later(_WINCH_STEP_S, self._run)
+
+    def winch_status(self) -> m.WinchStatus | None:
+        """Return WINCH_STATUS; None without a winch."""
+        if not self._is_set("WINCH_TYPE"):
+            return None
+        unknown = float("nan")
+        rest = (self.line_m, self.line_rate_m_s, unknown, unknown, unknown, 0x7FFF, 1)
+        return m.WinchStatus(self._vehicle.time_boot_us, *rest)

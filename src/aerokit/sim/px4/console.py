@@ -1,0 +1,99 @@
+"""System shell and log streaming of a simulated PX4."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import MavResult, SerialControlDev, SerialControlFlag
+from aerokit.sim.commands import ReceivedCommand
+from aerokit.sim.vehicle import sender_of
+
+if TYPE_CHECKING:
+    from aerokit.sim.channel import Channel
+    from aerokit.sim.vehicle import SimulatedVehicle
+
+_PIECE, _DATA, _NO_START = 70, 249, 255
+_STEP_S, _MAX_TRIES = 0.05, 50
+_HEADER = b"ULog\x01\x12\x35\x01" + bytes(8)
+
+
+class Px4Shell:
+    """Echoes each line and answers with its output and the prompt, to the station that wrote last."""
+
+    def __init__(self, px4: SimulatedVehicle) -> None:
+        self._px4, self._line = px4, b""
+        self.is_open = False
+        px4.on(m.SerialControl, self._on_input)
+
+    def _on_input(self, message: m.SerialControl, channel: Channel) -> None:
+        if message.device != SerialControlDev.DEV_SHELL or message.flags & SerialControlFlag.REPLY:
+            return
+        self.is_open = bool(message.flags & SerialControlFlag.RESPOND)
+        self._line += bytes(message.data[: message.count])
+        if not self.is_open or not self._line.endswith(b"\n"):
+            return
+        line, self._line = self._line, b""
+        output = line + self._output(line.decode(errors="replace").strip()) + b"pxh> "
+        for start in range(0, len(output), _PIECE):
+            piece = output[start : start + _PIECE]
+            target = sender_of(message)
+            reply = m.SerialControl(10, SerialControlFlag.REPLY, 0, 0, len(piece), piece.ljust(_PIECE, b"\0"), *target)
+            self._px4.send(reply, channel)
+
+    def _output(self, command: str) -> bytes:
+        if command.startswith("echo "):
+            return command.removeprefix("echo ").encode() + b"\n"
+        return f"Invalid command: {command}\ntype 'help' for a list of commands\n".encode() if command else b""
+
+
+class Px4LogStream:
+    """Streams a log: definitions that must be acknowledged one by one, then data that is not."""
+
+    def __init__(self, px4: SimulatedVehicle) -> None:
+        self._px4 = px4
+        self._station: tuple[int, int] | None = None
+        self._channel: Channel | None = None
+        self._sequence = self._tries = self._written = 0
+        px4.on(m.LoggingAck, self._on_ack)
+
+    def start(self, command: ReceivedCommand) -> int:
+        if self._station is not None:
+            return MavResult.TEMPORARILY_REJECTED
+        if command.param1:
+            return MavResult.UNSUPPORTED
+        self._station, self._channel = command.sender, command.channel
+        self._sequence = self._tries = self._written = 0
+        self._px4.call_later(_STEP_S, self._run)
+        return MavResult.ACCEPTED
+
+    def stop(self, _: ReceivedCommand) -> int:
+        self._station = None
+        return MavResult.ACCEPTED
+
+    def _on_ack(self, ack: m.LoggingAck, _: Channel) -> None:
+        if ack.sequence == self._sequence and self._written < 2:
+            self._sequence, self._written, self._tries = self._sequence + 1, self._written + 1, 0
+
+    def _run(self) -> None:
+        if self._station is None:
+            return
+        self._tries += 1
+        if self._tries > _MAX_TRIES and self._written < 2:
+            self._station = None
+            return
+        kind = m.LoggingDataAcked if self._written < 2 else m.LoggingData
+        data = _HEADER if self._written == 0 else b""
+        data += b"".join(_ulog_message(n) for n in range(2))
+        first = len(_HEADER) if self._written == 0 else 0
+        padded = data.ljust(_DATA, b"\0")
+        self._px4.send(kind(*self._station, self._sequence & 0xFFFF, len(data), first, padded), self._channel)
+        if self._written >= 2:
+            self._sequence += 1
+        self._px4.call_later(_STEP_S, self._run)
+
+
+def _ulog_message(number: int) -> bytes:
+    """Return a text message of ULog: its size, "L", level, time in µs, text."""
+    text = bytes([ord("6")]) + bytes(8) + f"part {number}".encode()
+    return len(text).to_bytes(2, "little") + b"L" + text

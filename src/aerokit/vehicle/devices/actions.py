@@ -1,0 +1,175 @@
+"""``DeviceActions``: tunes, status texts of the program, failure injection, grippers and winches of a vehicle."""
+
+from __future__ import annotations
+
+import re
+from functools import cached_property
+from typing import TYPE_CHECKING, Literal
+
+from aerokit._internal.arguments import check_range, checks_arguments
+from aerokit._internal.formatting import short_repr
+from aerokit.errors import InvalidArgument
+from aerokit.mavlink.enums import FailureType, FailureUnit, MavCmd, MavSeverity
+from aerokit.mavlink.messages import PlayTune, Statustext
+from aerokit.vehicle.commanding.context import VehicleBase
+from aerokit.vehicle.commanding.simple_orders import Argument, SimpleOrder
+
+if TYPE_CHECKING:
+    from aerokit.vehicle.devices.actuators import Actuators
+    from aerokit.vehicle.devices.gripper import Gripper
+    from aerokit.vehicle.devices.shell import Shell
+    from aerokit.vehicle.devices.winch import Winch
+
+# fmt: off
+FailingUnit = Literal[
+    "gyro", "accel", "mag", "baro", "gps", "optical_flow", "vio", "distance_sensor", "airspeed", "battery", "motor",
+    "servo", "avoidance", "rc_signal", "mavlink_signal",
+]
+FailureKind = Literal["ok", "off", "stuck", "garbage", "wrong", "slow", "delayed", "intermittent"]
+Severity = Literal["emergency", "alert", "critical", "error", "warning", "notice", "info", "debug"]
+# fmt: on
+FailureIntent = Literal["inject failure"]
+# FAILURE_UNIT_SENSOR_GYRO is "gyro".
+UNITS: dict[str, FailureUnit] = {unit.name.partition("_")[2].lower(): unit for unit in FailureUnit}
+INJECT_FAILURE = SimpleOrder(
+    "inject_failure",
+    MavCmd.INJECT_FAILURE,
+    (Argument("unit", 0, 255), Argument("kind", 0, 255), Argument("instance", 0, 16, whole=True)),
+)
+TUNE = re.compile(r"[A-Ga-gLlMmNnOoPpSsTt0-9#+.<>\- ]+")
+"""Characters of QBASIC 1.1's PLAY statement, which ArduPilot and PX4 play."""
+TUNE_PART, MAX_TUNE = 30, 230
+CHUNK, MAX_TEXT_BYTES = 50, 1000
+
+
+@checks_arguments
+class DeviceActions(VehicleBase):
+    """Devices and signals of a vehicle besides its flight."""
+
+    @cached_property
+    def actuators(self) -> Actuators:
+        """Servos, relays, actuators, landing gear, lights, motor test, parachute."""
+        from aerokit.vehicle.devices.actuators import Actuators
+
+        return Actuators(self._context)
+
+    def gripper(self, number: int = 1) -> Gripper:
+        """Return a gripper: ``await vehicle.gripper().release()``.
+
+        Args:
+            number: 1 to 8; ArduPilot and PX4 have one, and ignore the number.
+
+        Raises:
+            InvalidArgument: the number is out of range.
+        """
+        from aerokit.vehicle.devices.gripper import NUMBER, Gripper
+
+        NUMBER.to_wire(number)
+        return Gripper(self._context, number)
+
+    def winch(self, number: int = 1, *, component_id: int | None = None) -> Winch:
+        """Return a winch: ``await vehicle.winch().pay_out(5)``.
+
+        Args:
+            number: 1 to 255; ArduCopter has one, and ignores the number.
+            component_id: a winch that is a MAVLink component, 1 to 255 (MAV_COMP_ID_WINCH is 169); None: the
+                autopilot's.
+
+        Raises:
+            InvalidArgument: a number is out of range.
+        """
+        from aerokit.vehicle.devices.winch import Winch
+
+        check_range("number", number, 1, 255)
+        if component_id is not None:
+            check_range("component_id", component_id, 1, 255)
+        return Winch(self._context, number, component_id)
+
+    def shell(self) -> Shell:
+        """Open PX4's system shell for the duration of an ``async with`` block (SERIAL_CONTROL)."""
+        from aerokit.vehicle.devices.shell import Shell
+
+        return Shell(self._session)
+
+    def play_tune(self, tune: str) -> None:
+        """Play a tune on the vehicle's buzzer, such as ``"T200 L8 CEGO5C"`` (PLAY_TUNE); returns at once.
+
+        The message has no acknowledgement, and vehicles without a buzzer ignore it.
+
+        Args:
+            tune: notes in the format of QBASIC 1.1's PLAY statement, 1 to 230 characters: T tempo, L length, O octave,
+                A to G notes, P pause.
+
+        Raises:
+            InvalidArgument: it is empty, too long, or has other characters. Nothing was sent.
+        """
+        if not 1 <= len(tune) <= MAX_TUNE or not TUNE.fullmatch(tune):
+            raise InvalidArgument(
+                f"tune = {short_repr(tune)} is not allowed: 1 to {MAX_TUNE} characters of QBASIC's PLAY statement"
+            )
+        first, rest = tune[:TUNE_PART], tune[TUNE_PART:]
+        self._session.send(PlayTune(self.system_id, self.component_id, first, rest))
+
+    def send_status_text(self, text: str, *, severity: Severity = "info") -> None:
+        """Send a status text of your program to the vehicle and to other stations (STATUSTEXT); returns at once.
+
+        ArduPilot writes it to its flight log; it has no acknowledgement. A text of more than 50 bytes is sent in
+        chunks. ``connection.send`` of a message without ``vehicle`` reaches stations only.
+
+        Args:
+            text: 1 to 1000 bytes in UTF-8.
+            severity: name of a MAV_SEVERITY.
+
+        Raises:
+            InvalidArgument: the text is empty or too long, or the severity is unknown. Nothing was sent.
+        """
+        data = text.encode()
+        if not 1 <= len(data) <= MAX_TEXT_BYTES:
+            raise InvalidArgument(f"text has {len(data)} bytes, allowed are 1 to {MAX_TEXT_BYTES}")
+        self._text_id = self._text_id % 0xFFFF + 1
+        number = MavSeverity[severity.upper()]
+        for chunk, part in enumerate(_chunks(text)):
+            is_single = len(data) <= CHUNK
+            self._session.send(Statustext(number, part, 0 if is_single else self._text_id, chunk))
+
+    _text_id = 0
+
+    async def inject_failure(
+        self, unit: FailingUnit, kind: FailureKind, *, instance: int = 0, intent: FailureIntent
+    ) -> None:
+        """Make a part of the vehicle fail, to test how the vehicle reacts (MAV_CMD_INJECT_FAILURE).
+
+        PX4 only, if SYS_FAILURE_EN is 1. Returns when PX4 has acknowledged; it reports the failure by status texts and
+        by the health of its sensors. **The vehicle may crash.** ``kind="ok"`` ends the failure. Sent once.
+
+        Args:
+            unit: the part that fails, as FAILURE_UNIT.
+            kind: how it fails, as FAILURE_TYPE.
+            instance: number of the part from 1 to 16; 0 for all.
+            intent: must be ``"inject failure"``, so that no other call can be mistaken for it.
+
+        Raises:
+            InvalidArgument: an argument is not allowed. Nothing was sent.
+            NotSupported: ArduPilot, whose simulation has SIM_ parameters instead. Nothing was sent.
+            CommandRejected: SYS_FAILURE_EN is 0, or PX4 cannot let this part fail in this way.
+            CommandTimeout: there was no acknowledgement. PX4 sends none for a part that nothing there can let fail; the
+                part may have failed nevertheless.
+        """
+        await INJECT_FAILURE.send(self._context, UNITS[unit], FailureType[kind.upper()], instance)
+
+
+def _chunks(text: str) -> list[str]:
+    """Split a text into chunks of at most 50 bytes, at whole characters; a full last chunk is followed by an empty one.
+
+    The receiver takes a chunk that is not full as the end, so a chunk ends early only before a character that does not
+    fit; it is padded with a space then.
+    """
+    chunks = [""]
+    for character in text:
+        if len((chunks[-1] + character).encode()) > CHUNK:
+            chunks[-1] += " " * (CHUNK - len(chunks[-1].encode()))
+            chunks.append("")
+        chunks[-1] += character
+    if len(chunks) > 1 and len(chunks[-1].encode()) == CHUNK:
+        chunks.append("")
+    return chunks

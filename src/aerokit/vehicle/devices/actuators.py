@@ -1,0 +1,324 @@
+"""``Actuators``: servos, relays, actuators, landing gear, lights, the motor test and the parachute."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Literal
+
+import anyio
+
+from aerokit._internal.arguments import check_range, checks_arguments
+from aerokit._internal.async_block import ReadOnly
+from aerokit.errors import CommandRejected, InvalidArgument, OperationRejected
+from aerokit.mavlink.enums import MavCmd, MotorTestThrottleType, ParachuteAction
+from aerokit.vehicle.commanding.progress import await_progress
+from aerokit.vehicle.commanding.simple_orders import Argument, Effect, SimpleOrder
+from aerokit.vehicle.devices.text_effect import await_text, collected_texts
+
+if TYPE_CHECKING:
+    from aerokit.mavlink.messages import IlluminatorStatus, RelayStatus, ServoOutputRaw
+    from aerokit.vehicle.commanding.context import VehicleContext
+    from aerokit.vehicle.commanding.order import Order
+
+__all__ = ["Actuators"]
+
+SpinIntent = Literal["spin motor"]
+ReleaseIntent = Literal["release parachute"]
+
+MAX_MOTOR_TEST_S = 3.0
+"""PX4 ends a test after 3 s at the latest (Commander.cpp, handleCommandActuatorTest)."""
+TEST_END_TIMEOUT_S = 4.0
+PARACHUTE_TIMEOUT_S = 3.0
+ACTUATORS = 6
+ALL_GEARS = -1
+ILLUMINATOR = 243
+OUTPUTS_PER_MESSAGE = 16
+
+
+def _has_pulse(message: ServoOutputRaw, number: float, pulse_us: float) -> bool:
+    port, index = divmod(int(number) - 1, OUTPUTS_PER_MESSAGE)
+    return message.port == port and getattr(message, f"servo{index + 1}_raw") == int(pulse_us)
+
+
+def _is_switched(message: RelayStatus, number: float, on: float) -> bool:
+    return bool(message.on >> int(number) & 1) == bool(on)
+
+
+def _is_lit(message: IlluminatorStatus, on: float) -> bool:
+    return bool(message.enable) == bool(on)
+
+
+SERVO = Argument("number", 1, 32, whole=True)
+RELAY = Argument("number", 0, 15, whole=True)
+PULSE = Argument("pulse_us", 500, 2500, whole=True)
+COUNT = Argument("count", 1, 1000, whole=True)
+PERIOD = Argument("period_s", 0, 60, above=True)
+ON = Argument("on", 0, 1)
+MOTOR = Argument("number", 1, 12, whole=True)
+DURATION = Argument("duration_s", 0, MAX_MOTOR_TEST_S, above=True)
+SET_SERVO = SimpleOrder("set_servo", MavCmd.DO_SET_SERVO, (SERVO, PULSE), Effect("ServoOutputRaw", _has_pulse))
+REPEAT_SERVO = SimpleOrder("repeat_servo", MavCmd.DO_REPEAT_SERVO, (SERVO, PULSE, COUNT, PERIOD))
+SET_RELAY = SimpleOrder("set_relay", MavCmd.DO_SET_RELAY, (RELAY, ON), Effect("RelayStatus", _is_switched))
+REPEAT_RELAY = SimpleOrder("repeat_relay", MavCmd.DO_REPEAT_RELAY, (RELAY, COUNT, PERIOD))
+LANDING_GEAR = SimpleOrder("landing_gear", MavCmd.AIRFRAME_CONFIGURATION, (ALL_GEARS, Argument("up", 0, 1)))
+LIGHTS = SimpleOrder("set_lights", MavCmd.ILLUMINATOR_ON_OFF, (ON,), Effect("IlluminatorStatus", _is_lit))
+PARACHUTE = SimpleOrder("parachute", MavCmd.DO_PARACHUTE, (Argument("action", 0, 2),))
+PERCENT = MotorTestThrottleType.THROTTLE_PERCENT
+TEST_BY_SEQUENCE = SimpleOrder(
+    "test_motor", MavCmd.DO_MOTOR_TEST, (MOTOR, PERCENT, Argument("throttle_percent", 0, 100), DURATION, 1)
+)
+TEST_BY_FUNCTION = SimpleOrder(
+    "test_motor",
+    MavCmd.ACTUATOR_TEST,
+    (Argument("throttle_percent", 0, 100, scale=0.01), DURATION, 0, 0, MOTOR),
+)
+
+
+@checks_arguments
+class Actuators(ReadOnly):
+    """Outputs of the vehicle besides its flight controls: ``vehicle.actuators``.
+
+    ArduPilot has servos, relays, landing gear and a parachute; PX4 has actuators. After a cancellation the vehicle may
+    have executed the order.
+    """
+
+    def __init__(self, context: VehicleContext) -> None:
+        self._context = context
+
+    async def set_servo(self, number: int, pulse_us: int) -> None:
+        """Set the pulse width of a servo output, and return when SERVO_OUTPUT_RAW reports it (MAV_CMD_DO_SET_SERVO).
+
+        ArduPilot only. The output must have no function, or follow a stick (SERVOn_FUNCTION 0, 1, 51 to 66).
+
+        Args:
+            number: output, 1 to 32.
+            pulse_us: pulse width in microseconds, 500 to 2500.
+
+        Raises:
+            InvalidArgument: a value is out of range. Nothing was sent.
+            NotSupported: the firmware does not have the command. Nothing was sent.
+            CommandRejected: the vehicle refused, for example because the output has another function.
+            CommandTimeout: there was no acknowledgement.
+            OperationRejected: a newer order for this output was given.
+            OperationTimeout: the vehicle reports another state.
+        """
+        await SET_SERVO.send(self._context, number, pulse_us, topic=("servo", number))
+
+    async def repeat_servo(self, number: int, pulse_us: int, *, count: int, period_s: float) -> None:
+        """Move a servo ``count`` times to a pulse width and back to its trim (MAV_CMD_DO_REPEAT_SERVO).
+
+        Returns when ArduPilot has acknowledged and begins; no message reports the end. It has one cycle at a time: the
+        next order of this kind replaces it. Never sent twice, because each copy starts a new cycle. ArduPilot only.
+
+        Args:
+            number: output, 1 to 32, as for :meth:`set_servo`.
+            pulse_us: pulse width in microseconds, 500 to 2500.
+            count: number of cycles, 1 to 1000.
+            period_s: seconds from one pulse to the next, above 0, at most 60.
+
+        Raises:
+            InvalidArgument, NotSupported, CommandRejected, CommandTimeout: as for ``set_servo``.
+        """
+        await REPEAT_SERVO.send(self._context, number, pulse_us, count, period_s, topic=("servo", number))
+
+    async def set_relay(self, number: int, on: bool) -> None:
+        """Switch a relay, and return when RELAY_STATUS reports it (MAV_CMD_DO_SET_RELAY).
+
+        Firmware without RELAY_STATUS (before ArduPilot 4.5) only acknowledges. ArduPilot only; it refuses a relay
+        without a pin. Raises as :meth:`set_servo`.
+
+        Args:
+            number: relay from 0 (RELAY1_PIN) to 15.
+            on: the new state.
+        """
+        await SET_RELAY.send(self._context, number, on, topic=("relay", number))
+
+    async def repeat_relay(self, number: int, *, count: int, period_s: float) -> None:
+        """Switch a relay over and back ``count`` times (MAV_CMD_DO_REPEAT_RELAY).
+
+        Returns when ArduPilot has acknowledged and begins. Never sent twice. ArduPilot only.
+
+        Args:
+            number: relay from 0 to 15.
+            count: number of cycles, 1 to 1000.
+            period_s: seconds of one cycle, above 0, at most 60.
+
+        Raises:
+            InvalidArgument, NotSupported, CommandRejected, CommandTimeout: as for ``set_servo``.
+        """
+        await REPEAT_RELAY.send(self._context, number, count, period_s, topic=("relay", number))
+
+    async def set_actuator(self, number: int, value: float) -> None:
+        """Set one actuator (1 to 6) to a value from −1 to 1. Raises as :meth:`set_actuators`."""
+        check_range("number", number, 1, ACTUATORS)
+        await self.set_actuators(*(value if index == number else None for index in range(1, ACTUATORS + 1)))
+
+    async def set_actuators(self, *values: float | None) -> None:
+        """Set actuators by number: the first value is for "Peripheral via Actuator Set 1" (MAV_CMD_DO_SET_ACTUATOR).
+
+        Returns when PX4 has acknowledged, because no message reports the values. It acknowledges also if no output has
+        this function (PWM_MAIN_FUNCn 301 to 306). PX4 only.
+
+        Args:
+            values: up to six values, −1 to 1; None leaves an actuator as it is.
+
+        Raises:
+            InvalidArgument: none or more than six values, or one is out of range. Nothing was sent.
+            NotSupported: ArduPilot, which has :meth:`set_servo`. Nothing was sent.
+            CommandRejected: the vehicle refused.
+            CommandTimeout: there was no acknowledgement.
+        """
+        if not 1 <= len(values) <= ACTUATORS or all(value is None for value in values):
+            raise InvalidArgument(f"values = {values!r} is not allowed: one to {ACTUATORS} values, not all None")
+        for value in values:
+            if value is not None:
+                check_range("values", value, -1, 1)
+        params = [math.nan if value is None else float(value) for value in values]
+        order = SimpleOrder(
+            "set_actuators", MavCmd.DO_SET_ACTUATOR, (*params, *(math.nan,) * (ACTUATORS - len(params)), 0)
+        )
+        await order.send(self._context, topic="actuators")
+
+    async def raise_landing_gear(self) -> None:
+        """Retract the landing gear (MAV_CMD_AIRFRAME_CONFIGURATION); returns at the acknowledgement.
+
+        ArduCopter and ArduPlane only. They report the gear by no message, and accept the order also if there is no
+        landing gear (LGR_ENABLE), or while they stand on it.
+
+        Raises:
+            NotSupported: PX4, Rover and Sub. Nothing was sent.
+            OperationRejected: the vehicle is disarmed, or on the ground. Nothing was sent.
+            CommandRejected: the vehicle refused.
+            CommandTimeout: there was no acknowledgement.
+        """
+        LANDING_GEAR.check_supported(self._context)
+        if self._context.vehicle_position.is_on_ground() or self._context.session.telemetry.is_confirmed_disarmed:
+            raise OperationRejected("raise_landing_gear: the vehicle is disarmed or on the ground; nothing was sent")
+        await LANDING_GEAR.send(self._context, 1, topic="landing gear")
+
+    async def lower_landing_gear(self) -> None:
+        """Deploy the landing gear; returns at the acknowledgement.
+
+        Raises:
+            NotSupported, CommandRejected, CommandTimeout: as for ``raise_landing_gear``.
+        """
+        await LANDING_GEAR.send(self._context, 0, topic="landing gear")
+
+    async def set_lights(self, on: bool, *, component_id: int = ILLUMINATOR) -> None:
+        """Switch an illuminator, and return when ILLUMINATOR_STATUS reports it (MAV_CMD_ILLUMINATOR_ON_OFF).
+
+        For lights that are a MAVLink component. ArduPilot and PX4 do not have the command; lights on an output of
+        ArduPilot are servos or relays. Raises as :meth:`set_servo`.
+
+        Args:
+            on: the new state.
+            component_id: the light, 1 to 255; MAV_COMP_ID_ILLUMINATOR is 243.
+        """
+        check_range("component_id", component_id, 1, 255)
+        await LIGHTS.send(self._context, on, topic=("lights", component_id), component_id=component_id)
+
+    async def test_motor(self, number: int, *, throttle_percent: float, duration_s: float, intent: SpinIntent) -> None:
+        """Spin one motor of a disarmed vehicle, and return when it has stopped; remove the propellers.
+
+        Sent once: a copy would spin it again. If the call is cancelled or fails, aerokit orders the motor to stop at
+        once; without that, it stops after ``duration_s``. ArduCopter reports armed during the test, and the call
+        returns when it reports disarmed. PX4 acknowledges only, so the call returns after ``duration_s``.
+
+        ArduPilot: MAV_CMD_DO_MOTOR_TEST. PX4: MAV_CMD_ACTUATOR_TEST, if COM_MOT_TEST_EN is 1.
+
+        Args:
+            number: 1 to 12. ArduCopter counts clockwise from the front, PX4 by output function (Motor 1).
+            throttle_percent: 0 to 100.
+            duration_s: seconds, above 0, at most 3.
+            intent: must be ``"spin motor"``, so that no other call can be mistaken for it.
+
+        Raises:
+            InvalidArgument: a value is out of range, or the intent is another one. Nothing was sent.
+            OperationRejected: the vehicle is armed, or not known to be disarmed: nothing was sent. Or a newer order
+                for its motors was given.
+            CommandRejected: it refused (not landed, safety switch, COM_MOT_TEST_EN).
+            CommandTimeout: there was no acknowledgement; the motor may have turned.
+            OperationTimeout: the vehicle still reports armed four seconds after the end.
+        """
+        by_sequence = MavCmd.DO_MOTOR_TEST not in self._context.session.autopilot.unsupported_commands
+        row = TEST_BY_SEQUENCE if by_sequence else TEST_BY_FUNCTION
+        values: tuple[float, ...] = (number, throttle_percent, duration_s)
+        if not by_sequence:
+            values = (throttle_percent, duration_s, number)
+        row.wire_params(*values)
+        session, arbiter = self._context.session, self._context.arbiter
+        if not session.telemetry.is_confirmed_disarmed or not arbiter.is_known:
+            state = "armed" if session.telemetry.is_armed else "not known to be disarmed"
+            raise OperationRejected(f"test_motor: the vehicle is {state}; nothing was sent")
+        order, spins_until = arbiter.of_device("motor test"), math.inf
+        try:
+            await row.send(self._context, *values, of=order)
+            spins_until = session.connection.now() + duration_s
+            await anyio.sleep(duration_s)
+            await self._await_test_end(order)
+        except CommandRejected:
+            raise
+        except BaseException:
+            # After its end, the stop would be another test, which arms the motors.
+            is_spinning = session.connection.now() < spins_until
+            if is_spinning and order.is_newest and arbiter.is_known and session.connection.is_open:
+                # Throttle 0 for 0 s ends a test on ArduPilot; PX4 releases the output after 0 s.
+                stop = (number, PERCENT, 0, 0, 1) if by_sequence else (math.nan, 0, 0, 0, number)
+                session.commands.send_unconfirmed(row.command, *stop)
+            raise
+
+    async def _await_test_end(self, order: Order) -> None:
+        session = self._context.session
+        armed, ended_at = session.telemetry.armed, session.connection.now()
+        await await_progress(
+            session,
+            "test_motor",
+            is_done=lambda: armed.latest is False and armed.updated_at > ended_at,
+            trouble=lambda: None if order.is_newest else "another motor test was started",
+            describe=lambda: "the vehicle still reports armed",
+            timeout=TEST_END_TIMEOUT_S,
+        )
+
+    async def release_parachute(self, *, intent: ReleaseIntent) -> None:
+        """Release the parachute and stop the motors; return when ArduPilot reports that it was released.
+
+        MAV_CMD_DO_PARACHUTE. ArduPilot accepts the command also where it then refuses to release: on the ground, below
+        CHUTE_ALT_MIN, or if the parachute is disabled. ArduCopter and ArduPlane only. **The vehicle falls.**
+
+        Args:
+            intent: must be ``"release parachute"``, so that no other call can be mistaken for it.
+
+        Raises:
+            InvalidArgument: the intent is another one. Nothing was sent.
+            NotSupported: PX4, Rover and Sub. Nothing was sent.
+            OperationRejected: the vehicle refused after the acknowledgement; ``reasons`` has its status texts.
+            CommandRejected: the vehicle refused.
+            CommandTimeout: there was no acknowledgement.
+            OperationTimeout: no status text reported the release.
+        """
+        order = self._context.arbiter.of_device("parachute")
+        with collected_texts(self._context) as texts:
+            await PARACHUTE.send(self._context, ParachuteAction.RELEASE, of=order)
+            await await_text(
+                self._context,
+                "release_parachute",
+                texts,
+                lambda text, _: text.startswith("Parachute: Released"),
+                is_refusal=lambda text: text.startswith("Parachute: "),
+                order=order,
+                timeout=PARACHUTE_TIMEOUT_S,
+            )
+
+    async def enable_parachute(self, enabled: bool = True) -> None:
+        """Allow or forbid the release of the parachute until the next reboot; returns at the acknowledgement.
+
+        MAV_CMD_DO_PARACHUTE. ArduCopter and ArduPlane only.
+
+        Args:
+            enabled: False forbids it, also for failsafes.
+
+        Raises:
+            NotSupported, CommandRejected, CommandTimeout: as for ``release_parachute``.
+        """
+        action = ParachuteAction.ENABLE if enabled else ParachuteAction.DISABLE
+        await PARACHUTE.send(self._context, action, topic="parachute")

@@ -1,0 +1,67 @@
+"""``Gripper``: holds and releases a load."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from aerokit._internal.arguments import checks_arguments
+from aerokit._internal.async_block import ReadOnly
+from aerokit.mavlink.enums import GripperActions, MavCmd
+from aerokit.vehicle.commanding.simple_orders import Argument, SimpleOrder
+from aerokit.vehicle.devices.text_effect import await_text, collected_texts
+
+if TYPE_CHECKING:
+    from aerokit.vehicle.commanding.context import VehicleContext
+
+__all__ = ["Gripper"]
+
+NUMBER = Argument("number", 1, 8, whole=True)
+DO_GRIPPER = SimpleOrder("gripper", MavCmd.DO_GRIPPER, (NUMBER, Argument("action", 0, 1)))
+GRIP_TIMEOUT_S = 10.0
+EPM_WAIT_S = 3.0
+"""An electro-permanent gripper reports only that it begins; a servo reports its end 0.5 s later."""
+BEGINS = {GripperActions.GRAB: "Gripper load grabbing", GripperActions.RELEASE: "Gripper load releasing"}
+ENDS = {GripperActions.GRAB: "Gripper load grabbed", GripperActions.RELEASE: "Gripper load released"}
+
+
+@checks_arguments
+class Gripper(ReadOnly):
+    """One gripper: ``vehicle.gripper()`` (MAV_CMD_DO_GRIPPER).
+
+    PX4 acknowledges when the gripper has moved (PD_GRIPPER_EN). ArduPilot acknowledges at once and reports the end by
+    status text (GRIP_ENABLE); an electro-permanent gripper reports only its beginning, and the call returns three
+    seconds later. Orders are sent once. After a cancellation the gripper may have moved.
+    """
+
+    def __init__(self, context: VehicleContext, number: int) -> None:
+        self._context, self._number = context, number
+
+    async def grab(self) -> None:
+        """Close the gripper, and return when it has closed.
+
+        Raises:
+            CommandRejected: there is no gripper, or it refused.
+            CommandTimeout: there was no acknowledgement.
+            OperationRejected: a newer order for this gripper was given.
+            OperationTimeout: the end was not reported within ten seconds.
+        """
+        await self._move(GripperActions.GRAB)
+
+    async def release(self) -> None:
+        """Open the gripper, and return when it has opened. Raises as :meth:`grab`."""
+        await self._move(GripperActions.RELEASE)
+
+    async def _move(self, action: GripperActions) -> None:
+        context, name = self._context, f"gripper {action.name.lower()}"
+        order = context.arbiter.of_device(("gripper", self._number))
+        with collected_texts(context) as texts:
+            await DO_GRIPPER.send(context, self._number, action, of=order)
+            if context.session.autopilot.reports_gripper_by_text:
+                await await_text(
+                    context,
+                    name,
+                    texts,
+                    lambda text, after_s: text == ENDS[action] or (text == BEGINS[action] and after_s >= EPM_WAIT_S),
+                    order=order,
+                    timeout=GRIP_TIMEOUT_S,
+                )

@@ -1,0 +1,142 @@
+"""``Shell``: PX4's system shell over MAVLink."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from aerokit._internal.arguments import check_range, checks_arguments
+from aerokit._internal.async_block import ReadOnly
+from aerokit.errors import InvalidArgument, NotSupported, OperationTimeout
+from aerokit.mavlink.enums import SerialControlDev, SerialControlFlag
+from aerokit.mavlink.messages import SerialControl
+
+if TYPE_CHECKING:
+    from types import TracebackType
+
+    from typing_extensions import Self
+
+    from aerokit.connection.bus import Subscription
+    from aerokit.vehicle.session.session import VehicleSession
+
+__all__ = ["Shell"]
+
+PROMPTS = ("pxh> ", "nsh> ")
+"""Prompts of PX4 in simulation and on NuttX, after each command."""
+DATA_BYTES, MAX_LINE, MAX_WAITING, OPEN_TIMEOUT_S = 70, 1000, 4096, 5.0
+_RESPOND, _REPLY = SerialControlFlag.RESPOND, SerialControlFlag.REPLY
+
+
+@checks_arguments
+class Shell(ReadOnly):
+    """PX4's system shell, open for the duration of an ``async with`` block: ``vehicle.shell()`` (SERIAL_CONTROL).
+
+    PX4 has one shell for each of its ports, which all stations on that port share. aerokit sends each line once, and
+    does not know what it does: a command of the shell is no order. The messages have neither numbers nor answers, so a
+    bad link loses parts of the text.
+
+    Entering raises:
+        NotSupported: ArduPilot, which has no shell. Nothing was sent.
+        BusyError: this shell was entered before; call ``vehicle.shell()`` again.
+        OperationTimeout: there was no prompt within five seconds.
+    """
+
+    def __init__(self, session: VehicleSession) -> None:
+        self._session = session
+        self._output: Subscription[SerialControl] = session.connection.subscribe(
+            SerialControl, system_id=session.system_id, capacity=MAX_WAITING
+        )
+        self._is_open = False
+
+    async def __aenter__(self) -> Self:
+        autopilot = self._session.autopilot
+        if not autopilot.has_shell:
+            raise NotSupported(f"shell: {autopilot.firmware} has no shell; nothing was sent")
+        self._output.__enter__()
+        self._is_open = True
+        try:
+            await self.run("", timeout=OPEN_TIMEOUT_S)
+        except BaseException:
+            self._close()
+            raise
+        return self
+
+    async def __aexit__(
+        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._close()
+
+    def _close(self) -> None:
+        """Close the shell by a message that requests no response."""
+        self._output.close()
+        if self._is_open and self._session.connection.is_open:
+            self._send(b"", 0)
+        self._is_open = False
+
+    def write(self, line: str) -> None:
+        """Send one line without waiting for its output; :meth:`read` returns that.
+
+        Args:
+            line: at most 1000 bytes, without a line break.
+
+        Raises:
+            InvalidArgument: it is too long or has a line break, or the block is not open. Nothing was sent.
+        """
+        data = line.encode()
+        if len(data) > MAX_LINE or "\n" in line or "\r" in line:
+            raise InvalidArgument(f"line is not allowed: at most {MAX_LINE} bytes in one line, got {len(data)} bytes")
+        if not self._is_open:
+            raise InvalidArgument("the shell is not open: write to it inside its `async with` block")
+        data += b"\n"
+        for start in range(0, len(data), DATA_BYTES):
+            self._send(data[start : start + DATA_BYTES], _RESPOND)
+
+    def _send(self, data: bytes, flags: int) -> None:
+        session = self._session
+        padded = data.ljust(DATA_BYTES, b"\0")
+        target = (session.system_id, session.component_id)
+        session.send(SerialControl(SerialControlDev.DEV_SHELL, flags, 0, 0, len(data), padded, *target))
+
+    async def read(self, *, timeout: float | None = None) -> str:
+        """Return the next piece of output, up to 70 bytes, with echoes and prompts.
+
+        Args:
+            timeout: seconds; None waits without a limit.
+
+        Raises:
+            InvalidArgument: the timeout is out of range, or the block is not open.
+            OperationTimeout: there was no output in time.
+        """
+        if timeout is not None:
+            check_range("timeout", timeout, 0, 1e6)
+        while True:
+            message = await self._output.get(timeout)
+            is_for_us = message.target_system in (0, self._session.connection.source_system)
+            if is_for_us and message.device == SerialControlDev.DEV_SHELL and message.flags & _REPLY:
+                return bytes(message.data[: message.count]).decode(errors="replace")
+
+    async def run(self, command: str, *, timeout: float = 10.0) -> str:
+        """Run a command and return its output, when the shell shows its prompt again.
+
+        A cancelled or timed out call does not end the command. Output that was not read before is discarded.
+
+        Args:
+            command: at most 1000 bytes, without a line break.
+            timeout: seconds until the prompt, above 0.
+
+        Raises:
+            InvalidArgument: as for :meth:`write`.
+            OperationTimeout: there was no prompt in time; the text has the output so far.
+        """
+        check_range("timeout", timeout, 0, 1e6, above=True)
+        while self._output.get_nowait() is not None:
+            pass
+        self.write(command)
+        now = self._session.connection.now
+        until, text = now() + timeout, ""
+        try:
+            while not text.endswith(PROMPTS):
+                text += await self.read(timeout=max(0.0, until - now()))
+        except OperationTimeout:
+            raise OperationTimeout(f"shell: {command!r} was not done within {timeout:g} s; output: {text!r}") from None
+        text = text.removeprefix(command).removeprefix("\n")
+        return text.rpartition("\n")[0] if "\n" in text else ""

@@ -1,0 +1,195 @@
+"""``Winch``: lowers, raises and releases a load on a line."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from aerokit._internal.arguments import check_range, checks_arguments
+from aerokit._internal.async_block import ReadOnly
+from aerokit.errors import NotSupported
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import MavCmd, MavWinchStatusFlag, WinchActions
+from aerokit.vehicle.commanding.simple_orders import Argument, Effect, SimpleOrder, receive_once
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from aerokit.connection.cells import StateCell
+    from aerokit.vehicle.commanding.context import VehicleContext
+    from aerokit.vehicle.state.measurements import WinchStatus
+
+__all__ = ["Winch"]
+
+_A, _F = WinchActions, MavWinchStatusFlag
+LENGTH_TOLERANCE_M = 0.1
+RATE_TOLERANCE_M_S = 0.05
+ACTION_TIMEOUT_S = 120.0
+MAX_LENGTH_M, MAX_RATE_M_S = 1000.0, 20.0
+PARAMS = (
+    Argument("number", 1, 255, whole=True),
+    Argument("action", 0, 9, whole=True),
+    Argument("length_m", -MAX_LENGTH_M, MAX_LENGTH_M),
+    Argument("rate_m_s", -MAX_RATE_M_S, MAX_RATE_M_S),
+)
+# Flags of WINCH_STATUS that report the end of an action.
+ENDS: dict[WinchActions, MavWinchStatusFlag] = {
+    _A.LOCK: _F.LOCKED,
+    _A.RETRACT: _F.FULLY_RETRACTED,
+    _A.LOAD_LINE: _F.LOAD_LINE,
+    _A.ABANDON_LINE: _F.ABANDON_LINE,
+    _A.LOAD_PAYLOAD: _F.LOAD_PAYLOAD,
+}
+
+
+@checks_arguments
+class Winch(ReadOnly):
+    """One winch: ``vehicle.winch()`` (MAV_CMD_DO_WINCH).
+
+    ArduCopter has :meth:`relax`, :meth:`pay_out` and :meth:`set_rate`; the other orders are for winches that are
+    MAVLink components: ``vehicle.winch(component_id=169)``. PX4 has none of them and forwards the command to such a
+    component. An order that may pay out line twice is sent once. A newer order ends the wait for the previous one.
+    A cancelled call does not stop the winch: call ``set_rate(0)``.
+    """
+
+    def __init__(self, context: VehicleContext, number: int, component_id: int | None) -> None:
+        self._context, self._number, self._component_id = context, number, component_id
+
+    @property
+    def status(self) -> StateCell[WinchStatus]:
+        """Length, speed, tension and state of the autopilot's winch (WINCH_STATUS); ``vehicle.winch_status``."""
+        cell: StateCell[WinchStatus] = self._context.session.telemetry.cells["winch_status"]
+        return cell
+
+    async def relax(self) -> None:
+        """Let the line run freely; returns at the acknowledgement, which is all that ArduCopter reports.
+
+        Raises:
+            NotSupported: the autopilot has no such order. Nothing was sent.
+            CommandRejected: there is no winch (WINCH_TYPE).
+            CommandTimeout: there was no acknowledgement.
+        """
+        await self._send(_A.RELAXED)
+
+    async def pay_out(self, length_m: float, *, rate_m_s: float = 0.5, timeout: float = ACTION_TIMEOUT_S) -> None:
+        """Pay out a length of line, and return when WINCH_STATUS reports it within 0.1 m.
+
+        Without WINCH_STATUS it returns at the acknowledgement. Sent once, because a copy would pay out more.
+
+        Args:
+            length_m: metres, −1000 to 1000; negative values wind it up.
+            rate_m_s: speed, above 0, at most 20 m/s; ArduCopter uses WINCH_MAX_RATE instead.
+            timeout: seconds until the length is out.
+
+        Raises:
+            InvalidArgument: a value is out of range. Nothing was sent.
+            NotSupported: the autopilot has no such order. Nothing was sent.
+            CommandRejected: there is no winch (WINCH_TYPE).
+            CommandTimeout: there was no acknowledgement; the winch may run.
+            OperationRejected: a newer order for this winch was given.
+            HeartbeatTimeout: the vehicle was silent for ten seconds.
+            OperationTimeout: the length was not reported in time.
+        """
+        check_range("length_m", length_m, -MAX_LENGTH_M, MAX_LENGTH_M)
+        check_range("rate_m_s", rate_m_s, 0, MAX_RATE_M_S, above=True)
+        self._check_supported(_A.RELATIVE_LENGTH_CONTROL)
+        start = await receive_once(self._context, m.WinchStatus, self._component_id)
+        goal_m = None if start is None else start.line_length + length_m
+        await self._send(
+            _A.RELATIVE_LENGTH_CONTROL,
+            length_m,
+            rate_m_s,
+            None if goal_m is None else lambda status: abs(status.line_length - goal_m) <= LENGTH_TOLERANCE_M,
+            timeout=timeout,
+        )
+
+    async def set_rate(self, rate_m_s: float) -> None:
+        """Pay out line at this speed until the next order, and return when WINCH_STATUS reports the speed.
+
+        Args:
+            rate_m_s: −20 to 20 m/s; negative values wind it up, 0 stops. ArduCopter limits it to WINCH_MAX_RATE, and
+                this call then times out.
+
+        Raises:
+            InvalidArgument, NotSupported, CommandRejected, CommandTimeout, OperationRejected, OperationTimeout: as for
+                ``pay_out``.
+        """
+        await self._send(
+            _A.RATE_CONTROL, 0, rate_m_s, lambda status: abs(status.speed - rate_m_s) <= RATE_TOLERANCE_M_S
+        )
+
+    async def lock(self) -> None:
+        """Engage the brake, and return when WINCH_STATUS reports it locked. Raises as :meth:`retract`."""
+        await self._send_until_flag(_A.LOCK)
+
+    async def deliver(self) -> None:
+        """Start the winch's own delivery: lower, release, retract. Returns at the acknowledgement.
+
+        Raises as :meth:`relax`.
+        """
+        await self._send(_A.DELIVER)
+
+    async def hold(self) -> None:
+        """Hold the line by the motor, without the brake. Returns at the acknowledgement. Raises as :meth:`relax`."""
+        await self._send(_A.HOLD)
+
+    async def retract(self, *, timeout: float = ACTION_TIMEOUT_S) -> None:
+        """Wind up all line, and return when WINCH_STATUS reports it fully retracted.
+
+        Args:
+            timeout: seconds until it is retracted.
+
+        Raises:
+            NotSupported: the autopilot has no such order. Nothing was sent.
+            CommandRejected: the winch refused.
+            CommandTimeout: there was no acknowledgement; the winch may run.
+            OperationRejected: a newer order for this winch was given.
+            HeartbeatTimeout: the vehicle was silent for ten seconds.
+            OperationTimeout: the end was not reported in time.
+        """
+        await self._send_until_flag(_A.RETRACT, timeout=timeout)
+
+    async def load_line(self) -> None:
+        """Load new line: the motor turns slowly. Returns when WINCH_STATUS reports it. Raises as :meth:`retract`."""
+        await self._send_until_flag(_A.LOAD_LINE)
+
+    async def abandon_line(self) -> None:
+        """Spool out all line and release it. Returns when WINCH_STATUS reports it. Raises as :meth:`retract`."""
+        await self._send_until_flag(_A.ABANDON_LINE)
+
+    async def load_payload(self) -> None:
+        """Run slowly until a payload is attached. Returns when WINCH_STATUS reports it. Raises as :meth:`retract`."""
+        await self._send_until_flag(_A.LOAD_PAYLOAD)
+
+    async def _send_until_flag(self, action: WinchActions, *, timeout: float = ACTION_TIMEOUT_S) -> None:
+        flag = ENDS[action]
+        await self._send(action, is_done=lambda status: bool(status.status & flag), timeout=timeout)
+
+    async def _send(
+        self,
+        action: WinchActions,
+        length_m: float = 0.0,
+        rate_m_s: float = 0.0,
+        is_done: Callable[[m.WinchStatus], bool] | None = None,
+        timeout: float = 5.0,
+    ) -> None:
+        effect = None if is_done is None else Effect("WinchStatus", lambda status, *_: is_done(status))
+        order = SimpleOrder(f"winch {action.name.lower()}", MavCmd.DO_WINCH, PARAMS, effect)
+        order.wire_params(self._number, action, length_m, rate_m_s)
+        self._check_supported(action)
+        await order.send(
+            self._context,
+            self._number,
+            action,
+            length_m,
+            rate_m_s,
+            topic=("winch", self._number, self._component_id),
+            component_id=self._component_id,
+            timeout=timeout,
+        )
+
+    def _check_supported(self, action: WinchActions) -> None:
+        autopilot = self._context.session.autopilot
+        if self._component_id is None and (
+            MavCmd.DO_WINCH in autopilot.unsupported_commands or action not in autopilot.winch_actions
+        ):
+            raise NotSupported(f"winch: {autopilot.firmware} has no action {action.name}; nothing was sent")

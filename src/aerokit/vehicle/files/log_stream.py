@@ -1,0 +1,164 @@
+"""``LogStream``: the flight log that PX4 sends while it writes it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from aerokit._internal.arguments import checks_arguments
+from aerokit._internal.async_block import ReadOnly
+from aerokit.errors import CommandRejected
+from aerokit.mavlink.enums import MavCmd
+from aerokit.mavlink.messages import LoggingAck, LoggingData, LoggingDataAcked
+from aerokit.vehicle.commanding.simple_orders import SimpleOrder
+
+if TYPE_CHECKING:
+    from types import TracebackType
+
+    from typing_extensions import Self
+
+    from aerokit.connection.bus import Subscription
+    from aerokit.vehicle.commanding.context import VehicleContext
+
+__all__ = ["LogStream"]
+
+START = SimpleOrder("logs.stream", MavCmd.LOGGING_START, (0,))
+STOP = SimpleOrder("logs.stream", MavCmd.LOGGING_STOP)
+MAGIC, HEADER_BYTES, NO_START = b"ULog\x01\x12\x35", 16, 255
+MAX_WAITING = 8192
+"""Messages that may wait for the reader: about 2 MB."""
+DROPOUT = b"\x02\x00O"
+"""Head of the ULog message that marks a gap; the duration in ms follows (2 bytes)."""
+
+
+class UlogAssembler:
+    """Joins the messages of a log stream to a valid ULog file: whole ULog messages, and a mark where some are missing.
+
+    A gap in the numbers discards what is left of the current ULog message, up to the next one that begins.
+    """
+
+    def __init__(self) -> None:
+        self.lost = 0
+        """Number of messages that were not received."""
+        self._next: int | None = None
+        self._began = self._is_aligned = False
+        self._buffer = bytearray()
+        self._received_at = 0.0
+
+    def add(self, message: LoggingData | LoggingDataAcked, now: float) -> bytes:
+        """Take the next message and return the complete ULog messages."""
+        gap = 0 if self._next is None else (message.sequence - self._next) % 0x10000
+        if gap >= 0x8000:  # A repetition, because the acknowledgement was lost.
+            return b""
+        data, first = bytes(message.data[: message.length]), message.first_message_offset
+        marks = b""
+        if gap:
+            self.lost += gap
+            self._buffer.clear()
+            self._is_aligned = False
+        self._next = (message.sequence + 1) % 0x10000
+        if not self._began:
+            self._began = self._is_aligned = data.startswith(MAGIC)
+            if not self._began:
+                return b""
+            marks, data = data[:HEADER_BYTES], data[HEADER_BYTES:]
+        elif not self._is_aligned:
+            if first == NO_START:
+                return b""
+            self._is_aligned, data = True, data[first:]
+            marks = DROPOUT + min(0xFFFF, round(1000 * (now - self._received_at))).to_bytes(2, "little")
+        self._received_at = now
+        self._buffer += data
+        return marks + self._take_whole()
+
+    def _take_whole(self) -> bytes:
+        end = 0
+        while len(self._buffer) >= end + 3:
+            size = 3 + int.from_bytes(self._buffer[end : end + 2], "little")
+            if len(self._buffer) < end + size:
+                break
+            end += size
+        whole = bytes(self._buffer[:end])
+        del self._buffer[:end]
+        return whole
+
+
+@checks_arguments
+class LogStream(ReadOnly):
+    """The flight log that PX4 sends while its ``async with`` block runs (LOGGING_DATA): an async iterator over bytes.
+
+    Written to a file one after the other, the bytes are a valid ULog file at any time. Lost messages are marked there
+    as dropouts; ``lost`` counts them. The iterator ends with the connection. PX4 sends one such log at a time.
+
+    Entering raises:
+        NotSupported: ArduPilot. Nothing was sent.
+        CommandRejected: PX4 streams to another station, or the port is too slow (below 5 kB/s).
+        CommandTimeout: there was no acknowledgement; the stream that may have begun is stopped.
+    """
+
+    def __init__(self, context: VehicleContext, idle_timeout_s: float) -> None:
+        self._context, self._idle_timeout_s = context, idle_timeout_s
+        session = context.session
+        self._messages: Subscription[LoggingData | LoggingDataAcked] = session.connection.subscribe(
+            LoggingData, LoggingDataAcked, system_id=session.system_id, capacity=MAX_WAITING, overflow="drop_newest"
+        )
+        self._assembler = UlogAssembler()
+
+    @property
+    def lost(self) -> int:
+        """Number of LOGGING_DATA messages that were not received, or that the reader was too slow for."""
+        return self._assembler.lost
+
+    async def __aenter__(self) -> Self:
+        START.check_supported(self._context)
+        self._messages.__enter__()
+        session = self._context.session
+        self._detach = session.connection.bus.attach(LoggingDataAcked, self._acknowledge, system_id=session.system_id)
+        try:
+            await START.send(self._context)
+        except CommandRejected:  # The stream of another station must not be stopped.
+            self._close()
+            raise
+        except BaseException:
+            self._close()
+            self._context.session.transfers.command_in_background(MavCmd.LOGGING_STOP)
+            raise
+        return self
+
+    def _close(self) -> None:
+        self._messages.close()
+        self._detach()
+
+    def _acknowledge(self, message: LoggingDataAcked) -> None:
+        """Acknowledge at once: PX4 repeats a message every 50 ms, and gives up after 50 attempts."""
+        session = self._context.session
+        session.send(LoggingAck(session.system_id, session.component_id, message.sequence))
+
+    async def __aexit__(
+        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        is_stopped = False
+        try:
+            if exc is None:  # PX4 acknowledges when its last message was acknowledged (logger.cpp, stop_log_mavlink).
+                await STOP.send(self._context)
+                is_stopped = True
+        finally:
+            self._close()
+            if not is_stopped:
+                self._context.session.transfers.command_in_background(MavCmd.LOGGING_STOP)
+
+    def __aiter__(self) -> Self:
+        return self
+
+    async def __anext__(self) -> bytes:
+        """Return the next complete part of the log.
+
+        Raises:
+            InvalidArgument: the block is not open.
+            OperationTimeout: nothing was received for ``idle_timeout_s`` seconds.
+        """
+        connection = self._context.session.connection
+        while True:
+            message = await self._messages.get(self._idle_timeout_s)
+            is_for_us = message.target_system in (0, connection.source_system)
+            if is_for_us and (data := self._assembler.add(message, connection.now())):
+                return data

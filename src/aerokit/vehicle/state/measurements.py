@@ -1,0 +1,277 @@
+"""State values and decoders: inertial and pressure sensors, odometry, ground truth, traffic, winch."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from aerokit._internal.values import Snapshot
+from aerokit.mavlink.enums import AdsbAltitudeType, AdsbEmitterType, AdsbFlags, MavFrame, MavWinchStatusFlag
+from aerokit.position import Position
+from aerokit.vehicle.state.field import I16, Context, finite, member, unless
+from aerokit.vehicle.state.movement import place
+
+if TYPE_CHECKING:
+    from aerokit.mavlink import messages
+
+__all__ = ["ActuatorControls", "AirPressure", "Aircraft", "Altitude", "Imu", "Odometry", "RawImu", "WinchStatus"]
+
+MG_M_S2, MGAUSS_UT, HPA_PA, RAD_DEG = 9.80665e-3, 0.1, 100.0, math.degrees(1)
+NO_TERRAIN_M = -1000.0
+MAX_AIRCRAFT = 64
+_F = AdsbFlags
+
+
+class Imu(Snapshot):
+    """One inertial sensor, in body axes: x forward, y right, z down.
+
+    Accelerations in m/s², rates in degrees per second, magnetic field in microtesla (1 gauss is 100 µT). Pressures in
+    Pa and metres, None if the message has none.
+    """
+
+    acceleration_m_s2: tuple[float, float, float]
+    rate_deg_s: tuple[float, float, float]
+    field_ut: tuple[float, float, float]
+    temperature_c: float | None = None
+    pressure_pa: float | None = None
+    differential_pressure_pa: float | None = None
+    pressure_altitude_m: float | None = None
+
+
+class RawImu(Snapshot):
+    """Readings of one inertial sensor without a unit, as its driver gives them: x, y, z of the body axes."""
+
+    acceleration: tuple[int, int, int]
+    rate: tuple[int, int, int]
+    field: tuple[int, int, int]
+    temperature_c: float | None = None
+
+
+class Odometry(Snapshot):
+    """Pose in ``frame`` and velocity in ``child_frame`` (MAV_FRAME), as the estimator reports them.
+
+    Metres, m/s and degrees per second along x, y, z; ``quaternion`` is w, x, y, z. A covariance is the upper right
+    triangle of a 6×6 matrix, row by row (x, y, z, roll, pitch, yaw), None if unknown. ``quality_percent`` is None if
+    not reported, −1 if the odometry has failed.
+    """
+
+    frame: int
+    child_frame: int
+    position_m: tuple[float, float, float]
+    quaternion: tuple[float, float, float, float]
+    velocity_m_s: tuple[float, float, float]
+    rate_deg_s: tuple[float, float, float]
+    pose_covariance: tuple[float, ...] | None = None
+    velocity_covariance: tuple[float, ...] | None = None
+    quality_percent: int | None = None
+
+
+class AirPressure(Snapshot):
+    """Pressures in Pa and temperatures in °C of the first barometer and the first air-speed sensor."""
+
+    absolute_pa: float
+    differential_pa: float
+    temperature_c: float
+    differential_temperature_c: float | None = None
+
+
+class Altitude(Snapshot):
+    """Altitudes of PX4 in metres; None if unknown. ``monotonic_m`` never jumps, but its zero is arbitrary."""
+
+    monotonic_m: float | None
+    amsl_m: float | None
+    local_m: float | None
+    relative_m: float | None
+    terrain_m: float | None
+    bottom_clearance_m: float | None
+
+
+class ActuatorControls(Snapshot):
+    """Control outputs of one group, −1 to 1: roll, pitch, yaw, throttle and others, before mixing."""
+
+    group: int
+    controls: tuple[float, ...]
+
+
+class Aircraft(Snapshot):
+    """Another aircraft that an ADS-B receiver on board has reported; unknown values are None.
+
+    ``altitude_m`` is above mean sea level, geometric if ``altitude_is_geometric``, otherwise by pressure.
+    ``course_deg`` is clockwise from north, ``climb_m_s`` up is positive. ``silent_for_s``: seconds between its last
+    transmission and the message. ``emitter`` is an ADSB_EMITTER_TYPE. ``squawk`` is read as four decimal digits.
+    """
+
+    icao: int
+    callsign: str
+    latitude_deg: float | None
+    longitude_deg: float | None
+    altitude_m: float | None
+    altitude_is_geometric: bool
+    course_deg: float | None
+    ground_speed_m_s: float | None
+    climb_m_s: float | None
+    squawk: int | None
+    emitter: int
+    silent_for_s: int
+
+
+class WinchStatus(Snapshot):
+    """Line and motor of a winch; unknown values are None. ``flags`` are MAV_WINCH_STATUS_FLAG bits.
+
+    ``speed_m_s`` is positive while the line runs out. ArduCopter reports the ordered speed and the length that follows
+    from it.
+    """
+
+    length_m: float | None
+    speed_m_s: float | None
+    tension_kg: float | None
+    voltage_v: float | None
+    current_a: float | None
+    temperature_c: int | None
+    flags: int
+
+    @property
+    def is_healthy(self) -> bool:
+        """True if the winch reports no fault."""
+        return bool(self.flags & MavWinchStatusFlag.HEALTHY)
+
+
+def _scaled(factor: float, x: float, y: float, z: float) -> tuple[float, float, float]:
+    return (x * factor, y * factor, z * factor)
+
+
+def highres_imu(message: messages.HighresImu, context: Context) -> Imu:
+    """Decode HIGHRES_IMU."""
+    return Imu(
+        (message.xacc, message.yacc, message.zacc),
+        _scaled(RAD_DEG, message.xgyro, message.ygyro, message.zgyro),
+        _scaled(context.autopilot.highres_imu_field_ut, message.xmag, message.ymag, message.zmag),
+        finite(message.temperature),
+        message.abs_pressure * HPA_PA,
+        message.diff_pressure * HPA_PA,
+        finite(message.pressure_alt),
+    )
+
+
+def scaled_imu(message: messages.ScaledImu) -> Imu:
+    """Decode SCALED_IMU: thousandths of g, rad/s and gauss."""
+    return Imu(
+        _scaled(MG_M_S2, message.xacc, message.yacc, message.zacc),
+        _scaled(RAD_DEG / 1000, message.xgyro, message.ygyro, message.zgyro),
+        _scaled(MGAUSS_UT, message.xmag, message.ymag, message.zmag),
+        _centidegrees(message.temperature),
+    )
+
+
+def raw_imu(message: messages.RawImu) -> RawImu:
+    """Decode RAW_IMU."""
+    return RawImu(
+        (message.xacc, message.yacc, message.zacc),
+        (message.xgyro, message.ygyro, message.zgyro),
+        (message.xmag, message.ymag, message.zmag),
+        _centidegrees(message.temperature),
+    )
+
+
+def _centidegrees(value: int) -> float | None:
+    return value / 100 if value else None
+
+
+def odometry(message: messages.Odometry) -> Odometry:
+    """Decode ODOMETRY."""
+    w, x, y, z = message.q
+    return Odometry(
+        member(MavFrame, message.frame_id),
+        member(MavFrame, message.child_frame_id),
+        (message.x, message.y, message.z),
+        (w, x, y, z),
+        (message.vx, message.vy, message.vz),
+        _scaled(RAD_DEG, message.rollspeed, message.pitchspeed, message.yawspeed),
+        _covariance(message.pose_covariance),
+        _covariance(message.velocity_covariance),
+        message.quality or None,
+    )
+
+
+def _covariance(values: tuple[float, ...]) -> tuple[float, ...] | None:
+    return None if math.isnan(values[0]) else tuple(values)
+
+
+def air_pressure(message: messages.ScaledPressure) -> AirPressure:
+    """Decode SCALED_PRESSURE."""
+    return AirPressure(
+        message.press_abs * HPA_PA,
+        message.press_diff * HPA_PA,
+        message.temperature / 100,
+        _centidegrees(message.temperature_press_diff),
+    )
+
+
+def ground_truth(message: messages.HilStateQuaternion) -> Position | None:
+    """Return the position in HIL_STATE_QUATERNION, the truth of PX4's simulation; None if it is not a place."""
+    where = place(message.lat, message.lon)
+    return where and Position(*where, message.alt / 1000)
+
+
+def simulation_state(message: messages.SimState) -> Position | None:
+    """Return the position in SIM_STATE, the truth of ArduPilot's simulation; None if it is not a place."""
+    latitude, longitude = message.lat_int, message.lon_int
+    if not (latitude or longitude) and abs(message.lat) <= 90 and abs(message.lon) <= 180:
+        latitude, longitude = round(message.lat * 1e7), round(message.lon * 1e7)
+    where, altitude = place(latitude, longitude), finite(message.alt)
+    return None if where is None or altitude is None else Position(*where, altitude)
+
+
+def altitude(message: messages.Altitude) -> Altitude:
+    """Decode ALTITUDE."""
+    terrain, clearance = finite(message.altitude_terrain), finite(message.bottom_clearance)
+    return Altitude(
+        finite(message.altitude_monotonic),
+        finite(message.altitude_amsl),
+        finite(message.altitude_local),
+        finite(message.altitude_relative),
+        None if terrain is None or terrain < NO_TERRAIN_M else terrain,
+        None if clearance is None or clearance < 0 else clearance,
+    )
+
+
+def actuator_controls(message: messages.ActuatorControlTarget) -> ActuatorControls:
+    """Decode ACTUATOR_CONTROL_TARGET."""
+    return ActuatorControls(message.group_mlx, tuple(message.controls))
+
+
+def aircraft(message: messages.AdsbVehicle, context: Context) -> tuple[Aircraft, ...]:
+    """Return the aircraft reported so far, at most 64, with this one last."""
+
+    def if_valid(flag: AdsbFlags, value: float) -> float | None:
+        return value if message.flags & flag else None
+
+    others = [seen for seen in context.before or () if seen.icao != message.ICAO_address]
+    reported = Aircraft(
+        message.ICAO_address,
+        message.callsign.strip() if message.flags & _F.VALID_CALLSIGN else "",
+        if_valid(_F.VALID_COORDS, message.lat * 1e-7),
+        if_valid(_F.VALID_COORDS, message.lon * 1e-7),
+        if_valid(_F.VALID_ALTITUDE, message.altitude / 1000),
+        message.altitude_type == AdsbAltitudeType.GEOMETRIC,
+        if_valid(_F.VALID_HEADING, message.heading / 100),
+        if_valid(_F.VALID_VELOCITY, message.hor_velocity / 100),
+        if_valid(_F.VALID_VELOCITY, message.ver_velocity / 100),
+        message.squawk if message.flags & _F.VALID_SQUAWK else None,
+        member(AdsbEmitterType, message.emitter_type),
+        message.tslc,
+    )
+    return (*others[-(MAX_AIRCRAFT - 1) :], reported)
+
+
+def winch(message: messages.WinchStatus) -> WinchStatus:
+    """Decode WINCH_STATUS."""
+    return WinchStatus(
+        finite(message.line_length),
+        finite(message.speed),
+        finite(message.tension),
+        finite(message.voltage),
+        finite(message.current),
+        unless(message.temperature, I16),
+        message.status,
+    )

@@ -1,0 +1,237 @@
+"""Gripper, winch, tunes, status texts, failures, the shell and the log stream."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import anyio
+import pytest
+from device_calls import components_of
+from flight_harness import Px4Flight
+from test_actuators import on_ground, on_px4, params
+
+from aerokit import messages as m
+from aerokit.errors import CommandRejected, InvalidArgument, NotSupported, OperationRejected, OperationTimeout
+from aerokit.mavlink.enums import MavCmd as C
+from aerokit.vehicle.files.log_stream import UlogAssembler
+
+pytestmark = pytest.mark.anyio
+
+
+async def test_gripper_on_ardupilot_returns_at_its_end() -> None:
+    async with on_ground() as flight:
+        began = anyio.current_time()
+        await flight.vehicle.gripper().grab()
+        assert anyio.current_time() - began == pytest.approx(0.7, abs=0.3)
+        assert flight.copter.devices.is_gripped
+        await flight.vehicle.gripper().release()
+        assert not flight.copter.devices.is_gripped
+
+
+async def test_gripper_that_reports_beginning_only_ends_later() -> None:
+    """An electro-permanent gripper sends no text at its end."""
+    async with on_ground() as flight:
+        flight.copter.faults.refuse(C.DO_GRIPPER, 0, text="Gripper load grabbing")
+        began = anyio.current_time()
+        await flight.vehicle.gripper().grab()
+        assert anyio.current_time() - began == pytest.approx(3.0, abs=0.6)
+
+
+async def test_gripper_on_px4_returns_when_moved() -> None:
+    async with on_px4() as flight:
+        began = anyio.current_time()
+        await flight.vehicle.gripper(2).release()
+        assert anyio.current_time() - began > 1.0
+        assert params(flight, C.DO_GRIPPER) == [(2, 0, 0, 0, 0, 0, 0)]
+
+
+async def test_winch_pays_out_length_and_reports_it() -> None:
+    async with on_ground() as flight:
+        winch = flight.vehicle.winch()
+        await winch.pay_out(2.0)
+        assert flight.copter.devices.line_m == pytest.approx(2.0, abs=0.15)
+        assert params(flight, C.DO_WINCH) == [(1, 1, 2.0, 0.5, 0, 0, 0)]
+        status = await winch.status.wait_until(lambda _: True, timeout=2)
+        assert status.length_m == pytest.approx(2.0, abs=0.15)
+        assert status.is_healthy
+
+
+async def test_winch_newer_order_ends_wait_for_previous() -> None:
+    async with on_ground() as flight, anyio.create_task_group() as tasks:
+
+        async def stop() -> None:
+            await anyio.sleep(1.0)
+            await flight.vehicle.winch().set_rate(0)
+
+        tasks.start_soon(stop)
+        with pytest.raises(OperationRejected, match="another order was given"):
+            await flight.vehicle.winch().pay_out(50)
+        assert flight.copter.devices.line_rate_m_s == 0
+
+
+async def test_winch_order_that_firmware_lacks_is_sent_to_component_only() -> None:
+    async with on_ground() as flight:
+        stage: Any = flight
+        stage.simulated, stage.is_px4 = flight.copter, False
+        components_of(stage)
+        with pytest.raises(NotSupported, match="ArduCopter has no action RETRACT"):
+            await flight.vehicle.winch().retract()
+        await flight.vehicle.winch(component_id=169).retract()
+        assert [sent.target_component for sent in flight.wire.commands(C.DO_WINCH)] == [169]
+
+
+async def test_tune_is_divided_between_both_fields() -> None:
+    async with on_ground() as flight:
+        flight.vehicle.play_tune("T200 L8 " + "CEG" * 10)
+        tune = flight.wire.last(m.PlayTune)
+        assert (tune.tune, tune.tune2) == ("T200 L8 CEGCEGCEGCEGCEGCEGCEGC", "EGCEGCEG")
+
+
+@pytest.mark.parametrize("tune", ["", "héhé", "C" * 231])
+async def test_invalid_tune_is_not_sent(tune: str) -> None:
+    async with on_ground() as flight:
+        with pytest.raises(InvalidArgument, match="tune"):
+            flight.vehicle.play_tune(tune)
+        assert flight.wire.all(m.PlayTune) == []
+
+
+@pytest.mark.parametrize("text", ["short", "x" * 50, "x" * 51, "ä" * 60, "y" * 100])
+async def test_status_text_is_sent_in_chunks_that_join(text: str) -> None:
+    async with on_ground() as flight:
+        flight.vehicle.send_status_text(text, severity="warning")
+        sent = flight.wire.all(m.Statustext)
+        assert "".join(chunk.text for chunk in sent).replace(" ", "") == text
+        assert {chunk.severity for chunk in sent} == {4}
+        assert [chunk.chunk_seq for chunk in sent] == list(range(len(sent)))
+        is_full = [len(chunk.text.encode()) == 50 for chunk in sent]
+        assert is_full == ([len(text) == 50] if len(sent) == 1 else [True] * (len(sent) - 1) + [False])
+
+
+async def test_failure_is_injected_once_and_needs_intent() -> None:
+    async with on_px4() as flight:
+        await flight.vehicle.parameters.set("SYS_FAILURE_EN", 1)
+        intent: Any = "please"
+        with pytest.raises(InvalidArgument, match="intent"):
+            await flight.vehicle.inject_failure("motor", "off", instance=2, intent=intent)
+        await flight.vehicle.inject_failure("motor", "off", instance=2, intent="inject failure")
+        assert params(flight, C.INJECT_FAILURE) == [(101, 1, 2, 0, 0, 0, 0)]
+
+
+async def test_failure_that_px4_does_not_allow_is_refused() -> None:
+    async with on_px4() as flight:
+        flight.px4.parameters["SYS_FAILURE_EN"] = 0.0
+        with pytest.raises(CommandRejected, match="DENIED"):
+            await flight.vehicle.inject_failure("motor", "off", intent="inject failure")
+
+
+# --------------------------------------------------------------------------------------- shell
+
+
+async def test_shell_returns_output_of_command() -> None:
+    async with on_px4() as flight:
+        async with flight.vehicle.shell() as shell:
+            assert await shell.run("echo " + "long " * 30) == ("long " * 30).strip()
+            assert "Invalid command: nothing" in await shell.run("nothing")
+            assert flight.px4.shell.is_open
+        await anyio.sleep(0.1)
+        assert not flight.px4.shell.is_open
+
+
+async def test_shell_addresses_its_vehicle_only() -> None:
+    async with on_px4() as flight:
+        async with flight.vehicle.shell() as shell:
+            await shell.run("echo 1")
+        assert {(sent.target_system, sent.target_component) for sent in flight.wire.all(m.SerialControl)} == {(1, 1)}
+
+
+async def test_shell_output_of_other_station_is_ignored() -> None:
+    async with on_px4() as flight, flight.vehicle.shell() as shell:
+        shell.write("echo 1")
+        flight.px4.send(m.SerialControl(10, 1, 0, 0, 3, b"no!".ljust(70, b"\0"), 254, 190))
+        text = ""
+        while not text.endswith("pxh> "):
+            text += await shell.read(timeout=2)
+        assert text == "echo 1\n1\npxh> "
+
+
+async def test_shell_without_answer_times_out_and_is_closed() -> None:
+    async with on_px4() as flight:
+        flight.px4.handlers[m.SerialControl.ID] = lambda *_: None
+        with pytest.raises(OperationTimeout, match="was not done within 5 s"):
+            async with flight.vehicle.shell():
+                raise AssertionError
+        assert flight.wire.last(m.SerialControl).flags == 0
+
+
+# ---------------------------------------------------------------------------------- log stream
+
+
+async def streamed(flight: Px4Flight, seconds: float) -> tuple[bytes, Any]:
+    data = bytearray()
+    async with flight.vehicle.logs.stream() as stream:
+        with anyio.move_on_after(seconds):
+            async for part in stream:
+                data += part
+    return bytes(data), stream
+
+
+async def test_log_stream_is_valid_ulog() -> None:
+    async with on_px4() as flight:
+        data, stream = await streamed(flight, 2.0)
+        assert data.startswith(b"ULog\x01\x12\x35")
+        assert b"part 0" in data
+        assert stream.lost == 0
+        assert len(flight.wire.all(m.LoggingAck)) == 2
+        assert len(params(flight, C.LOGGING_START)) == len(params(flight, C.LOGGING_STOP)) == 1
+
+
+async def test_log_stream_of_other_station_is_not_stopped() -> None:
+    async with on_px4() as flight:
+        flight.px4.faults.refuse(C.LOGGING_START, 1)
+        with pytest.raises(CommandRejected):
+            await streamed(flight, 1.0)
+        assert params(flight, C.LOGGING_STOP) == []
+
+
+async def test_log_stream_without_ack_of_start_is_stopped() -> None:
+    async with on_px4() as flight:
+        with anyio.move_on_after(0.0):
+            await streamed(flight, 1.0)
+        flight.px4.faults.ignore(C.LOGGING_START)
+        with anyio.move_on_after(1.0):
+            await streamed(flight, 1.0)
+        await anyio.sleep(0.5)
+        assert params(flight, C.LOGGING_STOP) != []
+
+
+def message(sequence: int, data: bytes, first: int = 0) -> m.LoggingData:
+    return m.LoggingData(255, 190, sequence, len(data), first, data.ljust(249, b"\0"))
+
+
+HEADER = b"ULog\x01\x12\x35\x01" + bytes(8)
+
+
+def ulog(text: bytes) -> bytes:
+    return len(text).to_bytes(2, "little") + b"I" + text
+
+
+def test_assembler_joins_message_over_two_parts() -> None:
+    assembler, whole = UlogAssembler(), ulog(b"a" * 300)
+    assert assembler.add(message(0, HEADER + whole[:200]), 0.0) == HEADER
+    assert assembler.add(message(1, whole[200:], 255), 0.1) == whole
+
+
+def test_assembler_marks_gap_as_dropout_and_continues_at_next_message() -> None:
+    assembler, cut, complete = UlogAssembler(), ulog(b"a" * 100), ulog(b"b")
+    assembler.add(message(0xFFFF, HEADER + cut[:50]), 0.0)
+    assert assembler.add(message(2, b"rest", 255), 0.2) == b""
+    assert assembler.add(message(3, b"rest" + complete, 4), 0.25) == b"\x02\x00O\xfa\x00" + complete
+    assert assembler.lost == 2
+
+
+def test_assembler_ignores_repetition_and_data_before_header() -> None:
+    assembler = UlogAssembler()
+    assert assembler.add(message(7, ulog(b"a")), 0.0) == b""
+    assert assembler.add(message(8, HEADER + ulog(b"b")), 0.0) == HEADER + ulog(b"b")
+    assert assembler.add(message(8, HEADER + ulog(b"b")), 0.0) == b""
+    assert assembler.lost == 0
