@@ -31,7 +31,7 @@ from mavsdk.plugins.mission_raw import MissionItem
 
 import aerokit
 from aerokit.enums import MavAutopilot, MavCmd, MavType
-from aerokit.onboard import Camera, CommandRequest, Gimbal, GimbalTarget, OnboardComponent, Photo, Storage
+from aerokit.onboard import CameraDriver, CommandRequest, GimbalDriver, GimbalTarget, OnboardComponent, Photo, Storage
 
 CAMERA, GIMBAL = 100, 154
 STEP_TIMEOUT_S = 20.0
@@ -67,7 +67,7 @@ async def step(name: str, work: Awaitable[object]) -> bool:
 # ------------------------------------------------------------------------------- the components
 
 
-class Lens(Camera):
+class Lens(CameraDriver):
     """A camera in a few lines."""
 
     def __init__(self) -> None:
@@ -96,7 +96,7 @@ class Lens(Camera):
         return Storage(1000.0, 10.0, 990.0)
 
 
-class Head(Gimbal):
+class Head(GimbalDriver):
     """A gimbal that points at once."""
 
     def __init__(self) -> None:
@@ -240,9 +240,7 @@ async def use_camera(plugin: CameraAsync, lens: Lens) -> str:
     assert lens.tracked[:2] == (0.5, 0.5)
     await plugin.track_stop(CAMERA)
     storage = await until_available(lambda: plugin.get_storage(CAMERA))
-    while not (stream := await until_available(lambda: plugin.get_video_stream_info(CAMERA))).settings.uri:
-        await asyncio.sleep(0.5)
-    return f"{len(photos)} photos, {storage.total_storage_mib:.0f} MiB, {stream.settings.uri}"
+    return f"{len(photos)} photos, {storage.total_storage_mib:.0f} MiB"
 
 
 async def use_gimbal(plugin: GimbalAsync, head: Head) -> str:

@@ -17,7 +17,6 @@ from aerokit.errors import (
     SetpointStreamStopped,
     ValueUnknownError,
 )
-from aerokit.fleets.actions import fragments, rtcm_messages
 from aerokit.fleets.events import FollowingStopped, PathsCompared, PolicyCompleted, TooClose
 from aerokit.fleets.formation import Formation, Offset, follow_velocity
 from aerokit.fleets.members import MemberState
@@ -25,6 +24,7 @@ from aerokit.fleets.opening import fleet
 from aerokit.mavlink.enums import MavCmd
 from aerokit.missions import Mission, land, return_to_launch, take_off, waypoint
 from aerokit.position import Position
+from aerokit.protocols.rtcm import fragments, rtcm_messages
 from aerokit.sim import SimulatedPx4, simulated_link
 from aerokit.sim.px4.modes import POSITION, custom_mode
 from aerokit.testing.track import min_distance_m, record_track

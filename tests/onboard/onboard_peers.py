@@ -63,3 +63,12 @@ async def autopilot_and_client(**arguments: Any) -> AsyncIterator[tuple[OnboardC
     kind = {"component_id": 1, "type": MavType.QUADROTOR, "autopilot": MavAutopilot.GENERIC}
     async with aerokit.component(near, **{**kind, **arguments}) as node, aerokit.connect(far, rates={}) as vehicle:
         yield node, vehicle
+
+
+@asynccontextmanager
+async def device_and_client(component_id: int, kind: int) -> AsyncIterator[tuple[OnboardComponent, aerokit.Vehicle]]:
+    """Open an autopilot and a device beside it on one link, and aerokit's client."""
+    async with autopilot_and_client() as (node, vehicle):
+        device = aerokit.component(connection=node.connection, component_id=component_id, type=kind)
+        async with device as component:
+            yield component, vehicle

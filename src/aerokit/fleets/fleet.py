@@ -10,11 +10,12 @@ from aerokit._internal.formatting import short_repr
 from aerokit.connection.bus import Overflow, Subscription
 from aerokit.errors import InvalidArgument
 from aerokit.events import Event
-from aerokit.fleets.actions import Actions, fragments, rtcm_messages
+from aerokit.fleets.actions import Actions
 from aerokit.fleets.events import FleetEvent, MemberEvent, StateUpdate
 from aerokit.fleets.formation import Formations
 from aerokit.fleets.show_flight import Shows
 from aerokit.fleets.travel import Missions
+from aerokit.protocols.rtcm import fragments, rtcm_messages
 
 if TYPE_CHECKING:
     from aerokit.connection.bus import Detach, Sink

@@ -40,7 +40,7 @@ class Param(Snapshot):
             raise InvalidArgument(f"Param({short_repr(self.number)}) is not allowed: 1 to 7")
 
 
-class Argument(Snapshot):
+class CommandArgument(Snapshot):
     """One argument of a handler."""
 
     name: str
@@ -72,7 +72,7 @@ class Argument(Snapshot):
             raise InvalidArgument(f"{self.name} = {value:g} is not allowed: a {self.type.__name__}") from None
 
 
-def arguments_of(function: Callable[..., Any]) -> tuple[Argument, ...]:
+def arguments_of(function: Callable[..., Any]) -> tuple[CommandArgument, ...]:
     """Return the arguments of a handler after the first one, which is the request.
 
     Raises:
@@ -105,7 +105,7 @@ def _hint(function: Callable[..., Any], parameter: inspect.Parameter) -> Any:
         ) from None
 
 
-def _argument(function: str, name: str, number: int, hint: Any) -> Argument:
+def _argument(function: str, name: str, number: int, hint: Any) -> CommandArgument:
     range_ = Range()
     if get_origin(hint) is Annotated:
         hint, *extras = get_args(hint)
@@ -126,4 +126,4 @@ def _argument(function: str, name: str, number: int, hint: Any) -> Argument:
         )
     if number > MAX_ARGUMENTS:
         raise InvalidArgument(f"{function}(): a command has seven parameters, {name} would be number {number}")
-    return Argument(name, number, hint, is_optional, range_)
+    return CommandArgument(name, number, hint, is_optional, range_)

@@ -61,7 +61,7 @@ class Storage(Snapshot):
     is_ready: bool = True
 
 
-class Camera:
+class CameraDriver:
     """Base class of a program's camera; pass an instance to :meth:`OnboardComponent.add_camera`.
 
     Override what the camera can do, as coroutines; the capabilities that it reports follow from that. An error of a
@@ -161,12 +161,12 @@ class Camera:
         """Called when another program has changed a setting of the definition file."""
 
 
-def _has(camera: Camera, name: str) -> bool:
+def _has(camera: CameraDriver, name: str) -> bool:
     """Return True if the program's class overrides a method."""
-    return getattr(type(camera), name) is not getattr(Camera, name)
+    return getattr(type(camera), name) is not getattr(CameraDriver, name)
 
 
-def capabilities_of(camera: Camera) -> int:
+def capabilities_of(camera: CameraDriver) -> int:
     """Return the CAMERA_CAP_FLAGS of what the program's class overrides."""
     flags = CameraCapFlags(0)
     if _has(camera, "take_photo"):
@@ -195,7 +195,7 @@ _AUTO = (SetFocusType.AUTO, SetFocusType.AUTO_SINGLE, SetFocusType.AUTO_CONTINUO
 class CameraAdapter(CameraDevice):
     """Serves the camera protocol for a program's camera."""
 
-    def __init__(self, camera: Camera, host: ComponentHost, tasks: BackgroundTasks) -> None:
+    def __init__(self, camera: CameraDriver, host: ComponentHost, tasks: BackgroundTasks) -> None:
         self.vendor, self.model, self.resolution = camera.vendor, camera.model, camera.resolution
         self.focal_length_mm, self.sensor_mm = camera.focal_length_mm, camera.sensor_mm
         self.streams, self.capabilities = camera.streams, capabilities_of(camera)

@@ -14,9 +14,9 @@ from aerokit._internal.arguments import checks_arguments
 from aerokit._internal.values import Snapshot
 from aerokit.errors import AerokitError, BusyError, InvalidArgument, NotSupported
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavResult, MavSeverity
-from aerokit.onboard.arguments import Argument, arguments_of
+from aerokit.onboard.arguments import CommandArgument, arguments_of
 from aerokit.position import Position
-from aerokit.protocols.servers.commands import CommandServer, Outcome, RunningCommands
+from aerokit.protocols.servers.commands import CommandDispatcher, Outcome, RunningCommands
 
 if TYPE_CHECKING:
     from aerokit.connection.tasks import BackgroundTasks
@@ -123,7 +123,7 @@ class ComponentCommands:
     def __init__(self, host: ComponentHost, tasks: BackgroundTasks) -> None:
         self.handlers: dict[int, CommandHandler] = {}
         """MAV_CMD → handler; protocol servers add their own."""
-        self.server: CommandServer = CommandServer(host, self.handlers)
+        self.server: CommandDispatcher = CommandDispatcher(host, self.handlers)
         self._running = RunningCommands(host, self.server)
         self._host, self._tasks = host, tasks
         host.knows_command = self.handlers.__contains__
@@ -145,7 +145,9 @@ class ComponentCommands:
     def cancel_all(self) -> None:
         self._running.cancel_all()
 
-    def _execute(self, function: Callable[..., Any], arguments: tuple[Argument, ...], command: ReceivedCommand) -> None:
+    def _execute(
+        self, function: Callable[..., Any], arguments: tuple[CommandArgument, ...], command: ReceivedCommand
+    ) -> None:
         task: list[asyncio.Task[Any]] = []
 
         def cancel() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Awaitable, Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -34,8 +34,10 @@ from aerokit.protocols.servers.intervals import MessageStreams
 
 if TYPE_CHECKING:
     from aerokit.connection.connection import Connection
-    from aerokit.onboard.camera import Camera
-    from aerokit.onboard.gimbal import Gimbal
+    from aerokit.onboard.camera import CameraDriver
+    from aerokit.onboard.devices import WinchDriver
+    from aerokit.onboard.gimbal import GimbalDriver
+    from aerokit.onboard.sources import ComponentSources
 
 HEARTBEAT_INTERVAL_S = 1.0
 MAX_STREAMS = 64
@@ -83,6 +85,7 @@ class OnboardComponent:
         self._ftp: SessionFtpServer[DirectoryFiles] | None = None
         self._events = EventSender(self._host)
         self._missions: ComponentMissions | None = None
+        self._sources: ComponentSources | None = None
         answer_pings(self._host)
         self.parameters: ComponentParameters = ComponentParameters(self._host, parameters_file, bytewise=bytewise)
         """Parameters that this component offers."""
@@ -104,6 +107,8 @@ class OnboardComponent:
             with anyio.CancelScope(shield=True):
                 await self.parameters.aclose()
         finally:
+            if self._ftp is not None:
+                self._ftp.close()
             self._host.close()
 
     # ------------------------------------------------------------------------------------ state
@@ -289,13 +294,13 @@ class OnboardComponent:
 
     # ---------------------------------------------------------------------------- ready-made parts
 
-    def add_camera(self, camera: Camera) -> None:
+    def add_camera(self, camera: CameraDriver) -> None:
         """Serve the camera protocol: photos, series, videos, storage, streams, zoom, focus, tracking, settings.
 
         https://mavlink.io/en/services/camera.html
 
         Args:
-            camera: an instance of the program's class, see :class:`~aerokit.onboard.Camera`.
+            camera: an instance of the program's class, see :class:`~aerokit.onboard.CameraDriver`.
 
         Raises:
             InvalidArgument: the component has a camera, or its definition file and parameters exclude each other.
@@ -305,13 +310,13 @@ class OnboardComponent:
 
         add_camera(self, camera)
 
-    def add_gimbal(self, gimbal: Gimbal) -> None:
+    def add_gimbal(self, gimbal: GimbalDriver) -> None:
         """Serve the gimbal protocol v2, as gimbal device and gimbal manager in one component.
 
         https://mavlink.io/en/services/gimbal_v2.html
 
         Args:
-            gimbal: an instance of the program's class, see :class:`~aerokit.onboard.Gimbal`.
+            gimbal: an instance of the program's class, see :class:`~aerokit.onboard.GimbalDriver`.
 
         Raises:
             InvalidArgument: the component has a gimbal.
@@ -319,6 +324,50 @@ class OnboardComponent:
         from aerokit.onboard.parts import add_gimbal  # Imported here because few components have one.
 
         add_gimbal(self, gimbal)
+
+    def add_winch(self, winch: WinchDriver) -> None:
+        """Execute DO_WINCH by a program's winch, and send WINCH_STATUS at 5 Hz.
+
+        Raises:
+            InvalidArgument: the component has a winch.
+        """
+        from aerokit.onboard.devices import add_winch  # Imported here because few components have one.
+
+        add_winch(self, winch)
+
+    def add_gripper(self, grab: Callable[[], Awaitable[Any]], release: Callable[[], Awaitable[Any]]) -> None:
+        """Execute DO_GRIPPER by two coroutine functions, which return when the gripper has moved.
+
+        Raises:
+            InvalidArgument: the component has a gripper.
+        """
+        from aerokit.onboard.devices import add_gripper  # Imported here because few components have one.
+
+        add_gripper(self, grab, release)
+
+    def add_arm_authorizer(self, authorize: Callable[[int], Any]) -> None:
+        """Answer ARM_AUTHORIZATION_REQUEST (https://mavlink.io/en/services/arm_authorization.html).
+
+        Args:
+            authorize: function or coroutine function of the vehicle's system id. It returns for how many seconds (at
+                most 255) arming is allowed, or raises an error, whose text is sent as status text: DENIED. It may also
+                return a :class:`~aerokit.onboard.CommandResult` with a MAV_ARM_AUTH_DENIED_REASON as ``detail``.
+
+        Raises:
+            InvalidArgument: the component has an arm authorizer.
+        """
+        from aerokit.onboard.devices import add_arm_authorizer  # Imported here because few components are one.
+
+        add_arm_authorizer(self, authorize)
+
+    @property
+    def sources(self) -> ComponentSources:
+        """Sends measurements to the autopilot: obstacles, traffic, landing targets, GNSS corrections."""
+        from aerokit.onboard.sources import ComponentSources  # Imported here because few components measure.
+
+        if self._sources is None:
+            self._sources = ComponentSources(self._host)
+        return self._sources
 
     async def serve_forever(self) -> None:
         """Wait until the connection ends, and raise its error.

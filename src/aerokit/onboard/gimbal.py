@@ -10,7 +10,7 @@ from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import GimbalDeviceCapFlags as Can
 from aerokit.mavlink.enums import GimbalManagerFlags as Flags
 from aerokit.position import Position
-from aerokit.protocols.servers.gimbal import ALL_CAPABILITIES, Angles, GimbalDevice, Place
+from aerokit.protocols.servers.gimbal import ALL_CAPABILITIES, Angles, GimbalMount, Place
 
 if TYPE_CHECKING:
     from aerokit.onboard.host import ComponentHost
@@ -33,7 +33,7 @@ class GimbalTarget(Snapshot):
     is_retracted: bool = False
 
 
-class Gimbal:
+class GimbalDriver:
     """Base class of a program's gimbal; pass an instance to :meth:`OnboardComponent.add_gimbal`.
 
     Override :meth:`point` and :meth:`attitude`. Only the program in control can point it: others are DENIED, as the
@@ -86,15 +86,15 @@ class Gimbal:
         raise NotImplementedError
 
 
-class GimbalAdapter(GimbalDevice):
+class GimbalAdapter(GimbalMount):
     """Serves the gimbal protocol for a program's gimbal."""
 
-    def __init__(self, gimbal: Gimbal, host: ComponentHost) -> None:
+    def __init__(self, gimbal: GimbalDriver, host: ComponentHost) -> None:
         self.vendor, self.model = gimbal.vendor, gimbal.model
         roll, pitch, yaw = gimbal.limits_deg
         self.limits = tuple((math.radians(low), math.radians(high)) for low, high in (roll, pitch, yaw))
         self.slew_rad_s = math.radians(gimbal.max_rate_deg_s)
-        self.can_point_at_positions = type(gimbal).look_at is not Gimbal.look_at
+        self.can_point_at_positions = type(gimbal).look_at is not GimbalDriver.look_at
         self.capabilities = ALL_CAPABILITIES
         for axis, limits in ((_ROLL, roll), (_PITCH, pitch), (_YAW, yaw)):
             if limits[0] == limits[1]:

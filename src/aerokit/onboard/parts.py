@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavResult
-from aerokit.onboard.camera import Camera, CameraAdapter
-from aerokit.onboard.gimbal import STATUS_INTERVAL_S, Gimbal, GimbalAdapter
+from aerokit.onboard.camera import CameraAdapter, CameraDriver
+from aerokit.onboard.gimbal import STATUS_INTERVAL_S, GimbalAdapter, GimbalDriver
 from aerokit.parameters import parse_definition
 from aerokit.protocols.servers.camera import camera_builders
 from aerokit.protocols.servers.camera_commands import camera_commands, legacy_requests
@@ -38,7 +38,7 @@ class DefinedSettings(DefinedParameterServer):
         self._changed(name, value)
 
 
-def add_camera(component: OnboardComponent, camera: Camera) -> CameraAdapter:
+def add_camera(component: OnboardComponent, camera: CameraDriver) -> CameraAdapter:
     """Serve a camera."""
     host, streams = component._host, component._streams
     adapter = CameraAdapter(camera, host, component._tasks)
@@ -52,7 +52,7 @@ def add_camera(component: OnboardComponent, camera: Camera) -> CameraAdapter:
         adapter.definition_version, adapter.definition_uri = definition.version, f"mftp://{DEFINITION_PATH}"
     streams.builders.update(camera_builders(adapter))
     for command, handler in camera_commands(adapter).items():
-        if command == MavCmd.STORAGE_FORMAT and type(camera).format_storage is Camera.format_storage:
+        if command == MavCmd.STORAGE_FORMAT and type(camera).format_storage is CameraDriver.format_storage:
             continue
         component._commands.add_raw(command, partial(_run, handler))
     component._commands.handlers.update(legacy_requests(streams))
@@ -66,7 +66,7 @@ async def _run(handler: AsyncHandler, command: ReceivedCommand) -> int:
         return MavResult.UNSUPPORTED
 
 
-def add_gimbal(component: OnboardComponent, gimbal: Gimbal) -> GimbalAdapter:
+def add_gimbal(component: OnboardComponent, gimbal: GimbalDriver) -> GimbalAdapter:
     """Serve a gimbal."""
     streams = component._streams
     if m.GimbalManagerInformation.ID in streams.builders:

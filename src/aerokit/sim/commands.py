@@ -22,7 +22,7 @@ from aerokit.sim.motion import Ned
 from aerokit.sim.vehicle import MessageHost
 
 
-class CommandServer(commands.CommandServer):
+class CommandServer(commands.CommandDispatcher):
     """Answers commands, modified by the `Faults` of a vehicle or component."""
 
     def __init__(

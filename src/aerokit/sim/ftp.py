@@ -10,7 +10,7 @@ from aerokit.sim.channel import Channel
 from aerokit.sim.vehicle import MessageHost
 
 
-class FtpServer(ftp.FtpServer[FileTree]):
+class FtpServer(ftp.FtpRequestServer[FileTree]):
     """Receives MAVFTP requests; each autopilot's subclass answers them."""
 
     def __init__(self, vehicle: MessageHost, files: FileTree) -> None:

@@ -18,7 +18,7 @@ from aerokit.sim.parameters import SimParameters
 from aerokit.sim.vehicle import SimulatedVehicle, sender_of
 
 
-class ParameterServer(servers.ParameterServer):
+class ParameterServer(servers.ParameterProtocolServer):
     """Answers parameter requests; each autopilot has a subclass. The `Faults` of the vehicle apply."""
 
     def __init__(

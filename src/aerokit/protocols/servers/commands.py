@@ -70,7 +70,7 @@ class CommandProgress:
 CommandHandler = Callable[[ReceivedCommand], "int | CommandProgress | None"]
 
 
-class CommandServer:
+class CommandDispatcher:
     """Dispatches commands to handlers and sends COMMAND_ACK to the sender.
 
     Messages that a handler sends precede the acknowledgement. A command without a handler is UNSUPPORTED. ``refusal``
@@ -180,7 +180,7 @@ class RunningCommands:
     is TEMPORARILY_REJECTED while the first one runs, as is every command above ``MAX_RUNNING_COMMANDS``.
     """
 
-    def __init__(self, host: ServerHost, server: CommandServer) -> None:
+    def __init__(self, host: ServerHost, server: CommandDispatcher) -> None:
         self._host = host
         self._server = server
         self._running: dict[int, RunningCommand] = {}

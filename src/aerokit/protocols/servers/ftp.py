@@ -56,7 +56,7 @@ class FtpPacket(FtpMessage):
         return self.refuse(MavFtpErr.FAILERRNO, errno) if own is None else self.refuse(own)
 
 
-class FtpServer(Generic[FilesT]):
+class FtpRequestServer(Generic[FilesT]):
     """Receives MAVFTP requests; subclasses answer them."""
 
     is_enabled = True
@@ -140,7 +140,7 @@ class FtpPeer:
     """CalcFileCRC32 request that is being executed."""
 
 
-class SessionFtpServer(FtpServer[FilesT]):
+class SessionFtpServer(FtpRequestServer[FilesT]):
     """MAVFTP server with several sessions for each client, and immediate answers.
 
     A session is closed when its client has sent nothing for ``session_timeout_s``. A burst sends ``burst`` blocks every
@@ -176,6 +176,14 @@ class SessionFtpServer(FtpServer[FilesT]):
         return sum(len(peer.sessions) for peer in self._peers.values())
 
     def restart(self) -> None:
+        """Drop all sessions without closing their files, as a power cut does."""
+        self._peers.clear()
+
+    def close(self) -> None:
+        """Close all files."""
+        for peer in self._peers.values():
+            with suppress(FileFault):
+                self._close_all(peer)
         self._peers.clear()
 
     def _key(self, request: FtpPacket, channel: Channel) -> Hashable:

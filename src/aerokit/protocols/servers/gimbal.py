@@ -36,7 +36,7 @@ Place = tuple[int, int, float]  # latitude and longitude in degrees times 1e7, a
 _NOBODY: Owner = (0, 0)
 
 
-class GimbalDevice:
+class GimbalMount:
     """A gimbal device with its gimbal manager: its state, and methods that the protocol calls.
 
     Angles are in radians: roll and pitch from the horizon, yaw from the vehicle's nose or, if locked, from north.
@@ -120,12 +120,12 @@ class GimbalDevice:
         return sender in (self.primary, self.secondary) and sender != _NOBODY
 
 
-def gimbal_manager_status(gimbal: GimbalDevice) -> m.GimbalManagerStatus:
+def gimbal_manager_status(gimbal: GimbalMount) -> m.GimbalManagerStatus:
     device = gimbal.device_id
     return m.GimbalManagerStatus(gimbal.host.time_boot_ms, _flags(gimbal), device, *gimbal.primary, *gimbal.secondary)
 
 
-def _flags(gimbal: GimbalDevice) -> int:
+def _flags(gimbal: GimbalMount) -> int:
     """Return GIMBAL_MANAGER_FLAGS; roll and pitch are always relative to the horizon."""
     flags = gimbal.flags & (Flags.RETRACT | Flags.NEUTRAL) | Flags.ROLL_LOCK | Flags.PITCH_LOCK
     if gimbal.is_yaw_locked:
@@ -133,7 +133,7 @@ def _flags(gimbal: GimbalDevice) -> int:
     return flags | Flags.YAW_IN_VEHICLE_FRAME
 
 
-def _attitude_status(gimbal: GimbalDevice) -> m.GimbalDeviceAttitudeStatus:
+def _attitude_status(gimbal: GimbalMount) -> m.GimbalDeviceAttitudeStatus:
     is_from_north = gimbal.is_yaw_locked
     angles = gimbal.angles_from_north() if is_from_north else gimbal.angles()
     return m.GimbalDeviceAttitudeStatus(
@@ -152,7 +152,7 @@ def _attitude_status(gimbal: GimbalDevice) -> m.GimbalDeviceAttitudeStatus:
     )
 
 
-def _device_information(gimbal: GimbalDevice) -> m.GimbalDeviceInformation:
+def _device_information(gimbal: GimbalMount) -> m.GimbalDeviceInformation:
     (roll_min, roll_max), (pitch_min, pitch_max), (yaw_min, yaw_max) = gimbal.limits
     return m.GimbalDeviceInformation(
         time_boot_ms=gimbal.host.time_boot_ms,
@@ -173,7 +173,7 @@ def _device_information(gimbal: GimbalDevice) -> m.GimbalDeviceInformation:
     )
 
 
-def _manager_information(gimbal: GimbalDevice) -> m.GimbalManagerInformation:
+def _manager_information(gimbal: GimbalMount) -> m.GimbalManagerInformation:
     capabilities = int(gimbal.capabilities)
     if gimbal.can_point_at_positions:
         capabilities |= GimbalManagerCapFlags.CAN_POINT_LOCATION_GLOBAL
@@ -189,7 +189,7 @@ _ABSOLUTE = frozenset({MavFrame.GLOBAL, MavFrame.GLOBAL_INT})
 class GimbalRequests:
     """Handles the commands and messages to one gimbal."""
 
-    def __init__(self, gimbal: GimbalDevice) -> None:
+    def __init__(self, gimbal: GimbalMount) -> None:
         self._gimbal = gimbal
 
     def _is_mine(self, device_id: float) -> bool:
@@ -303,7 +303,7 @@ def _owner(before: Owner, wanted: tuple[int, int], sender: Owner) -> Owner:
     return wanted
 
 
-def gimbal_commands(gimbal: GimbalDevice) -> dict[int, CommandHandler]:
+def gimbal_commands(gimbal: GimbalMount) -> dict[int, CommandHandler]:
     """Return handlers by MAV_CMD."""
     control = GimbalRequests(gimbal)
     return {
@@ -315,7 +315,7 @@ def gimbal_commands(gimbal: GimbalDevice) -> dict[int, CommandHandler]:
     }
 
 
-def gimbal_builders(gimbal: GimbalDevice) -> dict[int, Builder]:
+def gimbal_builders(gimbal: GimbalMount) -> dict[int, Builder]:
     """Return builders by message id."""
     return {
         m.GimbalDeviceInformation.ID: lambda _: [_device_information(gimbal)],
@@ -325,7 +325,7 @@ def gimbal_builders(gimbal: GimbalDevice) -> dict[int, Builder]:
     }
 
 
-def listen_for_gimbal(gimbal: GimbalDevice) -> None:
+def listen_for_gimbal(gimbal: GimbalMount) -> None:
     """Register handlers of the other messages."""
     host, control = gimbal.host, GimbalRequests(gimbal)
     host.on(m.GimbalManagerSetAttitude, control.on_attitude)

@@ -74,7 +74,7 @@ class ParameterLists:
         raise NotImplementedError
 
 
-class ParameterServer(ParameterLists):
+class ParameterProtocolServer(ParameterLists):
     """Receives PARAM_REQUEST_LIST, PARAM_REQUEST_READ and PARAM_SET; subclasses answer them."""
 
     def __init__(self, host: ServerHost, parameters: NamedList, *, list_rate_hz: float) -> None:
@@ -103,7 +103,7 @@ class ParameterServer(ParameterLists):
         self._host.send(m.ParamError(*to, name, index, code), channel)
 
 
-class ParameterStore(NamedList, Protocol):
+class TypedStore(NamedList, Protocol):
     """Typed parameters of a component."""
 
     def __contains__(self, name: object) -> bool: ...
@@ -121,14 +121,14 @@ class ParameterStore(NamedList, Protocol):
         ...
 
 
-class TypedParameterServer(ParameterServer):
+class TypedParameterServer(ParameterProtocolServer):
     """PARAM server of a component with typed parameters; the value is encoded bytewise, or cast to a float.
 
     A refused PARAM_SET is answered by PARAM_ERROR and by the value that remains (PARAM_VALUE), for clients that do not
     know PARAM_ERROR. Parameters whose type does not fit into PARAM_VALUE are left out: texts and 64-bit numbers.
     """
 
-    def __init__(self, host: ServerHost, store: ParameterStore, *, bytewise: bool = True, list_rate_hz: float) -> None:
+    def __init__(self, host: ServerHost, store: TypedStore, *, bytewise: bool = True, list_rate_hz: float) -> None:
         self.bytewise = bytewise
         self._store = store
         super().__init__(host, self, list_rate_hz=list_rate_hz)
@@ -233,7 +233,7 @@ class ExtendedParameterServer(ParameterLists):
 class TypedExtendedServer(ExtendedParameterServer):
     """PARAM_EXT server of a component with typed parameters, texts included."""
 
-    def __init__(self, host: ServerHost, store: ParameterStore) -> None:
+    def __init__(self, host: ServerHost, store: TypedStore) -> None:
         super().__init__(host, store)
         self._store = store
 

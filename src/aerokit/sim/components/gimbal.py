@@ -14,7 +14,7 @@ from aerokit.mavlink.enums import MavType
 from aerokit.protocols.servers.commands import CommandHandler
 from aerokit.protocols.servers.gimbal import (
     Angles,
-    GimbalDevice,
+    GimbalMount,
     Place,
     gimbal_builders,
     gimbal_commands,
@@ -29,7 +29,7 @@ _STATUS_INTERVAL_S = 1.0
 _STILL: Angles = (0.0, 0.0, 0.0)
 
 
-class SimulatedGimbal(SimulatedComponent, GimbalDevice):
+class SimulatedGimbal(SimulatedComponent, GimbalMount):
     """A gimbal device and its gimbal manager; it turns at a limited rate and can point at positions.
 
     Only the component in control can command the gimbal; initially no component is. Take control with
