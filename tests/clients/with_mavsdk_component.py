@@ -256,10 +256,10 @@ async def use_gimbal(plugin: GimbalAsync, head: Head) -> str:
 
 async def main() -> bool:
     port, calls, lens, head = free_port(), list[str](), Lens(), Head()
-    kind = {"component_id": 1, "type": MavType.QUADROTOR, "autopilot": MavAutopilot.GENERIC}
+    kind, autopilot = MavType.QUADROTOR, MavAutopilot.GENERIC
     with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryDirectory() as local:
         async with (
-            aerokit.component(f"udpout:127.0.0.1:{port}", **kind) as node,
+            aerokit.component(f"udpout:127.0.0.1:{port}", component_id=1, type=kind, autopilot=autopilot) as node,
             aerokit.component(connection=node.connection, component_id=CAMERA, type=MavType.CAMERA) as camera,
             aerokit.component(connection=node.connection, component_id=GIMBAL, type=MavType.GIMBAL) as gimbal,
         ):

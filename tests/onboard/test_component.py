@@ -72,7 +72,7 @@ async def test_message_is_streamed_at_requested_interval() -> None:
             await asyncio.sleep(1.95)
         assert len(received) == 19
         with pytest.raises(InvalidArgument, match="already"):
-            payload.message(m.RawRpm)
+            payload.message(m.RawRpm)(rpm)
 
 
 async def test_long_text_arrives_in_chunks() -> None:

@@ -21,16 +21,14 @@ from aerokit.mavlink.enums import (
 )
 from aerokit.mavlink.enums import MavProtocolCapability as Can
 from aerokit.mavlink.message import Message
-from aerokit.onboard.commands import ComponentCommands
 from aerokit.onboard.events import EventSender, answer_pings
 from aerokit.onboard.files import DirectoryFiles
 from aerokit.onboard.host import ComponentHost
 from aerokit.onboard.identity import PARAMETER_PATH, Identity, IdentityMessages
 from aerokit.onboard.missions import ComponentMissions
 from aerokit.onboard.parameters import ComponentParameters
-from aerokit.protocols.servers.files import FileTree
+from aerokit.onboard.services import ComponentServices
 from aerokit.protocols.servers.ftp import SessionFtpServer
-from aerokit.protocols.servers.intervals import MessageStreams
 
 if TYPE_CHECKING:
     from aerokit.connection.connection import Connection
@@ -40,8 +38,6 @@ if TYPE_CHECKING:
     from aerokit.onboard.sources import ComponentSources
 
 HEARTBEAT_INTERVAL_S = 1.0
-MAX_STREAMS = 64
-MIN_STREAM_INTERVAL_S = 0.005
 MAX_UNSENT_BYTES = 8192
 """Bursts of files pause while more bytes wait in the link."""
 _MAVLINK_VERSION = 3
@@ -73,13 +69,14 @@ class OnboardComponent:
         self._host = ComponentHost(connection, system_id, component_id, accepts)
         self._heartbeat = heartbeat
         self._tasks = BackgroundTasks(connection.fail)
-        self._commands = ComponentCommands(self._host, self._tasks)
-        self._streams = MessageStreams(self._host, min_interval_s=MIN_STREAM_INTERVAL_S, max_streams=MAX_STREAMS)
-        self._commands.handlers.update(self._streams.commands())
+        self.parameters: ComponentParameters = ComponentParameters(self._host, parameters_file, bytewise=bytewise)
+        """Parameters that this component offers."""
+        self._services = ComponentServices(self._host, self._tasks, self.parameters)
+        self._commands, self._streams = self._services.commands, self._services.streams
         self._commands.handlers[MavCmd.REQUEST_AUTOPILOT_CAPABILITIES] = lambda command: self._streams.answer_with(
             m.AutopilotVersion.ID, command
         )
-        self._memory = FileTree()
+        self._memory = self._services.memory
         self._identity = IdentityMessages(self._host, identity, self._memory)
         self._streams.builders.update(self._identity.builders())
         self._ftp: SessionFtpServer[DirectoryFiles] | None = None
@@ -87,8 +84,6 @@ class OnboardComponent:
         self._missions: ComponentMissions | None = None
         self._sources: ComponentSources | None = None
         answer_pings(self._host)
-        self.parameters: ComponentParameters = ComponentParameters(self._host, parameters_file, bytewise=bytewise)
-        """Parameters that this component offers."""
         if bytewise:
             self._identity.capabilities |= Can.PARAM_ENCODE_BYTEWISE
         else:
@@ -200,19 +195,9 @@ class OnboardComponent:
         Raises:
             InvalidArgument: ``hz`` is out of range, or the message has a function already.
         """
-        if not 0.0 <= hz <= 1.0 / MIN_STREAM_INTERVAL_S:
-            raise InvalidArgument(f"hz = {hz} is not allowed: 0 to {1.0 / MIN_STREAM_INTERVAL_S:g}")
-        if message_type.ID in self._streams.builders:
-            raise InvalidArgument(f"{message_type.NAME} already has a function")
 
         def register(function: Callable[[], Message | None]) -> Callable[[], Message | None]:
-            def build(_: object) -> Iterable[Message]:
-                message = function()
-                return [] if message is None else [message]
-
-            self._streams.builders[message_type.ID] = build
-            if hz > 0:
-                self._streams.stream(message_type.ID, 1.0 / hz)
+            self._services.add_message(message_type, function, hz)
             return function
 
         return register
@@ -308,7 +293,7 @@ class OnboardComponent:
         """
         from aerokit.onboard.parts import add_camera  # Imported here because few components have one.
 
-        add_camera(self, camera)
+        add_camera(self._services, camera)
 
     def add_gimbal(self, gimbal: GimbalDriver) -> None:
         """Serve the gimbal protocol v2, as gimbal device and gimbal manager in one component.
@@ -323,7 +308,7 @@ class OnboardComponent:
         """
         from aerokit.onboard.parts import add_gimbal  # Imported here because few components have one.
 
-        add_gimbal(self, gimbal)
+        add_gimbal(self._services, gimbal)
 
     def add_winch(self, winch: WinchDriver) -> None:
         """Execute DO_WINCH by a program's winch, and send WINCH_STATUS at 5 Hz.
@@ -333,7 +318,7 @@ class OnboardComponent:
         """
         from aerokit.onboard.devices import add_winch  # Imported here because few components have one.
 
-        add_winch(self, winch)
+        add_winch(self._services, winch)
 
     def add_gripper(self, grab: Callable[[], Awaitable[Any]], release: Callable[[], Awaitable[Any]]) -> None:
         """Execute DO_GRIPPER by two coroutine functions, which return when the gripper has moved.
@@ -343,7 +328,7 @@ class OnboardComponent:
         """
         from aerokit.onboard.devices import add_gripper  # Imported here because few components have one.
 
-        add_gripper(self, grab, release)
+        add_gripper(self._services, grab, release)
 
     def add_arm_authorizer(self, authorize: Callable[[int], Any]) -> None:
         """Answer ARM_AUTHORIZATION_REQUEST (https://mavlink.io/en/services/arm_authorization.html).
@@ -358,7 +343,7 @@ class OnboardComponent:
         """
         from aerokit.onboard.devices import add_arm_authorizer  # Imported here because few components are one.
 
-        add_arm_authorizer(self, authorize)
+        add_arm_authorizer(self._services, authorize)
 
     @property
     def sources(self) -> ComponentSources:

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument, NotSupported
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import GripperActions, MavArmAuthDeniedReason, MavCmd, MavResult, WinchActions
+from aerokit.mavlink.enums import GripperActions, MavArmAuthDeniedReason, MavCmd, MavResult, MavSeverity, WinchActions
 from aerokit.onboard.commands import CommandResult, result_of
 
 if TYPE_CHECKING:
     from aerokit.onboard.commands import CommandRequest
-    from aerokit.onboard.component import OnboardComponent
+    from aerokit.onboard.services import ComponentServices
 
 Authorize = Callable[[int], "float | Awaitable[float]"]
 
@@ -99,7 +99,7 @@ _WINCH_CALLS: dict[int, str] = {
 STATUS_HZ = 5.0
 
 
-def add_winch(component: OnboardComponent, winch: WinchDriver) -> None:
+def add_winch(services: ComponentServices, winch: WinchDriver) -> None:
     """Serve DO_WINCH and WINCH_STATUS."""
 
     async def do_winch(
@@ -115,16 +115,17 @@ def add_winch(component: OnboardComponent, winch: WinchDriver) -> None:
 
     def status() -> m.WinchStatus:
         report, nan = winch.report(), math.nan
-        known = (nan if number is None else number for number in (report.length_m, report.speed_m_s, report.tension_kg))
-        time_us = round(component.connection.unix_time() * 1e6)
-        return m.WinchStatus(time_us, *known, nan, nan, _TEMPERATURE_UNKNOWN, report.flags)
+        numbers = (report.length_m, report.speed_m_s, report.tension_kg)
+        length, speed, tension = (nan if number is None else number for number in numbers)
+        time_us = round(services.host.connection.unix_time() * 1e6)
+        return m.WinchStatus(time_us, length, speed, tension, nan, nan, _TEMPERATURE_UNKNOWN, report.flags)
 
-    component.command(MavCmd.DO_WINCH)(do_winch)
-    component.message(m.WinchStatus, hz=STATUS_HZ)(status)
+    services.commands.add(MavCmd.DO_WINCH, do_winch)
+    services.add_message(m.WinchStatus, status, STATUS_HZ)
 
 
 def add_gripper(
-    component: OnboardComponent,
+    services: ComponentServices,
     grab: Callable[[], Awaitable[Any]],
     release: Callable[[], Awaitable[Any]],
 ) -> None:
@@ -138,10 +139,10 @@ def add_gripper(
         else:
             raise NotSupported(f"this gripper does not support {action.name}")
 
-    component.command(MavCmd.DO_GRIPPER)(do_gripper)
+    services.commands.add(MavCmd.DO_GRIPPER, do_gripper)
 
 
-def add_arm_authorizer(component: OnboardComponent, authorize: Authorize) -> None:
+def add_arm_authorizer(services: ComponentServices, authorize: Authorize) -> None:
     """Serve ARM_AUTHORIZATION_REQUEST."""
 
     async def arm_authorization(request: CommandRequest, system_id: int) -> CommandResult:
@@ -149,7 +150,7 @@ def add_arm_authorizer(component: OnboardComponent, authorize: Authorize) -> Non
             found = authorize(system_id)
             seconds = await found if inspect.isawaitable(found) else found
         except Exception as error:
-            component.send_text(f"arming denied: {error or type(error).__name__}", severity=4)
+            services.host.send_text(MavSeverity.WARNING, f"arming denied: {error or type(error).__name__}")
             result = result_of(error)
             reason = MavArmAuthDeniedReason.NONE if result == MavResult.DENIED else MavArmAuthDeniedReason.GENERIC
             return CommandResult(MavResult.DENIED, detail=reason)
@@ -159,4 +160,4 @@ def add_arm_authorizer(component: OnboardComponent, authorize: Authorize) -> Non
             raise ValueError(f"the authorizer returned {seconds!r}, not 1 to {MAX_AUTHORIZATION_S} seconds")
         return CommandResult(MavResult.ACCEPTED, progress=math.ceil(seconds))
 
-    component.command(MavCmd.ARM_AUTHORIZATION_REQUEST)(arm_authorization)
+    services.commands.add(MavCmd.ARM_AUTHORIZATION_REQUEST, arm_authorization)

@@ -18,8 +18,8 @@ from aerokit.protocols.servers.definitions import DefinedParameterServer
 from aerokit.protocols.servers.gimbal import gimbal_builders, gimbal_commands, listen_for_gimbal
 
 if TYPE_CHECKING:
-    from aerokit.onboard.component import OnboardComponent
     from aerokit.onboard.host import ComponentHost
+    from aerokit.onboard.services import ComponentServices
     from aerokit.parameters import CameraDefinition, SettingValue
     from aerokit.protocols.servers.camera import AsyncHandler
     from aerokit.protocols.servers.commands import ReceivedCommand
@@ -38,24 +38,24 @@ class DefinedSettings(DefinedParameterServer):
         self._changed(name, value)
 
 
-def add_camera(component: OnboardComponent, camera: CameraDriver) -> CameraAdapter:
+def add_camera(services: ComponentServices, camera: CameraDriver) -> CameraAdapter:
     """Serve a camera."""
-    host, streams = component._host, component._streams
-    adapter = CameraAdapter(camera, host, component._tasks)
+    host, streams = services.host, services.streams
+    adapter = CameraAdapter(camera, host, services.tasks)
     if m.CameraInformation.ID in streams.builders:
         raise InvalidArgument("this component has a camera already: open another component for the second one")
     if camera.definition is not None:
         definition = parse_definition(camera.definition)
-        component.parameters._give_way()
+        services.parameters._give_way()
         DefinedSettings(host, definition, camera.on_setting)
-        component._memory.put(DEFINITION_PATH, camera.definition)
+        services.memory.put(DEFINITION_PATH, camera.definition)
         adapter.definition_version, adapter.definition_uri = definition.version, f"mftp://{DEFINITION_PATH}"
     streams.builders.update(camera_builders(adapter))
     for command, handler in camera_commands(adapter).items():
         if command == MavCmd.STORAGE_FORMAT and type(camera).format_storage is CameraDriver.format_storage:
             continue
-        component._commands.add_raw(command, partial(_run, handler))
-    component._commands.handlers.update(legacy_requests(streams))
+        services.commands.add_raw(command, partial(_run, handler))
+    services.commands.handlers.update(legacy_requests(streams))
     return adapter
 
 
@@ -66,14 +66,14 @@ async def _run(handler: AsyncHandler, command: ReceivedCommand) -> int:
         return MavResult.UNSUPPORTED
 
 
-def add_gimbal(component: OnboardComponent, gimbal: GimbalDriver) -> GimbalAdapter:
+def add_gimbal(services: ComponentServices, gimbal: GimbalDriver) -> GimbalAdapter:
     """Serve a gimbal."""
-    streams = component._streams
+    streams = services.streams
     if m.GimbalManagerInformation.ID in streams.builders:
         raise InvalidArgument("this component has a gimbal already: open another component for the second one")
-    adapter = GimbalAdapter(gimbal, component._host)
+    adapter = GimbalAdapter(gimbal, services.host)
     streams.builders.update(gimbal_builders(adapter))
-    component._commands.handlers.update(gimbal_commands(adapter))
+    services.commands.handlers.update(gimbal_commands(adapter))
     listen_for_gimbal(adapter)
     streams.stream(m.GimbalManagerStatus.ID, STATUS_INTERVAL_S)
     if gimbal.attitude_hz > 0:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import CameraCapFlags, CameraTrackingMode, MavResult
@@ -13,8 +13,8 @@ from aerokit.mavlink.enums import CameraTrackingTargetData as Target
 from aerokit.mavlink.messages import CameraCaptureStatus, CameraImageCaptured
 
 if TYPE_CHECKING:
-    from aerokit.protocols.servers.camera import CameraDevice
     from aerokit.protocols.servers.commands import ReceivedCommand
+    from aerokit.protocols.servers.host import ServerHost
 
 _IDLE, _CAPTURING, _WAITING, _WAITING_AND_CAPTURING = 0, 1, 2, 3
 _UNLIMITED = -1
@@ -23,10 +23,33 @@ _UNLIMITED = -1
 Shot = Callable[..., CameraImageCaptured]
 
 
+class ImagingDevice(Protocol):
+    """The camera, as its captures and its tracking use it; see `CameraDevice`."""
+
+    shutter_s: float
+    max_images: int
+
+    @property
+    def host(self) -> ServerHost: ...
+
+    @property
+    def free_mib(self) -> float: ...
+
+    def can(self, *flags: int) -> bool: ...
+
+    def expose(self, done: Callable[[Shot | None], None]) -> None: ...
+
+    def failed_shot(self) -> Shot: ...
+
+    def store_image(self, image: CameraImageCaptured) -> str | None: ...
+
+    async def track(self, place: tuple[float, ...]) -> None: ...
+
+
 class Captures:
     """Series of images, videos, and the image log. An image begins when the device has finished the one before."""
 
-    def __init__(self, camera: CameraDevice) -> None:
+    def __init__(self, camera: ImagingDevice) -> None:
         self._camera = camera
         self.images: list[CameraImageCaptured] = []
         """Images since the image log was last cleared, by image index."""
@@ -151,7 +174,7 @@ _UNKNOWN = math.nan
 class Tracking:
     """Tracking of a point or a rectangle in the image; call ``lose()`` to lose the target."""
 
-    def __init__(self, camera: CameraDevice) -> None:
+    def __init__(self, camera: ImagingDevice) -> None:
         self._camera = camera
         self.reset()
 
