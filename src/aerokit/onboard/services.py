@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING
 
@@ -15,6 +16,8 @@ if TYPE_CHECKING:
     from aerokit.connection.tasks import BackgroundTasks
     from aerokit.onboard.host import ComponentHost
     from aerokit.onboard.parameters import ComponentParameters
+
+logger: logging.Logger = logging.getLogger("aerokit")
 
 MAX_STREAMS = 64
 MIN_STREAM_INTERVAL_S = 0.005
@@ -39,8 +42,18 @@ class ComponentServices:
         if message_type.ID in self.streams.builders:
             raise InvalidArgument(f"{message_type.NAME} already has a function")
 
+        is_failing = False
+
         def build(_: object) -> Iterable[Message]:
-            message = function()
+            nonlocal is_failing
+            try:
+                message = function()
+            except Exception:
+                if not is_failing:  # one line in the log, not one for each message
+                    logger.exception("the function for %s failed", message_type.NAME)
+                is_failing = True
+                return []
+            is_failing = False
             return [] if message is None else [message]
 
         self.streams.builders[message_type.ID] = build

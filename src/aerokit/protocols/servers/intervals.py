@@ -64,9 +64,11 @@ class MessageStreams:
         if self._streams.get(key) is not stream:  # Replaced by another stream, perhaps with the same interval.
             return
         channel, message_id = key
-        for message in self.builders[message_id](None):
-            self._host.send(message, channel)
-        self._host.call_later(stream.interval_s, lambda: self._send_stream(key, stream))
+        try:
+            for message in self.builders[message_id](None):
+                self._host.send(message, channel)
+        finally:  # an error of a builder, which the host reports, does not end the stream
+            self._host.call_later(stream.interval_s, lambda: self._send_stream(key, stream))
 
     def answer_with(self, message_id: int, command: ReceivedCommand) -> int:
         """Send the requested messages; return DENIED for an unknown id, FAILED if there is no message."""

@@ -15,6 +15,9 @@ from aerokit.parameters.encoding import UNKNOWN_INDEX, value_message, value_of
 from aerokit.parameters.parameter import setting_bytes, setting_value, settings_equal
 from aerokit.protocols.servers.host import Channel, ServerHost, sender_of
 
+MAX_LISTS = 8
+"""Lists that a component sends at once; it ignores further requests."""
+
 
 class NamedList(Protocol):
     """Parameters that are listed; the position of a name is its index."""
@@ -150,7 +153,8 @@ class TypedParameterServer(ParameterProtocolServer):
             self.send(name, self.names.index(name), None)
 
     def _on_list(self, request: m.ParamRequestList, channel: Channel) -> None:
-        self.start_list(channel)
+        if channel in self._lists or len(self._lists) < MAX_LISTS:
+            self.start_list(channel)
 
     def _on_read(self, request: m.ParamRequestRead, channel: Channel) -> None:
         names, index = self.names, request.param_index
