@@ -40,7 +40,8 @@ NAVIGATION: dict[str, list[str]] = {
     "Gallery": ["gallery.md", "examples/*.md"],
     "About": [
         "design.md", "design-rooms.md", "reliability.md", "verification.md", "firmware.md", "benchmarks.md",
-        "features.md", "states.md", "addresses.md", "signing.md", "simulator.md", "testing.md", "about/*.md",
+        "features.md", "features-onboard.md", "states.md", "addresses.md", "signing.md", "simulator.md", "testing.md",
+        "about/*.md",
     ],
 }  # fmt: skip
 """Maps the title of a tab to its pages and patterns, in order. Missing pages are skipped; an unlisted page fails the

@@ -135,6 +135,10 @@ class CameraDriver:
         """Focus continuously: -1 (near) to 1 (far), 0 stops."""
         raise NotImplementedError
 
+    async def focus_distance(self, metres: float) -> None:
+        """Focus at a distance, above 0."""
+        raise NotImplementedError
+
     async def autofocus(self) -> None:
         """Focus automatically."""
         raise NotImplementedError
@@ -179,7 +183,7 @@ def capabilities_of(camera: CameraDriver) -> int:
         flags |= CameraCapFlags.CAN_CAPTURE_IMAGE_IN_VIDEO_MODE | CameraCapFlags.CAN_CAPTURE_VIDEO_IN_IMAGE_MODE
     if _has(camera, "zoom_to") or _has(camera, "zoom_at"):
         flags |= CameraCapFlags.HAS_BASIC_ZOOM
-    if _has(camera, "focus_to") or _has(camera, "focus_at") or _has(camera, "autofocus"):
+    if any(_has(camera, name) for name in ("focus_to", "focus_at", "focus_distance", "autofocus")):
         flags |= CameraCapFlags.HAS_BASIC_FOCUS
     if camera.streams:
         flags |= CameraCapFlags.HAS_VIDEO_STREAM
@@ -290,6 +294,9 @@ class CameraAdapter(CameraDevice):
         camera = self._camera
         if kind in _AUTO and _has(camera, "autofocus"):
             await camera.autofocus()
+            return True
+        if kind == SetFocusType.METERS and value > 0 and _has(camera, "focus_distance"):
+            await camera.focus_distance(value)
             return True
         return await self._move(
             kind == SetFocusType.STEP, kind == SetFocusType.RANGE, kind == SetFocusType.CONTINUOUS,

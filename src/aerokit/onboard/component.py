@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import anyio
 
@@ -40,8 +40,10 @@ if TYPE_CHECKING:
 HEARTBEAT_INTERVAL_S = 1.0
 MAX_UNSENT_BYTES = 8192
 """Bursts of files pause while more bytes wait in the link."""
+MAX_METADATA_BYTES = 1 << 20
 _MAVLINK_VERSION = 3
 
+MetadataKind = Literal["commands", "peripherals", "events", "actuators"]
 HandlerT = TypeVar("HandlerT", bound=Callable[..., Any])
 BuilderT = TypeVar("BuilderT", bound=Callable[[], Any])
 
@@ -265,6 +267,23 @@ class OnboardComponent:
         else:
             self._ftp.files = files
 
+    def set_metadata(self, kind: MetadataKind, content: bytes) -> None:
+        """Offer a metadata file (JSON) by MAVFTP, and list it in the general metadata.
+
+        https://mavlink.io/en/services/component_information.html
+
+        Args:
+            kind: ``"commands"``, ``"peripherals"``, ``"events"`` or ``"actuators"``. The file of the parameters follows
+                from them.
+            content: the file, at most 1 MiB.
+
+        Raises:
+            InvalidArgument: the file is larger, or the kind is another one.
+        """
+        if len(content) > MAX_METADATA_BYTES:
+            raise InvalidArgument(f"content has {len(content)} bytes, at most {MAX_METADATA_BYTES} are allowed")
+        self._identity.offer(CompMetadataType[kind.upper()], f"/{kind}.json", lambda: content)
+
     def _is_congested(self) -> bool:
         return self.connection.unsent_bytes > MAX_UNSENT_BYTES
 
@@ -273,7 +292,7 @@ class OnboardComponent:
         """Missions, fences and rally points that other programs upload and download; served from the first use on."""
         if self._missions is None:
             self._missions = ComponentMissions(self._host, self._tasks, self._commands)
-            self._streams.builders[m.MissionCurrent.ID] = self._missions.build_current
+            self._streams.builders[m.MissionCurrent.ID] = self._missions._build_current
             self._identity.capabilities |= Can.MISSION_INT | Can.MISSION_FENCE | Can.MISSION_RALLY
         return self._missions
 

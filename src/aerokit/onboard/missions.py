@@ -88,7 +88,7 @@ class ComponentMissions:
         """Report that an item was reached (MISSION_ITEM_REACHED)."""
         self._host.send(m.MissionItemReached(index))
 
-    def build_current(self, _: object) -> Iterable[Message]:
+    def _build_current(self, _: object) -> Iterable[Message]:
         return [self._server.current_message()]
 
     def _judge(self, mission_type: int, items: tuple[MissionItem, ...], answer: Callable[[int], None]) -> None:
