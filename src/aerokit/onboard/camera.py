@@ -199,11 +199,13 @@ _AUTO = (SetFocusType.AUTO, SetFocusType.AUTO_SINGLE, SetFocusType.AUTO_CONTINUO
 class CameraAdapter(CameraDevice):
     """Serves the camera protocol for a program's camera."""
 
-    def __init__(self, camera: CameraDriver, host: ComponentHost, tasks: BackgroundTasks) -> None:
+    def __init__(
+        self, camera: CameraDriver, host: ComponentHost, tasks: BackgroundTasks, call: Callable[..., Any]
+    ) -> None:
         self.vendor, self.model, self.resolution = camera.vendor, camera.model, camera.resolution
         self.focal_length_mm, self.sensor_mm = camera.focal_length_mm, camera.sensor_mm
         self.streams, self.capabilities = camera.streams, capabilities_of(camera)
-        self._camera, self._host, self._tasks = camera, host, tasks
+        self._camera, self._host, self._tasks, self._call = camera, host, tasks, call
         self.set_up_captures()
         self.running_streams = set(range(1, len(self.streams) + 1))
         self._format_known = _has(camera, "format_storage")
@@ -239,7 +241,7 @@ class CameraAdapter(CameraDevice):
         async def take() -> None:
             shot = None
             try:
-                photo = await self._camera.take_photo(len(self.captures.images))
+                photo = await self._call(self._camera.take_photo, len(self.captures.images))
                 shot = _shot(photo, time_boot_ms, unix_time)
             except Exception as error:
                 if not isinstance(error, AerokitError):
@@ -275,13 +277,13 @@ class CameraAdapter(CameraDevice):
         ]
 
     async def start_video(self) -> None:
-        await self._camera.start_video()
+        await self._call(self._camera.start_video)
 
     async def stop_video(self) -> None:
-        await self._camera.stop_video()
+        await self._call(self._camera.stop_video)
 
     async def set_mode(self, mode: int) -> None:
-        await self._camera.set_mode(mode)
+        await self._call(self._camera.set_mode, mode)
 
     async def set_zoom(self, kind: int, value: float) -> bool:
         camera = self._camera
@@ -293,10 +295,10 @@ class CameraAdapter(CameraDevice):
     async def set_focus(self, kind: int, value: float) -> bool:
         camera = self._camera
         if kind in _AUTO and _has(camera, "autofocus"):
-            await camera.autofocus()
+            await self._call(camera.autofocus)
             return True
         if kind == SetFocusType.METERS and value > 0 and _has(camera, "focus_distance"):
-            await camera.focus_distance(value)
+            await self._call(camera.focus_distance, value)
             return True
         return await self._move(
             kind == SetFocusType.STEP, kind == SetFocusType.RANGE, kind == SetFocusType.CONTINUOUS,
@@ -318,25 +320,25 @@ class CameraAdapter(CameraDevice):
         if is_step and math.isfinite(now):
             value, is_range = max(0.0, min(100.0, now + value * _STEP_PERCENT)), True
         if is_range and 0.0 <= value <= 100.0 and _has(self._camera, to_name):
-            await to(value)
+            await self._call(to, value)
             return True
         if is_rate and -1.0 <= value <= 1.0 and _has(self._camera, at_name):
-            await at(value)
+            await self._call(at, value)
             return True
         return False
 
     async def switch_stream(self, numbers: set[int], *, on: bool) -> None:
         for number in sorted(numbers):
-            await self._camera.switch_stream(number, on)
+            await self._call(self._camera.switch_stream, number, on)
 
     async def track(self, place: tuple[float, ...]) -> None:
-        await self._camera.track(place)
+        await self._call(self._camera.track, place)
 
     async def format_storage(self) -> None:
-        await self._camera.format_storage()
+        await self._call(self._camera.format_storage)
 
     async def reset_settings(self) -> None:
-        await self._camera.reset_settings()
+        await self._call(self._camera.reset_settings)
 
     def publish_settings(self) -> None:
         """Send CAMERA_SETTINGS to all."""

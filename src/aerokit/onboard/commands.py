@@ -121,6 +121,8 @@ class ComponentCommands:
     """Commands of one component. Handlers run as tasks that end with the component."""
 
     def __init__(self, host: ComponentHost, tasks: BackgroundTasks) -> None:
+        self.uses_threads = False
+        """True to call plain functions in threads, for blocking programs."""
         self.handlers: dict[int, CommandHandler] = {}
         """MAV_CMD → handler; protocol servers add their own."""
         self.server: CommandDispatcher = CommandDispatcher(host, self.handlers)
@@ -138,9 +140,21 @@ class ComponentCommands:
             raise InvalidArgument(f"{command_name(command)} already has a handler")
         self.handlers[command] = partial(self._execute, function, arguments_of(function))
 
+    async def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Call a function of the program: a coroutine function, or a plain one, in a thread if ``uses_threads``."""
+        if inspect.iscoroutinefunction(function) or not self.uses_threads:
+            found = function(*arguments)
+        else:
+            found = await asyncio.to_thread(function, *arguments)
+        return await found if inspect.isawaitable(found) else found
+
     def add_raw(self, command: int, function: Callable[[ReceivedCommand], Awaitable[int]]) -> None:
         """Register a coroutine function of a protocol server, which checks the parameters itself."""
-        self.handlers[command] = lambda received: self._execute(lambda _: function(received), (), received)
+
+        async def run(request: CommandRequest) -> int:
+            return await function(request._command)
+
+        self.handlers[command] = partial(self._execute, run, ())
 
     def cancel_all(self) -> None:
         self._running.cancel_all()
@@ -157,10 +171,13 @@ class ComponentCommands:
         running = self._running.start(command, cancel)
         if running is None:
             return
-        request = CommandRequest(command, partial(self._running.report, running))
+        report = partial(self._running.report, running)
+        if self.uses_threads:
+            report = partial(asyncio.get_running_loop().call_soon_threadsafe, report)
+        request = CommandRequest(command, report)
         try:
             values = [argument.convert(request.params[argument.number - 1]) for argument in arguments]
-            answer = function(request, *values)
+            answer = self.call(function, request, *values) if self.uses_threads else function(request, *values)
         except Exception as error:
             self._fail(running, function, error)
             return
@@ -189,8 +206,8 @@ class ComponentCommands:
 
     def _fail(self, running: RunningCommand, function: Callable[..., Any], error: Exception) -> None:
         """Answer with the result for an error, and explain it in a status text."""
-        name = getattr(function, "__name__", "<lambda>")
-        name = command_name(running.command.command) if name == "<lambda>" else name
+        name = getattr(function, "__name__", "run")
+        name = command_name(running.command.command) if name == "run" else name
         if not isinstance(error, AerokitError):
             logger.error("the handler %s of a command failed", name, exc_info=error)
         self._host.send_text(MavSeverity.WARNING, f"{name}: {error or type(error).__name__}")

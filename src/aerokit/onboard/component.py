@@ -108,6 +108,10 @@ class OnboardComponent:
                 self._ftp.close()
             self._host.close()
 
+    def _use_threads(self) -> None:
+        """Call plain functions of the program in threads, because it is a blocking program."""
+        self._commands.uses_threads = True
+
     # ------------------------------------------------------------------------------------ state
 
     @property

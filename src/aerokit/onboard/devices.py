@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any
@@ -111,7 +110,7 @@ def add_winch(services: ComponentServices, winch: WinchDriver) -> None:
         arguments = {"pay_out": (length, rate), "set_rate": (rate,)}.get(name, ())
         if None in arguments:
             raise InvalidArgument("length and rate are required")
-        await getattr(winch, name)(*arguments)
+        await services.commands.call(getattr(winch, name), *arguments)
 
     def status() -> m.WinchStatus:
         report, nan = winch.report(), math.nan
@@ -133,9 +132,9 @@ def add_gripper(
 
     async def do_gripper(_: CommandRequest, instance: float | None, action: GripperActions) -> None:
         if action == GripperActions.RELEASE:
-            await release()
+            await services.commands.call(release)
         elif action == GripperActions.GRAB:
-            await grab()
+            await services.commands.call(grab)
         else:
             raise NotSupported(f"this gripper does not support {action.name}")
 
@@ -147,8 +146,7 @@ def add_arm_authorizer(services: ComponentServices, authorize: Authorize) -> Non
 
     async def arm_authorization(request: CommandRequest, system_id: int) -> CommandResult:
         try:
-            found = authorize(system_id)
-            seconds = await found if inspect.isawaitable(found) else found
+            seconds = await services.commands.call(authorize, system_id)
         except Exception as error:
             services.host.send_text(MavSeverity.WARNING, f"arming denied: {error or type(error).__name__}")
             result = result_of(error)

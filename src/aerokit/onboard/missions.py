@@ -34,7 +34,7 @@ class ComponentMissions:
     """
 
     def __init__(self, host: ComponentHost, tasks: BackgroundTasks, commands: ComponentCommands) -> None:
-        self._host, self._tasks = host, tasks
+        self._host, self._tasks, self._commands = host, tasks, commands
         self._server = MissionServer(host, self._judge, on_set_current=self._set_current)
         self._on_upload: Callable[[str, tuple[MissionItem, ...]], Any] | None = None
         self._on_current: Callable[[int], object] | None = None
@@ -96,7 +96,10 @@ class ComponentMissions:
         function = self._on_upload
         try:
             check_items(items, mission_type)
-            verdict = None if function is None else function(kind, items)
+            if function is not None and self._commands.uses_threads:
+                verdict = self._commands.call(function, kind, items)
+            else:
+                verdict = None if function is None else function(kind, items)
         except Exception as error:
             answer(self._refused(kind, error))
             return

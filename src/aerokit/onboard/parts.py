@@ -41,7 +41,7 @@ class DefinedSettings(DefinedParameterServer):
 def add_camera(services: ComponentServices, camera: CameraDriver) -> CameraAdapter:
     """Serve a camera."""
     host, streams = services.host, services.streams
-    adapter = CameraAdapter(camera, host, services.tasks)
+    adapter = CameraAdapter(camera, host, services.tasks, services.commands.call)
     if m.CameraInformation.ID in streams.builders:
         raise InvalidArgument("this component has a camera already: open another component for the second one")
     if camera.definition is not None:
