@@ -171,9 +171,15 @@ class ComponentCommands:
         running = self._running.start(command, cancel)
         if running is None:
             return
-        report = partial(self._running.report, running)
-        if self.uses_threads:
-            report = partial(asyncio.get_running_loop().call_soon_threadsafe, report)
+        started = running  # not None, also for the closure
+        loop = asyncio.get_running_loop() if self.uses_threads else None
+
+        def report(percent: int) -> None:
+            if loop is None:
+                self._running.report(started, percent)
+            else:  # called in a thread
+                loop.call_soon_threadsafe(self._running.report, started, percent)
+
         request = CommandRequest(command, report)
         try:
             values = [argument.convert(request.params[argument.number - 1]) for argument in arguments]

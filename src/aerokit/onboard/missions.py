@@ -96,10 +96,10 @@ class ComponentMissions:
         function = self._on_upload
         try:
             check_items(items, mission_type)
-            if function is not None and self._commands.uses_threads:
-                verdict = self._commands.call(function, kind, items)
-            else:
-                verdict = None if function is None else function(kind, items)
+            verdict: Any = None
+            if function is not None:
+                in_thread = self._commands.uses_threads
+                verdict = self._commands.call(function, kind, items) if in_thread else function(kind, items)
         except Exception as error:
             answer(self._refused(kind, error))
             return
