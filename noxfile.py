@@ -107,7 +107,7 @@ def docs(session: nox.Session) -> None:
 @nox.session
 def pictures(session: nox.Session) -> None:
     """Draw the pictures of the documentation again: `nox -s pictures -- [NAME …]`."""
-    session.install("-e", ".[all]")
+    session.install("-e", ".[all]", "playwright>=1.45")
     session.run("python", "docs/pictures.py", *session.posargs)
 
 

@@ -1,4 +1,4 @@
-"""Draws docs/images: the true tracks of the demonstration and the examples, and the terminal of the demonstration.
+"""Draws docs/images: the true tracks of the demonstration and the examples, terminals, the served page, a report.
 
 python docs/pictures.py [NAME …]        or: nox -s pictures
 
@@ -16,6 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from screen_pictures import take_monitor, take_page, take_report
 from terminal_picture import draw_terminal
 
 from aerokit.sim import HOME, SimulatedCamera, SimulatedCopter, simulated_link
@@ -53,13 +54,19 @@ def main(names: list[str]) -> None:
     makers: dict[str, Callable[[], None]] = {"demo": draw_demo}
     makers |= {name: partial(fly_on_virtual_time, name) for name in ON_VIRTUAL_TIME}
     makers |= {name: partial(fly_on_a_socket, name) for name in ON_A_SOCKET}
+    screens = IMAGES / "screens"
+    makers["monitor"] = partial(take_monitor, IMAGES / "monitor.svg", screens / "monitor-wide.svg")
+    makers["report"] = partial(take_report, IMAGES / "report.png", screens / "report.png", screens / "report-phone.png")
+    makers["serve"] = partial(
+        take_page, IMAGES / "serve.png", screens / "serve-flying.png", screens / "serve-phone.png"
+    )
     for name in names or makers:
         makers[name]()
 
 
 def draw_demo() -> None:
     """Draw the flight and the terminal of ``aerokit demo``."""
-    with tempfile.TemporaryDirectory() as folder, serve_flight(speedup=5.0) as flight:
+    with tempfile.TemporaryDirectory() as folder, serve_flight(speedup=1.0) as flight:
         output = run([sys.executable, "-m", "aerokit", "demo", "--connect", flight.address], folder)
         draw([flight.track], "demo")
     lines = [line for line in output.splitlines() if not line.startswith("connecting")]

@@ -21,10 +21,9 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).parent.parent
 HOW_TO = (
     "connecting", "state", "waiting", "actions", "errors", "parameters", "missions", "set-points", "files-and-logs",
-    "cameras", "gimbals", "outputs-and-devices", "px4-tools", "components", "being-a-component", "being-a-camera",
-    "being-a-device", "messages", "events", "links",
-    "several-links", "bad-radio", "signing", "several-vehicles", "own-loop", "sync", "recording", "dialects",
-    "testing", "logging",
+    "cameras", "gimbals", "corrections", "calibration", "outputs-and-devices", "px4-tools", "components",
+    "being-a-component", "being-a-camera", "being-a-device", "messages", "events", "links", "several-links",
+    "bad-radio", "signing", "several-vehicles", "own-loop", "sync", "recording", "dialects", "testing", "logging",
 )  # fmt: skip
 NAVIGATION: dict[str, list[str]] = {
     "Tutorial": ["tutorial.md"],

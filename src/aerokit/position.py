@@ -1,4 +1,4 @@
-"""``Position``: a place on earth."""
+"""Places on earth: ``Position`` and ``Home``."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from aerokit.errors import InvalidArgument
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-__all__ = ["Position"]
+__all__ = ["Home", "Position"]
 
 
 @checks_arguments
@@ -32,11 +32,11 @@ class Position(Snapshot):
     altitude_amsl_m: float | None = None
     altitude_relative_m: float | None = None
 
-    def distance_to(self, other: Position) -> float:
+    def distance_to(self, other: Position | Home) -> float:
         """Return the distance in metres along the ground, ignoring altitudes."""
         return geo.distance_m(self.latitude_deg, self.longitude_deg, other.latitude_deg, other.longitude_deg)
 
-    def bearing_to(self, other: Position) -> float:
+    def bearing_to(self, other: Position | Home) -> float:
         """Return the bearing to the other place in degrees: 0 to 360, clockwise from north."""
         return geo.bearing_deg(self.latitude_deg, self.longitude_deg, other.latitude_deg, other.longitude_deg)
 
@@ -52,6 +52,35 @@ class Position(Snapshot):
             altitude = getattr(self, name)
             if altitude is not None and not (isinstance(altitude, (float, int, Real)) and math.isfinite(altitude)):
                 raise InvalidArgument(f"{name} = {altitude!r} is not a finite number")
+
+
+class Home(Snapshot):
+    """The home position (HOME_POSITION); ``north_m`` … are from the local origin, None if not reported.
+
+    Calls that take a Position take it too. ``go_to`` keeps the present altitude on the way to it.
+    """
+
+    latitude_deg: float
+    longitude_deg: float
+    altitude_amsl_m: float
+    north_m: float | None = None
+    east_m: float | None = None
+    down_m: float | None = None
+
+    @property
+    def position(self) -> Position:
+        """Home as a target without an altitude: flying there keeps the present altitude."""
+        return Position(self.latitude_deg, self.longitude_deg)
+
+
+def point_at(place: Position | Home) -> Position:
+    """Return the position of a place; home's has an altitude above mean sea level."""
+    return place.position.replace(altitude_amsl_m=place.altitude_amsl_m) if isinstance(place, Home) else place
+
+
+def travel_target(place: Position | Home) -> Position:
+    """Return the position to fly to: without an altitude for home, so that the vehicle keeps the present one."""
+    return place.position if isinstance(place, Home) else place
 
 
 def _add(altitude: float | None, up_m: float) -> float | None:

@@ -7,11 +7,13 @@ from collections.abc import Callable, Iterator
 from types import FunctionType
 from typing import Any
 
+from calibration_calls import CALIBRATIONS_BLOCKING
 from call_stage import Stage
 from call_table import CALLS, KEY
 from camera_calls import BLOCKING
 from component_calls import COMPONENTS_BLOCKING
 from device_calls import BLOCKING_DEVICES
+from rtk_calls import RTK_BLOCKING
 
 import aerokit.sync
 from aerokit import (
@@ -40,6 +42,10 @@ CLASSES: tuple[type, ...] = (
     twins.Gimbals,
     twins.GimbalControl,
     twins.GimbalRates,
+    twins.CalibrationControl,
+    twins.Calibration,
+    twins.Rtk,
+    twins.NtripClient,
     twins.Camera,
     twins.PostedOrder,
     twins.SetpointStream,
@@ -268,4 +274,5 @@ WRITTEN: dict[str, Do] = {
 def blocking_calls() -> dict[str, Do]:
     """Return the calls by name; coroutine functions of the other table have no twin."""
     shared = {name: call.do for name, call in CALLS.items() if not inspect.iscoroutinefunction(call.do)}
-    return {**shared, **WRITTEN, **BLOCKING, **COMPONENTS_BLOCKING, **BLOCKING_DEVICES}
+    given = (WRITTEN, BLOCKING, COMPONENTS_BLOCKING, BLOCKING_DEVICES, CALIBRATIONS_BLOCKING, RTK_BLOCKING)
+    return shared | {name: do for calls in given for name, do in calls.items()}

@@ -11,6 +11,7 @@ import aerokit
 from aerokit.connection.bus import Subscription
 from aerokit.connection.cells import Changes, StateCell
 from aerokit.connection.connection import Connection
+from aerokit.vehicle.calibration.calibration import Calibration, CalibrationControl
 from aerokit.vehicle.camera.cameras import Camera
 from aerokit.vehicle.camera.link import CameraBlock
 from aerokit.vehicle.camera.photos import PhotoInterval
@@ -32,6 +33,8 @@ from aerokit.vehicle.missions.mission import MissionControl
 from aerokit.vehicle.missions.plans import FenceControl, RallyControl
 from aerokit.vehicle.parameters.parameters import Parameters
 from aerokit.vehicle.parameters.transaction import TemporaryParameters, Transaction
+from aerokit.vehicle.rtk.ntrip import NtripClient
+from aerokit.vehicle.rtk.rtk import Rtk
 
 __all__ = ["CLASSES", "FUNCTIONS", "Member", "awaited", "members", "own_classes_in"]
 
@@ -55,6 +58,10 @@ CLASSES: tuple[type, ...] = (
     MissionControl,
     FenceControl,
     RallyControl,
+    CalibrationControl,
+    Calibration,
+    Rtk,
+    NtripClient,
     Files,
     Logs,
     LogStream,

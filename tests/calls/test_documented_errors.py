@@ -9,6 +9,7 @@ from typing import Any
 
 import anyio
 import pytest
+from calibration_calls import CALIBRATIONS
 from call_stage import Stage, open_stage
 from call_table import provocations
 from camera_calls import CAMERA
@@ -21,12 +22,15 @@ from provoked_flight import FLIGHT
 from provoked_gimbals import GIMBALS
 from provoked_settings import SETTINGS
 from provoked_transfers import TRANSFERS
+from rtk_calls import RTK
 
 from aerokit import errors
 from aerokit.sim.faults import Faults
 from aerokit.testing import run_virtual
 
-PROVOCATIONS = provocations() | FLIGHT | GIMBALS | TRANSFERS | SETTINGS | CAMERA | COMPONENTS | DEVICE_ERRORS
+PROVOCATIONS = (
+    provocations() | FLIGHT | GIMBALS | TRANSFERS | SETTINGS | CAMERA | COMPONENTS | DEVICE_ERRORS | CALIBRATIONS | RTK
+)
 PROMISED = documented()
 MAX_WAIT_S = 200.0
 BY_DEFAULT = ("Vehicle", "Guided", "Parameters", "MissionControl", "Files", "Gimbal")

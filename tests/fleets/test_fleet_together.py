@@ -24,7 +24,7 @@ from aerokit.fleets.opening import fleet
 from aerokit.mavlink.enums import MavCmd
 from aerokit.missions import Mission, land, return_to_launch, take_off, waypoint
 from aerokit.position import Position
-from aerokit.protocols.rtcm import fragments, rtcm_messages
+from aerokit.protocols.rtcm import crc24q
 from aerokit.sim import SimulatedPx4, simulated_link
 from aerokit.sim.px4.modes import POSITION, custom_mode
 from aerokit.testing.track import min_distance_m, record_track
@@ -351,41 +351,15 @@ def test_formation_offset_rotates_with_heading() -> None:
 async def test_send_corrections_sends_once_per_link() -> None:
     async with open_stage(2, networks=("north", "south")) as stage:
         stage.clear()
-        message = b"\xd3\x00\xc8" + bytes(range(200)) + b"crc"
+        body = b"\xd3\x00\xc8" + bytes(range(200))
+        message = body + crc24q(body).to_bytes(3, "big")
         assert stage.fleet.send_corrections(message) == 2
         for wire in stage.wires.values():
             sent = wire.all(m.GpsRtcmData)
             assert b"".join(message.data[: message.len] for message in sent) == message
             assert [message.flags & 7 for message in sent] == [0b001, 0b011]
-        with pytest.raises(InvalidArgument, match="0 bytes"):
+        with pytest.raises(InvalidArgument, match="whole RTCM 3"):
             stage.fleet.send_corrections(b"")
-
-
-@pytest.mark.parametrize(
-    ("size", "lengths"),
-    [
-        (1, [1]),
-        (180, [180]),
-        (181, [180, 1]),
-        (360, [180, 180, 0]),
-        (719, [180, 180, 180, 179]),
-        (720, [180] * 4),
-    ],
-)
-def test_rtcm_fragments_end_with_a_short_or_fourth_one(size: int, lengths: list[int]) -> None:
-    pieces = fragments(bytes(size), 37)
-    assert [piece.len for piece in pieces] == lengths
-    assert {piece.flags >> 3 for piece in pieces} == {37 & 31}
-    assert [piece.flags & 1 for piece in pieces] == [int(len(lengths) > 1)] * len(lengths)
-    assert [piece.flags >> 1 & 3 for piece in pieces] == list(range(len(lengths)))
-
-
-def test_rtcm_messages_are_split() -> None:
-    one, other = b"\xd3\x00\x02ab123", b"\xd3\x00\x00456"
-    assert list(rtcm_messages(one + other)) == [one, other]
-    assert list(rtcm_messages(b"no rtcm")) == [b"no rtcm"]
-    with pytest.raises(InvalidArgument, match="721"):
-        fragments(bytes(721), 0)
 
 
 async def test_px4_after_mission_end_is_not_taken_over() -> None:
@@ -430,6 +404,8 @@ async def test_px4_fleet_flies_and_detects_pilot() -> None:
         for order in (both.wait_ready(), both.arm(), both.take_off(10)):
             (await order).raise_for_errors()
         (await both.go_to(lambda member: member.vehicle.position.value.offset(north_m=20))).raise_for_errors()
+        homes = {name: member.vehicle.home.value for name, member in both.members.items()}
+        (await both.go_to(homes)).raise_for_errors()
         line = Formation.line(["south/2"], 10.0, frame="north")
         async with both.following(line, leader="south/1") as following:
             await anyio.sleep(20)

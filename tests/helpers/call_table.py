@@ -7,12 +7,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import anyio
+from calibration_calls import CALIBRATIONS_AWAITED
 from call_stage import DATA, Place, Stage, airborne, anywhere, armed, grounded, on_mission
 from camera_beside import camera_of, settings_of
 from camera_calls import AWAITED
 from component_calls import COMPONENTS_AWAITED
 from device_calls import BLOCKS, DEVICE_CALLS, DEVICES, DeviceCall, components_of, fit
 from provoked import Do, Provocation, Table, ignored, refused
+from rtk_calls import RTK_AWAITED
 
 import aerokit
 from aerokit import (
@@ -381,6 +383,10 @@ CALLS: dict[str, Call] = {
     "SetpointStream.fly": Call(_fly, airborne),
     # ------------------------------------------------------------------------------------- Camera
     **{name: Call(do) for name, do in AWAITED.items()},
+    # ------------------------------------------------------------------------------- calibration
+    **{name: Call(do, grounded, on) for name, (do, on) in CALIBRATIONS_AWAITED.items()},
+    # ------------------------------------------------------------------------------- corrections
+    **{name: Call(do) for name, do in RTK_AWAITED.items()},
     # ------------------------------------------------------------------------------------ devices
     **{call.name: _device(call) for call in DEVICE_CALLS},
     **{name: Call(do, place, before=components_of) for name, (do, place) in DEVICES.items()},

@@ -159,7 +159,7 @@ def speed_of(copter: SimulatedCopter) -> float:
 
 def make_parts(vehicle: aerokit.Vehicle) -> None:
     """Create the components that are created on first use and kept, so that leak checks do not count them."""
-    for name in ("parameters", "gimbal", "mission"):
+    for name in ("parameters", "gimbal", "mission", "rtk", "calibrate"):
         getattr(vehicle, name)
 
 

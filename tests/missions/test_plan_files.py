@@ -463,6 +463,28 @@ def test_plan_file_error_names_missing_value(path: tuple[str | int, ...]) -> Non
         read(document)
 
 
+def test_plan_file_error_names_all_missing_values() -> None:
+    document = samples.full_document()
+    for path in (("version",), ("mission", "items", 0, "command"), ("mission", "items", 0, "params")):
+        del at(document, *path[:-1])[path[-1]]
+    del document["geoFence"]["circles"][0]["circle"]["center"]
+    with pytest.raises(FileFormatError) as caught:
+        read(document)
+    assert str(caught.value) == (
+        "test.plan: the document has no 'version'; mission.items[0] has no 'command' and 'params';"
+        " geoFence.circles[0].circle has no 'center', which are required"
+    )
+
+
+def test_plan_file_error_counts_further_incomplete_items() -> None:
+    document = samples.full_document()
+    document["mission"]["items"] = [{"type": "SimpleItem"}] * 9
+    with pytest.raises(
+        FileFormatError, match=r"items\[4\] has no 'command'.*'autoContinue'; 4 more objects are incomplete"
+    ):
+        read(document)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -524,3 +546,9 @@ def test_damaged_plan_file_raises_only_our_errors(seed: int, junk: object) -> No
     except FileFormatError:
         return
     assert written(plan) == document
+
+
+def test_plan_file_of_other_version_is_not_called_incomplete() -> None:
+    with pytest.raises(FileFormatError, match=r"version.*9") as caught:
+        read({"fileType": "Plan", "version": 9})
+    assert "required" not in str(caught.value)

@@ -22,6 +22,7 @@ from aerokit.onboard import (
     WinchReport,
 )
 from aerokit.position import Position
+from aerokit.protocols.rtcm import crc24q
 from aerokit.sim.components.camera_body import own_definition
 
 pytestmark = pytest.mark.anyio
@@ -238,7 +239,8 @@ async def test_sources_send_their_messages() -> None:
             sources.send_obstacles([1.5, None, math.inf], increment_deg=5.0, min_m=0.2, max_m=10.0)
             sources.send_traffic(0x4B1234, Position(47.4, 8.5, altitude_amsl_m=900.0), callsign="HBABC")
             sources.send_landing_target(2.0, -3.0, 4.5)
-            sources.send_corrections(bytes(200))
+            message = bytes([0xD3, 0, 194]) + bytes(194)
+            sources.send_corrections(message + crc24q(message).to_bytes(3, "big"))
             await asyncio.sleep(0.1)
     obstacles, traffic, target, *corrections = received
     assert obstacles.distances[:4] == (150, 0xFFFF, 1001, 0xFFFF)

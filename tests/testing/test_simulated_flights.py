@@ -166,3 +166,9 @@ def test_a_served_flight_is_recorded() -> None:
         assert flight.simulated.battery.percent == 50
         assert flight.track.end.armed is False
     assert len(flight.track) >= 1
+
+
+async def test_unknown_attribute_of_fault_injector_is_error() -> None:
+    async with open_flight("copter") as flight:
+        with pytest.raises(AttributeError):
+            flight.faults.rc_lost = True  # type: ignore[attr-defined]  # a field of flight.faults.all

@@ -31,6 +31,8 @@ OWNERS: dict[str, Callable[[aerokit.Vehicle], Any]] = {
     "camera": lambda vehicle: vehicle.camera,
     "files": lambda vehicle: vehicle.files,
     "logs": lambda vehicle: vehicle.logs,
+    "rtk": lambda vehicle: vehicle.rtk,
+    "calibrate": lambda vehicle: vehicle.calibrate,
     "actuators": lambda vehicle: vehicle.actuators,
     "gripper": lambda vehicle: vehicle.gripper(),
     "winch": lambda vehicle: vehicle.winch(),

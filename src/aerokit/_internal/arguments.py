@@ -132,7 +132,13 @@ def _is_time(parameter: inspect.Parameter) -> bool:
 def _check_value(rule: Rule, name: str, value: object) -> None:
     check, allowed = rule
     if not check(value):
-        raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: {allowed}")
+        raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: {allowed}{_hint(check, value)}")
+
+
+def _hint(check: Check, value: object) -> str:
+    """Return the hint to pass the value of a state cell instead of the cell; else an empty string."""
+    latest = getattr(value, "latest", None)
+    return "; pass its .value" if latest is not None and check(latest) else ""
 
 
 # ------------------------------------------------------------------------------------- annotations

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Mapping
 from datetime import date, datetime, timedelta
 from enum import Enum, Flag
@@ -77,12 +78,17 @@ def format_value(value: object) -> str:
     return name if isinstance(name, str) else str(value)
 
 
+# User and password of a URL.
+_CREDENTIALS = re.compile(r"//([^/@:\s]*):[^\s]*@")
+
+
 def short_repr(value: object) -> str:
-    """Return ``repr(value)``, at most 100 characters; the type's name if ``repr`` fails."""
+    """Return ``repr(value)``, at most 100 characters, without the password of a URL; the type's name if it fails."""
     try:
         text = repr(value)
     except Exception:  # repr fails for an int of 5000 digits, and may fail for classes of the program
         text = f"<{type(value).__name__}>"
+    text = _CREDENTIALS.sub(r"//\1:…@", text)
     return text if len(text) <= _MAX_LENGTH else f"{text[: _MAX_LENGTH - 3]}..."
 
 

@@ -5,12 +5,18 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from aerokit._internal.formatting import format_value
+from aerokit.mavlink.enums import MavAutopilot, MavType
 
 if TYPE_CHECKING:
     from aerokit.events import Event
 
 _NOTES = {"DuplicateSender": "a second sender has the same ids, and is ignored"}
 _UNLABELLED = frozenset(("name", "message", "link", "peer", "text", "error"))
+_ENUMS: dict[str, type[MavType] | type[MavAutopilot]] = {
+    "vehicle_type": MavType,
+    "type": MavType,
+    "autopilot": MavAutopilot,
+}
 _UNITS = {"_percent": " %", "_hz": " Hz", "_s": " s"}
 
 
@@ -27,6 +33,8 @@ def event_details(event: Event) -> str:
         elif isinstance(value, bool):
             label = name.removeprefix("is_").replace("_", " ")
             parts.append(label if value else f"not {label}")
+        elif name in _ENUMS and value in (known := _ENUMS[name]).__members__.values():
+            parts.append(known(value).name)
         elif name in _UNLABELLED:
             parts.append(format_value(value))
         else:

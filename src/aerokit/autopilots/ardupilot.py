@@ -174,6 +174,7 @@ class ArduPilot(Autopilot):
     home_is_item_0 = True
     runs_prearm_checks = True
     calibrates_compasses_by_command = True
+    calibration_protocol = "acknowledgements"
     parameter_interval_s: float | None = 0.02
     mission_storage = "ardupilot"
     mission_upload_window = 6

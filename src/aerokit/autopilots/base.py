@@ -385,6 +385,9 @@ class Autopilot:
         """Return False if this autopilot is known not to send the message."""
         return message.NAME not in self.unsupported_messages
 
+    calibration_protocol: str = ""
+    """How calibrations report: ``"acknowledgements"`` (ArduPilot), status ``"texts"`` (PX4), or ``""``: unknown."""
+
     unsupported_commands: frozenset[int] = frozenset()
     """MAV_CMDs without a handler in the firmware. Actions that need one raise NotSupported before anything is sent."""
     reports_gripper_by_text = False

@@ -104,6 +104,7 @@ class Px4(Autopilot):
     unknown_currents_ca: frozenset[int] = frozenset((-1, -100))  # inside PX4, −1 A means "unknown"
     reposition_purpose: Purpose = "hold"
     prearm_depends_on_mode = True
+    calibration_protocol = "texts"
     camera_by_trigger_only = True
     arming_mode: ClassVar[str | None] = "LOITER"
     # OFFBOARD needs set-points.

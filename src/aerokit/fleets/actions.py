@@ -20,6 +20,7 @@ from aerokit.vehicle.commanding.progress import ChangeSignal
 if TYPE_CHECKING:
     pass
 
+
 POLL_INTERVAL_S = 0.25
 
 

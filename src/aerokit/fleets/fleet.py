@@ -15,7 +15,8 @@ from aerokit.fleets.events import FleetEvent, MemberEvent, StateUpdate
 from aerokit.fleets.formation import Formations
 from aerokit.fleets.show_flight import Shows
 from aerokit.fleets.travel import Missions
-from aerokit.protocols.rtcm import fragments, rtcm_messages
+from aerokit.protocols.rtcm import rtcm_messages
+from aerokit.vehicle.rtk.output import output_of
 
 if TYPE_CHECKING:
     from aerokit.connection.bus import Detach, Sink
@@ -71,7 +72,6 @@ class Fleet(Selection):
 
     def __init__(self, context: FleetContext) -> None:
         super().__init__(context, None)
-        self._rtcm_sequence = 0
 
     def __contains__(self, name: object) -> bool:
         return name in self._context.members
@@ -107,26 +107,20 @@ class Fleet(Selection):
         """Send RTCM corrections (RTK, DGPS) as GPS_RTCM_DATA, once on each link.
 
         Args:
-            rtcm: one or more RTCM 3 messages, each of 720 bytes at most.
+            rtcm: one or more whole RTCM 3 messages, each of 720 bytes at most.
 
         Returns:
             The number of MAVLink messages sent on each link.
 
         Raises:
-            InvalidArgument: a message is longer, or ``rtcm`` is empty. Nothing was sent.
+            InvalidArgument: a message is incomplete, damaged or longer, or ``rtcm`` is empty. Nothing was sent.
             ConnectionClosed, LinkLost: a link has ended; the links before it got the corrections.
         """
-        pieces = [
-            piece
-            for number, message in enumerate(rtcm_messages(rtcm) if rtcm else [b""], self._rtcm_sequence)
-            for piece in fragments(message, number)
-        ]
-        self._rtcm_sequence += len({piece.flags >> 3 for piece in pieces})
+        messages, count = rtcm_messages(rtcm), 0
         connections = {id(connection): connection for connection in self._context.networks.values()}
         for connection in connections.values():
-            for piece in pieces:
-                connection.send(piece)
-        return len(pieces)
+            count = sum(output_of(connection).send(message, self) for message in messages)
+        return count
 
     # -------------------------------------------------------------------------------------- streams
 

@@ -25,7 +25,7 @@ from aerokit.fleets.separation import (
     separate_by_time,
 )
 from aerokit.missions.mission import Mission
-from aerokit.position import Position
+from aerokit.position import Home, Position, travel_target
 from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M
 
 SeparationMethod = Literal["layers", "corridors", "refuse"]
@@ -38,7 +38,7 @@ class Travel(SelectionBase):
 
     async def go_to(
         self,
-        targets: Mapping[str, Position] | Callable[[Member], Position],
+        targets: Mapping[str, Position | Home] | Callable[[Member], Position | Home],
         *,
         speed_m_s: float | None = None,
         max_distance_m: float = MAX_DISTANCE_M,
@@ -84,7 +84,7 @@ class Travel(SelectionBase):
 
     def plan_separation(
         self,
-        targets: Mapping[str, Position] | Callable[[Member], Position],
+        targets: Mapping[str, Position | Home] | Callable[[Member], Position | Home],
         *,
         min_distance_m: float | None = None,
         by: SeparationMethod = "layers",
@@ -150,7 +150,9 @@ class Travel(SelectionBase):
             return await self._fly_to(action, targets, speed_m_s, timeout, stagger_s, delays_s, (), max_distance_m)
         return await self._fly_in_layers(action, targets, speed_m_s, timeout, separation.heights_m, max_distance_m)
 
-    def _resolve_targets(self, targets: Mapping[str, Position] | Callable[[Member], Position]) -> dict[str, Position]:
+    def _resolve_targets(
+        self, targets: Mapping[str, Position | Home] | Callable[[Member], Position | Home]
+    ) -> dict[str, Position]:
         for member in self:
             member.refresh()
         if callable(targets):
@@ -158,7 +160,7 @@ class Travel(SelectionBase):
         for name in targets:
             if name not in self.members:
                 raise InvalidArgument(f"targets: {short_repr(name)} is not one of {', '.join(self.members)}")
-        return dict(targets)
+        return {name: travel_target(target) for name, target in targets.items()}
 
     def _routes(self, targets: Mapping[str, Position]) -> tuple[list[Route], dict[str, tuple[float, float, float]]]:
         """Return the routes of the moving members, and the known positions of all other members of the fleet."""
@@ -233,9 +235,9 @@ class Travel(SelectionBase):
         return result
 
 
-def _call(targets: Callable[[Member], Position], member: Member) -> Position:
+def _call(targets: Callable[[Member], Position | Home], member: Member) -> Position:
     try:
-        return targets(member)
+        return travel_target(targets(member))
     except ValueUnknownError as error:
         raise type(error)(f"{member.name}: {error}") from error
 

@@ -14,7 +14,7 @@ from aerokit.missions.item import action_item, in_range, place_item, whole_numbe
 
 if TYPE_CHECKING:
     from aerokit.missions.item import MissionItem
-    from aerokit.position import Position
+    from aerokit.position import Home, Position
 
 _MAX_DURATION_S = 86_400.0 * 365
 
@@ -244,7 +244,7 @@ def trigger_camera() -> MissionItem:
 
 @overload
 def region_of_interest(
-    position: Position,
+    position: Position | Home,
     /,
     *,
     altitude_relative_m: float | None = None,
@@ -261,7 +261,7 @@ def region_of_interest(
     altitude_terrain_m: float | None = None,
 ) -> MissionItem: ...
 def region_of_interest(
-    latitude_deg: Position | float,
+    latitude_deg: Position | Home | float,
     longitude_deg: float | None = None,
     *,
     altitude_relative_m: float | None = None,

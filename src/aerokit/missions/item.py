@@ -12,7 +12,7 @@ from aerokit._internal.geo import check_place
 from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavFrame
-from aerokit.position import Position
+from aerokit.position import Home, Position, travel_target
 
 DEFAULT_XY = 0x7FFFFFFF  # in x or y: "not given", as NaN is in the other parameters
 
@@ -243,7 +243,7 @@ Altitudes = tuple["float | None", "float | None", "float | None"]
 
 def place_item(
     command: int,
-    latitude_deg: Position | float | None,
+    latitude_deg: Position | Home | float | None,
     longitude_deg: float | None,
     altitudes: Altitudes,
     *parameters: float,
@@ -251,13 +251,13 @@ def place_item(
 ) -> MissionItem:
     """Create an item at a place. ``altitudes`` are relative to home, to mean sea level and to terrain; one is given.
 
-    A Position supplies latitude, longitude, and the altitude if none is given. If no place is given and none
-    ``is_needed``, the item has 0°, 0°, which ArduPilot understands as the current position.
+    A Position supplies latitude, longitude, and the altitude if none is given; Home supplies no altitude. If no place
+    is given and none ``is_needed``, the item has 0°, 0°, which ArduPilot understands as the current position.
     """
-    if isinstance(latitude_deg, Position):
+    if isinstance(latitude_deg, (Position, Home)):
         if longitude_deg is not None:
             raise InvalidArgument(f"longitude_deg = {longitude_deg!r} is not allowed together with a Position")
-        position = latitude_deg
+        position = travel_target(latitude_deg)
         latitude_deg, longitude_deg = position.latitude_deg, position.longitude_deg
         altitudes = _altitudes_of(position) if altitudes == (None, None, None) else altitudes
     z, frame = altitude_and_frame(*altitudes)

@@ -19,7 +19,7 @@ from aerokit.missions.item import action_item, heading, in_range, place_item
 
 if TYPE_CHECKING:
     from aerokit.missions.item import Altitudes, MissionItem
-    from aerokit.position import Position
+    from aerokit.position import Home, Position
 
 _MAX_DURATION_S = 65_535.0  # ArduPilot stores seconds in 16 bits
 _MAX_RADIUS_M = 65_535.0  # ArduPilot stores metres in 16 bits
@@ -27,7 +27,7 @@ _MAX_RADIUS_M = 65_535.0  # ArduPilot stores metres in 16 bits
 
 @overload
 def waypoint(
-    position: Position,
+    position: Position | Home,
     /,
     *,
     altitude_relative_m: float | None = None,
@@ -52,7 +52,7 @@ def waypoint(
     yaw_deg: float | None = None,
 ) -> MissionItem: ...
 def waypoint(
-    latitude_deg: Position | float,
+    latitude_deg: Position | Home | float,
     longitude_deg: float | None = None,
     *,
     altitude_relative_m: float | None = None,
@@ -84,7 +84,7 @@ def waypoint(
 
 @overload
 def spline_waypoint(
-    position: Position,
+    position: Position | Home,
     /,
     *,
     altitude_relative_m: float | None = None,
@@ -103,7 +103,7 @@ def spline_waypoint(
     hold_s: float = 0.0,
 ) -> MissionItem: ...
 def spline_waypoint(
-    latitude_deg: Position | float,
+    latitude_deg: Position | Home | float,
     longitude_deg: float | None = None,
     *,
     altitude_relative_m: float | None = None,
@@ -135,7 +135,7 @@ def take_off(
 ) -> MissionItem: ...
 @overload
 def take_off(
-    position: Position,
+    position: Position | Home,
     /,
     *,
     altitude_relative_m: float | None = None,
@@ -156,7 +156,7 @@ def take_off(
     yaw_deg: float | None = None,
 ) -> MissionItem: ...
 def take_off(
-    latitude_deg: Position | float | None = None,
+    latitude_deg: Position | Home | float | None = None,
     longitude_deg: float | None = None,
     *,
     altitude_relative_m: float | None = None,
@@ -189,7 +189,7 @@ def vtol_take_off(
 ) -> MissionItem: ...
 @overload
 def vtol_take_off(
-    position: Position,
+    position: Position | Home,
     /,
     *,
     altitude_relative_m: float | None = None,
@@ -208,7 +208,7 @@ def vtol_take_off(
     yaw_deg: float | None = None,
 ) -> MissionItem: ...
 def vtol_take_off(
-    latitude_deg: Position | float | None = None,
+    latitude_deg: Position | Home | float | None = None,
     longitude_deg: float | None = None,
     *,
     altitude_relative_m: float | None = None,
@@ -232,7 +232,7 @@ def vtol_take_off(
 
 @overload
 def land(
-    position: Position,
+    position: Position | Home,
     /,
     *,
     altitude_relative_m: float | None = None,
@@ -255,7 +255,7 @@ def land(
     yaw_deg: float | None = None,
 ) -> MissionItem: ...
 def land(
-    latitude_deg: Position | float | None = None,
+    latitude_deg: Position | Home | float | None = None,
     longitude_deg: float | None = None,
     *,
     altitude_relative_m: float | None = None,
@@ -286,7 +286,7 @@ def land(
 
 @overload
 def vtol_land(
-    position: Position,
+    position: Position | Home,
     /,
     *,
     altitude_relative_m: float | None = None,
@@ -305,7 +305,7 @@ def vtol_land(
     yaw_deg: float | None = None,
 ) -> MissionItem: ...
 def vtol_land(
-    latitude_deg: Position | float | None = None,
+    latitude_deg: Position | Home | float | None = None,
     longitude_deg: float | None = None,
     *,
     altitude_relative_m: float | None = None,
@@ -332,7 +332,7 @@ def vtol_land(
 
 @overload
 def loiter_unlimited(
-    position: Position,
+    position: Position | Home,
     /,
     *,
     altitude_relative_m: float | None = None,
@@ -353,7 +353,7 @@ def loiter_unlimited(
     yaw_deg: float | None = None,
 ) -> MissionItem: ...
 def loiter_unlimited(
-    latitude_deg: Position | float | None = None,
+    latitude_deg: Position | Home | float | None = None,
     longitude_deg: float | None = None,
     *,
     altitude_relative_m: float | None = None,
@@ -381,7 +381,7 @@ def loiter_unlimited(
 @overload
 def loiter_time(
     duration_s: float,
-    position: Position,
+    position: Position | Home,
     /,
     *,
     altitude_relative_m: float | None = None,
@@ -404,7 +404,7 @@ def loiter_time(
 ) -> MissionItem: ...
 def loiter_time(
     duration_s: float,
-    latitude_deg: Position | float | None = None,
+    latitude_deg: Position | Home | float | None = None,
     longitude_deg: float | None = None,
     *,
     altitude_relative_m: float | None = None,
@@ -433,7 +433,7 @@ def loiter_time(
 @overload
 def loiter_turns(
     turns: float,
-    position: Position,
+    position: Position | Home,
     /,
     *,
     altitude_relative_m: float | None = None,
@@ -456,7 +456,7 @@ def loiter_turns(
 ) -> MissionItem: ...
 def loiter_turns(
     turns: float,
-    latitude_deg: Position | float | None = None,
+    latitude_deg: Position | Home | float | None = None,
     longitude_deg: float | None = None,
     *,
     altitude_relative_m: float | None = None,
@@ -492,7 +492,7 @@ def loiter_to_altitude(
 ) -> MissionItem: ...
 @overload
 def loiter_to_altitude(
-    position: Position,
+    position: Position | Home,
     /,
     *,
     altitude_relative_m: float | None = None,
@@ -513,7 +513,7 @@ def loiter_to_altitude(
     leave_tangentially: bool = False,
 ) -> MissionItem: ...
 def loiter_to_altitude(
-    latitude_deg: Position | float | None = None,
+    latitude_deg: Position | Home | float | None = None,
     longitude_deg: float | None = None,
     *,
     altitude_relative_m: float | None = None,
@@ -546,7 +546,7 @@ def return_to_launch() -> MissionItem:
 
 @overload
 def rally_point(
-    position: Position,
+    position: Position | Home,
     /,
     *,
     altitude_relative_m: float | None = None,
@@ -563,7 +563,7 @@ def rally_point(
     altitude_terrain_m: float | None = None,
 ) -> MissionItem: ...
 def rally_point(
-    latitude_deg: Position | float,
+    latitude_deg: Position | Home | float,
     longitude_deg: float | None = None,
     *,
     altitude_relative_m: float | None = None,
@@ -581,8 +581,8 @@ def rally_point(
 
 
 def _up(
-    latitude_deg: Position | float | None, longitude_deg: float | None, altitudes: Altitudes
-) -> tuple[Position | float | None, float | None, Altitudes]:
+    latitude_deg: Position | Home | float | None, longitude_deg: float | None, altitudes: Altitudes
+) -> tuple[Position | Home | float | None, float | None, Altitudes]:
     # A number alone is an altitude above home.
     if isinstance(latitude_deg, (int, float)) and longitude_deg is None and altitudes == (None, None, None):
         return None, None, (latitude_deg, None, None)

@@ -21,6 +21,10 @@ from aerokit.position import Position
 
 if TYPE_CHECKING:
     import os
+    from collections.abc import Iterator
+
+_MAX_LISTED = 5
+"""Number of objects with missing fields that an error lists."""
 
 _NUMBERS = {
     "firmware_type": "firmwareType",
@@ -51,12 +55,15 @@ def write_plan_file(path: str | os.PathLike[str], plan: Plan) -> None:
 def parse_plan(text: str, name: str = "plan") -> Plan:
     """Parse the text of a file. Errors begin with ``name``."""
     document = load_json(text, name)
-    document["fileType"].one_of("Plan")
-    document["version"].one_of(1)
+    allowed = {"fileType": "Plan", "version": 1}
+    for key, value in allowed.items():  # First: another kind of file lacks most fields.
+        if _member(document.value, key) is not None:
+            document[key].one_of(value)
+    _check_required(document)
+    for key, value in allowed.items():
+        document[key].one_of(value)
     mission = document.child("mission")
     fence, rally = document.child("geoFence"), document.child("rallyPoints")
-    if mission is None and fence is None and rally is None:
-        document["mission"]
     return Plan(
         Mission() if mission is None else _read_mission(mission),
         Fence() if fence is None else _read_fence(fence),
@@ -104,6 +111,49 @@ def _document(plan: Plan) -> dict[str, Any]:
 
 
 # ------------------------------------------------------------------------------------------- reading
+
+
+def _check_required(document: JsonValue) -> None:
+    """Raise one error for all required fields that are missing. The functions that read them check the types."""
+    missing = [(path, absent) for path, absent in _missing_fields(document.value) if absent]
+    if not missing:
+        return
+    listed = [f"{path} has no {' and '.join(map(repr, absent))}" for path, absent in missing[:_MAX_LISTED]]
+    more = len(missing) - len(listed)
+    listed += [f"{more} more objects are incomplete"] if more else []
+    is_one = len(missing) == len(missing[0][1]) == 1
+    raise FileFormatError(f"{document.name}: {'; '.join(listed)}, which {'is' if is_one else 'are'} required")
+
+
+def _missing_fields(plan: Any) -> Iterator[tuple[str, list[str]]]:
+    """Yield each object of a plan with the names of the required fields that it lacks."""
+    mission, fence, rally = (_member(plan, key) for key in ("mission", "geoFence", "rallyPoints"))
+    is_empty = mission is None and fence is None and rally is None
+    yield _missing_in("the document", plan, "fileType", "version", *(("mission",) if is_empty else ()))
+    yield _missing_in("mission", mission, "version", "items")
+    for path, item in _entries("mission.items", _member(mission, "items")):
+        is_simple = _member(item, "type") == "SimpleItem"
+        simple = ("command", "frame", "params", "autoContinue") if is_simple else ()
+        yield _missing_in(path, item, "type", *simple)
+    yield _missing_in("geoFence", fence, "version")
+    for path, polygon in _entries("geoFence.polygons", _member(fence, "polygons")):
+        yield _missing_in(path, polygon, "polygon", "inclusion")
+    for path, circle in _entries("geoFence.circles", _member(fence, "circles")):
+        yield _missing_in(path, circle, "circle", "inclusion")
+        yield _missing_in(f"{path}.circle", _member(circle, "circle"), "center", "radius")
+    yield _missing_in("rallyPoints", rally, "version")
+
+
+def _member(value: Any, key: str) -> Any:
+    return value.get(key) if isinstance(value, dict) else None
+
+
+def _entries(path: str, value: Any) -> Iterator[tuple[str, Any]]:
+    return ((f"{path}[{number}]", entry) for number, entry in enumerate(value if isinstance(value, list) else ()))
+
+
+def _missing_in(path: str, value: Any, *keys: str) -> tuple[str, list[str]]:
+    return path, [key for key in keys if key not in value] if isinstance(value, dict) else []
 
 
 def _read_mission(value: JsonValue) -> Mission:

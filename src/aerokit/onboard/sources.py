@@ -165,17 +165,13 @@ class ComponentSources:
             rtcm: whole RTCM messages, of at most 720 bytes each.
 
         Raises:
-            InvalidArgument: a message is longer; nothing was sent.
+            InvalidArgument: a message is incomplete, damaged or longer; nothing was sent.
             ConnectionClosed, LinkLost: the connection has ended.
         """
-        pieces = [
-            piece
-            for number, message in enumerate(rtcm_messages(rtcm) if rtcm else [b""], self._rtcm_sequence)
-            for piece in fragments(message, number)
-        ]
-        for piece in pieces:
-            self._send(piece)
-        self._rtcm_sequence += 1 if not pieces else len({piece.flags >> 3 for piece in pieces})
+        for message in rtcm_messages(rtcm):
+            for piece in fragments(message, self._rtcm_sequence):
+                self._send(piece)
+            self._rtcm_sequence += 1
 
     def _send(self, message: m.ObstacleDistance | m.AdsbVehicle | m.LandingTarget | m.GpsRtcmData) -> None:
         self._host.connection.raise_if_ended()

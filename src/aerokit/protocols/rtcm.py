@@ -1,46 +1,129 @@
-"""RTCM 3 corrections as GPS_RTCM_DATA messages."""
+"""RTCM 3 messages (RTCM 10403): their frames with CRC-24Q, and their fragments in GPS_RTCM_DATA."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 from aerokit.errors import InvalidArgument
-from aerokit.mavlink.messages import GpsRtcmData
 
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from aerokit.mavlink.messages import GpsRtcmData
+
+__all__ = ["MAX_MESSAGE_SIZE", "RtcmReader", "crc24q", "fragments", "message_number", "rtcm_messages"]
+
+PREAMBLE, HEADER_SIZE, CRC_SIZE = 0xD3, 3, 3
 FRAGMENT_SIZE, MAX_FRAGMENTS = 180, 4
-
-# An RTCM 3 message: preamble, 6 reserved bits, 10 bits of length, payload, CRC of 3 bytes.
-RTCM_PREAMBLE, RTCM_OVERHEAD = 0xD3, 6
-
-
-def rtcm_messages(data: bytes) -> Iterator[bytes]:
-    """Split bytes into RTCM 3 messages. Bytes that are not RTCM 3 are returned unchanged."""
-    while data:
-        size = len(data)
-        if len(data) > 3 and data[0] == RTCM_PREAMBLE:
-            size = min(size, RTCM_OVERHEAD + ((data[1] & 0x03) << 8 | data[2]))
-        yield data[:size]
-        data = data[size:]
+MAX_MESSAGE_SIZE = FRAGMENT_SIZE * MAX_FRAGMENTS
+"""Bytes of the longest RTCM message that GPS_RTCM_DATA can carry; RTCM 3 itself allows 1029."""
 
 
-def fragments(data: bytes, sequence: int) -> list[GpsRtcmData]:
-    """Return one RTCM message as GPS_RTCM_DATA messages.
+def _crc_table() -> tuple[int, ...]:
+    table = []
+    for byte in range(256):
+        crc = byte << 16
+        for _ in range(8):
+            crc = crc << 1 ^ (0x1864CFB if crc & 0x800000 else 0)
+        table.append(crc)
+    return tuple(table)
+
+
+_TABLE = _crc_table()
+
+
+def crc24q(data: bytes) -> int:
+    """Return the CRC-24Q of RTCM 3; 0 for a whole frame with its CRC."""
+    crc = 0
+    for byte in data:
+        crc = (crc << 8 & 0xFFFFFF) ^ _TABLE[crc >> 16 ^ byte]
+    return crc
+
+
+def message_number(frame: bytes) -> int | None:
+    """Return the RTCM message number, e.g. 1005 or 1077; None for an empty message, which RTCM allows as a filler."""
+    return None if len(frame) < HEADER_SIZE + 2 + CRC_SIZE else frame[3] << 4 | frame[4] >> 4
+
+
+def _frame_size(data: bytes, begin: int) -> int | None:
+    """Return the size of the frame that begins here; None if no frame does. Needs three bytes."""
+    # The six bits before the length are reserved and zero.
+    if data[begin] != PREAMBLE or data[begin + 1] & 0xFC:
+        return None
+    return HEADER_SIZE + (data[begin + 1] << 8 | data[begin + 2]) + CRC_SIZE
+
+
+def rtcm_messages(data: bytes) -> list[bytes]:
+    """Split bytes that consist of whole RTCM 3 messages into the messages.
+
+    Raises:
+        InvalidArgument: ``data`` is empty, a message is incomplete, damaged, or longer than 720 bytes.
+    """
+    found: list[bytes] = []
+    begin = 0
+    while begin < len(data) or not found:
+        size = _frame_size(data, begin) if len(data) - begin > HEADER_SIZE else None
+        where = f"rtcm (byte {begin} of {len(data)})"
+        if size is None:
+            raise InvalidArgument(f"{where} is not allowed: whole RTCM 3 messages, which begin with 0xD3")
+        frame = data[begin : begin + size]
+        if len(frame) < size:
+            raise InvalidArgument(f"{where} is not allowed: the message has {size} bytes, {len(frame)} were given")
+        if crc24q(frame):
+            raise InvalidArgument(f"{where} is not allowed: the CRC-24Q of the message is wrong")
+        if size > MAX_MESSAGE_SIZE:
+            raise InvalidArgument(
+                f"{where} is not allowed: the message has {size} bytes, GPS_RTCM_DATA carries {MAX_MESSAGE_SIZE}"
+            )
+        found.append(frame)
+        begin += size
+    return found
+
+
+class RtcmReader:
+    """Finds RTCM 3 messages in a stream of bytes, which may arrive in any pieces and contain other bytes.
+
+    ``skipped_bytes`` counts bytes that belong to no message.
+    """
+
+    def __init__(self) -> None:
+        self._buffer = b""
+        self.skipped_bytes: int = 0
+
+    def feed(self, data: bytes) -> Iterator[bytes]:
+        """Take bytes, and yield the messages that are complete. At most one message (1029 bytes) is kept."""
+        buffer, begin = self._buffer + data, 0
+        while True:
+            start = buffer.find(PREAMBLE, begin)
+            self.skipped_bytes += (len(buffer) if start < 0 else start) - begin
+            begin = len(buffer) if start < 0 else start
+            if len(buffer) - begin < HEADER_SIZE:
+                break
+            size = _frame_size(buffer, begin)
+            if size is not None and len(buffer) - begin < size:
+                break
+            if size is None or crc24q(buffer[begin : begin + size]):
+                begin += 1
+                self.skipped_bytes += 1
+                continue
+            yield buffer[begin : begin + size]
+            begin += size
+        self._buffer = buffer[begin:]
+
+
+def fragments(message: bytes, sequence: int) -> list[GpsRtcmData]:
+    """Return one RTCM message of 1 to 720 bytes as GPS_RTCM_DATA messages.
 
     Flags: bit 0 is set for a fragment, bits 1 and 2 are the fragment number, bits 3 to 7 the sequence number. The
     receiver takes a message as complete after four fragments or after one that is not full. An empty fragment
     therefore follows a full last one.
-
-    Raises:
-        InvalidArgument: the message is empty, or longer than four fragments (720 bytes).
     """
-    if not 0 < len(data) <= FRAGMENT_SIZE * MAX_FRAGMENTS:
-        raise InvalidArgument(
-            f"rtcm: a message of {len(data)} bytes is not allowed: 1 to {FRAGMENT_SIZE * MAX_FRAGMENTS}"
-        )
+    from aerokit.mavlink.messages import GpsRtcmData
+
     flags = (sequence & 0x1F) << 3
-    if len(data) <= FRAGMENT_SIZE:
-        return [GpsRtcmData(flags, len(data), data.ljust(FRAGMENT_SIZE, b"\0"))]
-    pieces = [data[begin : begin + FRAGMENT_SIZE] for begin in range(0, len(data), FRAGMENT_SIZE)]
+    if len(message) <= FRAGMENT_SIZE:
+        return [GpsRtcmData(flags, len(message), message.ljust(FRAGMENT_SIZE, b"\0"))]
+    pieces = [message[begin : begin + FRAGMENT_SIZE] for begin in range(0, len(message), FRAGMENT_SIZE)]
     if len(pieces) < MAX_FRAGMENTS and len(pieces[-1]) == FRAGMENT_SIZE:
         pieces.append(b"")
     return [

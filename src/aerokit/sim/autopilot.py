@@ -14,6 +14,7 @@ from aerokit.mavlink.signing import LAST_TIMESTAMP, Signing, SigningKey, timesta
 from aerokit.protocols.servers.files import FileTree
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandHandler, CommandServer, ReceivedCommand
+from aerokit.sim.corrections import ReceivedCorrections
 from aerokit.sim.vehicle import AttachableComponent, SimulatedVehicle
 
 
@@ -130,6 +131,7 @@ class SimulatedAutopilot(SimulatedVehicle):
         self.unsupported_commands: frozenset[int] = frozenset(unsupported_commands)
         self._unix_time_at_start = unix_time_at_boot
         self.signing = self.make_signing(signing_key, timestamp_at(unix_time_at_boot))
+        self.corrections: ReceivedCorrections = ReceivedCorrections(self)
 
     def make_signing(self, key: SigningKey | None, timestamp: int) -> VehicleSigning:
         """Create the signing of this firmware, with a stored key and time stamp."""

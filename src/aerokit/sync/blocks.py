@@ -14,6 +14,7 @@ from aerokit.vehicle.connect import warn_if_left_flying
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterator
     from contextlib import AbstractAsyncContextManager, AbstractContextManager
+    from typing import TypeAlias
 
     from typing_extensions import Self
 
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
     from aerokit.connection.connection import Connection
     from aerokit.events import VehicleFound
     from aerokit.fleets.formation import Following
+    from aerokit.vehicle.calibration.calibration import Calibration  # noqa: F401
+    from aerokit.vehicle.calibration.values import CalibrationStep
     from aerokit.vehicle.camera.capture import Capture
     from aerokit.vehicle.camera.link import CameraBlock
     from aerokit.vehicle.camera.photos import PhotoInterval
@@ -33,7 +36,20 @@ if TYPE_CHECKING:
     from aerokit.vehicle.gimbal.rates import GimbalRates
     from aerokit.vehicle.parameters.transaction import TemporaryParameters, Transaction
     from aerokit.vehicle.parameters.writing import ParameterWrite
+    from aerokit.vehicle.rtk.ntrip import NtripClient
     from aerokit.vehicle.vehicle import Vehicle
+
+    Block: TypeAlias = (
+        CameraBlock
+        | Following
+        | GimbalControl
+        | GimbalRates
+        | LogStream
+        | NtripClient
+        | PhotoInterval
+        | SetpointStream[Any]
+        | Shell
+    )
 
 
 class BlockingContext:
@@ -80,11 +96,7 @@ T = TypeVar("T")
 
 EnteredT = TypeVar("EnteredT")
 
-BlockT = TypeVar(
-    "BlockT",
-    bound="CameraBlock | Following | GimbalControl | GimbalRates | LogStream | PhotoInterval | SetpointStream[Any]"
-    " | Shell",
-)
+BlockT = TypeVar("BlockT", bound="Block")
 
 ShieldedT = TypeVar("ShieldedT", bound="TemporaryParameters | Transaction")
 
@@ -215,6 +227,16 @@ class GimbalsTwin(TwinOf["Gimbals"], Generic[T]):
 
     def __len__(self) -> int:
         return len(self.ids)
+
+
+class CalibrationTwin(TwinOf["Calibration"]):
+    """Iterator over the steps of a calibration. Leaving the loop cancels it on the vehicle."""
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> CalibrationStep:
+        return _next_of(self._loop, self.aio)
 
 
 class PhotoIntervalTwin(BlockTwin["PhotoInterval"]):

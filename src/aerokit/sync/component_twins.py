@@ -297,7 +297,7 @@ class ComponentSources(TwinOf["AsyncComponentSources"]):
             rtcm: whole RTCM messages, of at most 720 bytes each.
 
         Raises:
-            InvalidArgument: a message is longer; nothing was sent.
+            InvalidArgument: a message is incomplete, damaged or longer; nothing was sent.
             ConnectionClosed, LinkLost: the connection has ended.
         """
         self._loop.call(self.aio.send_corrections, rtcm)

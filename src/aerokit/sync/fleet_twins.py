@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from aerokit.fleets.travel import SeparationMethod
     from aerokit.mavlink.message import Message
     from aerokit.missions.mission import Mission
-    from aerokit.position import Position
+    from aerokit.position import Home, Position
     from aerokit.transport.link import Link
 
 __all__ = [
@@ -99,7 +99,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
 
     def go_to(
         self,
-        targets: Mapping[str, Position] | Callable[[Member], Position],
+        targets: Mapping[str, Position | Home] | Callable[[Member], Position | Home],
         *,
         speed_m_s: float | None = None,
         max_distance_m: float = MAX_DISTANCE_M,
@@ -138,7 +138,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
 
     def plan_separation(
         self,
-        targets: Mapping[str, Position] | Callable[[Member], Position],
+        targets: Mapping[str, Position | Home] | Callable[[Member], Position | Home],
         *,
         min_distance_m: float | None = None,
         by: SeparationMethod = "layers",
@@ -531,13 +531,13 @@ class Fleet(FleetTwin, Selection):
         """Send RTCM corrections (RTK, DGPS) as GPS_RTCM_DATA, once on each link.
 
         Args:
-            rtcm: one or more RTCM 3 messages, each of 720 bytes at most.
+            rtcm: one or more whole RTCM 3 messages, each of 720 bytes at most.
 
         Returns:
             The number of MAVLink messages sent on each link.
 
         Raises:
-            InvalidArgument: a message is longer, or ``rtcm`` is empty. Nothing was sent.
+            InvalidArgument: a message is incomplete, damaged or longer, or ``rtcm`` is empty. Nothing was sent.
             ConnectionClosed, LinkLost: a link has ended; the links before it got the corrections.
         """
         return self._loop.call(self.aio.send_corrections, rtcm)

@@ -93,9 +93,13 @@ TWINS = (
     Twin("aerokit.vehicle.parameters.transaction.TemporaryParameters", "TemporarilyTwin"),
     Twin("aerokit.vehicle.parameters.transaction.Transaction", "TransactionTwin"),
     Twin("aerokit.vehicle.parameters.parameters.Parameters", direct=_names("load_metadata known")),
+    Twin("aerokit.vehicle.calibration.calibration.Calibration", "CalibrationTwin"),
+    Twin("aerokit.vehicle.calibration.calibration.CalibrationControl"),
     Twin("aerokit.vehicle.missions.mission.MissionControl"),
     Twin("aerokit.vehicle.missions.plans.FenceControl"),
     Twin("aerokit.vehicle.missions.plans.RallyControl"),
+    Twin("aerokit.vehicle.rtk.ntrip.NtripClient", "BlockTwin"),
+    Twin("aerokit.vehicle.rtk.rtk.Rtk"),
     Twin("aerokit.vehicle.camera.link.CameraBlock", "BlockTwin"),
     Twin("aerokit.vehicle.camera.photos.PhotoInterval", "PhotoIntervalTwin"),
     Twin("aerokit.vehicle.camera.cameras.Camera"),
@@ -107,7 +111,8 @@ TWINS = (
         without=_names("telemetry"),
         direct=_names("distance_to describe_now"),
         parts=_names(
-            "actuators camera cameras components guided gimbal gimbals files logs parameters mission fence rally"
+            "actuators calibrate camera cameras components guided gimbal gimbals files logs parameters mission fence"
+            " rally rtk"
         ),
     ),
     Twin(

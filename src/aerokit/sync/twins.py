@@ -20,6 +20,7 @@ from aerokit.mavlink.enums import MavComponent
 from aerokit.protocols.exchange import IDLE_TIMEOUT_S
 from aerokit.sync.blocks import (
     BlockTwin,
+    CalibrationTwin,
     CellTwin,
     ChangesTwin,
     ConnectionTwin,
@@ -69,10 +70,12 @@ if TYPE_CHECKING:
         Setting,
         SettingValue,
     )
-    from aerokit.position import Position
+    from aerokit.position import Home, Position
     from aerokit.protocols.exchange import OnProgress
     from aerokit.transport.link import Link
     from aerokit.transport.sockets import PeerFilter
+    from aerokit.vehicle.calibration.calibration import CalibrationControl as AsyncCalibrationControl
+    from aerokit.vehicle.calibration.calibration import EscIntent
     from aerokit.vehicle.camera.cameras import Camera as AsyncCamera
     from aerokit.vehicle.camera.capture import Capture
     from aerokit.vehicle.camera.controls import AutoFocus
@@ -117,6 +120,9 @@ if TYPE_CHECKING:
     from aerokit.vehicle.parameters.parameters import Parameters as AsyncParameters
     from aerokit.vehicle.parameters.parameters import ParameterSource
     from aerokit.vehicle.parameters.writing import ParameterWrite
+    from aerokit.vehicle.rtk.ntrip import NtripClient as AsyncNtripClient
+    from aerokit.vehicle.rtk.rtk import Corrections
+    from aerokit.vehicle.rtk.rtk import Rtk as AsyncRtk
     from aerokit.vehicle.state.condition import EstimatorHealth, MissionProgress, SensorHealth, StatusText, SystemTime
     from aerokit.vehicle.state.equipment import (
         Battery,
@@ -138,10 +144,12 @@ if TYPE_CHECKING:
         RawImu,
         WinchStatus,
     )
-    from aerokit.vehicle.state.movement import Attitude, Home, LocalPosition, Velocity, Wind
+    from aerokit.vehicle.state.movement import Attitude, LocalPosition, Velocity, Wind
 
 __all__ = [
     "Actuators",
+    "Calibration",
+    "CalibrationControl",
     "Camera",
     "CameraBlock",
     "Changes",
@@ -158,10 +166,12 @@ __all__ = [
     "LogStream",
     "Logs",
     "MissionControl",
+    "NtripClient",
     "Parameters",
     "PhotoInterval",
     "PostedOrder",
     "RallyControl",
+    "Rtk",
     "SetpointStream",
     "Settings",
     "Shell",
@@ -680,7 +690,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
 
     def look_at(
         self,
-        target: Position,
+        target: Position | Home,
         *,
         wait: bool = True,
         tolerance_deg: float = 5.0,
@@ -2001,6 +2011,97 @@ class Parameters(TwinOf["AsyncParameters"]):
         )
 
 
+class Calibration(CalibrationTwin):
+    """The steps of a calibration: iterate with ``async for``. The last step has the ``result``.
+
+    The calibration starts with the first step. Leaving the loop, in any way, cancels it on the vehicle, as does the end
+    of the vehicle's block. ArduPilot cannot cancel ``accelerometer``; a warning says so. Others that no vehicle cancels
+    (level, barometer, ArduPilot's gyroscope and airspeed, PX4's ESCs) end in seconds.
+
+    Iterating raises:
+        OperationRejected: the calibration failed, or was cancelled by another party, with the vehicle's texts as
+            reasons; or the vehicle is armed, or not known to be disarmed.
+        NotSupported: the vehicle has no such sensor or calibration. Nothing was sent.
+        CommandRejected: the vehicle refused to start.
+        CommandTimeout: the vehicle did not answer.
+        OperationTimeout: the vehicle reported nothing for two minutes, or its result was lost.
+        HeartbeatTimeout: the vehicle was silent for 10 s.
+        BusyError: another calibration of this vehicle is in progress. Nothing was sent.
+        ConnectionClosed, LinkLost: the connection has ended.
+    """
+
+    def cancel(self) -> None:
+        """Cancel the calibration; returns when the vehicle has confirmed it.
+
+        Does nothing if the calibration has not started or has ended.
+
+        Raises:
+            NotSupported: the vehicle cannot cancel it.
+            OperationTimeout: the vehicle did not confirm it.
+        """
+        self._loop.run(self.aio.cancel)
+
+
+class CalibrationControl(TwinOf["AsyncCalibrationControl"]):
+    """Calibrates the vehicle's sensors: ``async for step in vehicle.calibrate.compass(): …``.
+
+    Each method returns the steps. Print ``step.instruction``, show ``step.pose``; where ``step.needs_confirmation`` is
+    true, the calibration waits until the loop continues. See docs/how-to/calibration.md. Only one calibration runs at a
+    time, on a disarmed vehicle.
+    """
+
+    def compass(self) -> Calibration:
+        """Calibrate all compasses, while the vehicle is turned about all axes.
+
+        ArduPilot reports progress and fitness of each compass, and must reboot afterwards. PX4 wants up to six poses,
+        turned about the vertical in each.
+        """
+        return Calibration(self._loop, self._loop.call(self.aio.compass))
+
+    def accelerometer(self) -> Calibration:
+        """Calibrate the accelerometers in six poses.
+
+        ArduPilot waits for a confirmation in each pose, and must reboot afterwards. PX4 detects poses, in any order.
+        """
+        return Calibration(self._loop, self._loop.call(self.aio.accelerometer))
+
+    def gyroscope(self) -> Calibration:
+        """Calibrate the gyroscopes, while the vehicle stands still."""
+        return Calibration(self._loop, self._loop.call(self.aio.gyroscope))
+
+    def level(self) -> Calibration:
+        """Calibrate which attitude is level, while the vehicle stands level and still."""
+        return Calibration(self._loop, self._loop.call(self.aio.level))
+
+    def barometer(self) -> Calibration:
+        """Calibrate the barometer: ArduPilot by the present pressure, PX4 by the altitude of the GPS."""
+        return Calibration(self._loop, self._loop.call(self.aio.barometer))
+
+    def airspeed(self) -> Calibration:
+        """Calibrate the airspeed sensors: sheltered from wind first; on PX4, blow into the front afterwards."""
+        return Calibration(self._loop, self._loop.call(self.aio.airspeed))
+
+    def radio(self) -> Calibration:
+        """Calibrate the remote control: writes RCn_MIN, RCn_MAX and RCn_TRIM of each channel that was moved.
+
+        Both confirmations are needed: when all sticks and switches were at their ends, and when the sticks are centred.
+        """
+        return Calibration(self._loop, self._loop.call(self.aio.radio))
+
+    def escs(self, *, intent: EscIntent) -> Calibration:
+        """Calibrate the ESCs. **Remove the propellers**, because the motors get full throttle.
+
+        PX4 does it at once, while you connect the battery. ArduCopter does it at the next boot: the last step says so.
+
+        Args:
+            intent: ``"propellers are removed"``.
+
+        Raises:
+            InvalidArgument: the intent is another text. Nothing was sent.
+        """
+        return Calibration(self._loop, self._loop.call(self.aio.escs, intent=intent))
+
+
 class MissionControl(TwinOf["AsyncMissionControl"]):
     """The mission of a vehicle: ``await vehicle.mission.upload(mission)``, ``start()``, ``wait_finished()``.
 
@@ -2393,6 +2494,87 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
             OperationTimeout: not done within ``timeout``.
         """
         self._loop.run(self.aio.clear, idle_timeout_s=idle_timeout_s, timeout=timeout)
+
+
+class NtripClient(BlockTwin["AsyncNtripClient"]):
+    """Fetches corrections from an NTRIP caster while its ``async with`` block runs, and sends them to the vehicle.
+
+    Entering returns when the caster has accepted the request. A connection that ends, or is silent for 30 s, is opened
+    again, after 1 to 30 s, as often as necessary; the logger ``aerokit`` reports it. Messages that GPS_RTCM_DATA cannot
+    carry (above 720 bytes) are left out. Leaving the block closes the connection.
+
+    Entering raises:
+        OperationRejected: the caster refused: user or password, or no such mount point (the text lists others).
+        LinkOpenError: the caster could not be reached.
+        OperationTimeout: the caster did not answer in time.
+        BusyError: the client was entered before.
+    """
+
+    @property
+    def is_connected(self) -> bool:
+        """True while the caster's connection is open."""
+        return self.aio.is_connected
+
+    @property
+    def problem(self) -> str:
+        """Why the caster is not connected now; empty while it is."""
+        return self.aio.problem
+
+    @property
+    def reconnects(self) -> int:
+        """How often the connection was opened again."""
+        return self.aio.reconnects
+
+    @property
+    def oversized(self) -> int:
+        """Number of messages that were left out because they have more than 720 bytes."""
+        return self.aio.oversized
+
+
+class Rtk(TwinOf["AsyncRtk"]):
+    """RTCM corrections for the vehicle's satellite receivers (GPS_RTCM_DATA).
+
+    ``vehicle.gps`` reports the effect: fix types 5 (RTK float) and 6 (RTK fixed).
+    """
+
+    @cached_property
+    def corrections(self) -> StateCell[Corrections]:
+        """Number, bytes and bandwidth of the corrections; its age is that of the last one."""
+        return StateCell(self._loop, self.aio.corrections)
+
+    def send(self, rtcm: bytes) -> None:
+        """Send RTCM 3 messages to the vehicle; never blocks.
+
+        Each message is split as GPS_RTCM_DATA requires. That message has no target, so it is sent once on each link,
+        even if several vehicles of the connection send the same message within 0.9 s. There is no acknowledgement:
+        ``vehicle.gps`` shows whether the receiver uses the corrections.
+
+        Args:
+            rtcm: one or more whole messages, each of 720 bytes at most.
+
+        Raises:
+            InvalidArgument: ``rtcm`` is empty, or a message is incomplete, damaged or longer. Nothing was sent.
+            ConnectionClosed, LinkLost: the connection has ended, or the block of this vehicle was left.
+        """
+        self._loop.call(self.aio.send, rtcm)
+
+    def ntrip(self, url: str, *, send_position: bool | None = None, timeout: float = 10.0) -> NtripClient:
+        """Fetch corrections from an NTRIP caster while the ``async with`` block runs, and send them to the vehicle.
+
+        Args:
+            url: ``"ntrip://user:password@host:2101/MOUNT"``; ``ntrips://`` for TLS. Characters such as ``@`` in the
+                password are written as ``%40``. The password appears in no log, error or repr.
+            send_position: send the vehicle's position to the caster (GGA, every 10 s), which a virtual reference
+                station needs. None: if the caster's source table asks for it.
+            timeout: seconds to wait for the caster's answer.
+
+        Raises:
+            InvalidArgument: the URL is invalid. Nothing was opened.
+        """
+        return NtripClient(
+            self._loop,
+            self._loop.call(self.aio.ntrip, url, send_position=send_position, timeout=timeout),
+        )
 
 
 class CameraBlock(BlockTwin["AsyncCameraBlock"]):
@@ -3864,7 +4046,7 @@ class Vehicle(VehicleTwin):
         """
         self._loop.run(self.aio.reboot, force=force, timeout=timeout)
 
-    def look_at(self, target: Position) -> None:
+    def look_at(self, target: Position | Home) -> None:
         """Point nose or gimbal at a place until :meth:`stop_looking`; without an altitude, at the vehicle's altitude.
 
         Sends MAV_CMD_DO_SET_ROI_LOCATION (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_ROI_LOCATION), or
@@ -3890,7 +4072,7 @@ class Vehicle(VehicleTwin):
 
     def go_to(
         self,
-        target: Position,
+        target: Position | Home,
         *,
         speed_m_s: float | None = None,
         heading_deg: float | None = None,
@@ -3909,7 +4091,7 @@ class Vehicle(VehicleTwin):
 
         Args:
             target: latitude and longitude, and an altitude above home or above mean sea level; without an altitude
-                the present one is kept.
+                the present one is kept, also for ``vehicle.home.value``.
             speed_m_s: ground speed from now on, above 0; None keeps the present one.
             heading_deg: heading on arrival, 0–360 clockwise from north; None leaves it to the autopilot.
             tolerance_m: arrival radius in metres; None: the default of the type of vehicle.
@@ -3990,7 +4172,7 @@ class Vehicle(VehicleTwin):
             max_silence_s=max_silence_s,
         )
 
-    def set_home(self, place: Position | None = None, *, timeout: float = 5.0) -> None:
+    def set_home(self, place: Position | Home | None = None, *, timeout: float = 5.0) -> None:
         """Move the home position, to a place or to the vehicle's present position, and wait until HOME_POSITION
         reports it.
 
@@ -4009,7 +4191,7 @@ class Vehicle(VehicleTwin):
         """
         self._loop.run(self.aio.set_home, place, timeout=timeout)
 
-    def distance_to(self, target: Position) -> float:
+    def distance_to(self, target: Position | Home) -> float:
         """Return the distance to ``target`` in metres, three-dimensional if ``target`` has an altitude.
 
         Infinite while the position is unknown.
@@ -4162,13 +4344,22 @@ class Vehicle(VehicleTwin):
         """The vehicle's rally points."""
         return self._part("rally", RallyControl)
 
+    @property
+    def calibrate(self) -> CalibrationControl:
+        """CalibrationControl of sensors, radio and ESCs, step by step."""
+        return self._part("calibrate", CalibrationControl)
+
+    @property
+    def rtk(self) -> Rtk:
+        """RTCM corrections for the satellite receivers, from your program or from an NTRIP caster."""
+        return self._part("rtk", Rtk)
+
     def setup_signing(self, signing: Signing | None, *, timeout: float = 5.0) -> None:
         """Install a signing key on the vehicle and sign all traffic with it from then on; None removes the key.
 
-        **The key is sent unencrypted**: do this over a cable or a private link. Returns when the vehicle's frames
-        active. Every other vehicle on this connection needs the key too, or ``signing.allow_unsigned``. The vehicle may
-        accept the key even if the call is cancelled. See docs/signing.md.
-        cancellation the vehicle may have accepted the key nevertheless. See docs/signing.md.
+        **The key is sent unencrypted**: do this over a cable or a private link. Returns when the vehicle's frames are
+        signed with the key. Every other vehicle on this connection needs the key too, or ``signing.allow_unsigned``.
+        After a cancellation the vehicle may have accepted the key nevertheless. See docs/signing.md.
 
         Args:
             signing: the key, as for ``connect(signing=…)``.

@@ -25,6 +25,9 @@ class FaultInjector:
     Raises InvalidArgument for times and shares out of range.
     """
 
+    # An attribute of `Faults`, set here by mistake, raises AttributeError.
+    __slots__ = ("_schedule_with", "_vehicle")
+
     def __init__(self, vehicle: Any, schedule_with: ScheduleWith) -> None:
         self._vehicle = vehicle
         self._schedule_with = schedule_with

@@ -19,6 +19,7 @@ from aerokit.vehicle.state.field import MESSAGE_IDS
 if TYPE_CHECKING:
     from aerokit.connection.cells import StateCell
     from aerokit.mavlink.signing import Signing
+    from aerokit.vehicle.calibration.calibration import CalibrationControl
     from aerokit.vehicle.camera.cameras import Camera, Cameras
     from aerokit.vehicle.commanding.context import VehicleContext
     from aerokit.vehicle.commanding.guided import Guided
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.missions.mission import MissionControl
     from aerokit.vehicle.missions.plans import FenceControl, RallyControl
     from aerokit.vehicle.parameters.parameters import Parameters
+    from aerokit.vehicle.rtk.rtk import Rtk
 
 __all__ = ["Vehicle", "overview"]
 
@@ -192,16 +194,29 @@ class Vehicle(
 
         return RallyControl(self._plans)
 
+    @cached_property
+    def calibrate(self) -> CalibrationControl:
+        """CalibrationControl of sensors, radio and ESCs, step by step."""
+        from aerokit.vehicle.calibration.calibration import CalibrationControl
+
+        return CalibrationControl(self._context, lambda: self.parameters)
+
+    @cached_property
+    def rtk(self) -> Rtk:
+        """RTCM corrections for the satellite receivers, from your program or from an NTRIP caster."""
+        from aerokit.vehicle.rtk.rtk import Rtk
+
+        return Rtk(self._context)
+
     def __repr__(self) -> str:
         return f"<Vehicle {self.system_id}/{self.component_id} {self.autopilot.firmware}, {self.describe_link()}>"
 
     async def setup_signing(self, signing: Signing | None, *, timeout: float = 5.0) -> None:
         """Install a signing key on the vehicle and sign all traffic with it from then on; None removes the key.
 
-        **The key is sent unencrypted**: do this over a cable or a private link. Returns when the vehicle's frames
-        active. Every other vehicle on this connection needs the key too, or ``signing.allow_unsigned``. The vehicle may
-        accept the key even if the call is cancelled. See docs/signing.md.
-        cancellation the vehicle may have accepted the key nevertheless. See docs/signing.md.
+        **The key is sent unencrypted**: do this over a cable or a private link. Returns when the vehicle's frames are
+        signed with the key. Every other vehicle on this connection needs the key too, or ``signing.allow_unsigned``.
+        After a cancellation the vehicle may have accepted the key nevertheless. See docs/signing.md.
 
         Args:
             signing: the key, as for ``connect(signing=…)``.

@@ -25,6 +25,7 @@ CHANGING = (
     ("logs", "erase", "--yes"),
     ("gimbal", "neutral"),
     ("camera", "photo"),
+    ("calibrate", "gyroscope"),
     ("fly", "square.waypoints", "--yes"),
     ("demo",),
 )

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import asyncio
+import dataclasses
 import os
+import re
 import sys
 from pathlib import Path
 
+import anyio
 import pytest
 from recorded import SHORT
 
 from aerokit.apps.cli import main
-from aerokit.apps.cli.arguments import DEFAULT_SIM_ADDRESS, expand_address, is_address_template
+from aerokit.apps.cli.arguments import DEFAULT_SIM_ADDRESS, FAULTS, expand_address, fault, is_address_template
 from aerokit.apps.cli.main import make_parser
-from aerokit.apps.cli.sim import _client_address, simulated_fleet
+from aerokit.apps.cli.sim import _client_address, _inject, simulated_fleet
 from aerokit.sim import HOME, SimulatedCopter, SimulatedPx4
+from aerokit.sim.faults import Faults
+from aerokit.testing import run_virtual
 from aerokit.testing.track import true_point
 
 # ---------------------------------------------------------------------------------------- addresses
@@ -144,3 +150,60 @@ def test_sim_serves_recording(capsys: pytest.CaptureFixture[str]) -> None:
     assert "system 1 on udpout:" in capsys.readouterr().out
     assert main(["sim", *arguments, "--count", "2"]) == 2
     assert main(["sim", *arguments, "--picture", "track.svg"]) == 2
+
+
+# ------------------------------------------------------------------------------------------- faults
+
+
+@pytest.mark.parametrize(
+    ("text", "parsed"),
+    [
+        ("motor_failed@20", ("motor_failed", True, 20.0)),
+        ("gps_lost", ("gps_lost", True, 0.0)),
+        ("loss=0.2@5", ("loss", 0.2, 5.0)),
+        ("prearm_failures=Compass not healthy", ("prearm_failures", ["Compass not healthy"], 0.0)),
+    ],
+)
+def test_sim_fault_is_parsed_with_value_and_time(text: str, parsed: object) -> None:
+    assert fault(text) == parsed
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("motor_faild", r"not a fault \(did you mean 'motor_failed'\?\); faults: gps_lost, rc_lost, .*prearm_failures"),
+        ("motor_failed=1", "motor_failed takes no value"),
+        ("loss", "not a number from 0 to 1"),
+        ("prearm_failures", "needs a reason"),
+        ("gps_lost@soon", "'soon' is not a number"),
+    ],
+)
+def test_sim_wrong_fault_error_says_what_is_allowed(
+    text: str, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        main(["sim", "--fault", text])
+    assert re.search(message, capsys.readouterr().err)
+
+
+def test_sim_fault_begins_at_its_simulated_time() -> None:
+    options = make_parser("sim").parse_args(
+        ["sim", "--fault", "gps_lost@20", "--fault", "prearm_failures=No compass", "--speedup", "2"]
+    )
+    copters = [SimulatedCopter(), SimulatedCopter()]
+
+    async def inject() -> list[bool]:
+        task = asyncio.create_task(_inject(copters, options))
+        await anyio.sleep(9.9)
+        early = any(copter.faults.gps_lost for copter in copters)
+        await task
+        return [early, *(copter.faults.gps_lost for copter in copters)]
+
+    assert run_virtual(inject()) == [False, True, True]
+    assert [copter.faults.prearm_failures for copter in copters] == [["No compass"]] * 2
+
+
+def test_sim_faults_are_fields_and_documented() -> None:
+    assert set(FAULTS) <= {field.name for field in dataclasses.fields(Faults)}
+    document = (Path(__file__).parents[3] / "docs" / "simulator.md").read_text(encoding="utf-8")
+    assert re.findall(r"^\| `(\w+)` \|", document.partition("## Faults")[2].partition("\n## ")[0], re.M) == list(FAULTS)

@@ -236,8 +236,36 @@ def test_fly_ctrl_c_before_arming_leaves_vehicle_disarmed(capsys: pytest.Capture
         ctrl_c()
 
     assert fly_with(copter, interrupt) == 130
-    assert "interrupted, in STABILIZE, disarmed" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "interrupted, in STABILIZE, disarmed" in out
+    assert out.endswith("\ninterrupted; the plan is on the vehicle, nothing was armed\n")
     assert not copter.is_armed
+
+
+def test_fly_ctrl_c_at_question_does_not_arm(
+    copter: SimulatedCopter, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    async def confirm(_: str) -> bool:
+        ctrl_c()
+        await anyio.sleep(60)
+        return True
+
+    monkeypatch.setattr(flown_plan, "confirm", confirm)
+    monkeypatch.setattr(fly, "is_interactive", lambda: True)
+    assert run_with(copter, ("fly", "m.waypoints")) == [130]
+    assert capsys.readouterr().out.endswith("\ninterrupted; the plan is on the vehicle, nothing was armed\n")
+    assert not copter.is_armed
+
+
+def test_fly_ctrl_c_before_connection_sends_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    async def scenario() -> int:
+        flight = asyncio.create_task(run_on(memory_link_pair()[0], *FLY))
+        await anyio.sleep(3)
+        ctrl_c()
+        return await flight
+
+    assert run_virtual(scenario()) == 130
+    assert capsys.readouterr().out.endswith("\ninterrupted; nothing was sent\n")
 
 
 def test_fly_mode_change_by_pilot_ends_flight(copter: SimulatedCopter, capsys: pytest.CaptureFixture[str]) -> None:

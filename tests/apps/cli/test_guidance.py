@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import select
 import shutil
 import subprocess
 import sys
 import time
+import warnings
 from collections import Counter
 from pathlib import Path
 
@@ -17,8 +19,9 @@ from cli_harness import HOME, MISSION, run_on, run_with
 from aerokit import messages as m
 from aerokit.apps.cli import main
 from aerokit.apps.cli.main import COMMANDS, GROUPS, RUN
-from aerokit.apps.cli.output import near_names, suggestion
+from aerokit.apps.cli.output import near_names, plain_warnings, suggestion
 from aerokit.mavlink.tlog import read_tlog
+from aerokit.parameters.renames import ParameterRenamedWarning
 from aerokit.sim import SimulatedCamera, SimulatedCopter, SimulatedGimbal
 from aerokit.testing import run_virtual
 
@@ -257,3 +260,43 @@ def test_completion_in_zsh_completes_line(shell_environment: dict[str, str], tmp
         process.wait()
         os.close(ours)
         os.close(theirs)
+
+
+# ------------------------------------------------------------------------------------------- warnings
+
+
+def test_library_warning_is_printed_as_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    shown: list[object] = []
+    with warnings.catch_warnings():
+        warnings.showwarning = lambda message, *_: shown.append(message)
+        with plain_warnings():
+            warnings.showwarning("RTL_ALT_M is still called RTL_ALT", ParameterRenamedWarning, "params.py", 1)
+            warnings.showwarning("another library's", UserWarning, "other.py", 1)
+    assert capsys.readouterr().err == "aerokit: RTL_ALT_M is still called RTL_ALT\n"
+    assert shown == ["another library's"]
+
+
+def test_blocked_loop_is_reported_as_busy_computer(caplog: pytest.LogCaptureFixture) -> None:
+    with plain_warnings():
+        logging.getLogger("aerokit").warning("the event loop was blocked for %.1f s: ...; %s", 2.5, "use asyncio.sleep")
+        logging.getLogger("aerokit").warning("link lost")
+    assert caplog.messages == [
+        "this computer was busy for 2.5 s: no messages or heartbeats were processed",
+        "link lost",
+    ]
+
+
+# ---------------------------------------------------------------------------------------- parameters
+
+
+def test_params_list_takes_part_of_name(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_with(SimulatedCopter(boot_time_s=0.0), ["params", "list", "rtl_s"]) == [0]
+    names = [line.split()[0] for line in capsys.readouterr().out.splitlines()]
+    assert "RTL_SPEED" in names
+    assert all("RTL_S" in name for name in names)
+
+
+def test_params_set_without_equals_sign_error_says_how(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["params", "set", "RTL_ALT", "2000"])
+    assert "'RTL_ALT' has no value: write NAME=VALUE without spaces" in capsys.readouterr().err

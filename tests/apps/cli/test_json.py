@@ -17,6 +17,7 @@ from aerokit.sim import SimulatedCamera, SimulatedCopter, SimulatedGimbal
 SEEN: set[str] = set()
 TESTED_ELSEWHERE = {
     "conversion",
+    "report",
     "serving",
     "bridging",
     "publishing",
@@ -26,7 +27,7 @@ TESTED_ELSEWHERE = {
     "endpoint",
 }
 """Records of commands that need an extra, a browser or a viewer."""
-RARE = {"missed", "gimbal_silent", "interrupted"}
+RARE = {"missed", "gimbal_silent", "interrupted", "calibration_cancelled"}
 
 
 @pytest.fixture(autouse=True)
@@ -81,6 +82,7 @@ GROUPS = {
         ["gimbal", "info"],
         ["gimbal", "neutral"],
     ),
+    "calibration": (["calibrate", "gyroscope"], ["calibrate", "compass"]),
     "link": (
         ["status"],
         ["events", "--seconds", "2", "--all"],
@@ -117,9 +119,9 @@ def test_json_of_demo_matches_documentation(capsys: pytest.CaptureFixture[str]) 
 
 def test_json_of_sim_matches_documentation(capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["sim", "tcpin:127.0.0.1:0", "--duration", "1", "--speedup", "20", "--picture", "track.svg"]
-    assert main([*arguments, "--json"]) == 0
+    assert main([*arguments, "--fault", "gps_lost@0.5", "--json"]) == 0
     printed = records(capsys.readouterr().out)
-    assert [each["type"] for each in printed] == ["simulated", "stopped", "saved"]
+    assert [each["type"] for each in printed] == ["simulated", "fault", "stopped", "saved"]
     SEEN.update(record["type"] for record in printed)
 
 

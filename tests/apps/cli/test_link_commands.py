@@ -64,7 +64,15 @@ def test_status_prints_all_vehicles(
 def test_status_prints_what_is_missing_for_flight(capsys: pytest.CaptureFixture[str]) -> None:
     assert run_with(SimulatedCopter(boot_time_s=600.0), ["status"]) == [0]
     assert "missing  " in (out := capsys.readouterr().out)
-    assert "nothing known" not in out
+    assert "ready  " not in out
+
+
+def test_status_of_ready_vehicle_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    copter = SimulatedCopter(boot_time_s=0.0)
+    assert run_with(copter, ["status", "--seconds", "8"]) == [0]
+    out = capsys.readouterr().out
+    assert "ready    no reason against arming is reported\n" in out
+    assert "missing" not in out
 
 
 def test_status_sends_only_requests_and_restores_rates() -> None:
@@ -160,7 +168,7 @@ def test_record_without_frames_fails(capsys: pytest.CaptureFixture[str]) -> None
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        (["udpin:127.0.0.1:0"], "argument FILE: 'udpin:127.0.0.1:0' does not end in .tlog"),
+        (["udpin:127.0.0.1:0"], "argument FILE: 'udpin:127.0.0.1:0' is an address; the recording comes after it"),
         (["a.tlog", "--seconds", "1", "b.tlog"], "aerokit record: error: unrecognized arguments: b.tlog"),
         (
             ["--secnds", "3"],

@@ -30,6 +30,7 @@ from aerokit.events import (
     LandedStateChanged,
     ParameterChanged,
     StreamSlow,
+    VehicleFound,
     VehicleSilent,
 )
 from aerokit.mavlink.enums import MavCmd, MavLandedState
@@ -299,4 +300,6 @@ async def test_event_text_uses_enum_names() -> None:
     assert _event_line(DuplicateSender(1.0, 1, 1)) == (
         "duplicate sender: component 1, a second sender has the same ids, and is ignored"
     )
+    assert _event_text(VehicleFound(1.0, 1, 1, 2, 3)) == "VehicleFound  component 1, QUADROTOR, ARDUPILOTMEGA"
+    assert _event_text(VehicleFound(1.0, 1, 1, 250, 3)) == "VehicleFound  component 1, vehicle type 250, ARDUPILOTMEGA"
     assert _event_text(VehicleSilent(1.0, 1, 3.5)) == "VehicleSilent  silent for 3.5 s"

@@ -300,6 +300,26 @@ async def test_go_to_understands_altitudes_above_the_sea(flying: Flight) -> None
     assert command.frame == 5
 
 
+async def test_home_is_accepted_as_a_place(flying: Flight) -> None:
+    vehicle, home = flying.vehicle, flying.vehicle.home.value
+    await vehicle.go_to(vehicle.position.value.offset(east_m=20.0))
+    assert vehicle.position.value.distance_to(home) == pytest.approx(20.0, abs=2.5)
+    assert vehicle.position.value.bearing_to(home) == pytest.approx(270.0, abs=5.0)
+    await vehicle.go_to(home)
+    assert flying.copter.altitude_m == pytest.approx(10.0, abs=0.3)  # the present altitude, not that of the ground
+    assert vehicle.distance_to(home) == pytest.approx(10.0, abs=1.0)
+    await vehicle.set_home(home)
+    (command,) = flying.wire.commands(MavCmd.DO_SET_HOME)
+    assert isinstance(command, m.CommandInt)
+    assert command.x == round(home.latitude_deg * 1e7)
+    assert command.z == pytest.approx(home.altitude_amsl_m)
+
+
+async def test_go_to_state_cell_error_says_value(flying: Flight) -> None:
+    with pytest.raises(InvalidArgument, match=r"^target = <StateCell home .* a Position or a Home; pass its \.value$"):
+        await flying.vehicle.go_to(flying.vehicle.home)  # type: ignore[arg-type]
+
+
 async def test_go_to_at_a_speed(flying: Flight) -> None:
     fastest = 0.0
 

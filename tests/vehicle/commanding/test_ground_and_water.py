@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import itertools
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 
 import anyio
@@ -24,6 +25,7 @@ from aerokit.mavlink.messages import SetPositionTargetLocalNed
 from aerokit.missions import Mission
 from aerokit.missions.navigation import return_to_launch, take_off, waypoint
 from aerokit.sim import (
+    SimulatedCopter,
     SimulatedPlane,
     SimulatedPx4Plane,
     SimulatedRover,
@@ -148,6 +150,27 @@ async def test_go_to_vehicle_does_not_move_times_out() -> None:
         with pytest.raises(SetpointStreamStopped, match=r"not moved for 1[23] s"):
             async with vehicle.guided.velocity() as stream:
                 await stream.fly(VelocitySetpoint(north_m_s=1.0), 30.0)
+
+
+async def fall(copter: SimulatedCopter, begin: Callable[[], None]) -> None:
+    """Go somewhere at 20 m, and call ``begin`` two seconds later."""
+    async with guided(copter) as vehicle:
+        await vehicle.take_off(20)
+        asyncio.get_running_loop().call_later(2.0, begin)
+        await vehicle.go_to(vehicle.position.value.offset(north_m=100))
+
+
+async def test_go_to_vehicle_fell_error_names_descent() -> None:
+    copter = SimulatedCopter(boot_time_s=1.0)
+    descent = r"not moved for 1[23] s, after it descended (19|20)\.\d m at up to 1\d\.\d m/s; it is"
+    with pytest.raises(OperationTimeout, match=descent):
+        await fall(copter, lambda: setattr(copter.faults, "motor_failed", True))
+
+
+async def test_go_to_vehicle_disarmed_in_air_error_names_height() -> None:
+    copter = SimulatedCopter(boot_time_s=1.0)
+    with pytest.raises(OperationRejected, match=r"the vehicle disarmed 1\d\.\d m above home"):
+        await fall(copter, lambda: copter.motors.set_armed(False, copter.now))
 
 
 async def test_rover_return_to_launch_ends_at_home() -> None:

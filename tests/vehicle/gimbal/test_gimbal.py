@@ -213,6 +213,9 @@ async def test_px4_roi_uses_amsl_altitude() -> None:
             await vehicle.look_at(target)
             command: Any = wire.commands(MavCmd.DO_SET_ROI_LOCATION)[0]
             assert (command.frame, command.z) == (5, pytest.approx(home.altitude_amsl_m + 5.0))
+            await vehicle.look_at(home)
+            command = wire.commands(MavCmd.DO_SET_ROI_LOCATION)[-1]
+            assert (command.frame, command.z) == (5, pytest.approx(home.altitude_amsl_m))
 
 
 class WithoutCommandInt(SimulatedCopter):

@@ -299,9 +299,9 @@ class StallStage:
     def __init__(self) -> None:
         self.at = 0.0
         self.cell = StateCell[Position]("position", lambda: self.at, "GLOBAL_POSITION_INT")
-        session = SimpleNamespace(
-            connection=SimpleNamespace(now=lambda: self.at), telemetry=SimpleNamespace(position=self.cell)
-        )
+        unknown = SimpleNamespace(latest=None)
+        telemetry = SimpleNamespace(position=self.cell, velocity=unknown, armed=unknown)
+        session = SimpleNamespace(connection=SimpleNamespace(now=lambda: self.at), telemetry=telemetry)
         self.stillness = StallDetector(cast("VehicleSession", session))
 
     def receive(self, place: Position | None, at: float) -> str | None:

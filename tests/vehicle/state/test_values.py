@@ -11,11 +11,12 @@ from hypothesis import strategies as st
 
 from aerokit import enums, messages
 from aerokit.errors import InvalidArgument
-from aerokit.position import Position
+from aerokit.missions.navigation import waypoint
+from aerokit.position import Home, Position
 from aerokit.vehicle.state import equipment as gimbal
 from aerokit.vehicle.state.condition import EstimatorHealth, SensorHealth
 from aerokit.vehicle.state.equipment import GpsReceiver
-from aerokit.vehicle.state.movement import Attitude, Home, Velocity
+from aerokit.vehicle.state.movement import Attitude, Velocity
 
 angles = st.floats(-179, 179)
 
@@ -61,7 +62,11 @@ def test_offsets_keep_and_raise_the_altitude() -> None:
 
 def test_home_as_a_target() -> None:
     """Without an altitude: going home must not mean flying into the ground."""
-    assert Home(47.0, 8.0, 488.0).position == Position(47.0, 8.0)
+    home = Home(47.0, 8.0, 488.0)
+    assert home.position == Position(47.0, 8.0)
+    assert waypoint(home, altitude_relative_m=30.0) == waypoint(home.position, altitude_relative_m=30.0)
+    with pytest.raises(InvalidArgument, match="give exactly one of altitude_relative_m"):
+        waypoint(home)
 
 
 def test_velocity_has_speed_and_course() -> None:

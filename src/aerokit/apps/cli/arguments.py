@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 from aerokit._internal import geo
 from aerokit.apps.cli.completion import kinds as kind_names
 from aerokit.apps.cli.completion import offer
+from aerokit.apps.cli.misplaced import is_address, misplaced_file
+from aerokit.apps.cli.output import suggestion
 from aerokit.errors import AerokitError, InvalidArgument
 from aerokit.parameters import ParameterType, check_name, checked_value
 from aerokit.parameters.encoding import parse_number
@@ -44,6 +46,8 @@ def expand_address(address: str, number: int, system_id: int) -> str:
 
 
 def address(text: str) -> str:
+    if problem := misplaced_file(text):
+        raise ArgumentTypeError(problem)
     try:
         parse_address(text)
     except InvalidArgument as error:
@@ -86,6 +90,41 @@ port: Callable[[str], int] = integer(0, 65535, "a port number")
 system_id: Callable[[str], int] = integer(1, 255, "a system id")
 
 
+FAULTS: dict[str, str] = {
+    "gps_lost": "no GPS fix; the estimator drops its position after seven seconds",
+    "rc_lost": "the pilot's transmitter is off",
+    "motor_failed": "one motor stops, and the vehicle falls",
+    "silent": "the radio fails in both directions",
+    "frozen": "the autopilot hangs",
+    "heartbeats_stopped": "no HEARTBEAT, all other messages continue",
+    "leak": "water in the hull of a submarine",
+    "no_ftp": "no MAVFTP",
+    "loss": "share of messages from the vehicle that are lost: loss=0.2",
+    "loss_incoming": "share of messages to the vehicle that are lost: loss_incoming=0.2",
+    "prearm_failures": "a reason against arming: 'prearm_failures=Compass not healthy'",
+}
+"""Names of `aerokit.sim.Faults` that ``aerokit sim --fault`` takes → description."""
+_SHARES = ("loss", "loss_incoming")
+
+
+def fault(text: str) -> tuple[str, bool | float | list[str], float]:
+    """Parse ``NAME[=VALUE][@SECONDS]``: a fault of the simulator, its value, and the time at which it begins."""
+    named, _, begin = text.partition("@")
+    name, mark, value = named.partition("=")
+    if name not in FAULTS:
+        raise ArgumentTypeError(f"{name!r} is not a fault{suggestion(name, FAULTS)}; faults: {', '.join(FAULTS)}")
+    at_s = number(0, 1e6)(begin) if begin else 0.0
+    if name in _SHARES:
+        return name, number(0, 1)(value), at_s
+    if name == "prearm_failures":
+        if not value:
+            raise ArgumentTypeError("prearm_failures needs a reason: 'prearm_failures=Compass not healthy'")
+        return name, [value], at_s
+    if mark:
+        raise ArgumentTypeError(f"{name} takes no value: {name}@{at_s:g} begins after {at_s:g} simulated seconds")
+    return name, True, at_s
+
+
 def wind(text: str) -> tuple[float, ...]:
     try:
         values = tuple(float(part) for part in text.split(","))
@@ -125,8 +164,10 @@ def number(low: float, high: float) -> Callable[[str], float]:
 def assignment(text: str) -> tuple[str, int | float]:
     """Parse ``NAME=VALUE`` for a parameter; whole numbers may be hexadecimal (0x1F)."""
     name, mark, value = text.partition("=")
+    if not mark:
+        raise ArgumentTypeError(f"{text!r} has no value: write NAME=VALUE without spaces")
     try:
-        number = parse_number(value if mark else "")
+        number = parse_number(value)
     except ValueError:
         raise ArgumentTypeError(f"{text!r} is not NAME=VALUE with a finite number") from None
     try:
@@ -165,6 +206,8 @@ def writable_file(text: str) -> str:
 
 def log_file(text: str) -> str:
     """Parse the path of a recording to write."""
+    if is_address(text):
+        raise ArgumentTypeError(f"{text!r} is an address; the recording comes after it: ADDRESS flight.tlog")
     if not text.lower().endswith(".tlog"):
         raise ArgumentTypeError(f"{text!r} does not end in .tlog")
     return writable_file(text)

@@ -240,7 +240,8 @@ class LinkExamination:
                     " (PX4); ArduPilot sends version 1 until it receives version 2",
                 )
             else:
-                yield Finding("ok", "sender", text)
+                advice = "`aerokit status` shows what prevents it from arming" if is_autopilot(heartbeat) else ""
+                yield Finding("ok", "sender", text, advice)
 
     def _signing(self) -> Iterator[Finding]:
         signing = self._connection.signing

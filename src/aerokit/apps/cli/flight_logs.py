@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from aerokit._internal.formatting import printable
 from aerokit.apps.cli.output import DONE, add_json, emit, import_extra
 from aerokit.apps.cli.terminal import progress_bar
-from aerokit.logs.report.statistics import clock
+from aerokit.logs.report.statistics import clock, fall_text
 
 if TYPE_CHECKING:
     import argparse
@@ -127,4 +127,5 @@ def _report_text(report: Report) -> str:
         for failsafe in failsafes:
             lines.append(f"{clock(failsafe.time_s)} {failsafe.title}: {failsafe.reaction}")
             lines += [f"  {fact}" for fact in failsafe.context]
-    return "\n".join([*lines, f"{report.target}: {report.bytes / 1e6:.1f} MB"])
+    found = [f"; {fall_text(fall)}" for flight_falls in report.falls for fall in flight_falls]
+    return "\n".join([*lines, f"{report.target}: {report.bytes / 1e6:.1f} MB{''.join(found)}"])

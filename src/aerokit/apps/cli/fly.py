@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
 _MAX_START_DISTANCE_M = 1000.0
 _SIM_BOOT_TIME_S = 2.0
+_NOTHING_SENT = "nothing was sent"
 
 
 class PlanFlight(SupervisedFlight):
@@ -48,12 +49,16 @@ class PlanFlight(SupervisedFlight):
     ) -> None:
         super().__init__(vehicle, report, interrupts, options.on_interrupt)
         self._plan, self._options, self._report = plan, options, report
+        self.sent: str = _NOTHING_SENT
+        """Description of what was sent before arming, for the message after Ctrl-C."""
 
     async def _fly(self) -> int:
         vehicle = self._vehicle
         self._print(f"found {vehicle.autopilot.firmware}, system {vehicle.system_id}")
         self._check_vehicle()
+        self.sent = "the upload was not completed, nothing was armed"
         await upload_parts(vehicle, self._plan, self._options)
+        self.sent = "the plan is on the vehicle, nothing was armed"
         confirmed_mission = await self._download_mission() if self._needs_confirmation else ()
         self._print("waiting until the vehicle is ready")
         await vehicle.wait_ready(timeout=self._options.ready)
@@ -196,9 +201,10 @@ async def run_fly(options: argparse.Namespace) -> int:
     with on_interrupt(interrupts.interrupt):
         code = await interrupts.run(lambda: _connect_and_fly(options, plan, interrupts, flights))
     if code is None:
-        was_armed = any(flight.armed_by_us for flight in flights)
-        emit(options, "interrupted", {}, "interrupted" if was_armed else "interrupted; nothing was armed")
-        return INTERRUPTED
+        code = INTERRUPTED
+    if code == INTERRUPTED and not any(flight.armed_by_us for flight in flights):
+        sent = flights[-1].sent if flights else _NOTHING_SENT
+        emit(options, "interrupted", {}, f"interrupted; {sent}")
     return code
 
 
@@ -234,7 +240,8 @@ async def _connect_and_fly(
         async with report.running():
             flights.append(PlanFlight(vehicle, plan, report, interrupts, options))
             code = await flights[-1].fly()
-        report.print_summary(options.record)
+        if flights[-1].armed_by_us:
+            report.print_summary(options.record)
     return code
 
 

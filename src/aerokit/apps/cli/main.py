@@ -12,6 +12,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from aerokit._internal.imports import installation_problem
+from aerokit.apps.cli.misplaced import is_address, misplaced_address
 from aerokit.apps.cli.output import (
     DONE,
     FAILED,
@@ -20,6 +21,7 @@ from aerokit.apps.cli.output import (
     exit_code,
     exit_codes_help,
     import_extra,
+    plain_warnings,
     suggestion,
 )
 from aerokit.errors import AerokitError
@@ -99,6 +101,12 @@ COMMANDS = (
         " map. Keys command hold, land and return, after a confirmation.",
     ),
     CliCommand("params", "params", "Read, set, save, load and compare the parameters of a vehicle."),
+    CliCommand(
+        "calibrate",
+        "calibrate",
+        "Calibrate a sensor, the remote control or the ESCs. Shows what to do and how to place the vehicle, step by"
+        " step; Ctrl-C cancels the calibration on the vehicle.",
+    ),
     CliCommand("mission", "mission", "Transfer, show and check missions, fences and rally points."),
     CliCommand(
         "fly",
@@ -145,7 +153,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "without a vehicle": ("sim", "demo", "doctor", "report", "convert", "completion"),
     "watch vehicles": ("status", "monitor", "serve", "events", "record"),
     "fly": ("fly", "mission", RUN),
-    "parameters, files, devices": ("params", "files", "logs", "camera", "gimbal"),
+    "parameters, files, devices": ("params", "calibrate", "files", "logs", "camera", "gimbal"),
     "connect programs": ("hub", "bridge"),
 }
 """Commands by task, for the help."""
@@ -163,8 +171,11 @@ class Parser(argparse.ArgumentParser):
         self, args: Sequence[str] | None = None, namespace: Any = None
     ) -> tuple[Any, list[str]]:
         """Report unrecognized arguments in the subparser, which has the right usage message."""
-        if args is not None and self._subparsers is None:
-            self._check_option_names(args)
+        if args is not None and not isinstance(self, _TopParser):
+            if self._subparsers is None:
+                self._check_option_names(args)
+            if problem := misplaced_address(self, args):
+                self.error(problem)
         namespace, unknown = super().parse_known_args(args, namespace)
         if unknown:
             self._fail_unrecognized(unknown)
@@ -172,10 +183,11 @@ class Parser(argparse.ArgumentParser):
 
     def _check_option_names(self, args: Sequence[str]) -> None:
         # Checked first: otherwise argparse takes the value after an unknown option for a positional argument.
+        # misplaced_address() reports --connect, with the right command line.
         options = list(args[: args.index("--")] if "--" in args else args)
         names = [option.partition("=")[0] for option in options if option.startswith("--")]
         for name in names:
-            if not any(known.startswith(name) for known in self._option_string_actions):
+            if name != "--connect" and not any(known.startswith(name) for known in self._option_string_actions):
                 self._fail_unrecognized([name])
 
     def _fail_unrecognized(self, unknown: Sequence[str]) -> NoReturn:
@@ -188,6 +200,8 @@ class Parser(argparse.ArgumentParser):
         if found := re.search(r"invalid choice: '(.*)' \(choose from (.*)\)", message):
             hint = suggestion(found[1], re.findall(r"[\w.-]+", found[2]))
             is_command = message.startswith("argument COMMAND:")
+            if is_command and is_address(found[1]):
+                hint = f"; to see the vehicle there: aerokit status {found[1]}"
             message = f"unknown command {found[1]!r}{hint}; `aerokit` lists them" if is_command else message + hint
         super().error(message)
 
@@ -233,7 +247,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return DONE
     options = make_parser(arguments[0]).parse_args(arguments)
     try:
-        code: int = asyncio.run(options.run(options))
+        with plain_warnings():
+            code: int = asyncio.run(options.run(options))
     except BrokenPipeError:
         # Otherwise the interpreter reports another BrokenPipeError when it flushes stdout at exit.
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115

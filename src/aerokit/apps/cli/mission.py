@@ -67,7 +67,7 @@ async def upload_parts(vehicle: Vehicle, plan: Plan, options: argparse.Namespace
         count = len(content.to_items())
         if count == 0:
             continue
-        with progress_bar(part, "item") as show:
+        with progress_bar(part, None) as show:  # counts items or, over MAVFTP, bytes
             await getattr(vehicle, part).upload(content, idle_timeout_s=options.patience, on_progress=show)
         emit_part(options, part, count, "uploaded", f"{part}: {count} items uploaded to vehicle {vehicle.system_id}")
 
@@ -180,5 +180,5 @@ async def _clear(options: argparse.Namespace) -> int:
 
 
 async def _download_part(vehicle: Vehicle, part: str, options: argparse.Namespace) -> Any:
-    with progress_bar(part, "item") as show:
+    with progress_bar(part, None) as show:
         return await getattr(vehicle, part).download(idle_timeout_s=options.patience, on_progress=show)

@@ -24,6 +24,7 @@ from aerokit.errors import (
 )
 
 if TYPE_CHECKING:
+    import logging
     from collections.abc import Iterable, Iterator, Mapping
 
 
@@ -80,6 +81,38 @@ def _text(error: BaseException) -> str:
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         return f"{error.filename}: {error.strerror}"
     return str(error) or type(error).__name__
+
+
+@contextmanager
+def plain_warnings() -> Iterator[None]:
+    """Within the block, print warnings of this library without code and without advice on code."""
+    import logging
+    import warnings
+
+    original = warnings.showwarning
+    logger = logging.getLogger("aerokit")
+
+    def show(message: Any, category: type[Warning], *arguments: Any, **options: Any) -> None:
+        if category.__module__.partition(".")[0] == "aerokit":
+            print(f"aerokit: {printable(str(message))}", file=sys.stderr)
+        else:
+            original(message, category, *arguments, **options)
+
+    logger.addFilter(_describe_busy_computer)
+    try:
+        with warnings.catch_warnings():
+            warnings.showwarning = show
+            yield
+    finally:
+        logger.removeFilter(_describe_busy_computer)
+
+
+def _describe_busy_computer(record: logging.LogRecord) -> bool:
+    """Replace the warning of a blocked event loop, which advises programmers: a command only waits for the computer."""
+    if str(record.msg).startswith("the event loop was blocked") and isinstance(record.args, tuple):
+        record.msg = "this computer was busy for %.1f s: no messages or heartbeats were processed"
+        record.args = record.args[:1]
+    return True
 
 
 DONE, FAILED, WRONG_ARGUMENTS, NO_VEHICLE, TIMED_OUT, REFUSED, UNREADABLE, NOT_INSTALLED = range(8)

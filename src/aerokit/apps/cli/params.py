@@ -32,7 +32,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def _add_reading(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     listing = add_action(actions, "list", _list, "List parameters with their values.")
-    pattern = listing.add_argument("pattern", nargs="?", default="*", help="names to list: 'BATT_*' (all)")
+    pattern = listing.add_argument("pattern", nargs="?", default="*", help="part of the names, or 'BATT_*' (all)")
     offer(pattern, parameter_names)
     listing.add_argument("--changed", action="store_true", help="only those that differ from their default")
     get = add_action(actions, "get", _get, "Read single parameters.")
@@ -57,7 +57,9 @@ async def _list(options: argparse.Namespace) -> int:
         table = await _download(vehicle, options)
     if options.changed:
         table = table.changed_from_default()
-    found = [value for name, value in table.items() if fnmatch.fnmatch(name, options.pattern.upper())]
+    pattern = options.pattern.upper()
+    pattern = pattern if any(mark in pattern for mark in "*?[") else f"*{pattern}*"
+    found = [value for name, value in table.items() if fnmatch.fnmatch(name, pattern)]
     _emit_parameters(options, found)
     if not found and options.pattern != "*":
         hint = suggestion(options.pattern.strip("*"), table, 3)
@@ -138,9 +140,13 @@ async def _read(vehicle: Vehicle, name: str, options: argparse.Namespace) -> Par
 def _hint(name: str, error: Exception, vehicle: Vehicle) -> str:
     """Suggest similar parameter names, or the command that lists them. Empty if the error contains a suggestion."""
     names = parameter_names(vehicle.autopilot.name)
-    if "did you mean" in str(error) or name.upper() in names:
+    is_lacking = "has no parameter" in str(error)  # the names are of all vehicle types
+    if "did you mean" in str(error) or (name.upper() in names and not is_lacking):
         return ""
-    return suggestion(name, names, 3) or "; `aerokit params list` shows all names"
+    return (
+        suggestion(name, [other for other in names if other != name.upper()], 3)
+        or "; `aerokit params list` shows all names"
+    )
 
 
 def _emit_parameters(options: argparse.Namespace, parameters: Iterable[Parameter]) -> None:

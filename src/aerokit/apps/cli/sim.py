@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit.apps.cli.arguments import (
     DEFAULT_SIM_ADDRESS,
+    FAULTS,
     add_vehicle_kind,
     address_or_template,
     count,
     expand_address,
+    fault,
     home,
     is_address_template,
     number,
@@ -237,6 +239,17 @@ def _add_conditions(command: argparse.ArgumentParser) -> None:
         metavar="S",
         help="simulated seconds until the vehicle is ready to arm",
     )
+    faults = command.add_argument(
+        "--fault",
+        action="append",
+        type=fault,
+        default=[],
+        dest="faults",
+        metavar="NAME[@S]",
+        help="fault of every vehicle, from the start or after S simulated seconds (repeatable):"
+        f" {', '.join(FAULTS)}; loss=0.2 loses a share, 'prearm_failures=TEXT' refuses to arm",
+    )
+    offer(faults, lambda: FAULTS)
     add_signing_key(command, "signing key of the vehicles; ArduPilot's first port accepts unsigned messages too")
     command.add_argument(
         "--duration", type=number(0.1, 1e6), metavar="S", help="stop after S simulated seconds (at Ctrl-C)"
@@ -259,9 +272,11 @@ async def run_sim(options: argparse.Namespace) -> int:
     stop = asyncio.Event()
     with on_interrupt(stop.set):
         async with server:
+            injecting = asyncio.create_task(_inject(vehicles, options))
             _emit(server, options)
             with suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(stop.wait(), options.duration and options.duration / options.speedup)
+            injecting.cancel()
     emit(options, "stopped", {}, "stopped")
     if options.picture is not None:
         from aerokit.testing.picture import save_picture
@@ -270,6 +285,21 @@ async def run_sim(options: argparse.Namespace) -> int:
         record = {"file": options.picture, "what": "track", "count": len(tracks)}
         emit(options, "saved", record, f"track written to {options.picture}")
     return 0
+
+
+async def _inject(vehicles: Sequence[SimulatedVehicle], options: argparse.Namespace) -> None:
+    """Begin the faults of ``--fault`` at their times."""
+    loop = asyncio.get_running_loop()
+    started = loop.time()
+    for name, value, at_s in sorted(options.faults, key=lambda fault: fault[2]):
+        await asyncio.sleep(started + at_s / options.speedup - loop.time())
+        for vehicle in vehicles:
+            if isinstance(value, list):
+                getattr(vehicle.faults, name).extend(value)
+            else:
+                setattr(vehicle.faults, name, value)
+        if at_s:
+            emit(options, "fault", {"name": name, "value": value, "seconds": at_s}, f"{at_s:g} s: fault {name}")
 
 
 def _fleet(options: argparse.Namespace) -> list[SimulatedVehicle]:

@@ -71,7 +71,7 @@ def _vehicle_lines(vehicle: Vehicle, missing: Sequence[str]) -> list[str]:
         f"  GPS      {'; '.join(map(_gps, vehicle.gps.latest or ())) or _UNKNOWN}",
         f"  battery  {'; '.join(map(_battery, vehicle.batteries.latest or ())) or _UNKNOWN}",
         f"  link     {_link(vehicle, frame)}",
-        *_aligned("missing", missing or ["nothing known"]),
+        *(_aligned("missing", missing) if missing else _aligned("ready", ["no reason against arming is reported"])),
     ]
 
 

@@ -36,8 +36,19 @@ async def confirm(question: str) -> bool:
     """Ask a yes/no question. Return True for "y" or "yes", False for any other input and at its end."""
     _discard_typed_input()
     print(f"{question} [y/N] ", end="", file=sys.stderr, flush=True)
-    answer = await _read_line()
+    try:
+        answer = await _read_line()
+    except asyncio.CancelledError:  # Ctrl-C: what follows begins on a new line
+        print(file=sys.stderr, flush=True)
+        raise
     return answer.strip().lower() in ("y", "yes")
+
+
+async def press_enter() -> bool:
+    """Wait for a line of input. Return False at the end of the input."""
+    _discard_typed_input()
+    print("  press Enter when done (Ctrl-C cancels) ", end="", file=sys.stderr, flush=True)
+    return bool(await _read_line())
 
 
 def _discard_typed_input() -> None:
@@ -166,15 +177,16 @@ class _Bar(tqdm):  # type: ignore[misc]  # tqdm has no annotations
 
 
 @contextmanager
-def progress_bar(what: str, unit: str) -> Iterator[OnProgress]:
+def progress_bar(what: str, unit: str | None) -> Iterator[OnProgress]:
     """Show a progress bar within the block, and yield the ``on_progress`` callback.
 
-    ``unit`` is ``"B"`` for bytes, otherwise the singular noun for an item.
+    ``unit`` is ``"B"`` for bytes, the singular noun for an item, or None to show a percentage only.
     """
     is_bytes = unit == "B"
     with _Bar(
         desc=what,
         unit=unit if is_bytes else f" {unit}",
+        bar_format=None if unit else "{desc}: {percentage:3.0f} %|{bar}| {elapsed}",
         unit_scale=is_bytes,
         unit_divisor=1024 if is_bytes else 1000,
         file=sys.stderr,

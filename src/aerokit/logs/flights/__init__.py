@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from aerokit.errors import FileFormatError
 from aerokit.logs.flights.failsafes import Failsafe, evidence_in_texts, failsafes
+from aerokit.logs.flights.falls import Fall, falls
 from aerokit.logs.flights.flight import (
     FailsafeEvidence,
     FlightLog,
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Failsafe",
     "FailsafeEvidence",
+    "Fall",
     "FlightLog",
     "LoggedText",
     "ModeChange",
@@ -39,6 +41,7 @@ __all__ = [
     "TimeSeries",
     "Waypoint",
     "failsafes",
+    "falls",
     "read_flight",
 ]
 

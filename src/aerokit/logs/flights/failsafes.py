@@ -74,8 +74,8 @@ KINDS = {
 """Kind of failsafe → title in reports."""
 
 _NO_EVIDENCE = re.compile(
-    r"clear|resolved|\boff$|prearm|pre-arm|preflight|^arm\b|arming|re-?gained|recovered|restored|compensation off"
-    r"|connection .*established|fence enabled|fence disabled",
+    r"clear|resolved|\boff$|prearm|pre-arm|preflight|^arm\b|(?<!dis)arming|re-?gained|recovered|restored"
+    r"|compensation off|connection .*established|fence enabled|fence disabled",
     re.I,
 )
 _TEXTS: tuple[tuple[re.Pattern[str], str], ...] = tuple(

@@ -11,14 +11,16 @@ from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument
 from aerokit.logs.flights import check_log_name, read_flight
 from aerokit.logs.flights.failsafes import failsafes
+from aerokit.logs.flights.falls import falls
 from aerokit.logs.report.charts import COLOURS, timeline_shapes
 from aerokit.logs.report.comparing import NAMES, comparison
 from aerokit.logs.report.page import page
 from aerokit.logs.report.sections import SECTIONS
-from aerokit.logs.report.statistics import FlightStatistics, date, statistics_of, summary
+from aerokit.logs.report.statistics import FlightStatistics, date, findings, statistics_of, summary
 
 if TYPE_CHECKING:
     from aerokit.logs.flights.failsafes import Failsafe
+    from aerokit.logs.flights.falls import Fall
     from aerokit.logs.flights.flight import FlightLog
     from aerokit.protocols.exchange import OnProgress
 
@@ -36,6 +38,8 @@ class Report(Snapshot):
     """Statistics of each flight."""
     failsafes: tuple[tuple[Failsafe, ...], ...]
     """Failsafes of each flight."""
+    falls: tuple[tuple[Fall, ...], ...]
+    """Falls and hard landings of each flight."""
 
 
 def write_report(
@@ -83,6 +87,7 @@ def write_report(
         tuple(map(tuple, summaries)),
         tuple(statistics),
         tuple(tuple(failsafes(flight)) for flight in flights),
+        tuple(tuple(falls(flight)) for flight in flights),
     )
 
 
@@ -96,10 +101,16 @@ def _render(flights: list[FlightLog], statistics: list[FlightStatistics], summar
     if len(flights) == 1:
         flight = flights[0]
         sections = [section for make in SECTIONS if (section := make(flight)) is not None]
-        return page(flight.path.name, [(_heading(flight), summaries[0])], sections, COLOURS, timeline_shapes(flight))
+        return page(
+            flight.path.name,
+            [(_heading(flight), summaries[0], findings(flight))],
+            sections,
+            COLOURS,
+            timeline_shapes(flight),
+        )
     one, other = flights
     headed = [
-        (f"{name}: {flight.path.name}, {_heading(flight)}", sentences)
+        (f"{name}: {flight.path.name}, {_heading(flight)}", sentences, findings(flight))
         for name, flight, sentences in zip(NAMES, flights, summaries, strict=True)
     ]
     sections = comparison((one, other), (statistics[0], statistics[1]))

@@ -7,7 +7,8 @@ from bisect import bisect_left
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
-from aerokit.logs.flights.failsafes import failsafes
+from aerokit.logs.flights.failsafes import Failsafe, failsafes
+from aerokit.logs.flights.falls import Fall, falls
 from aerokit.logs.flights.flight import ModeChange, TangentPlane
 from aerokit.logs.report.page import Chart, Paragraphs
 from aerokit.logs.report.simplification import MAX_COORDINATE, simplify
@@ -154,7 +155,7 @@ def time_range(begin_s: float, end_s: float) -> list[float]:
 
 
 def timeline_shapes(flight: FlightLog) -> list[dict[str, Any]]:
-    """Return Plotly's shapes for all timelines: bands of each mode, and lines at failsafes."""
+    """Return Plotly's shapes for all timelines: bands of each mode, and lines at failsafes and falls."""
     spans: dict[str, list[str]] = {}
     for change, end in flight.mode_spans():
         band = f"M{change.time_s:.2f},0H{end:.2f}V1H{change.time_s:.2f}Z"
@@ -167,6 +168,7 @@ def timeline_shapes(flight: FlightLog) -> list[dict[str, Any]]:
     found = failsafes(flight)
     for acted, dash in ((True, "solid"), (False, "dot")):
         paths = [f"M{failsafe.time_s:.2f},0V1" for failsafe in found if failsafe.acted is acted]
+        paths += [f"M{fall.time_s:.2f},0V1" for fall in falls(flight) if acted]
         if paths:
             bands.append(_path(paths, line={"color": _FAILSAFE, "width": 1.5, "dash": dash}))
     return bands
@@ -332,11 +334,12 @@ def _fence(flight: FlightLog) -> list[dict[str, Any]]:
 
 def _failsafe_markers(flight: FlightLog, places: Sequence[tuple[float, float]]) -> list[dict[str, Any]]:
     found, names = [], []
-    for failsafe in failsafes(flight):
-        row = flight.track.index_at(failsafe.time_s)
+    events: list[Failsafe | Fall] = [*failsafes(flight), *falls(flight)]
+    for event in events:
+        row = flight.track.index_at(event.time_s)
         if row >= 0 and places[row][0] == places[row][0]:
             found.append(places[row])
-            names.append(f"{failsafe.title}, {clock(failsafe.time_s)}")
+            names.append(f"{event.title}, {clock(event.time_s)}")
     return [_marker("failsafe", found, "x", _FAILSAFE, 12, names)] if found else []
 
 

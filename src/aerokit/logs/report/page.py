@@ -64,6 +64,7 @@ class Chart:
     """True for a chart over time: it has the page's shapes as background, and zooms with the other timelines."""
 
 
+Summary: TypeAlias = "tuple[str, Sequence[str], Sequence[str]]"
 Part: TypeAlias = "Paragraphs | Table | Collapsed | Chart"
 MAX_OPEN_ROWS = 15
 """Longer tables are collapsed."""
@@ -83,15 +84,15 @@ class Section:
 
 def page(
     title: str,
-    summaries: Sequence[tuple[str, Sequence[str]]],
+    summaries: Sequence[Summary],
     sections: Sequence[Section],
     colours: Mapping[str, Mapping[str, str]],
     shapes: Sequence[dict[str, Any]] = (),
 ) -> str:
     """Return the HTML.
 
-    ``summaries`` has a heading and sentences for each flight, ``colours`` the colours by theme ("light", "dark") and
-    name, ``shapes`` Plotly's shapes for all timelines.
+    ``summaries`` has a heading, sentences, and those to emphasise for each flight, ``colours`` the colours by theme
+    ("light", "dark") and name, ``shapes`` Plotly's shapes for all timelines.
 
     The Content-Security-Policy allows only the two included scripts, and no network access. It is a second
     barrier after escaping, for hostile logs.
@@ -154,11 +155,13 @@ def _json(charts: Sequence[Chart], colours: Mapping[str, Mapping[str, str]], sha
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
-def _summary(summaries: Sequence[tuple[str, Sequence[str]]]) -> Iterator[str]:
-    for heading, sentences in summaries:
+def _summary(summaries: Sequence[Summary]) -> Iterator[str]:
+    for heading, sentences, findings in summaries:
         yield f'<p class="soft">{_escape(heading)}</p>'
         yield '<div class="summary">'
-        yield from (f"<p>{_escape(sentence)}</p>" for sentence in sentences)
+        for sentence in sentences:
+            mark = ' class="finding"' if sentence in findings else ""
+            yield f"<p{mark}>{_escape(sentence)}</p>"
         yield "</div>"
 
 

@@ -90,7 +90,7 @@ def failsafe_section(flight: FlightLog) -> Section:
     if not found:
         return Section(
             "Failsafes",
-            [Paragraphs(["None: no text, mode, error or flag indicates a failsafe while armed."])],
+            [Paragraphs(["No failsafe was reported: no text, mode change, error or flag in the log indicates one."])],
         )
     tables = [_failsafe(failsafe) for failsafe in found]
     parts: list[Part] = [*tables[:_MAX_OPEN_FAILSAFES]]

@@ -10,11 +10,13 @@ from typing import TYPE_CHECKING
 
 from aerokit._internal.values import Snapshot
 from aerokit.logs.flights.failsafes import failsafes
+from aerokit.logs.flights.falls import falls
 from aerokit.logs.flights.flight import TangentPlane
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from aerokit.logs.flights.falls import Fall
     from aerokit.logs.flights.flight import FlightLog, TimeSeries
 
 # Shorter steps are ignored, because they are noise of a stationary vehicle.
@@ -161,9 +163,22 @@ def _path_length(north_east: list[tuple[float, float]], rows: list[int]) -> floa
     return length_m
 
 
+def findings(flight: FlightLog) -> list[str]:
+    """Return a sentence for each fall and hard landing; empty for most flights."""
+    return [f"{fall_text(fall)}." for fall in falls(flight)]
+
+
+def fall_text(fall: Fall) -> str:
+    """Describe a fall: ``Fall: from 28.7 m, 16.9 m/s at the ground, at 0:24.9; disarmed in the air``."""
+    at = f"at the ground, at {clock(fall.time_s)}" if fall.has_impact else f"when the log ends, at {clock(fall.time_s)}"
+    text = f"{fall.title}: from {fall.height_m:.1f} m, {fall.sink_m_s:.1f} m/s {at} (descent since"
+    return "; ".join([f"{text} {clock(fall.begins_s)})", *fall.reasons])
+
+
 def summary(flight: FlightLog, statistics: FlightStatistics) -> list[str]:
     """Return sentences, the most important first."""
     sentences = [
+        *findings(flight),
         _flight_sentence(flight, statistics),
         _modes_sentence(flight),
         _battery_sentence(statistics),
@@ -218,9 +233,9 @@ def _failsafes_sentence(flight: FlightLog) -> str:
     found = failsafes(flight)
     acted = [failsafe for failsafe in found if failsafe.acted]
     warnings = [failsafe for failsafe in found if not failsafe.acted]
-    text = f"{len(acted) or 'No'} failsafe{'' if len(acted) == 1 else 's'}"
+    text = "No failsafe was reported"
     if acted:
-        text += ": " + _first_few(
+        text = f"{len(acted)} failsafe{'' if len(acted) == 1 else 's'}: " + _first_few(
             [f"{failsafe.title} at {clock(failsafe.time_s)} ({failsafe.reaction})" for failsafe in acted]
         )
     if warnings:

@@ -20,22 +20,35 @@ _AUTOMATIC_CALIBRATIONS: dict[str, tuple[Sequence[int], float]] = {
     "level": ((0, 20, 40, 60, 80, 100, 100), 0.5),
 }
 
-_SIDE_TEXTS = (
-    "pending: back front left right up down",
-    "hold vehicle still on a pending side",
-    "detected rest position, hold still...",
-    "down orientation detected",
-    "down orientation detected",
-)
-_SIDE_INSTRUCTIONS = {"mag": "Rotate vehicle", "accel": "Hold still, measuring down side"}
+_SIDES = ("back", "front", "left", "right", "up", "down")
+_SIDE_INSTRUCTIONS = {"mag": "Rotate vehicle", "accel": "Hold still, measuring {side} side"}
 _SIDE_INTERVAL_S = 0.8
+_PERCENT_PER_SIDE = 17
+
+
+def _side_texts(sensor: str, count: int) -> list[str]:
+    """Return the texts about the next side after ``count`` sides, until its measurement (calibration_routines.cpp)."""
+    side = _SIDES[-1 - count]
+    return [
+        f"pending: {' '.join(_SIDES[: len(_SIDES) - count])}",
+        "hold vehicle still on a pending side",
+        "detected rest position, hold still...",
+        f"{side} orientation detected",
+        f"{side} orientation detected",
+        _SIDE_INSTRUCTIONS[sensor].format(side=side),
+    ]
 
 
 class Px4Calibration:
-    """Sensor calibration on the ground; one calibration runs at a time."""
+    """Sensor calibration on the ground; one calibration runs at a time.
+
+    ``side_s``: seconds until the vehicle has been measured in one of six poses, and is placed in the next. With
+    infinity, as in SIH, the first pose is never completed.
+    """
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
+        self.side_s: float = math.inf
         self._sensor = ""
         self._number = 0
 
@@ -57,7 +70,11 @@ class Px4Calibration:
             self._measure(*_AUTOMATIC_CALIBRATIONS[sensor])
         elif sensor in _SIDE_INSTRUCTIONS:
             self._start(sensor)
-            self._send_later([*_SIDE_TEXTS, _SIDE_INSTRUCTIONS[sensor]], _SIDE_INTERVAL_S)
+            self._begin_side(0, self._number)
+        elif sensor == "esc":
+            # check_battery_disconnected in esc_calibration.cpp; the simulated battery is always connected.
+            self._px4.send_text(MavSeverity.CRITICAL, "[cal] calibration failed: Disconnect battery and try again")
+            return MavResult.DENIED
         elif sensor == "airspeed":
             self._start(sensor)
             self._px4.send_text(MavSeverity.CRITICAL, "[cal] Ensure sensor is not measuring wind")
@@ -81,6 +98,22 @@ class Px4Calibration:
         if self.is_running and number == self._number:
             self._px4.info(f"[cal] {text}")
 
+    def _begin_side(self, count: int, number: int) -> None:
+        if not self.is_running or number != self._number:
+            return
+        if count == len(_SIDES):
+            self._end(number)
+            return
+        self._send_later(_side_texts(self._sensor, count), _SIDE_INTERVAL_S)
+        if math.isfinite(self.side_s):
+            self._px4.call_later(6 * _SIDE_INTERVAL_S + self.side_s, lambda: self._end_side(count, number))
+
+    def _end_side(self, count: int, number: int) -> None:
+        if self.is_running and number == self._number:
+            done = f"{_SIDES[-1 - count]} side done, rotate to a different side"
+            self._send_later([f"progress <{min(100, _PERCENT_PER_SIDE * (count + 1))}>", done, done], 0.02)
+            self._px4.call_later(0.2, lambda: self._begin_side(count + 1, number))
+
     def _end(self, number: int) -> None:
         if self.is_running and number == self._number:
             self._px4.info(f"[cal] calibration done: {self._sensor}")
@@ -98,7 +131,8 @@ def _sensor_of(command: ReceivedCommand) -> str:
         "baro": command.param3 == 1,
         "accel": command.x == 1,
         "level": command.x == 2,
-        "airspeed": command.y == 1,
+        "airspeed": command.y in (1, 2),
+        "esc": command.z == 1,
     }
     return next((sensor for sensor, is_requested in requests.items() if is_requested), "")
 

@@ -199,7 +199,7 @@ def _gps_raw(px4: Px4Vehicle) -> m.GpsRawInt:
     course = round(math.degrees(math.atan2(motion.velocity_east, motion.velocity_north)) % 360.0 * 100) % 36000
     return m.GpsRawInt(
         px4.time_boot_us,
-        GpsFixType.TYPE_3D_FIX,
+        GpsFixType.RTK_FIXED if px4.corrections.is_recent else GpsFixType.TYPE_3D_FIX,
         place.latitude_e7,
         place.longitude_e7,
         altitude,

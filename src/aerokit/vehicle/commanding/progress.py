@@ -29,6 +29,9 @@ POSITION_MAX_AGE_S = 2.0
 
 STALL_TIMEOUT_S, STALL_DISTANCE_M = 12.0, 0.3
 
+FALL_SINK_M_S = 3.0
+"""A faster descent is mentioned when the vehicle does not move any more; autopilots descend at 1.5 m/s by default."""
+
 
 async def await_progress(
     session: VehicleSession,
@@ -64,6 +67,7 @@ async def await_progress(
             if done_since is not None and now - done_since >= held_for:
                 return
             if done_since is None and (reason := trouble()):
+                reason += _height_when_disarmed(session)
                 raise OperationRejected(f"{what}: {reason}", reasons=session.texts_since(reasons_from))
             if max_silence_s is not None and session.watch.silent_for_s > max_silence_s:
                 raise HeartbeatTimeout(f"{what}: {session.describe_link()}")
@@ -74,6 +78,14 @@ async def await_progress(
             if stillness is not None and (still := stillness()):
                 raise OperationTimeout(f"{what}: {still}; {describe()}; {session.describe_link()}")
             await changes.next(POLL_INTERVAL_S)
+
+
+def _height_when_disarmed(session: VehicleSession) -> str:
+    """Return the height of a vehicle that is disarmed in the air, as a clause, else an empty string."""
+    here = session.telemetry.position.latest
+    height_m = None if here is None else here.altitude_relative_m
+    is_falling = session.telemetry.is_confirmed_disarmed and height_m is not None and height_m > 1.0
+    return f" {height_m:.1f} m above home" if is_falling else ""
 
 
 class ChangeSignal:
@@ -118,6 +130,7 @@ class StallDetector:
     def __init__(self, session: VehicleSession) -> None:
         self._session = session
         self._from: Position | None = None
+        self._top_m, self._max_sink_m_s = -math.inf, 0.0
 
     def __call__(self) -> str | None:
         """Return a clause about how long the vehicle has not moved; None if it moves or its position is unknown."""
@@ -127,9 +140,22 @@ class StallDetector:
             self._from = None
         elif self._from is None or _metres(here, self._from) > STALL_DISTANCE_M:
             self._from, self._since = here, now
+            self._record_descent(here)
         elif now - self._since >= STALL_TIMEOUT_S:
-            return f"it accepted the order and has not moved for {now - self._since:.0f} s"
+            return f"it accepted the order and has not moved for {now - self._since:.0f} s{self._reason(here)}"
         return None
+
+    def _record_descent(self, here: Position) -> None:
+        velocity = self._session.telemetry.velocity.latest
+        self._top_m = max(self._top_m, here.altitude_relative_m if here.altitude_relative_m is not None else -math.inf)
+        self._max_sink_m_s = max(self._max_sink_m_s, 0.0 if velocity is None else velocity.down_m_s)
+
+    def _reason(self, here: Position) -> str:
+        """Return a fast descent before the standstill, as a clause; empty if there was none."""
+        height_m = here.altitude_relative_m
+        if height_m is None or self._max_sink_m_s < FALL_SINK_M_S or self._top_m - height_m <= 1.0:
+            return ""
+        return f", after it descended {self._top_m - height_m:.1f} m at up to {self._max_sink_m_s:.1f} m/s"
 
 
 def _metres(one: Position, other: Position) -> float:

@@ -19,7 +19,7 @@ from aerokit.errors import (
 )
 from aerokit.mavlink.enums import MavCmd, MavDoRepositionFlags, MavFrame, MavProtocolCapability, MavResult
 from aerokit.mavlink.messages import HomePosition, SetPositionTargetGlobalInt
-from aerokit.position import Position
+from aerokit.position import Home, Position, point_at, travel_target
 from aerokit.vehicle.commanding.context import VehicleBase
 from aerokit.vehicle.commanding.order import ROI
 from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M, MAX_SILENCE_S, StallDetector, await_progress
@@ -41,7 +41,7 @@ class TravelActions(VehicleBase):
 
     async def go_to(
         self,
-        target: Position,
+        target: Position | Home,
         *,
         speed_m_s: float | None = None,
         heading_deg: float | None = None,
@@ -60,7 +60,7 @@ class TravelActions(VehicleBase):
 
         Args:
             target: latitude and longitude, and an altitude above home or above mean sea level; without an altitude
-                the present one is kept.
+                the present one is kept, also for ``vehicle.home.value``.
             speed_m_s: ground speed from now on, above 0; None keeps the present one.
             heading_deg: heading on arrival, 0–360 clockwise from north; None leaves it to the autopilot.
             tolerance_m: arrival radius in metres; None: the default of the type of vehicle.
@@ -78,6 +78,7 @@ class TravelActions(VehicleBase):
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the vehicle did not arrive in time, or does not move.
         """
+        target = travel_target(target)
         latitude, longitude, altitude, is_relative = self._position.global_target(target)
         _check_travel(speed_m_s, heading_deg, tolerance_m, timeout)
         self._position.check_reach("target", [target], max_distance_m)
@@ -278,7 +279,7 @@ class TravelActions(VehicleBase):
                 max_silence_s=max_silence_s,
             )
 
-    async def set_home(self, place: Position | None = None, *, timeout: float = 5.0) -> None:
+    async def set_home(self, place: Position | Home | None = None, *, timeout: float = 5.0) -> None:
         """Move the home position, to a place or to the vehicle's present position, and wait until HOME_POSITION
         reports it.
 
@@ -302,19 +303,19 @@ class TravelActions(VehicleBase):
             if place is None:
                 await self._sender.run_command(order, self._session.commands.send_long, MavCmd.DO_SET_HOME, 1)
             else:
-                latitude, longitude, altitude, _ = self._position.global_target(place)
+                latitude, longitude, altitude, _ = self._position.global_target(point_at(place))
                 where: dict[str, Any] = {"x": latitude, "y": longitude, "z": altitude}
                 await self._sender.run_command(order, self._session.commands.send_place, MavCmd.DO_SET_HOME, 0, **where)
         requested_at = self.connection.now()
         await self._session.commands.send_long(MavCmd.REQUEST_MESSAGE, HomePosition.ID)
         await home.wait_until(lambda _: home.updated_at >= requested_at, timeout=timeout, description="set_home")
 
-    def distance_to(self, target: Position) -> float:
+    def distance_to(self, target: Position | Home) -> float:
         """Return the distance to ``target`` in metres, three-dimensional if ``target`` has an altitude.
 
         Infinite while the position is unknown.
         """
-        return self._position.distance_to(target)
+        return self._position.distance_to(point_at(target))
 
     def _check_can_turn(self, heading_deg: float | None) -> None:
         if heading_deg is not None and not self._turns_by_reposition and not self.autopilot.condition_yaw:
@@ -352,7 +353,7 @@ LOCATION = MavCmd.DO_SET_ROI_LOCATION
 class LookActions(VehicleBase):
     """Pointing the nose or the gimbal at a place. A new order replaces the previous one."""
 
-    async def look_at(self, target: Position) -> None:
+    async def look_at(self, target: Position | Home) -> None:
         """Point nose or gimbal at a place until :meth:`stop_looking`; without an altitude, at the vehicle's altitude.
 
         Sends MAV_CMD_DO_SET_ROI_LOCATION (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_ROI_LOCATION), or
@@ -364,7 +365,7 @@ class LookActions(VehicleBase):
             CommandTimeout: there was no acknowledgement.
             OperationRejected: the mode changed, or a newer order was given, before the acknowledgement.
         """
-        latitude, longitude, altitude, is_relative = self._position.global_target(target)
+        latitude, longitude, altitude, is_relative = self._position.global_target(point_at(target))
         if not self._session.commands.is_unknown(LOCATION):
             frame = MavFrame.GLOBAL_RELATIVE_ALT_INT if is_relative else MavFrame.GLOBAL_INT
             if await self._set_roi_location({"frame": frame, "x": latitude, "y": longitude, "z": altitude}):

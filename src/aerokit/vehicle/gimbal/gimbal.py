@@ -12,7 +12,7 @@ from aerokit._internal.async_block import ReadOnly
 from aerokit.errors import BusyError, CommandRejected, CommandTimeout, InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavFrame
 from aerokit.mavlink.messages import GimbalDeviceInformation, GimbalManagerInformation, GlobalPositionInt
-from aerokit.position import Position
+from aerokit.position import Home, Position, point_at
 from aerokit.vehicle.gimbal.control import GimbalControl
 from aerokit.vehicle.gimbal.device import MAX_GIMBAL_NUMBER, YawFrame, information_of
 from aerokit.vehicle.gimbal.discovery import MAX_GIMBALS, GimbalRegistry
@@ -77,7 +77,7 @@ class RoiMixin(GimbalMixin):
     """Region of interest: pointing a gimbal at a position or another vehicle. A newer order ends the previous one."""
 
     async def look_at(
-        self, target: Position, *, wait: bool = True, tolerance_deg: float = 5.0, timeout: float = 15.0
+        self, target: Position | Home, *, wait: bool = True, tolerance_deg: float = 5.0, timeout: float = 15.0
     ) -> None:
         """Keep the gimbal pointed at a position; returns when it points there.
 
@@ -104,6 +104,7 @@ class RoiMixin(GimbalMixin):
         check_range("tolerance_deg", tolerance_deg, 0, 45, above=True)
         orders = self._orders
         orders.check_roi()
+        target = point_at(target)
         x, y, z, is_relative = self._context.vehicle_position.global_target(target)
         frame = MavFrame.GLOBAL_RELATIVE_ALT_INT if is_relative else MavFrame.GLOBAL_INT
         order = orders.begin_order()

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from aerokit._internal import geo
 from aerokit._internal.values import Snapshot
-from aerokit.position import Position
+from aerokit.position import Home, Position
 from aerokit.vehicle.state.field import U16, Context, finite
 
 if TYPE_CHECKING:
@@ -43,22 +43,6 @@ __all__ = [
 # Positions within 0.01 degrees of 0°N 0°E are treated as missing.
 MIN_COORDINATE = 100_000
 SAME_ALTITUDE_MM = 100
-
-
-class Home(Snapshot):
-    """The home position (HOME_POSITION); ``north_m`` … are from the local origin, None if not reported."""
-
-    latitude_deg: float
-    longitude_deg: float
-    altitude_amsl_m: float
-    north_m: float | None = None
-    east_m: float | None = None
-    down_m: float | None = None
-
-    @property
-    def position(self) -> Position:
-        """Home as a target without an altitude: flying there keeps the present altitude."""
-        return Position(self.latitude_deg, self.longitude_deg)
 
 
 class LocalPosition(Snapshot):

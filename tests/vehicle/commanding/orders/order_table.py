@@ -58,6 +58,16 @@ def _set(name: tuple[str, str]) -> Give:
     return give
 
 
+def _calibrate(name: str) -> Give:
+    async def give(vehicle: aerokit.Vehicle) -> None:
+        with anyio.move_on_after(40.0):  # nobody turns the simulated PX4
+            async for _ in getattr(vehicle.calibrate, name)():
+                pass
+
+    return give
+
+
+CALIBRATION = int(MavCmd.PREFLIGHT_CALIBRATION)
 SET_MODE = int(MavCmd.DO_SET_MODE)
 PITCHYAW = int(MavCmd.DO_GIMBAL_MANAGER_PITCHYAW)
 REPOSITION = int(MavCmd.DO_REPOSITION)
@@ -67,6 +77,25 @@ REBOOT = int(MavCmd.PREFLIGHT_REBOOT_SHUTDOWN)
 
 ROWS = (
     *(call.order for call in CALLS.values() if call.order is not None),
+    Row(
+        "calibrate.compass",
+        _calibrate("compass"),
+        int(MavCmd.DO_START_MAG_CAL),
+        place="ground",
+        steers=False,
+        ends_later=True,
+        on=("ardupilot",),
+    ),
+    Row(
+        "calibrate.compass",
+        _calibrate("compass"),
+        CALIBRATION,
+        place="ground",
+        steers=False,
+        ends_later=True,
+        on=("px4",),
+    ),
+    Row("calibrate.gyroscope", _calibrate("gyroscope"), CALIBRATION, place="ground", steers=False, ends_later=True),
     Row(
         "set_mode",
         lambda v: v.set_mode("LOITER"),

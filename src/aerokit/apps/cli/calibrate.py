@@ -1,0 +1,207 @@
+"""``aerokit calibrate``: guides a person through a calibration."""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING
+
+import anyio
+import anyio.lowlevel
+
+from aerokit.apps.cli.arguments import system_id
+from aerokit.apps.cli.connecting import add_link, connect_to, signing_of
+from aerokit.apps.cli.output import DONE, INTERRUPTED, emit
+from aerokit.apps.cli.terminal import CLEAR_LINE, on_interrupt, press_enter
+from aerokit.connection.opening import OBSERVER_SYSTEM_ID
+from aerokit.errors import InvalidArgument, NotSupported, OperationTimeout
+from aerokit.vehicle.calibration.values import CalibrationPose
+
+if TYPE_CHECKING:
+    import argparse
+
+    from aerokit.vehicle.calibration.calibration import Calibration
+    from aerokit.vehicle.calibration.values import CalibrationStep
+    from aerokit.vehicle.vehicle import Vehicle
+
+_SENSORS = ("compass", "accelerometer", "gyroscope", "level", "airspeed", "barometer", "radio", "escs")
+_BAR_WIDTH = 30
+_CANCEL_TIMEOUT_S = 20.0
+
+_GROUND = "    ~~~~~~~~~~~~~~~~~~~~~~~~~~~~"
+# A vehicle with its nose to the right, seen from its right side, or from behind where a side is down.
+PICTURES: dict[CalibrationPose, tuple[str, str]] = {
+    CalibrationPose.LEVEL: (
+        "seen from the right side",
+        r"""
+          ----+----     ----+----
+              |   _______   |
+              '--[_______]>-'   nose
+                  /     \
+""",
+    ),
+    CalibrationPose.BACK: (
+        "seen from the right side",
+        r"""
+                  \_____/
+              .--[_______]>-.   nose
+              |             |
+          ----+----     ----+----
+""",
+    ),
+    CalibrationPose.NOSE_DOWN: (
+        "seen from the right side",
+        r"""
+                 _       |
+                | |------+   tail
+              ==| |      |
+       feet     | |
+              ==| |      |
+                |_|------+
+                 V       |   nose
+""",
+    ),
+    CalibrationPose.NOSE_UP: (
+        "seen from the right side",
+        r"""
+             |       A       nose
+             +------| |
+             |      | |==
+                    | |      feet
+             |      | |==
+             +------|_|
+             |               tail
+""",
+    ),
+    CalibrationPose.LEFT: (
+        "seen from behind",
+        r"""
+              |
+              +--.       right
+              |  |_
+                 |_|==   feet
+              |  |
+              +--'       left
+""",
+    ),
+    CalibrationPose.RIGHT: (
+        "seen from behind",
+        r"""
+                         |
+              left    .--+
+                     _|  |
+             feet  ==|_|
+                      |  |
+              right   '--+
+""",
+    ),
+}
+
+
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    command.add_argument("sensor", choices=_SENSORS, help="what to calibrate")
+    add_link(command)
+    command.add_argument("--system-id", type=system_id, metavar="ID", help="system id of the vehicle (the only one)")
+    command.add_argument(
+        "--propellers-removed", action="store_true", help="for escs: confirms that no propeller is mounted"
+    )
+    command.set_defaults(run=_run)
+
+
+async def _run(options: argparse.Namespace) -> int:
+    if options.sensor == "escs" and not options.propellers_removed:
+        raise InvalidArgument("escs: the motors get full throttle: remove the propellers and add --propellers-removed")
+    async with connect_to(
+        options,
+        options.address,
+        changes=True,
+        source_system=OBSERVER_SYSTEM_ID,
+        rates={},
+        signing=signing_of(options),
+    ) as vehicle:
+        return await _guide(options, _calibration(vehicle, options.sensor))
+
+
+def _calibration(vehicle: Vehicle, sensor: str) -> Calibration:
+    if sensor == "escs":
+        return vehicle.calibrate.escs(intent="propellers are removed")
+    made: Calibration = getattr(vehicle.calibrate, sensor)()
+    return made
+
+
+async def _guide(options: argparse.Namespace, calibration: Calibration) -> int:
+    """Show the steps until the end. Ctrl-C cancels the calibration on the vehicle."""
+    scope, display = anyio.CancelScope(), Display(options)
+    with on_interrupt(scope.cancel):
+        with scope:
+            async for step in calibration:
+                display.show(step)
+                if step.needs_confirmation and not await press_enter():
+                    scope.cancel()
+                    await anyio.lowlevel.checkpoint()
+            return DONE
+        return await _cancel(options, calibration)
+
+
+async def _cancel(options: argparse.Namespace, calibration: Calibration) -> int:
+    text = "cancelled on the vehicle"
+    try:
+        with anyio.fail_after(_CANCEL_TIMEOUT_S):
+            await calibration.cancel()
+    except (NotSupported, OperationTimeout, TimeoutError) as error:
+        text = f"not cancelled on the vehicle: {error}"
+    emit(options, "calibration_cancelled", {"sensor": options.sensor, "text": text}, f"{options.sensor}: {text}")
+    return INTERRUPTED
+
+
+class Display:
+    """Prints pictures of poses, instructions and progress; at most 80 columns and 24 lines at a time."""
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        self._options = options
+        self._shown: tuple[CalibrationPose | None, str] = (None, "")
+
+    def show(self, step: CalibrationStep) -> None:
+        if step.result is not None:
+            self._show_result(step)
+            return
+        record = {
+            "sensor": step.sensor,
+            "progress": step.progress,
+            "instruction": step.instruction,
+            "pose": step.pose,
+            "remaining": step.remaining,
+            "needs_confirmation": step.needs_confirmation,
+        }
+        pose, instruction = self._shown
+        self._shown = (step.pose, step.instruction)
+        lines = lines_of(step) if step.pose is not pose else [f"  {step.instruction[:76]}"]
+        is_new = self._shown != (pose, instruction)
+        emit(self._options, "calibration_step", record, "\n".join(lines) if is_new else None)
+        if not self._options.json and step.progress is not None and sys.stdout.isatty():
+            print(f"{CLEAR_LINE}{bar(step.progress)}", end="\r", flush=True)
+
+    def _show_result(self, step: CalibrationStep) -> None:
+        assert step.result is not None
+        result = step.result
+        fits = [f"  compass {fit.compass}: fitness {fit.fitness_mgauss:.1f} mgauss" for fit in result.compasses]
+        reboot = ["  reboot the vehicle before the next flight"] if result.reboot_due else []
+        record = {"sensor": step.sensor, "text": step.instruction, **result.to_dict()}
+        text = "\n".join((f"{step.sensor}: {step.instruction}", *fits, *reboot))
+        emit(self._options, "calibration_result", record, text)
+
+
+def lines_of(step: CalibrationStep) -> list[str]:
+    """Return a step as lines of text: the picture of the pose, the instruction, and the poses that follow."""
+    lines = []
+    if step.pose is not None:
+        seen, picture = PICTURES[step.pose]
+        others = ", ".join(pose.value for pose in step.remaining if pose is not step.pose)
+        lines = ["", f"  {step.pose.value.upper()} ({seen})", *picture.strip("\n").splitlines(), _GROUND]
+        lines += [f"  then: {others}"] if others else []
+    return [*lines, f"  {step.instruction[:76]}"]
+
+
+def bar(progress: float) -> str:
+    """Return a progress bar: ``  [######------]  50 %``."""
+    done = round(progress * _BAR_WIDTH)
+    return f"  [{'#' * done}{'-' * (_BAR_WIDTH - done)}] {100 * progress:3.0f} %"

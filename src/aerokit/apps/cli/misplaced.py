@@ -1,0 +1,90 @@
+"""Recognises an address or a file in the place of another argument, before anything is opened."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+_ADDRESS = re.compile(
+    r"(udp(in|out|bcast)?|tcp(in|out)?|serial|zenoh(in)?):.+|\d+(\.\d+){3}:\d+|/dev/(tty|cu|serial).+|com\d+([,:]\d+)?",
+    re.IGNORECASE,
+)
+_PLAN = "`aerokit fly {}` flies it, `aerokit mission upload {}` uploads it"
+_PARAMETERS = "`aerokit params load {}` sets these parameters"
+_COMMANDS_BY_SUFFIX = {
+    ".plan": _PLAN,
+    ".waypoints": _PLAN,
+    ".param": _PARAMETERS,
+    ".parm": _PARAMETERS,
+    ".params": _PARAMETERS,
+    ".py": "`aerokit run {}` runs a DroneKit program",
+}
+
+
+def is_address(word: str) -> bool:
+    """Return True for an address of a link that is unlikely to be anything else."""
+    return _ADDRESS.fullmatch(word) is not None
+
+
+def misplaced_file(word: str) -> str | None:
+    """Return an error text if a word given as an address is a file, with the right command; None for an address."""
+    path = Path(word)
+    advice = _COMMANDS_BY_SUFFIX.get(path.suffix.lower())
+    if advice is None and not (path.is_file() and path.suffix.lower() != ".tlog"):
+        return None
+    text = f"{word!r} is a file; an address is expected, such as udpin:0.0.0.0:14550"
+    return text if advice is None else f"{text}. {advice.replace('{}', shlex.quote(word))}"
+
+
+def misplaced_address(parser: argparse.ArgumentParser, words: Sequence[str]) -> str | None:
+    """Return an error text if a command's words have an address in the wrong place, with the right command line."""
+    words = list(words[: words.index("--")] if "--" in words else words)
+    command = parser.prog.split()
+    if parser._subparsers is not None:
+        return _address_before_action(parser, words) if words and is_address(words[0]) else None
+    has_connect = "--connect" in parser._option_string_actions
+    if not has_connect and any("address" in action.dest or action.dest == "endpoints" for action in parser._actions):
+        is_connected = any(word.partition("=")[0] == "--connect" for word in words)
+        line = shlex.join([*command, *(word.removeprefix("--connect=") for word in words if word != "--connect")])
+        return f"`{parser.prog}` takes the address without --connect: {line}" if is_connected else None
+    for number, word in enumerate(words):
+        # `aerokit files` takes paths on the vehicle, which may begin with /dev.
+        is_path = word.startswith("/") and command[1] == "files"
+        if is_path or not is_address(word) or (number and _takes_value(parser, words[number - 1])):
+            continue
+        if not has_connect:
+            return f"`{parser.prog}` takes no address; to record a link: aerokit record {shlex.quote(word)} flight.tlog"
+        if any(other.startswith("--connect") for other in words):
+            return f"{word!r} is a second address, after --connect"
+        others = words[:number] + words[number + 1 :] or _required(parser)
+        line = shlex.join([*command, *others, "--connect", word])
+        return f"{word!r} is an address, which needs --connect: {line}"
+    return None
+
+
+def _address_before_action(parser: argparse.ArgumentParser, words: list[str]) -> str:
+    """Return the error text for ``aerokit params udpin:… list``."""
+    address, action, *rest = [*words, "ACTION"] if len(words) == 1 else words
+    actions = next(item.choices for item in parser._actions if isinstance(item, argparse._SubParsersAction))
+    known = actions.get(action) or next(iter(actions.values()))
+    place = ["--connect", address] if "--connect" in known._option_string_actions else [address]
+    line = shlex.join([*parser.prog.split(), action, *place, *rest])
+    return f"{address!r} is an address, but an action comes first: {line}"
+
+
+def _takes_value(parser: argparse.ArgumentParser, option: str) -> bool:
+    """Return True for an option, possibly abbreviated, that the next word belongs to."""
+    actions = (action for name, action in parser._option_string_actions.items() if name.startswith(option))
+    return option.startswith("--") and any(action.nargs != 0 for action in actions)
+
+
+def _required(parser: argparse.ArgumentParser) -> list[str]:
+    """Return the names of the positional arguments that a command requires."""
+    positional = (action for action in parser._actions if not action.option_strings)
+    return [str(action.metavar or action.dest).upper() for action in positional if action.nargs not in ("?", "*")]

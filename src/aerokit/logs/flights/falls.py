@@ -1,0 +1,112 @@
+"""Detection of falls and hard landings in a flight, from heights, sink rates and the autopilot's texts."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from aerokit._internal.values import Snapshot
+from aerokit.logs.flights.failsafes import evidence_in_texts
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from aerokit.logs.flights.flight import FlightLog
+
+# Autopilots land at 0.5 to 2 m/s, and descend at 1.5 m/s by default (ArduPilot WP_SPD_DN, PX4 MPC_Z_VEL_MAX_DN).
+_MIN_SINK_M_S, _STOPPED_M_S = 3.0, 1.0
+_MIN_HEIGHT_M = 2.0
+# Free fall reaches this speed after two metres.
+_FALL_SINK_M_S = 6.0
+# The ground stops a vehicle within this time, a motor does not.
+_IMPACT_S = 0.6
+_SAME_HEIGHT_M = 1.5
+_DISARM_TIMEOUT_S = 30.0
+_NEAR_HOME_HEIGHT_M = 3.0
+_CRASH_KINDS = frozenset(("crash", "thrust", "motor", "termination"))
+
+
+class Fall(Snapshot):
+    """A descent that ended on the ground at more than 3 m/s; see docs/report.md."""
+
+    time_s: float
+    """Time of the impact, or of the last entry if the log ends before it."""
+    begins_s: float
+    """Start of the descent."""
+    height_m: float
+    """Height lost."""
+    sink_m_s: float
+    """Sink rate at the end."""
+    is_hard_landing: bool
+    """True below 6 m/s, unless the vehicle was disarmed in the air or the autopilot reported a crash."""
+    has_impact: bool
+    """False if the log ends in the descent."""
+    reasons: tuple[str, ...]
+    """Disarming in the air, and texts that report a crash, a motor failure or a termination."""
+
+    @property
+    def title(self) -> str:
+        return "Hard landing" if self.is_hard_landing else "Fall"
+
+
+def falls(flight: FlightLog) -> list[Fall]:
+    """Return the falls and hard landings of a flight, the oldest first; none without heights and sink rates.
+
+    A descent counts if the vehicle sank at more than 3 m/s, was stopped within 0.6 s, and then stayed at that height
+    until it was disarmed, or if the autopilot reported a crash; also a log that ends in such a descent near the ground.
+    """
+    if not flight.armed:
+        return []
+    return [fall for descent in _descents(flight) if (fall := _fall(flight, *descent)) is not None]
+
+
+def _descents(flight: FlightLog) -> Iterator[tuple[float, float, float, bool]]:
+    """Yield start, end and last sink rate of each fast descent, and True if it was stopped."""
+    begin_s = before_s = fast_s = -math.inf
+    sink_m_s = 0.0
+    for time_s, down_m_s in zip(flight.velocity.times, flight.velocity["down_m_s"], strict=True):
+        if down_m_s != down_m_s:
+            continue
+        if down_m_s >= _MIN_SINK_M_S:
+            is_recent = time_s - fast_s <= _IMPACT_S
+            fast_s, sink_m_s = time_s, max(down_m_s, sink_m_s if is_recent else 0.0)
+        elif down_m_s < _STOPPED_M_S:
+            if fast_s > begin_s and time_s - fast_s <= max(_IMPACT_S, 1.5 * (time_s - before_s)):
+                yield begin_s, time_s, sink_m_s, True
+            begin_s, sink_m_s = time_s, 0.0
+        before_s = time_s
+    if fast_s > begin_s and fast_s == before_s:
+        yield begin_s, fast_s, sink_m_s, False
+
+
+def _fall(flight: FlightLog, begin_s: float, end_s: float, sink_m_s: float, has_impact: bool) -> Fall | None:
+    above, below = (flight.track.at("altitude_relative_m", time_s) for time_s in (begin_s, end_s))
+    if not above - below >= _MIN_HEIGHT_M:  # also if a height is unknown
+        return None
+    reasons = _reasons(flight, begin_s, end_s)
+    is_on_ground = _stays(flight, end_s, below) if has_impact else below < 2 * sink_m_s
+    if not (is_on_ground or reasons):
+        return None
+    is_hard_landing = sink_m_s < _FALL_SINK_M_S and not reasons
+    return Fall(end_s, begin_s, above - below, sink_m_s, is_hard_landing, has_impact, tuple(reasons))
+
+
+def _stays(flight: FlightLog, time_s: float, height_m: float) -> bool:
+    """Return True if the vehicle stays at this height until it is disarmed, so that it is on the ground."""
+    disarmed_s = next((end for begin, end in flight.armed if begin <= time_s < end), time_s)
+    if disarmed_s > time_s + _DISARM_TIMEOUT_S:
+        return False
+    if disarmed_s >= flight.duration_s and height_m > _NEAR_HOME_HEIGHT_M:
+        return False  # the log ends while it is armed: it may hover
+    heights = flight.track.between("altitude_relative_m", time_s + _IMPACT_S, disarmed_s)
+    return all(abs(height - height_m) <= _SAME_HEIGHT_M for height in heights)
+
+
+def _reasons(flight: FlightLog, begin_s: float, end_s: float) -> list[str]:
+    """Return why it is a fall, by the log: disarming in the air, and texts."""
+    reasons = [
+        "disarmed in the air" for begin, end in flight.armed if begin < begin_s and begin_s - 3 <= end <= end_s - 0.3
+    ]
+    texts = [text for text in flight.texts if begin_s - 3 <= text.time_s <= end_s + 5]
+    reported = [item for item in evidence_in_texts(texts) if item.kind in _CRASH_KINDS]
+    return reasons + list(dict.fromkeys(item.text for item in reported))[:3]

@@ -1,0 +1,1 @@
+"""Calibration of sensors, radio and ESCs, step by step."""

@@ -1,0 +1,284 @@
+"""The steps of each calibration, on ArduPilot and on PX4."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from contextlib import ExitStack
+from typing import TYPE_CHECKING
+
+from aerokit.errors import NotSupported, OperationTimeout, ParameterRejected
+from aerokit.mavlink.enums import AccelcalVehiclePos, MagCalStatus, MavCmd, MavResult, MavState
+from aerokit.mavlink.messages import CommandLong, MagCalProgress, MagCalReport
+from aerokit.vehicle.calibration.values import CalibrationPose, CompassFit, parse_report
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncGenerator
+
+    from aerokit.vehicle.calibration.run import CalibrationRun
+    from aerokit.vehicle.calibration.values import CalibrationReport, CalibrationStep
+    from aerokit.vehicle.parameters.parameters import Parameters
+
+CANCEL_ALL = (MavCmd.PREFLIGHT_CALIBRATION, (0.0,) * 7)
+REPORT_HZ = 4.0
+# PX4's HEARTBEAT leaves CALIBRATING before the last text arrives.
+END_GRACE_S = 3.0
+# ArduPilot repeats its request every second; one that arrives sooner after a confirmation was sent before it.
+POSE_REPEAT_S = 2.0
+POSES = {
+    AccelcalVehiclePos.LEVEL: CalibrationPose.LEVEL,
+    AccelcalVehiclePos.LEFT: CalibrationPose.LEFT,
+    AccelcalVehiclePos.RIGHT: CalibrationPose.RIGHT,
+    AccelcalVehiclePos.NOSEDOWN: CalibrationPose.NOSE_DOWN,
+    AccelcalVehiclePos.NOSEUP: CalibrationPose.NOSE_UP,
+    AccelcalVehiclePos.BACK: CalibrationPose.BACK,
+}
+IS_NOT_CANCELLED = "ArduPilot cannot cancel it: it waits for the next pose, and cannot be armed, until it reboots"
+
+
+async def by_texts(run: CalibrationRun, *params: float) -> AsyncGenerator[CalibrationStep, None]:
+    """PX4: the vehicle detects the poses itself and reports by ``[cal]`` texts."""
+    await run.begin(CANCEL_ALL)
+    telemetry, now = run.session.telemetry, run.session.connection.now
+    reports: deque[CalibrationReport] = deque()
+    calibrating_at = math.inf
+    with ExitStack() as ends:
+
+        def on_text(text: str) -> None:
+            if report := parse_report(text):
+                reports.append(report)
+
+        ends.callback(telemetry.status_text.observe(lambda _, text: on_text(text.text), every_arrival=True))
+
+        def has_ended_silently() -> bool:
+            nonlocal calibrating_at
+            if telemetry.system_status.latest == MavState.CALIBRATING:
+                calibrating_at = now()
+            return now() - calibrating_at > END_GRACE_S
+
+        await run.start(*params)
+        step = run.step(0.0, "keep the vehicle still")
+        yield step
+        while True:
+            await run.wait(lambda: reports or has_ended_silently())
+            if not reports:
+                run.finish()
+                raise OperationTimeout(
+                    f"{run.what}: the vehicle has ended the calibration, but the text with its result was lost;"
+                    f" {run.session.describe_link()}"
+                )
+            report = reports.popleft()
+            if report.kind in ("failed", "cancelled"):
+                run.finish()
+                raise run.failure(f"the vehicle reports: {report.text}")
+            if report.kind == "done":
+                yield run.result()
+                return
+            if (following := _after(run, step, report)) != step:
+                yield (step := following)
+
+
+def _after(run: CalibrationRun, step: CalibrationStep, report: CalibrationReport) -> CalibrationStep:
+    """Return the step after a report of PX4."""
+    progress, pose, remaining, instruction = step.progress, step.pose, step.remaining, step.instruction
+    if report.kind == "progress":
+        progress = report.progress
+    elif report.kind == "pending":
+        remaining, pose = report.poses, report.poses[0]
+        instruction = "place the vehicle in one of the remaining poses and keep it still"
+    elif report.kind == "detected":
+        pose, instruction = report.poses[0], report.text
+    elif report.kind == "side done":
+        remaining = tuple(other for other in remaining if other not in report.poses)
+        pose, instruction = remaining[0] if remaining else None, report.text
+    elif report.kind in ("text", "already done"):
+        instruction = report.text
+    return run.step(progress, instruction, pose, remaining)
+
+
+async def acknowledged(
+    run: CalibrationRun, *params: float, instruction: str, reboot_due: bool = False
+) -> AsyncGenerator[CalibrationStep, None]:
+    """ArduPilot: the acknowledgement is the result."""
+    run.check_disarmed()
+    yield run.step(None, instruction)
+    await run.begin(None)
+    await run.start(*params)
+    yield run.result(reboot_due=reboot_due)
+
+
+async def ardupilot_airspeed(
+    run: CalibrationRun, parameters: Parameters, *params: float
+) -> AsyncGenerator[CalibrationStep, None]:
+    """ArduPilot calibrates airspeed sensors with the barometer, if there are any."""
+    run.check_disarmed()
+    if await _parameter(run, parameters, "ARSPD_TYPE") == 0:
+        raise run.failure("no airspeed sensor is enabled (ARSPD_TYPE is 0); nothing was sent")
+    async for step in acknowledged(run, *params, instruction="cover the airspeed sensor against wind"):
+        yield step
+
+
+async def ardupilot_escs(run: CalibrationRun, parameters: Parameters) -> AsyncGenerator[CalibrationStep, None]:
+    """ArduCopter calibrates ESCs while it boots, if ESC_CALIBRATION is 3."""
+    run.check_disarmed()
+    await _parameter(run, parameters, "ESC_CALIBRATION")
+    yield run.step(None, "remove the propellers, then continue", needs_confirmation=True)
+    await run.begin(None)
+    try:
+        await parameters.set("ESC_CALIBRATION", 3)
+    finally:
+        run.finish()
+    yield run.result("disconnect the battery, then connect it: the ESCs are calibrated at boot", reboot_due=True)
+
+
+async def _parameter(run: CalibrationRun, parameters: Parameters, name: str) -> float:
+    try:
+        return (await parameters.read(name)).value
+    except ParameterRejected:
+        firmware = run.session.autopilot.firmware
+        raise NotSupported(f"{run.what}: {firmware} has no parameter {name} on this vehicle") from None
+
+
+async def ardupilot_compass(run: CalibrationRun, *_: float) -> AsyncGenerator[CalibrationStep, None]:
+    """ArduPilot: progress and reports of each compass; the result is accepted if all have succeeded."""
+    await run.begin((MavCmd.DO_CANCEL_MAG_CAL, (0.0,)))
+    percents: dict[int, int] = {}
+    reports: dict[int, MagCalReport] = {}
+    changes: deque[None] = deque(maxlen=1)
+    mask = 0
+
+    def on_progress(message: MagCalProgress) -> None:
+        nonlocal mask
+        mask |= message.cal_mask
+        if percents.get(message.compass_id) != message.completion_pct:
+            percents[message.compass_id] = message.completion_pct
+            changes.append(None)
+
+    def on_report(message: MagCalReport) -> None:
+        nonlocal mask
+        mask |= message.cal_mask
+        reports[message.compass_id] = message
+        changes.append(None)
+
+    bus, rates, system_id = run.session.connection.bus, run.session.rates, run.session.system_id
+    with ExitStack() as ends:
+        await run.start(0, 0, 0, 0, 0, command=MavCmd.DO_START_MAG_CAL)
+        for kind, sink in ((MagCalProgress, on_progress), (MagCalReport, on_report)):
+            ends.callback(bus.attach(kind, sink, system_id=system_id))
+            ends.callback(rates.request(kind, REPORT_HZ, is_optional=True))
+        yield run.step(0.0, "turn the vehicle slowly in all directions, about each of its axes")
+        while not mask or any(mask >> compass & 1 and compass not in reports for compass in range(8)):
+            await run.wait(lambda: changes)
+            changes.clear()
+            progress = min(percents.values(), default=0) / 100
+            yield run.step(progress, "turn the vehicle slowly in all directions, about each of its axes")
+    failed = [report for report in reports.values() if report.cal_status != MagCalStatus.SUCCESS]
+    if failed:
+        names = "; ".join(
+            f"compass {report.compass_id} {_status_name(report.cal_status)} (fitness {report.fitness:.1f} mgauss)"
+            for report in failed
+        )
+        raise run.failure(f"{names}; the previous calibration is kept")
+    await run.command(MavCmd.DO_ACCEPT_MAG_CAL, 0)
+    fits = tuple(
+        CompassFit(report.compass_id, report.fitness, (report.ofs_x, report.ofs_y, report.ofs_z))
+        for _, report in sorted(reports.items())
+    )
+    yield run.result(reboot_due=True, compasses=fits)
+
+
+def _status_name(status: int) -> str:
+    try:
+        return MagCalStatus(status).name.lower().replace("_", " ")
+    except ValueError:
+        return f"status {status}"
+
+
+async def ardupilot_accelerometer(run: CalibrationRun, *params: float) -> AsyncGenerator[CalibrationStep, None]:
+    """ArduPilot: requests six poses one after the other, each of which is confirmed."""
+    await run.begin(None, IS_NOT_CANCELLED)
+    requests: deque[int] = deque()
+    confirmed, confirmed_at = 0, -math.inf
+    now = run.session.connection.now
+
+    def on_request(message: CommandLong) -> None:
+        is_repeated = message.param1 == confirmed and now() - confirmed_at < POSE_REPEAT_S
+        if message.command == MavCmd.ACCELCAL_VEHICLE_POS and not is_repeated:
+            requests.append(int(message.param1))
+
+    with ExitStack() as ends:
+        await run.start(*params)
+        # The result of an earlier calibration is broadcast until this one starts, so it is attached now.
+        ends.callback(run.session.connection.bus.attach(CommandLong, on_request, system_id=run.session.system_id))
+        while True:
+            await run.wait(lambda: requests)
+            request = requests.pop()
+            requests.clear()
+            if request == AccelcalVehiclePos.SUCCESS:
+                yield run.result(reboot_due=True)
+                return
+            if request == AccelcalVehiclePos.FAILED:
+                run.finish()
+                raise run.failure("the calibration failed; keep the vehicle still in each pose")
+            if request in POSES:
+                pose = POSES[AccelcalVehiclePos(request)]
+                left = tuple(POSES.values())[request - 1 :]
+                text = f"place the vehicle {pose.value}, keep it still, then continue"
+                yield run.step((request - 1) / len(POSES), text, pose, left, needs_confirmation=True)
+                await run.command(MavCmd.ACCELCAL_VEHICLE_POS, request)
+                confirmed, confirmed_at = request, now()
+                requests.clear()
+
+
+MIN_CHANNELS, MIN_TRAVEL_US = 4, 300
+CHANNELS_TIMEOUT_S = 5.0
+# Ranges of RCn_MIN, RCn_MAX on both firmwares (RC_Channel.cpp, PX4 rc_params).
+LOWEST_US, MIDDLE_US, HIGHEST_US = 800, 1500, 2200
+ENDED_RC = (MavResult.UNSUPPORTED,)  # ArduPilot prevents arming while it calibrates, and answers UNSUPPORTED.
+
+
+async def radio_by_channels(run: CalibrationRun, parameters: Parameters) -> AsyncGenerator[CalibrationStep, None]:
+    """Both: the travel of each channel of RC_CHANNELS becomes RCn_MIN, RCn_MAX and RCn_TRIM."""
+    run.check_disarmed()
+    cell = run.session.telemetry.cells["rc_channels"]
+    lows: dict[int, int] = {}
+    highs: dict[int, int] = {}
+    with ExitStack() as ends:
+        ends.enter_context(run.session.streaming("rc_channels"))
+        seen = cell.updated_at
+        await run.wait(lambda: cell.updated_at > seen, CHANNELS_TIMEOUT_S, "no RC_CHANNELS: is there a receiver?")
+        if not _pulses(cell.latest):
+            raise run.failure("the receiver reports no channels: is the transmitter on? nothing was sent")
+        await run.begin(CANCEL_ALL)
+        await run.command(MavCmd.PREFLIGHT_CALIBRATION, 0, 0, 0, 1, accepts=ENDED_RC)
+
+        def on_channels(value: object) -> None:
+            for number, pulse in _pulses(value).items():
+                lows[number] = min(pulse, lows.get(number, pulse))
+                highs[number] = max(pulse, highs.get(number, pulse))
+
+        ends.callback(cell.observe(lambda _, value: on_channels(value), every_arrival=True))
+        yield run.step(0.0, "move all sticks and switches to all their ends, then continue", needs_confirmation=True)
+        yield run.step(
+            0.5, "centre the sticks, with the throttle at its lowest, then continue", needs_confirmation=True
+        )
+        trims = _pulses(cell.latest)
+    moved = [number for number in lows if highs[number] - lows[number] >= MIN_TRAVEL_US]
+    if len(moved) < MIN_CHANNELS:
+        raise run.failure(f"only {len(moved)} channels moved by {MIN_TRAVEL_US} µs or more; nothing was written")
+    values: dict[str, float] = {}
+    for number in moved:
+        low, high, trim = lows[number], highs[number], trims.get(number, 0)
+        if not LOWEST_US <= low <= trim <= high <= HIGHEST_US or not low < MIDDLE_US < high:
+            raise run.failure(f"channel {number} has {low} to {high} µs, centre {trim}; nothing was written")
+        values |= {f"RC{number}_MIN": low, f"RC{number}_MAX": high, f"RC{number}_TRIM": trim}
+    async with parameters.transaction() as transaction:
+        await transaction.set_many(values)
+    await run.command(*CANCEL_ALL[:1], *CANCEL_ALL[1], accepts=ENDED_RC)
+    yield run.result(f"{len(moved)} channels were calibrated")
+
+
+def _pulses(value: object) -> dict[int, int]:
+    """Return the pulses in µs of the channels that are received, by number from 1."""
+    pulses: tuple[int | None, ...] = getattr(value, "channels_us", ())
+    return {number: pulse for number, pulse in enumerate(pulses, 1) if pulse}

@@ -1,0 +1,250 @@
+"""`CalibrationRun`: one calibration on the vehicle: its start, its end, and its cancellation."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+from contextlib import ExitStack
+from typing import TYPE_CHECKING
+
+import anyio
+import anyio.lowlevel
+
+from aerokit.errors import (
+    BusyError,
+    CommandRejected,
+    ConnectionClosed,
+    LinkLost,
+    NotSupported,
+    OperationRejected,
+    OperationTimeout,
+)
+from aerokit.mavlink.enums import MavCmd, MavState
+from aerokit.vehicle.calibration.values import CalibrationResult, CalibrationStep
+from aerokit.vehicle.commanding.progress import await_progress
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection
+
+    from aerokit.vehicle.calibration.values import CalibrationPose, CompassFit
+    from aerokit.vehicle.commanding.context import VehicleContext
+    from aerokit.vehicle.commanding.order import SentCommand
+
+logger: logging.Logger = logging.getLogger("aerokit")
+
+REPORT_TIMEOUT_S = 120.0
+"""Seconds to wait for the vehicle's next report. PX4 waits up to two minutes for a pose (calibration_routines.cpp)."""
+START_TIMEOUT_S = 40.0
+"""Seconds to wait for the acknowledgement: ArduPilot sends it when its gyroscopes are calibrated, within 30 s."""
+# Longer than two intervals of HEARTBEAT, which shows that PX4 has ended the calibration.
+MAX_CANCEL_ATTEMPTS, CANCEL_INTERVAL_S = 6, 2.5
+CONFIRM_POLL_INTERVAL_S = 0.1
+
+Cancel = tuple[int, tuple[float, ...]]
+"""The command that cancels a calibration, with its parameters."""
+
+
+class CalibrationRun:
+    """One calibration. It may run on the vehicle from the first transmission until ``finish`` or a confirmed cancel."""
+
+    def __init__(self, context: VehicleContext, sensor: str, runs: list[CalibrationRun]) -> None:
+        self.context, self.session, self.sensor = context, context.session, sensor
+        self.what = f"calibrate.{sensor}"
+        self._runs = runs  # those of the vehicle that may be running
+        self._cancel: Cancel | None = None
+        self._why_not_cancelled = ""
+        self._started_at = math.inf
+        self._cancelled_at: float | None = None
+        self._watch = ExitStack()
+        self._sent: SentCommand | None = None
+        self._has_rebooted = self._is_abandoned = False
+        self._ended = asyncio.Event()
+
+    # ------------------------------------------------------------------------------- start and end
+
+    def check_disarmed(self) -> None:
+        """Raise OperationRejected unless the vehicle is known to be disarmed."""
+        if not self.session.telemetry.is_confirmed_disarmed:
+            state = "armed" if self.session.telemetry.is_armed else "not known to be disarmed"
+            raise OperationRejected(f"{self.what}: the vehicle is {state}; nothing was sent")
+
+    async def begin(self, cancel: Cancel | None, why_not_cancelled: str = "") -> None:
+        """Claim the vehicle. A calibration that is being cancelled is waited for.
+
+        Args:
+            cancel: the command that cancels the calibration on the vehicle; None if there is none.
+            why_not_cancelled: what remains on the vehicle, if there is none.
+        """
+        self.check_disarmed()
+        await anyio.lowlevel.checkpoint()  # An abandoned iterator reports itself in the next iteration of the loop.
+        for run in tuple(self._runs):
+            if not run._is_abandoned:
+                raise BusyError(f"{self.what}: {run.what} is in progress; nothing was sent")
+            await run.wait_cancelled()
+        self.check_disarmed()
+        self._cancel, self._why_not_cancelled = cancel, why_not_cancelled
+        self._started_at = self.session.connection.now()
+        self._runs.append(self)
+        self.context.on_finish.append(self.abandon)
+        self.session.on_reboot.append(self._on_reboot)
+
+    async def command(self, command: int, *params: float, accepts: Collection[int] = ()) -> None:
+        """Send a command of the calibration and wait for its answer. ``accepts``: results that are no error."""
+        with self.context.arbiter.auxiliary_order() as order:
+            try:
+                await self.context.sender.run_command(
+                    order,
+                    self.session.commands.send_long,
+                    command,
+                    *params,
+                    attempt_timeout=START_TIMEOUT_S if command == MavCmd.PREFLIGHT_CALIBRATION else None,
+                )
+            except CommandRejected as error:
+                if error.result not in accepts:
+                    raise
+
+    async def start(self, *params: float, command: int = MavCmd.PREFLIGHT_CALIBRATION) -> None:
+        """Send the command that starts the calibration; a refusal means that it does not run."""
+        try:
+            await self.command(command, *params)
+        except CommandRejected:
+            self.finish()
+            raise
+
+    def finish(self) -> None:
+        """Register that the calibration has ended on the vehicle."""
+        if not self._ended.is_set():
+            self._ended.set()
+            self._watch.close()
+            if self.is_running:
+                self._runs.remove(self)
+                self.context.on_finish.remove(self.abandon)
+                self.session.on_reboot.remove(self._on_reboot)
+
+    def _on_reboot(self) -> None:
+        self._has_rebooted = True
+
+    @property
+    def is_running(self) -> bool:
+        """True if the calibration may be running on the vehicle."""
+        return self in self._runs
+
+    # --------------------------------------------------------------------------------------- cancel
+
+    def abandon(self) -> None:
+        """Cancel the calibration on the vehicle, without waiting. Does nothing if it is not running."""
+        if not self.is_running or self._is_abandoned:
+            return
+        self._is_abandoned = True
+        if self._why_not_cancelled:
+            logger.warning("%s was left: %s", self.what, self._why_not_cancelled)
+        if self._cancel is None or self._has_rebooted or self.session.is_closed:
+            self.finish()
+            return
+        arbiter = self.context.arbiter
+        # Notices another party, after which the cancel is not repeated.
+        self._sent = self._watch.enter_context(arbiter.sending(self._watch.enter_context(arbiter.auxiliary_order())))
+        if self.session.connection.is_open and arbiter.is_known:
+            self._send_cancel(self._cancel)
+        self.session.background.start(self._confirm_cancel, "aerokit calibration")
+
+    async def wait_cancelled(self) -> None:
+        """Wait until the vehicle has confirmed that the calibration was cancelled.
+
+        Raises:
+            NotSupported: the vehicle cannot cancel it.
+            OperationTimeout: it was not confirmed in time.
+        """
+        with anyio.move_on_after(MAX_CANCEL_ATTEMPTS * CANCEL_INTERVAL_S):
+            await self._ended.wait()
+        if self._why_not_cancelled:
+            raise NotSupported(f"{self.what}: {self._why_not_cancelled}")
+        if not self._ended.is_set():
+            raise OperationTimeout(
+                f"{self.what}: the vehicle did not confirm the cancellation; {self.session.describe_link()}"
+            )
+
+    def _send_cancel(self, cancel: Cancel) -> None:
+        # Not into a silence; repeating it has no further effect. See docs/reliability.md.
+        self._cancelled_at = self.session.connection.now()
+        self.session.commands.send_unconfirmed(cancel[0], *cancel[1])
+
+    async def _confirm_cancel(self) -> None:
+        """Send the cancel, if that was not possible before, and repeat it as docs/reliability.md says."""
+        assert self._cancel is not None
+        armed = self.session.telemetry.armed
+        try:
+            for _ in range(MAX_CANCEL_ATTEMPTS):
+                if self._cancelled_at is not None:
+                    with anyio.move_on_after(CANCEL_INTERVAL_S):
+                        while not self._is_cancelled(self._cancel[0]):  # noqa: ASYNC110
+                            await anyio.sleep(CONFIRM_POLL_INTERVAL_S)
+                        return
+                since = self.session.connection.now() if self._cancelled_at is None else self._cancelled_at
+                await armed.wait_until(lambda _: armed.updated_at > since)  # noqa: B023
+                if self._has_rebooted or (self._sent is not None and self._sent.end):
+                    return
+                if self.context.arbiter.is_known:
+                    self._send_cancel(self._cancel)
+            logger.warning("%s: the vehicle did not confirm the cancellation", self.what)
+        except (ConnectionClosed, LinkLost):
+            pass
+        finally:
+            self.finish()
+
+    def _is_cancelled(self, command: int) -> bool:
+        """ArduPilot acknowledges; PX4 acknowledges twice with different results, so its HEARTBEAT counts."""
+        if self._has_rebooted:
+            return True
+        assert self._cancelled_at is not None
+        if command != MavCmd.PREFLIGHT_CALIBRATION:
+            return self.session.commands.accepted_at(command) >= self._cancelled_at
+        status = self.session.telemetry.system_status
+        return status.updated_at > self._cancelled_at and status.latest != MavState.CALIBRATING
+
+    # --------------------------------------------------------------------------------------- steps
+
+    async def wait(
+        self,
+        is_ready: Callable[[], object],
+        timeout: float = REPORT_TIMEOUT_S,
+        missing: str = "the vehicle reported nothing about the calibration",
+    ) -> None:
+        """Wait for the next report. Errors as for `await_progress`."""
+        await await_progress(
+            self.session,
+            self.what,
+            is_done=lambda: bool(is_ready()),
+            trouble=self._trouble,
+            describe=lambda: missing,
+            timeout=timeout,
+        )
+
+    def _trouble(self) -> str | None:
+        if self._has_rebooted:
+            return "the vehicle rebooted"
+        return "the vehicle was armed" if self.session.telemetry.is_armed else None
+
+    def step(
+        self,
+        progress: float | None,
+        instruction: str,
+        pose: CalibrationPose | None = None,
+        remaining: tuple[CalibrationPose, ...] = (),
+        *,
+        needs_confirmation: bool = False,
+    ) -> CalibrationStep:
+        return CalibrationStep(self.sensor, progress, instruction, pose, remaining, needs_confirmation)
+
+    def result(
+        self, instruction: str = "done", *, reboot_due: bool = False, compasses: tuple[CompassFit, ...] = ()
+    ) -> CalibrationStep:
+        """Register the end, and return the last step."""
+        self.finish()
+        found = CalibrationResult(compasses, reboot_due, self.session.texts_since(self._started_at))
+        return CalibrationStep(self.sensor, 1.0, instruction, result=found)
+
+    def failure(self, reason: str) -> OperationRejected:
+        """Return the error of a calibration that failed, with the vehicle's texts."""
+        return OperationRejected(f"{self.what}: {reason}", reasons=self.session.texts_since(self._started_at))

@@ -1,0 +1,349 @@
+"""``NtripClient``: fetches RTCM corrections from an NTRIP caster (version 1 or 2) while its block runs."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import ssl
+from asyncio import open_connection
+from base64 import b64encode
+from contextlib import suppress
+from typing import TYPE_CHECKING
+from urllib.parse import unquote, urlsplit
+
+import anyio
+
+from aerokit._internal.formatting import printable
+from aerokit.connection.tasks import Cancellation, run_shielded
+from aerokit.errors import (
+    BusyError,
+    ConnectionClosed,
+    InvalidArgument,
+    LinkLost,
+    LinkOpenError,
+    OperationRejected,
+    OperationTimeout,
+)
+from aerokit.protocols.rtcm import MAX_MESSAGE_SIZE, RtcmReader
+from aerokit.vehicle.rtk.position_report import gga_sentence
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+    from types import TracebackType
+
+    from typing_extensions import Self
+
+    from aerokit.vehicle.session.session import VehicleSession
+
+__all__ = ["Caster", "NtripClient"]
+
+logger: logging.Logger = logging.getLogger("aerokit")
+
+DEFAULT_PORT = 2101
+MIN_RETRY_S, MAX_RETRY_S = 1.0, 30.0
+MAX_SILENCE_S = 30.0
+"""Seconds without data after which the caster is connected to again; base stations send every second or two."""
+POSITION_INTERVAL_S = 10.0
+POSITION_POLL_INTERVAL_S = 1.0
+MAX_HEADER_LINES, MAX_CHUNK_SIZE, MAX_TABLE_SIZE = 100, 1 << 20, 4 << 20
+CLOSE_TIMEOUT_S = 1.0
+
+
+class Caster:
+    """Address of a mount point, with the credentials. Its repr and texts do not contain the password."""
+
+    def __init__(self, host: str, port: int, mount: str, credentials: str, is_encrypted: bool) -> None:
+        self.host, self.port, self.mount = host, port, mount
+        self.is_encrypted = is_encrypted
+        self._credentials = credentials
+
+    @classmethod
+    def parse(cls, url: str) -> Caster:
+        """Parse ``ntrip://user:password@host:port/MOUNT``; the text of an error does not contain the URL."""
+        try:
+            parts = urlsplit(url)
+            host, port = parts.hostname, parts.port
+        except ValueError:  # Its text may contain the password.
+            parts, host, port = urlsplit(""), None, None
+        mount = unquote(parts.path[1:])
+        is_printable = mount.isascii() and mount.isprintable() and "/" not in mount and " " not in mount
+        if not host or not mount or not is_printable or parts.scheme not in ("ntrip", "ntrips") or port == 0:
+            raise InvalidArgument(
+                "url is not allowed (it is not shown, because it may contain a password):"
+                " ntrip://user:password@host:2101/MOUNT, with %40 for an @ in the password"
+            )
+        user, password = unquote(parts.username or ""), unquote(parts.password or "")
+        credentials = f"{user}:{password}" if user or password else ""
+        return cls(host, port or DEFAULT_PORT, mount, credentials, parts.scheme == "ntrips")
+
+    def request(self, mount: str, position: bytes | None = None) -> bytes:
+        """Return the request for a mount point, or for the source table if ``mount`` is empty."""
+        lines = [
+            f"GET /{mount} HTTP/1.1",
+            f"Host: {self.host}:{self.port}",
+            "Ntrip-Version: Ntrip/2.0",
+            "User-Agent: NTRIP aerokit",
+            "Connection: close",
+        ]
+        if self._credentials:
+            lines.append(f"Authorization: Basic {b64encode(self._credentials.encode()).decode()}")
+        if position:
+            lines.append(f"Ntrip-GGA: {position.decode().strip()}")
+        return "\r\n".join((*lines, "", "")).encode()
+
+    def __repr__(self) -> str:
+        return f"ntrip{'s' * self.is_encrypted}://{self.host}:{self.port}/{self.mount}"
+
+
+class _Response:
+    """The answer of a caster: status line, and the body without its chunks."""
+
+    def __init__(self, reader: asyncio.StreamReader, status: str, headers: dict[str, str]) -> None:
+        self._reader, self.status, self._headers = reader, status, headers
+        words = status.split()
+        self.code = words[1] if len(words) > 1 and words[0] != "ERROR" else ""
+        self.is_table = words[:1] == ["SOURCETABLE"] or "sourcetable" in headers.get("content-type", "")
+        self.is_stream = self.code == "200" and not self.is_table
+
+    @classmethod
+    async def read(cls, reader: asyncio.StreamReader) -> _Response:
+        status = (await reader.readline()).decode("latin-1").strip()
+        headers: dict[str, str] = {}
+        # The data of NTRIP 1 follow "ICY 200 OK" at once, or after an empty line, which is no RTCM and is skipped.
+        if not status.startswith(("ICY", "ERROR")):
+            for _ in range(MAX_HEADER_LINES):
+                name, _, value = (await reader.readline()).decode("latin-1").strip().partition(":")
+                if not name:
+                    break
+                headers[name.lower()] = value.strip().lower()
+        return cls(reader, status, headers)
+
+    async def body(self) -> AsyncIterator[bytes]:
+        """Yield the data until the caster closes the connection."""
+        if self._headers.get("transfer-encoding") != "chunked":
+            while data := await self._reader.read(4096):
+                yield data
+            return
+        while line := await self._reader.readline():
+            size = int(line.split(b";")[0] or b"0", 16)
+            if not 0 < size <= MAX_CHUNK_SIZE:
+                return
+            yield await self._reader.readexactly(size)
+            await self._reader.readline()
+
+
+class NtripClient:
+    """Fetches corrections from an NTRIP caster while its ``async with`` block runs, and sends them to the vehicle.
+
+    Entering returns when the caster has accepted the request. A connection that ends, or is silent for 30 s, is opened
+    again, after 1 to 30 s, as often as necessary; the logger ``aerokit`` reports it. Messages that GPS_RTCM_DATA cannot
+    carry (above 720 bytes) are left out. Leaving the block closes the connection.
+
+    Entering raises:
+        OperationRejected: the caster refused: user or password, or no such mount point (the text lists others).
+        LinkOpenError: the caster could not be reached.
+        OperationTimeout: the caster did not answer in time.
+        BusyError: the client was entered before.
+    """
+
+    def __init__(
+        self,
+        session: VehicleSession,
+        send: Callable[[bytes], None],
+        caster: Caster,
+        send_position: bool | None,
+        timeout: float,
+    ) -> None:
+        self._session, self._send, self._caster, self._timeout = session, send, caster, timeout
+        self._sends_position = send_position
+        self._work = Cancellation()
+        self._ended: asyncio.Event | None = None
+        self._writer: asyncio.StreamWriter | None = None
+        self._problem = ""
+        self._oversized = self._reconnects = 0
+
+    @property
+    def is_connected(self) -> bool:
+        """True while the caster's connection is open."""
+        return self._writer is not None
+
+    @property
+    def problem(self) -> str:
+        """Why the caster is not connected now; empty while it is."""
+        return "" if self.is_connected else self._problem
+
+    @property
+    def reconnects(self) -> int:
+        """How often the connection was opened again."""
+        return self._reconnects
+
+    @property
+    def oversized(self) -> int:
+        """Number of messages that were left out because they have more than 720 bytes."""
+        return self._oversized
+
+    def __repr__(self) -> str:
+        return f"<NtripClient {self._caster!r}, {'connected' if self.is_connected else 'not connected'}>"
+
+    async def __aenter__(self) -> Self:
+        if self._ended is not None:
+            raise BusyError("NtripClient can be entered only once: call ntrip() again")
+        self._ended = asyncio.Event()
+        try:
+            if self._sends_position is None:
+                self._sends_position = await self._asks_for_position()
+            response = await self._open(self._caster.mount)
+        except BaseException:
+            self._close()
+            raise
+        self._session.background.start(lambda: self._run(response), "aerokit ntrip")
+        return self
+
+    async def __aexit__(
+        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._work.cancel()
+        writer = self._writer
+        self._close()
+        await run_shielded(self._wait_closed(writer))
+
+    async def _wait_closed(self, writer: asyncio.StreamWriter | None) -> None:
+        assert self._ended is not None
+        with anyio.move_on_after(CLOSE_TIMEOUT_S):
+            if not self._session.is_closed:
+                await self._ended.wait()
+            if writer is not None:
+                with suppress(OSError):
+                    await writer.wait_closed()
+
+    async def _run(self, response: _Response) -> None:
+        """Forward corrections, and connect again, until the block ends."""
+        assert self._ended is not None
+        try:
+            with self._work:
+                await self._forward(response)
+                pause_s = MIN_RETRY_S
+                while True:
+                    await anyio.sleep(pause_s)
+                    pause_s = min(2 * pause_s, MAX_RETRY_S)
+                    try:
+                        response = await self._open(self._caster.mount)
+                    # A refusal may pass too: casters limit the connections of a user, and the old one may linger.
+                    except (OperationRejected, OperationTimeout, LinkOpenError) as error:
+                        self._report(str(error))
+                        continue
+                    self._reconnects += 1
+                    logger.info("NTRIP %r: connected again", self._caster)
+                    if await self._forward(response):
+                        pause_s = MIN_RETRY_S
+        except (ConnectionClosed, LinkLost) as error:
+            self._problem = f"the vehicle's connection has ended: {error}"
+        finally:
+            self._close()
+            self._ended.set()
+
+    async def _forward(self, response: _Response) -> int:
+        """Send the corrections of one connection to the vehicle; return their number."""
+        reader, count = RtcmReader(), 0
+        reason = "the caster closed the connection"
+        writer = self._writer
+        reports = asyncio.ensure_future(self._report_position()) if self._sends_position else None
+        body = response.body()
+        try:
+            while True:
+                data = await asyncio.wait_for(body.__anext__(), MAX_SILENCE_S)
+                for message in reader.feed(data):
+                    count += 1
+                    if len(message) <= MAX_MESSAGE_SIZE:
+                        self._send(message)
+                    else:
+                        self._oversized += 1
+        except asyncio.TimeoutError:
+            reason = f"no data for {MAX_SILENCE_S:g} s"
+        except StopAsyncIteration:
+            pass
+        except (OSError, ValueError, EOFError) as error:
+            reason = f"the connection failed ({type(error).__name__})"
+        finally:
+            if reports is not None:
+                reports.cancel()
+                await asyncio.gather(reports, return_exceptions=True)
+            if self._writer is writer:
+                self._close()
+        self._report(f"NTRIP {self._caster!r}: {reason} after {count} messages")
+        return count
+
+    def _report(self, problem: str) -> None:
+        self._problem = problem
+        logger.warning("%s; trying again", problem)
+
+    # -------------------------------------------------------------------------------------- caster
+
+    async def _open(self, mount: str) -> _Response:
+        """Request a mount point; the connection stays open in ``_writer``."""
+        response = await self._request(mount)
+        if response.is_stream:
+            return response
+        names = await self._table(response) if response.is_table else {}
+        self._close()
+        status = printable(response.status[:80]) or "an empty answer"
+        what = f"NTRIP {self._caster!r}"
+        if response.is_table or response.code == "404":
+            known = f"; it has {', '.join(sorted(names)[:20])}" if names else ""
+            raise OperationRejected(f"{what}: the caster has no mount point {mount!r}{known}")
+        if response.code in ("401", "403") or "password" in status.lower():
+            raise OperationRejected(f"{what}: the caster refused the user or the password ({status})")
+        raise OperationRejected(f"{what}: the caster answered {status!r}")
+
+    async def _request(self, mount: str) -> _Response:
+        caster, what = self._caster, f"NTRIP {self._caster!r}"
+        context = ssl.create_default_context() if caster.is_encrypted else None
+
+        async def exchange() -> _Response:
+            reader, self._writer = await open_connection(caster.host, caster.port, ssl=context)
+            self._writer.write(caster.request(mount, self._position() if mount and self._sends_position else None))
+            return await _Response.read(reader)
+
+        try:
+            return await asyncio.wait_for(exchange(), self._timeout)
+        except asyncio.TimeoutError:
+            self._close()
+            raise OperationTimeout(f"{what}: the caster did not answer within {self._timeout:g} s") from None
+        except (OSError, ValueError) as error:
+            self._close()
+            reason = getattr(error, "strerror", None) or type(error).__name__
+            raise LinkOpenError(f"{what}: the caster could not be reached: {reason}") from None
+
+    async def _asks_for_position(self) -> bool:
+        """Return True if the source table says that the mount point needs GGA; False if it does not say."""
+        try:
+            response = await self._request("")
+            return (await self._table(response)).get(self._caster.mount, False)
+        finally:
+            self._close()
+
+    async def _table(self, response: _Response) -> dict[str, bool]:
+        """Read a source table: mount point → whether it needs the position (the field ``nmea``)."""
+        text = b""
+        with suppress(OSError, ValueError, EOFError, asyncio.TimeoutError):
+            async for data in response.body():
+                text += data
+                if b"ENDSOURCETABLE" in data or len(text) > MAX_TABLE_SIZE:
+                    break
+        rows = [line.split(";") for line in text.decode("latin-1").splitlines() if line.startswith("STR;")]
+        return {printable(row[1]): row[11:12] == ["1"] for row in rows if len(row) > 1}
+
+    async def _report_position(self) -> None:
+        with self._session.streaming("position", "gps"):
+            while (writer := self._writer) is not None:
+                if sentence := self._position():
+                    writer.write(sentence)
+                await anyio.sleep(POSITION_INTERVAL_S if sentence else POSITION_POLL_INTERVAL_S)
+
+    def _position(self) -> bytes | None:
+        return gga_sentence(self._session.telemetry, self._session.connection.unix_time())
+
+    def _close(self) -> None:
+        writer, self._writer = self._writer, None
+        if writer is not None:
+            writer.close()

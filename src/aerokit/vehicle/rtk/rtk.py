@@ -1,0 +1,105 @@
+"""``Rtk``: sends corrections to the vehicle's satellite receivers."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import TYPE_CHECKING
+
+from aerokit._internal.arguments import checks_arguments
+from aerokit._internal.values import Snapshot
+from aerokit.connection.cells import Source, StateCell
+from aerokit.errors import ConnectionClosed
+from aerokit.protocols.rtcm import message_number, rtcm_messages
+from aerokit.vehicle.rtk.output import output_of
+
+if TYPE_CHECKING:
+    from aerokit.vehicle.commanding.context import VehicleContext
+    from aerokit.vehicle.rtk.ntrip import NtripClient
+
+__all__ = ["Corrections", "Rtk"]
+
+BANDWIDTH_WINDOW_S = 10.0
+
+
+class Corrections(Snapshot):
+    """The corrections sent to the vehicle so far. The age of the cell is the age of the last one.
+
+    ``message_number`` is the RTCM number of the last message (1005, 1077 …), None if it was empty.
+    ``bandwidth_bytes_s`` is the mean of RTCM bytes per second over the last ten seconds.
+    """
+
+    message_number: int | None
+    messages: int
+    bytes_sent: int
+    bandwidth_bytes_s: float
+
+
+@checks_arguments
+class Rtk:
+    """RTCM corrections for the vehicle's satellite receivers (GPS_RTCM_DATA).
+
+    ``vehicle.gps`` reports the effect: fix types 5 (RTK float) and 6 (RTK fixed).
+    """
+
+    def __init__(self, context: VehicleContext) -> None:
+        self._session = context.session
+        self._output = output_of(context.session.connection)
+        self._corrections: StateCell[Corrections] = StateCell(
+            "rtk.corrections", context.session.connection.now, "corrections by rtk.send or rtk.ntrip"
+        )
+        self._session.keep(self._corrections)
+        self._messages = self._bytes = 0
+        self._recent: deque[tuple[float, int]] = deque()
+
+    @property
+    def corrections(self) -> StateCell[Corrections]:
+        """Number, bytes and bandwidth of the corrections; its age is that of the last one."""
+        return self._corrections
+
+    def send(self, rtcm: bytes) -> None:
+        """Send RTCM 3 messages to the vehicle; never blocks.
+
+        Each message is split as GPS_RTCM_DATA requires. That message has no target, so it is sent once on each link,
+        even if several vehicles of the connection send the same message within 0.9 s. There is no acknowledgement:
+        ``vehicle.gps`` shows whether the receiver uses the corrections.
+
+        Args:
+            rtcm: one or more whole messages, each of 720 bytes at most.
+
+        Raises:
+            InvalidArgument: ``rtcm`` is empty, or a message is incomplete, damaged or longer. Nothing was sent.
+            ConnectionClosed, LinkLost: the connection has ended, or the block of this vehicle was left.
+        """
+        for message in rtcm_messages(rtcm):
+            self._send(message)
+
+    def ntrip(self, url: str, *, send_position: bool | None = None, timeout: float = 10.0) -> NtripClient:
+        """Fetch corrections from an NTRIP caster while the ``async with`` block runs, and send them to the vehicle.
+
+        Args:
+            url: ``"ntrip://user:password@host:2101/MOUNT"``; ``ntrips://`` for TLS. Characters such as ``@`` in the
+                password are written as ``%40``. The password appears in no log, error or repr.
+            send_position: send the vehicle's position to the caster (GGA, every 10 s), which a virtual reference
+                station needs. None: if the caster's source table asks for it.
+            timeout: seconds to wait for the caster's answer.
+
+        Raises:
+            InvalidArgument: the URL is invalid. Nothing was opened.
+        """
+        from aerokit.vehicle.rtk.ntrip import Caster, NtripClient
+
+        return NtripClient(self._session, self._send, Caster.parse(url), send_position, timeout)
+
+    def _send(self, message: bytes) -> None:
+        if self._session.is_closed:
+            raise ConnectionClosed("the block of this vehicle was left; nothing was sent")
+        self._output.send(message, self)
+        now = self._session.connection.now()
+        self._messages += 1
+        self._bytes += len(message)
+        self._recent.append((now, len(message)))
+        while self._recent[0][0] <= now - BANDWIDTH_WINDOW_S:
+            self._recent.popleft()
+        bandwidth = sum(size for _, size in self._recent) / BANDWIDTH_WINDOW_S
+        value = Corrections(message_number(message), self._messages, self._bytes, bandwidth)
+        self._corrections.set(value, Source(self._session.system_id, self._session.component_id, "GPS_RTCM_DATA"))

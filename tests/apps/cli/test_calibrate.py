@@ -1,0 +1,102 @@
+"""`aerokit calibrate`: pictures, results, confirmation, cancellation."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+from typing import Any
+
+import pytest
+from cli_harness import run_on
+
+from aerokit.apps.cli import calibrate
+from aerokit.apps.cli.calibrate import bar, lines_of
+from aerokit.sim import SimulatedCopter, SimulatedPx4, SimulatedVehicle, simulated_link
+from aerokit.testing import run_virtual
+from aerokit.vehicle.calibration.values import CalibrationPose as Pose
+from aerokit.vehicle.calibration.values import CalibrationStep
+
+
+def run(vehicle: SimulatedVehicle, *arguments: str, interrupt_after_s: float | None = None) -> int:
+    async def on_link() -> int:
+        async with simulated_link(vehicle) as link:
+            if interrupt_after_s is not None:
+                asyncio.get_running_loop().call_later(interrupt_after_s, os.kill, os.getpid(), signal.SIGINT)
+            return await run_on(link, "calibrate", *arguments)
+
+    return run_virtual(on_link())
+
+
+@pytest.fixture
+def entered(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
+    """Answers to the question whether the pose is reached; True for all after the last one."""
+    answers: list[bool] = []
+
+    async def press_enter() -> bool:
+        return answers.pop(0) if answers else True
+
+    monkeypatch.setattr(calibrate, "press_enter", press_enter)
+    return answers
+
+
+@pytest.mark.parametrize("pose", Pose)
+def test_picture_fits_small_terminal(pose: Pose) -> None:
+    step = CalibrationStep("accelerometer", 0.5, "x" * 300, pose, tuple(Pose), needs_confirmation=True)
+    lines = lines_of(step)
+    assert len(lines) <= 20
+    assert all(len(line) < 80 and line.isascii() for line in [*lines, bar(0.5)])
+
+
+def test_pictures_of_poses_differ() -> None:
+    assert len({"\n".join(lines_of(CalibrationStep("level", None, "", pose))) for pose in Pose}) == len(Pose)
+
+
+def test_accelerometer_shows_each_pose(entered: list[bool], capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(SimulatedCopter(boot_time_s=0.0), "accelerometer") == 0
+    out = capsys.readouterr().out
+    for pose in Pose:
+        assert f"  {pose.value.upper()} (seen from" in out
+    assert out.splitlines()[-2:] == ["accelerometer: done", "  reboot the vehicle before the next flight"]
+
+
+def test_compass_prints_fitness(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(SimulatedCopter(boot_time_s=0.0), "compass") == 0
+    assert "  compass 2: fitness 5.0 mgauss" in capsys.readouterr().out
+
+
+def test_end_of_input_cancels_on_vehicle(entered: list[bool], capsys: pytest.CaptureFixture[str]) -> None:
+    entered += [True, False]
+    assert run(SimulatedCopter(boot_time_s=0.0), "accelerometer") == 130
+    assert "not cancelled on the vehicle" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("kind", [SimulatedCopter, SimulatedPx4])
+def test_interrupt_cancels_on_vehicle(kind: type[Any], capsys: pytest.CaptureFixture[str]) -> None:
+    vehicle = kind(boot_time_s=0.0)
+    assert run(vehicle, "compass", interrupt_after_s=8.0) == 130
+    assert capsys.readouterr().out.splitlines()[-1] == "compass: cancelled on the vehicle"
+    is_running = vehicle.calibration.is_running if kind is SimulatedPx4 else vehicle.calibrations.compasses.is_running
+    assert not is_running
+
+
+def test_json_has_steps_and_result(entered: list[bool], capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(SimulatedCopter(boot_time_s=0.0), "accelerometer", "--json") == 0
+    records = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    steps = [record for record in records if record["type"] == "calibration_step"]
+    assert [step["pose"] for step in steps] == ["LEVEL", "LEFT", "RIGHT", "NOSE_DOWN", "NOSE_UP", "BACK"]
+    assert records[-1]["type"] == "calibration_result"
+    assert records[-1]["reboot_due"] is True
+
+
+def test_armed_vehicle_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    copter = SimulatedCopter(boot_time_s=0.0)
+    copter.call_later(0.5, lambda: copter.motors.set_armed(True, copter.now))
+    assert run(copter, "gyroscope") == 5
+    assert "the vehicle is armed; nothing was sent" in capsys.readouterr().err
+
+
+def test_escs_without_confirmation_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(SimulatedCopter(boot_time_s=0.0), "escs") == 2
+    assert "--propellers-removed" in capsys.readouterr().err
