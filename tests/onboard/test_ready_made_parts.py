@@ -169,6 +169,18 @@ async def test_gimbal_denies_program_that_is_not_in_control() -> None:
     assert head.targets == []
 
 
+async def test_error_of_gimbal_is_result_of_command() -> None:
+    class Jammed(Head):
+        def point(self, target: GimbalTarget) -> None:
+            raise RuntimeError("jammed")
+
+    async with payload_and_station(component_id=154, type=MavType.GIMBAL) as (component, station):
+        component.add_gimbal(Jammed())
+        await station.command(MavCmd.DO_GIMBAL_MANAGER_CONFIGURE, 255, 190, -1, -1, 0, 0, 154)
+        ack = await station.command(MavCmd.DO_GIMBAL_MANAGER_PITCHYAW, -30, 0, math.nan, math.nan, 0, 0, 154)
+    assert ack.result == MavResult.FAILED
+
+
 class Spool(WinchDriver):
     def __init__(self) -> None:
         self.length_m, self.flags = 0.0, int(MavWinchStatusFlag.HEALTHY)

@@ -19,9 +19,11 @@ from aerokit.position import Position
 from aerokit.protocols.servers.commands import CommandDispatcher, Outcome, RunningCommands
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from aerokit.connection.tasks import BackgroundTasks
     from aerokit.onboard.host import ComponentHost
-    from aerokit.protocols.servers.commands import CommandHandler, ReceivedCommand, RunningCommand
+    from aerokit.protocols.servers.commands import CommandHandler, CommandProgress, ReceivedCommand, RunningCommand
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
@@ -140,6 +142,21 @@ class ComponentCommands:
             raise InvalidArgument(f"{command_name(command)} already has a handler")
         self.handlers[command] = partial(self._execute, function, arguments_of(function))
 
+    def add_guarded(self, handlers: Mapping[int, CommandHandler]) -> None:
+        """Register handlers of a protocol server that call the program; an error of the program is the result."""
+
+        def guard(handler: CommandHandler) -> CommandHandler:
+            def guarded(command: ReceivedCommand) -> int | CommandProgress | None:
+                try:
+                    return handler(command)
+                except Exception as error:
+                    self._explain(command_name(command.command), error)
+                    return result_of(error)
+
+            return guarded
+
+        self.handlers.update({command: guard(handler) for command, handler in handlers.items()})
+
     async def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Call a function of the program: a coroutine function, or a plain one, in a thread if ``uses_threads``."""
         if inspect.iscoroutinefunction(function) or not self.uses_threads:
@@ -214,7 +231,10 @@ class ComponentCommands:
         """Answer with the result for an error, and explain it in a status text."""
         name = getattr(function, "__name__", "run")
         name = command_name(running.command.command) if name == "run" else name
+        self._explain(name, error)
+        self._running.finish(running, Outcome(result_of(error)))
+
+    def _explain(self, name: str, error: Exception) -> None:
         if not isinstance(error, AerokitError):
             logger.error("the handler %s of a command failed", name, exc_info=error)
         self._host.send_text(MavSeverity.WARNING, f"{name}: {error or type(error).__name__}")
-        self._running.finish(running, Outcome(result_of(error)))

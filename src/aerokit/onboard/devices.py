@@ -43,7 +43,7 @@ class WinchDriver:
         raise NotImplementedError
 
     async def pay_out(self, length_m: float, rate_m_s: float) -> None:
-        """Wind the line out (positive length) or in, at this rate."""
+        """Wind the line out (positive length) or in, at this rate, which is above 0."""
         raise NotImplementedError
 
     async def set_rate(self, rate_m_s: float) -> None:
@@ -110,6 +110,8 @@ def add_winch(services: ComponentServices, winch: WinchDriver) -> None:
         arguments = {"pay_out": (length, rate), "set_rate": (rate,)}.get(name, ())
         if None in arguments:
             raise InvalidArgument("length and rate are required")
+        if name == "pay_out" and rate is not None and rate <= 0:
+            raise InvalidArgument(f"rate = {rate:g} is not allowed: above 0")
         await services.commands.call(getattr(winch, name), *arguments)
 
     def status() -> m.WinchStatus:

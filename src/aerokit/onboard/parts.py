@@ -73,7 +73,7 @@ def add_gimbal(services: ComponentServices, gimbal: GimbalDriver) -> GimbalAdapt
         raise InvalidArgument("this component has a gimbal already: open another component for the second one")
     adapter = GimbalAdapter(gimbal, services.host)
     streams.builders.update(gimbal_builders(adapter))
-    services.commands.handlers.update(gimbal_commands(adapter))
+    services.commands.add_guarded(gimbal_commands(adapter))
     listen_for_gimbal(adapter)
     streams.stream(m.GimbalManagerStatus.ID, STATUS_INTERVAL_S)
     if gimbal.attitude_hz > 0:

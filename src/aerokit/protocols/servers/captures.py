@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 _IDLE, _CAPTURING, _WAITING, _WAITING_AND_CAPTURING = 0, 1, 2, 3
 _UNLIMITED = -1
 
+MIN_STATUS_INTERVAL_S = 0.02
+"""Least time between two CAMERA_CAPTURE_STATUS, whatever rate a client asks for."""
+
 # Creates CAMERA_IMAGE_CAPTURED from the keywords image_index, capture_result and file_url.
 Shot = Callable[..., CameraImageCaptured]
 
@@ -134,7 +137,7 @@ class Captures:
         self._recording_since = self._camera.host.now
         self._camera.host.send(self.status())
         if 0.0 < status_interval_s < math.inf:
-            self._send_status_every(self._recording_since, status_interval_s)
+            self._send_status_every(self._recording_since, max(MIN_STATUS_INTERVAL_S, status_interval_s))
 
     def stop_recording(self) -> float:
         """Note the end of the video and return its length in seconds; 0 if there was none."""

@@ -106,7 +106,8 @@ _REPLY_KEPT = 4
 _BURST_BYTES = 35_000
 _BURST_BLOCKS = 24
 _CRC_BLOCK = 65_536
-_CRC_BLOCKS_AT_ONCE = 32
+_CRC_BLOCKS_AT_ONCE = 8
+_CRC_PAUSE_S = 0.002
 _MAX_SIZE = 0xFFFFFFFF
 
 Op = MavFtpOpcode
@@ -431,7 +432,7 @@ class SessionFtpServer(FtpRequestServer[FilesT]):
         except FileFault as fault:
             data, answer = b"", self._fault(peer, request, fault)
         if peer.checksum is request and data:
-            self._host.call_later(0.0, lambda: self._continue_crc32(peer, request, file, offset, checksum))
+            self._host.call_later(_CRC_PAUSE_S, lambda: self._continue_crc32(peer, request, file, offset, checksum))
             return
         with suppress(FileFault):
             file.close()

@@ -246,6 +246,8 @@ class GimbalRequests:
 
     def look_ahead(self, command: ReceivedCommand) -> int:
         gimbal = self._gimbal
+        if not gimbal.can_point_at_positions:
+            return MavResult.UNSUPPORTED
         if not self._is_mine(command.param1) or not gimbal.is_in_control(command.sender):
             return MavResult.DENIED
         gimbal.look_at(None)
