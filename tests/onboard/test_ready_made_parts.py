@@ -228,8 +228,9 @@ async def test_gripper_grabs_and_releases() -> None:
 @pytest.mark.parametrize(
     ("system_id", "expected"),
     [
-        (1, (MavResult.ACCEPTED, 30, 0)),
+        (1, (MavResult.ACCEPTED, 30, 30)),
         (2, (MavResult.DENIED, 0, MavArmAuthDeniedReason.NONE)),
+        (0, (MavResult.DENIED, 0, MavArmAuthDeniedReason.NONE)),  # the sender itself, system 255
     ],
 )
 async def test_arm_authorizer_allows_or_denies(system_id: int, expected: tuple[int, int, int]) -> None:

@@ -148,7 +148,8 @@ def add_arm_authorizer(services: ComponentServices, authorize: Authorize) -> Non
 
     async def arm_authorization(request: CommandRequest, system_id: int) -> CommandResult:
         try:
-            seconds = await services.commands.call(authorize, system_id)
+            # PX4 sends 0 for itself (ArmAuthorization.cpp).
+            seconds = await services.commands.call(authorize, system_id or request.sender[0])
         except Exception as error:
             services.host.send_text(MavSeverity.WARNING, f"arming denied: {error or type(error).__name__}")
             result = result_of(error)
@@ -158,6 +159,7 @@ def add_arm_authorizer(services: ComponentServices, authorize: Authorize) -> Non
             return seconds
         if not 0 < seconds <= MAX_AUTHORIZATION_S:
             raise ValueError(f"the authorizer returned {seconds!r}, not 1 to {MAX_AUTHORIZATION_S} seconds")
-        return CommandResult(MavResult.ACCEPTED, progress=math.ceil(seconds))
+        # The standard has the seconds in `progress`; PX4 reads them from `result_param2` (ArmAuthorization.cpp).
+        return CommandResult(MavResult.ACCEPTED, progress=math.ceil(seconds), detail=math.ceil(seconds))
 
     services.commands.add(MavCmd.ARM_AUTHORIZATION_REQUEST, arm_authorization)
