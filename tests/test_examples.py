@@ -21,10 +21,26 @@ from aerokit.testing import run_virtual
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
+
+class FakePad:
+    """A gamepad whose right stick is pushed forward for two seconds, and then its button."""
+
+    def __init__(self) -> None:
+        self._reads = 0
+
+    def get_axis(self, number: int, /) -> float:
+        self._reads += number == 3
+        return {3: -0.5, 0: 0.05}.get(number, 0.0)
+
+    def get_button(self, number: int, /) -> bool:
+        return number == 1 and self._reads > 50
+
+
 ON_VIRTUAL_TIME: dict[str, tuple[list[Any], list[str]]] = {
     "fly_square": ([], ["at Position(", "landed"]),
     "watch_state": ([5.0], ["s old", "rad, 0 missed", "LinkReport(", "enough"]),
     "guided_velocity": ([], ["holding in BRAKE", "landed"]),
+    "gamepad": ([FakePad()], ["you have the sticks in LOITER", "sticks released in BRAKE", "landed"]),
     "custom_mode_and_command": ([], ["mode BRAKE", "'FASTER'", "AutopilotVersion(", "result 4: "]),
     "land_on_low_battery": ([95.0], ["landing with 94 %"]),
     "mission": ([], ["item 3 was reached", "flown"]),

@@ -35,6 +35,7 @@ ROOMS = {
         {"commanding"},
         {"devices", "gimbal"},
         {"rtk"},
+        {"external"},
         {"files"},
         {"parameters", "missions"},
         {"calibration"},

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
     from aerokit import errors as errors
     from aerokit import events as events
+    from aerokit._internal.wire import wire_implementation as wire_implementation
     from aerokit.connection.connection import Connection as Connection
     from aerokit.connection.heartbeats import OwnHeartbeat as OwnHeartbeat
     from aerokit.connection.opening import open_connection as open_connection
@@ -48,12 +49,26 @@ if TYPE_CHECKING:
     from aerokit.onboard.opening import component as component
     from aerokit.position import Position as Position
     from aerokit.vehicle.commanding.setpoints import AccelerationSetpoint as AccelerationSetpoint
+    from aerokit.vehicle.commanding.setpoints import ActuatorSetpoint as ActuatorSetpoint
+    from aerokit.vehicle.commanding.setpoints import AttitudeRateSetpoint as AttitudeRateSetpoint
     from aerokit.vehicle.commanding.setpoints import AttitudeSetpoint as AttitudeSetpoint
     from aerokit.vehicle.commanding.setpoints import BodyVelocitySetpoint as BodyVelocitySetpoint
     from aerokit.vehicle.commanding.setpoints import LocalPositionSetpoint as LocalPositionSetpoint
     from aerokit.vehicle.commanding.setpoints import PositionSetpoint as PositionSetpoint
+    from aerokit.vehicle.commanding.setpoints import TrajectorySetpoint as TrajectorySetpoint
     from aerokit.vehicle.commanding.setpoints import VelocitySetpoint as VelocitySetpoint
+    from aerokit.vehicle.commanding.sticks import StickInput as StickInput
     from aerokit.vehicle.connect import connect as connect
+    from aerokit.vehicle.external.values import FlowMeasurement as FlowMeasurement
+    from aerokit.vehicle.external.values import GpsMeasurement as GpsMeasurement
+    from aerokit.vehicle.external.values import ObstaclePoints as ObstaclePoints
+    from aerokit.vehicle.external.values import ObstacleSectors as ObstacleSectors
+    from aerokit.vehicle.external.values import OdometryMeasurement as OdometryMeasurement
+    from aerokit.vehicle.external.values import PoseMeasurement as PoseMeasurement
+    from aerokit.vehicle.external.values import RangeMeasurement as RangeMeasurement
+    from aerokit.vehicle.external.values import SpeedMeasurement as SpeedMeasurement
+    from aerokit.vehicle.external.values import TargetMeasurement as TargetMeasurement
+    from aerokit.vehicle.state.movement import Attitude as Attitude
     from aerokit.vehicle.vehicle import Vehicle as Vehicle
 
 __version__ = "0.1.0"
@@ -69,6 +84,7 @@ __dir__: Callable[[], list[str]]
 __getattr__, __dir__, __all__ = lazy_exports(
     __name__,
     {
+        "aerokit._internal.wire": ("wire_implementation",),
         "aerokit.connection.connection": ("Connection",),
         "aerokit.connection.opening": ("open_connection",),
         "aerokit.connection.heartbeats": ("OwnHeartbeat",),
@@ -91,13 +107,29 @@ __getattr__, __dir__, __all__ = lazy_exports(
         "aerokit.position": ("Position",),
         "aerokit.vehicle.commanding.setpoints": (
             "AccelerationSetpoint",
+            "ActuatorSetpoint",
+            "AttitudeRateSetpoint",
             "AttitudeSetpoint",
             "BodyVelocitySetpoint",
             "LocalPositionSetpoint",
             "PositionSetpoint",
+            "TrajectorySetpoint",
             "VelocitySetpoint",
         ),
+        "aerokit.vehicle.commanding.sticks": ("StickInput",),
         "aerokit.vehicle.connect": ("connect",),
+        "aerokit.vehicle.external.values": (
+            "FlowMeasurement",
+            "GpsMeasurement",
+            "ObstaclePoints",
+            "ObstacleSectors",
+            "OdometryMeasurement",
+            "PoseMeasurement",
+            "RangeMeasurement",
+            "SpeedMeasurement",
+            "TargetMeasurement",
+        ),
+        "aerokit.vehicle.state.movement": ("Attitude",),
         "aerokit.vehicle.vehicle": ("Vehicle",),
     },
 )

@@ -188,7 +188,7 @@ UNKNOWN: dict[str, Any] = {
     "unknown_currents_ca": {-1},
     "mode_when_landed": None,
     "reposition_purpose": "setpoint",
-    "setpoints": SetpointRules(False, False, False, False, False, False, False, False),
+    "setpoints": SetpointRules(False, False, False, False, False, False, False, False, False, False),
 }
 ARDUPILOT = UNKNOWN | {
     **dict.fromkeys(("mission_completes_at_home", "has_upper_case_parameters", "home_is_item_0"), True),
@@ -207,21 +207,21 @@ STEERED = ARDUPILOT | {
 COPTER = STEERED | {
     "condition_yaw": True,
     "lands_after_return": True,
-    "setpoints": SetpointRules(True, True, True, True, True, False, True, False),
+    "setpoints": SetpointRules(True, True, True, True, True, False, True, False, True, True),
 }
 PLANE = STEERED | {
     "arrival_radius_m": 90.0,
-    "setpoints": SetpointRules(False, False, False, False, True, False, False, False),
+    "setpoints": SetpointRules(False, False, False, False, True, False, False, False, False, False),
 }
 ROVER = STEERED | {
     "arrival_radius_m": 4.0,
     "is_surface_vehicle": True,
-    "setpoints": SetpointRules(True, True, True, False, True, False, True, False),
+    "setpoints": SetpointRules(True, True, True, False, True, False, True, False, False, False),
 }
 SUB = STEERED | {
     "condition_yaw": True,
     "mode_when_landed": "ALT_HOLD",
-    "setpoints": SetpointRules(True, True, True, False, True, False, False, True),
+    "setpoints": SetpointRules(True, True, True, False, True, False, False, True, False, False),
 }
 PX4 = UNKNOWN | {
     **dict.fromkeys(("has_parameter_hash", "prearm_depends_on_mode", "lands_after_return"), True),
@@ -231,7 +231,7 @@ PX4 = UNKNOWN | {
     "unknown_currents_ca": {-1, -100},
     "reposition": Reposition(relative_altitude=False, yaw=True, speed=True),
     "reposition_purpose": "hold",
-    "setpoints": SetpointRules(True, True, True, True, True, True, False, False),
+    "setpoints": SetpointRules(True, True, True, True, True, True, False, False, True, True),
 }
 PX4_DOWN = PX4 | {"lands_after_return": False}
 

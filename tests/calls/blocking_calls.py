@@ -14,15 +14,18 @@ from camera_calls import BLOCKING
 from component_calls import COMPONENTS_BLOCKING
 from device_calls import BLOCKING_DEVICES
 from rtk_calls import RTK_BLOCKING
+from stream_calls import STREAMS_BLOCKING
 
 import aerokit.sync
 from aerokit import (
     AccelerationSetpoint,
+    AttitudeRateSetpoint,
     AttitudeSetpoint,
     BodyVelocitySetpoint,
     LocalPositionSetpoint,
     PositionSetpoint,
     Signing,
+    TrajectorySetpoint,
     VelocitySetpoint,
     messages,
 )
@@ -36,10 +39,14 @@ Do = Callable[[Any], object]
 CLASSES: tuple[type, ...] = (
     twins.Vehicle,
     twins.Guided,
+    twins.StickStream,
+    twins.External,
+    twins.MeasurementStream,
     twins.Gimbal,
     twins.Component,
     twins.Settings,
     twins.Gimbals,
+    twins.FollowStream,
     twins.GimbalControl,
     twins.GimbalRates,
     twins.CalibrationControl,
@@ -214,7 +221,16 @@ def _streams(stage: Any) -> None:
         pass
 
 
+def _follow_target(stage: Any) -> None:
+    place = stage.vehicle.position.value
+    with stage.vehicle.follow(lambda: place, bearing_deg=180) as following:
+        following.fly(0.5)
+
+
 WRITTEN: dict[str, Do] = {
+    "Vehicle.transition_to": lambda s: s.vehicle.transition_to("fixed_wing"),
+    "Vehicle.follow": _follow_target,
+    "FollowStream.fly": _follow_target,
     "Gimbal.control": _in_control(lambda _: None),
     "GimbalControl.raise_if_taken": _in_control(lambda block: block.raise_if_taken()),
     "GimbalControl.until_lost": _until_lost,
@@ -247,6 +263,8 @@ WRITTEN: dict[str, Do] = {
     "Guided.position": _stream("position", lambda s: PositionSetpoint(s.target())),
     "Guided.attitude": _stream("attitude", lambda _: AttitudeSetpoint(0, 2, 0, thrust=0.5)),
     "SetpointStream.fly": _stream("velocity", lambda _: VelocitySetpoint(north_m_s=1.0)),
+    "Guided.attitude_rate": _stream("attitude_rate", lambda _: AttitudeRateSetpoint(pitch_deg_s=1.0)),
+    "Guided.trajectory": _stream("trajectory", lambda _: TrajectorySetpoint(3, 3, -6)),
     "SetpointStream.set": _set,
     "Parameters.temporarily": _temporarily,
     "Parameters.transaction": _transaction,
@@ -274,5 +292,8 @@ WRITTEN: dict[str, Do] = {
 def blocking_calls() -> dict[str, Do]:
     """Return the calls by name; coroutine functions of the other table have no twin."""
     shared = {name: call.do for name, call in CALLS.items() if not inspect.iscoroutinefunction(call.do)}
-    given = (WRITTEN, BLOCKING, COMPONENTS_BLOCKING, BLOCKING_DEVICES, CALIBRATIONS_BLOCKING, RTK_BLOCKING)
+    given = (
+        *(WRITTEN, BLOCKING, COMPONENTS_BLOCKING, BLOCKING_DEVICES, CALIBRATIONS_BLOCKING, RTK_BLOCKING),
+        STREAMS_BLOCKING,
+    )
     return shared | {name: do for calls in given for name, do in calls.items()}

@@ -144,7 +144,7 @@ def _actions() -> Table:
         ("Vehicle.setup_signing", "NotSupported"): P(_sign, grounded, _old, alone=True),
         ("Vehicle.setup_signing", "OperationRejected"): P(_sign, armed),
         ("Vehicle.setup_signing", "OperationTimeout"): P(_sign, grounded, stops_sending),
-        ("Vehicle.setup_signing", "BusyError"): P(_sign_twice, grounded, stops_sending),
+        ("Vehicle.setup_signing", "BusyError"): P(_sign_twice, grounded, stops_sending, alone=True),
         ("Vehicle.set_mode", "InvalidArgument"): P(_method("set_mode", "NONE")),
         ("Vehicle.set_heading", "InvalidArgument"): P(_method("set_heading", 999), airborne),
         ("Vehicle.set_home", "OperationTimeout"): P(
@@ -191,6 +191,7 @@ def _actions() -> Table:
         ("Vehicle.take_off", "OperationTimeout"): P(_method("take_off", 50, timeout=2), armed),
         ("Vehicle.take_off", "ValueUnknownError"): P(_method("take_off", 5), armed, _clear_state("home"), on="px4"),
     }
+    rows |= _maneuvers()
     for name, do, repeated in (
         ("Vehicle.set_mode", _method("set_mode", "LOITER"), mode),
         ("Vehicle.hold", _method("hold"), mode),
@@ -213,6 +214,112 @@ def _actions() -> Table:
         rows[f"Vehicle.{name}", "OperationTimeout"] = P(_method(name, timeout=1), airborne)
     rows["Vehicle.go_to", "HeartbeatTimeout"] = later(_go, stops_sending)
     rows["Vehicle.go_to", "OperationTimeout"] = P(lambda s: _go(s, timeout=1), airborne)
+    return rows
+
+
+def _has_no_such_parameter(stage: Stage) -> None:
+    autopilot: Any = stage.vehicle.autopilot
+    autopilot.return_altitude_parameters = lambda **_: (("NOSUCH_ALT", 1.0),)
+
+
+def _rover(stage: Stage) -> None:
+    """A vehicle type that neither climbs nor has an airspeed."""
+    autopilot: Any = stage.vehicle.autopilot
+    autopilot.speed_types, autopilot.circles_by = frozenset(), None
+    autopilot.return_altitude_parameters = lambda **_: ()
+
+
+def _orbit(stage: Stage, **options: Any) -> Any:
+    return stage.vehicle.orbit(stage.target(), radius_m=8, **options)
+
+
+def _figure_eight(stage: Stage, **options: Any) -> Any:
+    return stage.vehicle.figure_eight(stage.target(), major_radius_m=16, minor_radius_m=8, **options)
+
+
+def _loiter(stage: Stage, **options: Any) -> Any:
+    return stage.vehicle.loiter(stage.target(), **options)
+
+
+def _following(stage: Stage, target: Position | None = None, **options: Any) -> Any:
+    return stage.vehicle.follow(lambda: target, **options)
+
+
+async def _follow(stage: Stage, *target: Position | None, **options: Any) -> None:
+    place = target[0] if target else stage.home
+    async with _following(stage, place, **options) as following:
+        await following.fly(20)
+
+
+async def _vtol_in_the_air(stage: Stage) -> None:
+    await airborne(stage)
+    stage.simulated.vtol_state = 3  # type: ignore[union-attr]
+    await stage.vehicle.vtol_state.wait_until(lambda state: state == 3, timeout=5)
+
+
+def _px4_pilot(stage: Stage) -> None:
+    stage.simulated.switch_to((3, 0))  # type: ignore[union-attr]
+
+
+def _maneuvers() -> Table:
+    end, off = Cmd.DO_FLIGHTTERMINATION, Cmd.PREFLIGHT_REBOOT_SHUTDOWN
+    terminate = _method("terminate", intent="terminate flight", timeout=2)
+    patient = _method("terminate", intent="terminate flight", timeout=30)
+    shut_down = _method("shutdown", intent="shut down", timeout=2)
+    rows: Table = {
+        ("Vehicle.terminate", "HeartbeatTimeout"): later(patient, stops_sending, 0.3, before=accepted(end)),
+        ("Vehicle.terminate", "OperationTimeout"): P(terminate, airborne, accepted(end)),
+        ("Vehicle.shutdown", "NotSupported"): P(shut_down, grounded),
+        ("Vehicle.shutdown", "OperationRejected"): P(shut_down, armed, on="px4"),
+        ("Vehicle.shutdown", "OperationTimeout"): P(shut_down, grounded, accepted(off), on="px4"),
+        ("Vehicle.set_airspeed", "NotSupported"): P(_method("set_airspeed", 15), before=_rover, alone=True),
+        ("Vehicle.set_climb_speed", "NotSupported"): P(_method("set_climb_speed", 1), on="px4"),
+        ("Vehicle.set_return_altitude", "InvalidArgument"): P(_method("set_return_altitude", 0)),
+    }
+    orbit, eight = Cmd.DO_ORBIT, Cmd.DO_SET_MODE
+    for name, give, command, on in (
+        ("Vehicle.orbit", _orbit, orbit, "px4"),
+        ("Vehicle.figure_eight", _figure_eight, eight, "ardupilot"),
+        ("Vehicle.loiter", _loiter, Cmd.DO_REPOSITION, "ardupilot"),
+    ):
+        rows[name, "CommandRejected"] = P(give, airborne, refused(command), on=on)
+        rows[name, "CommandTimeout"] = P(give, airborne, ignored(command), on=on)
+        rows[name, "OperationRejected"] = P(give, grounded)
+        rows[name, "ValueUnknownError"] = P(give, airborne, _clear_state("position"), alone=True)
+        rows[name, "HeartbeatTimeout"] = later(give, stops_sending, 3.0, alone=True)
+        rows[name, "OperationTimeout"] = P(lambda s, give=give: give(s, timeout=1.5), airborne)  # type: ignore[misc]
+    rows["Vehicle.figure_eight", "CommandTimeout"] = P(_figure_eight, airborne, ignored(eight))
+    rows["Vehicle.orbit", "NotSupported"] = P(_orbit, airborne, _rover, alone=True)
+    rows["Vehicle.figure_eight", "NotSupported"] = P(_figure_eight, airborne, _obeys_nothing, alone=True)
+    rows["Vehicle.loiter", "NotSupported"] = P(lambda s: _loiter(s, radius_m=50))
+    rows["Vehicle.follow", "InvalidArgument"] = P(_now(lambda s: _following(s, distance_m=-1)))
+    rows["Vehicle.follow", "NotSupported"] = P(_now(_following), before=_obeys_nothing, alone=True)
+    rows["FollowStream", "OperationRejected"] = P(_follow, grounded)
+    rows["FollowStream", "OperationTimeout"] = P(lambda s: _follow(s, None), airborne)
+    rows["FollowStream", "InvalidArgument"] = P(lambda s: _follow(s, s.home, height_m=5), airborne)
+    rows["FollowStream", "SetpointStreamStopped"] = later(_follow, pilot, 2.0)
+    rows["FollowStream.fly", "SetpointStreamStopped"] = later(_follow, pilot, 2.0)
+    tune = _method("autotune")
+    rows["Vehicle.autotune", "NotSupported"] = P(tune, airborne)
+    rows["Vehicle.autotune", "OperationTimeout"] = P(_method("autotune", timeout=2), airborne, on="px4")
+    rows["Vehicle.autotune", "OperationRejected"] = later(tune, _px4_pilot, 2.5, on="px4", alone=True)
+    transition = Cmd.DO_VTOL_TRANSITION
+    to_wings = _method("transition_to", "fixed_wing", timeout=30)
+    rows["Vehicle.transition_to", "NotSupported"] = P(to_wings, airborne)
+    for error, trouble in (("CommandRejected", refused(transition)), ("CommandTimeout", ignored(transition))):
+        rows["Vehicle.transition_to", error] = P(to_wings, _vtol_in_the_air, trouble, on="px4", alone=True)
+    in_transition: dict[str, Any] = {"place": _vtol_in_the_air, "on": "px4", "alone": True}
+    in_transition["before"] = accepted(transition)
+    rows["Vehicle.transition_to", "OperationTimeout"] = P(
+        _method("transition_to", "fixed_wing", timeout=2), **in_transition
+    )
+    rows["Vehicle.transition_to", "HeartbeatTimeout"] = later(to_wings, stops_sending, 1.0, **in_transition)
+    rows["Vehicle.transition_to", "OperationRejected"] = later(to_wings, _px4_pilot, 1.0, **in_transition)
+    for name, args in (("return_altitude", ()), ("set_return_altitude", (20.0,))):
+        call, do = f"Vehicle.{name}", _method(name, *args)
+        rows[call, "NotSupported"] = P(do, before=_rover, alone=True)
+        rows[call, "ParameterRejected"] = P(do, before=_has_no_such_parameter, on="px4", alone=True)
+        rows[call, "ParameterTimeout"] = P(do, before=stops_sending, alone=True)
     return rows
 
 

@@ -15,14 +15,18 @@ from aerokit.vehicle.calibration.calibration import Calibration, CalibrationCont
 from aerokit.vehicle.camera.cameras import Camera
 from aerokit.vehicle.camera.link import CameraBlock
 from aerokit.vehicle.camera.photos import PhotoInterval
+from aerokit.vehicle.commanding.follow import FollowStream
 from aerokit.vehicle.commanding.guided import Guided, SetpointStream
 from aerokit.vehicle.commanding.posted import PostedOrder
+from aerokit.vehicle.commanding.sticks import StickStream
 from aerokit.vehicle.components.component import Component
 from aerokit.vehicle.components.settings import Settings
 from aerokit.vehicle.devices.actuators import Actuators
 from aerokit.vehicle.devices.gripper import Gripper
 from aerokit.vehicle.devices.shell import Shell
 from aerokit.vehicle.devices.winch import Winch
+from aerokit.vehicle.external.external import External
+from aerokit.vehicle.external.streams import MeasurementStream
 from aerokit.vehicle.files.files import Files
 from aerokit.vehicle.files.log_stream import LogStream
 from aerokit.vehicle.files.logs import Logs
@@ -42,6 +46,10 @@ CLASSES: tuple[type, ...] = (
     aerokit.Vehicle,
     Guided,
     SetpointStream,
+    FollowStream,
+    StickStream,
+    External,
+    MeasurementStream,
     Gimbal,
     Component,
     Gimbals,

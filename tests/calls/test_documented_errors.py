@@ -23,14 +23,25 @@ from provoked_gimbals import GIMBALS
 from provoked_settings import SETTINGS
 from provoked_transfers import TRANSFERS
 from rtk_calls import RTK
+from stream_calls import stream_provocations
 
 from aerokit import errors
 from aerokit.sim.faults import Faults
 from aerokit.testing import run_virtual
 
-PROVOCATIONS = (
-    provocations() | FLIGHT | GIMBALS | TRANSFERS | SETTINGS | CAMERA | COMPONENTS | DEVICE_ERRORS | CALIBRATIONS | RTK
-)
+PROVOCATIONS = {
+    **provocations(),
+    **FLIGHT,
+    **GIMBALS,
+    **TRANSFERS,
+    **SETTINGS,
+    **CAMERA,
+    **COMPONENTS,
+    **DEVICE_ERRORS,
+    **CALIBRATIONS,
+    **RTK,
+    **stream_provocations(),
+}
 PROMISED = documented()
 MAX_WAIT_S = 200.0
 BY_DEFAULT = ("Vehicle", "Guided", "Parameters", "MissionControl", "Files", "Gimbal")

@@ -142,6 +142,7 @@ Place = Callable[[Stage], Awaitable[None]]
 async def anywhere(stage: Stage) -> None:
     """The initial state."""
     stage.simulated.battery.percent = 100.0
+    stage.simulated.battery.consumed_mah = 0.0
 
 
 async def grounded(stage: Stage) -> None:
@@ -172,7 +173,7 @@ async def airborne(stage: Stage) -> None:
     """Hovering."""
     vehicle = stage.vehicle
     await anywhere(stage)
-    if not (vehicle.is_armed and _altitude(stage) > 3.0):
+    if not (vehicle.is_armed and _altitude(stage) > 2.0):
         await armed(stage)
         await vehicle.take_off(6.0)
     elif vehicle.mode_name not in ("GUIDED", "LOITER"):

@@ -15,21 +15,25 @@ from component_calls import COMPONENTS_AWAITED
 from device_calls import BLOCKS, DEVICE_CALLS, DEVICES, DeviceCall, components_of, fit
 from provoked import Do, Provocation, Table, ignored, refused
 from rtk_calls import RTK_AWAITED
+from stream_calls import ARDUPILOT_STREAMS, STREAMS_AWAITED
 
 import aerokit
 from aerokit import (
     AccelerationSetpoint,
+    AttitudeRateSetpoint,
     AttitudeSetpoint,
     BodyVelocitySetpoint,
     LocalPositionSetpoint,
     PositionSetpoint,
     Signing,
     SigningKey,
+    TrajectorySetpoint,
     VelocitySetpoint,
     messages,
 )
+from aerokit.connection.cells import Source
 from aerokit.mavlink.encoder import FrameEncoder
-from aerokit.mavlink.enums import MavCmd
+from aerokit.mavlink.enums import MavCmd, MavVtolState, SpeedType
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.vehicle.components.settings import Settings
 
@@ -106,6 +110,7 @@ def _action(
     *,
     wrong: Give | None = None,
     on: tuple[str, ...] = BOTH,
+    after: Callable[[Stage], object] = _nothing,
     **order: Any,
 ) -> dict[str, Call]:
     """Create the call of an action that sends this command, with its row in the table of orders."""
@@ -113,6 +118,7 @@ def _action(
         lambda stage: give(stage.vehicle),
         place,
         on,
+        after=after,
         command=command,
         wrong=None if wrong is None else lambda stage: wrong(stage.vehicle),
         order=Row(name, give, command, PLACES[place], on=on, **order),
@@ -323,6 +329,50 @@ def _pass_checks(stage: Stage) -> None:
     stage.simulated.faults.prearm_failures.clear()
 
 
+def _set_airspeed(vehicle: aerokit.Vehicle) -> Awaitable[object]:
+    """The copter accepts an airspeed and changes its ground speed; only a plane has this call."""
+    autopilot: Any = vehicle.autopilot
+    autopilot.speed_types |= {SpeedType.AIRSPEED}
+    return vehicle.set_airspeed(15)
+
+
+async def _follow(stage: Stage) -> None:
+    target = stage.target()
+    async with stage.vehicle.follow(lambda: target, distance_m=5) as following:
+        await following.fly(1.0)
+
+
+def _make_vtol(stage: Stage) -> None:
+    stage.simulated.vtol_state = int(MavVtolState.MC)  # type: ignore[union-attr]
+
+
+def _unmake_vtol(stage: Stage) -> None:
+    stage.simulated.vtol_state = 0  # type: ignore[union-attr]
+
+
+async def _become_plane(stage: Stage) -> None:
+    await stage.vehicle.vtol_state.wait_until(lambda state: state == MavVtolState.MC, timeout=5)
+    await stage.vehicle.transition_to("fixed_wing")
+
+
+async def _transition(vehicle: aerokit.Vehicle) -> None:
+    """The vehicle of the order table is no VTOL, and does not answer."""
+    vehicle.telemetry.vtol_state.set(int(MavVtolState.MC), Source(1, 1, "the test"))
+    await vehicle.transition_to("fixed_wing")
+
+
+def _undo_termination(stage: Stage) -> None:
+    """A terminated PX4 flies again only after a restart, which would take long."""
+    if isinstance(stage.simulated, SimulatedPx4):
+        stage.simulated.arming.disarm("the test", force=True)
+        stage.simulated.arming.is_terminated = stage.simulated.is_in_failsafe = False
+
+
+def _switch_on(stage: Stage) -> None:
+    if stage.simulated.now > 0 and not stage.simulated._is_on:
+        stage.simulated.power_on()
+
+
 CALLS: dict[str, Call] = {
     "connect": Call(_connect),
     "open_connection": Call(_open_connection),
@@ -356,6 +406,31 @@ CALLS: dict[str, Call] = {
         wrong=lambda v: v.set_speed(-1),
         steers=False,
     ),
+    **_action(
+        "set_airspeed",
+        _set_airspeed,
+        MavCmd.DO_CHANGE_SPEED,
+        wrong=lambda v: v.set_airspeed(0),
+        on=COPTER,
+        steers=False,
+    ),
+    **_action(
+        "set_climb_speed",
+        lambda v: v.set_climb_speed(1.5),
+        MavCmd.DO_CHANGE_SPEED,
+        wrong=lambda v: v.set_climb_speed(-1),
+        on=COPTER,
+        steers=False,
+    ),
+    "Vehicle.autotune": Call(
+        lambda s: s.vehicle.autotune(),
+        airborne,
+        on=PX4,
+        command=MavCmd.DO_AUTOTUNE_ENABLE,
+        order=Row("autotune", lambda v: v.autotune(), MavCmd.DO_AUTOTUNE_ENABLE, steers=False, on=PX4),
+    ),
+    "Vehicle.return_altitude": Call(lambda s: s.vehicle.return_altitude()),
+    "Vehicle.set_return_altitude": Call(lambda s: s.vehicle.set_return_altitude(s.other_value() + 20)),
     "Vehicle.set_heading": Call(lambda s: s.vehicle.set_heading(60, relative=True), airborne),
     **_action(
         "set_home",
@@ -366,6 +441,53 @@ CALLS: dict[str, Call] = {
     ),
     **_action("look_at", lambda v: v.look_at(north(v, 50.0)), MavCmd.DO_SET_ROI_LOCATION, steers=False),
     **_action("stop_looking", lambda v: v.stop_looking(), MavCmd.DO_SET_ROI_NONE, steers=False),
+    "Vehicle.orbit": Call(
+        lambda s: s.vehicle.orbit(s.target(), radius_m=8, speed_m_s=4, turns=0.25),
+        airborne,
+        wrong=lambda s: s.vehicle.orbit(s.target(), radius_m=0),
+    ),
+    "Vehicle.figure_eight": Call(
+        lambda s: s.vehicle.figure_eight(s.target(), major_radius_m=16, minor_radius_m=8, speed_m_s=4, rounds=0.5),
+        airborne,
+        wrong=lambda s: s.vehicle.figure_eight(s.target(), major_radius_m=16, minor_radius_m=9),
+    ),
+    "Vehicle.loiter": Call(
+        lambda s: s.vehicle.loiter(s.target(), duration_s=2),
+        airborne,
+        command=MavCmd.DO_REPOSITION,
+        wrong=lambda s: s.vehicle.loiter(turns=1),
+    ),
+    "Vehicle.follow": Call(_follow, airborne),
+    "FollowStream.fly": Call(_follow, airborne),
+    "Vehicle.transition_to": Call(
+        _become_plane,
+        airborne,
+        on=PX4,
+        before=_make_vtol,
+        after=_unmake_vtol,
+        command=MavCmd.DO_VTOL_TRANSITION,
+        wrong=lambda s: s.vehicle.transition_to("tailsitter"),  # type: ignore[arg-type]
+        order=Row("transition_to", _transition, MavCmd.DO_VTOL_TRANSITION, steers=False, on=PX4),
+    ),
+    **_action(
+        "terminate",
+        lambda v: v.terminate(intent="terminate flight"),
+        MavCmd.DO_FLIGHTTERMINATION,
+        armed,
+        wrong=lambda v: v.terminate(intent="land"),  # type: ignore[arg-type]
+        modes=((), ("TERMINATION",)),
+        after=_undo_termination,
+    ),
+    **_action(
+        "shutdown",
+        lambda v: v.shutdown(intent="shut down"),
+        MavCmd.PREFLIGHT_REBOOT_SHUTDOWN,
+        grounded,
+        wrong=lambda v: v.shutdown(intent="sleep"),  # type: ignore[arg-type]
+        on=PX4,
+        steers=False,
+        after=_switch_on,
+    ),
     **_action("reboot", lambda v: v.reboot(timeout=20), MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, grounded, steers=False),
     "Vehicle.setup_signing": Call(_sign, grounded, after=_no_key),
     "Vehicle.command": Call(lambda s: s.vehicle.command(MavCmd.REQUEST_MESSAGE, messages.AutopilotVersion.ID)),
@@ -380,7 +502,13 @@ CALLS: dict[str, Call] = {
     "Guided.local_position": _stream("local_position", lambda _: LocalPositionSetpoint(3, 3, -6)),
     "Guided.position": _stream("position", lambda s: PositionSetpoint(s.target())),
     "Guided.attitude": _stream("attitude", lambda _: AttitudeSetpoint(0, 2, 0, thrust=0.5)),
+    "Guided.attitude_rate": _stream("attitude_rate", lambda _: AttitudeRateSetpoint(pitch_deg_s=1.0)),
+    "Guided.trajectory": _stream("trajectory", lambda _: TrajectorySetpoint(3, 3, -6, north_m_s=0.1)),
     "SetpointStream.fly": Call(_fly, airborne),
+    **{
+        name: Call(do, place, COPTER if name in ARDUPILOT_STREAMS else BOTH, before=before)
+        for name, (do, place, before) in STREAMS_AWAITED.items()
+    },
     # ------------------------------------------------------------------------------------- Camera
     **{name: Call(do) for name, do in AWAITED.items()},
     # ------------------------------------------------------------------------------- calibration

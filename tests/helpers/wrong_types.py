@@ -16,11 +16,14 @@ from aerokit import Position, messages
 from aerokit.errors import InvalidArgument
 from aerokit.missions import Fence, Mission, RallyPoints
 from aerokit.vehicle.commanding.setpoints import (
+    ActuatorSetpoint,
     AttitudeSetpoint,
     LocalPositionSetpoint,
     PositionSetpoint,
+    TrajectorySetpoint,
     VelocitySetpoint,
 )
+from aerokit.vehicle.commanding.sticks import StickInput
 
 __all__ = ["Misuse", "misuses", "misuses_of", "refusal_of"]
 
@@ -52,6 +55,7 @@ WRONG: dict[str, tuple[object, ...]] = {
     "str | int": (*NOTHING, *STRANGE, 1.5, b"GUIDED"),
     "str | os.PathLike[str]": (*NOTHING, *STRANGE, *NUMBER),
     "str | os.PathLike[str] | None": (*STRANGE, *NUMBER),
+    "Position": (*NOTHING, *STRANGE, *TEXT, *NUMBER, [47.0, 8.0]),
     "Position | Home": (*NOTHING, *STRANGE, *TEXT, *NUMBER, [47.0, 8.0]),
     "Position | Home | None": (*STRANGE, *TEXT, *NUMBER, [47.0, 8.0]),
     "Message": (*NOTHING, *STRANGE, *TEXT, *NUMBER, messages.Heartbeat),
@@ -64,6 +68,7 @@ WRONG: dict[str, tuple[object, ...]] = {
         {"HEARTBEAT": 1.0},
         {messages.Heartbeat: "1"},
     ),
+    "Callable[[int], object] | None": (*TEXT, *NUMBER, [print]),
     "Callable[[int | None], None] | None": (*TEXT, *NUMBER, [print]),
     "OnProgress | None": (*TEXT, *NUMBER, [print]),
     "Callable[[T], object]": (*NOTHING, *TEXT, *NUMBER, [print]),
@@ -94,8 +99,15 @@ WRONG: dict[str, tuple[object, ...]] = {
 }
 """Maps an annotation to values that it does not allow."""
 WRONG["type[ItemT]"] = WRONG["type[MessageT]"] = WRONG["type[Message]"]
-for _setpoint in ("Velocity", "BodyVelocity", "Acceleration", "LocalPosition", "Position", "Attitude"):
-    WRONG[f"{_setpoint}Setpoint"] = (*NOTHING, *STRANGE, *TEXT, *NUMBER, PLACE)
+_SETPOINTS = (
+    *("Velocity", "BodyVelocity", "Acceleration", "LocalPosition", "Position", "Attitude"),
+    *("AttitudeRate", "Trajectory", "Actuator"),
+)
+for _value in (*(f"{kind}Setpoint" for kind in _SETPOINTS), "StickInput"):
+    WRONG[_value] = (*NOTHING, *STRANGE, *TEXT, *NUMBER, PLACE)
+WRONG["TargetSource"] = (*NOTHING, [PLACE], (47.0, 8.0), {"a": "b"}, 1j, *TEXT, *NUMBER, PLACE)
+WRONG["StickInput | None"] = (*STRANGE, *TEXT, *NUMBER, PLACE)
+WRONG["FollowTarget"] = (*NOTHING, 1j, *TEXT, *NUMBER, PLACE)
 WRONG["CacheChoice"] = (*NOTHING, *STRANGE, *NUMBER)
 WRONG["Capture"] = (*NOTHING, *STRANGE, *TEXT, *NUMBER)
 for _literal in (
@@ -108,6 +120,10 @@ for _literal in (
     "LogMethod",
     "Overflow",
     "Subject",
+    "Facing",
+    "FlightState",
+    "TerminationIntent",
+    "ShutdownIntent",
     "EscIntent",
     "SpinIntent",
     "ReleaseIntent",
@@ -133,6 +149,7 @@ RIGHT: dict[str, object] = {
     "str | Link | Sequence[str | Link]": "udpin:127.0.0.1:0",
     "str | Link | Sequence[str | Link] | Connection": "udpin:127.0.0.1:0",
     "str | Link | Connection": "udpin:127.0.0.1:0",
+    "Position": PLACE,
     "Position | Home": PLACE,
     "Position | Home | None": PLACE,
     "Message": messages.Heartbeat(6, 8, 0, 0, 4),
@@ -148,6 +165,10 @@ RIGHT: dict[str, object] = {
     **{kind.__name__: kind() for kind in (Mission, Fence, RallyPoints)},
     "PlanT": Mission(),
     "SourceName": "rgb",
+    "FlightState": "fixed_wing",
+    "FollowTarget": lambda: PLACE,
+    "TerminationIntent": "terminate flight",
+    "ShutdownIntent": "shut down",
     "ModeName": "photo",
     "SpinIntent": "spin motor",
     "ReleaseIntent": "release parachute",
@@ -157,6 +178,10 @@ RIGHT: dict[str, object] = {
     "SetpointT": VelocitySetpoint(),
     "PositionSetpoint": PositionSetpoint(PLACE),
     "LocalPositionSetpoint": LocalPositionSetpoint(0, 0, -5),
+    "TrajectorySetpoint": TrajectorySetpoint(0, 0, -5),
+    "ActuatorSetpoint": ActuatorSetpoint((0.0,) * 8),
+    "StickInput": StickInput(),
+    "TargetSource": lambda: None,
     "AttitudeSetpoint": AttitudeSetpoint(0, 0, 0, thrust=0.5),
 }
 """Maps an annotation to a valid value, for required parameters in a call whose wrong value is another parameter."""

@@ -50,7 +50,7 @@ def flying() -> tuple[SimulatedPx4, Client]:
         (MavCmd.CONTROL_HIGH_LATENCY, 0, MavResult.FAILED),
         (MavCmd.DO_FLIGHTTERMINATION, 1, MavResult.DENIED),
         (MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, 0, MavResult.ACCEPTED),
-        (MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, 2, MavResult.DENIED),
+        (MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, 3, MavResult.DENIED),
         (MavCmd.DO_SET_STANDARD_MODE, 3, MavResult.FAILED),
         (MavCmd.DO_SET_STANDARD_MODE, 6, MavResult.ACCEPTED),
     ],

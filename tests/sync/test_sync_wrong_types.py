@@ -18,6 +18,8 @@ from aerokit.testing.journal import Journal
 OWNERS: dict[str, Callable[[aerokit.sync.Vehicle], Any]] = {
     "vehicle": lambda vehicle: vehicle,
     "guided": lambda vehicle: vehicle.guided,
+    "external": lambda vehicle: vehicle.external,
+    "sticks": lambda vehicle: vehicle.sticks(),
     "stream": lambda vehicle: vehicle.guided.velocity(),
     "parameters": lambda vehicle: vehicle.parameters,
     "settings": lambda vehicle: vehicle.component(100).settings,

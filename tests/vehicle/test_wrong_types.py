@@ -22,6 +22,8 @@ pytestmark = pytest.mark.anyio
 OWNERS: dict[str, Callable[[aerokit.Vehicle], Any]] = {
     "vehicle": lambda vehicle: vehicle,
     "guided": lambda vehicle: vehicle.guided,
+    "external": lambda vehicle: vehicle.external,
+    "sticks": lambda vehicle: vehicle.sticks(),
     "stream": lambda vehicle: vehicle.guided.velocity(),
     "parameters": lambda vehicle: vehicle.parameters,
     "settings": lambda vehicle: vehicle.component(100).settings,

@@ -39,6 +39,10 @@ _SIMPLE: dict[str, Rule] = {
     "None": (lambda value: value is None, "None"),
     "Callable": (callable, "a function"),
     "OnProgress": (callable, "a function"),
+    "TargetSource": (
+        lambda value: callable(value) or hasattr(value, "__aiter__"),
+        "a function or an asynchronous iterable",
+    ),
     "PeerFilter": (lambda _: True, "addresses and networks"),  # checked by the links, with a better message
     "PathLike": (lambda value: isinstance(value, os.PathLike), "a path"),
 }

@@ -7,12 +7,22 @@ Modes are from ``enum class Number`` in each vehicle's mode.h. Their names are t
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, Literal
 
-from aerokit.autopilots.base import Autopilot, GimbalRules, Purpose, Reposition, SetpointRules, TakeOff
+from aerokit.autopilots.base import (
+    VTOLS,
+    Autopilot,
+    GimbalRules,
+    Purpose,
+    Reposition,
+    SetpointRules,
+    StickRules,
+    TakeOff,
+)
+from aerokit.autopilots.external import ARDUPILOT_EXTERNAL, ExternalRules
 from aerokit.autopilots.modes import ModeTable
 from aerokit.autopilots.telemetry import ARDUPILOT_GROUPS, ATTITUDE_AND_HEIGHT, POS_HORIZ_ABS, bit_names
-from aerokit.mavlink.enums import EkfStatusFlags, MavCmd, MavLandedState, MavState, MavType
+from aerokit.mavlink.enums import EkfStatusFlags, MavCmd, MavLandedState, MavState, MavType, SpeedType
 
 if TYPE_CHECKING:
     from aerokit.mavlink.messages import Heartbeat
@@ -22,7 +32,8 @@ NOT_ON_ARDUPILOT = frozenset(
     (_C.DO_SET_ACTUATOR, _C.ACTUATOR_TEST, _C.INJECT_FAILURE, _C.ILLUMINATOR_ON_OFF, _C.LOGGING_START)
 )
 NOT_ON_PLANE = NOT_ON_ARDUPILOT | {_C.DO_WINCH}
-NOT_ON_GROUND_OR_WATER = NOT_ON_PLANE | {_C.DO_PARACHUTE, _C.AIRFRAME_CONFIGURATION}
+NOT_ON_COPTER = NOT_ON_ARDUPILOT | {_C.DO_VTOL_TRANSITION}
+NOT_ON_GROUND_OR_WATER = NOT_ON_PLANE | NOT_ON_COPTER | {_C.DO_PARACHUTE, _C.AIRFRAME_CONFIGURATION}
 
 COPTER = ModeTable(
     {
@@ -143,16 +154,6 @@ TRACKER = ModeTable({0: "MANUAL", 1: "STOP", 2: "SCAN", 3: "SERVOTEST", 4: "GUID
 
 EKF_PROBLEMS: Mapping[int, str] = {1024: "initialisation", 32768: "GPS without glitches"}
 
-VTOLS = (
-    MavType.VTOL_TAILSITTER_DUOROTOR,
-    MavType.VTOL_TAILSITTER_QUADROTOR,
-    MavType.VTOL_TILTROTOR,
-    MavType.VTOL_FIXEDROTOR,
-    MavType.VTOL_TAILSITTER,
-    MavType.VTOL_TILTWING,
-    MavType.VTOL_RESERVED5,
-)
-
 COPTERS = (
     MavType.QUADROTOR,
     MavType.COAXIAL,
@@ -186,6 +187,7 @@ class ArduPilot(Autopilot):
     sets_current_by_command = True
     accepts_ftp_session_ids = True
     has_upper_case_parameters = True
+    external: ExternalRules = ARDUPILOT_EXTERNAL
     log_suffix = ".bin"
     video_addresses_camera = True
     log_directories: ClassVar[tuple[str, str]] = ("/APM/LOGS", "/logs")
@@ -229,19 +231,27 @@ class ArduCopter(ArduPilot):
     """ArduCopter: multicopters and helicopters."""
 
     firmware = "ArduCopter"
+    unsupported_commands: frozenset[int] = NOT_ON_COPTER
     modes: ModeTable = COPTER
     purposes: ClassVar[Mapping[str, str]] = {
         "hold": "BRAKE",  # LOITER follows the throttle stick, which is down or absent while a program flies
         "land": "LAND",
+        "precision_land": "LAND",  # with PLND_ENABLED
         "return": "RTL",
         "setpoint": "GUIDED",
+        "sticks": "LOITER",
         "take_off": "GUIDED",
         "mission": "AUTO",
     }
-    setpoints: SetpointRules = SetpointRules(body_yaw_is_relative=True)
+    sticks: StickRules | None = StickRules()
+    setpoints: SetpointRules = SetpointRules(body_yaw_is_relative=True, attitude_rate=True, trajectory=True)
     reposition: Reposition | None = Reposition(relative_altitude=True, yaw=False, speed=False)
+    # An airspeed changes the ground speed (GCS_MAVLink_Copter.cpp, handle_MAV_CMD_DO_CHANGE_SPEED).
+    speed_types: frozenset[int] = frozenset((SpeedType.GROUNDSPEED, SpeedType.CLIMB_SPEED))
     condition_yaw = True
     lands_after_return = True
+    # There is no DO_ORBIT, and CIRCLE follows the throttle stick (mode_circle.cpp).
+    circles_by: Literal["orbit", "reposition", "setpoints"] | None = "setpoints"
     arming_mode: ClassVar[str | None] = "GUIDED"
     unarmable_modes: frozenset[str] = frozenset(
         (
@@ -269,6 +279,9 @@ class ArduCopter(ArduPilot):
         # STANDBY is reported on the ground only, ACTIVE in the air only. A failsafe (CRITICAL) hides both.
         return _landed_state(heartbeat)
 
+    def return_altitude_parameters(self, *, is_vtol: bool) -> tuple[tuple[str, float], ...]:
+        return (("RTL_ALT_M", 1.0), ("RTL_ALT", 100.0))
+
 
 class ArduPlane(ArduPilot):
     """ArduPlane: planes, and VTOL planes, which ArduPilot calls QuadPlanes."""
@@ -281,14 +294,18 @@ class ArduPlane(ArduPilot):
         "land": "AUTOLAND",
         "return": "RTL",
         "setpoint": "GUIDED",
+        "sticks": "FBWA",
         "take_off": "TAKEOFF",
         "mission": "AUTO",
     }
+    sticks: StickRules | None = StickRules()
     setpoints: SetpointRules = SetpointRules(
         local_position=False, global_position=False, velocity=False, acceleration=False
     )
     reposition: Reposition | None = Reposition(relative_altitude=True, yaw=False, speed=False)
+    speed_types: frozenset[int] = frozenset((SpeedType.AIRSPEED, SpeedType.GROUNDSPEED))
     arrival_radius_m: float = 90.0  # it circles at WP_LOITER_RAD, 60 m by default
+    circles_by: Literal["orbit", "reposition", "setpoints"] | None = "reposition"
     arming_mode: ClassVar[str | None] = "FBWA"  # manual throttle; a plane armed in TAKEOFF starts to move
     unarmable_modes: frozenset[str] = frozenset(("AUTOLAND", "INITIALISING", "QLAND", "QRTL", "RTL"))
 
@@ -307,11 +324,16 @@ class ArduPlane(ArduPilot):
     def landed_state_of(self, heartbeat: Heartbeat) -> int | None:
         return _landed_state(heartbeat)
 
+    def return_altitude_parameters(self, *, is_vtol: bool) -> tuple[tuple[str, float], ...]:
+        if self._can_hover(is_vtol):
+            return (("Q_RTL_ALT", 1.0),)  # It returns in QRTL.
+        return (("RTL_ALTITUDE", 1.0), ("ALT_HOLD_RTL", 100.0))
+
     def _can_hover(self, is_vtol: bool) -> bool:
         return is_vtol or self.vehicle_type in VTOLS
 
 
-_QUADPLANE: Mapping[str, str] = {"land": "QLAND", "return": "QRTL", "take_off": "GUIDED"}
+_QUADPLANE: Mapping[str, str] = {"land": "QLAND", "return": "QRTL", "sticks": "QLOITER", "take_off": "GUIDED"}
 
 
 class ArduRover(ArduPilot):
@@ -325,8 +347,10 @@ class ArduRover(ArduPilot):
         "hold": "HOLD",
         "return": "RTL",
         "setpoint": "GUIDED",
+        "sticks": "MANUAL",
         "mission": "AUTO",
     }
+    sticks: StickRules | None = StickRules(signed_throttle=True)
     setpoints: SetpointRules = SetpointRules(acceleration=False, body_yaw_is_relative=True)
     reposition: Reposition | None = Reposition(relative_altitude=True, yaw=False, speed=False)
     arrival_radius_m: float = 4.0
@@ -349,8 +373,10 @@ class ArduSub(ArduPilot):
         "hold": "POSHOLD",
         "land": "SURFACE",
         "setpoint": "GUIDED",
+        "sticks": "ALT_HOLD",
         "mission": "AUTO",
     }
+    sticks: StickRules | None = StickRules(release="channels")
     setpoints: SetpointRules = SetpointRules(acceleration=False, position_restarts_path=True)
     mode_when_landed: ClassVar[str | None] = "ALT_HOLD"  # at the surface
     reposition: Reposition | None = Reposition(relative_altitude=True, yaw=False, speed=False)

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from aerokit._internal.values import Snapshot
+from aerokit.autopilots.external import ExternalRules
 from aerokit.autopilots.modes import CUSTOM_MODE_ENABLED, NO_MODES, Mode, ModeTable, base_mode_name
 from aerokit.autopilots.telemetry import (
     ATTITUDE_AND_HEIGHT,
@@ -19,7 +20,7 @@ from aerokit.autopilots.telemetry import (
     version_text,
 )
 from aerokit.mavlink import messages
-from aerokit.mavlink.enums import MavCmd, MavProtocolCapability
+from aerokit.mavlink.enums import MavCmd, MavProtocolCapability, MavType, SpeedType
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -30,7 +31,7 @@ NAN = math.nan
 _BYTEWISE = MavProtocolCapability.PARAM_ENCODE_BYTEWISE.value
 _C_CAST = MavProtocolCapability.PARAM_ENCODE_C_CAST.value
 
-Purpose = Literal["hold", "land", "return", "setpoint", "take_off", "mission"]
+Purpose = Literal["hold", "land", "precision_land", "return", "setpoint", "sticks", "take_off", "mission"]
 """Purpose for which a program uses a mode."""
 
 # Maps a MAV_CMD to the purposes of the modes that it may lead to. An autopilot may use several modes for one purpose.
@@ -53,7 +54,19 @@ PURPOSES_OF_COMMANDS: Mapping[int, tuple[Purpose, ...]] = {
 NAMES_OF_COMMANDS: Mapping[int, tuple[str, ...]] = {
     MavCmd.NAV_LOITER_UNLIM: ("LOITER",),
     MavCmd.DO_ORBIT: ("ORBIT", "CIRCLE"),
+    MavCmd.DO_FLIGHTTERMINATION: ("TERMINATION",),
 }
+
+
+VTOLS = (
+    MavType.VTOL_TAILSITTER_DUOROTOR,
+    MavType.VTOL_TAILSITTER_QUADROTOR,
+    MavType.VTOL_TILTROTOR,
+    MavType.VTOL_FIXEDROTOR,
+    MavType.VTOL_TAILSITTER,
+    MavType.VTOL_TILTWING,
+    MavType.VTOL_RESERVED5,
+)
 
 
 class TakeOff(Snapshot):
@@ -75,6 +88,7 @@ class SetpointRules(Snapshot):
     - ``stream_before_mode``: the stream must be running before the mode is requested.
     - ``body_yaw_is_relative``: in MAV_FRAME_BODY_NED, yaw is relative to the current heading instead of north.
     - ``position_restarts_path``: each position set-point, even a repeated one, restarts the path from a standstill.
+    - ``trajectory``: positions with velocity and acceleration.
     """
 
     local_position: bool = True
@@ -85,12 +99,29 @@ class SetpointRules(Snapshot):
     stream_before_mode: bool = False
     body_yaw_is_relative: bool = False
     position_restarts_path: bool = False
+    attitude_rate: bool = False
+    trajectory: bool = False
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the supported kinds."""
-        kinds = ("local_position", "global_position", "velocity", "acceleration", "attitude")
+        kinds = (
+            *("local_position", "global_position", "velocity", "acceleration", "attitude"),
+            *("attitude_rate", "trajectory"),
+        )
         return tuple(kind.replace("_", " ") for kind in kinds if getattr(self, kind))
+
+
+class StickRules(Snapshot):
+    """Interpretation of MANUAL_CONTROL.
+
+    - ``signed_throttle``: the throttle is from −1000 to 1000; otherwise from 0 to 1000.
+    - ``release``: "axes" without a value, or overriding "channels" with 0, returns the sticks to the transmitter;
+      "none": there is no such message.
+    """
+
+    signed_throttle: bool = False
+    release: Literal["axes", "channels", "none"] = "axes"
 
 
 class GimbalRules(Snapshot):
@@ -157,6 +188,12 @@ class Autopilot:
     purposes: ClassVar[Mapping[str, str]] = {}
     """Maps purposes to names of modes."""
     setpoints: SetpointRules = SetpointRules(*[False] * 5)
+    external: ExternalRules = ExternalRules()
+    """Measurements of other sensors that the autopilot accepts by MAVLink."""
+    sticks: StickRules | None = None
+    """None if MANUAL_CONTROL is not known to work."""
+    actuators_until: tuple[int, int] | None = None
+    """First version (major, minor) without SET_ACTUATOR_CONTROL_TARGET; None if no version supports it."""
     reposition: Reposition | None = None
     """Behaviour of MAV_CMD_DO_REPOSITION; None if it is not known to work."""
     home_is_item_0 = False
@@ -169,6 +206,16 @@ class Autopilot:
     """True if MAV_CMD_RUN_PREARM_CHECKS (401) repeats the failing checks as status texts."""
     calibrates_compasses_by_command = False
     """True if MAV_CMD_DO_START_MAG_CAL (42424) calibrates compasses; otherwise PREFLIGHT_CALIBRATION does."""
+    speed_types: frozenset[int] = frozenset((SpeedType.GROUNDSPEED,))
+    """SPEED_TYPEs of MAV_CMD_DO_CHANGE_SPEED (178) that change this speed, and no other."""
+    circles_by: Literal["orbit", "reposition", "setpoints"] | None = None
+    """Way to circle a place: MAV_CMD_DO_ORBIT (34), DO_REPOSITION (192) with a radius, or set-points; None: there is
+    none.
+    """
+    tunes_by_command = False
+    """True if MAV_CMD_DO_AUTOTUNE_ENABLE (212) tunes the controllers without a pilot, and reports its progress."""
+    can_shut_down = False
+    """True if MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN (246) can switch the autopilot off."""
     condition_yaw = False
     """True if MAV_CMD_CONDITION_YAW (115) turns the vehicle in its set-point mode."""
     reposition_purpose: Purpose = "setpoint"
@@ -303,6 +350,12 @@ class Autopilot:
     ) -> TakeOff | None:
         """Return the take-off procedure for this altitude above home; None if the vehicle cannot take off."""
         return None
+
+    def return_altitude_parameters(self, *, is_vtol: bool) -> tuple[tuple[str, float], ...]:
+        """Return the names of the parameter with the altitude of a return, newest first, and the number of its units in
+        a metre; empty if there is none.
+        """
+        return ()
 
     def take_off_needs_home(self) -> bool:
         """Return True if :meth:`take_off` needs the altitude of home above mean sea level."""

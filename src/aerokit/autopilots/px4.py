@@ -7,19 +7,22 @@ from typing import ClassVar
 
 from aerokit.autopilots.base import (
     NAN,
+    VTOLS,
     Autopilot,
     GimbalRules,
     ModeOrder,
     Purpose,
     Reposition,
     SetpointRules,
+    StickRules,
     TakeOff,
     mode_numbers,
 )
+from aerokit.autopilots.external import PX4_EXTERNAL, ExternalRules
 from aerokit.autopilots.modes import CUSTOM_MODE_ENABLED, NO_MODES, Mode, ModeTable
 from aerokit.autopilots.telemetry import ATTITUDE_AND_HEIGHT, POS_HORIZ_ABS, PREARM_CHECK, SENSORS, bit_names
 from aerokit.errors import InvalidArgument
-from aerokit.mavlink.enums import EstimatorStatusFlags, MavCmd, MavType
+from aerokit.mavlink.enums import EstimatorStatusFlags, MavCmd, MavType, SpeedType
 
 MAIN_POSCTL, MAIN_AUTO, SUB_MISSION = 3, 4, 4
 _E, _C = EstimatorStatusFlags, MavCmd
@@ -93,7 +96,10 @@ class Px4(Autopilot):
     modes_are_numbered = False
     # The MAVLink module acknowledges with ACCEPTED at once, then the commander with the result.
     acks_per_command: ClassVar[Mapping[int, int]] = {MavCmd.DO_SET_MODE: 2}
-    setpoints: SetpointRules = SetpointRules(stream_before_mode=True)
+    setpoints: SetpointRules = SetpointRules(stream_before_mode=True, attitude_rate=True, trajectory=True)
+    sticks: StickRules | None = StickRules(release="none")
+    external: ExternalRules = PX4_EXTERNAL
+    actuators_until = (1, 14)  # removed on 2023-03-06: MavlinkReceiver.cpp, commit 27658354
     reposition: Reposition | None = Reposition(relative_altitude=False, yaw=True, speed=True)
     gimbals: GimbalRules = GimbalRules(*[False] * 6)
     log_suffix = ".ulg"
@@ -112,11 +118,14 @@ class Px4(Autopilot):
     purposes: ClassVar[Mapping[str, str]] = {
         "hold": "LOITER",
         "land": "LAND",
+        "precision_land": "PRECLAND",
         "return": "RTL",
         "setpoint": "OFFBOARD",
+        "sticks": "POSCTL",
         "take_off": "TAKEOFF",
         "mission": "MISSION",
     }
+    can_shut_down = tunes_by_command = True
     mission_storage = "px4"
     mission_upload_window = 6
     reports_mission_checksum = True
@@ -138,7 +147,12 @@ class Px4(Autopilot):
     def __init__(self, vehicle_type: int) -> None:
         super().__init__(vehicle_type)
         self.is_surface_vehicle: bool = vehicle_type in (MavType.GROUND_ROVER, MavType.SURFACE_BOAT)
+        self.circles_by = None if self._cannot_fly else "orbit"
         self.lands_after_return: bool = not self._cannot_fly and vehicle_type != MavType.FIXED_WING
+        if vehicle_type == MavType.FIXED_WING or vehicle_type in VTOLS:
+            # Only the fixed-wing controller has an airspeed. PX4 takes every other type for the cruise speed
+            # (navigator_main.cpp), also that of a climb.
+            self.speed_types: frozenset[int] = frozenset((SpeedType.AIRSPEED, SpeedType.GROUNDSPEED))
         if vehicle_type == MavType.FIXED_WING:
             self.arrival_radius_m: float = 120.0  # it circles with NAV_LOITER_RAD, 80 m by default
 
@@ -189,6 +203,9 @@ class Px4(Autopilot):
         params = (NAN, 0, 0, NAN, NAN, NAN, home_altitude_amsl_m + altitude_relative_m)
         return TakeOff(None, MavCmd.NAV_TAKEOFF, params, self.modes.find("LOITER"))
 
+    def return_altitude_parameters(self, *, is_vtol: bool) -> tuple[tuple[str, float], ...]:
+        return () if self._cannot_fly else (("RTL_RETURN_ALT", 1.0),)
+
     def take_off_needs_home(self) -> bool:
         """True, because the altitude of NAV_TAKEOFF is above mean sea level."""
         return not self._cannot_fly
@@ -214,6 +231,9 @@ class Px4(Autopilot):
             if text.startswith(prefix):
                 return text[len(prefix) :].strip()
         return None
+
+    def is_refusal(self, text: str) -> bool:
+        return super().is_refusal(text) or "limit exceeded" in text.lower()  # "Orbit radius limit exceeded"
 
     def _purpose_name(self, purpose: Purpose, is_vtol: bool) -> str | None:
         if self._cannot_fly and purpose in ("take_off", "land"):

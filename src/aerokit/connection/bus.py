@@ -367,7 +367,8 @@ class Subscription(Generic[ItemT]):
             self._queue.append(item)
         else:
             self._overflowed(item)
-        self._wake()
+        if self._waiter is not None:
+            self._wake()
 
     def _overflowed(self, item: ItemT) -> None:
         self.missed += 1

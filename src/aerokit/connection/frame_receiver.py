@@ -112,6 +112,8 @@ class PeerTable:
         return bool(evicted)
 
 
+_HEARTBEAT_ID = Heartbeat.ID
+
 logger: logging.Logger = logging.getLogger("aerokit")
 
 # From this length on, a pause of the loop delays a heartbeat.
@@ -171,27 +173,29 @@ class FrameReceiver:
             frames = framer.receive(data, now)
         else:
             framer, frames = self._peers.receive_unverified(peer, data, now)
+        framers, gate, deliver = self.framers, self._gate, self._bus.deliver
+        has_stale = bool(framer.late or framer.foreign)
         for frame in frames:
             if self._is_closed:  # a sink closed the receiver while processing an earlier frame
                 return
             if multilink is not None and multilink.is_copy(frame, peer):
                 continue
-            is_other_peer = len(self.framers) > 1 and self._routes.arrived_on_other_peer(frame, peer)
-            if not self._gate.is_open and not self._is_admitted(frame, is_other_peer):
+            is_other_peer = len(framers) > 1 and self._routes.arrived_on_other_peer(frame, peer)
+            if not gate.is_open and not self._is_admitted(frame, is_other_peer):
                 continue
             if observers.recording is not None and multilink is None:
                 observers.recording.write(frame.raw, self._clock())
             if is_other_peer and not self._claims_route(framer, frame, peer):
                 continue
-            if (framer.late or framer.foreign) and self._is_stale(framer, frame):
+            if has_stale and self._is_stale(framer, frame):
                 continue
             if multilink is not None:
                 if not multilink.accepts(frame, peer, framer.counters_of(frame)):
                     continue
                 observers.record_received(frame.raw, self._clock())
-            if frame.message_id == Heartbeat.ID:
+            if frame.message_id == _HEARTBEAT_ID:
                 self._record_heartbeat(framer, frame, peer)
-            self._bus.deliver(frame)
+            deliver(frame)
             if observers.received:
                 observers.notify_received(frame, peer)
 

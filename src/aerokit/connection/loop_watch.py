@@ -27,14 +27,15 @@ CLOCKS = {
     "darwin": ("CLOCK_MONOTONIC", "CLOCK_UPTIME_RAW"),
 }
 
+_CLOCKS = tuple(getattr(time, clock) for clock in CLOCKS[sys.platform]) if sys.platform in CLOCKS else None
+
 
 def suspended_s() -> float:
     """Return the seconds since boot that the computer was suspended and the loop's clock stood still."""
-    clocks = CLOCKS.get(sys.platform)
-    if clocks is None:
+    if _CLOCKS is None:
         return 0.0
-    total, awake = (time.clock_gettime(getattr(time, clock)) for clock in clocks)
-    return total - awake
+    total, awake = _CLOCKS
+    return time.clock_gettime(total) - time.clock_gettime(awake)
 
 
 class LoopWatch:

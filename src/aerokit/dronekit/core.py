@@ -14,7 +14,7 @@ from aerokit.dronekit.classic_connection import weak_callback
 from aerokit.dronekit.exceptions import APIException, TimeoutError, classic_errors  # noqa: A004 - DroneKit's name
 from aerokit.dronekit.observers import EVERY_NAME, HasObservers, Listeners
 from aerokit.mavlink.frame import Frame
-from aerokit.mavlink.message import Message
+from aerokit.mavlink.message import Message, decoder_of
 from aerokit.protocols.command import max_attempts
 
 if TYPE_CHECKING:
@@ -83,7 +83,7 @@ class LatestMessage(Generic[MessageT]):
     """The latest message of a type from the autopilot, and its handlers. Decodes only when a value is read."""
 
     def __init__(self, message_type: type[MessageT], ready: set[str], listeners: Listeners) -> None:
-        self._decode: Callable[[bytes, Frame], MessageT] = message_type.decode_body
+        self._decode: Callable[[bytes, Frame], MessageT] = decoder_of(message_type)
         self._ready = ready
         self._listeners = [listeners]
         self._names: set[str] = set()

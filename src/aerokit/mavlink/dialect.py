@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 import aerokit.mavlink.enums as enums
 import aerokit.mavlink.messages as messages
+from aerokit._internal.wire import wire
 from aerokit.errors import InvalidArgument
-from aerokit.mavlink.message import Message, make_enum
+from aerokit.mavlink.message import Message, decoder_of, layout_of, make_enum
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -47,6 +48,11 @@ class Dialect:
         self._decoders: dict[int, Callable[[bytes, Frame | None], Message]] = {
             message_id: partial(self._decode_first, message_id) for message_id in rows
         }
+        if wire is not None:
+            self.table: Any = wire.table(
+                rows, lambda message_id: layout_of(self[message_id]), partial(Dialect.decode, self)
+            )
+            self.decode = self.table.decode  # type: ignore[method-assign]
 
     @classmethod
     def from_xml(cls, path: str | Path) -> Dialect:
@@ -109,7 +115,7 @@ class Dialect:
 
     def _decode_first(self, message_id: int, body: bytes, frame: Frame | None) -> Message:
         # Replaces itself by the decoder of the class, so that `decode` needs no check whether the class is loaded.
-        decoder = self._decoders[message_id] = self[message_id].decode_body
+        decoder = self._decoders[message_id] = decoder_of(self[message_id])
         return decoder(body, frame)
 
     def extended_by(self, other: Dialect) -> Dialect:

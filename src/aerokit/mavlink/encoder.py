@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from struct import Struct
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from aerokit._internal.wire import wire
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.frame import MAGIC_V1, MAGIC_V2, SIGNED, x25
-from aerokit.mavlink.message import Message
+from aerokit.mavlink.message import Message, layout_of
 
 if TYPE_CHECKING:
     from aerokit.mavlink.signing import Signing
@@ -22,6 +23,8 @@ class FrameEncoder:
 
     Use one for each link, so that the peer can detect losses.
     """
+
+    _encode_frame: Any = None if wire is None else wire.encode_frame
 
     def __init__(self, system_id: int, component_id: int, *, version: int = 2) -> None:
         """Create an encoder. ``system_id`` is 1..255, ``component_id`` 0..255, ``version`` 1 or 2.
@@ -62,6 +65,13 @@ class FrameEncoder:
             InvalidArgument: a field has an invalid value; no sequence number is used.
         """
         signing = self.signing if self._version == 2 else None
+        if self._encode_frame is not None:
+            flags, source = 0 if signing is None else SIGNED, (self.system_id, self.component_id)
+            compiled: bytes | None = self._encode_frame(message, self._version, flags, self.sequence, *source)
+            if compiled is not None:
+                self.sequence = (self.sequence + 1) & 0xFF
+                return compiled if signing is None else compiled + signing.sign(compiled, now)
+            layout_of(type(message))  # for its next message
         payload = message.encode()
         number = message.ID
         if self._version == 2:

@@ -6,6 +6,9 @@ https://mavlink.io/en/guide/serialization.html
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from aerokit._internal.wire import FrameFields, wire
 
 MAGIC_V1 = 0xFE
 """First byte of a MAVLink 1 frame."""
@@ -21,11 +24,12 @@ HEADER_LENGTH = 9  # without the magic byte
 SIGNATURE_LENGTH = 13
 
 
-class Frame:
+class Frame(FrameFields):
     """One frame with a valid checksum. Treat it as immutable, because all receivers share it."""
 
     # No constructor, for speed: the framer sets the attributes, and properties compute the rest.
-    __slots__ = ("_raw", "body", "checksum", "component_id", "message_id", "received_at", "system_id")
+    if not TYPE_CHECKING:  # those of the base class
+        __slots__ = ()
 
     body: bytes
     """The data covered by the checksum: a header of nine bytes, in the layout of MAVLink 2, and the payload."""
@@ -98,6 +102,10 @@ class Frame:
         return f"<Frame v{self.version} id={self.message_id} from={source} seq={self.sequence}>"
 
 
+if wire is not None:
+    wire.register(0, Frame)
+
+
 def is_whole_frame(data: bytes) -> bool:
     """Return True if the bytes have the length and header of exactly one frame. The checksum is not verified."""
     if len(data) < 8 or data[0] not in (MAGIC_V1, MAGIC_V2):
@@ -125,6 +133,9 @@ def x25_in_python() -> Callable[[bytes], int]:
 
 
 def _fastest_x25() -> Callable[[bytes], int]:
+    if wire is not None:
+        compiled: Callable[[bytes], int] = wire.x25
+        return compiled
     try:
         from fastcrc.crc16 import mcrf4xx
     except ImportError:

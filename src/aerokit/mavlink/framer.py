@@ -13,7 +13,9 @@ from collections.abc import Container
 from itertools import chain
 from struct import Struct
 from struct import error as StructError  # noqa: N812
+from typing import TYPE_CHECKING
 
+from aerokit._internal.wire import wire
 from aerokit.mavlink.dialect import STANDARD, Dialect
 from aerokit.mavlink.frame import MAGIC_V1, MAGIC_V2, SIGNATURE_LENGTH, SIGNED, Frame, x25
 from aerokit.mavlink.statistics import OTHERS, FramerStatistics, SourceLimit, SourceStatistics
@@ -48,7 +50,7 @@ _ScanState = tuple[int, list[tuple[int, int, int]], list[int]]
 _NEW_SCAN: _ScanState = (0, [], [])
 
 
-class Framer:
+class PythonFramer:
     """Extracts frames from the data of one peer on one link. Keeps at most two unfinished frames, about 600 bytes."""
 
     def __init__(self, dialect: Dialect = STANDARD, limit: SourceLimit | None = None) -> None:
@@ -142,8 +144,7 @@ class Framer:
                 if found is None:
                     found = self._search(data, begin, _NEW_SCAN if begin else scan)
                 if self._unknown:
-                    frames += [Frame.parse(raw, now) for raw in self._unknown]
-                    self._unknown.clear()
+                    frames += self._take_unknown(now)
                 if found is None:
                     break
                 begin, end, message_id, sequence, key = found
@@ -251,6 +252,11 @@ class Framer:
         )
         return None
 
+    def _take_unknown(self, now: float) -> list[Frame]:
+        frames = [Frame.parse(raw, now) for raw in self._unknown]
+        self._unknown.clear()
+        return frames
+
     def _skip_unknown(self, data: bytes, begin: int, end: int) -> None:
         # The sender sent this frame, so its sequence number is not lost.
         if self.keep_unknown:
@@ -311,3 +317,38 @@ def _earliest(hold: int, unknown: int, here: int) -> int:
     if unknown >= 0:  # earlier than `hold`, because it is only set if nothing is held
         return unknown
     return here if hold < 0 else hold
+
+
+if TYPE_CHECKING or wire is None:
+    Framer = PythonFramer
+else:
+
+    class Framer(wire.FramerFields, PythonFramer):
+        """`PythonFramer` with a compiled `receive`, which calls these methods for what is rare."""
+
+        def __init__(self, dialect: Dialect = STANDARD, limit: SourceLimit | None = None) -> None:
+            PythonFramer.__init__(self, dialect, limit)
+            self._table = dialect.table
+            self._out_of_order: list[tuple[int, int, int]] = []
+
+        def _find(self, data: bytes, begin: int, kept: int, now: float, frames: list[Frame]) -> int | None:
+            # `kept` is 2 if `_scan` describes the beginning of the data, 1 if that was a single plausible frame.
+            scan = self._scan if kept == 2 else (1, [(0, _WAIT, 0)], []) if kept else _NEW_SCAN
+            found = self._search(data, begin, scan)
+            if self._unknown:
+                frames += self._take_unknown(now)
+            return None if found is None else found[0]
+
+        def _add_source(self, key: int, sequence: int, now: float) -> SourceStatistics:
+            return self.statistics.add_source(key, sequence, self._limit.make_room(now))
+
+        def _count_out_of_order(self, source: SourceStatistics, key: int, sequence: int, now: float, at: int) -> None:
+            if verdict := source.out_of_order(sequence, now):
+                self._out_of_order.append((at, verdict, sequence << 16 | key))
+
+        def _sort_out_of_order(self, frames: list[Frame]) -> None:
+            out_of_order, self._out_of_order = self._out_of_order, []
+            self._sort_out(frames, out_of_order)
+
+        def _clear_out_of_order(self) -> None:
+            self.late, self.foreign, self._out_of_order = [], [], []

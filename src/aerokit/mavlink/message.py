@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import enum
 import struct
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
+from aerokit._internal.wire import wire
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.frame import HEADER_LENGTH
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Callable, Iterable, Sequence
 
     from typing_extensions import Self, dataclass_transform
 
@@ -23,6 +24,8 @@ else:  # typing_extensions takes longer to import than this package
 
 # Errors of packing a wrong value. Generated classes convert them to InvalidArgument.
 PACK_ERRORS = (struct.error, OverflowError, TypeError, ValueError, AttributeError)
+
+MessageT = TypeVar("MessageT", bound="Message")
 
 _ANY_HEADER = bytes(HEADER_LENGTH)
 # Message and field of ``char`` arrays that carry bytes, a number or a text depending on another field. As strings,
@@ -139,6 +142,52 @@ def offset_of(message_type: type[Message], field: str) -> int:
     raise InvalidArgument(f"{message_type.NAME} has no field {field!r}")
 
 
+_KINDS = {
+    "int8_t": "b",
+    "uint8_t": "B",
+    "int16_t": "h",
+    "uint16_t": "H",
+    "int32_t": "i",
+    "uint32_t": "I",
+    "int64_t": "q",
+    "uint64_t": "Q",
+    "float": "f",
+    "double": "d",
+}
+
+
+def layout_of(message_type: type[Message]) -> Any:
+    """Return the layout that compiled code uses for a generated class, created on first use; None for other classes."""
+    own = message_type.__dict__
+    if "_LAYOUT" not in own:
+        is_generated = wire is not None and {"_FIELDS", "decode_body", "encode"} <= own.keys()
+        message_type._LAYOUT = _new_layout(message_type) if is_generated else None
+    return message_type._LAYOUT
+
+
+def _new_layout(message_type: type[Message]) -> Any:
+    fields = [row for row in message_type._FIELDS if not row[7]]
+    fields.sort(key=lambda row: -SIZES[row[1]])
+    fields += [row for row in message_type._FIELDS if row[7]]
+    rows = tuple((row[0], _kind(row), row[2]) for row in fields)
+    numbers = message_type.ID, message_type.CRC_EXTRA, message_type.LENGTH, message_type.BASE_LENGTH
+    return wire.layout(message_type, *numbers, rows)
+
+
+def _kind(row: tuple[Any, ...]) -> str:
+    kind, array_length = row[1:3]
+    if kind == "char":
+        return "p" if row[8:] == (True,) else "s"
+    return "p" if kind == "uint8_t" and array_length else _KINDS[kind]
+
+
+def decoder_of(message_type: type[MessageT]) -> Callable[[bytes, Frame | None], MessageT]:
+    """Return a function like `Message.decode_body` of the class: compiled if possible."""
+    layout = layout_of(message_type)
+    decode: Callable[[bytes, Frame | None], MessageT] = message_type.decode_body if layout is None else layout.decode
+    return decode
+
+
 def field_names(message: Message) -> tuple[str, ...]:
     """Return the names of the fields, in the order of the XML."""
     return message.__match_args__  # type: ignore[attr-defined,no-any-return]
@@ -172,6 +221,7 @@ class Message:
     else:
         FIELDS = _Fields()
     _FIELDS: ClassVar[tuple[tuple[Any, ...], ...]] = ()
+    _LAYOUT: ClassVar[Any] = None
 
     received_frame: Frame | None
     """The frame this message was decoded from; None if the program created the message."""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+from aerokit._internal.wire import CounterFields, SourceFields, wire
+
 _SILENCE_S = 10.0
 
 _MAX_UNKNOWN_IDS = 64
@@ -20,7 +22,7 @@ _MIN_RETURNS = 3
 IN_ORDER, LATE, OTHERS = range(3)
 
 
-class SourceStatistics:
+class SourceStatistics(SourceFields):
     """Counters of one sender (system, component): frames received and lost.
 
     Two senders with the same ids are detected by their sequence numbers: two streams advance independently. The one
@@ -47,7 +49,6 @@ class SourceStatistics:
         "_turns",
         "_without",
         "component_id",
-        "expected",
         "lost",
         "system_id",
     )
@@ -236,7 +237,7 @@ class SourceLimit:
         return True
 
 
-class FramerStatistics:
+class FramerStatistics(CounterFields):
     """Counters of one framer.
 
     Every byte is part of a valid frame or of a frame of an unknown message, bad, or still in the buffer.
@@ -250,7 +251,6 @@ class FramerStatistics:
         "_others",
         "bad_bytes",
         "bad_crcs",
-        "bytes",
         "sources",
         "unknown_ids",
         "unknown_messages",
@@ -311,3 +311,8 @@ class FramerStatistics:
     def __repr__(self) -> str:
         names = ("bytes", "frames", "bad_bytes", "bad_crcs", "unknown_ids")
         return f"<FramerStatistics {', '.join(f'{name}={getattr(self, name)}' for name in names)}>"
+
+
+if wire is not None:
+    wire.register(1, SourceStatistics)
+    wire.register(2, FramerStatistics)

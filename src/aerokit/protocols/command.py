@@ -50,6 +50,7 @@ UNREPEATABLE_COMMANDS: Mapping[int, tuple[str, tuple[int, float] | None]] = {
     MavCmd.PREFLIGHT_CALIBRATION: ("calibrates again", None),
     MavCmd.PREFLIGHT_STORAGE: ("writes, reads or resets all parameters again", None),
     MavCmd.PREFLIGHT_REBOOT_SHUTDOWN: ("reboots again", None),
+    MavCmd.DO_FLIGHTTERMINATION: ("stops the motors of a flight that began since", None),
     MavCmd.START_RX_PAIR: ("starts pairing again", None),
     MavCmd.STORAGE_FORMAT: ("erases what was stored since", None),
     MavCmd.SET_CAMERA_ZOOM: ("zooms another step", _STEP),

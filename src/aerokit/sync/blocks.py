@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Generic, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, NoReturn, TypeAlias, TypeVar
 
 from aerokit._internal.async_block import ReadOnly
 from aerokit.errors import ConnectionClosed
@@ -14,7 +14,6 @@ from aerokit.vehicle.connect import warn_if_left_flying
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterator
     from contextlib import AbstractAsyncContextManager, AbstractContextManager
-    from typing import TypeAlias
 
     from typing_extensions import Self
 
@@ -28,8 +27,11 @@ if TYPE_CHECKING:
     from aerokit.vehicle.camera.capture import Capture
     from aerokit.vehicle.camera.link import CameraBlock
     from aerokit.vehicle.camera.photos import PhotoInterval
+    from aerokit.vehicle.commanding.follow import FollowStream
     from aerokit.vehicle.commanding.guided import SetpointStream
+    from aerokit.vehicle.commanding.sticks import StickStream
     from aerokit.vehicle.devices.shell import Shell
+    from aerokit.vehicle.external.streams import MeasurementStream
     from aerokit.vehicle.files.log_stream import LogStream
     from aerokit.vehicle.gimbal.control import GimbalControl
     from aerokit.vehicle.gimbal.gimbal import Gimbals  # noqa: F401
@@ -42,13 +44,16 @@ if TYPE_CHECKING:
     Block: TypeAlias = (
         CameraBlock
         | Following
+        | FollowStream
         | GimbalControl
         | GimbalRates
         | LogStream
+        | MeasurementStream[Any]
         | NtripClient
         | PhotoInterval
         | SetpointStream[Any]
         | Shell
+        | StickStream
     )
 
 
@@ -205,6 +210,10 @@ class BlockTwin(TwinOf[BlockT]):
 
 class StreamTwin(BlockTwin["SetpointStream[T]"], Generic[T]):
     """Twin of a stream that sends set-points while its ``with`` block runs."""
+
+
+class MeasurementTwin(BlockTwin["MeasurementStream[T]"], Generic[T]):
+    """Twin of a stream of measurements that is open while its ``with`` block runs."""
 
 
 class GimbalsTwin(TwinOf["Gimbals"], Generic[T]):

@@ -263,6 +263,7 @@ TYPE_VARIABLES = {
     "ItemT": '"Message | Event"',
     "MessageT": '"Message"',
     "SetpointT": "",
+    "MeasurementT": "",
     "T": "",
 }
 

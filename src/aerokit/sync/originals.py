@@ -78,6 +78,10 @@ TWINS = (
     ),
     Twin("aerokit.vehicle.commanding.guided.SetpointStream", "StreamTwin", parameter="SetpointT"),
     Twin("aerokit.vehicle.commanding.guided.Guided"),
+    Twin("aerokit.vehicle.commanding.follow.FollowStream", "BlockTwin", called=_names("target distance_m")),
+    Twin("aerokit.vehicle.commanding.sticks.StickStream", "BlockTwin"),
+    Twin("aerokit.vehicle.external.streams.MeasurementStream", "MeasurementTwin", parameter="MeasurementT"),
+    Twin("aerokit.vehicle.external.external.External"),
     Twin("aerokit.vehicle.gimbal.control.GimbalControl", "BlockTwin"),
     Twin("aerokit.vehicle.gimbal.rates.GimbalRates", "BlockTwin"),
     Twin("aerokit.vehicle.gimbal.gimbal.Gimbal", called=_names("device_id")),
@@ -111,8 +115,8 @@ TWINS = (
         without=_names("telemetry"),
         direct=_names("distance_to describe_now"),
         parts=_names(
-            "actuators calibrate camera cameras components guided gimbal gimbals files logs parameters mission fence"
-            " rally rtk"
+            "actuators calibrate camera cameras components external guided gimbal gimbals files logs parameters mission"
+            " fence rally rtk"
         ),
     ),
     Twin(

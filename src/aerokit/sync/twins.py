@@ -26,6 +26,7 @@ from aerokit.sync.blocks import (
     ConnectionTwin,
     GimbalsTwin,
     LogStreamTwin,
+    MeasurementTwin,
     PhotoIntervalTwin,
     StreamTwin,
     SubscriptionTwin,
@@ -37,9 +38,13 @@ from aerokit.sync.blocks import (
 )
 from aerokit.vehicle.camera.controls import FORMAT_TIMEOUT_S
 from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M, MAX_SILENCE_S
-from aerokit.vehicle.commanding.setpoints import AccelerationSetpoint, BodyVelocitySetpoint, VelocitySetpoint
+from aerokit.vehicle.commanding.setpoints import (
+    AccelerationSetpoint,
+    AttitudeRateSetpoint,
+    BodyVelocitySetpoint,
+    VelocitySetpoint,
+)
 from aerokit.vehicle.connect import connect as connect_async
-from aerokit.vehicle.devices.actuators import ILLUMINATOR
 from aerokit.vehicle.devices.winch import ACTION_TIMEOUT_S
 from aerokit.vehicle.files.logs import ERASE_PATIENCE_S
 
@@ -91,10 +96,22 @@ if TYPE_CHECKING:
         TrackingStatus,
     )
     from aerokit.vehicle.camera.videos import SourceName
+    from aerokit.vehicle.commanding.follow import FollowStream as AsyncFollowStream
+    from aerokit.vehicle.commanding.follow_target import FollowTarget
     from aerokit.vehicle.commanding.guided import Guided as AsyncGuided
+    from aerokit.vehicle.commanding.maneuvers import Facing, FlightState
     from aerokit.vehicle.commanding.order import Subject
     from aerokit.vehicle.commanding.posted import PostedOrder as AsyncPostedOrder
-    from aerokit.vehicle.commanding.setpoints import AttitudeSetpoint, LocalPositionSetpoint, PositionSetpoint
+    from aerokit.vehicle.commanding.setpoints import (
+        ActuatorSetpoint,
+        AttitudeSetpoint,
+        LocalPositionSetpoint,
+        PositionSetpoint,
+        TrajectorySetpoint,
+    )
+    from aerokit.vehicle.commanding.sticks import StickInput
+    from aerokit.vehicle.commanding.sticks import StickStream as AsyncStickStream
+    from aerokit.vehicle.commanding.termination import ShutdownIntent, TerminationIntent
     from aerokit.vehicle.components.component import Component as AsyncComponent
     from aerokit.vehicle.components.component import ComponentInformation, ComponentStatus, MetadataKind
     from aerokit.vehicle.components.settings import Settings as AsyncSettings
@@ -104,6 +121,20 @@ if TYPE_CHECKING:
     from aerokit.vehicle.devices.gripper import Gripper as AsyncGripper
     from aerokit.vehicle.devices.shell import Shell as AsyncShell
     from aerokit.vehicle.devices.winch import Winch as AsyncWinch
+    from aerokit.vehicle.external.external import External as AsyncExternal
+    from aerokit.vehicle.external.landing import LandingReport, TargetSource
+    from aerokit.vehicle.external.streams import EstimatorUse
+    from aerokit.vehicle.external.values import (
+        FlowMeasurement,
+        GpsMeasurement,
+        ObstaclePoints,
+        ObstacleSectors,
+        OdometryMeasurement,
+        PoseMeasurement,
+        RangeMeasurement,
+        SpeedMeasurement,
+        TargetMeasurement,
+    )
     from aerokit.vehicle.files.files import FileEntry
     from aerokit.vehicle.files.files import Files as AsyncFiles
     from aerokit.vehicle.files.logs import LogEntry, LogMethod
@@ -155,8 +186,10 @@ __all__ = [
     "Changes",
     "Component",
     "Connection",
+    "External",
     "FenceControl",
     "Files",
+    "FollowStream",
     "Gimbal",
     "GimbalControl",
     "GimbalRates",
@@ -165,6 +198,7 @@ __all__ = [
     "Guided",
     "LogStream",
     "Logs",
+    "MeasurementStream",
     "MissionControl",
     "NtripClient",
     "Parameters",
@@ -176,6 +210,7 @@ __all__ = [
     "Settings",
     "Shell",
     "StateCell",
+    "StickStream",
     "Subscription",
     "TemporaryParameters",
     "Transaction",
@@ -188,6 +223,7 @@ __all__ = [
 ItemT = TypeVar("ItemT", bound="Message | Event")
 MessageT = TypeVar("MessageT", bound="Message")
 SetpointT = TypeVar("SetpointT")
+MeasurementT = TypeVar("MeasurementT")
 T = TypeVar("T")
 
 
@@ -428,7 +464,7 @@ class SetpointStream(StreamTwin[SetpointT]):
 
     @property
     def is_running(self) -> bool:
-        """True while set-points are being sent."""
+        """True while values are being sent."""
         return self.aio.is_running
 
     def set(self, setpoint: SetpointT) -> None:
@@ -452,7 +488,7 @@ class SetpointStream(StreamTwin[SetpointT]):
 class Guided(TwinOf["AsyncGuided"]):
     """Opens set-point streams: ``async with vehicle.guided.velocity() as stream: stream.set(...)``.
 
-    Every stream takes ``rate_hz`` (transmission rate of the latest set-point, 2 to 100), ``valid_for_s`` (how long a
+    Every stream takes ``rate_hz`` (transmission rate of the latest set-point, 2 to 400), ``valid_for_s`` (how long a
     set-point may be resent without a new one) and ``max_lag_s`` (how late the event loop may be). NotSupported is
     raised for a kind that this type of vehicle does not support. Rates and seconds are in real time: a simulation at
     ten times the speed needs ten times the rate.
@@ -559,6 +595,346 @@ class Guided(TwinOf["AsyncGuided"]):
             self._loop,
             self._loop.call(self.aio.attitude, initial, rate_hz=rate_hz, valid_for_s=valid_for_s, max_lag_s=max_lag_s),
         )
+
+    def attitude_rate(
+        self,
+        initial: AttitudeRateSetpoint = AttitudeRateSetpoint(),
+        *,
+        rate_hz: float = 100.0,
+        valid_for_s: float = 0.1,
+        max_lag_s: float = 0.1,
+    ) -> SetpointStream[AttitudeRateSetpoint]:
+        """Stream body rates with thrust (SET_ATTITUDE_TARGET without an attitude).
+
+        ArduCopter and PX4 obey them. Nothing levels the vehicle: it keeps turning until the next set-point, or until it
+        holds, which is ordered after ``valid_for_s`` without one.
+        """
+        return SetpointStream(
+            self._loop,
+            self._loop.call(
+                self.aio.attitude_rate,
+                initial,
+                rate_hz=rate_hz,
+                valid_for_s=valid_for_s,
+                max_lag_s=max_lag_s,
+            ),
+        )
+
+    def trajectory(
+        self,
+        initial: TrajectorySetpoint,
+        *,
+        rate_hz: float = 50.0,
+        valid_for_s: float = 0.5,
+        max_lag_s: float = 0.5,
+    ) -> SetpointStream[TrajectorySetpoint]:
+        """Stream local positions with velocity and acceleration feed-forward (SET_POSITION_TARGET_LOCAL_NED)."""
+        return SetpointStream(
+            self._loop,
+            self._loop.call(
+                self.aio.trajectory,
+                initial,
+                rate_hz=rate_hz,
+                valid_for_s=valid_for_s,
+                max_lag_s=max_lag_s,
+            ),
+        )
+
+    def actuators(
+        self,
+        initial: ActuatorSetpoint,
+        *,
+        rate_hz: float = 100.0,
+        valid_for_s: float = 0.1,
+        max_lag_s: float = 0.1,
+    ) -> SetpointStream[ActuatorSetpoint]:
+        """Stream actuator controls (SET_ACTUATOR_CONTROL_TARGET).
+
+        PX4 obeys them up to version 1.13; newer ones, and ArduPilot, ignore the message.
+
+        Raises:
+            NotSupported: this firmware does not obey them, or its version is not known yet. Nothing was sent.
+        """
+        return SetpointStream(
+            self._loop,
+            self._loop.call(self.aio.actuators, initial, rate_hz=rate_hz, valid_for_s=valid_for_s, max_lag_s=max_lag_s),
+        )
+
+
+class FollowStream(BlockTwin["AsyncFollowStream"]):
+    """Follows a target while its ``async with`` block runs; opened by :meth:`aerokit.Vehicle.follow`.
+
+    Entering the block waits for the first position of the target, and changes the mode: to GUIDED on ArduPilot, to
+    OFFBOARD on PX4. Leaving it in any way makes the vehicle hold. It stops by itself, and the vehicle holds, when no
+    new position of the target arrives for ``valid_for_s``, when the target's positions end or raise, when it is farther
+    away than ``max_distance_m``, and for the reasons of set-point streams. After a pilot or a failsafe has changed the
+    mode, nothing more is sent. ``fly`` and leaving the block then raise :class:`SetpointStreamStopped`.
+
+    Entering raises:
+        OperationRejected: the vehicle is not flying. Nothing was sent.
+        OperationTimeout: no position of the target was known within ``valid_for_s``. Nothing was sent.
+        InvalidArgument: a height is wanted, and the target has no altitude. Nothing was sent.
+    """
+
+    @property
+    def is_running(self) -> bool:
+        """True while values are being sent."""
+        return self.aio.is_running
+
+    @property
+    def target(self) -> Position | None:
+        """The latest position of the target; None before the first one."""
+        return self._loop.call(lambda: self.aio.target)
+
+    @property
+    def distance_m(self) -> float:
+        """Distance to the target along the ground in metres; infinite while it is unknown."""
+        return self._loop.call(lambda: self.aio.distance_m)
+
+    def fly(self, duration_s: float | None = None) -> None:
+        """Follow for ``duration_s`` seconds; None: until it stops by itself.
+
+        Raises:
+            SetpointStreamStopped: it has stopped; the text has the reason.
+        """
+        self._loop.run(self.aio.fly, duration_s)
+
+
+class StickStream(BlockTwin["AsyncStickStream"]):
+    """Sends the latest stick positions at a fixed rate while the ``async with`` block supplies them.
+
+    Entering the block sends the initial positions for a second and then changes to the mode. Leaving it in any way
+    orders the vehicle to hold and releases the sticks. If the stream stops by itself (no new positions, a blocked event
+    loop, a silent vehicle), ``set`` and leaving the block raise :class:`SetpointStreamStopped`. If a pilot or a
+    failsafe changes the mode, the sticks are released at once and no hold is ordered.
+
+    If the program is killed, ArduPilot returns to the transmitter after RC_OVERRIDE_TIME (3 s), and PX4 treats the
+    sticks as lost after COM_RC_LOSS_T (0.5 s). PX4 has no release, so every end of a stream is such a loss: without
+    another source of manual control it acts as NAV_RCL_ACT says (return by default), also in its hold mode unless
+    COM_RCL_EXCEPT has bit 1. ArduCopter without a transmitter acts on the loss as FS_THR_ENABLE says.
+
+    Entering raises:
+        InvalidArgument: a position is out of range. Nothing was sent.
+        NotSupported: this type of vehicle has no sticks. Nothing was sent.
+        OperationRejected: a parameter makes the vehicle ignore the sticks, or keep them for ever; the text names it.
+        ParameterTimeout: the vehicle did not report these parameters. Nothing else was sent.
+        CommandRejected: the vehicle refused the mode.
+        BusyError: another set-point stream is open.
+    """
+
+    @property
+    def is_running(self) -> bool:
+        """True while values are being sent."""
+        return self.aio.is_running
+
+    def set(self, sticks: StickInput) -> None:
+        """Move the sticks; the positions are sent at the next tick and repeated until ``valid_for_s`` has passed.
+
+        Raises:
+            InvalidArgument: a position is out of range; the previous ones remain in force until they expire.
+            SetpointStreamStopped: the stream has ended by itself, or the block was left.
+        """
+        self._loop.call(self.aio.set, sticks)
+
+    def move(self, sticks: StickInput, duration_s: float) -> None:
+        """Keep the sticks in one position for ``duration_s`` seconds.
+
+        Raises:
+            InvalidArgument: a position is out of range.
+            SetpointStreamStopped: the stream ended meanwhile.
+        """
+        self._loop.run(self.aio.move, sticks, duration_s)
+
+
+class MeasurementStream(MeasurementTwin[MeasurementT]):
+    """Sends the measurements that you give to ``send``, each once, at most ``rate_hz`` times a second.
+
+    A measurement is never repeated: without new ones nothing is sent, and the vehicle acts as without its sensor. Of
+    several measurements within one period only the newest is sent. One that is older than ``valid_for_s`` when it
+    could be sent is dropped, after a blocked event loop for example; while the vehicle is silent all are dropped.
+    ``sent`` and ``dropped`` count them. The stream does not end by itself; it ends with the block.
+
+    Entering raises:
+        NotSupported: this firmware does not read such measurements. Nothing was sent.
+        OperationRejected: a parameter makes the vehicle ignore them; the text names it. Nothing else was sent.
+        ParameterTimeout: the vehicle did not report these parameters.
+    """
+
+    @property
+    def sent(self) -> int:
+        """Number of measurements that were sent."""
+        return self.aio.sent
+
+    @property
+    def dropped(self) -> int:
+        """Number of measurements that were not sent: replaced by a newer one, too old, or during a silence."""
+        return self.aio.dropped
+
+    @property
+    def is_open(self) -> bool:
+        """True inside the block."""
+        return self.aio.is_open
+
+    @property
+    def estimator_use(self) -> EstimatorUse:
+        """Use of these measurements by the vehicle's estimator.
+
+        No message reports this. It is derived from EKF_STATUS_REPORT or ESTIMATOR_STATUS and from the parameters at
+        the beginning of the block. "used": the estimator has a position or velocity, and its parameters allow no other
+        source. "not used": it has none. "unknown" in all other cases, such as with a GPS beside, for sensors that are
+        not a position, or without a recent report.
+        """
+        return self.aio.estimator_use
+
+    def send(self, measurement: MeasurementT) -> None:
+        """Send a measurement now, or at the end of the period if one was sent within it.
+
+        Raises:
+            InvalidArgument: a value is out of range; nothing was sent.
+            SetpointStreamStopped: the block was left or not entered.
+            ValueUnknownError: a landing target for PX4, whose attitude or local position is unknown.
+            ConnectionClosed: the connection has ended.
+        """
+        self._loop.call(self.aio.send, measurement)
+
+
+class External(TwinOf["AsyncExternal"]):
+    """Supplies the vehicle with measurements: ``async with vehicle.external.odometry() as stream: stream.send(…)``.
+
+    ``rate_hz`` (above 0, to 400) is the highest rate at which measurements are sent, ``valid_for_s`` the age at which
+    one is dropped. Time stamps are those of the event loop's clock, and aerokit answers the vehicle's TIMESYNC
+    requests with it meanwhile.
+    """
+
+    def odometry(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[OdometryMeasurement]:
+        """Supply pose and velocity (ODOMETRY). ArduPilot needs VISO_TYPE, PX4 EKF2_EV_CTRL."""
+        return MeasurementStream(
+            self._loop,
+            self._loop.call(self.aio.odometry, rate_hz=rate_hz, valid_for_s=valid_for_s),
+        )
+
+    def vision_position(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[PoseMeasurement]:
+        """Supply a pose (VISION_POSITION_ESTIMATE). ArduPilot needs VISO_TYPE, PX4 EKF2_EV_CTRL."""
+        return MeasurementStream(
+            self._loop,
+            self._loop.call(self.aio.vision_position, rate_hz=rate_hz, valid_for_s=valid_for_s),
+        )
+
+    def vision_speed(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[SpeedMeasurement]:
+        """Supply a velocity (VISION_SPEED_ESTIMATE; ODOMETRY without a pose to PX4)."""
+        return MeasurementStream(
+            self._loop,
+            self._loop.call(self.aio.vision_speed, rate_hz=rate_hz, valid_for_s=valid_for_s),
+        )
+
+    def motion_capture(self, *, rate_hz: float = 50.0, valid_for_s: float = 0.2) -> MeasurementStream[PoseMeasurement]:
+        """Supply a pose by motion capture (ATT_POS_MOCAP; VISION_POSITION_ESTIMATE to PX4)."""
+        return MeasurementStream(
+            self._loop,
+            self._loop.call(self.aio.motion_capture, rate_hz=rate_hz, valid_for_s=valid_for_s),
+        )
+
+    def gps(self, *, rate_hz: float = 5.0, valid_for_s: float = 0.5) -> MeasurementStream[GpsMeasurement]:
+        """Supply a satellite position (GPS_INPUT). ArduPilot needs GPS1_TYPE 14; PX4 does not read it."""
+        return MeasurementStream(self._loop, self._loop.call(self.aio.gps, rate_hz=rate_hz, valid_for_s=valid_for_s))
+
+    def obstacles(self, *, rate_hz: float = 10.0, valid_for_s: float = 0.5) -> MeasurementStream[ObstacleSectors]:
+        """Supply distances around the vehicle (OBSTACLE_DISTANCE).
+
+        ArduPilot needs PRX1_TYPE 2; PX4 uses them if CP_DIST is above 0.
+        """
+        return MeasurementStream(
+            self._loop,
+            self._loop.call(self.aio.obstacles, rate_hz=rate_hz, valid_for_s=valid_for_s),
+        )
+
+    def obstacle_points(self, *, rate_hz: float = 10.0, valid_for_s: float = 0.5) -> MeasurementStream[ObstaclePoints]:
+        """Supply places of obstacles (OBSTACLE_DISTANCE_3D). ArduPilot needs PRX1_TYPE 2; PX4 does not read them."""
+        return MeasurementStream(
+            self._loop,
+            self._loop.call(self.aio.obstacle_points, rate_hz=rate_hz, valid_for_s=valid_for_s),
+        )
+
+    def range_finder(self, *, rate_hz: float = 20.0, valid_for_s: float = 0.2) -> MeasurementStream[RangeMeasurement]:
+        """Supply a distance (DISTANCE_SENSOR). ArduPilot needs RNGFND1_TYPE 10 and its orientation."""
+        return MeasurementStream(
+            self._loop,
+            self._loop.call(self.aio.range_finder, rate_hz=rate_hz, valid_for_s=valid_for_s),
+        )
+
+    def landing_target(
+        self,
+        *,
+        rate_hz: float = 20.0,
+        valid_for_s: float = 0.3,
+    ) -> MeasurementStream[TargetMeasurement]:
+        """Supply the place of a landing target (LANDING_TARGET). ArduPilot needs PLND_ENABLED and PLND_TYPE 1.
+
+        ``vehicle.land_on`` does this and lands.
+        """
+        return MeasurementStream(
+            self._loop,
+            self._loop.call(self.aio.landing_target, rate_hz=rate_hz, valid_for_s=valid_for_s),
+        )
+
+    def optical_flow(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[FlowMeasurement]:
+        """Supply optical flow (OPTICAL_FLOW; OPTICAL_FLOW_RAD to PX4).
+
+        ArduPilot needs FLOW_TYPE 5, PX4 EKF2_OF_CTRL.
+        """
+        return MeasurementStream(
+            self._loop,
+            self._loop.call(self.aio.optical_flow, rate_hz=rate_hz, valid_for_s=valid_for_s),
+        )
+
+    def set_wind(
+        self,
+        speed_m_s: float,
+        direction_deg: float,
+        *,
+        speed_accuracy_m_s: float = 1.0,
+        direction_accuracy_deg: float = 15.0,
+    ) -> None:
+        """Supply an estimate of the wind (MAV_CMD_EXTERNAL_WIND_ESTIMATE); returns when it is acknowledged.
+
+        No message reports the effect. ArduPilot applies it to its simpler estimator (DCM), PX4 to EKF2.
+
+        Args:
+            speed_m_s: horizontal speed, 0 to 100.
+            direction_deg: direction that it comes from, 0 to 360.
+            speed_accuracy_m_s: one standard deviation, 0 to 100.
+            direction_accuracy_deg: one standard deviation, 0 to 180.
+
+        Raises:
+            InvalidArgument: a value is out of range. Nothing was sent.
+            CommandRejected: the vehicle refused, or does not support it.
+            CommandTimeout: there was no acknowledgement.
+        """
+        self._loop.run(
+            self.aio.set_wind,
+            speed_m_s,
+            direction_deg,
+            speed_accuracy_m_s=speed_accuracy_m_s,
+            direction_accuracy_deg=direction_accuracy_deg,
+        )
+
+    def set_origin(self, origin: Position, *, timeout: float = 10.0) -> None:
+        """Set the origin of the estimator's local frame, and wait until GPS_GLOBAL_ORIGIN reports it.
+
+        A vehicle without GPS needs it for global positions. SET_GPS_GLOBAL_ORIGIN is sent once; it has no
+        acknowledgement. Returns at once if the vehicle has this origin already. After a cancellation the vehicle may
+        have accepted it.
+
+        Args:
+            origin: latitude, longitude and altitude above mean sea level.
+            timeout: seconds until the vehicle reports it.
+
+        Raises:
+            InvalidArgument: the place has no altitude above mean sea level. Nothing was sent.
+            OperationRejected: ArduPilot has another origin and keeps it until a reboot. Nothing was sent.
+            OperationTimeout: the vehicle did not report it.
+        """
+        self._loop.run(self.aio.set_origin, origin, timeout=timeout)
 
 
 class GimbalControl(BlockTwin["AsyncGimbalControl"]):
@@ -1462,7 +1838,7 @@ class Actuators(TwinOf["AsyncActuators"]):
         """
         self._loop.run(self.aio.lower_landing_gear)
 
-    def set_lights(self, on: bool, *, component_id: int = ILLUMINATOR) -> None:
+    def set_lights(self, on: bool, *, component_id: int = MavComponent.ILLUMINATOR) -> None:
         """Switch an illuminator, and return when ILLUMINATOR_STATUS reports it (MAV_CMD_ILLUMINATOR_ON_OFF).
 
         For lights that are a MAVLink component. ArduPilot and PX4 do not have the command; lights on an output of
@@ -3890,6 +4266,67 @@ class Vehicle(VehicleTwin):
         """Return the status texts (STATUSTEXT) received since this time of the loop's clock, oldest first."""
         return self._loop.call(self.aio.texts_since, at)
 
+    def autotune(self, *, timeout: float = 120.0, on_progress: Callable[[int], object] | None = None) -> None:
+        """Let PX4 tune its controllers (MAV_CMD_DO_AUTOTUNE_ENABLE): **the vehicle shakes about each axis**.
+
+        Call it while the vehicle hovers, or circles on its wings. Returns when PX4 has finished: with MC_AT_APPLY 1 it
+        saves the new gains when it is disarmed. PX4 aborts if the mode changes or the sticks are moved. After a
+        cancellation it goes on tuning; change the mode to stop it.
+
+        Args:
+            timeout: seconds for all axes; PX4 needs about forty.
+            on_progress: called with each new percentage.
+
+        Raises:
+            NotSupported: this firmware tunes by a pilot's sticks, in its mode AUTOTUNE. Nothing was sent.
+            OperationRejected: the mode changed, or another party disarmed the vehicle.
+            CommandRejected: PX4 has no such module, or the tuning failed.
+            CommandTimeout: an answer is missing; PX4 may go on tuning.
+            OperationTimeout: it was not done in time; PX4 may go on tuning.
+        """
+        self._loop.run(self.aio.autotune, timeout=timeout, on_progress=on_progress)
+
+    def terminate(self, *, intent: TerminationIntent, timeout: float = 10.0) -> None:
+        """Terminate the flight (MAV_CMD_DO_FLIGHTTERMINATION): **the motors stop, and the vehicle falls**.
+
+        Returns when HEARTBEAT reports disarmed, PX4's mode TERMINATION, or MAV_STATE_FLIGHT_TERMINATION. The command is
+        sent at once, also to a silent vehicle, and only once: it is neither repeated nor sent later. A cancelled call
+        may have terminated the flight. PX4 releases its parachute if it has one, and needs a restart afterwards.
+        ArduPlane and Rover refuse it unless AFS_ENABLE is 1 and AFS_TERM_ACTION is 42.
+
+        Args:
+            intent: must be ``"terminate flight"``.
+            timeout: seconds for HEARTBEAT to report the termination after the command was accepted.
+
+        Raises:
+            InvalidArgument: the intent is another one. Nothing was sent.
+            CommandRejected: the vehicle refused; ``reasons`` has its status texts. PX4 refuses while it is disarmed.
+            CommandTimeout: there was no acknowledgement; the flight may have been terminated nevertheless.
+            HeartbeatTimeout: the vehicle was silent for ten seconds after its acknowledgement.
+            OperationTimeout: it accepted the command, and HEARTBEAT does not report the termination.
+        """
+        self._loop.run(self.aio.terminate, intent=intent, timeout=timeout)
+
+    def shutdown(self, *, intent: ShutdownIntent, timeout: float = 15.0) -> None:
+        """Switch the autopilot off (MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN) and wait until its HEARTBEATs end.
+
+        HEARTBEAT counts as ended after 3.5 s, or when the link goes down after the acknowledgement. The command is sent
+        only once. Only a person at the vehicle can switch it on again. A cancelled call may have switched it off.
+
+        Args:
+            intent: must be ``"shut down"``.
+            timeout: seconds until it is silent.
+
+        Raises:
+            InvalidArgument: the intent is another one. Nothing was sent.
+            NotSupported: this firmware cannot be switched off (ArduPilot). Nothing was sent.
+            OperationRejected: it is armed, or not known to be disarmed. Nothing was sent.
+            CommandRejected: it refused; PX4 does on boards that cannot switch their power off.
+            CommandTimeout: there was no acknowledgement; it may have switched off nevertheless.
+            OperationTimeout: it accepted the command and still sends HEARTBEATs.
+        """
+        self._loop.run(self.aio.shutdown, intent=intent, timeout=timeout)
+
     def set_mode(self, mode: str | int, *, timeout: float = 6.0) -> None:
         """Change the flight mode and wait until HEARTBEAT reports it.
 
@@ -3976,6 +4413,7 @@ class Vehicle(VehicleTwin):
         *,
         mode: str | int | None = None,
         force: bool = False,
+        reason: str = "",
         timeout: float = 10.0,
         max_silence_s: float | None = MAX_SILENCE_S,
     ) -> None:
@@ -3992,11 +4430,15 @@ class Vehicle(VehicleTwin):
             mode: the mode to arm in. None: the present mode, or one that ``take_off`` starts in if the present mode
                 does not allow arming.
             force: skip the vehicle's own arming checks. Dangerous.
+            reason: why your program arms, at most 50 bytes. Logger "aerokit" reports it at INFO, and a STATUSTEXT takes
+                it to the vehicle right before the command, where ArduPilot writes it into its flight log. PX4 logs only
+                texts that have the vehicle's own system id.
             timeout: seconds for HEARTBEAT to report armed after the command was accepted.
             max_silence_s: raise when no heartbeat was received for this long; None: wait until ``timeout``.
 
         Raises:
-            InvalidArgument: there is no such mode, or it does not allow arming. Nothing was sent.
+            InvalidArgument: there is no such mode, it does not allow arming, or the reason is too long. Nothing was
+                sent.
             CommandRejected: the vehicle refused; ``reasons`` has its pre-arm texts, failing sensors and missing
                 estimates. Where the vehicle can run its checks on request, they are run again for this.
             CommandTimeout: there was no acknowledgement, and the vehicle did not arm; the text says whether it may
@@ -4006,7 +4448,14 @@ class Vehicle(VehicleTwin):
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the vehicle accepted the command but did not arm.
         """
-        self._loop.run(self.aio.arm, mode=mode, force=force, timeout=timeout, max_silence_s=max_silence_s)
+        self._loop.run(
+            self.aio.arm,
+            mode=mode,
+            force=force,
+            reason=reason,
+            timeout=timeout,
+            max_silence_s=max_silence_s,
+        )
 
     def disarm(
         self,
@@ -4069,6 +4518,255 @@ class Vehicle(VehicleTwin):
             OperationRejected: the mode changed, or a newer order was given, before the acknowledgement.
         """
         self._loop.run(self.aio.stop_looking)
+
+    def set_airspeed(self, airspeed_m_s: float) -> None:
+        """Change the airspeed of a fixed wing in m/s, above 0 (MAV_CMD_DO_CHANGE_SPEED, SPEED_TYPE_AIRSPEED).
+
+        Returns at the acknowledgement, because no message reports the setting; VFR_HUD has what the
+        vehicle measures.
+        ArduPlane applies it in GUIDED and AUTO, within AIRSPEED_MIN and AIRSPEED_MAX, and refuses it otherwise. PX4
+        applies it in modes that navigate, and accepts it always.
+
+        Raises:
+            InvalidArgument: out of range. Nothing was sent.
+            NotSupported: this vehicle has no wings: use ``set_speed``. Nothing was sent.
+            CommandRejected: the vehicle refused.
+            CommandTimeout: there was no acknowledgement.
+        """
+        self._loop.run(self.aio.set_airspeed, airspeed_m_s)
+
+    def set_climb_speed(self, climb_m_s: float) -> None:
+        """Change the speed of climbs in m/s, above 0 (MAV_CMD_DO_CHANGE_SPEED, SPEED_TYPE_CLIMB_SPEED).
+
+        Returns at the acknowledgement, because no message reports the setting. ArduCopter applies it in GUIDED, AUTO
+        and RTL until the mode changes, and refuses it otherwise. PX4 would take it for the cruise speed.
+
+        Raises:
+            InvalidArgument: out of range. Nothing was sent.
+            NotSupported: this firmware has no such command. Nothing was sent.
+            CommandRejected: the vehicle refused.
+            CommandTimeout: there was no acknowledgement.
+        """
+        self._loop.run(self.aio.set_climb_speed, climb_m_s)
+
+    def orbit(
+        self,
+        center: Position | Home,
+        *,
+        radius_m: float,
+        speed_m_s: float = 2.0,
+        turns: float | None = 1.0,
+        clockwise: bool = True,
+        facing: Facing = "center",
+        max_distance_m: float = MAX_DISTANCE_M,
+        timeout: float | None = None,
+        max_silence_s: float | None = MAX_SILENCE_S,
+    ) -> None:
+        """Fly around a place; returns when the reported positions have gone around it ``turns`` times.
+
+        Then a multicopter holds, and a fixed wing goes on circling. After a cancellation or a time-out, aerokit orders
+        the vehicle to hold.
+
+        PX4 flies the circle itself (MAV_CMD_DO_ORBIT). ArduCopter has no such command, and its mode CIRCLE follows the
+        throttle stick, so aerokit streams set-points with velocity and acceleration in GUIDED; if your program dies,
+        the vehicle stops. ArduPlane circles a place in GUIDED (MAV_CMD_DO_REPOSITION).
+
+        Args:
+            center: the middle of the circle; its altitude is that of the circle, without one, or for home, the
+                vehicle's own.
+            radius_m: above 0, at most 10,000. PX4's multicopters refuse more than MC_ORBIT_RAD_MAX.
+            speed_m_s: ground speed, above 0, at most 50. A fixed wing ignores it.
+            turns: number of turns, above 0, at most 1000; None: until the call is cancelled, or another order is given.
+            clockwise: direction, as seen from above.
+            facing: direction of the nose: to the center, ahead, as at the beginning, or left to the autopilot. A fixed
+                wing ignores it.
+            max_distance_m: a center farther away than this many metres is refused.
+            timeout: seconds; None: no limit while heartbeats arrive, the mode stays and the vehicle moves.
+            max_silence_s: raise when no heartbeat was received for this long; None: no limit.
+
+        Raises:
+            InvalidArgument: an argument is out of range. Nothing was sent.
+            NotSupported: this type of vehicle has no way to do it. Nothing was sent.
+            ValueUnknownError: position or home is needed here and not known.
+            OperationRejected: it is not flying, or the mode changed or it disarmed on the way.
+            CommandRejected: the vehicle refused.
+            CommandTimeout: there was no acknowledgement.
+            HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
+            OperationTimeout: it was not done in time, or does not move.
+        """
+        self._loop.run(
+            self.aio.orbit,
+            center,
+            radius_m=radius_m,
+            speed_m_s=speed_m_s,
+            turns=turns,
+            clockwise=clockwise,
+            facing=facing,
+            max_distance_m=max_distance_m,
+            timeout=timeout,
+            max_silence_s=max_silence_s,
+        )
+
+    def figure_eight(
+        self,
+        center: Position | Home,
+        *,
+        major_radius_m: float,
+        minor_radius_m: float,
+        axis_deg: float = 0.0,
+        speed_m_s: float = 2.0,
+        rounds: float | None = 1.0,
+        clockwise: bool = True,
+        max_distance_m: float = MAX_DISTANCE_M,
+        timeout: float | None = None,
+        max_silence_s: float | None = MAX_SILENCE_S,
+    ) -> None:
+        """Fly an eight around a place; returns when the reported positions were ``rounds`` times in both lobes.
+
+        PX4's fixed wings fly it themselves (MAV_CMD_DO_FIGURE_EIGHT: two circles and straight lines between them, and
+        on until another order). For ArduCopter and PX4's multicopters aerokit streams the set-points of a lemniscate;
+        they hold at its center. All else is as for :meth:`orbit`.
+
+        Args:
+            center: where the lines cross; its altitude is that of the figure, without one the vehicle's own.
+            major_radius_m: half the length of the figure, above 0, at most 10,000.
+            minor_radius_m: half its width, above 0, at most the half of ``major_radius_m``.
+            axis_deg: direction of its long axis, 0–360 clockwise from north; the first lobe is there.
+            speed_m_s: ground speed, above 0, at most 50. A fixed wing ignores it.
+            rounds: number of figures, a multiple of a half, above 0, at most 1000; None: until the call is cancelled.
+            clockwise: direction in the first lobe, as seen from above.
+            max_distance_m: a center farther away than this many metres is refused.
+            timeout: seconds; None: no limit while heartbeats arrive, the mode stays and the vehicle moves.
+            max_silence_s: raise when no heartbeat was received for this long; None: no limit.
+        """
+        self._loop.run(
+            self.aio.figure_eight,
+            center,
+            major_radius_m=major_radius_m,
+            minor_radius_m=minor_radius_m,
+            axis_deg=axis_deg,
+            speed_m_s=speed_m_s,
+            rounds=rounds,
+            clockwise=clockwise,
+            max_distance_m=max_distance_m,
+            timeout=timeout,
+            max_silence_s=max_silence_s,
+        )
+
+    def loiter(
+        self,
+        target: Position | Home | None = None,
+        *,
+        radius_m: float | None = None,
+        clockwise: bool = True,
+        turns: float | None = None,
+        duration_s: float | None = None,
+        max_distance_m: float = MAX_DISTANCE_M,
+        timeout: float | None = None,
+        max_silence_s: float | None = MAX_SILENCE_S,
+    ) -> None:
+        """Go to a place and stay: a fixed wing circles there, a multicopter hovers.
+
+        Returns when it is there, or after ``turns`` or ``duration_s`` more. The vehicle stays until another order.
+        After a cancellation or a time-out, aerokit orders it to hold where it is. Sends MAV_CMD_DO_REPOSITION
+        (ArduPilot in GUIDED, PX4 in LOITER), or MAV_CMD_DO_ORBIT for the radius of a PX4 fixed wing.
+
+        Args:
+            target: the place, as for ``go_to``; None: where the vehicle is.
+            radius_m: radius of the circle of a fixed wing, above 0, at most 10,000; None: its own (WP_LOITER_RAD,
+                NAV_LOITER_RAD).
+            clockwise: direction of the circle, as seen from above; only with ``radius_m``.
+            turns: return after this many turns, above 0, at most 1000; only with ``radius_m``.
+            duration_s: return this many seconds after the arrival.
+            max_distance_m: a place farther away than this many metres is refused.
+            timeout: seconds in total; None: no limit while heartbeats arrive, the mode stays and the vehicle moves.
+            max_silence_s: raise when no heartbeat was received for this long; None: no limit.
+
+        All else is as for :meth:`orbit`. NotSupported is raised for a radius if the vehicle hovers, InvalidArgument for
+        ``turns`` without one.
+        """
+        self._loop.run(
+            self.aio.loiter,
+            target,
+            radius_m=radius_m,
+            clockwise=clockwise,
+            turns=turns,
+            duration_s=duration_s,
+            max_distance_m=max_distance_m,
+            timeout=timeout,
+            max_silence_s=max_silence_s,
+        )
+
+    def follow(
+        self,
+        target: FollowTarget,
+        *,
+        distance_m: float = 10.0,
+        bearing_deg: float | None = None,
+        from_course: bool = False,
+        height_m: float | None = None,
+        face_target: bool = True,
+        valid_for_s: float = 3.0,
+        max_distance_m: float = 1000.0,
+    ) -> FollowStream:
+        """Follow a moving target: ``async with vehicle.follow(leader) as following: await following.fly(60)``.
+
+        aerokit computes the place beside the target and streams it with the target's velocity, at 10 Hz
+        (SET_POSITION_TARGET_GLOBAL_INT). The modes FOLLOW of ArduCopter and FOLLOWME of PX4 are not used: they need
+        parameters that stay, and differ in what they keep.
+
+        Args:
+            target: another vehicle, of this connection or of any other; an asynchronous iterable of positions; or a
+                function that returns the latest position, or None, called on the event loop ten times a second. The
+                velocity of positions is computed from two of them.
+            distance_m: distance along the ground to keep, 0 to 1000.
+            bearing_deg: direction from the target in which to stay, 0–360 clockwise from north; None: where the vehicle
+                is when it begins.
+            from_course: count ``bearing_deg`` from the direction in which the target moves: 180 is behind it.
+            height_m: height above the target, −1000 to 1000; None: the vehicle keeps its own altitude.
+            face_target: turn the nose to the target.
+            valid_for_s: without a new position of the target for this long, the vehicle holds.
+            max_distance_m: if the target is farther away than this many metres, the vehicle holds.
+
+        Raises:
+            InvalidArgument: an argument is out of range.
+            NotSupported: this type of vehicle takes no position set-points, or it flies on its wings.
+        """
+        return FollowStream(
+            self._loop,
+            self._loop.call(
+                self.aio.follow,
+                target,
+                distance_m=distance_m,
+                bearing_deg=bearing_deg,
+                from_course=from_course,
+                height_m=height_m,
+                face_target=face_target,
+                valid_for_s=valid_for_s,
+                max_distance_m=max_distance_m,
+            ),
+        )
+
+    def transition_to(self, state: FlightState, *, timeout: float = 60.0) -> None:
+        """Change a VTOL between hovering and flying on its wings (MAV_CMD_DO_VTOL_TRANSITION).
+
+        Returns when EXTENDED_SYS_STATE reports the state; at once if it is reported already. ArduPilot does it only in
+        AUTO. After a cancellation the vehicle goes on with its transition.
+
+        Args:
+            state: ``"fixed_wing"`` or ``"multicopter"``.
+            timeout: seconds until it is in that state.
+
+        Raises:
+            InvalidArgument: there is no such state. Nothing was sent.
+            NotSupported: it is no VTOL. Nothing was sent.
+            OperationRejected: the mode changed or it disarmed meanwhile.
+            CommandRejected: the vehicle refused; ``reasons`` has its status texts.
+            CommandTimeout: there was no acknowledgement.
+            HeartbeatTimeout: the vehicle was silent for ten seconds.
+            OperationTimeout: it did not reach the state in time.
+        """
+        self._loop.run(self.aio.transition_to, state, timeout=timeout)
 
     def go_to(
         self,
@@ -4301,8 +4999,94 @@ class Vehicle(VehicleTwin):
 
     @property
     def guided(self) -> Guided:
-        """Set-point streams: velocity, position, acceleration, attitude."""
+        """Set-point streams: velocity, position, acceleration, attitude, body rates, trajectory, actuators."""
         return self._part("guided", Guided)
+
+    def sticks(
+        self,
+        initial: StickInput | None = None,
+        *,
+        mode: str | int | None = None,
+        rate_hz: float = 20.0,
+        valid_for_s: float = 0.5,
+        max_lag_s: float = 0.5,
+    ) -> StickStream:
+        """Fly by stick positions of your program (MANUAL_CONTROL): ``async with vehicle.sticks() as sticks: …``.
+
+        Args:
+            initial: positions while the mode is entered; None centres all sticks.
+            mode: the piloted mode. By default LOITER (ArduCopter), FBWA or QLOITER (ArduPlane), MANUAL (ArduPilot
+                Rover), ALT_HOLD (ArduSub), POSCTL (PX4).
+            rate_hz: transmission rate of the latest positions, 2 to 400.
+            valid_for_s: seconds for which they may be repeated without new ones.
+            max_lag_s: how late the event loop may be.
+
+        Raises:
+            InvalidArgument: a rate or a time is out of range, or the autopilot has no such mode.
+        """
+        return StickStream(
+            self._loop,
+            self._loop.call(
+                self.aio.sticks,
+                initial,
+                mode=mode,
+                rate_hz=rate_hz,
+                valid_for_s=valid_for_s,
+                max_lag_s=max_lag_s,
+            ),
+        )
+
+    @property
+    def external(self) -> External:
+        """Measurements that your program supplies: odometry, vision, GPS, obstacles, ranges; the origin; the wind."""
+        return self._part("external", External)
+
+    def land_on(
+        self,
+        target: TargetSource,
+        *,
+        rate_hz: float = 20.0,
+        acquire_timeout: float = 10.0,
+        timeout: float | None = 300.0,
+        max_silence_s: float | None = MAX_SILENCE_S,
+    ) -> LandingReport:
+        """Land on a target that your program sees; returns on the ground, disarmed, with a report of the landing.
+
+        Streams LANDING_TARGET and uses the autopilot's own precision landing: LAND with PLND_ENABLED on ArduCopter,
+        PRECLAND on PX4. If the target is lost, the autopilot decides: ArduCopter retries or lands where it is
+        (PLND_STRICT, PLND_RET_MAX); PX4 climbs to PLD_SRCH_ALT, searches for PLD_SRCH_TOUT and then lands where it
+        is. The report says for how long the target was lost. After a cancellation the vehicle continues to land,
+        without new targets.
+
+        Args:
+            target: a function, also a coroutine function, that returns a
+                :class:`aerokit.TargetMeasurement`, or None while the target is not visible;
+                or an asynchronous iterable of them.
+            rate_hz: rate at which the function is called, and the highest rate of LANDING_TARGET.
+            acquire_timeout: seconds until the target must be seen first; the landing is ordered after that.
+            timeout: seconds until the vehicle is on the ground and disarmed; None: no limit.
+            max_silence_s: raise when no heartbeat was received for this long; None: no limit.
+
+        Raises:
+            InvalidArgument: a rate or a time is out of range, or the target is of another type.
+            NotSupported: this type of vehicle has no precision landing. Nothing was sent.
+            CommandRejected: the vehicle refused the mode.
+            CommandTimeout: there was no acknowledgement.
+            OperationRejected: a parameter makes the vehicle ignore the target (nothing else was sent), or the mode
+                changed meanwhile.
+            HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
+            OperationTimeout: the target was not seen in time (the landing was not ordered), or the vehicle was not
+                down in time.
+            ParameterTimeout: the vehicle did not report these parameters.
+        """
+        return self._loop.run(
+            self.aio.land_on,
+            target,
+            rate_hz=rate_hz,
+            acquire_timeout=acquire_timeout,
+            timeout=timeout,
+            max_silence_s=max_silence_s,
+        )
 
     @property
     def gimbal(self) -> Gimbal:
@@ -4353,6 +5137,37 @@ class Vehicle(VehicleTwin):
     def rtk(self) -> Rtk:
         """RTCM corrections for the satellite receivers, from your program or from an NTRIP caster."""
         return self._part("rtk", Rtk)
+
+    def return_altitude(self) -> float:
+        """Return the altitude above home, in metres, at which the vehicle returns to launch.
+
+        Reads RTL_ALT_M (ArduCopter 4.7; before: RTL_ALT, in centimetres), RTL_ALTITUDE (ArduPlane; ALT_HOLD_RTL before
+        4.5), Q_RTL_ALT (ArduPilot's VTOL planes, which return in QRTL) or RTL_RETURN_ALT (PX4). ArduPlane reports −1 if
+        it keeps the present altitude, ArduCopter 0.
+
+        Raises:
+            NotSupported: this type of vehicle does not climb for a return. Nothing was sent.
+            ParameterRejected: the vehicle has no such parameter.
+            ParameterTimeout: there was no answer.
+        """
+        return self._loop.run(self.aio.return_altitude)
+
+    def set_return_altitude(self, altitude_m: float) -> None:
+        """Set the altitude of returns to launch; returns when the vehicle has confirmed the value.
+
+        Writes the parameter that :meth:`return_altitude` reads, so the value survives a reboot. A vehicle that is
+        higher than that does not descend for its return.
+
+        Args:
+            altitude_m: metres above home, above 0, at most 3,000. Q_RTL_ALT holds whole metres only.
+
+        Raises:
+            InvalidArgument: the altitude is out of range, or has a fraction that the parameter cannot hold.
+            NotSupported: this type of vehicle does not climb for a return. Nothing was sent.
+            ParameterRejected: the vehicle has no such parameter, or keeps the previous value.
+            ParameterTimeout: not confirmed, but it may have been set.
+        """
+        self._loop.run(self.aio.set_return_altitude, altitude_m)
 
     def setup_signing(self, signing: Signing | None, *, timeout: float = 5.0) -> None:
         """Install a signing key on the vehicle and sign all traffic with it from then on; None removes the key.

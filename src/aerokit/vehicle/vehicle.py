@@ -10,8 +10,13 @@ from aerokit._internal.async_block import ReadOnly
 from aerokit.mavlink.messages import ParamValue
 from aerokit.vehicle.commanding.arming import ArmingActions
 from aerokit.vehicle.commanding.flight import FlightActions, ModeActions
+from aerokit.vehicle.commanding.maneuvers import ManeuverActions
 from aerokit.vehicle.commanding.messaging import MessagingActions
+from aerokit.vehicle.commanding.progress import MAX_SILENCE_S
+from aerokit.vehicle.commanding.speeds import SpeedActions
+from aerokit.vehicle.commanding.termination import TerminationActions
 from aerokit.vehicle.commanding.travel import LookActions, TravelActions
+from aerokit.vehicle.commanding.tuning import TuningActions
 from aerokit.vehicle.devices.actions import DeviceActions
 from aerokit.vehicle.missions.context import PlanContext
 from aerokit.vehicle.state.field import MESSAGE_IDS
@@ -23,7 +28,10 @@ if TYPE_CHECKING:
     from aerokit.vehicle.camera.cameras import Camera, Cameras
     from aerokit.vehicle.commanding.context import VehicleContext
     from aerokit.vehicle.commanding.guided import Guided
+    from aerokit.vehicle.commanding.sticks import StickInput, StickStream
     from aerokit.vehicle.components.component import Component, Components, ComponentStatus
+    from aerokit.vehicle.external.external import External
+    from aerokit.vehicle.external.landing import LandingReport, TargetSource
     from aerokit.vehicle.files.files import Files
     from aerokit.vehicle.files.logs import Logs
     from aerokit.vehicle.gimbal.gimbal import Gimbal, Gimbals
@@ -48,9 +56,13 @@ class Vehicle(
     ReadOnly,
     FlightActions,
     TravelActions,
+    ManeuverActions,
+    SpeedActions,
     LookActions,
     ArmingActions,
     ModeActions,
+    TerminationActions,
+    TuningActions,
     MessagingActions,
     DeviceActions,
 ):
@@ -135,10 +147,86 @@ class Vehicle(
 
     @cached_property
     def guided(self) -> Guided:
-        """Set-point streams: velocity, position, acceleration, attitude."""
+        """Set-point streams: velocity, position, acceleration, attitude, body rates, trajectory, actuators."""
         from aerokit.vehicle.commanding.guided import Guided
 
         return Guided(self._context)
+
+    def sticks(
+        self,
+        initial: StickInput | None = None,
+        *,
+        mode: str | int | None = None,
+        rate_hz: float = 20.0,
+        valid_for_s: float = 0.5,
+        max_lag_s: float = 0.5,
+    ) -> StickStream:
+        """Fly by stick positions of your program (MANUAL_CONTROL): ``async with vehicle.sticks() as sticks: …``.
+
+        Args:
+            initial: positions while the mode is entered; None centres all sticks.
+            mode: the piloted mode. By default LOITER (ArduCopter), FBWA or QLOITER (ArduPlane), MANUAL (ArduPilot
+                Rover), ALT_HOLD (ArduSub), POSCTL (PX4).
+            rate_hz: transmission rate of the latest positions, 2 to 400.
+            valid_for_s: seconds for which they may be repeated without new ones.
+            max_lag_s: how late the event loop may be.
+
+        Raises:
+            InvalidArgument: a rate or a time is out of range, or the autopilot has no such mode.
+        """
+        from aerokit.vehicle.commanding.sticks import StickStream
+
+        limits = (rate_hz, valid_for_s, max_lag_s)
+        return StickStream(self._context, self.parameters.probe, mode, initial, *limits)
+
+    @cached_property
+    def external(self) -> External:
+        """Measurements that your program supplies: odometry, vision, GPS, obstacles, ranges; the origin; the wind."""
+        from aerokit.vehicle.external.external import External
+
+        return External(self._context, self.parameters.probe)
+
+    async def land_on(
+        self,
+        target: TargetSource,
+        *,
+        rate_hz: float = 20.0,
+        acquire_timeout: float = 10.0,
+        timeout: float | None = 300.0,
+        max_silence_s: float | None = MAX_SILENCE_S,
+    ) -> LandingReport:
+        """Land on a target that your program sees; returns on the ground, disarmed, with a report of the landing.
+
+        Streams LANDING_TARGET and uses the autopilot's own precision landing: LAND with PLND_ENABLED on ArduCopter,
+        PRECLAND on PX4. If the target is lost, the autopilot decides: ArduCopter retries or lands where it is
+        (PLND_STRICT, PLND_RET_MAX); PX4 climbs to PLD_SRCH_ALT, searches for PLD_SRCH_TOUT and then lands where it
+        is. The report says for how long the target was lost. After a cancellation the vehicle continues to land,
+        without new targets.
+
+        Args:
+            target: a function, also a coroutine function, that returns a
+                :class:`aerokit.TargetMeasurement`, or None while the target is not visible;
+                or an asynchronous iterable of them.
+            rate_hz: rate at which the function is called, and the highest rate of LANDING_TARGET.
+            acquire_timeout: seconds until the target must be seen first; the landing is ordered after that.
+            timeout: seconds until the vehicle is on the ground and disarmed; None: no limit.
+            max_silence_s: raise when no heartbeat was received for this long; None: no limit.
+
+        Raises:
+            InvalidArgument: a rate or a time is out of range, or the target is of another type.
+            NotSupported: this type of vehicle has no precision landing. Nothing was sent.
+            CommandRejected: the vehicle refused the mode.
+            CommandTimeout: there was no acknowledgement.
+            OperationRejected: a parameter makes the vehicle ignore the target (nothing else was sent), or the mode
+                changed meanwhile.
+            HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
+            OperationTimeout: the target was not seen in time (the landing was not ordered), or the vehicle was not
+                down in time.
+            ParameterTimeout: the vehicle did not report these parameters.
+        """
+        from aerokit.vehicle.external.landing import land_on
+
+        return await land_on(self._context, self.external, target, rate_hz, acquire_timeout, timeout, max_silence_s)
 
     @cached_property
     def gimbal(self) -> Gimbal:
@@ -207,6 +295,41 @@ class Vehicle(
         from aerokit.vehicle.rtk.rtk import Rtk
 
         return Rtk(self._context)
+
+    async def return_altitude(self) -> float:
+        """Return the altitude above home, in metres, at which the vehicle returns to launch.
+
+        Reads RTL_ALT_M (ArduCopter 4.7; before: RTL_ALT, in centimetres), RTL_ALTITUDE (ArduPlane; ALT_HOLD_RTL before
+        4.5), Q_RTL_ALT (ArduPilot's VTOL planes, which return in QRTL) or RTL_RETURN_ALT (PX4). ArduPlane reports −1 if
+        it keeps the present altitude, ArduCopter 0.
+
+        Raises:
+            NotSupported: this type of vehicle does not climb for a return. Nothing was sent.
+            ParameterRejected: the vehicle has no such parameter.
+            ParameterTimeout: there was no answer.
+        """
+        from aerokit.vehicle.parameters.return_altitude import read_return_altitude
+
+        return await read_return_altitude(self.parameters, self.autopilot, self.telemetry)
+
+    async def set_return_altitude(self, altitude_m: float) -> None:
+        """Set the altitude of returns to launch; returns when the vehicle has confirmed the value.
+
+        Writes the parameter that :meth:`return_altitude` reads, so the value survives a reboot. A vehicle that is
+        higher than that does not descend for its return.
+
+        Args:
+            altitude_m: metres above home, above 0, at most 3,000. Q_RTL_ALT holds whole metres only.
+
+        Raises:
+            InvalidArgument: the altitude is out of range, or has a fraction that the parameter cannot hold.
+            NotSupported: this type of vehicle does not climb for a return. Nothing was sent.
+            ParameterRejected: the vehicle has no such parameter, or keeps the previous value.
+            ParameterTimeout: not confirmed, but it may have been set.
+        """
+        from aerokit.vehicle.parameters.return_altitude import write_return_altitude
+
+        await write_return_altitude(self.parameters, self.autopilot, self.telemetry, altitude_m)
 
     def __repr__(self) -> str:
         return f"<Vehicle {self.system_id}/{self.component_id} {self.autopilot.firmware}, {self.describe_link()}>"

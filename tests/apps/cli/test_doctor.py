@@ -16,6 +16,7 @@ from cli_harness import GROUND_STATION, run_on_messages
 from pymavlink.dialects.v20 import common
 
 from aerokit import messages as m
+from aerokit import wire_implementation
 from aerokit.apps.cli import doctor, main
 from aerokit.apps.cli.doctor import EXTRAS, check_installation, check_network_port, check_serial_port
 from aerokit.mavlink.encoder import FrameEncoder
@@ -282,3 +283,8 @@ def test_doctor_extras_match_pyproject() -> None:
     section = text.partition("[project.optional-dependencies]")[2].partition("\n[")[0]
     extras = set(re.findall(r"^(\w+) = ", section, re.MULTILINE))
     assert extras - {"all", "test", "dev", "docs"} == set(EXTRAS)
+
+
+def test_doctor_names_implementation_of_wire() -> None:
+    (finding,) = [finding for finding in check_installation() if finding.subject == "wire"]
+    assert finding.text.startswith("compiled" if wire_implementation == "c" else "Python")

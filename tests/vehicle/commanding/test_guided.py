@@ -23,14 +23,18 @@ from aerokit.errors import (
     SetpointStreamStopped,
 )
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult
+from aerokit.sim import SimulatedPx4
 from aerokit.sim.px4.modes import POSITION
 from aerokit.vehicle.commanding.guided import SetpointStream
 from aerokit.vehicle.commanding.setpoints import (
     AccelerationSetpoint,
+    ActuatorSetpoint,
+    AttitudeRateSetpoint,
     AttitudeSetpoint,
     BodyVelocitySetpoint,
     LocalPositionSetpoint,
     PositionSetpoint,
+    TrajectorySetpoint,
     VelocitySetpoint,
 )
 
@@ -119,7 +123,77 @@ async def test_attitude(flying: Flight) -> None:
     assert (sent.body_roll_rate, sent.body_pitch_rate, sent.body_yaw_rate) == (0, 0, 0)
 
 
-@pytest.mark.parametrize("rate_hz", [2.0, 10.0, 40.0])
+async def test_attitude_rate(flying: Flight) -> None:
+    setpoint = AttitudeRateSetpoint(-10.0, 20.0, 90.0, 0.25)
+    sent = await first_sent(flying, flying.vehicle.guided.attitude_rate(setpoint, valid_for_s=1.0))
+    assert isinstance(sent, m.SetAttitudeTarget)
+    assert (sent.target_system, sent.type_mask, sent.thrust) == (1, 0x80, 0.25)
+    rates = (sent.body_roll_rate, sent.body_pitch_rate, sent.body_yaw_rate)
+    assert rates == pytest.approx((-math.pi / 18, math.pi / 9, math.pi / 2))
+
+
+async def test_trajectory(flying: Flight) -> None:
+    setpoint = TrajectorySetpoint(1.0, 2.0, -10.0, 0.5, 0.25, -0.125, 0.0625, 0.03125, -0.5, yaw_deg=90.0)
+    sent = await first_sent(flying, flying.vehicle.guided.trajectory(setpoint))
+    assert isinstance(sent, m.SetPositionTargetLocalNed)
+    assert (sent.coordinate_frame, sent.type_mask) == (1, 0x800)
+    assert (sent.x, sent.y, sent.z, sent.vx, sent.vy, sent.vz) == (1.0, 2.0, -10.0, 0.5, 0.25, -0.125)
+    assert (sent.afx, sent.afy, sent.afz) == (0.0625, 0.03125, -0.5)
+
+
+async def test_attitude_rate_is_flown(flying: Flight) -> None:
+    async with flying.vehicle.guided.attitude_rate(rate_hz=100.0) as stream:
+        await stream.fly(AttitudeRateSetpoint(roll_deg_s=10.0), 1.0)
+        assert math.degrees(flying.copter.motion.roll) == pytest.approx(10.0, abs=1.5)
+        assert flying.copter.motion.velocity_east > 0.2
+
+
+async def test_trajectory_with_velocity_lags_less_than_position(flying: Flight) -> None:
+    """A point that moves north at 2 m/s is followed within half a metre."""
+    here = flying.copter.motion
+    north, east, down, started = here.north, here.east, here.down, now()
+
+    def place(moving: bool) -> TrajectorySetpoint:
+        return TrajectorySetpoint(north + 2.0 * (now() - started), east, down, north_m_s=2.0 * moving)
+
+    async with flying.vehicle.guided.trajectory(place(True)) as stream:
+        for _ in range(200):
+            stream.set(place(True))
+            await anyio.sleep(0.05)
+        assert here.north == pytest.approx(place(True).north_m, abs=0.5)
+
+
+async def test_actuators_of_new_firmware_raise_not_supported(flying: Flight) -> None:
+    with pytest.raises(NotSupported, match=r"ArduCopter .* does not obey SET_ACTUATOR_CONTROL_TARGET"):
+        flying.vehicle.guided.actuators(ActuatorSetpoint((0.0,) * 8))
+    assert flying.wire.setpoints() == []
+
+
+async def test_px4_actuators_of_old_firmware_are_flown() -> None:
+    async with open_px4(SimulatedPx4(boot_time_s=1.0, version="1.13.3")) as flight:
+        await flight.vehicle.version.wait_until(lambda version: version.number[:2] == (1, 13))
+        stream = flight.vehicle.guided.actuators(ActuatorSetpoint((0.5, *(0.0,) * 7), group=1))
+        sent: Any = stream._encode(stream._value)
+        assert (sent.group_mlx, sent.target_system, tuple(sent.controls)) == (1, 1, (0.5, *(0.0,) * 7))
+        with pytest.raises(InvalidArgument, match="8 numbers"):
+            async with flight.vehicle.guided.actuators(ActuatorSetpoint((0.5,))):
+                raise AssertionError("entered")
+        await flight.take_off()
+        climb = ActuatorSetpoint((0.0, 0.0, 0.0, 0.7, *(0.0,) * 4))
+        async with flight.vehicle.guided.actuators(climb) as actuators:
+            await actuators.fly(climb, 2.0)
+            assert flight.px4.motion.velocity_down < -1.0
+
+
+async def test_px4_attitude_rate_is_flown() -> None:
+    async with open_px4() as flight:
+        await flight.take_off()
+        async with flight.vehicle.guided.attitude_rate() as stream:
+            await stream.fly(AttitudeRateSetpoint(roll_deg_s=10.0, thrust=0.5), 1.0)
+            assert math.degrees(flight.px4.motion.roll) > 5.0
+
+
+@pytest.mark.parametrize("rate_hz", [400.0, 2.0, 10.0, 40.0])
 async def test_setpoint_stream_rate_is_kept(flying: Flight, rate_hz: float) -> None:
     async with flying.vehicle.guided.velocity(rate_hz=rate_hz) as stream:
         flying.wire.clear()
@@ -394,7 +468,7 @@ async def test_setpoint_stream_outside_block_or_reused_raises(flying: Flight) ->
 
 BAD: list[Callable[[Any], object]] = [
     lambda guided: guided.velocity(rate_hz=1.0),
-    lambda guided: guided.velocity(rate_hz=101.0),
+    lambda guided: guided.velocity(rate_hz=401.0),
     lambda guided: guided.velocity(rate_hz=math.nan),
     lambda guided: guided.velocity(valid_for_s=0.0),
     lambda guided: guided.velocity(valid_for_s=math.inf),
@@ -437,6 +511,9 @@ async def test_invalid_setpoints_raise_before_sending(flying: Flight) -> None:
         guided.local_position(LocalPositionSetpoint(0.0, math.nan, 0.0)),
         guided.attitude(AttitudeSetpoint(0.0, 0.0, 0.0, 1.1)),
         guided.attitude(AttitudeSetpoint(math.nan, 0.0, 0.0, 0.5)),
+        guided.attitude_rate(AttitudeRateSetpoint(roll_deg_s=3601.0)),
+        guided.attitude_rate(AttitudeRateSetpoint(thrust=-0.1)),
+        guided.trajectory(TrajectorySetpoint(0.0, 0.0, 0.0, north_m_s=math.nan)),
     ):
         with pytest.raises(InvalidArgument):
             async with stream:

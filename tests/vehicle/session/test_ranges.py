@@ -39,7 +39,7 @@ REFUSED: dict[str, Callable[[Any], Awaitable[object]]] = {
     "rate_deg_s = -1 is not allowed: 0 to 360": lambda v: v.set_heading(0, rate_deg_s=-1),
     "tolerance_deg = -1 is not allowed: above 0 to 180": lambda v: v.set_heading(0, tolerance_deg=-1),
     "pitch_deg = 999 is not allowed: -360 to 360": lambda v: v.gimbal.point(999, 0),
-    "rate_hz = 1 is not allowed: 2 to 100": lambda v: entered(v.guided.velocity(rate_hz=1)),
+    "rate_hz = 1 is not allowed: 2 to 400": lambda v: entered(v.guided.velocity(rate_hz=1)),
     "valid_for_s = 61 is not allowed: above 0 to 60": lambda v: entered(v.guided.velocity(valid_for_s=61)),
     "max_lag_s = 61 is not allowed: above 0 to 60": lambda v: entered(v.guided.velocity(max_lag_s=61)),
     "rate_hz of ATTITUDE = -1 is not allowed: above 0 to 1000": lambda v: entered(v.rate(m.Attitude, -1)),

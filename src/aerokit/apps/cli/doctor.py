@@ -57,9 +57,12 @@ def check_installation() -> Iterator[Finding]:
     """Check the version, the extras, and whether another package named ``aerokit`` has overwritten files."""
     import aerokit
     from aerokit._internal.imports import installation_problem
+    from aerokit._internal.wire import wire_implementation
 
     where = f"Python {platform.python_version()} on {platform.platform(terse=True)}, in {Path(aerokit.__file__).parent}"
     yield Finding("ok", "aerokit", f"{aerokit.__version__}, {where}")
+    wire = "compiled" if wire_implementation == "c" else "Python (slower; see docs/benchmarks.md)"
+    yield Finding("ok", "wire", wire)
     if mixed := installation_problem(aerokit.__path__[0]):
         yield Finding("problem", "installation", mixed, "uninstall both, then install aerokit-mavlink again")
     try:

@@ -64,6 +64,7 @@ def common_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
         _C.SET_CAMERA_SOURCE: lambda _: _R.DENIED,
         _C.VIDEO_START_CAPTURE: lambda _: _R.FAILED,
         _C.VIDEO_STOP_CAPTURE: lambda _: _R.FAILED,
+        _C.EXTERNAL_WIND_ESTIMATE: lambda c: vehicle.external.set_wind(c),
         _C.SET_EKF_SOURCE_SET: lambda c: _R.ACCEPTED if c.param1 in _SOURCE_SETS else _R.DENIED,
         _C.BATTERY_RESET: common.reset_battery,
         _C.CONTROL_HIGH_LATENCY: common.control_high_latency,

@@ -49,6 +49,7 @@ class CopterGuided(CopterModeBase):
         self.velocity: Ned = _ZERO
         self.acceleration: Ned = _ZERO  # Targets in the world frame: north, east, down.
         self._attitude = (0.0, 0.0)
+        self._body_rates: tuple[float, float] | None = None
         self._attitude_climb = 0.0
         self._updated_at = -math.inf
         self._take_off: CopterTakeOff | None = None
@@ -102,7 +103,15 @@ class CopterGuided(CopterModeBase):
     def lean(self, roll: float, pitch: float, climb: float) -> None:
         """Hold roll and pitch (radians) and a climb rate (m/s); on the ground a positive climb rate takes off."""
         self.submode = GuidedSubmode.ATTITUDE
-        self._attitude, self._attitude_climb = (roll, pitch), climb
+        self._attitude, self._attitude_climb, self._body_rates = (roll, pitch), climb, None
+        self._updated_at = self.vehicle.now
+
+    def rotate(self, roll_rate: float, pitch_rate: float, climb: float) -> None:
+        """Roll and pitch at rates in radians per second, from the present attitude, and climb (m/s)."""
+        if self.submode is not GuidedSubmode.ATTITUDE or self._body_rates is None:
+            self._attitude = (self.vehicle.motion.roll, self.vehicle.motion.pitch)
+        self.submode = GuidedSubmode.ATTITUDE
+        self._attitude_climb, self._body_rates = climb, (roll_rate, pitch_rate)
         self._updated_at = self.vehicle.now
 
     def pause(self) -> bool:
@@ -136,7 +145,7 @@ class CopterGuided(CopterModeBase):
             self.is_taking_off: bool = not self._take_off.is_complete
             copter.yaw.update()
         elif self.submode is GuidedSubmode.ATTITUDE:
-            self._run_attitude()
+            self._run_attitude(dt)
         elif copter.is_landed:
             copter.hold_position()  # Only a take-off command or a climb rate leaves the ground.
         else:
@@ -148,8 +157,11 @@ class CopterGuided(CopterModeBase):
     def _is_stale(self) -> bool:
         return self.vehicle.now - self._updated_at > self.vehicle.parameters["GUID_TIMEOUT"]
 
-    def _run_attitude(self) -> None:
+    def _run_attitude(self, dt: float) -> None:
         copter = self.vehicle
+        if self._body_rates is not None and not copter.is_landed:
+            roll, pitch = (angle + rate * dt for angle, rate in zip(self._attitude, self._body_rates, strict=True))
+            self._attitude = (roll, pitch)
         (roll, pitch), climb = self._attitude, self._attitude_climb
         if self._is_stale:
             roll = pitch = climb = 0.0
@@ -267,4 +279,8 @@ class CopterSetpoints:
         # Thrust is a climb rate; 0.5 holds the altitude. Thrust as throttle (GUID_OPTIONS bit 3) is not simulated.
         share = (max(0.0, min(1.0, target.thrust)) - 0.5) * 2.0
         name = "WPNAV_SPEED_UP" if share > 0 else "WPNAV_SPEED_DN"
-        guided.lean(roll, pitch, share * copter.parameters[name] / 100.0)
+        climb = share * copter.parameters[name] / 100.0
+        if mask & AttitudeMask.ATTITUDE_IGNORE and not rates_ignored:
+            guided.rotate(target.body_roll_rate, target.body_pitch_rate, climb)
+        else:
+            guided.lean(roll, pitch, climb)

@@ -150,7 +150,7 @@ class CopterHost(ArduPilotVehicle):
         speed = self.speed_limit("LAND_SPEED")
         if self.navigation.altitude_above_home > self.parameters["LAND_ALT_LOW"] / 100.0:
             speed = self.speed_limit("LAND_SPEED_HIGH") or self.speed_limit("WPNAV_SPEED_DN")
-        self.motion.seek_velocity(0.0, 0.0, speed)
+        self.motion.seek_velocity(*self.external.velocity_to_target(), speed)
 
     def land(self) -> None:
         """Descend, and disarm once the motors idle on the ground."""

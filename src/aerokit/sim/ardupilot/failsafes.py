@@ -251,7 +251,7 @@ class ArduPilotArming(Generic[HostT]):
     def gps_reasons(self) -> Sequence[str]:
         """Check the GPS receiver and home."""
         nav = self.vehicle.navigation
-        if nav.fix_type < GpsFixType.TYPE_3D_FIX:
+        if nav.fix_type < GpsFixType.TYPE_3D_FIX and not (nav.uses_external and not nav.is_gps_detected):
             return ("GPS 1: Bad fix" if nav.is_gps_detected else "GPS 1: not healthy",)
         return () if nav.home is not None else ("AHRS: waiting for home",)
 

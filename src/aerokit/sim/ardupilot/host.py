@@ -190,6 +190,13 @@ class ArduPilotMotors:
 # Interfaces of the parts, for other parts.
 
 
+class ArduPilotExternalHost(Protocol):
+    @property
+    def navigation_age_s(self) -> float: ...
+
+    def velocity_to_target(self) -> tuple[float, float]: ...
+
+
 class ArduPilotNavigationHost(Protocol):
     origin: Ned | None
     home: Ned | None
@@ -200,6 +207,8 @@ class ArduPilotNavigationHost(Protocol):
     is_healthy: bool
 
     @property
+    def uses_external(self) -> bool: ...
+    @property
     def has_position(self) -> bool: ...
     @property
     def has_attitude(self) -> bool: ...
@@ -208,6 +217,7 @@ class ArduPilotNavigationHost(Protocol):
     @property
     def altitude_above_home(self) -> float: ...
     def set_home(self, point: Ned, *, lock: bool) -> None: ...
+    def set_origin(self, point: Ned) -> bool: ...
     def world(self, local: Ned) -> Ned: ...
 
 
@@ -320,6 +330,7 @@ class ArduPilotHost(SimulatedAutopilot):
     camera: ArduPilotCameraHost
     gimbal: ArduPilotGimbalHost
     rc: ArduPilotRadioHost
+    external: ArduPilotExternalHost
     calibrations: ArduPilotCalibrationsHost
 
     @property

@@ -18,12 +18,14 @@ _WITH_POSITION = int(
     _DEAD_RECKONING | Ekf.VELOCITY_HORIZ | Ekf.POS_HORIZ_REL | Ekf.POS_HORIZ_ABS
     | Ekf.PRED_POS_HORIZ_REL | Ekf.PRED_POS_HORIZ_ABS
 )  # fmt: skip
+_RELATIVE = int(_DEAD_RECKONING | Ekf.VELOCITY_HORIZ | Ekf.POS_HORIZ_REL | Ekf.PRED_POS_HORIZ_REL)
+_EXTERNAL_NAVIGATION = 6
 _POSITION_TIMEOUT_S, _AIDING_TIMEOUT_S = 7.0, 15.0
 _GPS_CHECK_INTERVAL_S = 0.1
 
 
 class ArduPilotNavigation:
-    """State of GPS and estimator; follows the boot timeline, ``faults.gps_lost`` and SIM_GPS1_ENABLE.
+    """State of GPS and estimator; follows the boot timeline, ``faults.gps_lost``, SIM_GPS1_ENABLE and EK3_SRC1_POSXY.
 
     Positions are in the world frame, whose origin is the power-on location.
     """
@@ -53,6 +55,7 @@ class ArduPilotNavigation:
         later(line.origin_set, self._set_origin)
         later(line.healthy, self._become_healthy)
         later(line.position_good, self._use_gps)
+        later(line.yaw_aligned, self._watch_external)
 
     @property
     def has_position(self) -> bool:
@@ -111,6 +114,28 @@ class ArduPilotNavigation:
             self._vehicle.info(f"Field Elevation Set: {self.frame.origin.altitude_m - point[2]:.0f}m")
         return True
 
+    @property
+    def uses_external(self) -> bool:
+        """True if EK3_SRC1_POSXY selects external navigation instead of GPS."""
+        return self._vehicle.parameters.get("EK3_SRC1_POSXY", 0.0) == _EXTERNAL_NAVIGATION
+
+    def _watch_external(self) -> None:
+        self._vehicle.every(_GPS_CHECK_INTERVAL_S, self._check_external)
+
+    def _check_external(self) -> None:
+        """Follow external navigation. Positions are relative until the origin is set."""
+        if not self.uses_external or not self.has_attitude:
+            return
+        age = self._vehicle.external.navigation_age_s
+        if age > _POSITION_TIMEOUT_S:
+            self.flags = _ATTITUDE_ONLY
+            return
+        if self.flags == _ATTITUDE_ONLY:
+            self._report_cores("is using external nav data")
+        self.flags = _RELATIVE if self.origin is None else _WITH_POSITION
+        if self.origin is not None and self.home is None:
+            self._set_first_home()
+
     def _set_flags(self, flags: int) -> None:
         self.flags = flags
 
@@ -129,13 +154,15 @@ class ArduPilotNavigation:
         self._report_cores("MAG0 initial yaw alignment complete")
 
     def _detect_gps(self) -> None:
+        if not self._vehicle.parameters.get("GPS1_TYPE", 1.0):
+            return
         self.is_gps_detected = True
         self.fix_type = GpsFixType.NO_FIX
         self._vehicle.info("GPS 1: probing for u-blox at 230400 baud")
         self._vehicle.info("GPS 1: detected u-blox")
 
     def _get_fix(self) -> None:
-        if not self.gps_is_lost:
+        if self.is_gps_detected and not self.gps_is_lost:
             self.fix_type = GpsFixType.RTK_FIXED
             if not self._vehicle.timeline.estimator_leads_early:
                 self._set_first_home()
@@ -158,7 +185,7 @@ class ArduPilotNavigation:
         self.is_healthy = True
 
     def _use_gps(self) -> None:
-        if self.origin is None or self.fix_type < GpsFixType.TYPE_3D_FIX:
+        if self.origin is None or self.fix_type < GpsFixType.TYPE_3D_FIX or self.uses_external:
             self._vehicle.call_later(1.0, self._use_gps)
             return
         self.flags = _WITH_POSITION
@@ -167,9 +194,11 @@ class ArduPilotNavigation:
             self._vehicle.info("AHRS: EKF3 active")
 
     def _check_gps(self) -> None:
-        now, lost = self._vehicle.now, self.gps_is_lost
+        now, lost = self._vehicle.now, self.gps_is_lost or not self.is_gps_detected
         if lost and math.isnan(self._lost_at):
             self._lost_at, self.fix_type = now, GpsFixType.NO_FIX
+        elif lost and self.uses_external:
+            return
         elif lost and self.has_position and now - self._lost_at >= _POSITION_TIMEOUT_S:
             self.flags = _DEAD_RECKONING | (Ekf.VELOCITY_HORIZ if self._vehicle.is_landed else 0)
         elif lost and self.flags != _ATTITUDE_ONLY and now - self._lost_at >= _AIDING_TIMEOUT_S:
@@ -177,7 +206,7 @@ class ArduPilotNavigation:
             self._report_cores("stopped aiding")
         elif not lost and self.fix_type < GpsFixType.TYPE_3D_FIX:
             self._lost_at, self.fix_type = math.nan, GpsFixType.RTK_FIXED
-            if self.origin is not None and not self.has_position:
+            if self.origin is not None and not self.has_position and not self.uses_external:
                 self._use_gps()
 
 

@@ -18,6 +18,7 @@ from aerokit.protocols.servers.files import FileTree
 from aerokit.sim.ardupilot.calibration import Calibrations
 from aerokit.sim.ardupilot.camera import ArduPilotCamera
 from aerokit.sim.ardupilot.devices import ArduPilotDevices
+from aerokit.sim.ardupilot.external import ArduPilotExternal
 from aerokit.sim.ardupilot.failsafes import ArduPilotArming, ArduPilotFailsafes
 from aerokit.sim.ardupilot.fence import ArduPilotFence
 from aerokit.sim.ardupilot.ftp import ArduPilotFtp
@@ -128,6 +129,8 @@ class ArduPilotVehicle(ArduPilotHost):
         self._boot_text = boot_text
         self._stream_groups = stream_groups
         self.frame: LocalFrame = LocalFrame(GlobalPoint(round(home[0] * 1e7), round(home[1] * 1e7), home[2]))
+        self.external: ArduPilotExternal = ArduPilotExternal(self)
+        """Measurements received from companion computers."""
         self.missions: ArduPilotMissionServer = ArduPilotMissionServer(self)
         """Mission, fence and rally points; they survive a reboot."""
         self._reset()
@@ -153,6 +156,7 @@ class ArduPilotVehicle(ArduPilotHost):
         self.gimbal: ArduPilotGimbal = ArduPilotGimbal(self)
         self.camera: ArduPilotCamera = ArduPilotCamera(self)
         self.calibrations.reset()
+        self.external.reset()
         self.rc.release_overrides()
         self._modes: dict[int, ArduPilotMode] = {mode.number: mode for mode in (make(self) for make in self.MODES)}
         self.reset_controllers()
@@ -171,6 +175,7 @@ class ArduPilotVehicle(ArduPilotHost):
         self.on(m.SetMode, self._on_set_mode)
         self.serve_timesync()
         self.rc.listen()
+        self.external.listen()
         self.JOYSTICK(self)
         self.missions.listen()
 

@@ -31,6 +31,7 @@ from aerokit.sim.parameters import SimParameters
 from aerokit.sim.px4 import modes
 from aerokit.sim.px4.arming import Px4Arming, Px4Calibration
 from aerokit.sim.px4.console import Px4LogStream, Px4Shell
+from aerokit.sim.px4.external import Px4External
 from aerokit.sim.px4.failsafes import Px4Failsafes
 from aerokit.sim.px4.flight import Px4Flight
 from aerokit.sim.px4.ftp import Px4Ftp
@@ -149,6 +150,8 @@ class Px4Vehicle(Px4Host):
         self.throttle: float = 0.0
         self.home_is_set_by_hand = False
         self.mode_after_landing: Px4Mode = modes.HOLD
+        self.vtol_state: int = 0
+        """MAV_VTOL_STATE that is reported; assign it to simulate a VTOL, whose motion stays that of this vehicle."""
         self._touched_at = math.nan
         self._landed_at = math.nan
         self._has_flown = False
@@ -164,6 +167,8 @@ class Px4Vehicle(Px4Host):
     def _listen(self) -> None:
         self.offboard: Px4Offboard = Px4Offboard(self)
         self.sticks: Px4Sticks = Px4Sticks(self)
+        self.external: Px4External = Px4External(self)
+        """Measurements received from companion computers."""
         self.gimbal: Px4Gimbal = Px4Gimbal(self)
         """Gimbal on the AUX outputs, enabled by MNT_MODE_IN."""
         self.shell: Px4Shell = Px4Shell(self)
@@ -186,7 +191,13 @@ class Px4Vehicle(Px4Host):
     @property
     def has_position(self) -> bool:
         """True if the estimator has a global position."""
-        return self.uptime >= 0.5 * self._boot_time_s and not self.faults.gps_lost
+        has_global = self.external.has_gps or (self.external.has_vision and self.has_origin)
+        return self.uptime >= 0.5 * self._boot_time_s and has_global
+
+    @property
+    def has_origin(self) -> bool:
+        """True if the local frame has a global origin."""
+        return self.external.has_gps or self.external.origin is not None
 
     def next_ping(self) -> int:
         """Return the sequence number of the next PING."""
@@ -226,6 +237,11 @@ class Px4Vehicle(Px4Host):
         self._reset()
         self._next_text_id = 0
         self.reboot(_REBOOT_SILENCE_S)
+
+    def shut_down(self) -> None:
+        """Switch off until `power_on`."""
+        self._reset()
+        self.reboot(math.inf)
 
     def send_text(self, severity: int, text: str) -> None:
         """Queue a text with an id, and mostly a final tab; it follows the answer that is being sent."""

@@ -5,7 +5,17 @@ from __future__ import annotations
 import math
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import FailureType, FailureUnit, MavCmd, MavFrame, MavModeFlag, MavResult, MavSeverity
+from aerokit.mavlink.enums import (
+    FailureType,
+    FailureUnit,
+    MavCmd,
+    MavFrame,
+    MavModeFlag,
+    MavResult,
+    MavSeverity,
+    MavType,
+    MavVtolState,
+)
 from aerokit.sim.commands import CommandHandler, CommandProgress, ReceivedCommand, whole
 from aerokit.sim.px4 import modes
 from aerokit.sim.px4.base import Px4Vehicle
@@ -25,10 +35,12 @@ _UNANSWERED = (
     _C.NAV_DELAY, _C.DO_DIGICAM_CONTROL, _C.DO_MOUNT_CONFIGURE, _C.DO_MOUNT_CONTROL, _C.DO_SET_CAM_TRIGG_DIST,
     _C.DO_SET_CAM_TRIGG_INTERVAL, _C.PREFLIGHT_UAVCAN, _C.REQUEST_CAMERA_INFORMATION, _C.SET_CAMERA_MODE,
     _C.SET_CAMERA_ZOOM, _C.SET_CAMERA_FOCUS, _C.DO_GIMBAL_MANAGER_PITCHYAW, _C.DO_GIMBAL_MANAGER_CONFIGURE,
-    _C.DO_TRIGGER_CONTROL, _C.DO_VTOL_TRANSITION, _C.DO_WINCH,
+    _C.DO_TRIGGER_CONTROL, _C.DO_WINCH,
 )  # fmt: skip
 
 _GRIP_DURATION_S = 1.3
+_TUNING_STEP_S, _TUNING_PROGRESS = 2.0, (0, 20, 40, 60, 80, 95)
+_TRANSITION_S, _NO_TRANSITION = 4.0, frozenset({modes.TAKEOFF, modes.LAND, modes.RTL, modes.ORBIT})
 _UNKNOWN_PROGRESS = 255
 _STORAGE_ACTIONS = range(5)
 _ACTUATORS, _FIRST_OUTPUT_FUNCTION = (range(1, 13), range(33, 41)), 1000
@@ -105,6 +117,8 @@ def px4_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
         MavCmd.NAV_LAND: flight.land,
         MavCmd.NAV_LAND_LOCAL: flight.land_precisely,
         MavCmd.DO_ORBIT: flight.orbit,
+        MavCmd.DO_VTOL_TRANSITION: flight.transition,
+        MavCmd.DO_AUTOTUNE_ENABLE: flight.tune,
         MavCmd.DO_CHANGE_ALTITUDE: flight.change_altitude,
         MavCmd.DO_FLIGHTTERMINATION: flight.terminate,
         MavCmd.NAV_RETURN_TO_LAUNCH: flight.return_to_launch,
@@ -112,6 +126,7 @@ def px4_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
         MavCmd.DO_CHANGE_SPEED: flight.change_speed,
         MavCmd.MISSION_START: flight.start_mission,
         MavCmd.DO_SET_HOME: flight.set_home,
+        MavCmd.EXTERNAL_WIND_ESTIMATE: px4.external.set_wind,
         MavCmd.PREFLIGHT_CALIBRATION: lambda command: px4.calibration.command(command),
         MavCmd.RUN_PREARM_CHECKS: flight.run_prearm_checks,
         MavCmd.PREFLIGHT_REBOOT_SHUTDOWN: flight.reboot,
@@ -152,6 +167,7 @@ def _change(px4: Px4Vehicle, mode: Px4Mode) -> int:
 class _Flight:
     def __init__(self, px4: Px4Vehicle) -> None:
         self._px4 = px4
+        self._tuning_since = math.nan
 
     def arm_or_disarm(self, command: ReceivedCommand) -> int | None:
         force = command.param2 == _FORCE_MAGIC
@@ -254,10 +270,42 @@ class _Flight:
         north, east, down = self._destination(command)
         radius = command.param1 if math.isfinite(command.param1) else orbit.radius_m
         speed = abs(command.param2) if math.isfinite(command.param2) else orbit.speed_m_s
+        if px4.VEHICLE_TYPE == MavType.FIXED_WING:
+            px4.flight.target, result = (north, east, down), self._change(modes.HOLD)
+            px4.flight.radius_m = radius
+            return result
         if not orbit.plan(radius, speed, (north, east), down):
             px4.send_text(MavSeverity.CRITICAL, "Orbit radius limit exceeded")
             return MavResult.ACCEPTED
         return self._change(modes.ORBIT)
+
+    def tune(self, command: ReceivedCommand) -> int | None:
+        """Start tuning, or report its progress. It then waits for disarming, as with MC_AT_APPLY 1."""
+        px4 = self._px4
+        if command.param1 != 1.0 or command.param2 != 0.0:
+            return MavResult.DENIED
+        if not px4.is_armed:
+            self._tuning_since = math.nan
+        elif math.isnan(self._tuning_since):
+            self._tuning_since = px4.now
+        steps = (px4.now - self._tuning_since) / _TUNING_STEP_S
+        progress = 0 if math.isnan(steps) else _TUNING_PROGRESS[min(int(steps), len(_TUNING_PROGRESS) - 1)]
+        answer = m.CommandAck(command.command, MavResult.IN_PROGRESS, progress, 0, *command.sender)
+        px4.send(answer, command.channel)
+        return None
+
+    def transition(self, command: ReceivedCommand) -> int | None:
+        """Report a transition, then the state of param 1. Not answered by a vehicle that is no VTOL."""
+        px4, wanted = self._px4, whole(command.param1)
+        if not px4.vtol_state:
+            return None
+        if wanted not in (MavVtolState.MC, MavVtolState.FW) or px4.mode in _NO_TRANSITION:
+            return MavResult.TEMPORARILY_REJECTED
+        is_forward = wanted == MavVtolState.FW
+        if px4.vtol_state != wanted:
+            px4.vtol_state = MavVtolState.TRANSITION_TO_FW if is_forward else MavVtolState.TRANSITION_TO_MC
+            px4.call_later(_TRANSITION_S, lambda: setattr(px4, "vtol_state", wanted))
+        return MavResult.ACCEPTED
 
     def change_altitude(self, command: ReceivedCommand) -> int:
         """Change the altitude to param 1 (AMSL)."""
@@ -298,9 +346,9 @@ class _Flight:
     def reboot(self, command: ReceivedCommand) -> int:
         if command.param1 == 0.0:
             return MavResult.ACCEPTED
-        if self._px4.is_armed or command.param1 != 1.0:
+        if self._px4.is_armed or command.param1 not in (1.0, 2.0):
             return MavResult.DENIED
-        self._px4.call_later(0.2, self._px4.restart)
+        self._px4.call_later(0.2, self._px4.restart if command.param1 == 1.0 else self._px4.shut_down)
         return MavResult.ACCEPTED
 
 

@@ -9,6 +9,7 @@ from aerokit.mavlink.enums import MavFrame, MavMissionType
 from aerokit.missions import MissionItem
 from aerokit.sim.motion import Ned, approach_speed
 from aerokit.sim.px4 import modes
+from aerokit.sim.px4.external import PrecisionLanding
 from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.manual import Px4ManualFlight
 from aerokit.sim.px4.modes import Px4Mode
@@ -96,8 +97,10 @@ class Px4Flight:
         self.destination: Ned = (0.0, 0.0, 0.0)  # Landing point of RTL: home or a rally point.
         self.heading: float | None = None
         self.speed_m_s: float = 0.0
+        self.radius_m: float = 0.0  # Radius of the circle of a plane.
         self.lifts_off: bool = False  # True if the mode requests to leave the ground.
         self.by_hand: Px4ManualFlight = Px4ManualFlight(vehicle)
+        self.precision_landing: PrecisionLanding = PrecisionLanding(vehicle)
         self.orbit: Px4Orbit = Px4Orbit(vehicle)
         self._phase = ""
         self._ramp_from = 0.0
@@ -120,6 +123,7 @@ class Px4Flight:
         self._phase = "climb"
         self.stay_here()
         self.by_hand.enter()
+        self.precision_landing.enter()
         if mode == modes.RTL and self._vehicle.is_armed:
             self._plan_return()
         elif mode == modes.MISSION:
@@ -144,8 +148,10 @@ class Px4Flight:
             return
         if mode == modes.TAKEOFF:
             self._take_off()
-        elif mode in (modes.LAND, modes.PRECISION_LAND):
+        elif mode == modes.LAND:
             self.descend()
+        elif mode == modes.PRECISION_LAND:
+            self.precision_landing.update()
         elif mode == modes.RTL:
             self._return()
         elif mode == modes.OFFBOARD:
@@ -207,12 +213,17 @@ class Px4Flight:
             motion.face(math.atan2(motion.velocity_east, motion.velocity_north))
 
     def descend(self) -> None:
-        """Descend, at MPC_Z_V_AUTO_DN above MPC_LAND_ALT1, at MPC_LAND_SPEED below MPC_LAND_ALT2."""
+        """Descend vertically."""
+        self._vehicle.motion.seek_velocity(0.0, 0.0, self.descent_speed_m_s)
+
+    @property
+    def descent_speed_m_s(self) -> float:
+        """Speed of a landing: MPC_Z_V_AUTO_DN above MPC_LAND_ALT1, MPC_LAND_SPEED below MPC_LAND_ALT2."""
         vehicle, limits = self._vehicle, self._vehicle.parameters
         fast, slow = limits["MPC_Z_V_AUTO_DN"], limits["MPC_LAND_SPEED"]
         high, low = limits["MPC_LAND_ALT1"], limits["MPC_LAND_ALT2"]
         share = min(1.0, max(0.0, (vehicle.altitude_m - low) / max(0.1, high - low)))
-        vehicle.motion.seek_velocity(0.0, 0.0, slow + (fast - slow) * share)
+        return slow + (fast - slow) * share
 
     def _plan_return(self) -> None:
         """Plan a return at RTL_RETURN_ALT above the landing point, or at RTL_DESCEND_ALT if it is near."""

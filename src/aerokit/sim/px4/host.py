@@ -65,6 +65,9 @@ class Px4FlightInterface(Protocol):
     speed_m_s: float
 
     @property
+    def descent_speed_m_s(self) -> float: ...
+
+    @property
     def top_speed_m_s(self) -> float: ...
 
     def stay_here(self) -> None: ...
@@ -111,6 +114,11 @@ class Px4OffboardInterface(Protocol):
     def fly(self) -> None: ...
 
 
+class Px4ExternalInterface(Protocol):
+    @property
+    def target(self) -> tuple[float, float] | None: ...
+
+
 class Px4Host(SimulatedAutopilot):
     """State and operations of a PX4 that its modules use; `Px4Vehicle` implements them."""
 
@@ -137,6 +145,7 @@ class Px4Host(SimulatedAutopilot):
     mission: Px4MissionInterface
     missions: Px4MissionsInterface
     offboard: Px4OffboardInterface
+    external: Px4ExternalInterface
 
     @property
     def altitude_m(self) -> float:

@@ -6,9 +6,15 @@ https://docs.px4.io/main/en/flight_modes/offboard.html
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 from aerokit.mavlink.enums import AttitudeTargetTypemask, MavFrame, MavSeverity
-from aerokit.mavlink.messages import SetAttitudeTarget, SetPositionTargetGlobalInt, SetPositionTargetLocalNed
+from aerokit.mavlink.messages import (
+    SetActuatorControlTarget,
+    SetAttitudeTarget,
+    SetPositionTargetGlobalInt,
+    SetPositionTargetLocalNed,
+)
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import PositionTarget, Setpoint, rotated
 from aerokit.sim.motion import Ned, euler_from_quaternion
@@ -22,6 +28,11 @@ _GLOBAL_FRAMES = (MavFrame.GLOBAL_INT, MavFrame.GLOBAL_RELATIVE_ALT_INT, MavFram
 _CLIMB_AT_FULL_THRUST_M_S = 5.0
 
 
+def _three(parts: Iterable[float]) -> Ned:
+    first, second, third = parts
+    return (first, second, third)
+
+
 class Px4Offboard:
     """The latest set-point. It is stored in every mode, and followed in OFFBOARD."""
 
@@ -31,10 +42,13 @@ class Px4Offboard:
         self._position, self._velocity, self._acceleration = _NAN3, _NAN3, _NAN3
         self._yaw = self._yaw_rate = math.nan
         self._attitude: tuple[float, float, float] | None = None
+        self._body_rates: tuple[float, float, float] | None = None
+        self._flown_at = 0.0
         self._thrust = 0.0
         vehicle.on(SetPositionTargetLocalNed, self._on_local)
         vehicle.on(SetPositionTargetGlobalInt, self._on_global)
         vehicle.on(SetAttitudeTarget, self._on_attitude)
+        vehicle.on(SetActuatorControlTarget, self._on_actuators)
 
     @property
     def is_fresh(self) -> bool:
@@ -94,12 +108,25 @@ class Px4Offboard:
         return True
 
     def _on_attitude(self, target: SetAttitudeTarget, _: Channel) -> None:
+        motion = self._vehicle.motion
         if target.type_mask & AttitudeTargetTypemask.ATTITUDE_IGNORE:
-            self._attitude = (0.0, 0.0, self._vehicle.motion.yaw)
+            if self._attitude is None or self._body_rates is None:
+                self._attitude = (motion.roll, motion.pitch, motion.yaw)
+            self._body_rates = (target.body_roll_rate, target.body_pitch_rate, target.body_yaw_rate)
         elif all(math.isfinite(part) for part in target.q):
-            self._attitude = euler_from_quaternion(*target.q)
+            self._attitude, self._body_rates = euler_from_quaternion(*target.q), None
         if math.isfinite(target.thrust):
             self._thrust = target.thrust
+        self.updated_at = self._vehicle.now
+
+    def _on_actuators(self, target: SetActuatorControlTarget, _: Channel) -> None:
+        """Apply the thrust of group 0; PX4 1.14 and later ignore the message."""
+        if self._vehicle.version_number >= 1 << 24 | 14 << 16:
+            return
+        motion = self._vehicle.motion
+        self._attitude, self._body_rates = (motion.roll, motion.pitch, motion.yaw), None
+        if target.group_mlx == 0:
+            self._thrust = target.controls[3]
         self.updated_at = self._vehicle.now
 
     def watch(self) -> None:
@@ -117,7 +144,11 @@ class Px4Offboard:
 
     def fly(self) -> None:
         motion = self._vehicle.motion
+        elapsed, self._flown_at = min(0.1, self._vehicle.now - self._flown_at), self._vehicle.now
         if self._attitude is not None:
+            if self._body_rates is not None:
+                turned = zip(self._attitude, self._body_rates, strict=True)
+                self._attitude = _three(angle + rate * elapsed for angle, rate in turned)
             roll, pitch, yaw = self._attitude
             climb = (max(0.0, min(1.0, self._thrust)) - 0.5) * 2.0 * _CLIMB_AT_FULL_THRUST_M_S
             motion.seek_attitude(roll, pitch, -climb)

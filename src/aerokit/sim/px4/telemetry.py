@@ -85,6 +85,7 @@ def _estimator_status(px4: Px4Vehicle) -> m.EstimatorStatus:
         flags |= _F.CONST_POS_MODE
     if not px4.has_position:
         flags &= ~_POSITION_FLAGS
+        flags |= _F.POS_HORIZ_REL if px4.external.has_vision else 0
     if not px4.is_ready:
         flags = _BOOT_FLAGS
     size = 0.02 if px4.is_ready else math.nan
@@ -99,7 +100,7 @@ def _extended_sys_state(px4: Px4Vehicle) -> m.ExtendedSysState:
         state = MavLandedState.TAKEOFF
     elif px4.mode == modes.LAND:
         state = MavLandedState.LANDING
-    return m.ExtendedSysState(0, state)
+    return m.ExtendedSysState(px4.vtol_state, state)
 
 
 def _battery_status(px4: Px4Vehicle) -> m.BatteryStatus:
@@ -226,9 +227,11 @@ def _home_position(px4: Px4Vehicle) -> m.HomePosition | None:
     )
 
 
-def global_origin(px4: Px4Vehicle) -> m.GpsGlobalOrigin:
-    """Return GPS_GLOBAL_ORIGIN, the origin of the local frame."""
-    origin = px4.frame.origin
+def global_origin(px4: Px4Vehicle) -> m.GpsGlobalOrigin | None:
+    """Return GPS_GLOBAL_ORIGIN, the origin of the local frame; None without one."""
+    if not px4.has_origin:
+        return None
+    origin = px4.external.origin or px4.frame.origin
     altitude = round(origin.altitude_m * 1000)
     return m.GpsGlobalOrigin(origin.latitude_e7, origin.longitude_e7, altitude, px4.time_boot_us)
 

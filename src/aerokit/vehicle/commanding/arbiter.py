@@ -107,17 +107,18 @@ class CommandArbiter:
 
     # ------------------------------------------------------------------------------- steering
 
-    def order(self, *modes: Mode, subjects: Iterable[Subject] = ("mode", "motion")) -> Order:
+    def order(self, *modes: Mode, subjects: Iterable[Subject] = ("mode", "motion"), ends_flight: bool = False) -> Order:
         """Create a steering order that may bring about these modes.
 
-        It supersedes the previous one and posted orders about these subjects.
+        It supersedes the previous one and posted orders about these subjects. A failsafe does not end one that ends the
+        flight.
         """
         self._notify_steering()
         self._modes_ordered.extend((self._now(), mode.custom_mode) for mode in modes)
         if self._posted_modes():
             self.doubt_mode()
         was_flown = self.is_flown_by_program
-        order = self._watching(modes, (STEERING,), self._end_flights(modes))
+        order = self._watching(modes, (STEERING,), ends_flight or self._end_flights(modes))
         order.was_flown_before = was_flown
         order.may_move = self._steers()
         self._register(order, (*subjects, STEERING, ACTION))

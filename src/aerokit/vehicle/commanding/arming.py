@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import anyio
 
 from aerokit._internal.arguments import checks_arguments
+from aerokit._internal.formatting import short_repr
 from aerokit.errors import (
     AerokitError,
     CommandRejected,
@@ -17,7 +18,8 @@ from aerokit.errors import (
     OperationRejected,
     OperationTimeout,
 )
-from aerokit.mavlink.enums import MavCmd
+from aerokit.mavlink.enums import MavCmd, MavSeverity
+from aerokit.mavlink.messages import Statustext
 from aerokit.vehicle.commanding.cleanup import ARM_WATCH_S
 from aerokit.vehicle.commanding.context import VehicleBase
 from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, ChangeSignal, await_progress
@@ -34,6 +36,8 @@ POLL_INTERVAL_S = 0.1
 # MAV_STATE_BOOT and MAV_STATE_CALIBRATING.
 BOOTING = (1, 2)
 REBOOT_ANSWER_S = 3.0
+MAX_REASON_BYTES = 50
+"""Bytes of text in one STATUSTEXT."""
 MODE_READY_TIMEOUT_S = 3.0
 """Seconds that a vehicle may need to become armable after a mode change."""
 
@@ -91,6 +95,7 @@ class ArmingActions(VehicleBase):
         *,
         mode: str | int | None = None,
         force: bool = False,
+        reason: str = "",
         timeout: float = 10.0,
         max_silence_s: float | None = MAX_SILENCE_S,
     ) -> None:
@@ -107,11 +112,15 @@ class ArmingActions(VehicleBase):
             mode: the mode to arm in. None: the present mode, or one that ``take_off`` starts in if the present mode
                 does not allow arming.
             force: skip the vehicle's own arming checks. Dangerous.
+            reason: why your program arms, at most 50 bytes. Logger "aerokit" reports it at INFO, and a STATUSTEXT takes
+                it to the vehicle right before the command, where ArduPilot writes it into its flight log. PX4 logs only
+                texts that have the vehicle's own system id.
             timeout: seconds for HEARTBEAT to report armed after the command was accepted.
             max_silence_s: raise when no heartbeat was received for this long; None: wait until ``timeout``.
 
         Raises:
-            InvalidArgument: there is no such mode, or it does not allow arming. Nothing was sent.
+            InvalidArgument: there is no such mode, it does not allow arming, or the reason is too long. Nothing was
+                sent.
             CommandRejected: the vehicle refused; ``reasons`` has its pre-arm texts, failing sensors and missing
                 estimates. Where the vehicle can run its checks on request, they are run again for this.
             CommandTimeout: there was no acknowledgement, and the vehicle did not arm; the text says whether it may
@@ -121,10 +130,15 @@ class ArmingActions(VehicleBase):
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the vehicle accepted the command but did not arm.
         """
+        if len(reason.encode()) > MAX_REASON_BYTES:
+            raise InvalidArgument(f"reason = {short_repr(reason)} is not allowed: at most {MAX_REASON_BYTES} bytes")
         wanted = self._mode_to_arm_in(mode)
         if wanted is not None:
             await self._change_to_arming_mode(wanted)
         self._arm_cleanup.stop()
+        if reason:
+            logger.info("arming vehicle %d: %s", self.system_id, reason)
+            self.connection.send(Statustext(MavSeverity.INFO, reason, 0, 0))
         started, was_armed = self.connection.now(), self.telemetry.is_armed
         with self._arbiter.auxiliary_order() as order:
             try:

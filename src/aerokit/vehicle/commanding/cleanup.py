@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import anyio
 
 from aerokit.connection.tasks import Cancellation
-from aerokit.errors import AerokitError, OperationTimeout
+from aerokit.errors import AerokitError, BusyError, HeartbeatTimeout, OperationTimeout
 from aerokit.mavlink.enums import MavCmd, MavDoRepositionFlags
 from aerokit.vehicle.commanding.arbiter import ARM_HEARTBEAT_DELAY_S, was_armed_by_order
 
@@ -223,6 +223,27 @@ class FlightCleanup:
         finally:
             if self._flight is order:
                 self._flight = None
+
+    @contextmanager
+    def preparing(self, mode: Mode) -> Iterator[Order]:
+        """Give the order for this mode before the preparation of a stream, which may wait.
+
+        Raises:
+            BusyError: another stream is open.
+            OperationRejected: the order has ended meanwhile: it was superseded or taken over.
+            HeartbeatTimeout: the vehicle is silent.
+        """
+        if self.stop_stream is not None:
+            raise BusyError("another set-point stream is open: leave it first; nothing was sent")
+        order = self._arbiter.order(mode)
+        try:
+            yield order
+            self._sender.raise_if_ended(order)
+            if not self._arbiter.is_known:
+                raise HeartbeatTimeout(f"{self._session.describe_link()}; nothing was sent")
+        except BaseException:
+            self.hold_in_background(order)
+            raise
 
     def end_flights(self) -> None:
         """End the flights of other tasks and hold the vehicle, when its block is left."""

@@ -172,11 +172,26 @@ MAX_DISTANCE_M = 100_000.0
 """
 
 
+CIRCLE_MARGIN = 1.3
+"""Part of its radius within which a vehicle flies a circle."""
+
+
 class VehiclePosition:
     """Distances and altitudes from the vehicle's reported position."""
 
     def __init__(self, session: VehicleSession) -> None:
         self._telemetry, self._autopilot = session.telemetry, session.autopilot
+        self._circle_m = 0.0
+        session.telemetry.mode.observe(lambda *_: self.note_circle(0.0))
+
+    def note_circle(self, radius_m: float) -> None:
+        """Record the radius that was ordered: ArduPlane keeps it for the next place, until it leaves GUIDED."""
+        self._circle_m = radius_m
+
+    @property
+    def arrival_radius_m(self) -> float:
+        """Distance in metres at which the vehicle counts as arrived; includes the circle that it was ordered to fly."""
+        return max(self._autopilot.arrival_radius_m, CIRCLE_MARGIN * self._circle_m)
 
     def distance_to(self, target: Position) -> float:
         """Return the distance to ``target`` in metres, three-dimensional if ``target`` has an altitude.
@@ -187,7 +202,7 @@ class VehiclePosition:
         if here is None:
             return math.inf
         along = geo.distance_m(here.latitude_deg, here.longitude_deg, target.latitude_deg, target.longitude_deg)
-        return math.hypot(along, self._altitude_difference(here, target))
+        return math.hypot(along, self.height_above(here, target))
 
     def check_reach(self, name: str, places: Iterable[Position], max_distance_m: float) -> None:
         """Raise InvalidArgument for a place farther away than the limit; accept all while the position is unknown."""
@@ -214,7 +229,8 @@ class VehiclePosition:
         return self.distance_to(target)
 
     @staticmethod
-    def _altitude_difference(here: Position, target: Position) -> float:
+    def height_above(here: Position, target: Position) -> float:
+        """Return how much higher the first place is; 0 if that is not known."""
         for mine, its in (
             (here.altitude_relative_m, target.altitude_relative_m),
             (here.altitude_amsl_m, target.altitude_amsl_m),

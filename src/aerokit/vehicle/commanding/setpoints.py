@@ -8,10 +8,12 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+from aerokit._internal.arguments import check_range
 from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavFrame
 from aerokit.mavlink.messages import (
+    SetActuatorControlTarget,
     SetAttitudeTarget,
     SetPositionTargetGlobalInt,
     SetPositionTargetLocalNed,
@@ -25,18 +27,22 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AccelerationSetpoint",
+    "ActuatorSetpoint",
+    "AttitudeRateSetpoint",
     "AttitudeSetpoint",
     "BodyVelocitySetpoint",
     "LocalPositionSetpoint",
     "PositionSetpoint",
     "SetpointEncoder",
+    "TrajectorySetpoint",
     "VelocitySetpoint",
     "wants_motion",
 ]
 
 IGNORE_POSITION, IGNORE_VELOCITY, IGNORE_ACCELERATION = 0x007, 0x038, 0x1C0
 IGNORE_YAW, IGNORE_YAW_RATE = 0x400, 0x800
-IGNORE_BODY_RATES = 0x07
+IGNORE_BODY_RATES, IGNORE_ATTITUDE = 0x07, 0x80
+ACTUATORS_PER_GROUP, MAX_BODY_RATE_DEG_S = 8, 3600.0
 # Below this speed, or within this many arrival radii, a vehicle that obeys may stand still.
 SLOW_M_S, MAX_RESTING_RADII = 0.3, 2.0
 
@@ -102,9 +108,47 @@ class AttitudeSetpoint(Snapshot):
     thrust: float
 
 
+class AttitudeRateSetpoint(Snapshot):
+    """Body rates in degrees/s, at most 3600 in either direction, and ``thrust`` from 0 to 1.
+
+    Positive rates roll to the right, pitch up and turn clockwise. ``thrust`` is as in :class:`AttitudeSetpoint`.
+    """
+
+    roll_deg_s: float = 0.0
+    pitch_deg_s: float = 0.0
+    yaw_deg_s: float = 0.0
+    thrust: float = 0.5
+
+
+class ActuatorSetpoint(Snapshot):
+    """Eight normalized controls, −1 to 1, of one actuator control group (0 to 3) of PX4's old mixers."""
+
+    controls: tuple[float, ...]
+    group: int = 0
+
+
+class TrajectorySetpoint(Snapshot):
+    """Position in metres from the estimator's origin, with the velocity (m/s) and the acceleration (m/s²) there.
+
+    Velocity and acceleration are feed-forward: with them the vehicle follows a moving position without lag.
+    """
+
+    north_m: float
+    east_m: float
+    down_m: float
+    north_m_s: float = 0.0
+    east_m_s: float = 0.0
+    down_m_s: float = 0.0
+    north_m_s2: float = 0.0
+    east_m_s2: float = 0.0
+    down_m_s2: float = 0.0
+    yaw_deg: float | None = None
+    yaw_rate_deg_s: float | None = None
+
+
 def wants_motion(setpoint: object, context: VehicleContext) -> bool:
     """Return True if a vehicle that obeys this set-point must move now; False if unknown."""
-    if isinstance(setpoint, VelocitySetpoint):
+    if isinstance(setpoint, (VelocitySetpoint, TrajectorySetpoint)):
         return math.hypot(setpoint.north_m_s, setpoint.east_m_s, setpoint.down_m_s) >= SLOW_M_S
     if isinstance(setpoint, BodyVelocitySetpoint):
         return math.hypot(setpoint.forward_m_s, setpoint.right_m_s, setpoint.down_m_s) >= SLOW_M_S
@@ -159,6 +203,18 @@ class SetpointEncoder:
         vector = (s.north_m, s.east_m, s.down_m)
         return self._local(MavFrame.LOCAL_NED, IGNORE_POSITION, vector, s.yaw_deg, s.yaw_rate_deg_s)
 
+    def trajectory(self, s: TrajectorySetpoint) -> Message:
+        """Return SET_POSITION_TARGET_LOCAL_NED with position, velocity and acceleration in MAV_FRAME_LOCAL_NED."""
+        vectors = (
+            *(s.north_m, s.east_m, s.down_m),
+            *(s.north_m_s, s.east_m_s, s.down_m_s),
+            *(s.north_m_s2, s.east_m_s2, s.down_m_s2),
+        )
+        _check_finite("set-point", *vectors)
+        mask, yaw, yaw_rate = _yaw(s.yaw_deg, s.yaw_rate_deg_s)
+        address = (self._session.system_id, self._session.component_id)
+        return SetPositionTargetLocalNed(self._time_ms(), *address, MavFrame.LOCAL_NED, mask, *vectors, yaw, yaw_rate)
+
     def _local(
         self,
         frame: int,
@@ -208,8 +264,7 @@ class SetpointEncoder:
     def attitude(self, s: AttitudeSetpoint) -> Message:
         """Return SET_ATTITUDE_TARGET with attitude and thrust."""
         _check_finite("attitude", s.roll_deg, s.pitch_deg, s.yaw_deg, s.thrust)
-        if not 0 <= s.thrust <= 1:
-            raise InvalidArgument(f"thrust = {s.thrust} is not allowed: 0 to 1")
+        check_range("thrust", s.thrust, 0, 1)
         return SetAttitudeTarget(
             self._time_ms(),
             self._session.system_id,
@@ -220,6 +275,35 @@ class SetpointEncoder:
             0.0,
             0.0,
             s.thrust,
+        )
+
+    def attitude_rate(self, s: AttitudeRateSetpoint) -> Message:
+        """Return SET_ATTITUDE_TARGET with body rates and thrust."""
+        rates = (s.roll_deg_s, s.pitch_deg_s, s.yaw_deg_s)
+        for name, rate in zip(("roll_deg_s", "pitch_deg_s", "yaw_deg_s"), rates, strict=True):
+            check_range(name, rate, -MAX_BODY_RATE_DEG_S, MAX_BODY_RATE_DEG_S)
+        check_range("thrust", s.thrust, 0, 1)
+        return SetAttitudeTarget(
+            self._time_ms(),
+            self._session.system_id,
+            self._session.component_id,
+            IGNORE_ATTITUDE,
+            (1.0, 0.0, 0.0, 0.0),
+            math.radians(s.roll_deg_s),
+            math.radians(s.pitch_deg_s),
+            math.radians(s.yaw_deg_s),
+            s.thrust,
+        )
+
+    def actuators(self, s: ActuatorSetpoint) -> Message:
+        """Return SET_ACTUATOR_CONTROL_TARGET."""
+        check_range("group", s.group, 0, 3)
+        if len(s.controls) != ACTUATORS_PER_GROUP:
+            raise InvalidArgument(f"controls = {s.controls!r} is not allowed: {ACTUATORS_PER_GROUP} numbers")
+        for control in s.controls:
+            check_range("controls", control, -1, 1)
+        return SetActuatorControlTarget(
+            self._time_ms() * 1000, s.group, self._session.system_id, self._session.component_id, s.controls
         )
 
     def _time_ms(self) -> int:

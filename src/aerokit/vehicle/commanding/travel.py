@@ -82,7 +82,7 @@ class TravelActions(VehicleBase):
         latitude, longitude, altitude, is_relative = self._position.global_target(target)
         _check_travel(speed_m_s, heading_deg, tolerance_m, timeout)
         self._position.check_reach("target", [target], max_distance_m)
-        near_m = self.autopilot.arrival_radius_m if tolerance_m is None else tolerance_m
+        near_m = self._position.arrival_radius_m if tolerance_m is None else tolerance_m
         self._check_can_turn(heading_deg)
         if not self.telemetry.is_armed:
             raise OperationRejected("go_to: the vehicle is not armed; nothing was sent")

@@ -10,7 +10,7 @@ import anyio
 from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit._internal.async_block import ReadOnly
 from aerokit.errors import CommandRejected, InvalidArgument, OperationRejected
-from aerokit.mavlink.enums import MavCmd, MotorTestThrottleType, ParachuteAction
+from aerokit.mavlink.enums import MavCmd, MavComponent, MotorTestThrottleType, ParachuteAction
 from aerokit.vehicle.commanding.progress import await_progress
 from aerokit.vehicle.commanding.simple_orders import Argument, Effect, SimpleOrder
 from aerokit.vehicle.devices.text_effect import await_text, collected_texts
@@ -31,7 +31,6 @@ TEST_END_TIMEOUT_S = 4.0
 PARACHUTE_TIMEOUT_S = 3.0
 ACTUATORS = 6
 ALL_GEARS = -1
-ILLUMINATOR = 243
 OUTPUTS_PER_MESSAGE = 16
 
 
@@ -204,7 +203,7 @@ class Actuators(ReadOnly):
         """
         await LANDING_GEAR.send(self._context, 0, topic="landing gear")
 
-    async def set_lights(self, on: bool, *, component_id: int = ILLUMINATOR) -> None:
+    async def set_lights(self, on: bool, *, component_id: int = MavComponent.ILLUMINATOR) -> None:
         """Switch an illuminator, and return when ILLUMINATOR_STATUS reports it (MAV_CMD_ILLUMINATOR_ON_OFF).
 
         For lights that are a MAVLink component. ArduPilot and PX4 do not have the command; lights on an output of

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from aerokit.autopilots import Autopilot, autopilot_for
 from aerokit.connection.cells import Source, StateCell
 from aerokit.connection.heartbeats import is_autopilot
-from aerokit.mavlink.message import offset_of
+from aerokit.mavlink.message import decoder_of, offset_of
 from aerokit.vehicle.state.field import MESSAGE_IDS, Context, MessageSource, StreamedMessage, message_type
 from aerokit.vehicle.state.states import DEFAULT_RATES_HZ, LAZY, SOURCES, STATES, States
 from aerokit.vehicle.state.status_text import StatusTextAssembler
@@ -238,7 +238,7 @@ class Telemetry(States):
 
     def _streamed(self, class_name: str, handler: Handler) -> StreamedMessage:
         source, kind = self._source(class_name), message_type(class_name)
-        decode = kind.decode_body
+        decode = decoder_of(kind)
 
         def apply(frame: Frame, message: Message | None) -> None:
             decoded = decode(frame.body, frame) if message is None else message

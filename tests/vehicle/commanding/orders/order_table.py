@@ -12,6 +12,7 @@ from call_table import CALLS, Row, north
 import aerokit
 from aerokit import missions
 from aerokit.mavlink.enums import MavCmd
+from aerokit.vehicle.external.values import TargetMeasurement
 
 Give = Callable[[aerokit.Vehicle], Awaitable[object]]
 
@@ -19,6 +20,17 @@ Give = Callable[[aerokit.Vehicle], Awaitable[object]]
 async def _fly_setpoints(vehicle: aerokit.Vehicle) -> None:
     async with vehicle.guided.velocity() as stream:
         await stream.fly(aerokit.VelocitySetpoint(north_m_s=1.0), 6.0)
+
+
+async def _follow(vehicle: aerokit.Vehicle) -> None:
+    target = north(vehicle, 12.0)
+    async with vehicle.follow(lambda: target, distance_m=4) as following:
+        await following.fly(6.0)
+
+
+async def _fly_by_sticks(vehicle: aerokit.Vehicle) -> None:
+    async with vehicle.sticks() as sticks:
+        await sticks.move(aerokit.StickInput(forward=0.3), 6.0)
 
 
 async def upload(vehicle: aerokit.Vehicle) -> None:
@@ -121,6 +133,37 @@ ROWS = (
         holds=True,
     ),
     Row(
+        "orbit",
+        lambda v: v.orbit(north(v, 12.0), radius_m=6, speed_m_s=3, timeout=30),
+        SET_MODE,
+        modes=(("GUIDED", "BRAKE"), ()),
+        holds=True,
+        on=("ardupilot",),
+    ),
+    Row(
+        "orbit",
+        lambda v: v.orbit(north(v, 12.0), radius_m=6, speed_m_s=3, timeout=30),
+        int(MavCmd.DO_ORBIT),
+        modes=((), ("ORBIT", "LOITER")),
+        holds=True,
+        on=("px4",),
+    ),
+    Row(
+        "figure_eight",
+        lambda v: v.figure_eight(north(v, 12.0), major_radius_m=8, minor_radius_m=4, speed_m_s=3, timeout=30),
+        SET_MODE,
+        modes=(("GUIDED", "BRAKE"), ("OFFBOARD", "LOITER")),
+        holds=True,
+    ),
+    Row(
+        "loiter",
+        lambda v: v.loiter(north(v, 12.0), duration_s=2, timeout=30),
+        REPOSITION,
+        modes=(("GUIDED", "BRAKE"), ("LOITER",)),
+        holds=True,
+    ),
+    Row("follow", _follow, SET_MODE, modes=(("GUIDED", "BRAKE"), ("OFFBOARD", "LOITER")), holds=True),
+    Row(
         "take_off",
         lambda v: v.take_off(6.0, timeout=30),
         int(MavCmd.NAV_TAKEOFF),
@@ -141,6 +184,26 @@ ROWS = (
         SET_MODE,
         modes=(("GUIDED", "BRAKE"), ("OFFBOARD", "LOITER")),
         holds=True,
+    ),
+    Row(
+        "sticks",
+        _fly_by_sticks,
+        SET_MODE,
+        modes=(("LOITER", "BRAKE"), ("POSCTL", "LOITER")),
+        holds=True,
+    ),
+    Row(
+        "land_on",
+        lambda v: v.land_on(lambda: TargetMeasurement(0.1, 0.1, 5.0, is_level=True), timeout=60),
+        SET_MODE,
+        modes=((), ("PRECLAND",)),
+        on=("px4",),  # ArduPilot needs parameters
+    ),
+    Row(
+        "external.set_wind",
+        lambda v: v.external.set_wind(3.0, 90.0),
+        int(MavCmd.EXTERNAL_WIND_ESTIMATE),
+        steers=False,
     ),
     Row(
         "mission.start",

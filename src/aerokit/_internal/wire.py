@@ -1,0 +1,75 @@
+"""Choice of the wire: compiled (`aerokit._wire`, built from ``_wire.c``) or pure Python, decided once, at import.
+
+The Python code is the reference, and is used where the extension is not built, was built from other sources, or is
+switched off by the environment variable ``AEROKIT_PURE=1``.
+"""
+
+from __future__ import annotations
+
+import os
+from importlib import import_module
+from types import MemberDescriptorType
+from typing import TYPE_CHECKING, Any
+
+_VERSION = 1  # as in _wire.c: a stale build in a clone is not used
+
+
+def _load() -> Any:
+    if os.environ.get("AEROKIT_PURE", "") not in ("", "0"):
+        return None
+    try:
+        module = import_module("aerokit._wire")
+    except ImportError:
+        return None
+    return module if getattr(module, "VERSION", None) == _VERSION else None
+
+
+wire: Any = _load()
+"""The module `aerokit._wire`, or None."""
+
+wire_implementation: str = "python" if wire is None else "c"
+"""``"c"`` if frames and messages are processed by the compiled extension, ``"python"`` if by Python code."""
+
+
+class _FrameFields:
+    __slots__ = ("_raw", "body", "checksum", "component_id", "message_id", "received_at", "system_id")
+
+
+class _SourceFields:
+    __slots__ = ("expected",)
+
+
+class _CounterFields:
+    __slots__ = ("bytes",)
+
+
+class Copyable:
+    """Lets objects with compiled fields be copied and pickled, in the form in which those with slots are."""
+
+    __slots__ = ()
+
+    def __getstate__(self) -> tuple[None, dict[str, Any]]:
+        names = (
+            name
+            for cls in type(self).__mro__
+            for name, value in vars(cls).items()
+            if isinstance(value, MemberDescriptorType) and hasattr(self, name)
+        )
+        return None, {name: getattr(self, name) for name in names}
+
+
+# Base classes with the fields that compiled code accesses.
+if TYPE_CHECKING:
+
+    class FrameFields: ...
+
+    class SourceFields: ...
+
+    class CounterFields: ...
+elif wire is None:
+    FrameFields, SourceFields, CounterFields = _FrameFields, _SourceFields, _CounterFields
+else:
+    FrameFields, SourceFields, CounterFields = (
+        type(base.__name__, (Copyable, base), {"__slots__": ()})
+        for base in (wire.FrameFields, wire.SourceFields, wire.CounterFields)
+    )

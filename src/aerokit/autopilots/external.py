@@ -1,0 +1,117 @@
+"""`ExternalRules`: the measurements of a companion computer that an autopilot accepts, and the parameters they need."""
+
+from __future__ import annotations
+
+from typing import Literal, TypeAlias
+
+from aerokit._internal.values import Snapshot
+from aerokit.mavlink.enums import MavFrame
+
+__all__ = ["ARDUPILOT_EXTERNAL", "PX4_EXTERNAL", "ExternalKind", "ExternalRule", "ExternalRules"]
+
+ExternalKind: TypeAlias = Literal[
+    "odometry",
+    "vision_position",
+    "vision_speed",
+    "motion_capture",
+    "gps",
+    "obstacles",
+    "obstacle_points",
+    "range_finder",
+    "landing_target",
+    "optical_flow",
+]
+"""Kind of measurement."""
+
+
+class ExternalRule(Snapshot):
+    """Parameters that decide about one kind of measurement.
+
+    - ``required``: alternative names of a parameter, and the values with which the autopilot reads the messages
+    - ``sole_source``: names of parameters, and the values with which the estimator has no other source of the position
+      or velocity, for parameters that the vehicle has
+    """
+
+    required: tuple[tuple[tuple[str, ...], tuple[float, ...]], ...] = ()
+    sole_source: tuple[tuple[str, tuple[float, ...]], ...] = ()
+
+
+class ExternalRules(Snapshot):
+    """Supported kinds of measurements, and their messages where those differ.
+
+    - ``ned_frame``: MAV_FRAME for a pose north, east, down in ODOMETRY
+    - ``has_mocap``: the estimator reads ATT_POS_MOCAP; otherwise VISION_POSITION_ESTIMATE is sent
+    - ``has_vision_speed``: it reads VISION_SPEED_ESTIMATE; otherwise ODOMETRY without a pose is sent
+    - ``flow_in_radians``: it reads OPTICAL_FLOW_RAD instead of OPTICAL_FLOW
+    - ``target_is_local``: it needs the landing target in the local frame instead of relative to the vehicle
+    - ``constant_position_at_rest``: the flag CONST_POS_MODE is also set for a vehicle at rest that has a position
+    - ``origin_is_final``: it refuses another origin of the local frame once it has one
+    """
+
+    kinds: tuple[tuple[ExternalKind, ExternalRule], ...] = ()
+    ned_frame: int = MavFrame.LOCAL_NED
+    has_mocap: bool = True
+    has_vision_speed: bool = True
+    flow_in_radians: bool = False
+    target_is_local: bool = False
+    constant_position_at_rest: bool = False
+    origin_is_final: bool = False
+
+    def find(self, kind: ExternalKind) -> ExternalRule | None:
+        """Return the rule for a kind; None if the autopilot does not accept it."""
+        return dict(self.kinds).get(kind)
+
+
+def _external_navigation(what: str) -> ExternalRule:
+    """Return the rule of AP_VisualOdom: its type, and source 6 (ExternalNav) in each set of EK3_SRC."""
+    sources = [(f"EK3_SRC1_{what}", (6.0,)), *((f"EK3_SRC{n}_{what}", (0.0, 6.0)) for n in (2, 3))]
+    return ExternalRule(((("VISO_TYPE",), (1.0, 2.0, 3.0)),), tuple(sources))
+
+
+_GPS_ALONE = (("EK3_SRC1_POSXY", (3.0,)), ("EK3_SRC2_POSXY", (0.0, 3.0)), ("GPS2_TYPE", (0.0,)))
+
+ARDUPILOT_EXTERNAL = ExternalRules(
+    kinds=(
+        ("odometry", _external_navigation("POSXY")),
+        ("vision_position", _external_navigation("POSXY")),
+        ("motion_capture", _external_navigation("POSXY")),
+        ("vision_speed", _external_navigation("VELXY")),
+        ("gps", ExternalRule(((("GPS1_TYPE", "GPS_TYPE"), (14.0,)),), _GPS_ALONE)),
+        ("obstacles", ExternalRule(((("PRX1_TYPE", "PRX_TYPE"), (2.0,)),))),
+        ("obstacle_points", ExternalRule(((("PRX1_TYPE", "PRX_TYPE"), (2.0,)),))),
+        ("range_finder", ExternalRule(((("RNGFND1_TYPE",), (10.0,)),))),
+        ("landing_target", ExternalRule(((("PLND_ENABLED",), (1.0,)), (("PLND_TYPE",), (1.0,))))),
+        ("optical_flow", ExternalRule(((("FLOW_TYPE",), (5.0,)),))),
+    ),
+    ned_frame=MavFrame.LOCAL_FRD,  # GCS_Common.cpp, handle_odometry: the only frame; the estimator reads it as NED
+    origin_is_final=True,  # GCS_Common.cpp, set_ekf_origin
+)
+
+# EKF2_EV_CTRL: 1 horizontal position, 2 vertical position, 4 velocity, 8 yaw. EKF2_GPS_CTRL: 1 position, 2 altitude,
+# 4 velocity.
+_EV_ANY = tuple(float(bits) for bits in range(1, 16))
+_EV_VELOCITY = tuple(bits for bits in _EV_ANY if int(bits) & 4)
+_NO_GPS_POSITION = tuple(float(bits) for bits in range(0, 16, 2))
+_VISION_ALONE = (
+    ("EKF2_EV_CTRL", tuple(bits for bits in _EV_ANY if int(bits) & 1)),
+    ("EKF2_GPS_CTRL", _NO_GPS_POSITION),
+)
+_VISION = ExternalRule(((("EKF2_EV_CTRL",), _EV_ANY),), _VISION_ALONE)
+
+PX4_EXTERNAL = ExternalRules(
+    kinds=(
+        ("odometry", _VISION),
+        ("vision_position", _VISION),
+        ("motion_capture", _VISION),
+        ("vision_speed", ExternalRule(((("EKF2_EV_CTRL",), _EV_VELOCITY),))),
+        ("obstacles", ExternalRule()),
+        ("range_finder", ExternalRule()),
+        ("landing_target", ExternalRule()),
+        ("optical_flow", ExternalRule(((("EKF2_OF_CTRL",), (1.0,)),))),
+    ),
+    has_mocap=False,  # EKF2.hpp subscribes to vehicle_visual_odometry only
+    has_vision_speed=False,
+    flow_in_radians=True,
+    constant_position_at_rest=True,  # seen in flight; ArduPilot sets it only without aiding
+    target_is_local=True,  # mavlink_receiver.cpp, handle_message_landing_target
+)

@@ -1,0 +1,90 @@
+"""Measurements that a companion computer sends to a simulated ArduPilot: poses, landing targets, sensors."""
+
+from __future__ import annotations
+
+import math
+
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import MavFrame, MavResult
+from aerokit.mavlink.message import Message
+from aerokit.sim.ardupilot.host import ArduPilotHost
+from aerokit.sim.channel import Channel
+from aerokit.sim.commands import ReceivedCommand, rotated
+
+_EXTERNAL_NAVIGATION = (m.Odometry, m.VisionPositionEstimate, m.AttPosMocap)
+_SENSORS = (
+    *(m.VisionSpeedEstimate, m.GpsInput, m.ObstacleDistance, m.ObstacleDistance3d),
+    *(m.DistanceSensor, m.OpticalFlow),
+)
+_MAVLINK = 1
+_TARGET_TIMEOUT_S, _APPROACH_PER_S, _MAX_APPROACH_M_S = 2.0, 0.8, 1.5
+
+
+class ArduPilotExternal:
+    """The newest measurement of each kind. Only external navigation (VISO_TYPE) and landing targets have effects."""
+
+    def __init__(self, vehicle: ArduPilotHost) -> None:
+        self._vehicle = vehicle
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all measurements, as a reboot does."""
+        self.latest: dict[type[Message], Message] = {}
+        self._navigation_at = self._target_at = -math.inf
+        self._target: tuple[float, float] = (0.0, 0.0)
+        self.wind: tuple[float, float] | None = None  # Speed in m/s, and direction in degrees that it comes from.
+
+    def listen(self) -> None:
+        """Register the handlers."""
+        vehicle = self._vehicle
+        for kind in _EXTERNAL_NAVIGATION:
+            vehicle.on(kind, self._on_navigation)
+        for sensor in _SENSORS:
+            vehicle.on(sensor, self._on_sensor)
+        vehicle.on(m.LandingTarget, self._on_target)
+
+    @property
+    def navigation_age_s(self) -> float:
+        """Seconds since the last pose; infinity before the first one."""
+        return self._vehicle.now - self._navigation_at
+
+    def velocity_to_target(self) -> tuple[float, float]:
+        """Return the horizontal velocity of a landing towards a target that was seen recently, else zero."""
+        if self._vehicle.now - self._target_at > _TARGET_TIMEOUT_S:
+            return (0.0, 0.0)
+        motion = self._vehicle.motion
+        north, east = (
+            _APPROACH_PER_S * (self._target[0] - motion.north),
+            _APPROACH_PER_S * (self._target[1] - motion.east),
+        )
+        speed = math.hypot(north, east)
+        share = 1.0 if speed <= _MAX_APPROACH_M_S else _MAX_APPROACH_M_S / speed
+        return (north * share, east * share)
+
+    def _on_navigation(self, message: Message, _: Channel) -> None:
+        if not self._vehicle.parameters.get("VISO_TYPE", 0.0):
+            return
+        frames = (MavFrame.LOCAL_FRD, MavFrame.BODY_FRD)
+        if isinstance(message, m.Odometry) and (message.frame_id, message.child_frame_id) != frames:
+            return
+        self.latest[type(message)] = message
+        self._navigation_at = self._vehicle.now
+
+    def _on_sensor(self, message: Message, _: Channel) -> None:
+        self.latest[type(message)] = message
+
+    def _on_target(self, target: m.LandingTarget, _: Channel) -> None:
+        parameters, motion = self._vehicle.parameters, self._vehicle.motion
+        is_enabled = parameters.get("PLND_ENABLED", 0.0) and parameters.get("PLND_TYPE", 0.0) == _MAVLINK
+        if not is_enabled or target.frame not in (MavFrame.BODY_FRD, MavFrame.LOCAL_FRD):
+            return
+        self.latest[type(target)] = target
+        north, east, _down = rotated((target.x, target.y, target.z), motion.yaw)
+        self._target, self._target_at = (motion.north + north, motion.east + east), self._vehicle.now
+
+    def set_wind(self, command: ReceivedCommand) -> int:
+        """Execute EXTERNAL_WIND_ESTIMATE; the wind has no effect."""
+        if command.param1 < 0 or not 0 <= command.param3 <= 360:
+            return MavResult.DENIED
+        self.wind = (command.param1, command.param3)
+        return MavResult.ACCEPTED

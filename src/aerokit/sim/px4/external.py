@@ -1,0 +1,129 @@
+"""Measurements that a companion computer sends to a simulated PX4, and precision landing."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import MavFrame, MavResult
+from aerokit.sim.commands import ReceivedCommand
+from aerokit.sim.motion import GlobalPoint
+
+if TYPE_CHECKING:
+    from aerokit.mavlink.message import Message
+    from aerokit.sim.channel import Channel
+    from aerokit.sim.px4.host import Px4Host
+
+_SENSORS = (m.ObstacleDistance, m.DistanceSensor, m.OpticalFlowRad)
+_VISION_TIMEOUT_S = 5.0
+_APPROACH_PER_S, _MAX_APPROACH_M_S = 0.8, 1.5
+_HORIZONTAL, _GPS_POSITION = 1, 1
+
+
+class Px4External:
+    """The newest measurement of each kind. External vision (EKF2_EV_CTRL) and landing targets have effects."""
+
+    def __init__(self, px4: Px4Host) -> None:
+        self._px4 = px4
+        self.latest: dict[type[Message], Message] = {}
+        self.clock_answers: int = 0
+        """Number of answers to TIMESYNC requests."""
+        self.origin: GlobalPoint | None = None
+        """Origin set by SET_GPS_GLOBAL_ORIGIN."""
+        self._vision_at = self._target_at = -math.inf
+        self._target: tuple[float, float] = (0.0, 0.0)
+        self.wind: tuple[float, float] | None = None
+        """Speed in m/s, and direction in degrees that the wind comes from, by EXTERNAL_WIND_ESTIMATE."""
+        px4.on(m.Odometry, self._on_vision)
+        px4.on(m.VisionPositionEstimate, self._on_vision)
+        px4.on(m.LandingTarget, self._on_target)
+        px4.on(m.SetGpsGlobalOrigin, self._on_origin)
+        px4.observe(m.Timesync, self._on_timesync)
+        for sensor in _SENSORS:
+            px4.on(sensor, self._on_sensor)
+
+    @property
+    def has_gps(self) -> bool:
+        """True if the estimator uses GPS."""
+        is_used = int(self._px4.parameters["EKF2_GPS_CTRL"]) & _GPS_POSITION
+        return bool(is_used) and not self._px4.faults.gps_lost
+
+    @property
+    def has_vision(self) -> bool:
+        """True if the estimator uses external vision, received within five seconds."""
+        is_used = int(self._px4.parameters["EKF2_EV_CTRL"]) & _HORIZONTAL
+        return bool(is_used) and self._px4.now - self._vision_at <= _VISION_TIMEOUT_S
+
+    @property
+    def target(self) -> tuple[float, float] | None:
+        """Place of the landing target (north, east) in the world frame; None if it was lost for PLD_BTOUT seconds."""
+        is_fresh = self._px4.now - self._target_at <= self._px4.parameters["PLD_BTOUT"]
+        return self._target if is_fresh else None
+
+    def set_wind(self, command: ReceivedCommand) -> int:
+        """Execute EXTERNAL_WIND_ESTIMATE; the wind has no effect."""
+        self.wind = (command.param1, command.param3)
+        return MavResult.ACCEPTED
+
+    def _on_vision(self, message: Message, _: Channel) -> None:
+        if isinstance(message, m.Odometry) and not math.isfinite(message.x):
+            self.latest[type(message)] = message
+            return
+        self.latest[type(message)] = message
+        self._vision_at = self._px4.now
+
+    def _on_sensor(self, message: Message, _: Channel) -> None:
+        self.latest[type(message)] = message
+
+    def _on_target(self, target: m.LandingTarget, _: Channel) -> None:
+        if target.position_valid and target.frame == MavFrame.LOCAL_NED:
+            self.latest[type(target)] = target
+            self._target, self._target_at = (target.x, target.y), self._px4.now
+
+    def _on_origin(self, message: m.SetGpsGlobalOrigin, channel: Channel) -> None:
+        if message.target_system == self._px4.system_id:
+            self.origin = GlobalPoint(message.latitude, message.longitude, message.altitude / 1000)
+            self._px4.send_built(m.GpsGlobalOrigin.ID, channel)
+
+    def _on_timesync(self, message: m.Timesync, _: Channel) -> None:
+        self.clock_answers += message.tc1 != 0
+
+
+class PrecisionLanding:
+    """Approach above the target, descent, and PLD_MAX_SRCH climbs to PLD_SRCH_ALT while the target is lost."""
+
+    def __init__(self, px4: Px4Host) -> None:
+        self._px4 = px4
+        self._search_from: float | None = None
+        self._searches = 0
+
+    def enter(self) -> None:
+        """Start a landing."""
+        self._search_from, self._searches = None, 0
+
+    def update(self) -> None:
+        """Set the target of the motion for the next tick."""
+        px4, motion, limits = self._px4, self._px4.motion, self._px4.parameters
+        target = px4.external.target
+        if target is None or self._searches > limits["PLD_MAX_SRCH"]:
+            self._search()
+            return
+        self._search_from = None
+        north, east = target[0] - motion.north, target[1] - motion.east
+        distance = math.hypot(north, east)
+        share = min(_APPROACH_PER_S, _MAX_APPROACH_M_S / max(distance, 1e-6))
+        is_above = distance <= max(limits["PLD_HACC_RAD"], 0.05)
+        descent = px4.flight.descent_speed_m_s if is_above else 0.0
+        motion.seek_velocity(north * share, east * share, descent)
+
+    def _search(self) -> None:
+        px4, motion, limits = self._px4, self._px4.motion, self._px4.parameters
+        if self._search_from is None:
+            self._search_from, self._searches = px4.now, self._searches + 1
+        is_over = px4.now - self._search_from > limits["PLD_SRCH_TOUT"]
+        if is_over or self._searches > limits["PLD_MAX_SRCH"]:
+            px4.flight.descend()
+            return
+        height = px4.home[2] - limits["PLD_SRCH_ALT"]
+        motion.seek_position(motion.north, motion.east, height, speed=1.0, climb=2.0, descent=1.0)

@@ -1,0 +1,302 @@
+"""`FollowStream`: keeps a vehicle at its place relative to a moving target."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import AsyncIterable, Callable
+from typing import TYPE_CHECKING, Any
+
+import anyio
+
+from aerokit._internal.arguments import check_range, checks_arguments
+from aerokit._internal.formatting import short_repr
+from aerokit._internal.values import Snapshot
+from aerokit.connection.tasks import Cancellation
+from aerokit.errors import InvalidArgument, NotSupported, OperationRejected, OperationTimeout
+from aerokit.mavlink.enums import MavFrame
+from aerokit.mavlink.messages import SetPositionTargetGlobalInt
+from aerokit.position import Position
+from aerokit.vehicle.commanding.follow_target import FollowTarget, HasTelemetry
+from aerokit.vehicle.commanding.progress import POSITION_MAX_AGE_S
+from aerokit.vehicle.commanding.setpoints import IGNORE_ACCELERATION, IGNORE_YAW, IGNORE_YAW_RATE
+from aerokit.vehicle.commanding.streams import SteeringStream
+
+if TYPE_CHECKING:
+    from types import TracebackType
+
+    from typing_extensions import Self
+
+    from aerokit.autopilots import Mode
+    from aerokit.mavlink.message import Message
+    from aerokit.vehicle.commanding.context import VehicleContext
+
+__all__ = ["FollowStream"]
+
+
+RATE_HZ, MAX_LAG_S = 10.0, 1.0
+MAX_DISTANCE_M = 1000.0
+MIN_COURSE_SPEED_M_S = 0.5
+"""Ground speed from which a movement has a direction."""
+MIN_INTERVAL_S = 0.05
+"""Seconds between two positions from which a velocity can be computed."""
+POLL_INTERVAL_S = 0.1
+
+
+class FollowPlace(Snapshot):
+    """The place of the follower relative to its target; see :meth:`aerokit.Vehicle.follow`."""
+
+    distance_m: float
+    bearing_deg: float | None
+    from_course: bool
+    height_m: float | None
+    face_target: bool
+
+    def check(self) -> None:
+        """Raise InvalidArgument if a value is out of range."""
+        check_range("distance_m", self.distance_m, 0, MAX_DISTANCE_M)
+        if self.bearing_deg is not None:
+            check_range("bearing_deg", self.bearing_deg, 0, 360)
+        if self.height_m is not None:
+            check_range("height_m", self.height_m, -MAX_DISTANCE_M, MAX_DISTANCE_M)
+
+
+class TargetState(Snapshot):
+    """Position of the target with its velocity (north, east, down in m/s), and when it was known."""
+
+    position: Position
+    velocity: tuple[float, float, float]
+    at: float
+
+
+class FollowedTarget:
+    """The latest position of the target, and its velocity: reported by a vehicle, or computed from two positions."""
+
+    def __init__(self, target: FollowTarget, now: Callable[[], float]) -> None:
+        self._target, self._now = target, now
+        self.latest: TargetState | None = None
+
+    async def read_iterable(self) -> None:
+        """Read an asynchronous iterable to its end."""
+        assert isinstance(self._target, AsyncIterable)
+        async for position in self._target:
+            self.add(position)
+
+    def read(self) -> TargetState | None:
+        """Read a vehicle or call the function; return the latest state."""
+        if isinstance(self._target, HasTelemetry):
+            self._read_vehicle(self._target.telemetry)
+        elif not isinstance(self._target, AsyncIterable):
+            position = self._target()
+            if position is not None:
+                self.add(position)
+        return self.latest
+
+    def _read_vehicle(self, telemetry: Any) -> None:
+        position, velocity = telemetry.position, telemetry.velocity.latest
+        if position.latest is None or not math.isfinite(position.age):
+            return
+        at = self._now() - position.age
+        speeds = (0.0, 0.0, 0.0) if velocity is None else (velocity.north_m_s, velocity.east_m_s, velocity.down_m_s)
+        self.latest = TargetState(position.latest.replace(altitude_relative_m=None), speeds, at)
+
+    def add(self, position: object) -> None:
+        """Process a position that the program supplied. An unchanged one counts as new.
+
+        Raises:
+            InvalidArgument: it is no position.
+        """
+        if not isinstance(position, Position):
+            raise InvalidArgument(f"position = {short_repr(position)} is not allowed: a Position")
+        before, now = self.latest, self._now()
+        if before is not None and now - before.at < MIN_INTERVAL_S:
+            return
+        velocity = (0.0, 0.0, 0.0)
+        if before is not None:
+            seconds = now - before.at
+            there = before.position
+            distance, bearing = there.distance_to(position), math.radians(there.bearing_to(position))
+            down = (there.altitude_amsl_m or 0.0) - (position.altitude_amsl_m or 0.0)
+            speed = distance / seconds
+            velocity = (speed * math.cos(bearing), speed * math.sin(bearing), down / seconds)
+        self.latest = TargetState(position, velocity, now)
+
+
+@checks_arguments
+class FollowStream(SteeringStream[TargetState]):
+    """Follows a target while its ``async with`` block runs; opened by :meth:`aerokit.Vehicle.follow`.
+
+    Entering the block waits for the first position of the target, and changes the mode: to GUIDED on ArduPilot, to
+    OFFBOARD on PX4. Leaving it in any way makes the vehicle hold. It stops by itself, and the vehicle holds, when no
+    new position of the target arrives for ``valid_for_s``, when the target's positions end or raise, when it is farther
+    away than ``max_distance_m``, and for the reasons of set-point streams. After a pilot or a failsafe has changed the
+    mode, nothing more is sent. ``fly`` and leaving the block then raise :class:`SetpointStreamStopped`.
+
+    Entering raises:
+        OperationRejected: the vehicle is not flying. Nothing was sent.
+        OperationTimeout: no position of the target was known within ``valid_for_s``. Nothing was sent.
+        InvalidArgument: a height is wanted, and the target has no altitude. Nothing was sent.
+    """
+
+    _NAME, _VALUE = "following", "position of the target"
+
+    def __init__(
+        self,
+        context: VehicleContext,
+        target: FollowTarget,
+        place: FollowPlace,
+        valid_for_s: float,
+        max_distance_m: float,
+    ) -> None:
+        place.check()
+        check_range("max_distance_m", max_distance_m, place.distance_m, math.inf)
+        autopilot = context.session.autopilot
+        if not (autopilot.setpoints.global_position and autopilot.setpoints.velocity):
+            raise NotSupported(f"follow: {autopilot.firmware} does not support position set-points; nothing was sent")
+        nowhere = TargetState(Position(0.0, 0.0), (0.0, 0.0, 0.0), -math.inf)
+        super().__init__(context, self._encode_place, nowhere, RATE_HZ, valid_for_s, MAX_LAG_S)
+        self._target, self._tracker = target, FollowedTarget(target, self._now)
+        self._place, self._max_distance_m = place, max_distance_m
+        self._reading: Cancellation | None = None
+        self._end_reason = ""
+        self._bearing_deg = self._course_deg = self._own_altitude_m = 0.0
+
+    @property
+    def target(self) -> Position | None:
+        """The latest position of the target; None before the first one."""
+        return None if self._tracker.latest is None else self._tracker.latest.position
+
+    @property
+    def distance_m(self) -> float:
+        """Distance to the target along the ground in metres; infinite while it is unknown."""
+        here, target = self._session.telemetry.position.latest, self.target
+        return math.inf if here is None or target is None else here.distance_to(target)
+
+    async def fly(self, duration_s: float | None = None) -> None:
+        """Follow for ``duration_s`` seconds; None: until it stops by itself.
+
+        Raises:
+            SetpointStreamStopped: it has stopped; the text has the reason.
+        """
+        until = math.inf if duration_s is None else self._now() + duration_s
+        while (left := until - self._now()) > 0:
+            self._raise_if_stopped()
+            await anyio.sleep(min(left, POLL_INTERVAL_S))
+        self._raise_if_stopped()
+
+    # ------------------------------------------------------------------------------- the block
+
+    async def __aenter__(self) -> Self:
+        self._raise_if_entered()
+        position = self._context.vehicle_position
+        if not self._session.telemetry.is_armed or position.is_on_ground():
+            raise OperationRejected("follow: the vehicle is not flying: call take_off() first; nothing was sent")
+        mode = self._wanted_mode()
+        self._start_reading()
+        try:
+            with self._context.flight_cleanup.preparing(mode) as self._prepared_order:
+                self._value = await self._first_state()
+                self._choose_place(self._value.position)
+            return await super().__aenter__()
+        except BaseException:
+            self._stop_reading()
+            raise
+
+    async def __aexit__(
+        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._stop_reading()
+        await super().__aexit__(exc_type, exc, traceback)
+
+    def _start_reading(self) -> None:
+        if isinstance(self._target, HasTelemetry) or not isinstance(self._target, AsyncIterable):
+            return
+        scope = self._reading = Cancellation()
+
+        async def read() -> None:
+            with scope:
+                try:
+                    await self._tracker.read_iterable()
+                    self._end_reason = "the positions of the target ended"
+                except Exception as error:
+                    self._end_reason = f"the positions of the target raised {error!r}"
+
+        self._session.background.start(read, "aerokit follow")
+
+    def _stop_reading(self) -> None:
+        if self._reading is not None:
+            self._reading.cancel()
+
+    async def _first_state(self) -> TargetState:
+        until = self._now() + self._valid_for_s
+        while (state := self._tracker.read()) is None or self._now() - state.at > self._valid_for_s:
+            if self._now() > until or self._end_reason:
+                why = self._end_reason or f"no position of the target was known within {self._valid_for_s:g} s"
+                raise OperationTimeout(f"follow: {why}; nothing was sent")
+            await anyio.sleep(POLL_INTERVAL_S)
+        return state
+
+    def _choose_place(self, target: Position) -> None:
+        """Choose what was left open: the present bearing from the target, and the present altitude."""
+        here = self._session.telemetry.position.fresh(POSITION_MAX_AGE_S)
+        self._bearing_deg = target.bearing_to(here) if self._place.bearing_deg is None else self._place.bearing_deg
+        self._course_deg = here.bearing_to(target)
+        if self._place.height_m is None:
+            self._own_altitude_m = here.altitude_amsl_m or 0.0
+        elif target.altitude_amsl_m is None and target.altitude_relative_m is None:
+            raise InvalidArgument("height_m is not allowed: the target has no altitude; nothing was sent")
+
+    # ------------------------------------------------------------------------------ the stream
+
+    def _wanted_mode(self) -> Mode:
+        return self._context.sender.mode_for("follow", "setpoint")
+
+    def _tick(self, due: float) -> None:
+        try:
+            state = self._tracker.read()
+            if state is not None:
+                self._take(state)
+                self._set_at = max(state.at, -math.inf)
+        except Exception as error:
+            self._end_reason = f"the position of the target raised {error!r}"
+        super()._tick(due)
+
+    def _why_stop(self, lag: float) -> str | None:
+        if self._end_reason:
+            return self._end_reason
+        if math.inf > self.distance_m > self._max_distance_m:
+            return f"the target is {self.distance_m:.0f} m away (max_distance_m = {self._max_distance_m:g})"
+        return super()._why_stop(lag)
+
+    def _encode_place(self, state: TargetState) -> Message:
+        """Return the place at this moment: the target moves on between two of its positions."""
+        seconds = max(0.0, min(self._now() - state.at, self._valid_for_s))
+        north_m_s, east_m_s, down_m_s = state.velocity
+        if math.hypot(north_m_s, east_m_s) >= MIN_COURSE_SPEED_M_S:
+            self._course_deg = math.degrees(math.atan2(east_m_s, north_m_s))
+        bearing = math.radians(self._bearing_deg + (self._course_deg if self._place.from_course else 0.0))
+        distance_m = self._place.distance_m
+        place = state.position.offset(
+            north_m=distance_m * math.cos(bearing) + north_m_s * seconds,
+            east_m=distance_m * math.sin(bearing) + east_m_s * seconds,
+            up_m=(self._place.height_m or 0.0) - down_m_s * seconds,
+        )
+        if self._place.height_m is None:
+            place = place.replace(altitude_amsl_m=self._own_altitude_m, altitude_relative_m=None)
+            down_m_s = 0.0
+        latitude, longitude, altitude, is_relative = self._context.vehicle_position.global_target(place)
+        yaw = math.remainder(bearing + math.pi, 2 * math.pi)
+        mask = IGNORE_ACCELERATION | IGNORE_YAW_RATE | (0 if self._place.face_target else IGNORE_YAW)
+        return SetPositionTargetGlobalInt(
+            int(self._now() * 1000) & 0xFFFFFFFF,
+            self._session.system_id,
+            self._session.component_id,
+            MavFrame.GLOBAL_RELATIVE_ALT_INT if is_relative else MavFrame.GLOBAL_INT,
+            mask,
+            latitude,
+            longitude,
+            altitude,
+            *(north_m_s, east_m_s, down_m_s),
+            *(0.0, 0.0, 0.0),
+            yaw if self._place.face_target else 0.0,
+            0.0,
+        )

@@ -1,0 +1,327 @@
+"""Manoeuvres: orbit, figure eight, loiter, VTOL transition."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Literal
+
+from aerokit._internal.arguments import check_range, checks_arguments
+from aerokit.errors import InvalidArgument, NotSupported
+from aerokit.mavlink.enums import MavCmd, MavDoRepositionFlags, MavType, MavVtolState, OrbitYawBehaviour
+from aerokit.position import travel_target
+from aerokit.vehicle.commanding.context import VehicleBase
+from aerokit.vehicle.commanding.follow_target import FollowTarget
+from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M, MAX_SILENCE_S, await_progress
+
+if TYPE_CHECKING:
+    from aerokit.autopilots import Mode
+    from aerokit.position import Home, Position
+    from aerokit.vehicle.commanding.closed_paths import TurnCounter
+    from aerokit.vehicle.commanding.follow import FollowStream
+
+Facing = Literal["center", "ahead", "initial", "free"]
+FlightState = Literal["fixed_wing", "multicopter"]
+
+YAW_BEHAVIOURS: dict[str, OrbitYawBehaviour] = {
+    "center": OrbitYawBehaviour.HOLD_FRONT_TO_CIRCLE_CENTER,
+    "ahead": OrbitYawBehaviour.HOLD_FRONT_TANGENT_TO_CIRCLE,
+    "initial": OrbitYawBehaviour.HOLD_INITIAL_HEADING,
+    "free": OrbitYawBehaviour.UNCONTROLLED,
+}
+VTOL_STATES: dict[str, MavVtolState] = {"fixed_wing": MavVtolState.FW, "multicopter": MavVtolState.MC}
+MAX_RADIUS_M, MAX_SPEED_M_S, MAX_ROUNDS = 10_000, 50, 1000
+MIN_TOLERANCE_M, TOLERANCE_SHARE = 5.0, 0.3
+"""A vehicle is on its circle within this part of the radius, at least within so many metres."""
+
+
+def _turn_counter(radius_m: float, *, clockwise: bool) -> TurnCounter:
+    from aerokit.vehicle.commanding.closed_paths import TurnCounter
+
+    return TurnCounter(radius_m, max(MIN_TOLERANCE_M, TOLERANCE_SHARE * radius_m), clockwise=clockwise)
+
+
+@checks_arguments
+class ManeuverActions(VehicleBase):
+    """Orbit, figure eight, loiter, VTOL transition."""
+
+    async def orbit(
+        self,
+        center: Position | Home,
+        *,
+        radius_m: float,
+        speed_m_s: float = 2.0,
+        turns: float | None = 1.0,
+        clockwise: bool = True,
+        facing: Facing = "center",
+        max_distance_m: float = MAX_DISTANCE_M,
+        timeout: float | None = None,
+        max_silence_s: float | None = MAX_SILENCE_S,
+    ) -> None:
+        """Fly around a place; returns when the reported positions have gone around it ``turns`` times.
+
+        Then a multicopter holds, and a fixed wing goes on circling. After a cancellation or a time-out, aerokit orders
+        the vehicle to hold.
+
+        PX4 flies the circle itself (MAV_CMD_DO_ORBIT). ArduCopter has no such command, and its mode CIRCLE follows the
+        throttle stick, so aerokit streams set-points with velocity and acceleration in GUIDED; if your program dies,
+        the vehicle stops. ArduPlane circles a place in GUIDED (MAV_CMD_DO_REPOSITION).
+
+        Args:
+            center: the middle of the circle; its altitude is that of the circle, without one, or for home, the
+                vehicle's own.
+            radius_m: above 0, at most 10,000. PX4's multicopters refuse more than MC_ORBIT_RAD_MAX.
+            speed_m_s: ground speed, above 0, at most 50. A fixed wing ignores it.
+            turns: number of turns, above 0, at most 1000; None: until the call is cancelled, or another order is given.
+            clockwise: direction, as seen from above.
+            facing: direction of the nose: to the center, ahead, as at the beginning, or left to the autopilot. A fixed
+                wing ignores it.
+            max_distance_m: a center farther away than this many metres is refused.
+            timeout: seconds; None: no limit while heartbeats arrive, the mode stays and the vehicle moves.
+            max_silence_s: raise when no heartbeat was received for this long; None: no limit.
+
+        Raises:
+            InvalidArgument: an argument is out of range. Nothing was sent.
+            NotSupported: this type of vehicle has no way to do it. Nothing was sent.
+            ValueUnknownError: position or home is needed here and not known.
+            OperationRejected: it is not flying, or the mode changed or it disarmed on the way.
+            CommandRejected: the vehicle refused.
+            CommandTimeout: there was no acknowledgement.
+            HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
+            OperationTimeout: it was not done in time, or does not move.
+        """
+        from aerokit.vehicle.commanding.closed_paths import Circle
+        from aerokit.vehicle.commanding.rounds import RoundFlight
+
+        check_range("radius_m", radius_m, 0, MAX_RADIUS_M, above=True)
+        check_range("speed_m_s", speed_m_s, 0, MAX_SPEED_M_S, above=True)
+        if turns is not None:
+            check_range("turns", turns, 0, MAX_ROUNDS, above=True)
+        counter = _turn_counter(radius_m, clockwise=clockwise)
+        flight = RoundFlight(self._context, "orbit", travel_target(center), counter, turns, timeout, max_silence_s)
+        if self.autopilot.circles_by == "setpoints":
+            flight.check_place(max_distance_m)
+            path = Circle(radius_m, clockwise=clockwise, first_phase=flight.bearing_rad)
+            await flight.by_setpoints(path, speed_m_s, facing)
+            return
+        command, params, mode = self._circling("orbit", radius_m, speed_m_s, facing, clockwise=clockwise)
+        flight.check_place(max_distance_m)
+        await flight.by_command(command, params, mode, is_held=not self._is_on_wings, circle_m=radius_m)
+
+    async def figure_eight(
+        self,
+        center: Position | Home,
+        *,
+        major_radius_m: float,
+        minor_radius_m: float,
+        axis_deg: float = 0.0,
+        speed_m_s: float = 2.0,
+        rounds: float | None = 1.0,
+        clockwise: bool = True,
+        max_distance_m: float = MAX_DISTANCE_M,
+        timeout: float | None = None,
+        max_silence_s: float | None = MAX_SILENCE_S,
+    ) -> None:
+        """Fly an eight around a place; returns when the reported positions were ``rounds`` times in both lobes.
+
+        PX4's fixed wings fly it themselves (MAV_CMD_DO_FIGURE_EIGHT: two circles and straight lines between them, and
+        on until another order). For ArduCopter and PX4's multicopters aerokit streams the set-points of a lemniscate;
+        they hold at its center. All else is as for :meth:`orbit`.
+
+        Args:
+            center: where the lines cross; its altitude is that of the figure, without one the vehicle's own.
+            major_radius_m: half the length of the figure, above 0, at most 10,000.
+            minor_radius_m: half its width, above 0, at most the half of ``major_radius_m``.
+            axis_deg: direction of its long axis, 0–360 clockwise from north; the first lobe is there.
+            speed_m_s: ground speed, above 0, at most 50. A fixed wing ignores it.
+            rounds: number of figures, a multiple of a half, above 0, at most 1000; None: until the call is cancelled.
+            clockwise: direction in the first lobe, as seen from above.
+            max_distance_m: a center farther away than this many metres is refused.
+            timeout: seconds; None: no limit while heartbeats arrive, the mode stays and the vehicle moves.
+            max_silence_s: raise when no heartbeat was received for this long; None: no limit.
+        """
+        from aerokit.vehicle.commanding.closed_paths import Eight, LobeCounter
+        from aerokit.vehicle.commanding.rounds import RoundFlight
+
+        check_range("major_radius_m", major_radius_m, 0, MAX_RADIUS_M, above=True)
+        check_range("minor_radius_m", minor_radius_m, 0, major_radius_m / 2, above=True)
+        check_range("axis_deg", axis_deg, 0, 360)
+        check_range("speed_m_s", speed_m_s, 0, MAX_SPEED_M_S, above=True)
+        if rounds is not None:
+            check_range("rounds", rounds, 0, MAX_ROUNDS, above=True)
+            if rounds * 2 != int(rounds * 2):
+                raise InvalidArgument(f"rounds = {rounds!r} is not allowed: a multiple of a half")
+        counter = LobeCounter(major_radius_m, axis_deg)
+        flight = RoundFlight(
+            self._context, "figure_eight", travel_target(center), counter, rounds, timeout, max_silence_s
+        )
+        if not self._is_on_wings and self.autopilot.setpoints.trajectory:
+            flight.check_place(max_distance_m)
+            path = Eight(major_radius_m, minor_radius_m, axis_deg, clockwise=clockwise)
+            await flight.by_setpoints(path, speed_m_s, "ahead")
+        elif self._is_on_wings and self.autopilot.circles_by == "orbit":
+            flight.check_place(max_distance_m)
+            major_m = major_radius_m if clockwise else -major_radius_m
+            params = (major_m, minor_radius_m, 0, math.radians(axis_deg))
+            mode = self._sender.mode_for("figure_eight", "hold")
+            await flight.by_command(MavCmd.DO_FIGURE_EIGHT, params, mode, is_held=False)
+        else:
+            raise NotSupported(f"figure_eight: {self.autopilot.firmware} has no such manoeuvre; nothing was sent")
+
+    async def loiter(
+        self,
+        target: Position | Home | None = None,
+        *,
+        radius_m: float | None = None,
+        clockwise: bool = True,
+        turns: float | None = None,
+        duration_s: float | None = None,
+        max_distance_m: float = MAX_DISTANCE_M,
+        timeout: float | None = None,
+        max_silence_s: float | None = MAX_SILENCE_S,
+    ) -> None:
+        """Go to a place and stay: a fixed wing circles there, a multicopter hovers.
+
+        Returns when it is there, or after ``turns`` or ``duration_s`` more. The vehicle stays until another order.
+        After a cancellation or a time-out, aerokit orders it to hold where it is. Sends MAV_CMD_DO_REPOSITION
+        (ArduPilot in GUIDED, PX4 in LOITER), or MAV_CMD_DO_ORBIT for the radius of a PX4 fixed wing.
+
+        Args:
+            target: the place, as for ``go_to``; None: where the vehicle is.
+            radius_m: radius of the circle of a fixed wing, above 0, at most 10,000; None: its own (WP_LOITER_RAD,
+                NAV_LOITER_RAD).
+            clockwise: direction of the circle, as seen from above; only with ``radius_m``.
+            turns: return after this many turns, above 0, at most 1000; only with ``radius_m``.
+            duration_s: return this many seconds after the arrival.
+            max_distance_m: a place farther away than this many metres is refused.
+            timeout: seconds in total; None: no limit while heartbeats arrive, the mode stays and the vehicle moves.
+            max_silence_s: raise when no heartbeat was received for this long; None: no limit.
+
+        All else is as for :meth:`orbit`. NotSupported is raised for a radius if the vehicle hovers, InvalidArgument for
+        ``turns`` without one.
+        """
+        from aerokit.vehicle.commanding.rounds import RoundFlight
+
+        if turns is not None:
+            check_range("turns", turns, 0, MAX_ROUNDS, above=True)
+        if radius_m is not None:
+            check_range("radius_m", radius_m, 0, MAX_RADIUS_M, above=True)
+            if not self._is_on_wings:
+                raise NotSupported(
+                    f"loiter: this {self.autopilot.firmware} vehicle hovers and takes no radius: use orbit()"
+                )
+        elif turns is not None:
+            raise InvalidArgument(f"turns = {turns!r} is not allowed without radius_m")
+        center = self.telemetry.position.value if target is None else travel_target(target)
+        if radius_m is None:
+            counter = None
+            flags = MavDoRepositionFlags.CHANGE_MODE
+            params: tuple[float, ...] = (-1.0, float(flags), 0.0, math.nan)
+            command = int(MavCmd.DO_REPOSITION)
+            mode = self._sender.mode_for("loiter", self.autopilot.reposition_purpose)
+        else:
+            counter = _turn_counter(radius_m, clockwise=clockwise)
+            command, params, mode = self._circling("loiter", radius_m, math.nan, "free", clockwise=clockwise)
+        flight = RoundFlight(self._context, "loiter", center, counter, turns or 0.0, timeout, max_silence_s)
+        flight.check_place(max_distance_m)
+        stay_s, circle_m = duration_s or 0.0, radius_m or 0.0
+        await flight.by_command(command, params, mode, is_held=False, stay_s=stay_s, circle_m=circle_m)
+
+    def follow(
+        self,
+        target: FollowTarget,
+        *,
+        distance_m: float = 10.0,
+        bearing_deg: float | None = None,
+        from_course: bool = False,
+        height_m: float | None = None,
+        face_target: bool = True,
+        valid_for_s: float = 3.0,
+        max_distance_m: float = 1000.0,
+    ) -> FollowStream:
+        """Follow a moving target: ``async with vehicle.follow(leader) as following: await following.fly(60)``.
+
+        aerokit computes the place beside the target and streams it with the target's velocity, at 10 Hz
+        (SET_POSITION_TARGET_GLOBAL_INT). The modes FOLLOW of ArduCopter and FOLLOWME of PX4 are not used: they need
+        parameters that stay, and differ in what they keep.
+
+        Args:
+            target: another vehicle, of this connection or of any other; an asynchronous iterable of positions; or a
+                function that returns the latest position, or None, called on the event loop ten times a second. The
+                velocity of positions is computed from two of them.
+            distance_m: distance along the ground to keep, 0 to 1000.
+            bearing_deg: direction from the target in which to stay, 0–360 clockwise from north; None: where the vehicle
+                is when it begins.
+            from_course: count ``bearing_deg`` from the direction in which the target moves: 180 is behind it.
+            height_m: height above the target, −1000 to 1000; None: the vehicle keeps its own altitude.
+            face_target: turn the nose to the target.
+            valid_for_s: without a new position of the target for this long, the vehicle holds.
+            max_distance_m: if the target is farther away than this many metres, the vehicle holds.
+
+        Raises:
+            InvalidArgument: an argument is out of range.
+            NotSupported: this type of vehicle takes no position set-points, or it flies on its wings.
+        """
+        from aerokit.vehicle.commanding.follow import FollowPlace, FollowStream
+
+        if self._is_on_wings:
+            raise NotSupported("follow: the vehicle flies on its wings, and cannot fly as slowly as its target")
+        place = FollowPlace(distance_m, bearing_deg, from_course, height_m, face_target)
+        return FollowStream(self._context, target, place, valid_for_s, max_distance_m)
+
+    def _circling(
+        self, what: str, radius_m: float, speed_m_s: float, facing: Facing, *, clockwise: bool
+    ) -> tuple[int, tuple[float, ...], Mode]:
+        """Return the command that circles a place, its first four parameters, and its mode."""
+        if self.autopilot.circles_by == "orbit":
+            radius = radius_m if clockwise else -radius_m
+            params: tuple[float, ...] = (radius, speed_m_s, float(YAW_BEHAVIOURS[facing]), 0.0)
+            orbit = self.autopilot.modes.find("ORBIT")
+            mode = self._sender.mode_for(what, "hold") if self._is_on_wings else orbit
+            return MavCmd.DO_ORBIT, params, mode
+        if self.autopilot.circles_by == "reposition":
+            params = (-1.0, float(MavDoRepositionFlags.CHANGE_MODE), radius_m, 0.0 if clockwise else 1.0)
+            return MavCmd.DO_REPOSITION, params, self._sender.mode_for(what, "setpoint")
+        raise NotSupported(f"{what}: {self.autopilot.firmware} cannot circle a place; nothing was sent")
+
+    @property
+    def _is_on_wings(self) -> bool:
+        """True if it flies on its wings now, and so cannot stop."""
+        state = self.telemetry.vtol_state.latest
+        return state == MavVtolState.FW if state else self.vehicle_type == MavType.FIXED_WING
+
+    async def transition_to(self, state: FlightState, *, timeout: float = 60.0) -> None:
+        """Change a VTOL between hovering and flying on its wings (MAV_CMD_DO_VTOL_TRANSITION).
+
+        Returns when EXTENDED_SYS_STATE reports the state; at once if it is reported already. ArduPilot does it only in
+        AUTO. After a cancellation the vehicle goes on with its transition.
+
+        Args:
+            state: ``"fixed_wing"`` or ``"multicopter"``.
+            timeout: seconds until it is in that state.
+
+        Raises:
+            InvalidArgument: there is no such state. Nothing was sent.
+            NotSupported: it is no VTOL. Nothing was sent.
+            OperationRejected: the mode changed or it disarmed meanwhile.
+            CommandRejected: the vehicle refused; ``reasons`` has its status texts.
+            CommandTimeout: there was no acknowledgement.
+            HeartbeatTimeout: the vehicle was silent for ten seconds.
+            OperationTimeout: it did not reach the state in time.
+        """
+        if MavCmd.DO_VTOL_TRANSITION in self.autopilot.unsupported_commands or not self.telemetry.is_vtol:
+            raise NotSupported(f"transition_to: this {self.autopilot.firmware} vehicle is no VTOL; nothing was sent")
+        wanted, cell = VTOL_STATES[state], self.telemetry.vtol_state
+        with self._arbiter.auxiliary_order() as order:
+            started = self.connection.now()
+            await self._sender.run_command(
+                order, self._session.commands.send_long, MavCmd.DO_VTOL_TRANSITION, float(wanted)
+            )
+            with self._session.streaming("vtol_state"):
+                await await_progress(
+                    self._session,
+                    f"transition_to({state})",
+                    is_done=lambda: cell.latest == wanted and cell.updated_at > started,
+                    trouble=lambda: order.takeover_reason,
+                    describe=lambda: f"MAV_VTOL_STATE is {cell.latest}",
+                    timeout=timeout,
+                )

@@ -1,0 +1,175 @@
+"""`StickStream`: flies the vehicle by the sticks of your program, as a pilot does by those of a transmitter.
+
+MAVLink's MANUAL_CONTROL (https://mavlink.io/en/services/manual_control.html). ArduPilot treats it as an override of
+the transmitter's channels, PX4 as a second source of manual control.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from typing import TYPE_CHECKING
+
+from aerokit._internal.arguments import check_kind, check_range, checks_arguments
+from aerokit._internal.values import Snapshot
+from aerokit.errors import AerokitError, NotSupported, OperationRejected
+from aerokit.mavlink.messages import ManualControl, RcChannelsOverride
+from aerokit.vehicle.commanding.streams import SteeringStream, known_values
+
+if TYPE_CHECKING:
+    from aerokit.autopilots import Mode
+    from aerokit.mavlink.message import Message
+    from aerokit.vehicle.commanding.context import VehicleContext
+    from aerokit.vehicle.commanding.streams import Probe
+
+__all__ = ["StickInput", "StickStream"]
+
+# An axis without a value: ArduPilot releases its channel (GCS_Common.cpp, manual_override).
+NO_VALUE = 0x7FFF
+# RC_CHANNELS_OVERRIDE: release a channel (1 to 8, and 9 to 18), or leave it as it is.
+RELEASED, RELEASED_UPPER, UNCHANGED = 0, 0xFFFE, 0xFFFF
+# Channels that MANUAL_CONTROL overrides on ArduSub, from 1 (joystick.cpp).
+SUB_CHANNELS = 11
+MAX_BUTTONS = 0xFFFF
+
+# Values of PX4's COM_RC_IN_MODE that ignore MAVLink (ManualControlSelector.cpp).
+RC_ONLY, DISABLED = 0, 4
+# Bit of ArduPilot's RC_OPTIONS: ignore overrides (RC_Channels.h).
+IGNORE_OVERRIDES = 1 << 1
+
+
+class StickInput(Snapshot):
+    """Stick positions from −1 to 1; 0 is the centre.
+
+    ``forward`` is the pitch stick, ``right`` the roll stick, ``yaw`` turns clockwise. ``throttle`` −1 is the lowest
+    position: a multicopter that holds its altitude descends, a plane has no thrust; a rover reverses. ``buttons`` is a
+    bit mask (ArduSub has functions for them).
+    """
+
+    forward: float = 0.0
+    right: float = 0.0
+    throttle: float = 0.0
+    yaw: float = 0.0
+    buttons: int = 0
+
+
+@checks_arguments
+class StickStream(SteeringStream[StickInput]):
+    """Sends the latest stick positions at a fixed rate while the ``async with`` block supplies them.
+
+    Entering the block sends the initial positions for a second and then changes to the mode. Leaving it in any way
+    orders the vehicle to hold and releases the sticks. If the stream stops by itself (no new positions, a blocked event
+    loop, a silent vehicle), ``set`` and leaving the block raise :class:`SetpointStreamStopped`. If a pilot or a
+    failsafe changes the mode, the sticks are released at once and no hold is ordered.
+
+    If the program is killed, ArduPilot returns to the transmitter after RC_OVERRIDE_TIME (3 s), and PX4 treats the
+    sticks as lost after COM_RC_LOSS_T (0.5 s). PX4 has no release, so every end of a stream is such a loss: without
+    another source of manual control it acts as NAV_RCL_ACT says (return by default), also in its hold mode unless
+    COM_RCL_EXCEPT has bit 1. ArduCopter without a transmitter acts on the loss as FS_THR_ENABLE says.
+
+    Entering raises:
+        InvalidArgument: a position is out of range. Nothing was sent.
+        NotSupported: this type of vehicle has no sticks. Nothing was sent.
+        OperationRejected: a parameter makes the vehicle ignore the sticks, or keep them for ever; the text names it.
+        ParameterTimeout: the vehicle did not report these parameters. Nothing else was sent.
+        CommandRejected: the vehicle refused the mode.
+        BusyError: another set-point stream is open.
+    """
+
+    _NAME, _VALUE = "stick stream", "stick position"
+
+    def __init__(
+        self,
+        context: VehicleContext,
+        probe: Probe,
+        mode: str | int | None,
+        initial: StickInput | None,
+        rate_hz: float,
+        valid_for_s: float,
+        max_lag_s: float,
+    ) -> None:
+        super().__init__(context, self._message_of, initial or StickInput(), rate_hz, valid_for_s, max_lag_s)
+        self._rules = context.session.autopilot.sticks
+        self._probe, self._has_sent = probe, False
+        telemetry = context.session.telemetry
+        self._given_mode = None if mode is None else self._session.autopilot.find_mode(mode, telemetry.mode_names)
+
+    def set(self, sticks: StickInput) -> None:
+        """Move the sticks; the positions are sent at the next tick and repeated until ``valid_for_s`` has passed.
+
+        Raises:
+            InvalidArgument: a position is out of range; the previous ones remain in force until they expire.
+            SetpointStreamStopped: the stream has ended by itself, or the block was left.
+        """
+        check_kind("sticks", sticks, StickInput)
+        self._set(sticks)
+
+    async def move(self, sticks: StickInput, duration_s: float) -> None:
+        """Keep the sticks in one position for ``duration_s`` seconds.
+
+        Raises:
+            InvalidArgument: a position is out of range.
+            SetpointStreamStopped: the stream ended meanwhile.
+        """
+        check_kind("sticks", sticks, StickInput)
+        await self._feed(sticks, duration_s)
+
+    @property
+    def _is_stream_before_mode(self) -> bool:
+        return True  # otherwise the mode would begin with the transmitter's throttle
+
+    def _wanted_mode(self) -> Mode:
+        if self._rules is None:
+            raise NotSupported(f"sticks: {self._session.autopilot.firmware} does not accept MANUAL_CONTROL")
+        return self._given_mode or self._context.sender.mode_for("sticks", "sticks")
+
+    async def _check_support(self) -> None:
+        if self._session.autopilot.name == "PX4":
+            source = (await known_values(self._probe, "COM_RC_IN_MODE")).get("COM_RC_IN_MODE")
+            if source in (RC_ONLY, DISABLED):
+                raise OperationRejected(
+                    f"sticks: COM_RC_IN_MODE = {source:g} makes PX4 ignore MANUAL_CONTROL; set it to 1 (MAVLink only)"
+                    " or 3 (either)"
+                )
+            return
+        values = await known_values(self._probe, "MAV_GCS_SYSID", "SYSID_MYGCS", "RC_OVERRIDE_TIME", "RC_OPTIONS")
+        own_id = self._session.connection.source_system
+        ground_station = values.get("MAV_GCS_SYSID", values.get("SYSID_MYGCS", own_id))
+        if ground_station != own_id:
+            raise OperationRejected(
+                f"sticks: ArduPilot accepts them from system {ground_station:g} only (MAV_GCS_SYSID), and this program"
+                f" is system {own_id}: connect with source_system={ground_station:g}"
+            )
+        if (seconds := values.get("RC_OVERRIDE_TIME", 3.0)) <= 0:
+            why = "keeps the last position for ever if this program dies" if seconds < 0 else "ignores them"
+            raise OperationRejected(f"sticks: with RC_OVERRIDE_TIME = {seconds:g} ArduPilot {why}; set it to 3")
+        if int(values.get("RC_OPTIONS", 0)) & IGNORE_OVERRIDES:
+            raise OperationRejected("sticks: bit 1 of RC_OPTIONS makes ArduPilot ignore overrides; clear it")
+
+    def _message_of(self, sticks: StickInput) -> Message:
+        for name in ("forward", "right", "throttle", "yaw"):
+            check_range(name, getattr(sticks, name), -1, 1)
+        check_range("buttons", sticks.buttons, 0, MAX_BUTTONS)
+        forward, right, yaw = (round(1000 * value) for value in (sticks.forward, sticks.right, sticks.yaw))
+        is_signed = self._rules is not None and self._rules.signed_throttle
+        throttle = 1000 * sticks.throttle if is_signed else 500 * (sticks.throttle + 1)
+        return ManualControl(self._session.system_id, forward, right, round(throttle), yaw, sticks.buttons)
+
+    def _send(self) -> None:
+        super()._send()
+        self._has_sent = True
+
+    def _release(self) -> None:
+        """Return the channels to the transmitter; PX4 has no message for that."""
+        if not self._has_sent or self._rules is None or not self._session.connection.is_open:
+            return
+        self._has_sent = False
+        message: Message | None = None
+        if self._rules.release == "axes":
+            message = ManualControl(self._session.system_id, NO_VALUE, NO_VALUE, NO_VALUE, NO_VALUE, 0)
+        elif self._rules.release == "channels":
+            upper = SUB_CHANNELS - 8
+            values = [RELEASED] * 8 + [RELEASED_UPPER] * upper + [UNCHANGED] * (10 - upper)
+            message = RcChannelsOverride(self._session.system_id, self._session.component_id, *values)
+        if message is not None:
+            with contextlib.suppress(AerokitError):  # The overrides expire by themselves.
+                self._session.connection.send(message)

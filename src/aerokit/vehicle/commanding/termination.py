@@ -1,0 +1,112 @@
+"""Orders that end a flight or the vehicle's operation for good: flight termination and shutdown."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any, Literal
+
+from aerokit._internal.arguments import checks_arguments
+from aerokit.errors import CommandTimeout, LinkLost, NotSupported, OperationRejected
+from aerokit.mavlink.enums import MavCmd, MavState
+from aerokit.vehicle.commanding.context import VehicleBase
+from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, await_progress
+
+if TYPE_CHECKING:
+    from aerokit.vehicle.commanding.order import Order
+
+TerminationIntent = Literal["terminate flight"]
+ShutdownIntent = Literal["shut down"]
+
+ANSWER_TIMEOUT_S = 3.0
+SHUTDOWN = 2
+"""param1 of PREFLIGHT_REBOOT_SHUTDOWN."""
+ONCE: dict[str, Any] = {"attempts": 1, "attempt_timeout": ANSWER_TIMEOUT_S}
+
+
+@checks_arguments
+class TerminationActions(VehicleBase):
+    """Flight termination and shutdown. Each call names its intent, so that no other call can be mistaken for it."""
+
+    async def terminate(self, *, intent: TerminationIntent, timeout: float = 10.0) -> None:
+        """Terminate the flight (MAV_CMD_DO_FLIGHTTERMINATION): **the motors stop, and the vehicle falls**.
+
+        Returns when HEARTBEAT reports disarmed, PX4's mode TERMINATION, or MAV_STATE_FLIGHT_TERMINATION. The command is
+        sent at once, also to a silent vehicle, and only once: it is neither repeated nor sent later. A cancelled call
+        may have terminated the flight. PX4 releases its parachute if it has one, and needs a restart afterwards.
+        ArduPlane and Rover refuse it unless AFS_ENABLE is 1 and AFS_TERM_ACTION is 42.
+
+        Args:
+            intent: must be ``"terminate flight"``.
+            timeout: seconds for HEARTBEAT to report the termination after the command was accepted.
+
+        Raises:
+            InvalidArgument: the intent is another one. Nothing was sent.
+            CommandRejected: the vehicle refused; ``reasons`` has its status texts. PX4 refuses while it is disarmed.
+            CommandTimeout: there was no acknowledgement; the flight may have been terminated nevertheless.
+            HeartbeatTimeout: the vehicle was silent for ten seconds after its acknowledgement.
+            OperationTimeout: it accepted the command, and HEARTBEAT does not report the termination.
+        """
+        modes = self.autopilot.modes_of_command(MavCmd.DO_FLIGHTTERMINATION, (1.0,))
+        self._arm_cleanup.stop()
+        order = self._arbiter.order(*modes, ends_flight=True)
+        try:
+            await self._send_once(order, MavCmd.DO_FLIGHTTERMINATION, 1.0, modes=modes, armed=False)
+        except CommandTimeout as error:
+            raise CommandTimeout(f"{error}; the flight may have been terminated nevertheless") from None
+        armed, state = self.telemetry.armed, self.telemetry.system_status
+
+        def is_terminated() -> bool:
+            is_off = armed.latest is False and armed.updated_at > order.given_at
+            return is_off or state.latest == MavState.FLIGHT_TERMINATION or any(map(self.telemetry.is_in, modes))
+
+        await await_progress(
+            self._session,
+            "terminate",
+            is_done=is_terminated,
+            trouble=lambda: None,
+            describe=lambda: f"the vehicle is in {self.telemetry.mode_name}, still armed",
+            timeout=timeout,
+            max_silence_s=MAX_SILENCE_S,
+        )
+
+    async def shutdown(self, *, intent: ShutdownIntent, timeout: float = 15.0) -> None:
+        """Switch the autopilot off (MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN) and wait until its HEARTBEATs end.
+
+        HEARTBEAT counts as ended after 3.5 s, or when the link goes down after the acknowledgement. The command is sent
+        only once. Only a person at the vehicle can switch it on again. A cancelled call may have switched it off.
+
+        Args:
+            intent: must be ``"shut down"``.
+            timeout: seconds until it is silent.
+
+        Raises:
+            InvalidArgument: the intent is another one. Nothing was sent.
+            NotSupported: this firmware cannot be switched off (ArduPilot). Nothing was sent.
+            OperationRejected: it is armed, or not known to be disarmed. Nothing was sent.
+            CommandRejected: it refused; PX4 does on boards that cannot switch their power off.
+            CommandTimeout: there was no acknowledgement; it may have switched off nevertheless.
+            OperationTimeout: it accepted the command and still sends HEARTBEATs.
+        """
+        if not self.autopilot.can_shut_down:
+            raise NotSupported(f"shutdown: {self.autopilot.firmware} cannot be switched off; nothing was sent")
+        if not self.telemetry.is_confirmed_disarmed:
+            state = "armed" if self.telemetry.is_armed else "not known to be disarmed"
+            raise OperationRejected(f"shutdown: the vehicle is {state}; nothing was sent")
+        with self._arbiter.auxiliary_order() as order:
+            try:
+                await self._send_once(order, MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, SHUTDOWN)
+            except CommandTimeout as error:
+                raise CommandTimeout(f"{error}; it may have switched off nevertheless") from None
+        with suppress(LinkLost):
+            await await_progress(
+                self._session,
+                "shutdown",
+                is_done=lambda: self._session.watch.is_silent,
+                trouble=lambda: None,
+                describe=lambda: "it still sends HEARTBEATs",
+                timeout=timeout,
+                max_silence_s=None,
+            )
+
+    async def _send_once(self, order: Order, command: int, *params: float, **options: Any) -> None:
+        await self._sender.run_command(order, self._session.commands.send_long, command, *params, **ONCE, **options)

@@ -1,0 +1,79 @@
+"""Automatic tuning of the controllers."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import anyio
+
+from aerokit._internal.arguments import checks_arguments
+from aerokit.errors import CommandTimeout, NotSupported, OperationTimeout
+from aerokit.mavlink.enums import MavCmd, MavResult
+from aerokit.mavlink.messages import CommandAck
+from aerokit.protocols.command import rejection
+from aerokit.vehicle.commanding.context import VehicleBase
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+POLL_INTERVAL_S, ANSWER_TIMEOUT_S = 1.0, 1.0
+"""PX4 reports the result for two seconds; the command would start another tuning after that."""
+TUNED_PERCENT = 95
+"""Progress from which PX4 waits for disarming, to save its new gains."""
+
+
+@checks_arguments
+class TuningActions(VehicleBase):
+    """Automatic tuning."""
+
+    async def autotune(self, *, timeout: float = 120.0, on_progress: Callable[[int], object] | None = None) -> None:
+        """Let PX4 tune its controllers (MAV_CMD_DO_AUTOTUNE_ENABLE): **the vehicle shakes about each axis**.
+
+        Call it while the vehicle hovers, or circles on its wings. Returns when PX4 has finished: with MC_AT_APPLY 1 it
+        saves the new gains when it is disarmed. PX4 aborts if the mode changes or the sticks are moved. After a
+        cancellation it goes on tuning; change the mode to stop it.
+
+        Args:
+            timeout: seconds for all axes; PX4 needs about forty.
+            on_progress: called with each new percentage.
+
+        Raises:
+            NotSupported: this firmware tunes by a pilot's sticks, in its mode AUTOTUNE. Nothing was sent.
+            OperationRejected: the mode changed, or another party disarmed the vehicle.
+            CommandRejected: PX4 has no such module, or the tuning failed.
+            CommandTimeout: an answer is missing; PX4 may go on tuning.
+            OperationTimeout: it was not done in time; PX4 may go on tuning.
+        """
+        if not self.autopilot.tunes_by_command:
+            raise NotSupported(f"autotune: {self.autopilot.firmware} tunes by a pilot's sticks; nothing was sent")
+        started, percent = self.connection.now(), -1
+        answers: list[CommandAck] = []
+        detach = self.connection.bus.attach(CommandAck, answers.append, system_id=self.system_id)
+        try:
+            with self._arbiter.auxiliary_order() as order:
+                while percent < TUNED_PERCENT:
+                    if self.connection.now() - started > timeout:
+                        raise OperationTimeout(f"autotune: {percent} % within {timeout:g} s; PX4 may go on tuning")
+                    answer = await self._ask(answers)
+                    if answer.result not in (MavResult.IN_PROGRESS, MavResult.ACCEPTED):
+                        raise rejection(MavCmd.DO_AUTOTUNE_ENABLE, answer.result)
+                    if answer.progress != percent and on_progress is not None:
+                        on_progress(answer.progress)
+                    percent = answer.progress
+                    await anyio.sleep(POLL_INTERVAL_S if percent < TUNED_PERCENT else 0)
+                    self._sender.raise_if_ended(order)
+        finally:
+            detach()
+
+    async def _ask(self, answers: list[CommandAck]) -> CommandAck:
+        """Send the command once and return its answer."""
+        answers.clear()
+        self._session.commands.send_unconfirmed(MavCmd.DO_AUTOTUNE_ENABLE, 1)
+        until = self.connection.now() + ANSWER_TIMEOUT_S
+        while True:
+            for answer in answers:
+                if answer.command == MavCmd.DO_AUTOTUNE_ENABLE and self._session.commands.is_for_us(answer):
+                    return answer
+            if self.connection.now() >= until:
+                raise CommandTimeout("autotune: MAV_CMD_DO_AUTOTUNE_ENABLE was not acknowledged; PX4 may go on tuning")
+            await anyio.sleep(POLL_INTERVAL_S / 20)

@@ -1,0 +1,207 @@
+"""`External`: measurements, origin and wind that a program supplies to the vehicle's estimator."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from aerokit._internal.arguments import check_range, checks_arguments
+from aerokit.errors import InvalidArgument, OperationRejected, OperationTimeout
+from aerokit.mavlink.enums import MavCmd
+from aerokit.mavlink.messages import GpsGlobalOrigin, SetGpsGlobalOrigin
+from aerokit.vehicle.external.encoding import MeasurementEncoder
+from aerokit.vehicle.external.streams import MeasurementStream, TimesyncAnswers
+from aerokit.vehicle.external.values import (
+    FlowMeasurement,
+    GpsMeasurement,
+    ObstaclePoints,
+    ObstacleSectors,
+    OdometryMeasurement,
+    PoseMeasurement,
+    RangeMeasurement,
+    SpeedMeasurement,
+    TargetMeasurement,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from aerokit.autopilots.external import ExternalKind
+    from aerokit.mavlink.message import Message
+    from aerokit.position import Position
+    from aerokit.vehicle.commanding.context import VehicleContext
+    from aerokit.vehicle.commanding.streams import Probe
+    from aerokit.vehicle.external.streams import MeasurementT
+
+__all__ = ["External"]
+
+# The origin is stored in centimetres by ArduPilot; PX4 reports it as 32-bit degrees.
+ORIGIN_TOLERANCE_M = 1.0
+POLL_INTERVAL_S = 0.5
+
+
+@checks_arguments
+class External:
+    """Supplies the vehicle with measurements: ``async with vehicle.external.odometry() as stream: stream.send(…)``.
+
+    ``rate_hz`` (above 0, to 400) is the highest rate at which measurements are sent, ``valid_for_s`` the age at which
+    one is dropped. Time stamps are those of the event loop's clock, and aerokit answers the vehicle's TIMESYNC
+    requests with it meanwhile.
+    """
+
+    def __init__(self, context: VehicleContext, probe: Probe) -> None:
+        self._context, self._session, self._probe = context, context.session, probe
+        self._encode = MeasurementEncoder(context.session)
+        self._answers = TimesyncAnswers(context.session)
+
+    def odometry(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[OdometryMeasurement]:
+        """Supply pose and velocity (ODOMETRY). ArduPilot needs VISO_TYPE, PX4 EKF2_EV_CTRL."""
+        return self._stream("odometry", OdometryMeasurement, self._encode.odometry, rate_hz, valid_for_s)
+
+    def vision_position(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[PoseMeasurement]:
+        """Supply a pose (VISION_POSITION_ESTIMATE). ArduPilot needs VISO_TYPE, PX4 EKF2_EV_CTRL."""
+        return self._stream("vision_position", PoseMeasurement, self._encode.vision_position, rate_hz, valid_for_s)
+
+    def vision_speed(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[SpeedMeasurement]:
+        """Supply a velocity (VISION_SPEED_ESTIMATE; ODOMETRY without a pose to PX4)."""
+        return self._stream("vision_speed", SpeedMeasurement, self._encode.vision_speed, rate_hz, valid_for_s)
+
+    def motion_capture(self, *, rate_hz: float = 50.0, valid_for_s: float = 0.2) -> MeasurementStream[PoseMeasurement]:
+        """Supply a pose by motion capture (ATT_POS_MOCAP; VISION_POSITION_ESTIMATE to PX4)."""
+        return self._stream("motion_capture", PoseMeasurement, self._encode.motion_capture, rate_hz, valid_for_s)
+
+    def gps(self, *, rate_hz: float = 5.0, valid_for_s: float = 0.5) -> MeasurementStream[GpsMeasurement]:
+        """Supply a satellite position (GPS_INPUT). ArduPilot needs GPS1_TYPE 14; PX4 does not read it."""
+        return self._stream("gps", GpsMeasurement, self._encode.gps, rate_hz, valid_for_s)
+
+    def obstacles(self, *, rate_hz: float = 10.0, valid_for_s: float = 0.5) -> MeasurementStream[ObstacleSectors]:
+        """Supply distances around the vehicle (OBSTACLE_DISTANCE).
+
+        ArduPilot needs PRX1_TYPE 2; PX4 uses them if CP_DIST is above 0.
+        """
+        return self._stream("obstacles", ObstacleSectors, self._encode.obstacles, rate_hz, valid_for_s)
+
+    def obstacle_points(self, *, rate_hz: float = 10.0, valid_for_s: float = 0.5) -> MeasurementStream[ObstaclePoints]:
+        """Supply places of obstacles (OBSTACLE_DISTANCE_3D). ArduPilot needs PRX1_TYPE 2; PX4 does not read them."""
+        return self._stream("obstacle_points", ObstaclePoints, self._encode.obstacle_points, rate_hz, valid_for_s)
+
+    def range_finder(self, *, rate_hz: float = 20.0, valid_for_s: float = 0.2) -> MeasurementStream[RangeMeasurement]:
+        """Supply a distance (DISTANCE_SENSOR). ArduPilot needs RNGFND1_TYPE 10 and its orientation."""
+        return self._stream("range_finder", RangeMeasurement, self._encode.range_finder, rate_hz, valid_for_s)
+
+    def landing_target(
+        self, *, rate_hz: float = 20.0, valid_for_s: float = 0.3
+    ) -> MeasurementStream[TargetMeasurement]:
+        """Supply the place of a landing target (LANDING_TARGET). ArduPilot needs PLND_ENABLED and PLND_TYPE 1.
+
+        ``vehicle.land_on`` does this and lands.
+        """
+        return self._stream("landing_target", TargetMeasurement, self._encode.landing_target, rate_hz, valid_for_s)
+
+    def optical_flow(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[FlowMeasurement]:
+        """Supply optical flow (OPTICAL_FLOW; OPTICAL_FLOW_RAD to PX4).
+
+        ArduPilot needs FLOW_TYPE 5, PX4 EKF2_OF_CTRL.
+        """
+        return self._stream("optical_flow", FlowMeasurement, self._encode.optical_flow, rate_hz, valid_for_s)
+
+    async def set_wind(
+        self,
+        speed_m_s: float,
+        direction_deg: float,
+        *,
+        speed_accuracy_m_s: float = 1.0,
+        direction_accuracy_deg: float = 15.0,
+    ) -> None:
+        """Supply an estimate of the wind (MAV_CMD_EXTERNAL_WIND_ESTIMATE); returns when it is acknowledged.
+
+        No message reports the effect. ArduPilot applies it to its simpler estimator (DCM), PX4 to EKF2.
+
+        Args:
+            speed_m_s: horizontal speed, 0 to 100.
+            direction_deg: direction that it comes from, 0 to 360.
+            speed_accuracy_m_s: one standard deviation, 0 to 100.
+            direction_accuracy_deg: one standard deviation, 0 to 180.
+
+        Raises:
+            InvalidArgument: a value is out of range. Nothing was sent.
+            CommandRejected: the vehicle refused, or does not support it.
+            CommandTimeout: there was no acknowledgement.
+        """
+        check_range("speed_m_s", speed_m_s, 0, 100)
+        check_range("direction_deg", direction_deg, 0, 360)
+        check_range("speed_accuracy_m_s", speed_accuracy_m_s, 0, 100)
+        check_range("direction_accuracy_deg", direction_accuracy_deg, 0, 180)
+        params = (speed_m_s, speed_accuracy_m_s, direction_deg, direction_accuracy_deg)
+        await self._context.sender.auxiliary_command(MavCmd.EXTERNAL_WIND_ESTIMATE, *params)
+
+    async def set_origin(self, origin: Position, *, timeout: float = 10.0) -> None:
+        """Set the origin of the estimator's local frame, and wait until GPS_GLOBAL_ORIGIN reports it.
+
+        A vehicle without GPS needs it for global positions. SET_GPS_GLOBAL_ORIGIN is sent once; it has no
+        acknowledgement. Returns at once if the vehicle has this origin already. After a cancellation the vehicle may
+        have accepted it.
+
+        Args:
+            origin: latitude, longitude and altitude above mean sea level.
+            timeout: seconds until the vehicle reports it.
+
+        Raises:
+            InvalidArgument: the place has no altitude above mean sea level. Nothing was sent.
+            OperationRejected: ArduPilot has another origin and keeps it until a reboot. Nothing was sent.
+            OperationTimeout: the vehicle did not report it.
+        """
+        if origin.altitude_amsl_m is None:
+            raise InvalidArgument("origin has no altitude_amsl_m, which the local frame requires")
+        cell, session = self._session.telemetry.origin, self._session
+        if not cell.is_known:
+            await self._request_origin()
+        if (present := cell.latest) is not None:
+            if _are_equal(present, origin):
+                return
+            if session.autopilot.external.origin_is_final:
+                raise OperationRejected(
+                    f"set_origin: {session.autopilot.firmware} has the origin {present} and keeps it until a reboot"
+                )
+        latitude, longitude = round(origin.latitude_deg * 1e7), round(origin.longitude_deg * 1e7)
+        altitude = round(origin.altitude_amsl_m * 1000)
+        time_us = int(session.connection.now() * 1e6)
+        with self._context.arbiter.auxiliary_order() as order:
+            self._context.sender.raise_if_ended(order)
+            session.send(SetGpsGlobalOrigin(session.system_id, latitude, longitude, altitude, time_us))
+        await self._await_origin(origin, timeout)
+
+    async def _await_origin(self, origin: Position, timeout: float) -> None:
+        cell, connection = self._session.telemetry.origin, self._session.connection
+        until = connection.now() + timeout
+        while (left := until - connection.now()) > 0:
+            await self._request_origin()
+            try:
+                await cell.wait_until(lambda value: _are_equal(value, origin), timeout=min(POLL_INTERVAL_S, left))
+            except OperationTimeout:
+                continue
+            return
+        known = f"it reports {cell.latest}" if cell.is_known else "it reports none"
+        raise OperationTimeout(f"set_origin: the vehicle did not report the origin within {timeout:g} s; {known}")
+
+    async def _request_origin(self) -> None:
+        """Request GPS_GLOBAL_ORIGIN without waiting for an acknowledgement."""
+        self._session.commands.send_unconfirmed(MavCmd.REQUEST_MESSAGE, GpsGlobalOrigin.ID)
+
+    def _stream(
+        self,
+        kind: ExternalKind,
+        value_type: type[MeasurementT],
+        encode: Callable[[MeasurementT], tuple[Message, ...]],
+        rate_hz: float,
+        valid_for_s: float,
+    ) -> MeasurementStream[MeasurementT]:
+        return MeasurementStream(
+            self._session, kind, value_type, encode, self._answers, self._probe, rate_hz, valid_for_s
+        )
+
+
+def _are_equal(present: Position, wanted: Position) -> bool:
+    if present.altitude_amsl_m is None or wanted.altitude_amsl_m is None:
+        return False
+    is_level = abs(present.altitude_amsl_m - wanted.altitude_amsl_m) <= ORIGIN_TOLERANCE_M
+    return is_level and present.distance_to(wanted) <= ORIGIN_TOLERANCE_M

@@ -1,0 +1,240 @@
+"""`MeasurementStream`: sends each measurement of a program once, as long as it is recent."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from typing import TYPE_CHECKING, Generic, Literal, TypeAlias, TypeVar
+
+from aerokit._internal.arguments import check_kind, check_range, checks_arguments
+from aerokit.errors import NotSupported, OperationRejected, SetpointStreamStopped
+from aerokit.mavlink.enums import MavLandedState
+from aerokit.mavlink.messages import Timesync
+from aerokit.vehicle.commanding.streams import MAX_RATE_HZ, known_values
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from types import TracebackType
+
+    from typing_extensions import Self
+
+    from aerokit.autopilots.external import ExternalKind
+    from aerokit.connection.bus import Detach
+    from aerokit.mavlink.message import Message
+    from aerokit.vehicle.commanding.streams import Probe
+    from aerokit.vehicle.session.session import VehicleSession
+
+__all__ = ["EstimatorUse", "MeasurementStream", "MeasurementT"]
+
+MeasurementT = TypeVar("MeasurementT")
+EstimatorUse: TypeAlias = Literal["used", "not used", "unknown"]
+
+# Bit of EKF_STATUS_REPORT and ESTIMATOR_STATUS: the estimator only holds a constant position.
+CONSTANT_POSITION = 1 << 7
+ESTIMATOR_MAX_AGE_S = 2.5
+
+
+class TimesyncAnswers:
+    """Answers the vehicle's TIMESYNC requests with the clock of the event loop while a stream is open.
+
+    PX4 needs the answers to convert the time stamps of measurements to its own clock (Timesync.cpp, sync_stamp); until
+    they have converged it uses the times of arrival, as ArduPilot does always.
+    """
+
+    def __init__(self, session: VehicleSession) -> None:
+        self._session = session
+        self._users = 0
+        self._detach: Detach | None = None
+
+    def open(self) -> None:
+        """Begin to answer; each call needs a call of `close`."""
+        self._users += 1
+        if self._users == 1:
+            bus = self._session.connection.bus
+            self._detach = bus.attach(Timesync, self._on_timesync, system_id=self._session.system_id)
+
+    def close(self) -> None:
+        """Stop answering after the last stream."""
+        self._users -= 1
+        if self._users == 0 and self._detach is not None:
+            self._detach()
+            self._detach = None
+
+    def _on_timesync(self, request: Timesync) -> None:
+        frame = request.received_frame
+        if request.tc1 == 0 and frame is not None and frame.component_id == self._session.component_id:
+            connection = self._session.connection
+            if connection.is_open:
+                connection.send(Timesync(int(frame.received_at * 1e9), request.ts1), to=self._session.system_id)
+
+
+@checks_arguments
+class MeasurementStream(Generic[MeasurementT]):
+    """Sends the measurements that you give to ``send``, each once, at most ``rate_hz`` times a second.
+
+    A measurement is never repeated: without new ones nothing is sent, and the vehicle acts as without its sensor. Of
+    several measurements within one period only the newest is sent. One that is older than ``valid_for_s`` when it
+    could be sent is dropped, after a blocked event loop for example; while the vehicle is silent all are dropped.
+    ``sent`` and ``dropped`` count them. The stream does not end by itself; it ends with the block.
+
+    Entering raises:
+        NotSupported: this firmware does not read such measurements. Nothing was sent.
+        OperationRejected: a parameter makes the vehicle ignore them; the text names it. Nothing else was sent.
+        ParameterTimeout: the vehicle did not report these parameters.
+    """
+
+    def __init__(
+        self,
+        session: VehicleSession,
+        kind: ExternalKind,
+        value_type: type[MeasurementT],
+        encode: Callable[[MeasurementT], tuple[Message, ...]],
+        answers: TimesyncAnswers,
+        probe: Probe,
+        rate_hz: float,
+        valid_for_s: float,
+    ) -> None:
+        check_range("rate_hz", rate_hz, 0, MAX_RATE_HZ, above=True)
+        check_range("valid_for_s", valid_for_s, 0, 60, above=True)
+        self._session, self._value_type, self._encode = session, value_type, encode
+        self._kind: ExternalKind = kind
+        self._answers, self._probe = answers, probe
+        self._period_s, self._valid_for_s = 1 / rate_hz, valid_for_s
+        self._parameters: dict[str, float] = {}
+        self._waiting: tuple[tuple[Message, ...], float] | None = None
+        self._timer: asyncio.TimerHandle | None = None
+        self._next_at = -math.inf
+        self._is_open = self._was_entered = False
+        self._sent = self._dropped = 0
+
+    @property
+    def sent(self) -> int:
+        """Number of measurements that were sent."""
+        return self._sent
+
+    @property
+    def dropped(self) -> int:
+        """Number of measurements that were not sent: replaced by a newer one, too old, or during a silence."""
+        return self._dropped
+
+    @property
+    def is_open(self) -> bool:
+        """True inside the block."""
+        return self._is_open
+
+    @property
+    def estimator_use(self) -> EstimatorUse:
+        """Use of these measurements by the vehicle's estimator.
+
+        No message reports this. It is derived from EKF_STATUS_REPORT or ESTIMATOR_STATUS and from the parameters at
+        the beginning of the block. "used": the estimator has a position or velocity, and its parameters allow no other
+        source. "not used": it has none. "unknown" in all other cases, such as with a GPS beside, for sensors that are
+        not a position, or without a recent report.
+        """
+        rule = self._session.autopilot.external.find(self._kind)
+        estimator = self._session.telemetry.estimator
+        health = estimator.latest
+        if rule is None or not rule.sole_source or not self._parameters or health is None:
+            return "unknown"
+        if estimator.age > ESTIMATOR_MAX_AGE_S or not self._sent:
+            return "unknown"
+        has_position = health.has_relative_position or health.has_absolute_position
+        # PX4 sets the flag also for a vehicle at rest.
+        is_resting = self._session.telemetry.landed_state.latest == MavLandedState.ON_GROUND
+        is_constant = health.flags & CONSTANT_POSITION and not (
+            is_resting and self._session.autopilot.external.constant_position_at_rest
+        )
+        if is_constant or not has_position:
+            return "not used"
+        known = [(self._parameters[name], allowed) for name, allowed in rule.sole_source if name in self._parameters]
+        is_alone = rule.sole_source[0][0] in self._parameters and all(value in allowed for value, allowed in known)
+        return "used" if is_alone else "unknown"
+
+    def send(self, measurement: MeasurementT) -> None:
+        """Send a measurement now, or at the end of the period if one was sent within it.
+
+        Raises:
+            InvalidArgument: a value is out of range; nothing was sent.
+            SetpointStreamStopped: the block was left or not entered.
+            ValueUnknownError: a landing target for PX4, whose attitude or local position is unknown.
+            ConnectionClosed: the connection has ended.
+        """
+        check_kind("measurement", measurement, self._value_type)
+        if not self._is_open:
+            raise SetpointStreamStopped(f"this {self._kind} stream is not open: use it inside its `async with` block")
+        messages = self._encode(measurement)
+        for message in messages:
+            message.encode()
+        connection = self._session.connection
+        if not connection.is_open:
+            connection.send(messages[0])  # Raises the reason of the end.
+        now = connection.now()
+        given: float | None = getattr(measurement, "measured_at", None)
+        if self._waiting is not None:
+            self._dropped += 1
+        self._waiting = (messages, now if given is None else given)
+        if now >= self._next_at:
+            self._flush()
+        elif self._timer is None:
+            self._timer = asyncio.get_running_loop().call_at(self._next_at, self._flush)
+
+    def _flush(self) -> None:
+        """Send the waiting measurement unless it is too old."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        if self._waiting is None:
+            return
+        (messages, measured_at), self._waiting = self._waiting, None
+        session, now = self._session, self._session.connection.now()
+        if now - measured_at > self._valid_for_s or session.watch.is_silent or not session.connection.is_open:
+            self._dropped += 1
+            return
+        following = self._next_at + self._period_s
+        self._next_at = following if following > now else now + self._period_s
+        for message in messages:
+            session.send(message)
+        self._sent += 1
+
+    async def __aenter__(self) -> Self:
+        if self._was_entered:
+            raise SetpointStreamStopped(f"this {self._kind} stream can be entered only once: open another one")
+        self._was_entered = True
+        self._parameters = await check_external(self._session, self._kind, self._probe)
+        self._answers.open()
+        self._is_open = True
+        return self
+
+    async def __aexit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._is_open, self._waiting = False, None
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        self._answers.close()
+
+
+async def check_external(session: VehicleSession, kind: ExternalKind, probe: Probe) -> dict[str, float]:
+    """Raise unless the vehicle reads measurements of this kind; return the parameters that decide about them."""
+    autopilot = session.autopilot
+    what = kind.replace("_", " ")
+    rule = autopilot.external.find(kind)
+    if rule is None:
+        raise NotSupported(f"{what}: {autopilot.firmware} does not read such measurements by MAVLink")
+    names = [name for group, _ in rule.required for name in group]
+    values = await known_values(probe, *names, *(name for name, _ in rule.sole_source))
+    for group, allowed in rule.required:
+        found = next((name for name in group if name in values), None)
+        value = None if found is None else values[found]
+        if value not in allowed:
+            now = f"{group[0]} does not exist" if value is None else f"{found} = {value:g}"
+            choice = " or ".join(f"{each:g}" for each in allowed[:4])
+            raise OperationRejected(
+                f"{what}: {now}, so that {autopilot.firmware} ignores the measurements; set {group[0]} to {choice}"
+                " and reboot"
+            )
+    return values

@@ -1,0 +1,39 @@
+"""Runs the tests of the wire with both implementations, in one process."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from types import MethodType
+
+import framer_harness
+import pytest
+from exhaustive import exhaustive
+
+from aerokit.mavlink import STANDARD, Dialect, encoder, tlog
+from aerokit.mavlink.frame import x25_in_python
+from aerokit.mavlink.framer import Framer, PythonFramer
+
+WITH_BOTH = ("test_framer", "test_hostile_bytes", "test_encoder", "test_tlog", "test_recorded_traffic", "test_signing")
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    name = getattr(metafunc.module, "__name__", "")
+    if name in WITH_BOTH:
+        metafunc.fixturenames.append("wire")
+        python = exhaustive("python") if name == "test_recorded_traffic" else "python"
+        rows = ["python"] if Framer is PythonFramer else ["c", python]  # built, and not AEROKIT_PURE=1?
+        metafunc.parametrize("wire", rows, indirect=True, scope="module")
+
+
+@pytest.fixture(scope="module")
+def wire(request: pytest.FixtureRequest) -> Iterator[str]:
+    """Replace what is compiled by the Python code, if the parameter says so."""
+    with pytest.MonkeyPatch.context() as patch:
+        if request.param == "python":
+            patch.setattr(encoder.FrameEncoder, "_encode_frame", None)
+            patch.setattr(encoder, "x25", x25_in_python())
+            patch.setattr(tlog, "_compiled", None)
+            patch.setattr(STANDARD, "decode", MethodType(Dialect.decode, STANDARD))
+            for module in (request.module, framer_harness):
+                patch.setattr(module, "Framer", PythonFramer, raising=False)
+        yield request.param
