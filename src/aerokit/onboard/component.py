@@ -45,7 +45,6 @@ _MAVLINK_VERSION = 3
 
 MetadataKind = Literal["commands", "peripherals", "events", "actuators"]
 HandlerT = TypeVar("HandlerT", bound=Callable[..., Any])
-BuilderT = TypeVar("BuilderT", bound=Callable[[], Any])
 
 
 @checks_arguments
