@@ -12,7 +12,7 @@ import pytest
 
 from aerokit.mavlink import messages
 from aerokit.mavlink.enums import MavCmd
-from aerokit.onboard import CameraDriver, ComponentMissions, ComponentParameters, OnboardComponent
+from aerokit.onboard import AutopilotDriver, CameraDriver, ComponentMissions, ComponentParameters, OnboardComponent
 
 PAGE = Path(__file__).parents[2] / "docs" / "features-onboard.md"
 ROW = re.compile(r"^\| `(\w+)\.(\w+)` \| (.+) \|$", re.MULTILINE)
@@ -21,6 +21,7 @@ ROOTS: dict[str, Any] = {
     "component.missions": ComponentMissions,
     "component": OnboardComponent,
     "camera": CameraDriver,
+    "autopilot": AutopilotDriver,
     "messages": messages,
     "MavCmd": MavCmd,
 }

@@ -7,12 +7,13 @@ import math
 from pathlib import Path
 
 import pytest
-from onboard_peers import device_and_client, payload_and_station
+from onboard_peers import autopilot_and_client, device_and_client, payload_and_station
 
-from aerokit.errors import AerokitError, CommandRejected, InvalidArgument
+from aerokit.errors import AerokitError, BusyError, CommandRejected, InvalidArgument, OperationRejected
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavArmAuthDeniedReason, MavCmd, MavResult, MavType, MavWinchStatusFlag
+from aerokit.mavlink.enums import MavArmAuthDeniedReason, MavCmd, MavModeFlag, MavResult, MavType, MavWinchStatusFlag
 from aerokit.onboard import (
+    AutopilotDriver,
     CameraDriver,
     GimbalDriver,
     GimbalTarget,
@@ -207,6 +208,43 @@ async def test_winch_pays_out_and_retracts() -> None:
         with pytest.raises(CommandRejected):
             await winch.relax()
     assert spool.length_m == 0.0
+
+
+class Model(AutopilotDriver):
+    def __init__(self) -> None:
+        self.calls: list[object] = []
+
+    async def arm(self, force: bool) -> None:
+        if not force:
+            raise BusyError("the batteries are cold")
+        self.calls.append("arm")
+
+    async def disarm(self, force: bool) -> None:
+        self.calls.append("disarm")
+
+    async def set_mode(self, custom_mode: int) -> None:
+        self.calls.append(custom_mode)
+
+    async def take_off(self, altitude_m: float | None) -> None:
+        self.calls.append(altitude_m)
+
+
+async def test_autopilot_executes_commands_and_reports_them_in_heartbeat() -> None:
+    model = Model()
+    async with autopilot_and_client() as (node, vehicle):
+        node.add_autopilot(model)
+        with pytest.raises(OperationRejected, match="cold"):
+            await vehicle.arm()
+        await vehicle.arm(force=True)
+        await vehicle.command(MavCmd.DO_SET_MODE, 1, 7)
+        await vehicle.command(MavCmd.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 12.5)
+        heartbeat = await vehicle.message(m.Heartbeat).wait_until(lambda beat: beat.custom_mode == 7, timeout=5)
+        with pytest.raises(CommandRejected) as raised:
+            await vehicle.command(MavCmd.NAV_LAND)
+        await vehicle.disarm()
+    assert model.calls == ["arm", 7, 12.5, "disarm"]
+    assert heartbeat.base_mode & MavModeFlag.SAFETY_ARMED
+    assert raised.value.result == MavResult.UNSUPPORTED
 
 
 async def test_gripper_grabs_and_releases() -> None:

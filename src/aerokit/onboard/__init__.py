@@ -11,6 +11,7 @@ if TYPE_CHECKING:
 
     from aerokit.onboard.arguments import Param as Param
     from aerokit.onboard.arguments import Range as Range
+    from aerokit.onboard.autopilot import AutopilotDriver as AutopilotDriver
     from aerokit.onboard.camera import CameraDriver as CameraDriver
     from aerokit.onboard.camera import Photo as Photo
     from aerokit.onboard.camera import Storage as Storage
@@ -33,6 +34,7 @@ __getattr__, __dir__, __all__ = lazy_exports(
     __name__,
     {
         "aerokit.onboard.arguments": ("Param", "Range"),
+        "aerokit.onboard.autopilot": ("AutopilotDriver",),
         "aerokit.onboard.camera": ("CameraDriver", "Photo", "Storage"),
         "aerokit.onboard.commands": ("CommandRequest", "CommandResult"),
         "aerokit.onboard.component": ("OnboardComponent",),

@@ -287,10 +287,7 @@ class CameraAdapter(CameraDevice):
 
     async def set_zoom(self, kind: int, value: float) -> bool:
         camera = self._camera
-        return await self._move(
-            kind == CameraZoomType.STEP, kind == CameraZoomType.RANGE, kind == CameraZoomType.CONTINUOUS,
-            value, self.zoom, "zoom_to", camera.zoom_to, "zoom_at", camera.zoom_at,
-        )  # fmt: skip
+        return await self._move(kind, value, self.zoom, camera.zoom_to, camera.zoom_at)
 
     async def set_focus(self, kind: int, value: float) -> bool:
         camera = self._camera
@@ -300,30 +297,19 @@ class CameraAdapter(CameraDevice):
         if kind == SetFocusType.METERS and value > 0 and _has(camera, "focus_distance"):
             await self._call(camera.focus_distance, value)
             return True
-        return await self._move(
-            kind == SetFocusType.STEP, kind == SetFocusType.RANGE, kind == SetFocusType.CONTINUOUS,
-            value, self.focus, "focus_to", camera.focus_to, "focus_at", camera.focus_at,
-        )  # fmt: skip
+        return await self._move(kind, value, self.focus, camera.focus_to, camera.focus_at)
 
     async def _move(
-        self,
-        is_step: bool,
-        is_range: bool,
-        is_rate: bool,
-        value: float,
-        now: float,
-        to_name: str,
-        to: Callable[[float], Any],
-        at_name: str,
-        at: Callable[[float], Any],
+        self, kind: int, value: float, now: float, to: Callable[[float], Any], at: Callable[[float], Any]
     ) -> bool:
-        if is_step and math.isfinite(now):
-            value, is_range = max(0.0, min(100.0, now + value * _STEP_PERCENT)), True
-        if is_range and 0.0 <= value <= 100.0 and _has(self._camera, to_name):
-            await self._call(to, value)
-            return True
-        if is_rate and -1.0 <= value <= 1.0 and _has(self._camera, at_name):
-            await self._call(at, value)
+        """Move zoom or focus. The numbers of CAMERA_ZOOM_TYPE are those of SET_FOCUS_TYPE."""
+        if kind == CameraZoomType.STEP and math.isfinite(now):
+            kind, value = CameraZoomType.RANGE, max(0.0, min(100.0, now + value * _STEP_PERCENT))
+        low, move = (0.0, to) if kind == CameraZoomType.RANGE else (-1.0, at)
+        high = 100.0 if kind == CameraZoomType.RANGE else 1.0
+        is_possible = kind in (CameraZoomType.RANGE, CameraZoomType.CONTINUOUS) and low <= value <= high
+        if is_possible and _has(self._camera, move.__name__):
+            await self._call(move, value)
             return True
         return False
 

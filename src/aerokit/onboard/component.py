@@ -15,6 +15,7 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import (
     CompMetadataType,
     MavCmd,
+    MavModeFlag,
     MavSeverity,
     MavState,
     MavType,
@@ -32,6 +33,7 @@ from aerokit.protocols.servers.ftp import SessionFtpServer
 
 if TYPE_CHECKING:
     from aerokit.connection.connection import Connection
+    from aerokit.onboard.autopilot import AutopilotDriver
     from aerokit.onboard.camera import CameraDriver
     from aerokit.onboard.devices import WinchDriver
     from aerokit.onboard.gimbal import GimbalDriver
@@ -300,6 +302,30 @@ class OnboardComponent:
         return self._missions
 
     # ---------------------------------------------------------------------------- ready-made parts
+
+    def add_autopilot(self, driver: AutopilotDriver) -> None:
+        """Execute a ground station's commands by a program's vehicle: arm, mode, take-off, landing, return, reboot.
+
+        The component should have component id 1, a vehicle's ``type``, and ``autopilot=MavAutopilot.GENERIC``.
+        HEARTBEAT follows: armed after ``arm``, the mode after ``set_mode``. Send telemetry by :meth:`message`.
+
+        Args:
+            driver: an instance of the program's class, see :class:`~aerokit.onboard.AutopilotDriver`.
+
+        Raises:
+            InvalidArgument: one of the commands has a handler.
+        """
+        from aerokit.onboard.autopilot import add_autopilot  # Imported here because few components are one.
+
+        add_autopilot(self._services, driver, self._report_flight)
+
+    def _report_flight(self, is_armed: bool | None, custom_mode: int | None) -> None:
+        before = self._heartbeat
+        flags = before.base_mode | MavModeFlag.CUSTOM_MODE_ENABLED
+        if is_armed is not None:
+            flags = flags & ~MavModeFlag.SAFETY_ARMED | (MavModeFlag.SAFETY_ARMED if is_armed else 0)
+        mode = before.custom_mode if custom_mode is None else custom_mode
+        self.set_state(before.system_status, base_mode=int(flags), custom_mode=mode)
 
     def add_camera(self, camera: CameraDriver) -> None:
         """Serve the camera protocol: photos, series, videos, storage, streams, zoom, focus, tracking, settings.

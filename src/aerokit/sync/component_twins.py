@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.mavlink.signing import Signing
     from aerokit.missions import MissionItem
+    from aerokit.onboard.autopilot import AutopilotDriver
     from aerokit.onboard.camera import CameraDriver
     from aerokit.onboard.component import MetadataKind
     from aerokit.onboard.devices import WinchDriver
@@ -411,6 +412,20 @@ class OnboardComponent(ComponentTwin):
     def missions(self) -> ComponentMissions:
         """Missions, fences and rally points that other programs upload and download; served from the first use on."""
         return ComponentMissions(self._loop, self._loop.call(lambda: self.aio.missions))
+
+    def add_autopilot(self, driver: AutopilotDriver) -> None:
+        """Execute a ground station's commands by a program's vehicle: arm, mode, take-off, landing, return, reboot.
+
+        The component should have component id 1, a vehicle's ``type``, and ``autopilot=MavAutopilot.GENERIC``.
+        HEARTBEAT follows: armed after ``arm``, the mode after ``set_mode``. Send telemetry by :meth:`message`.
+
+        Args:
+            driver: an instance of the program's class, see :class:`~aerokit.onboard.AutopilotDriver`.
+
+        Raises:
+            InvalidArgument: one of the commands has a handler.
+        """
+        self._loop.call(self.aio.add_autopilot, driver)
 
     def add_camera(self, camera: CameraDriver) -> None:
         """Serve the camera protocol: photos, series, videos, storage, streams, zoom, focus, tracking, settings.
