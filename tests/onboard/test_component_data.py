@@ -38,6 +38,16 @@ async def test_parameter_out_of_range_is_refused() -> None:
         assert node.parameters["WINCH_SPEED"] == 1.5
 
 
+@pytest.mark.parametrize(("bytewise", "expected"), [(False, 7), (True, 1)])
+async def test_integer_sent_as_float_is_accepted_only_if_cast(bytewise: bool, expected: int) -> None:
+    async with payload_and_station(bytewise=bytewise) as (payload, station):
+        payload.parameters.add("SPOOL", 1)
+        value = await station.ask(m.ParamSet(*station.target, "SPOOL", 7.0, 9), m.ParamValue)
+    assert payload.parameters["SPOOL"] == expected
+    assert type(payload.parameters["SPOOL"]) is int
+    assert value.param_type == 6
+
+
 async def test_parameter_is_refused_by_on_set() -> None:
     def check(value: object) -> None:
         raise InvalidArgument("not while the line is out")

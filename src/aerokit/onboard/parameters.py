@@ -253,8 +253,8 @@ class _Store:
             return MavParamError.VALUE_OUT_OF_RANGE, ParamAck.FAILED
         return None
 
-    def store(self, name: str, value: Any) -> None:
-        self._parameters._store(name, value)
+    def store(self, name: str, value: object) -> None:
+        self._parameters._store(name, self._parameters._checked(self._parameters._rows[name], value))
 
 
 def _as_stored(limit: float | None, default: ParameterValue) -> float | None:

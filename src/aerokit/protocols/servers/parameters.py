@@ -170,13 +170,15 @@ class TypedParameterServer(ParameterProtocolServer):
             self.send_error(sender_of(request), name, -1, MavParamError.DOES_NOT_EXIST, channel)
             return
         value = value_of(request, bytewise=self.bytewise)
-        problem = store.problem(name, value, request.param_type)
+        # A cast value needs no type, and ArduPilot's clients send all values as REAL32.
+        problem = store.problem(name, value, request.param_type if self.bytewise else store.type(name))
         if problem is not None:
             self.send_error(sender_of(request), name, names.index(name), problem[0], channel)
             self.send(name, names.index(name), channel)
             return
-        is_new = not settings_equal(store[name], value)
+        before = store[name]
         store.store(name, value)
+        is_new = not settings_equal(before, store[name])
         self.send(name, names.index(name), channel if not is_new else None)
 
 
