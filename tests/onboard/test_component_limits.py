@@ -64,6 +64,19 @@ async def test_fifth_file_of_a_client_is_refused(tmp_path: Path) -> None:
     assert answers[4].data[0] == MavFtpErr.NOSESSIONSAVAILABLE
 
 
+async def test_file_is_opened_with_session_and_number_of_mavproxy(tmp_path: Path) -> None:
+    """MAVProxy closes a session that is not open, and opens a file, both with number 0 and a session of its own."""
+    (tmp_path / "a").write_bytes(b"1")
+    async with payload_and_station() as (payload, station):
+        payload.serve_files(tmp_path)
+        answers = []
+        for opcode, size in ((MavFtpOpcode.TERMINATESESSION, 0), (MavFtpOpcode.OPENFILERO, 2)):
+            request = FtpPacket(0, opcode, 131, size, data=b"/a", client=station.target)
+            answers.append(FtpPacket.parse(await station.ask(request.message(), m.FileTransferProtocol)))
+    assert [answer.opcode for answer in answers] == [MavFtpOpcode.NAK, MavFtpOpcode.ACK]
+    assert answers[1].session == 131
+
+
 async def test_second_upload_is_denied_and_silent_one_is_cancelled() -> None:
     async with payload_and_station() as (payload, station):
         _ = payload.missions

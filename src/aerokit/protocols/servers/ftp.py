@@ -191,6 +191,17 @@ class SessionFtpServer(FtpRequestServer[FilesT]):
         """Return the key of the client."""
         return request.client
 
+    def _is_repeated(self, request: FtpPacket, last: FtpPacket) -> bool:
+        """Return True if the last reply answers this request. MAVProxy begins each operation with number 0."""
+        same = request.client == last.client and request.opcode == last.request_opcode
+        return same and request.sequence + 1 == last.sequence
+
+    def _new_number(self, peer: FtpPeer, request: FtpPacket) -> int:
+        """Return the number of a new session: the one that the client wants, as MAVProxy does, or the first free."""
+        if request.session and request.session not in peer.sessions:
+            return request.session
+        return next(number for number in range(self.max_sessions) if number not in peer.sessions)
+
     def _fault(self, peer: FtpPeer, request: FtpPacket, fault: FileFault) -> FtpPacket:
         """Return the answer to a request that failed."""
         return request.refuse_errno(fault.errno)
@@ -215,7 +226,7 @@ class SessionFtpServer(FtpRequestServer[FilesT]):
         peer.used_at = self._host.now
         if request.size > DATA_SIZE:
             self._reply(peer, request.refuse(MavFtpErr.INVALIDDATASIZE))
-        elif (last := peer.reply) is not None and _is_repeated(request, last):
+        elif (last := peer.reply) is not None and self._is_repeated(request, last):
             self._host.send(last.message(), channel)
         else:
             self._answer(peer, request)
@@ -284,7 +295,7 @@ class SessionFtpServer(FtpRequestServer[FilesT]):
             raise FileFault(EFBIG)
         create = request.opcode == Op.CREATEFILE or (not reading and path not in self.files)
         file = self.files.open(path, writing=not reading, create=create)
-        number = next(number for number in range(self.max_sessions) if number not in peer.sessions)
+        number = self._new_number(peer, request)
         session = peer.sessions[number] = _Session(number, file, path, size)
         self._watch(peer, session)
         return request.acknowledge(size.to_bytes(4, "little"), offset=request.offset, session=number)
@@ -439,10 +450,6 @@ class SessionFtpServer(FtpRequestServer[FilesT]):
         if peer.checksum is request:  # otherwise a newer request has replaced it
             peer.checksum, peer.used_at = None, self._host.now
             self._reply(peer, answer)
-
-
-def _is_repeated(request: FtpPacket, last: FtpPacket) -> bool:
-    return request.sequence + 1 == last.sequence and request.client == last.client
 
 
 def leaves(path: str) -> bool:
