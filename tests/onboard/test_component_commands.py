@@ -107,6 +107,22 @@ async def test_cancelled_command_ends_with_cancelled() -> None:
     assert (ack.result, was_cancelled) == (MavResult.CANCELLED, True)
 
 
+async def test_command_cancelled_before_its_task_begins_is_not_executed() -> None:
+    calls = 0
+    async with payload_and_station() as (payload, station):
+
+        @payload.command(MavCmd.USER_2)
+        async def lower(_: CommandRequest) -> None:
+            nonlocal calls
+            calls += 1
+
+        with station.collecting(m.CommandAck) as acks:
+            station.connection.send(station.command_long(MavCmd.USER_2))
+            station.connection.send(m.CommandCancel(*station.target, MavCmd.USER_2))
+            await asyncio.sleep(1.0)
+    assert ([ack.result for ack in acks], calls) == ([MavResult.CANCELLED], 0)
+
+
 @pytest.mark.parametrize(
     ("error", "result"),
     [

@@ -179,10 +179,17 @@ class ComponentCommands:
         self, function: Callable[..., Any], arguments: tuple[CommandArgument, ...], command: ReceivedCommand
     ) -> None:
         task: list[asyncio.Task[Any]] = []
+        is_cancelled = False
 
         def cancel() -> None:
+            nonlocal is_cancelled
             if task:
                 task[0].cancel()
+            elif not is_cancelled:  # the task has not begun yet
+                is_cancelled = True
+                if inspect.iscoroutine(answer):
+                    answer.close()
+                self._running.finish(started, Outcome(MavResult.CANCELLED))
 
         running = self._running.start(command, cancel)
         if running is None:
@@ -208,6 +215,8 @@ class ComponentCommands:
             return
 
         async def run() -> None:
+            if is_cancelled:
+                return
             current = asyncio.current_task()
             assert current is not None
             task.append(current)
