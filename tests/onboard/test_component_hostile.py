@@ -19,7 +19,7 @@ from aerokit.mavlink.enums import MavCmd, MavFtpOpcode
 from aerokit.mavlink.frame import x25
 from aerokit.mavlink.message import Message
 from aerokit.onboard import CommandRequest
-from aerokit.protocols.servers.ftp import FtpPacket
+from aerokit.protocols.servers.ftp_packets import FtpPacket
 
 pytestmark = pytest.mark.anyio
 

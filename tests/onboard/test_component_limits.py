@@ -13,7 +13,7 @@ from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd, MavFtpErr, MavFtpOpcode, MavMissionResult, MavResult
 from aerokit.onboard import CommandRequest
 from aerokit.protocols.servers.commands import MAX_RUNNING_COMMANDS
-from aerokit.protocols.servers.ftp import FtpPacket
+from aerokit.protocols.servers.ftp_packets import FtpPacket
 
 pytestmark = pytest.mark.anyio
 

@@ -43,7 +43,7 @@ HEARTBEAT_INTERVAL_S = 1.0
 MAX_UNSENT_BYTES = 8192
 """Bursts of files pause while more bytes wait in the link."""
 MAX_METADATA_BYTES = 1 << 20
-_MAVLINK_VERSION = 3
+MAVLINK_VERSION = 3
 
 MetadataKind = Literal["commands", "peripherals", "events", "actuators"]
 HandlerT = TypeVar("HandlerT", bound=Callable[..., Any])
@@ -154,7 +154,7 @@ class OnboardComponent:
         if state not in MavState.__members__.values():
             raise InvalidArgument(f"state = {state} is not allowed: a MAV_STATE, 0 to 8")
         before = self._heartbeat
-        heartbeat = m.Heartbeat(before.type, before.autopilot, base_mode, custom_mode, state, _MAVLINK_VERSION)
+        heartbeat = m.Heartbeat(before.type, before.autopilot, base_mode, custom_mode, state, MAVLINK_VERSION)
         heartbeat.encode()
         self._heartbeat = heartbeat
         self._host.send(heartbeat)
@@ -420,11 +420,3 @@ class OnboardComponent:
         kind = self._heartbeat.type
         name = MavType(kind).name if kind in MavType.__members__.values() else kind
         return f"<OnboardComponent {self.system_id}/{self.component_id}, {name}>"
-
-
-def make_heartbeat(type_: int, autopilot: int) -> m.Heartbeat:
-    """Return the first heartbeat of a component."""
-    for name, value in (("type", type_), ("autopilot", autopilot)):
-        if not 0 <= value <= 255:
-            raise InvalidArgument(f"{name} = {value} is not allowed: 0 to 255")
-    return m.Heartbeat(type_, autopilot, 0, 0, MavState.ACTIVE, _MAVLINK_VERSION)

@@ -11,8 +11,9 @@ from aerokit._internal.async_block import async_block
 from aerokit.connection.opening import open_connection
 from aerokit.errors import BusyError, InvalidArgument
 from aerokit.mavlink.dialect import STANDARD
-from aerokit.mavlink.enums import MavAutopilot, MavType
-from aerokit.onboard.component import OnboardComponent, make_heartbeat
+from aerokit.mavlink.enums import MavAutopilot, MavState, MavType
+from aerokit.mavlink.messages import Heartbeat
+from aerokit.onboard.component import MAVLINK_VERSION, OnboardComponent
 from aerokit.onboard.identity import Identity
 
 if TYPE_CHECKING:
@@ -83,7 +84,7 @@ async def component(
         LinkOpenError: the link or the recording could not be opened.
         FileFormatError, OSError: ``parameters_file`` cannot be read.
     """
-    heartbeat = make_heartbeat(type, autopilot)
+    heartbeat = _heartbeat(type, autopilot)
     if not 1 <= system_id <= 255 or not 1 <= component_id <= 255:
         raise InvalidArgument(f"system_id, component_id = {system_id}, {component_id} are not allowed: 1 to 255 each")
     if (address is None) == (connection is None):
@@ -131,3 +132,11 @@ async def component(
         finally:
             connection.components.discard(key)
             await found._aclose()
+
+
+def _heartbeat(type_: int, autopilot: int) -> Heartbeat:
+    """Return the first heartbeat of a component."""
+    for name, value in (("type", type_), ("autopilot", autopilot)):
+        if not 0 <= value <= 255:
+            raise InvalidArgument(f"{name} = {value} is not allowed: 0 to 255")
+    return Heartbeat(type_, autopilot, 0, 0, MavState.ACTIVE, MAVLINK_VERSION)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from aerokit.mavlink.messages import FileTransferProtocol
 from aerokit.protocols.servers import ftp
 from aerokit.protocols.servers.files import FileTree
-from aerokit.protocols.servers.ftp import FtpPacket
+from aerokit.protocols.servers.ftp_packets import FtpPacket
 from aerokit.sim.channel import Channel
 from aerokit.sim.vehicle import MessageHost
 

@@ -14,7 +14,7 @@ from aerokit.mavlink.enums import MavCmd, MavFrame, MavFtpErr, MavMissionResult,
 from aerokit.mavlink.message import Message
 from aerokit.parameters.encoding import UNKNOWN_INDEX
 from aerokit.parameters.pack import HASH_NAME
-from aerokit.protocols.servers.ftp import FtpPacket
+from aerokit.protocols.servers.ftp_packets import FtpPacket
 from aerokit.protocols.servers.missions import AnyItem, AnyRequest, item_from, item_message_float
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandServer, ReceivedCommand

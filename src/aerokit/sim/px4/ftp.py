@@ -8,7 +8,8 @@ from typing import ClassVar
 from aerokit.mavlink.enums import MavFtpErr
 from aerokit.mavlink.messages import FileTransferProtocol
 from aerokit.protocols.servers.files import EEXIST, FileFault, FileTree
-from aerokit.protocols.servers.ftp import FtpPacket, FtpPeer, SessionFtpServer, leaves, path_in, read_crc32
+from aerokit.protocols.servers.ftp import FtpPeer, SessionFtpServer
+from aerokit.protocols.servers.ftp_packets import FtpPacket, leaves, path_in, read_crc32
 from aerokit.sim.channel import Channel
 from aerokit.sim.vehicle import MessageHost
 
