@@ -12,9 +12,9 @@ from aerokit.mavlink.enums import MavProtocolCapability
 from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.messages import GpsRtcmData, SetupSigning
 from aerokit.mavlink.signing import LAST_TIMESTAMP, Signing, SigningKey, timestamp_at
+from aerokit.protocols.servers.files import FileTree
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandHandler, CommandServer, ReceivedCommand
-from aerokit.sim.ftp import FileTree
 from aerokit.sim.vehicle import AttachableComponent, SimulatedVehicle
 
 _CORRECTIONS_MAX_AGE_S, _FRAGMENT_SIZE = 5.0, 180
