@@ -20,12 +20,17 @@ ARMED_S, DISARMED_S = 1.0, 40.0
 
 
 def descending(
-    sink_m_s: Callable[[float], float], *, end_s: float = 60.0, ground_m: float = 0.0, texts: tuple[str, ...] = ()
+    sink_m_s: Callable[[float], float],
+    *,
+    end_s: float = 60.0,
+    ground_m: float = 0.0,
+    texts: tuple[str, ...] = (),
+    disarmed_s: float = DISARMED_S,
 ) -> FlightLog:
     """Return a flight that hovers at 30 m, sinks from second 10 on with ``sink_m_s(height)``, and stops at
     ``ground_m``.
     """
-    flight = FlightLog(Path("flight.tlog"), ends_at=end_s, armed=[(ARMED_S, min(DISARMED_S, end_s))])
+    flight = FlightLog(Path("flight.tlog"), ends_at=end_s, armed=[(ARMED_S, min(disarmed_s, end_s))])
     height_m = 30.0
     for step in range(int(end_s * 10)):
         is_above = height_m > ground_m
@@ -73,6 +78,16 @@ def test_stop_before_landing_is_no_fall() -> None:
 def test_touchdown_below_six_m_s_is_hard_landing() -> None:
     (fall,) = falls(descending(lambda height_m: 4.5))
     assert (fall.title, fall.sink_m_s) == ("Hard landing", 4.5)
+
+
+def test_fall_of_vehicle_that_stays_armed_is_found() -> None:
+    (fall,) = falls(descending(free_fall, end_s=600.0, disarmed_s=590.0))
+    assert (fall.title, fall.has_impact) == ("Fall", True)
+    assert falls(descending(free_fall, end_s=600.0, disarmed_s=600.0)) == [fall]
+
+
+def test_hover_for_minutes_after_fast_descent_is_no_fall() -> None:
+    assert falls(descending(lambda height_m: 8.0, ground_m=10.0, end_s=600.0, disarmed_s=590.0)) == []
 
 
 def test_crash_text_of_firmware_makes_hard_landing_a_fall() -> None:
