@@ -226,6 +226,7 @@ SUB = STEERED | {
 PX4 = UNKNOWN | {
     **dict.fromkeys(("has_parameter_hash", "prearm_depends_on_mode", "lands_after_return"), True),
     **dict.fromkeys(("repeats_item_reached", "silent_without_logs", "reports_mission_checksum"), True),
+    "runs_prearm_checks": True,
     "mission_upload_window": 6,
     "overwrites_plans_in_place": set(),
     "unknown_currents_ca": {-1, -100},

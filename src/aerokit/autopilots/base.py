@@ -271,6 +271,8 @@ class Autopilot:
     """Modes in which the autopilot refuses to arm, or disarms at once."""
     prearm_depends_on_mode = False
     """True if the pre-arm bit of SYS_STATUS is about the current mode only."""
+    modes_with_rc: frozenset[str] | None = None
+    """Modes that require an RC receiver, or MANUAL_CONTROL; None if its health bit is about arming in any mode."""
     camera_by_trigger_only = False
     """True if the autopilot's own camera supports only DO_DIGICAM_CONTROL and DO_TRIGGER_CONTROL."""
     video_addresses_camera = False
