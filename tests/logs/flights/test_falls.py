@@ -14,6 +14,7 @@ from aerokit.apps.cli import main
 from aerokit.logs.flights.failsafes import evidence_in_texts
 from aerokit.logs.flights.falls import falls
 from aerokit.logs.flights.flight import FlightLog, LoggedText
+from aerokit.logs.report.statistics import fall_measurements, findings
 from aerokit.testing import open_flight, run_virtual
 
 ARMED_S, DISARMED_S = 1.0, 40.0
@@ -86,6 +87,23 @@ def test_fall_of_vehicle_that_stays_armed_is_found() -> None:
     assert falls(descending(free_fall, end_s=600.0, disarmed_s=600.0)) == [fall]
 
 
+def test_measurements_of_fall_are_those_of_the_descent() -> None:
+    flight = descending(free_fall)
+    (fall,) = falls(flight)
+    assert fall_measurements(flight, fall) == []
+    for step in range(600):
+        is_falling = fall.begins_s <= step / 10 < fall.time_s - 0.3
+        flight.air.add(step / 10, 0.0, 100.0 if is_falling else 40.0)
+        flight.attitude.add(step / 10, 62.0 if is_falling else 0.0, 0.0, 0.0)
+        flight.attitude_target.add(step / 10, 0.0, 0.0, 0.0)
+    assert fall_measurements(flight, fall) == [
+        "throttle up to 100 %, so look at motors, propellers and battery",
+        "tilt up to 62°",
+        "attitude up to 62° off its set-point, so look at the attitude charts",
+    ]
+    assert findings(flight)[1].startswith("Measured in the descent: throttle up to 100 %")
+
+
 def test_hover_for_minutes_after_fast_descent_is_no_fall() -> None:
     assert falls(descending(lambda height_m: 8.0, ground_m=10.0, end_s=600.0, disarmed_s=590.0)) == []
 
@@ -137,6 +155,9 @@ def test_report_of_crash_begins_and_ends_with_fall(
     html = log.with_suffix(".html").read_text(encoding="utf-8")
     assert f'<p class="finding">{first}</p>' in html
     assert "No failsafe was reported" in html
+    assert "max ground speed" in html
+    assert '"name":"fall"' in html.replace('": "', '":"')
+    assert '"name":"failsafe"' not in html.replace('": "', '":"')
 
 
 @pytest.mark.parametrize(
