@@ -265,6 +265,8 @@ class Autopilot:
     gimbals: GimbalRules = GimbalRules()
     is_surface_vehicle = False
     """True for vehicles that drive, or swim on the surface, for which altitudes are meaningless."""
+    mission_needs_take_off = False
+    """True if a mission is refused on the ground unless its first navigation command is a take-off."""
     mode_when_landed: ClassVar[str | None] = None
     """Mode to which the vehicle changes after landing; None if it stays in the landing mode."""
     unarmable_modes: frozenset[str] = frozenset()

@@ -154,11 +154,11 @@ async def test_wait_finished_continues_through_hold_of_minutes() -> None:
         mission = flight.vehicle.mission
         first, second, *_ = short_mission(flight)
         assert second.position is not None
-        await mission.upload(Mission([first, waypoint(second.position, hold_s=150)]))
+        await mission.upload(Mission([first, waypoint(second.position, hold_s=80)]))
         await mission.start()
         started = now()
         await mission.wait_finished()
-        assert now() - started > 150
+        assert now() - started > 80
 
 
 async def test_wait_finished_continues_through_pause_of_minutes() -> None:
@@ -169,7 +169,7 @@ async def test_wait_finished_continues_through_pause_of_minutes() -> None:
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(mission.wait_finished)
             await mission.pause()
-            await anyio.sleep(150)
+            await anyio.sleep(80)
             await mission.resume()
         assert mission.progress.value.state == 5
 

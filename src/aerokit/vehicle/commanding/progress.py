@@ -216,20 +216,28 @@ class VehiclePosition:
         along = geo.distance_m(here.latitude_deg, here.longitude_deg, target.latitude_deg, target.longitude_deg)
         return math.hypot(along, self.height_above(here, target))
 
-    def check_reach(self, name: str, places: Iterable[Position], max_distance_m: float) -> None:
-        """Raise InvalidArgument for a place farther away than the limit; accept all while the position is unknown."""
+    def check_reach(
+        self, name: str, places: Iterable[Position | None], max_distance_m: float, *, are_items: bool = False
+    ) -> None:
+        """Raise InvalidArgument for a place farther away than the limit; accept all while the position is unknown.
+
+        With ``are_items`` the places are those of the items of a plan, None for an item without one.
+        """
         check_range("max_distance_m", max_distance_m, 0, math.inf, above=True)
         here = self._telemetry.position.latest
         if here is None:
             return
-        for place in places:
+        for index, place in enumerate(places):
+            if place is None:
+                continue
             degrees = abs(place.latitude_deg - here.latitude_deg) + abs(place.longitude_deg - here.longitude_deg)
             if degrees * METRES_PER_DEGREE < max_distance_m:  # Missions have thousands of nearby places.
                 continue
             distance_m = self.distance_to(place)
             if distance_m > max_distance_m:
+                where = f"{name}, item {index}" if are_items else name
                 raise InvalidArgument(
-                    f"{name} = {place.latitude_deg:.7f}, {place.longitude_deg:.7f} is not allowed: it is"
+                    f"{where} = {place.latitude_deg:.7f}, {place.longitude_deg:.7f} is not allowed: it is"
                     f" {distance_m / 1000:,.0f} km away, more than max_distance_m = {max_distance_m:,.0f}; nothing was"
                     " sent. Pass a greater max_distance_m to allow it"
                 )
