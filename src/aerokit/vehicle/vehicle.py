@@ -310,7 +310,7 @@ class Vehicle(
         """
         from aerokit.vehicle.parameters.return_altitude import read_return_altitude
 
-        return await read_return_altitude(self.parameters, self.autopilot, self.telemetry)
+        return await read_return_altitude(self.parameters, self._session)
 
     async def set_return_altitude(self, altitude_m: float) -> None:
         """Set the altitude of returns to launch; returns when the vehicle has confirmed the value.
@@ -329,7 +329,7 @@ class Vehicle(
         """
         from aerokit.vehicle.parameters.return_altitude import write_return_altitude
 
-        await write_return_altitude(self.parameters, self.autopilot, self.telemetry, altitude_m)
+        await write_return_altitude(self.parameters, self._session, altitude_m)
 
     def __repr__(self) -> str:
         return f"<Vehicle {self.system_id}/{self.component_id} {self.autopilot.firmware}, {self.describe_link()}>"

@@ -8,10 +8,10 @@ from typing import ClassVar
 from aerokit.mavlink.enums import MavSeverity
 from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.signing import ONE_MINUTE, SigningKey, timestamp_at
+from aerokit.protocols.servers.files import FileTree, TextMount
 from aerokit.sim.ardupilot.ftp import ArduPilotFtp
 from aerokit.sim.ardupilot.host import ArduPilotHost
 from aerokit.sim.autopilot import VehicleSigning
-from aerokit.sim.ftp import FileTree, TextMount
 from aerokit.sim.logs import ArduPilotLogServer, SimulatedLog
 from aerokit.sim.missions import MissionMount
 from aerokit.sim.parameter_server import ArduPilotParameterServer, rounded

@@ -25,7 +25,6 @@ from aerokit.vehicle.gimbal.orders import CONFIGURE, GimbalOrders
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from types import TracebackType
 
     from typing_extensions import Self
 
@@ -236,19 +235,17 @@ class GimbalControl:
             raise
         return self
 
-    async def __aexit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         if self._taken is not None:
             self._end()
-            if exc is None and not self._was_raised:
+            if error is None and not self._was_raised:
                 self.raise_if_taken()
             return
         if self._is_ended:  # the block of the vehicle has ended before
             return
         release = self._release_command()
         self._end()
-        if exc is None:
+        if error is None:
             await release.send_and_wait(f"{self._orders.name}: releasing control")
         else:
             release.send_soon()

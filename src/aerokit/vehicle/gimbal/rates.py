@@ -18,8 +18,6 @@ from aerokit.vehicle.gimbal.control import ReleaseCommand
 from aerokit.vehicle.gimbal.orders import LEVEL, LOCKED, NAN, PITCHYAW, GimbalOrders
 
 if TYPE_CHECKING:
-    from types import TracebackType
-
     from typing_extensions import Self
 
     from aerokit.mavlink.message import Message
@@ -136,20 +134,18 @@ class GimbalRates:
             raise
         return self
 
-    async def __aexit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        if self._stopped is None and (error := self._lost_to()):
-            self._stop(error, zero=False)
+    async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
+        if self._stopped is None and (loss := self._lost_to()):
+            self._stop(loss, zero=False)
         if self._stopped is None:
             zero = self._zero()
             self._end()
             self._stopped = SetpointStreamStopped("the block of these rates has ended")
-            if exc is None:
+            if error is None:
                 await zero.send_and_wait(f"{self._orders.name}: rates of zero")
             else:
                 zero.send_soon()
-        elif exc is None and not self._was_raised:
+        elif error is None and not self._was_raised:
             raise self._stopped
 
     def _tick(self, due: float) -> None:

@@ -37,7 +37,6 @@ from aerokit.vehicle.session.commands import CommandSender
 from aerokit.vehicle.session.rates import ComponentSubscriber, MessageRates
 from aerokit.vehicle.session.transfers import Transfers
 from aerokit.vehicle.session.watch import LinkWatch, VehicleWatch
-from aerokit.vehicle.session.watched import WatchedStream
 from aerokit.vehicle.state.field import MESSAGE_IDS
 from aerokit.vehicle.state.states import STATES
 from aerokit.vehicle.state.telemetry import Telemetry
@@ -104,6 +103,31 @@ ACTION_HZ = 4.0
 """Rate in Hz of the messages that an action waits for."""
 
 RESULTS_OF_REFUSAL = (MavResult.TEMPORARILY_REJECTED, MavResult.DENIED, MavResult.FAILED)
+
+
+class WatchedStream:
+    """Feed of a cell whose message is not requested by default: it is while your program waits for it or follows it.
+
+    Reading the cell requests nothing.
+    """
+
+    pending = False
+
+    def __init__(self, cell: StateCell[Any], rates: MessageRates, message: type[Message], hz: float) -> None:
+        self._cell, self._rates, self._message, self._hz = cell, rates, message, hz
+        self._release: Callable[[], None] | None = None
+
+    def catch_up(self) -> None:
+        """Do nothing: another feed decodes the message."""
+
+    def watchers_changed(self) -> None:
+        """Request the message while the cell is watched."""
+        if not self._cell._is_watched:
+            if self._release is not None:
+                self._release()
+            self._release = None
+        elif self._release is None:
+            self._release = self._rates.request(self._message, self._hz, is_optional=True)
 
 
 class VehicleSession:
