@@ -121,6 +121,7 @@ async def test_wait_finished_continues_through_pause() -> None:
 
 async def test_wait_finished_reports_fall_of_armed_vehicle() -> None:
     async with armed(open_flight) as flight:
+        assert isinstance(flight, Flight)
         mission = flight.vehicle.mission
         await mission.start()
         await reaches(flight, 1)

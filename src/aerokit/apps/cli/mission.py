@@ -29,7 +29,7 @@ _COPTERS = frozenset(
         *(MavType.TRICOPTER, MavType.DODECAROTOR, MavType.DECAROTOR),
     }
 )
-_KNOWN_COMMANDS = frozenset(int(command) for command in MavCmd)
+_STANDARD_COMMANDS = frozenset(int(command) for command in MavCmd)
 
 
 def read_plan(path: str) -> Plan:
@@ -63,7 +63,7 @@ def plan_warnings(plan: Plan) -> list[str]:
         f"{part} item {index}: command {item.command} is not a MAV_CMD; a vehicle that does not know it refuses it"
         for part, items in names
         for index, item in enumerate(items)
-        if item.command not in _KNOWN_COMMANDS
+        if item.command not in _STANDARD_COMMANDS
     ]
     mission = plan.mission.items
     may_be_arducopter = plan.vehicle_type in _COPTERS and plan.firmware_type != MavAutopilot.PX4
