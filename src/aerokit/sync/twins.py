@@ -671,7 +671,7 @@ class FollowStream(BlockTwin["AsyncFollowStream"]):
     mode, nothing more is sent. ``fly`` and leaving the block then raise :class:`SetpointStreamStopped`.
 
     Entering raises:
-        OperationRejected: the vehicle is not flying, or its altitude is unknown. Nothing was sent.
+        OperationRejected: the vehicle is not flying (nothing was sent), or its altitude is unknown (it holds).
         OperationTimeout: no position of the target was known within ``valid_for_s``. Nothing was sent.
         InvalidArgument: a height is wanted, and the target has no altitude. Nothing was sent.
     """

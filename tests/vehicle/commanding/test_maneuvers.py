@@ -25,7 +25,7 @@ from aerokit.errors import (
     OperationRejected,
     SetpointStreamStopped,
 )
-from aerokit.mavlink.enums import MavCmd, MavVtolState
+from aerokit.mavlink.enums import CopterMode, MavCmd, MavVtolState
 from aerokit.sim import (
     SimulatedCopter,
     SimulatedPlane,
@@ -315,7 +315,7 @@ async def test_follow_holds_when_the_target_is_too_far_away() -> None:
                 await following.fly(5)
 
 
-async def test_follow_without_own_altitude_is_refused() -> None:
+async def test_follow_without_own_altitude_holds() -> None:
     async with in_the_air() as flight:
         cell = flight.vehicle.telemetry.position
         here = cell.value
@@ -327,7 +327,7 @@ async def test_follow_without_own_altitude_is_refused() -> None:
         with pytest.raises(OperationRejected, match="altitude above sea level is unknown"):
             async with flight.vehicle.follow(lambda: here):
                 pass
-        assert not flight.wire.mode_orders()
+        assert flight.wire.mode_orders() == [CopterMode.BRAKE]
 
 
 async def test_follow_function_that_raises_stops_it() -> None:

@@ -111,7 +111,7 @@ class FollowStream(SteeringStream[TargetState]):
     mode, nothing more is sent. ``fly`` and leaving the block then raise :class:`SetpointStreamStopped`.
 
     Entering raises:
-        OperationRejected: the vehicle is not flying, or its altitude is unknown. Nothing was sent.
+        OperationRejected: the vehicle is not flying (nothing was sent), or its altitude is unknown (it holds).
         OperationTimeout: no position of the target was known within ``valid_for_s``. Nothing was sent.
         InvalidArgument: a height is wanted, and the target has no altitude. Nothing was sent.
     """
@@ -219,10 +219,10 @@ class FollowStream(SteeringStream[TargetState]):
         self._course_deg = here.bearing_to(target)
         if self._place.height_m is None:
             if here.altitude_amsl_m is None:
-                raise OperationRejected("follow: the vehicle's altitude above sea level is unknown; nothing was sent")
+                raise OperationRejected("follow: the vehicle's altitude above sea level is unknown; a hold was ordered")
             self._own_altitude_m = here.altitude_amsl_m
         elif target.altitude_amsl_m is None and target.altitude_relative_m is None:
-            raise InvalidArgument("height_m is not allowed: the target has no altitude; nothing was sent")
+            raise InvalidArgument("height_m is not allowed: the target has no altitude; a hold was ordered")
 
     # ------------------------------------------------------------------------------ the stream
 
