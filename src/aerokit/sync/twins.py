@@ -672,8 +672,8 @@ class FollowStream(BlockTwin["AsyncFollowStream"]):
 
     Entering raises:
         OperationRejected: the vehicle is not flying (nothing was sent), or its altitude is unknown (it holds).
-        OperationTimeout: no position of the target was known within ``valid_for_s``. Nothing was sent.
-        InvalidArgument: a height is wanted, and the target has no altitude. Nothing was sent.
+        OperationTimeout: no position of the target was known within ``valid_for_s``. The vehicle holds.
+        InvalidArgument: a height is wanted, and the target has no altitude. The vehicle holds.
     """
 
     @property

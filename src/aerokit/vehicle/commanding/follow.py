@@ -112,8 +112,8 @@ class FollowStream(SteeringStream[TargetState]):
 
     Entering raises:
         OperationRejected: the vehicle is not flying (nothing was sent), or its altitude is unknown (it holds).
-        OperationTimeout: no position of the target was known within ``valid_for_s``. Nothing was sent.
-        InvalidArgument: a height is wanted, and the target has no altitude. Nothing was sent.
+        OperationTimeout: no position of the target was known within ``valid_for_s``. The vehicle holds.
+        InvalidArgument: a height is wanted, and the target has no altitude. The vehicle holds.
     """
 
     _NAME, _VALUE = "following", "position of the target"
@@ -208,7 +208,7 @@ class FollowStream(SteeringStream[TargetState]):
         while (state := self._tracker.read()) is None or self._now() - state.at > self._valid_for_s:
             if self._now() > until or self._end_reason:
                 why = self._end_reason or f"no position of the target was known within {self._valid_for_s:g} s"
-                raise OperationTimeout(f"follow: {why}; nothing was sent")
+                raise OperationTimeout(f"follow: {why}; a hold was ordered")
             await anyio.sleep(POLL_INTERVAL_S)
         return state
 
