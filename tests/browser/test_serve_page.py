@@ -322,10 +322,29 @@ def test_page_shows_why_vehicle_is_not_ready(browser: Any, copters: tuple[list[S
         page.locator("#readiness.good", has_text="Ready to arm").wait_for(timeout=30_000)
 
 
+def test_disarm_needs_known_ground(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
+    expected = {"ON_GROUND": "", "TAKEOFF": "Land first", "LANDING": "Land first", "IN_AIR": "Land first"}
+    with serving(copters[1]) as server, opened(browser, server["page"]) as page:
+        obstacles = """async ([landed, age, type, link]) => {
+            const { obstacle } = await import("/static/readiness.js");
+            const states = { armed: { value: true, age_s: 0 }, landed_state: { value: landed, age_s: age } };
+            const vehicle = { states, link: { state: link }, vehicle_type: type, missing_for_flight: [] };
+            return obstacle("disarm", vehicle, { isOpen: true });
+        }"""
+        for landed, text in expected.items():
+            assert page.evaluate(obstacles, [landed, 0, 2, "connected"]) == text
+        assert page.evaluate(obstacles, ["ON_GROUND", 10, 2, "connected"]) == "Unknown if landed"
+        assert page.evaluate(obstacles, ["ON_GROUND", 0, 2, "silent"]) == "Silent"
+        assert page.evaluate(obstacles, [None, 0, 10, "connected"]) == ""  # a rover has no landed state
+
+
 def test_page_words_errors_for_people(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
     said = {
         "take_off: the vehicle is not armed: arm() comes first": "The vehicle is not armed: “Arm” comes first",
         "MAV_CMD_NAV_TAKEOFF was refused: FAILED": "The vehicle refused (failed)",
+        "MAV_CMD_COMPONENT_ARM_DISARM was refused: FAILED\n  - not on the ground": (
+            "The vehicle refused (failed)\n  - not on the ground"
+        ),
         "x.plan: line 3: no JSON": "x.plan: line 3: no JSON",
     }
     with serving(copters[1]) as server, opened(browser, server["page"]) as page:
