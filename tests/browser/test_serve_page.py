@@ -216,6 +216,8 @@ def test_page_sets_parameter_after_confirmation(browser: Any, copters: tuple[lis
         page.locator(".vehicle", has_text="2 ArduCopter").click()
         page.get_by_role("tab", name="Parameters").click()
         page.fill("input[type=search]", "wpnav_speed")
+        page.locator("tr", has_text="WPNAV_SPEED_UP").wait_for()
+        page.fill("input[type=search]", "wp_spd_up")  # its other name
         page.locator("tr", has_text="WPNAV_SPEED_UP").click()
         page.fill("dialog input[name=value]", "321")
         assert "Vehicle 2" in page.locator("dialog").inner_text()

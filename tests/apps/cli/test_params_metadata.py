@@ -101,3 +101,19 @@ def test_px4_without_answer_says_that_ranges_are_unchecked(
     monkeypatch.setattr(params_metadata, "_FETCH_TIMEOUT_S", 0.0)
     assert run_with(SimulatedPx4(boot_time_s=0.0), ["params", "set", "MIS_TAKEOFF_ALT=20"]) == [0]
     assert "the ranges of the values are not checked" in capsys.readouterr().err
+
+
+def test_diff_names_sides(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "mine.param"
+    file.write_text("RTL_ALT,9000\nNOT_THERE,3\n")
+    assert run_with(SimulatedCopter(boot_time_s=0.0), ["params", "diff", str(file)]) == [1]
+    first, second, _ = capsys.readouterr().out.splitlines()
+    assert first == "RTL_ALT          vehicle 1500, file 9000"
+    assert second == "NOT_THERE        vehicle does not have it, file 3"
+
+
+def test_get_unknown_name_prints_one_error(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_with(SimulatedCopter(boot_time_s=0.0), ["params", "get", "NOSUCH"]) == [5]
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "NOSUCH" in line
+    assert "`aerokit params list` shows all names" in line

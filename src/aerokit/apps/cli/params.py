@@ -110,7 +110,8 @@ async def _diff(options: argparse.Namespace) -> int:
         await _download(vehicle, options)
         differences = await vehicle.parameters.diff(wanted, idle_timeout_s=options.patience)
     for difference in differences:
-        emit(options, "parameter_difference", difference.to_dict(), str(difference))
+        sides = f"vehicle {_side(difference.before)}, file {_side(difference.after)}"
+        emit(options, "parameter_difference", difference.to_dict(), f"{difference.name:16} {sides}")
     record = {"file": options.file, "parameters": len(wanted), "different": len(differences)}
     emit(options, "comparison", record, f"{len(differences)} of {len(wanted)} parameters differ")
     return DONE if not differences else FAILED
@@ -158,8 +159,7 @@ async def _read(vehicle: Vehicle, name: str, options: argparse.Namespace) -> Par
     try:
         return await vehicle.parameters.read(name, idle_timeout_s=options.patience)
     except (ParameterRejected, ParameterTimeout) as error:
-        if hint := _hint(name, error, vehicle):
-            print(f"aerokit: could not read parameter {name!r}{hint}", file=sys.stderr)
+        error.args = (f"{error}{_hint(name, error, vehicle)}",)
         raise
 
 
@@ -208,6 +208,10 @@ def _record(parameter: Parameter | ParameterWrite) -> dict[str, object]:
     # the key "type" is reserved for the type of the record
     fields = parameter.to_dict()
     return {("value_type" if name == "type" else name): value for name, value in fields.items()}
+
+
+def _side(value: float | None) -> str:
+    return "does not have it" if value is None else _text(value)
 
 
 def _text(value: float | None) -> str:

@@ -25,6 +25,7 @@ from aerokit.apps.serve.requests import (
 )
 from aerokit.errors import ParameterRejected
 from aerokit.mavlink.enums import EkfStatusFlags, EstimatorStatusFlags, MavPowerStatus, MavSysStatusSensor
+from aerokit.parameters.renames import other_names
 from aerokit.vehicle.vehicle import overview
 
 if TYPE_CHECKING:
@@ -423,12 +424,13 @@ def _items(items: Iterable[MissionItem]) -> list[dict[str, Any]]:
 
 def _parameter(parameter: Parameter, metadata: Metadata | None) -> dict[str, Any]:
     known = None if metadata is None else metadata.get(parameter.name)
+    fields = {**to_jsonable(parameter), "other_names": other_names(parameter.name)}
     if known is None:
-        return dict(to_jsonable(parameter))
+        return fields
     default = known.default if parameter.default is None else parameter.default
     about = {name: to_jsonable(getattr(known, name)) for name in _METADATA}
     about |= {"default": to_jsonable(default), "meaning": known.describe(parameter.value)}
-    return {**to_jsonable(parameter), **about}
+    return {**fields, **about}
 
 
 async def _wait_ended(record: OrderRecord, timeout_s: float | None) -> None:

@@ -130,9 +130,10 @@ export class ParameterPanel {
       const name = element("button", { type: "button", class: "link", title: "Set …" }, each.name);
       const facts = [changedFrom(each), range(each)].filter(Boolean).join(" · ");
       const node = element("tr", { class: "clickable", onclick: () => this.setParameter(this.vehicle, each) },
-        element("td", {}, name, about ? element("div", { class: "detail" }, about) : null),
+        element("td", {}, name, each.other_names?.length ? element("div", { class: "detail" }, `other versions: ${each.other_names.join(", ")}`) : null, about ? element("div", { class: "detail" }, about) : null),
         element("td", { class: "number" }, withUnit(each, each.value), element("div", { class: "detail" }, meaning(each) || facts, meaning(each) && facts ? ` · ${facts}` : "")));
-      return { node, text: `${each.name} ${about ?? ""} ${each.description ?? ""}`.toUpperCase() };
+      const names = [each.name, ...(each.other_names ?? [])].join(" ");
+      return { node, text: `${names} ${about ?? ""} ${each.description ?? ""}`.toUpperCase() };
     });
     this.body.replaceChildren(...this.rows.map((each) => each.node));
     this.filter();
