@@ -7,9 +7,10 @@ import fnmatch
 import sys
 from typing import TYPE_CHECKING
 
+from aerokit.apps.cli import connecting
 from aerokit.apps.cli.arguments import assignment, writable_file
 from aerokit.apps.cli.completion import assignments, offer, parameter_names
-from aerokit.apps.cli.connecting import add_action, connected
+from aerokit.apps.cli.connecting import add_action
 from aerokit.apps.cli.output import DONE, FAILED, add_force, check_not_existing, emit, suggestion
 from aerokit.apps.cli.params_metadata import (
     about,
@@ -25,6 +26,7 @@ from aerokit.errors import ParameterRejected, ParameterTimeout
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
+    from contextlib import AbstractAsyncContextManager
 
     from aerokit.parameters import Metadata, Parameter, ParameterTable
     from aerokit.vehicle.parameters.parameters import ParameterWrite
@@ -63,6 +65,14 @@ def _add_writing(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -
     load = add_action(actions, "load", _load, "Set all parameters in a file that differ on the vehicle.")
     load.add_argument("file")
     add_metadata(load, checks=True)
+
+
+def connected(options: argparse.Namespace, *, changes: bool = False) -> AbstractAsyncContextManager[Vehicle]:
+    """Connect as in :func:`aerokit.apps.cli.connecting.connected`."""
+    # Importing this while connected would block the event loop.
+    import aerokit.vehicle.parameters.parameters  # noqa: F401
+
+    return connecting.connected(options, changes=changes)
 
 
 async def _list(options: argparse.Namespace) -> int:
