@@ -420,6 +420,25 @@ def test_page_on_phone_without_token_and_read_only(browser: Any, copters: tuple[
         picture(page, "phone")
 
 
+def test_page_without_token_asks_at_once(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
+    with serving(copters[1]) as server, opened(browser, server["url"], 1280, 800) as page:
+        page.locator("#server", has_text="no token").wait_for()
+        arm = page.locator("button[data-order='arm']")
+        assert (arm.is_disabled(), arm.locator("small").inner_text()) == (True, "No token")
+        page.fill("#notice input", server["token"])
+        page.click("#notice button")
+        page.locator("#notice").wait_for(state="hidden")
+        page.locator("button[data-order='arm']:enabled").wait_for()
+        picture(page, "token")
+        widths = page.locator("#orders button").evaluate_all("all => all.map(e => e.getBoundingClientRect().width)")
+        assert max(widths) < 2.5 * min(widths)
+        panel = page.locator("#side").bounding_box()
+        page.evaluate("document.getElementById('toasts').append(Object.assign(document.createElement('button'),"
+                      " { className: 'toast', textContent: 'x'.repeat(300) }))")
+        toast = page.locator("#toasts").bounding_box()
+        assert toast["x"] + toast["width"] <= panel["x"]
+
+
 def test_page_after_server_end_shows_banner(browser: Any) -> None:
     with serving("--sim") as server:
         started = opened(browser, server["url"])

@@ -24,6 +24,7 @@ export const isConnected = (vehicle) => vehicle.link.state === "connected";
 export function obstacle(order, vehicle, page) {
   if (!page.isOpen) return "No connection";
   if (page.isReadOnly) return "Read-only";
+  if (page.hasToken === false) return "No token";
   if (!vehicle) return "No vehicle";
   if (!isConnected(vehicle)) return SAFE_ORDERS.has(order) && order !== "disarm" ? "" : "Silent";
   const isArmed = valueOf(vehicle, "armed"), landed = landedState(vehicle);
