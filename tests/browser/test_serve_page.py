@@ -27,6 +27,7 @@ from aerokit.missions import (
     Mission,
     Plan,
     format_plan,
+    format_waypoints,
     return_to_launch,
     take_off,
     waypoint,
@@ -374,17 +375,20 @@ def test_page_uploads_dropped_plan_after_confirmation(browser: Any, copters: tup
     with serving(address) as server, opened(browser, server["page"]) as page:
         page.locator(".vehicle", has_text="2 ArduCopter").click()
         page.evaluate(DROP, ["notes.plan", "no JSON"])
-        page.locator(".toast.failed", has_text="notes.plan is not a .plan file").wait_for()
+        page.locator(".toast.failed", has_text="notes.plan: line 1: expected 'QGC WPL 110', found 'no JSON'").wait_for()
         page.evaluate(DROP, ["field.plan", format_plan(plan)])
-        text = page.locator("dialog").inner_text()
+        text = page.locator("dialog[open]").inner_text()
         assert "Vehicle 2" in text
         assert "get 2 mission items, 1 fence area from field.plan" in text
         page.click("dialog .yes")
         wait_done(page, "upload field.plan (2 items)")
         page.get_by_role("tab", name="Mission").click()
         page.locator("#panel tr", has_text="waypoint").wait_for()
-        page.evaluate(DROP, ["broken.plan", format_plan(plan).replace('"version": 2', '"version": 7')])
+        page.evaluate(DROP, ["field.waypoints", format_waypoints(plan.mission)])
+        assert "get 2 mission items from field.waypoints" in page.locator("dialog[open]").inner_text()
         page.click("dialog .yes")
+        wait_done(page, "upload field.waypoints (2 items)")
+        page.evaluate(DROP, ["broken.plan", format_plan(plan).replace('"version": 2', '"version": 7')])
         page.locator(".toast.failed", has_text="broken.plan").wait_for()
         picture(page, "uploaded")
 
@@ -433,8 +437,10 @@ def test_page_without_token_asks_at_once(browser: Any, copters: tuple[list[Simul
         widths = page.locator("#orders button").evaluate_all("all => all.map(e => e.getBoundingClientRect().width)")
         assert max(widths) < 2.5 * min(widths)
         panel = page.locator("#side").bounding_box()
-        page.evaluate("document.getElementById('toasts').append(Object.assign(document.createElement('button'),"
-                      " { className: 'toast', textContent: 'x'.repeat(300) }))")
+        page.evaluate(
+            "document.getElementById('toasts').append(Object.assign(document.createElement('button'),"
+            " { className: 'toast', textContent: 'x'.repeat(300) }))"
+        )
         toast = page.locator("#toasts").bounding_box()
         assert toast["x"] + toast["width"] <= panel["x"]
 

@@ -140,11 +140,11 @@ function onMap(vehicle) {
   };
 }
 
-// A .plan file dropped anywhere is uploaded to the selected vehicle, after confirmation.
+// A plan dropped anywhere is uploaded to the selected vehicle, after confirmation.
 window.addEventListener("dragover", (event) => {
   event.preventDefault();
   byId("drop").hidden = !selected() || page.isReadOnly;
-  show(byId("drop"), `Drop a .plan file to upload it to vehicle ${page.selected}`);
+  show(byId("drop"), `Drop a .plan or .waypoints file to upload it to vehicle ${page.selected}`);
 });
 window.addEventListener("dragleave", (event) => { if (!event.relatedTarget) byId("drop").hidden = true; });
 window.addEventListener("drop", (event) => {

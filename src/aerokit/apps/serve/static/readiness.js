@@ -12,7 +12,7 @@ const MAX_REASONS = 4;
 // What the page calls the library's actions.
 const TITLES = {
   arm: "Arm", take_off: "Take off", go_to: "Go to …", hold: "Hold", land: "Land", return_to_launch: "Return", disarm: "Disarm",
-  start: "Start mission", pause: "Pause", resume: "Resume", upload: "Upload a .plan …", set_mode: "Mode …",
+  start: "Start mission", pause: "Pause", resume: "Resume", upload: "Upload a plan …", set_mode: "Mode …",
 };
 
 const valueOf = (vehicle, name) => (vehicle.states[name] || {}).value;
