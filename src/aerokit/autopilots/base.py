@@ -105,11 +105,8 @@ class SetpointRules(Snapshot):
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the supported kinds."""
-        kinds = (
-            *("local_position", "global_position", "velocity", "acceleration", "attitude"),
-            *("attitude_rate", "trajectory"),
-        )
-        return tuple(kind.replace("_", " ") for kind in kinds if getattr(self, kind))
+        kinds = "local_position global_position velocity acceleration attitude attitude_rate trajectory"
+        return tuple(kind.replace("_", " ") for kind in kinds.split() if getattr(self, kind))
 
 
 class StickRules(Snapshot):

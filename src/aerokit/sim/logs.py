@@ -86,7 +86,6 @@ class LogServer:
         return bool(self._outgoing)
 
     def restart(self) -> None:
-        """Abort the transfer."""
         self._transfer += 1
         self._outgoing.clear()
 

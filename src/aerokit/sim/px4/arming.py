@@ -153,7 +153,6 @@ class Px4Arming:
         self._is_logging = False
 
     def reasons(self) -> list[str]:
-        """Return the texts of the failed checks."""
         px4 = self._px4
         reasons = list(px4.faults.prearm_failures)
         if not px4.is_ready:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from aerokit._internal import geo
 from aerokit._internal.arguments import check_range
 from aerokit.errors import HeartbeatTimeout, InvalidArgument, OperationRejected, OperationTimeout
-from aerokit.mavlink.enums import MavLandedState
+from aerokit.mavlink.enums import MavFrame, MavLandedState
 from aerokit.position import Position
 
 if TYPE_CHECKING:
@@ -271,11 +271,24 @@ class VehiclePosition:
             altitude, is_relative = altitude + self.home_altitude(), False
         return round(target.latitude_deg * 1e7), round(target.longitude_deg * 1e7), altitude, is_relative
 
+    def command_place(self, target: Position) -> dict[str, Any]:
+        """Return the place as arguments of a COMMAND_INT; see :meth:`global_target`."""
+        latitude, longitude, altitude, is_relative = self.global_target(target)
+        frame = MavFrame.GLOBAL_RELATIVE_ALT_INT if is_relative else MavFrame.GLOBAL_INT
+        return {"frame": frame, "x": latitude, "y": longitude, "z": altitude}
+
     def is_on_ground(self) -> bool:
         """Return True if a vehicle that can fly was recently reported on the ground."""
         landed = self._telemetry.landed_state
         flies = self._autopilot.mode_for("take_off", is_vtol=self._telemetry.is_vtol) is not None
         return flies and landed.latest == MavLandedState.ON_GROUND and landed.age <= POSITION_MAX_AGE_S
+
+    def check_flying(self, what: str) -> None:
+        """Raise OperationRejected if the vehicle is disarmed or on the ground."""
+        if not self._telemetry.is_armed:
+            raise OperationRejected(f"{what}: the vehicle is not armed; nothing was sent")
+        if self.is_on_ground():
+            raise OperationRejected(f"{what}: the vehicle is on the ground: call take_off() first; nothing was sent")
 
     @property
     def takes_relative_altitude(self) -> bool:

@@ -320,7 +320,7 @@ class MissionControl(VehiclePlan["Mission"]):
         seq = item + self._context.offset_of(0)
         if session.autopilot.sets_current_by_command:
             try:
-                await vehicle_context.sender.follow_up_command(
+                await vehicle_context.sender.send_long(
                     order, MavCmd.DO_SET_MISSION_CURRENT, 0 if item == 0 and not keeps_jump_counts else seq
                 )
             except CommandRejected as error:
@@ -367,9 +367,7 @@ class MissionControl(VehiclePlan["Mission"]):
             return
         try:
             with vehicle_context.arbiter.changing_mode():
-                await vehicle_context.sender.run_command(
-                    order, session.commands.send_long, MavCmd.MISSION_START, modes=(mode,)
-                )
+                await vehicle_context.sender.send_long(order, MavCmd.MISSION_START, modes=(mode,))
                 await vehicle_context.sender.await_mode(mode, order, [], timeout, order.given_at)
         except CommandRejected as error:
             if error.result != MavResult.UNSUPPORTED:
