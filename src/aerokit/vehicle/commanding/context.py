@@ -55,7 +55,9 @@ class VehicleContext:
         disarmed = "disarmed" if telemetry.is_confirmed_disarmed else "possibly armed"
         position = telemetry.position.latest
         height = None if position is None else position.altitude_relative_m
-        where = "on the ground in" if telemetry.landed_state.latest == MavLandedState.ON_GROUND else "in"
+        # A copter in LAND disarms some seconds after the touchdown.
+        has_landed = telemetry.is_armed and telemetry.landed_state.latest == MavLandedState.ON_GROUND
+        where = "on the ground in" if has_landed else "in"
         return (
             f"{'holding in' if mode is not None and mode == hold else where} {telemetry.mode_name},"
             f" {'still armed' if telemetry.is_armed else disarmed},"
