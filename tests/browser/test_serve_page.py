@@ -158,6 +158,13 @@ def test_page_commands_flight(browser: Any, copters: tuple[list[SimulatedCopter]
         wait_done(page, "arm")
         assert (first.is_armed, second.is_armed) == (True, False)
         order(page, "take_off", {"altitude_m": "20"})
+        disarm = page.locator("button[data-order='disarm']")
+        page.locator("button[data-order='disarm'][disabled]").wait_for()
+        seen = set()
+        while not page.locator(".toast.done", has_text="take off to 20 m: done").count():
+            if true_point(first).altitude_m > 1:
+                seen.add((disarm.is_disabled(), disarm.locator("small").inner_text()))
+        assert seen == {(True, "Land first")}
         wait_done(page, "Vehicle 1: take off to 20 m: done")
         values_have_units(page)
         order(page, "mission/start")
