@@ -671,7 +671,7 @@ class FollowStream(BlockTwin["AsyncFollowStream"]):
     mode, nothing more is sent. ``fly`` and leaving the block then raise :class:`SetpointStreamStopped`.
 
     Entering raises:
-        OperationRejected: the vehicle is not flying. Nothing was sent.
+        OperationRejected: the vehicle is not flying (nothing was sent), or its altitude is unknown (it holds).
         OperationTimeout: no position of the target was known within ``valid_for_s``. Nothing was sent.
         InvalidArgument: a height is wanted, and the target has no altitude. Nothing was sent.
     """
@@ -2603,7 +2603,8 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
     def wait_finished(self, *, timeout: float | None = None, max_silence_s: float | None = MAX_SILENCE_S) -> None:
         """Wait until the mission has been flown to its end; if it ends with a landing, until the vehicle has landed.
 
-        A :meth:`pause` by another task does not end the wait. Cancelling this call does not stop the vehicle.
+        A :meth:`pause` by another task does not end the wait. Cancelling this call does not stop the vehicle, and no
+        command is sent when it fails.
 
         Args:
             timeout: seconds to wait; None for no limit.
@@ -2612,7 +2613,9 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         Raises:
             OperationRejected: the vehicle no longer flies the mission: a pilot, a failsafe or another order changed the
                 mode, or it disarmed on the way. ``reasons`` has what the vehicle reported.
-            OperationTimeout: not finished in time.
+            OperationTimeout: not finished in time; or the armed vehicle has not moved for 12 s after a descent at more
+                than 3 m/s that ended on the ground; or it has not moved for 60 s at a take-off or at a waypoint without
+                a hold, which requires that the items were uploaded or downloaded.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
         """
         self._loop.run(self.aio.wait_finished, timeout=timeout, max_silence_s=max_silence_s)

@@ -12,7 +12,7 @@ from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit._internal.formatting import short_repr
 from aerokit._internal.values import Snapshot
 from aerokit.connection.tasks import Cancellation
-from aerokit.errors import InvalidArgument, NotSupported, OperationTimeout
+from aerokit.errors import InvalidArgument, NotSupported, OperationRejected, OperationTimeout
 from aerokit.position import Position
 from aerokit.vehicle.commanding.follow_target import FollowTarget, HasTelemetry
 from aerokit.vehicle.commanding.progress import POSITION_MAX_AGE_S
@@ -111,7 +111,7 @@ class FollowStream(SteeringStream[TargetState]):
     mode, nothing more is sent. ``fly`` and leaving the block then raise :class:`SetpointStreamStopped`.
 
     Entering raises:
-        OperationRejected: the vehicle is not flying. Nothing was sent.
+        OperationRejected: the vehicle is not flying (nothing was sent), or its altitude is unknown (it holds).
         OperationTimeout: no position of the target was known within ``valid_for_s``. Nothing was sent.
         InvalidArgument: a height is wanted, and the target has no altitude. Nothing was sent.
     """
@@ -218,9 +218,11 @@ class FollowStream(SteeringStream[TargetState]):
         self._bearing_deg = target.bearing_to(here) if self._place.bearing_deg is None else self._place.bearing_deg
         self._course_deg = here.bearing_to(target)
         if self._place.height_m is None:
-            self._own_altitude_m = here.altitude_amsl_m or 0.0
+            if here.altitude_amsl_m is None:
+                raise OperationRejected("follow: the vehicle's altitude above sea level is unknown; a hold was ordered")
+            self._own_altitude_m = here.altitude_amsl_m
         elif target.altitude_amsl_m is None and target.altitude_relative_m is None:
-            raise InvalidArgument("height_m is not allowed: the target has no altitude; nothing was sent")
+            raise InvalidArgument("height_m is not allowed: the target has no altitude; a hold was ordered")
 
     # ------------------------------------------------------------------------------ the stream
 
