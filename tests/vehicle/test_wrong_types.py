@@ -56,6 +56,7 @@ USED_BY_THE_LIBRARY = {
         "describe_signature_problems",
         "fail",
         "last_heartbeat_at",
+        "send_as",
     }
     | {"on_end", "record", "observe_frames", "observe_sent_frames", "order_refused"}
     | {"member_link_changed", "member_link_open_failed", "member_link_stalled"},
