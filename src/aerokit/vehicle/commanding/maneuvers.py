@@ -11,7 +11,7 @@ from aerokit.mavlink.enums import MavCmd, MavDoRepositionFlags, MavType, MavVtol
 from aerokit.position import travel_target
 from aerokit.vehicle.commanding.context import VehicleBase
 from aerokit.vehicle.commanding.follow_target import FollowTarget
-from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M, MAX_SILENCE_S, await_progress
+from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M, MAX_SILENCE_S, POSITION_MAX_AGE_S, await_progress
 
 if TYPE_CHECKING:
     from aerokit.autopilots import Mode
@@ -211,7 +211,7 @@ class ManeuverActions(VehicleBase):
                 )
         elif turns is not None:
             raise InvalidArgument(f"turns = {turns!r} is not allowed without radius_m")
-        center = self.telemetry.position.value if target is None else travel_target(target)
+        center = self.telemetry.position.fresh(POSITION_MAX_AGE_S) if target is None else travel_target(target)
         if radius_m is None:
             counter = None
             flags = MavDoRepositionFlags.CHANGE_MODE
