@@ -10,10 +10,12 @@ import anyio
 import pytest
 from flight_harness import block_loop, in_the_air, open_px4
 
-from aerokit import Position
+from aerokit import Position, TargetMeasurement, VelocitySetpoint
 from aerokit import messages as m
-from aerokit.errors import CommandTimeout, InvalidArgument, OperationRejected, ValueUnknownError
+from aerokit.errors import CommandTimeout, InvalidArgument, OperationRejected, SetpointStreamStopped, ValueUnknownError
+from aerokit.mavlink.enums import CopterMode
 from aerokit.mavlink.enums import MavCmd as C
+from aerokit.sim import SimulatedCopter
 
 pytestmark = pytest.mark.anyio
 
@@ -108,3 +110,68 @@ async def test_follow_invalid_first_place_holds_the_earlier_flight() -> None:
             await going
         await anyio.sleep(3)
         assert flight.vehicle.mode_name == "BRAKE"
+
+
+async def test_follow_own_vehicle_is_refused() -> None:
+    async with in_the_air() as flight:
+        with pytest.raises(InvalidArgument, match="target"):
+            async with flight.vehicle.follow(flight.vehicle) as following:
+                await following.fly(10)
+        print(flight.copter.motion.north, flight.copter.motion.east)
+        assert not flight.wire.all(m.SetPositionTargetGlobalInt)
+
+
+async def test_follow_function_that_raises_cancellation_holds() -> None:
+    async with in_the_air() as flight:
+        here = flight.vehicle.position.value
+        numbers = count()
+
+        def latest() -> Position:
+            if next(numbers) >= 10:
+                raise asyncio.CancelledError  # as Task.result() of a task that was cancelled
+            return here
+
+        with pytest.raises(SetpointStreamStopped, match="CancelledError"):
+            async with flight.vehicle.follow(latest) as following:
+                await following.fly(5)
+        await anyio.sleep(3)
+        assert flight.vehicle.mode_name == "BRAKE"
+
+
+async def test_land_on_after_hold_in_the_meantime_lands_not() -> None:
+    """The hold is on its way when the target is seen."""
+    simulated = SimulatedCopter(boot_time_s=0.0, parameters={"PLND_ENABLED": 1.0, "PLND_TYPE": 1.0})
+    async with in_the_air(copter=simulated) as flight:
+        going = asyncio.ensure_future(flight.vehicle.go_to(flight.vehicle.position.value.offset(north_m=30)))
+        await anyio.sleep(1)
+        sees = asyncio.Event()
+        target = lambda: TargetMeasurement(0.0, 0.0, 10.0) if sees.is_set() else None  # noqa: E731
+        landing = asyncio.ensure_future(flight.vehicle.land_on(target))
+        await anyio.sleep(1)
+        going.cancel()
+        going = asyncio.ensure_future(flight.vehicle.go_to(flight.vehicle.position.value.offset(east_m=200)))
+        await anyio.sleep(1)
+        sees.set()
+        with pytest.raises(OperationRejected, match="another order was given before anything was ordered"):
+            await landing
+        assert not [each for each in flight.wire.mode_orders() if each == CopterMode.LAND]
+        going.cancel()
+
+
+async def test_terminated_flight_gets_no_mode_afterwards() -> None:
+    async with in_the_air() as flight:
+
+        async def fly() -> None:
+            with suppress(SetpointStreamStopped, OperationRejected):
+                async with flight.vehicle.guided.velocity() as stream:
+                    await stream.fly(VelocitySetpoint(1, 0, 0), 20)
+
+        task = asyncio.ensure_future(fly())
+        await anyio.sleep(2)
+        flight.wire.clear()
+        terminating = asyncio.ensure_future(flight.vehicle.terminate(intent="terminate flight"))
+        await anyio.sleep(0)
+        task.cancel()
+        await asyncio.wait([task, terminating])
+        await anyio.sleep(5)
+        assert not flight.wire.mode_orders()

@@ -7,7 +7,7 @@ import asyncio
 import anyio
 import pytest
 from flight_harness import open_flight
-from test_actuators import fitted_copter, params
+from test_actuators import fitted_copter, on_px4, params
 
 from aerokit import messages as m
 from aerokit.errors import OperationRejected
@@ -53,3 +53,26 @@ async def test_escs_cancelled_do_not_calibrate_at_next_boot(after_s: float) -> N
             await task
         await anyio.sleep(10)
         assert flight.copter.parameters["ESC_CALIBRATION"] == before
+
+
+async def test_gear_on_ground_is_not_retracted_in_silence() -> None:
+    async with open_flight(fitted_copter()) as flight:
+        await flight.vehicle.wait_ready()
+        await flight.vehicle.arm()
+        await anyio.sleep(3)
+        flight.copter.faults.drop_outgoing = 1_000_000
+        await anyio.sleep(3)
+        with pytest.raises(OperationRejected, match="on the ground"):
+            await flight.vehicle.actuators.raise_landing_gear()
+        assert not flight.wire.commands(C.AIRFRAME_CONFIGURATION)
+
+
+async def test_escs_of_silent_vehicle_are_not_calibrated() -> None:
+    """PX4 gives the motors full throttle at once."""
+    async with on_px4() as flight:
+        flight.px4.faults.drop_outgoing = 1_000_000
+        await anyio.sleep(30)
+        with pytest.raises(OperationRejected, match="not known to be disarmed"):
+            async for _ in flight.vehicle.calibrate.escs(intent="propellers are removed"):
+                pass
+        assert not flight.wire.commands(C.PREFLIGHT_CALIBRATION)

@@ -65,7 +65,7 @@ class CalibrationRun:
 
     def check_disarmed(self) -> None:
         """Raise OperationRejected unless the vehicle is known to be disarmed."""
-        if not self.session.telemetry.is_confirmed_disarmed:
+        if not self.session.telemetry.is_confirmed_disarmed or not self.context.arbiter.is_known:
             state = "armed" if self.session.telemetry.is_armed else "not known to be disarmed"
             raise OperationRejected(f"{self.what}: the vehicle is {state}; nothing was sent")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 from collections.abc import AsyncIterable, Callable
 from typing import TYPE_CHECKING, Any
@@ -168,6 +169,8 @@ class FollowStream(SteeringStream[TargetState]):
         place.check()
         check_range("max_distance_m", max_distance_m, place.distance_m, math.inf)
         autopilot = context.session.autopilot
+        if getattr(target, "telemetry", None) is context.session.telemetry:
+            raise InvalidArgument("target is not allowed: the vehicle itself, which would flee from itself")
         if not (autopilot.setpoints.global_position and autopilot.setpoints.velocity):
             raise NotSupported(f"follow: {autopilot.firmware} does not support position set-points; nothing was sent")
         nowhere = TargetState(Position(0.0, 0.0), AT_REST, -math.inf, -math.inf)
@@ -275,7 +278,8 @@ class FollowStream(SteeringStream[TargetState]):
             if state is not None:
                 self._take(state)
                 self._set_at = max(state.at, -math.inf)
-        except Exception as error:
+        # CancelledError: of a task whose result the function returns.
+        except (Exception, asyncio.CancelledError) as error:
             self._end_reason = f"the position of the target raised {error!r}"
         super()._tick(due)
 
