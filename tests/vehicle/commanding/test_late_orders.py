@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable, Coroutine
 from contextlib import suppress
-from itertools import count
+from itertools import count, pairwise
 
 import anyio
+import anyio.lowlevel
 import pytest
-from flight_harness import block_loop, in_the_air, open_px4
+from flight_harness import Flight, block_loop, in_the_air, open_px4
 
-from aerokit import Position, TargetMeasurement, VelocitySetpoint
+from aerokit import Position, StickInput, TargetMeasurement, VelocitySetpoint
 from aerokit import messages as m
 from aerokit.errors import CommandTimeout, InvalidArgument, OperationRejected, SetpointStreamStopped, ValueUnknownError
 from aerokit.mavlink.enums import CopterMode
@@ -18,6 +20,8 @@ from aerokit.mavlink.enums import MavCmd as C
 from aerokit.sim import SimulatedCopter
 
 pytestmark = pytest.mark.anyio
+
+Fly = Callable[[Flight], Coroutine[None, None, None]]
 
 
 async def test_land_while_sticks_read_parameters_stands() -> None:
@@ -53,7 +57,7 @@ async def test_autotune_is_not_started_again_after_pause() -> None:
         with pytest.raises(CommandTimeout, match="may go on tuning"):
             await flight.vehicle.autotune()
         sent = [at for at, each in flight.wire.sent if getattr(each, "command", 0) == C.DO_AUTOTUNE_ENABLE]
-        assert max(late - early for early, late in zip(sent, sent[1:], strict=False)) < 3
+        assert max(late - early for early, late in pairwise(sent)) < 3
 
 
 async def test_follow_slow_function_gives_no_velocity_peaks() -> None:
@@ -117,7 +121,6 @@ async def test_follow_own_vehicle_is_refused() -> None:
         with pytest.raises(InvalidArgument, match="target"):
             async with flight.vehicle.follow(flight.vehicle) as following:
                 await following.fly(10)
-        print(flight.copter.motion.north, flight.copter.motion.east)
         assert not flight.wire.all(m.SetPositionTargetGlobalInt)
 
 
@@ -138,8 +141,7 @@ async def test_follow_function_that_raises_cancellation_holds() -> None:
         assert flight.vehicle.mode_name == "BRAKE"
 
 
-async def test_land_on_after_hold_in_the_meantime_lands_not() -> None:
-    """The hold is on its way when the target is seen."""
+async def test_land_on_newer_order_before_first_sight_stands() -> None:
     simulated = SimulatedCopter(boot_time_s=0.0, parameters={"PLND_ENABLED": 1.0, "PLND_TYPE": 1.0})
     async with in_the_air(copter=simulated) as flight:
         going = asyncio.ensure_future(flight.vehicle.go_to(flight.vehicle.position.value.offset(north_m=30)))
@@ -170,8 +172,36 @@ async def test_terminated_flight_gets_no_mode_afterwards() -> None:
         await anyio.sleep(2)
         flight.wire.clear()
         terminating = asyncio.ensure_future(flight.vehicle.terminate(intent="terminate flight"))
-        await anyio.sleep(0)
+        await anyio.lowlevel.checkpoint()
         task.cancel()
         await asyncio.wait([task, terminating])
         await anyio.sleep(5)
         assert not flight.wire.mode_orders()
+
+
+async def _fly_sticks(flight: Flight) -> None:
+    async with flight.vehicle.sticks() as sticks:
+        await sticks.move(StickInput(forward=0.5), 1.0)
+        flight.copter.faults.drop_incoming = 3
+
+
+async def _fly_velocity(flight: Flight) -> None:
+    async with flight.vehicle.guided.velocity() as stream:
+        await stream.fly(VelocitySetpoint(3, 0, 0), 2.0)
+        flight.copter.faults.drop_incoming = 3
+
+
+@pytest.mark.parametrize("fly", [_fly_sticks, _fly_velocity])
+async def test_lost_hold_of_left_block_survives_cancellation(
+    fly: Callable[[Flight], Coroutine[None, None, None]],
+) -> None:
+    async with in_the_air() as flight:
+        task = asyncio.ensure_future(fly(flight))
+        while not flight.copter.faults.drop_incoming:  # noqa: ASYNC110
+            await anyio.sleep(0.05)
+        await anyio.sleep(0.1)
+        task.cancel()
+        await asyncio.wait([task])
+        assert task.cancelled()
+        await anyio.sleep(5.0)
+        assert flight.vehicle.mode_name == "BRAKE"

@@ -45,7 +45,7 @@ async def test_escs_cancelled_do_not_calibrate_at_next_boot(after_s: float) -> N
         before = flight.copter.parameters["ESC_CALIBRATION"]
         task = asyncio.ensure_future(calibrate())
         flight.wire.clear()
-        while not flight.wire.all(m.ParamSet):
+        while not flight.wire.all(m.ParamSet):  # noqa: ASYNC110
             await anyio.sleep(0.01)
         await anyio.sleep(after_s)
         task.cancel()

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 import anyio
 
 from aerokit._internal.arguments import check_range, checks_arguments
-from aerokit.errors import BusyError, OperationRejected, ParameterTimeout, SetpointStreamStopped
+from aerokit.errors import BusyError, OperationRejected, OperationTimeout, ParameterTimeout, SetpointStreamStopped
 from aerokit.parameters import Parameter
 from aerokit.vehicle.commanding.arbiter import STEERING
 from aerokit.vehicle.commanding.order import SUPERSEDED
@@ -260,7 +260,13 @@ class SteeringStream(ValueStream[ValueT]):
             self._stop(f"the vehicle has been silent for {self._session.heartbeat_age:.1f} s")
             raise self._stopped
         elif not self._session.telemetry.is_confirmed_disarmed:
-            await self._context.flight_cleanup.hold()
+            cleanup, mode = self._context.flight_cleanup, self._context.sender.mode_for("hold", "hold")
+            order = self._context.arbiter.order(mode)
+            try:
+                await cleanup.stop_in(mode, order)
+            except (anyio.get_cancelled_exc_class(), OperationTimeout):  # The hold may have been lost.
+                cleanup.hold_in_background(order)
+                raise
 
     async def _enter(self, mode: Mode, order: Order) -> None:
         """Change the mode. ArduPilot takes values once it is in the mode; PX4 enters the mode once it receives them."""
