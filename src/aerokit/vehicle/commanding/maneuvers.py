@@ -247,7 +247,7 @@ class ManeuverActions(VehicleBase):
         Args:
             target: another vehicle, of this connection or of any other; an asynchronous iterable of positions; or a
                 function that returns the latest position, or None, called on the event loop ten times a second. The
-                velocity of positions is computed from two of them.
+                velocity of positions is computed from two different ones; above 100 m/s it is a jump, and counts as 0.
             distance_m: distance along the ground to keep, 0 to 1000.
             bearing_deg: direction from the target in which to stay, 0–360 clockwise from north; None: where the vehicle
                 is when it begins.
@@ -258,7 +258,7 @@ class ManeuverActions(VehicleBase):
             max_distance_m: if the target is farther away than this many metres, the vehicle holds.
 
         Raises:
-            InvalidArgument: an argument is out of range.
+            InvalidArgument: an argument is out of range, or the target is the vehicle itself.
             NotSupported: this type of vehicle takes no position set-points, or it flies on its wings.
         """
         from aerokit.vehicle.commanding.follow import FollowPlace, FollowStream

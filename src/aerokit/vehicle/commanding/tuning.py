@@ -44,7 +44,7 @@ class TuningActions(VehicleBase):
             NotSupported: this firmware tunes by a pilot's sticks, in its mode AUTOTUNE. Nothing was sent.
             OperationRejected: the mode changed, or another party disarmed the vehicle.
             CommandRejected: PX4 has no such module, or the tuning failed.
-            CommandTimeout: an answer is missing; PX4 may go on tuning.
+            CommandTimeout: an answer is missing, or the program has paused; PX4 may go on tuning.
             OperationTimeout: it was not done in time; PX4 may go on tuning.
         """
         if not self.autopilot.tunes_by_command:
