@@ -333,6 +333,7 @@ def clients(session: nox.Session) -> None:
     session.install("-e", ".", "MAVProxy", "mavsdk>=4", "pymavlink", "future")
     session.run("python", "tests/clients/fly.py", *session.posargs)
     session.run("python", "tests/clients/with_mavsdk_camera.py")
+    session.run("python", "tests/clients/with_mavsdk_component.py")
 
 
 @nox.session

@@ -22,8 +22,9 @@ ROOT = Path(__file__).parent.parent
 HOW_TO = (
     "connecting", "state", "waiting", "actions", "maneuvers", "errors", "parameters", "missions", "set-points",
     "sticks", "external", "precision-landing", "files-and-logs", "cameras", "gimbals", "corrections", "calibration",
-    "outputs-and-devices", "px4-tools", "components", "messages", "events", "links", "several-links", "bad-radio",
-    "signing", "several-vehicles", "own-loop", "sync", "recording", "dialects", "testing", "logging",
+    "outputs-and-devices", "px4-tools", "components", "being-a-component", "being-a-camera", "being-a-device",
+    "messages", "events", "links", "several-links", "bad-radio", "signing", "several-vehicles", "own-loop", "sync",
+    "recording", "dialects", "testing", "logging",
 )  # fmt: skip
 NAVIGATION: dict[str, list[str]] = {
     "Tutorial": ["tutorial.md"],
@@ -39,7 +40,8 @@ NAVIGATION: dict[str, list[str]] = {
     "Gallery": ["gallery.md", "examples/*.md"],
     "About": [
         "design.md", "design-rooms.md", "reliability.md", "verification.md", "firmware.md", "benchmarks.md",
-        "features.md", "states.md", "addresses.md", "signing.md", "simulator.md", "testing.md", "about/*.md",
+        "features.md", "features-onboard.md", "states.md", "addresses.md", "signing.md", "simulator.md", "testing.md",
+        "about/*.md",
     ],
 }  # fmt: skip
 """Maps the title of a tab to its pages and patterns, in order. Missing pages are skipped; an unlisted page fails the

@@ -84,6 +84,8 @@ GROUPS: dict[str, tuple[Page, ...]] = {
         Page("components", "vehicle.component()", "Any component on board",
              holders=("aerokit.vehicle.components.component", "aerokit.vehicle.components.settings"),
              search_boost=1.5),
+        Page("onboard", "aerokit.onboard", "Your program as a component, and its ready-made parts",
+             ("aerokit.onboard",), search_boost=1.5),
         Page("fleets", "Fleet", "Many vehicles together",
              holders=("aerokit.fleets.fleet", "aerokit.fleets.members", "aerokit.fleets.policy",
                       "aerokit.fleets.events", "aerokit.fleets.formation", "aerokit.fleets.formation",

@@ -61,7 +61,9 @@ AS_PROGRAMS: dict[str, list[str]] = {
     "blocking_messages": ["m/s at", "holding in BRAKE"],
 }
 """Example name: expected output."""
-TESTED_SEPARATELY = {"record_and_replay", "signed_link", "survey_photos", "web_server"}
+COMPONENTS = {"arm_authorizer", "camera_server", "landing_beacon", "payload"}
+"""Tested in onboard/test_component_examples.py."""
+TESTED_SEPARATELY = {"record_and_replay", "signed_link", "survey_photos", "web_server", *COMPONENTS}
 
 
 def test_every_example_has_a_test() -> None:

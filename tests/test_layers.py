@@ -21,7 +21,7 @@ FLOORS = [
     {"protocols"},
     {"connection", "sim"},
     {"hub"},
-    {"vehicle"},
+    {"vehicle", "onboard"},
     {"fleets"},
     {"sync", "video", "logs"},
     {"dronekit"},

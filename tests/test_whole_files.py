@@ -19,6 +19,7 @@ EXPECTED_WRITERS = {
     "logs/convert/tracks.py": "converting.py moves it when it is whole",
     "apps/cli/listening.py": "os.devnull",
     "mavlink/generator.py": "our own sources",
+    "onboard/files.py": "a MAVFTP client writes block by block, as the protocol does",
     "mavlink/tlog.py": "recordings: connection/frame_observers.py replaces a file when the first frame is received",
     "connection/frame_observers.py": "only to see whether it can be written",
     "sync/generator.py": "our own sources",

@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from aerokit.mavlink.dialect import Dialect as Dialect
     from aerokit.mavlink.signing import Signing as Signing
     from aerokit.mavlink.signing import SigningKey as SigningKey
+    from aerokit.onboard.opening import component as component
     from aerokit.position import Position as Position
     from aerokit.vehicle.commanding.setpoints import AccelerationSetpoint as AccelerationSetpoint
     from aerokit.vehicle.commanding.setpoints import ActuatorSetpoint as ActuatorSetpoint
@@ -102,6 +103,7 @@ __getattr__, __dir__, __all__ = lazy_exports(
         "aerokit.mavlink.enums": ("enums",),
         "aerokit.mavlink.messages": ("messages",),
         "aerokit.mavlink.signing": ("Signing", "SigningKey"),
+        "aerokit.onboard.opening": ("component",),
         "aerokit.position": ("Position",),
         "aerokit.vehicle.commanding.setpoints": (
             "AccelerationSetpoint",

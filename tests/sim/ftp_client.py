@@ -6,7 +6,7 @@ from simulated_client import Client
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
-from aerokit.sim.ftp import FtpPacket
+from aerokit.protocols.servers.ftp_packets import FtpPacket
 
 Op = MavFtpOpcode
 Err = MavFtpErr

@@ -18,9 +18,9 @@ from aerokit.parameters import (
     pack_parameters,
     unpack_parameters,
 )
+from aerokit.protocols.servers.files import FileFault
 from aerokit.sim import SimulatedCopter, SimulatedPx4
 from aerokit.sim.ardupilot.kinds import KINDS, parameters_of
-from aerokit.sim.ftp import FileFault
 from aerokit.sim.parameter_server import rounded
 from aerokit.sim.parameters import ParameterPackMount, SimParameters
 from aerokit.sim.px4.storage import px4_parameters

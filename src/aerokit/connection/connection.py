@@ -103,6 +103,8 @@ class Connection:
         self.source_component: int = source_component
         self.attached: set[int] = set()
         """System ids that have a vehicle object on this connection."""
+        self.components: set[tuple[int, int]] = set()
+        """(system id, component id) of the components that this program is on this connection."""
         # (system id, component id) → function from loop time to milliseconds since boot; None while unknown.
         self.boot_clocks: dict[tuple[int, int], Callable[[float], float | None]] = {}
         self.link_state: StateCell[LinkState] = StateCell("link_state", self.now, "frame")
@@ -181,6 +183,14 @@ class Connection:
         frame = Frame.parse(bytes(data))
         message_type = self.bus.dialect.get(frame.message_id)
         self._write(frame.raw, None if message_type is None else self.bus.dialect.decode(frame), None)
+
+    def send_as(self, encoder: FrameEncoder, message: Message, *, to: int | None = None) -> None:
+        """Send a message of another component of this program, which has an encoder of its own. See :meth:`send`."""
+        self.raise_if_ended()
+        encoder.version, encoder.signing = self._encoder.version, self._encoder.signing
+        data = encoder.encode(message, 0.0 if encoder.signing is None else self.unix_time())
+        self._write(data, message, to)
+        self._observers.notify_sent(data)
 
     def feed(self) -> None:
         """Keep our heartbeat going for another ``fed_within_s`` seconds (see `OwnHeartbeat`).

@@ -16,7 +16,7 @@ from aerokit.fleets.formation import Formations
 from aerokit.fleets.show_flight import Shows
 from aerokit.fleets.travel import Missions
 from aerokit.protocols.rtcm import rtcm_messages
-from aerokit.vehicle.rtk.output import output_of
+from aerokit.vehicle.rtk.rtk import send_rtcm
 
 if TYPE_CHECKING:
     from aerokit.connection.bus import Detach, Sink
@@ -117,9 +117,8 @@ class Fleet(Selection):
             ConnectionClosed, LinkLost: a link has ended; the links before it got the corrections.
         """
         messages, count = rtcm_messages(rtcm), 0
-        connections = {id(connection): connection for connection in self._context.networks.values()}
-        for connection in connections.values():
-            count = sum(output_of(connection).send(message, self) for message in messages)
+        for connection in dict.fromkeys(self._context.networks.values()):
+            count = sum(send_rtcm(connection, message, self) for message in messages)
         return count
 
     # -------------------------------------------------------------------------------------- streams

@@ -120,13 +120,12 @@ def fragments(message: bytes, sequence: int) -> list[GpsRtcmData]:
     """
     from aerokit.mavlink.messages import GpsRtcmData
 
-    flags = (sequence & 0x1F) << 3
-    if len(message) <= FRAGMENT_SIZE:
-        return [GpsRtcmData(flags, len(message), message.ljust(FRAGMENT_SIZE, b"\0"))]
     pieces = [message[begin : begin + FRAGMENT_SIZE] for begin in range(0, len(message), FRAGMENT_SIZE)]
-    if len(pieces) < MAX_FRAGMENTS and len(pieces[-1]) == FRAGMENT_SIZE:
+    is_split = len(pieces) > 1
+    if is_split and len(pieces) < MAX_FRAGMENTS and len(pieces[-1]) == FRAGMENT_SIZE:
         pieces.append(b"")
+    flags = (sequence & 0x1F) << 3 | is_split
     return [
-        GpsRtcmData(flags | number << 1 | 1, len(piece), piece.ljust(FRAGMENT_SIZE, b"\0"))
+        GpsRtcmData(flags | number << 1, len(piece), piece.ljust(FRAGMENT_SIZE, b"\0"))
         for number, piece in enumerate(pieces)
     ]

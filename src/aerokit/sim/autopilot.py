@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Iterable, Mapping
 from itertools import pairwise
 from typing import ClassVar
@@ -9,13 +10,14 @@ from typing import ClassVar
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavProtocolCapability
 from aerokit.mavlink.frame import Frame
-from aerokit.mavlink.messages import SetupSigning
+from aerokit.mavlink.messages import GpsRtcmData, SetupSigning
 from aerokit.mavlink.signing import LAST_TIMESTAMP, Signing, SigningKey, timestamp_at
+from aerokit.protocols.servers.files import FileTree
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandHandler, CommandServer, ReceivedCommand
-from aerokit.sim.corrections import ReceivedCorrections
-from aerokit.sim.ftp import FileTree
 from aerokit.sim.vehicle import AttachableComponent, SimulatedVehicle
+
+_CORRECTIONS_MAX_AGE_S, _FRAGMENT_SIZE = 5.0, 180
 
 
 class VehicleSigning:
@@ -93,6 +95,43 @@ class _Signing(Signing):
         if self.timestamp > LAST_TIMESTAMP:
             self.timestamp = 0
         return super().sign(frame, now)
+
+
+class ReceivedCorrections:
+    """Assembles the fragments of RTCM messages as ArduPilot does (AP_GPS.cpp, handle_gps_rtcm_fragment).
+
+    ``messages`` has the assembled messages; ``is_recent`` is True while they arrive.
+    """
+
+    def __init__(self, vehicle: SimulatedVehicle) -> None:
+        self._vehicle = vehicle
+        self.messages: list[bytes] = []
+        self._received_at = -math.inf
+        self._sequence, self._pieces = -1, dict[int, bytes]()
+        vehicle.on(GpsRtcmData, lambda message, _: self._on_fragment(message))
+
+    @property
+    def is_recent(self) -> bool:
+        return self._vehicle.now - self._received_at < _CORRECTIONS_MAX_AGE_S
+
+    def _on_fragment(self, message: GpsRtcmData) -> None:
+        data = bytes(message.data[: message.len])
+        if not message.flags & 1:
+            self._add(data)
+            return
+        number, sequence = message.flags >> 1 & 3, message.flags >> 3
+        if sequence != self._sequence or number in self._pieces:
+            self._pieces.clear()
+        self._sequence, self._pieces[number] = sequence, data
+        is_ended = any(len(piece) < _FRAGMENT_SIZE for piece in self._pieces.values()) or len(self._pieces) == 4
+        if is_ended and len(self._pieces) == max(self._pieces) + 1:
+            self._add(b"".join(self._pieces[index] for index in range(len(self._pieces))))
+            self._pieces.clear()
+
+    def _add(self, message: bytes) -> None:
+        self.messages.append(message)
+        del self.messages[:-1000]
+        self._received_at = self._vehicle.now
 
 
 # FIRMWARE_VERSION_TYPE by the suffix of the version.

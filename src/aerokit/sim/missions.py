@@ -12,18 +12,14 @@ from contextlib import suppress
 from typing import Protocol
 
 from aerokit.errors import InvalidArgument, RemoteProtocolError
-from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavMissionResult, MavMissionType
 from aerokit.mavlink.messages import MissionItemInt
 from aerokit.missions import MissionItem
-from aerokit.missions.wire import NO_CLEAR, pack_items, read_header, to_wire, unpack_items
-from aerokit.sim.ftp import EINVAL, ENFILE, ENOENT, FileFault, FileHandle, Mount, UploadedFile
+from aerokit.missions.wire import NO_CLEAR, pack_items, read_header, unpack_items
+from aerokit.protocols.servers.files import EINVAL, ENFILE, ENOENT, FileFault, FileHandle, Mount, UploadedFile
 
 INVALID_INDEX = 0xFFFF
 """The value of an unset index."""
-
-AnyItem = m.MissionItemInt | m.MissionItem
-AnyRequest = m.MissionRequestInt | m.MissionRequest
 
 
 class MissionStore(Protocol):
@@ -52,48 +48,6 @@ def float32(value: float) -> float:
         return float(struct.unpack("<f", struct.pack("<f", value))[0])
     except OverflowError:
         return float("inf") if value > 0 else float("-inf")
-
-
-def item_from(message: AnyItem) -> MissionItem:
-    """Convert a MISSION_ITEM_INT or MISSION_ITEM to an item; does not scale ``x`` and ``y``."""
-    numbers = (
-        message.param1,
-        message.param2,
-        message.param3,
-        message.param4,
-        message.x,
-        message.y,
-        message.z,
-    )
-    return MissionItem(message.command, message.frame, *numbers, autocontinue=bool(message.autocontinue))
-
-
-def item_message_int(
-    item: MissionItem, seq: int, to: tuple[int, int], mission_type: int, *, current: bool
-) -> m.MissionItemInt:
-    system, component = to
-    return to_wire(
-        item,
-        seq,
-        target_system=system,
-        target_component=component,
-        mission_type=mission_type,
-        current=current,
-    )
-
-
-def item_message_float(
-    item: MissionItem,
-    place: tuple[float, float],
-    seq: int,
-    to: tuple[int, int],
-    mission_type: int,
-    current: int = 0,
-) -> m.MissionItem:
-    """Create a MISSION_ITEM; ``place`` becomes ``x`` and ``y``."""
-    head = (*to, seq, item.frame, item.command, current, int(item.autocontinue))
-    numbers = (item.param1, item.param2, item.param3, item.param4)
-    return m.MissionItem(*head, *numbers, *place, item.z, mission_type)
 
 
 _FILES = {

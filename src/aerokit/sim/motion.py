@@ -12,6 +12,8 @@ import random
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from aerokit._internal.rotations import euler_from_quaternion as euler_from_quaternion
+from aerokit._internal.rotations import quaternion_from_euler as quaternion_from_euler
 from aerokit.errors import InvalidArgument
 
 _METRES_PER_DEGREE_E7 = 0.011131884502145034  # ArduPilot's LOCATION_SCALING_FACTOR: the same sphere and rounding.
@@ -72,28 +74,6 @@ HOME = (-35.363261, 149.165230, 584.09)
 """SITL's default home, a model airfield near Canberra: degrees, and metres above mean sea level."""
 
 
-def quaternion_from_euler(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
-    """Return the quaternion of a rotation by yaw, then pitch, then roll (radians)."""
-    cr, sr = math.cos(roll / 2), math.sin(roll / 2)
-    cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
-    cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
-    return (
-        cr * cp * cy + sr * sp * sy,
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-    )
-
-
-def euler_from_quaternion(w: float, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Return roll, pitch and yaw of a unit quaternion in radians."""
-    return (
-        math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
-        math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x)))),
-        math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
-    )
-
-
 GRAVITY_M_S2 = 9.80665
 _DRAG_PER_S = 0.33  # Deceleration divided by airspeed: a 450 mm quadrotor leans 20 degrees at 10 m/s.
 _VELOCITY_TIME_CONSTANT_S = 0.3
@@ -108,7 +88,6 @@ def wrap_pi(angle: float) -> float:
 
 
 def _clamp(value: float, limit: float) -> float:
-    """Limit the absolute value."""
     if value > limit:
         return limit
     return value if value > -limit else -limit

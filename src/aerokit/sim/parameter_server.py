@@ -8,22 +8,18 @@ from collections import deque
 from collections.abc import Callable
 
 from aerokit.mavlink.enums import MavParamError, MavParamType, MavSeverity
-from aerokit.mavlink.messages import ParamError, ParamRequestList, ParamRequestRead, ParamSet, ParamValue
+from aerokit.mavlink.messages import ParamRequestList, ParamRequestRead, ParamSet, ParamValue
 from aerokit.parameters import Parameter, ParameterTable, ParameterType
 from aerokit.parameters.encoding import UNKNOWN_INDEX, value_message, value_of
 from aerokit.parameters.pack import HASH_NAME, px4_hash
+from aerokit.protocols.servers import parameters as servers
 from aerokit.sim.channel import Channel
 from aerokit.sim.parameters import SimParameters
 from aerokit.sim.vehicle import SimulatedVehicle, sender_of
 
 
-class ParameterServer:
-    """Handles PARAM_REQUEST_LIST, PARAM_REQUEST_READ and PARAM_SET; each autopilot has a subclass.
-
-    A list is sent only on the requesting port: ``list_rate_hz`` parameters a second, in groups of ``burst``.
-    """
-
-    burst = 5
+class ParameterServer(servers.ParameterProtocolServer):
+    """Answers parameter requests; each autopilot has a subclass. The `Faults` of the vehicle apply."""
 
     def __init__(
         self,
@@ -33,52 +29,10 @@ class ParameterServer:
         list_rate_hz: float = 1000.0,
         errors: bool = True,
     ) -> None:
-        self.list_rate_hz = list_rate_hz
+        super().__init__(vehicle, parameters, list_rate_hz=list_rate_hz)
         self.errors = errors
         self._vehicle = vehicle
         self._parameters = parameters
-        self._lists: dict[Channel, int] = {}
-        self._list_number = 0
-        vehicle.on(ParamRequestList, self._on_list)
-        vehicle.on(ParamRequestRead, self._on_read)
-        vehicle.on(ParamSet, self._on_set)
-
-    @property
-    def running_lists(self) -> int:
-        """Number of ports on which a list is being sent."""
-        return len(self._lists)
-
-    def restart(self) -> None:
-        self._lists.clear()
-
-    def start_list(self, channel: Channel) -> None:
-        """Send all parameters on a port; restarts a running list."""
-        self._list_number += 1
-        self._lists[channel] = number = self._list_number
-        self._vehicle.call_later(self.burst / self.list_rate_hz, lambda: self._send_from(0, channel, number))
-
-    def stop_list(self, channel: Channel) -> None:
-        self._lists.pop(channel, None)
-
-    def _send_from(self, index: int, channel: Channel, number: int) -> None:
-        if self._lists.get(channel) != number:
-            return
-        names, end = self._parameters.names, index + self.burst
-        for position, name in enumerate(names[index:end], start=index):
-            self.send(name, position, channel)
-        if end >= len(names):
-            self.stop_list(channel)
-            return
-        self._vehicle.call_later(self.burst / self.list_rate_hz, lambda: self._send_from(end, channel, number))
-
-    def _on_list(self, request: ParamRequestList, channel: Channel) -> None:
-        raise NotImplementedError
-
-    def _on_read(self, request: ParamRequestRead, channel: Channel) -> None:
-        raise NotImplementedError
-
-    def _on_set(self, request: ParamSet, channel: Channel) -> None:
-        raise NotImplementedError
 
     def value_message(self, name: str, index: int) -> ParamValue:
         parameters = self._parameters
@@ -87,10 +41,7 @@ class ParameterServer:
     def send(self, name: str, index: int, channel: Channel | None) -> None:
         """Send a PARAM_VALUE on one port, or on all if ``channel`` is None."""
         if name not in self._vehicle.faults.mute_parameters:
-            self._vehicle.send(self.value_message(name, index), channel)
-
-    def send_error(self, to: tuple[int, int], name: str, index: int, code: int, channel: Channel) -> None:
-        self._vehicle.send(ParamError(*to, name, index, code), channel)
+            super().send(name, index, channel)
 
     def clamped(self, name: str, value: float) -> float:
         """Apply `Faults.parameter_limits` to a value."""

@@ -13,7 +13,7 @@ from aerokit.errors import InvalidArgument, RemoteProtocolError
 from aerokit.mavlink.enums import MavParamType
 from aerokit.parameters import Parameter, ParameterType
 from aerokit.parameters.pack import HEADER, MAGIC, pack_for_download, read_entry, read_header
-from aerokit.sim.ftp import EINVAL, ENOENT, FileFault, FileHandle, Mount, UploadedFile
+from aerokit.protocols.servers.files import EINVAL, ENOENT, FileFault, FileHandle, Mount, UploadedFile
 
 _VOLATILE = "v"
 
@@ -127,7 +127,6 @@ class SimParameters:
         return self._indices[name]
 
     def type(self, name: str) -> int:
-        """Return the MAV_PARAM_TYPE."""
         return self.row(name).type
 
     def default(self, name: str) -> float:

@@ -17,6 +17,8 @@ from typing import Any, Protocol
 from aerokit.mavlink.enums import MavAutopilot, MavModeFlag, MavSeverity, MavState, MavType
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import Heartbeat, Statustext
+from aerokit.protocols.servers.host import ServerHost
+from aerokit.protocols.servers.host import sender_of as sender_of
 from aerokit.sim.channel import Channel
 from aerokit.sim.faults import Faults
 
@@ -27,23 +29,10 @@ _TEXT_SIZE = 50
 Handler = Callable[[Any, Channel], None]
 
 
-class MessageHost(Protocol):
+class MessageHost(ServerHost, Protocol):
     """Interface of a vehicle or component that its protocol servers use."""
 
     faults: Faults
-
-    @property
-    def now(self) -> float: ...
-
-    def on(self, message_class: type[Message], handler: Handler) -> None: ...
-
-    def send(self, message: Message, channel: Channel | None = None) -> None: ...
-
-    def send_text(self, severity: int, text: str) -> None: ...
-
-    def call_at(self, when: float, action: Callable[[], None]) -> None: ...
-
-    def call_later(self, delay: float, action: Callable[[], None]) -> None: ...
 
 
 class VehicleJournal(Protocol):
@@ -360,9 +349,3 @@ class SimulatedVehicle:
 
 def _ignore(_message: Message, _channel: Channel) -> None:
     pass
-
-
-def sender_of(message: Message) -> tuple[int, int]:
-    """Return system and component id of the sender; zeros if the message was not received."""
-    frame = message.received_frame
-    return (0, 0) if frame is None else (frame.system_id, frame.component_id)

@@ -28,6 +28,8 @@ from aerokit._internal.imports import lazy_exports
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from aerokit.sync.component_twins import OnboardComponent as OnboardComponent
+    from aerokit.sync.component_twins import component as component
     from aerokit.sync.fleet_twins import Fleet as Fleet
     from aerokit.sync.fleet_twins import Selection as Selection
     from aerokit.sync.fleet_twins import fleet as fleet
@@ -45,6 +47,7 @@ __dir__: Callable[[], list[str]]
 __getattr__, __dir__, __all__ = lazy_exports(
     __name__,
     {
+        "aerokit.sync.component_twins": ("OnboardComponent", "component"),
         "aerokit.sync.fleet_twins": ("Fleet", "Selection", "fleet"),
         "aerokit.sync.twins": (
             "Connection",

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from aerokit.events import VehicleFound
     from aerokit.fleets.formation import Following
     from aerokit.vehicle.calibration.calibration import Calibration  # noqa: F401
-    from aerokit.vehicle.calibration.values import CalibrationStep
-    from aerokit.vehicle.camera.capture import Capture
+    from aerokit.vehicle.calibration.values import CalibrationStep  # noqa: F401
+    from aerokit.vehicle.camera.capture import Capture  # noqa: F401
     from aerokit.vehicle.camera.link import CameraBlock
     from aerokit.vehicle.camera.photos import PhotoInterval
     from aerokit.vehicle.commanding.follow import FollowStream
@@ -101,6 +101,10 @@ T = TypeVar("T")
 
 EnteredT = TypeVar("EnteredT")
 
+IteratorA = TypeVar("IteratorA", bound="AsyncIterator[Any]")
+
+ItemT = TypeVar("ItemT")
+
 BlockT = TypeVar("BlockT", bound="Block")
 
 ShieldedT = TypeVar("ShieldedT", bound="TemporaryParameters | Transaction")
@@ -154,32 +158,32 @@ class CellTwin(TwinOf["StateCell[T]"], Generic[T]):
             return getattr(self.aio, name)  # raises AttributeError with a suggestion
 
 
-class ChangesTwin(TwinOf["Changes[T]"], Generic[T]):
-    """Blocking iterator over the values of a cell."""
+class IteratorTwin(TwinOf[IteratorA], Generic[IteratorA, ItemT]):
+    """Twin of an asynchronous iterator over items."""
 
     def __iter__(self) -> Self:
         return self
 
-    def __next__(self) -> T:
-        return self._loop.run(self.aio.__anext__)
+    def __next__(self) -> ItemT:
+        items = self.aio
+
+        async def read() -> tuple[ItemT, ...]:  # a coroutine cannot raise StopAsyncIteration
+            try:
+                return (await items.__anext__(),)
+            except StopAsyncIteration:
+                return ()
+
+        found = self._loop.run(read)
+        if not found:
+            raise StopIteration
+        return found[0]
 
 
-def _next_of(loop: LoopThread, items: AsyncIterator[T]) -> T:
-    """Return the next item, or raise StopIteration."""
-
-    async def read() -> tuple[T, ...]:  # a coroutine cannot raise StopAsyncIteration
-        try:
-            return (await items.__anext__(),)
-        except StopAsyncIteration:
-            return ()
-
-    found = loop.run(read)
-    if not found:
-        raise StopIteration
-    return found[0]
+class ChangesTwin(IteratorTwin["Changes[T]", T], Generic[T]):
+    """Blocking iterator over the values of a cell."""
 
 
-class SubscriptionTwin(TwinOf["Subscription[T]"], Generic[T]):
+class SubscriptionTwin(IteratorTwin["Subscription[T]", T], Generic[T]):
     """Iterator over received items; subscribed while its ``with`` block runs."""
 
     def __enter__(self) -> Self:
@@ -189,12 +193,6 @@ class SubscriptionTwin(TwinOf["Subscription[T]"], Generic[T]):
     def __exit__(self, exc_type: Any, exc: Any, traceback: Any) -> None:
         with contextlib.suppress(ConnectionClosed):  # it is closed already
             self._loop.call(self.aio.close)
-
-    def __iter__(self) -> Self:
-        return self
-
-    def __next__(self) -> T:
-        return _next_of(self._loop, self.aio)
 
 
 class BlockTwin(TwinOf[BlockT]):
@@ -238,34 +236,16 @@ class GimbalsTwin(TwinOf["Gimbals"], Generic[T]):
         return len(self.ids)
 
 
-class CalibrationTwin(TwinOf["Calibration"]):
+class CalibrationTwin(IteratorTwin["Calibration", "CalibrationStep"]):
     """Iterator over the steps of a calibration. Leaving the loop cancels it on the vehicle."""
 
-    def __iter__(self) -> Self:
-        return self
 
-    def __next__(self) -> CalibrationStep:
-        return _next_of(self._loop, self.aio)
-
-
-class PhotoIntervalTwin(BlockTwin["PhotoInterval"]):
+class PhotoIntervalTwin(BlockTwin["PhotoInterval"], IteratorTwin["PhotoInterval", "Capture"]):
     """Takes pictures while its ``with`` block runs; an iterator over them."""
 
-    def __iter__(self) -> Self:
-        return self
 
-    def __next__(self) -> Capture:
-        return _next_of(self._loop, self.aio)
-
-
-class LogStreamTwin(BlockTwin["LogStream"]):
+class LogStreamTwin(BlockTwin["LogStream"], IteratorTwin["LogStream", bytes]):
     """A flight log while PX4 writes it; an iterator over its bytes."""
-
-    def __iter__(self) -> Self:
-        return self
-
-    def __next__(self) -> bytes:
-        return _next_of(self._loop, self.aio)
 
 
 class ShieldedBlockTwin(TwinOf[ShieldedT]):

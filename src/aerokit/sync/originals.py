@@ -119,6 +119,21 @@ TWINS = (
             " fence rally rtk"
         ),
     ),
+    Twin(
+        "aerokit.onboard.parameters.ComponentParameters",
+        special=_names("__getitem__ __iter__ __len__"),
+        direct=_names("__getitem__ __iter__ __len__"),
+        page="component_twins",
+    ),
+    Twin("aerokit.onboard.missions.ComponentMissions", page="component_twins"),
+    Twin("aerokit.onboard.sources.ComponentSources", page="component_twins"),
+    Twin(
+        "aerokit.onboard.component.OnboardComponent",
+        "ComponentTwin",
+        without=_names("command message connection"),
+        called=_names("missions sources"),
+        page="component_twins",
+    ),
     Twin("aerokit.fleets.formation.Following", "BlockTwin", direct=_names("error_m"), page="fleet_twins"),
     Twin(
         "aerokit.fleets.fleet.Selection",

@@ -14,10 +14,10 @@ from aerokit.mavlink.enums import MavCmd, MavFrame, MavFtpErr, MavMissionResult,
 from aerokit.mavlink.message import Message
 from aerokit.parameters.encoding import UNKNOWN_INDEX
 from aerokit.parameters.pack import HASH_NAME
+from aerokit.protocols.servers.ftp_packets import FtpPacket
+from aerokit.protocols.servers.missions import AnyItem, AnyRequest, item_from, item_message_float
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandServer, ReceivedCommand
-from aerokit.sim.ftp import FtpPacket
-from aerokit.sim.missions import AnyItem, AnyRequest, item_from, item_message_float
 from aerokit.sim.vehicle import AttachableComponent, SimulatedVehicle, sender_of
 from aerokit.testing.recording import RecordedAnswer, RecordedFlight
 

@@ -13,7 +13,6 @@ from aerokit.vehicle.commanding.flight import FlightActions, ModeActions
 from aerokit.vehicle.commanding.maneuvers import ManeuverActions
 from aerokit.vehicle.commanding.messaging import MessagingActions
 from aerokit.vehicle.commanding.progress import MAX_SILENCE_S
-from aerokit.vehicle.commanding.speeds import SpeedActions
 from aerokit.vehicle.commanding.termination import TerminationActions
 from aerokit.vehicle.commanding.travel import LookActions, TravelActions
 from aerokit.vehicle.commanding.tuning import TuningActions
@@ -57,7 +56,6 @@ class Vehicle(
     FlightActions,
     TravelActions,
     ManeuverActions,
-    SpeedActions,
     LookActions,
     ArmingActions,
     ModeActions,
@@ -310,7 +308,7 @@ class Vehicle(
         """
         from aerokit.vehicle.parameters.return_altitude import read_return_altitude
 
-        return await read_return_altitude(self.parameters, self.autopilot, self.telemetry)
+        return await read_return_altitude(self.parameters, self._session)
 
     async def set_return_altitude(self, altitude_m: float) -> None:
         """Set the altitude of returns to launch; returns when the vehicle has confirmed the value.
@@ -329,7 +327,7 @@ class Vehicle(
         """
         from aerokit.vehicle.parameters.return_altitude import write_return_altitude
 
-        await write_return_altitude(self.parameters, self.autopilot, self.telemetry, altitude_m)
+        await write_return_altitude(self.parameters, self._session, altitude_m)
 
     def __repr__(self) -> str:
         return f"<Vehicle {self.system_id}/{self.component_id} {self.autopilot.firmware}, {self.describe_link()}>"

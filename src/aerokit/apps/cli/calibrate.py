@@ -29,28 +29,21 @@ _CANCEL_TIMEOUT_S = 20.0
 
 _GROUND = "    ~~~~~~~~~~~~~~~~~~~~~~~~~~~~"
 # A vehicle with its nose to the right, seen from its right side, or from behind where a side is down.
-PICTURES: dict[CalibrationPose, tuple[str, str]] = {
-    CalibrationPose.LEVEL: (
-        "seen from the right side",
-        r"""
+_FROM_BEHIND = (CalibrationPose.LEFT, CalibrationPose.RIGHT)
+PICTURES: dict[CalibrationPose, str] = {
+    CalibrationPose.LEVEL: r"""
           ----+----     ----+----
               |   _______   |
               '--[_______]>-'   nose
                   /     \
 """,
-    ),
-    CalibrationPose.BACK: (
-        "seen from the right side",
-        r"""
+    CalibrationPose.BACK: r"""
                   \_____/
               .--[_______]>-.   nose
               |             |
           ----+----     ----+----
 """,
-    ),
-    CalibrationPose.NOSE_DOWN: (
-        "seen from the right side",
-        r"""
+    CalibrationPose.NOSE_DOWN: r"""
                  _       |
                 | |------+   tail
               ==| |      |
@@ -59,10 +52,7 @@ PICTURES: dict[CalibrationPose, tuple[str, str]] = {
                 |_|------+
                  V       |   nose
 """,
-    ),
-    CalibrationPose.NOSE_UP: (
-        "seen from the right side",
-        r"""
+    CalibrationPose.NOSE_UP: r"""
              |       A       nose
              +------| |
              |      | |==
@@ -71,10 +61,7 @@ PICTURES: dict[CalibrationPose, tuple[str, str]] = {
              +------|_|
              |               tail
 """,
-    ),
-    CalibrationPose.LEFT: (
-        "seen from behind",
-        r"""
+    CalibrationPose.LEFT: r"""
               |
               +--.       right
               |  |_
@@ -82,10 +69,7 @@ PICTURES: dict[CalibrationPose, tuple[str, str]] = {
               |  |
               +--'       left
 """,
-    ),
-    CalibrationPose.RIGHT: (
-        "seen from behind",
-        r"""
+    CalibrationPose.RIGHT: r"""
                          |
               left    .--+
                      _|  |
@@ -93,7 +77,6 @@ PICTURES: dict[CalibrationPose, tuple[str, str]] = {
                       |  |
               right   '--+
 """,
-    ),
 }
 
 
@@ -164,19 +147,11 @@ class Display:
         if step.result is not None:
             self._show_result(step)
             return
-        record = {
-            "sensor": step.sensor,
-            "progress": step.progress,
-            "instruction": step.instruction,
-            "pose": step.pose,
-            "remaining": step.remaining,
-            "needs_confirmation": step.needs_confirmation,
-        }
-        pose, instruction = self._shown
-        self._shown = (step.pose, step.instruction)
-        lines = lines_of(step) if step.pose is not pose else [f"  {step.instruction[:76]}"]
-        is_new = self._shown != (pose, instruction)
-        emit(self._options, "calibration_step", record, "\n".join(lines) if is_new else None)
+        record = step.to_dict()
+        del record["result"]
+        shown, self._shown = self._shown, (step.pose, step.instruction)
+        lines = lines_of(step if step.pose is not shown[0] else step.replace(pose=None))
+        emit(self._options, "calibration_step", record, "\n".join(lines) if self._shown != shown else None)
         if not self._options.json and step.progress is not None and sys.stdout.isatty():
             print(f"{CLEAR_LINE}{bar(step.progress)}", end="\r", flush=True)
 
@@ -194,9 +169,9 @@ def lines_of(step: CalibrationStep) -> list[str]:
     """Return a step as lines of text: the picture of the pose, the instruction, and the poses that follow."""
     lines = []
     if step.pose is not None:
-        seen, picture = PICTURES[step.pose]
+        seen = "seen from behind" if step.pose in _FROM_BEHIND else "seen from the right side"
         others = ", ".join(pose.value for pose in step.remaining if pose is not step.pose)
-        lines = ["", f"  {step.pose.value.upper()} ({seen})", *picture.strip("\n").splitlines(), _GROUND]
+        lines = ["", f"  {step.pose.value.upper()} ({seen})", *PICTURES[step.pose].strip("\n").splitlines(), _GROUND]
         lines += [f"  then: {others}"] if others else []
     return [*lines, f"  {step.instruction[:76]}"]
 

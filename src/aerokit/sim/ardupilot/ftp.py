@@ -9,19 +9,10 @@ from functools import partial
 
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode, MavSeverity
 from aerokit.protocols.ftp import DATA_SIZE
+from aerokit.protocols.servers.files import EISDIR, ENOENT, Entry, FileFault, FileHandle, FileTree
+from aerokit.protocols.servers.ftp_packets import FtpPacket, path_in, read_crc32
 from aerokit.sim.channel import Channel
-from aerokit.sim.ftp import (
-    EISDIR,
-    ENOENT,
-    Entry,
-    FileFault,
-    FileHandle,
-    FileTree,
-    FtpPacket,
-    FtpServer,
-    path_in,
-    read_crc32,
-)
+from aerokit.sim.ftp import FtpServer
 from aerokit.sim.vehicle import SimulatedVehicle
 
 _SESSION_TIMEOUT_S = 3.0

@@ -14,11 +14,12 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavMissionResult, MavMissionType, MavSeverity
 from aerokit.mavlink.message import Message
 from aerokit.missions import MissionItem
+from aerokit.protocols.servers.missions import AnyItem, item_from, item_message_float, item_message_int
 from aerokit.sim.ardupilot.host import ArduPilotHost
 from aerokit.sim.ardupilot.mission_items import has_location, stored, whole
 from aerokit.sim.ardupilot.mission_lists import CommandList, FenceList, ItemList, RallyList
 from aerokit.sim.channel import Channel
-from aerokit.sim.missions import AnyItem, float32, item_from, item_message_float, item_message_int
+from aerokit.sim.missions import float32
 from aerokit.sim.vehicle import sender_of
 
 _RETRY_INTERVAL_S, _UPLOAD_TIMEOUT_S = 1.0, 8.0

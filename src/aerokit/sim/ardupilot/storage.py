@@ -8,10 +8,10 @@ from typing import ClassVar
 from aerokit.mavlink.enums import MavSeverity
 from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.signing import ONE_MINUTE, SigningKey, timestamp_at
+from aerokit.protocols.servers.files import FileTree, TextMount
 from aerokit.sim.ardupilot.ftp import ArduPilotFtp
 from aerokit.sim.ardupilot.host import ArduPilotHost
 from aerokit.sim.autopilot import VehicleSigning
-from aerokit.sim.ftp import FileTree, TextMount
 from aerokit.sim.logs import ArduPilotLogServer, SimulatedLog
 from aerokit.sim.missions import MissionMount
 from aerokit.sim.parameter_server import ArduPilotParameterServer, rounded
@@ -87,7 +87,6 @@ class ArduPilotStorage:
             self.files.remove_file(f"{LOG_FOLDER}/{name}")
 
     def _apply(self, name: str, value: float) -> None:
-        """Apply a parameter of an uploaded file."""
         parameters = self._vehicle.parameters
         if name not in self._vehicle.faults.read_only_parameters:
             parameters[name] = rounded(self.parameters.clamped(name, value), parameters.type(name))

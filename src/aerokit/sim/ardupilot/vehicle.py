@@ -14,6 +14,7 @@ from aerokit.mavlink.enums import MavModeFlag, MavResult, MavSeverity
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.signing import SigningKey
 from aerokit.parameters.encoding import UNKNOWN_INDEX
+from aerokit.protocols.servers.files import FileTree
 from aerokit.sim.ardupilot.calibration import Calibrations
 from aerokit.sim.ardupilot.camera import ArduPilotCamera
 from aerokit.sim.ardupilot.devices import ArduPilotDevices
@@ -33,7 +34,6 @@ from aerokit.sim.ardupilot.storage import DEFAULT_LOGS, ArduPilotSigning, ArduPi
 from aerokit.sim.autopilot import SimulatedBattery
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandHandler
-from aerokit.sim.ftp import FileTree
 from aerokit.sim.logs import SimulatedLog
 from aerokit.sim.motion import HOME, GlobalPoint, LocalFrame, Motion, Ned, SimulatedWind
 from aerokit.sim.parameters import SimParameters

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
 from aerokit.errors import InvalidArgument
-from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavAutopilot, MavCmd, MavParamExtType, MavResult, MavState, ParamAck
+from aerokit.mavlink.enums import MavAutopilot, MavState
 from aerokit.mavlink.message import Message
-from aerokit.mavlink.messages import CommandInt, CommandLong, Heartbeat, MessageInterval, Statustext
+from aerokit.mavlink.messages import CommandInt, CommandLong, Heartbeat, Statustext
 from aerokit.parameters import CameraDefinition, SettingValue
-from aerokit.parameters.parameter import setting_bytes, setting_value, settings_equal
+from aerokit.protocols.servers.definitions import DefinedParameterServer
+from aerokit.protocols.servers.files import FileTree
+from aerokit.protocols.servers.ftp import SessionFtpServer
+from aerokit.protocols.servers.intervals import Builder as Builder
+from aerokit.protocols.servers.intervals import MessageStreams
 from aerokit.sim.channel import Channel
-from aerokit.sim.commands import CommandHandler, CommandServer, ReceivedCommand, whole
+from aerokit.sim.commands import CommandHandler, CommandServer, ReceivedCommand
 from aerokit.sim.faults import Faults
-from aerokit.sim.ftp import FileTree, FtpServer
 from aerokit.sim.motion import GlobalPoint, true_place
 from aerokit.sim.vehicle import SimulatedVehicle
 
@@ -42,7 +44,7 @@ def pose_of(vehicle: SimulatedVehicle) -> Pose | None:
     return Pose(place, height, motion.roll, motion.pitch, motion.yaw)
 
 
-def serve_files(component: SimulatedComponent, files: FileTree) -> FtpServer:
+def serve_files(component: SimulatedComponent, files: FileTree) -> SessionFtpServer[FileTree]:
     """Serve files by MAVFTP under the component's address, as PX4 does; call it in ``listen()``.
 
     The files may change at any time, see `FileTree.put`. Power-off ends sessions and keeps files. The component's
@@ -57,9 +59,6 @@ def serve_files(component: SimulatedComponent, files: FileTree) -> FtpServer:
 
 _HEARTBEAT_INTERVAL_S = 1.0
 _MAVLINK_VERSION = 3
-
-# Returns the current messages of one id; the argument is the REQUEST_MESSAGE command, None for a stream.
-Builder = Callable[["ReceivedCommand | None"], "Iterable[Message]"]
 
 
 class SimulatedComponent:
@@ -82,7 +81,7 @@ class SimulatedComponent:
         self._vehicle: SimulatedVehicle | None = None
         self._commands: dict[int, CommandHandler] = {}
         self._builders: dict[int, Builder] = {}
-        self._streams: dict[tuple[Channel | None, int], _Stream] = {}
+        self._streams: MessageStreams = MessageStreams(self)
 
     def commands(self) -> dict[int, CommandHandler]:
         """Return handlers by MAV_CMD, in addition to the message requests."""
@@ -125,13 +124,8 @@ class SimulatedComponent:
         if self._vehicle is not None:
             raise InvalidArgument("the component is on another vehicle already; create one for each vehicle")
         self._vehicle = vehicle
-        self._builders = self.builders()
-        self._commands = {
-            MavCmd.REQUEST_MESSAGE: self._request_message,
-            MavCmd.SET_MESSAGE_INTERVAL: self._set_interval,
-            MavCmd.GET_MESSAGE_INTERVAL: self._get_interval,
-            **self.commands(),
-        }
+        self._builders = self._streams.builders = self.builders()
+        self._commands = {**self._streams.commands(), **self.commands()}
         CommandServer(self, self._commands)
         self.listen()
         vehicle.on_power_on(self._power_on)
@@ -175,22 +169,7 @@ class SimulatedComponent:
 
     def stream(self, message_id: int, interval_s: float, channel: Channel | None = None) -> None:
         """Stream messages of this id on one channel, or on all if None; an interval of 0 stops the stream."""
-        key = (channel, message_id)
-        if interval_s <= 0.0:
-            self._streams.pop(key, None)
-            return
-        before = self._streams.get(key)
-        if before is None or before.interval_s != interval_s:
-            self._streams[key] = _Stream(interval_s)
-            self._send_stream(key, self._streams[key])
-
-    def _send_stream(self, key: tuple[Channel | None, int], stream: _Stream) -> None:
-        if self._streams.get(key) is not stream:  # Replaced by another stream, perhaps with the same interval.
-            return
-        channel, message_id = key
-        for message in self._builders[message_id](None):
-            self.send(message, channel)
-        self.call_later(stream.interval_s, lambda: self._send_stream(key, stream))
+        self._streams.stream(message_id, interval_s, channel)
 
     def _is_addressed(self, message: Message) -> bool:
         system, component = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
@@ -202,161 +181,25 @@ class SimulatedComponent:
 
     def answer_with(self, message_id: int, command: ReceivedCommand) -> int:
         """Send the requested messages; return DENIED for an unknown id, FAILED if there is no message."""
-        builder = self._builders.get(message_id)
-        if builder is None:
-            return MavResult.DENIED
-        messages = list(builder(command))
-        for message in messages:
-            self.send(message, command.channel)
-        return MavResult.ACCEPTED if messages else MavResult.FAILED
-
-    def _request_message(self, command: ReceivedCommand) -> int:
-        return self.answer_with(whole(command.param1), command)
-
-    def _set_interval(self, command: ReceivedCommand) -> int:
-        """Set or stop a stream. 0 (default rate) stops it as -1 does, because streams have no default rate."""
-        message_id = whole(command.param1)
-        if message_id not in self._builders:
-            return MavResult.DENIED
-        self._streams.pop((None, message_id), None)
-        self.stream(message_id, whole(command.param2) / 1e6, command.channel)
-        return MavResult.ACCEPTED
-
-    def _get_interval(self, command: ReceivedCommand) -> int:
-        message_id = whole(command.param1)
-        if message_id not in self._builders:
-            return MavResult.DENIED
-        of_all = self._streams.get((None, message_id), _Stream(0.0))
-        interval = self._streams.get((command.channel, message_id), of_all).interval_s
-        self.send(MessageInterval(message_id, round(interval * 1e6) or -1), command.channel)
-        return MavResult.ACCEPTED
+        return self._streams.answer_with(message_id, command)
 
 
-class _Stream:
-    def __init__(self, interval_s: float) -> None:
-        self.interval_s = interval_s
-
-
-_LIST_INTERVAL_S = 0.01
-_ZEROS: dict[str, SettingValue] = {"bool": False, "float": 0.0, "double": 0.0, "string": "", "custom": ""}
-
-
-class ExtendedParameters:
+class ExtendedParameters(DefinedParameterServer):
     """Settings that a camera definition defines and PARAM_EXT serves; create it in ``listen()``.
 
-    A list is sent at a hundred parameters a second, without write-only parameters. The answer to a value that the
-    definition does not allow is VALUE_UNSUPPORTED, to setting a read-only or excluded parameter FAILED. Values survive
-    a reboot. ``mute_parameters`` and ``parameter_limits`` of the component's faults apply.
-
-    https://mavlink.io/en/services/parameter_ext.html
+    Values survive a reboot. ``mute_parameters`` and ``parameter_limits`` of the component's faults apply.
     """
 
     def __init__(self, component: SimulatedComponent, definition: CameraDefinition) -> None:
-        self.definition = definition
-        self.values: dict[str, SettingValue] = {}
-        """Current values; assign them at any time."""
-        self.slow: dict[str, float] = {}
-        """Name → seconds that setting the parameter takes; the answer is IN_PROGRESS until then."""
         self._component = component
-        self._pending: set[str] = set()
-        self._list_number = 0
-        self.reset()
-        component.on(m.ParamExtRequestList, self._on_list)
-        component.on(m.ParamExtRequestRead, self._on_read)
-        component.on(m.ParamExtSet, self._on_set)
+        super().__init__(component, definition)
 
-    def reset(self) -> None:
-        """Restore all defaults."""
-        for name, setting in self.definition.settings.items():
-            self.values[name] = _ZEROS.get(setting.type, 0) if setting.default is None else setting.default
+    def send(self, name: str, index: int, channel: Channel | None) -> None:
+        if name not in self._component.faults.mute_parameters:
+            super().send(name, index, channel)
 
-    def refresh(self) -> None:
-        """Called before a value is sent or set; overridden to update values that the device changes."""
-
-    def can_set(self, name: str) -> bool:
-        """Return True if a setting can be changed now; otherwise the answer is FAILED."""
-        return True
-
-    def on_set(self, name: str, value: SettingValue) -> None:
-        """Called when the value of a setting has changed."""
-
-    def restart(self) -> None:
-        """Drop pending changes, as a reboot does."""
-        self._pending.clear()
-        self._list_number += 1
-
-    @property
-    def _names(self) -> list[str]:
-        return [name for name, setting in self.definition.settings.items() if not setting.write_only]
-
-    def _on_list(self, _: m.ParamExtRequestList, channel: Channel) -> None:
-        self._list_number += 1
-        self._send_from(0, self._list_number, channel)
-
-    def _send_from(self, index: int, number: int, channel: Channel) -> None:
-        if number == self._list_number and index < len(self._names):
-            self._send_value(self._names[index], channel)
-            self._component.call_later(_LIST_INTERVAL_S, lambda: self._send_from(index + 1, number, channel))
-
-    def _on_read(self, request: m.ParamExtRequestRead, channel: Channel) -> None:
-        names = self._names
-        if 0 <= request.param_index < len(names):
-            self._send_value(names[request.param_index], channel)
-        elif request.param_index < 0 and request.param_id in names:
-            self._send_value(request.param_id, channel)
-
-    def _send_value(self, name: str, channel: Channel | None) -> None:
-        if name in self._component.faults.mute_parameters:
-            return
-        self.refresh()
-        kind, names = self.definition.settings[name].wire_type, self._names
-        data = setting_bytes(self.values[name], kind)
-        self._component.send(m.ParamExtValue(name, data, kind, len(names), names.index(name)), channel)
-
-    def _on_set(self, request: m.ParamExtSet, _: Channel) -> None:
-        name, kind = request.param_id, request.param_type
-        own = self.definition.settings.get(name)
-        if own is None:
-            self._acknowledge(name, request.param_value, kind, ParamAck.VALUE_UNSUPPORTED)
-            return
-        result, value = self._verdict(name, setting_value(request.param_value, kind), kind)
-        if result == ParamAck.ACCEPTED and name in self.slow and name not in self._pending:
-            self._pending.add(name)
-            self._component.call_later(self.slow[name], lambda: self._finish(name, value))
-        if name in self._pending:
-            self._acknowledge_setting(name, ParamAck.IN_PROGRESS)
-        elif result == ParamAck.ACCEPTED:
-            self._finish(name, value)
-        else:
-            self._acknowledge_setting(name, result)
-
-    def _verdict(self, name: str, value: SettingValue, kind: int) -> tuple[ParamAck, SettingValue]:
-        self.refresh()
-        own, definition = self.definition.settings[name], self.definition
-        if own.read_only or not self.can_set(name) or definition.excluded_by(name, self.values):
-            return ParamAck.FAILED, value
-        if kind != own.wire_type:
-            return ParamAck.VALUE_UNSUPPORTED, value
+    def limited(self, name: str, value: SettingValue) -> SettingValue:
         low, high = self._component.faults.parameter_limits.get(name, (None, None))
         if low is not None and high is not None and isinstance(value, (int, float)):
-            value = type(value)(max(low, min(high, value)))
-        try:
-            return ParamAck.ACCEPTED, definition.checked(name, value, self.values)
-        except InvalidArgument:
-            return ParamAck.VALUE_UNSUPPORTED, value
-
-    def _finish(self, name: str, value: SettingValue) -> None:
-        self._pending.discard(name)
-        is_new = not settings_equal(self.values[name], value)
-        self.values[name] = value
-        if is_new:
-            self.on_set(name, value)
-        self._acknowledge_setting(name, ParamAck.ACCEPTED)
-
-    def _acknowledge_setting(self, name: str, result: int) -> None:
-        kind = self.definition.settings[name].wire_type
-        self._acknowledge(name, setting_bytes(self.values[name], kind), kind, result)
-
-    def _acknowledge(self, name: str, data: bytes, kind: int, result: int) -> None:
-        known = kind if kind in MavParamExtType.__members__.values() else int(MavParamExtType.CUSTOM)
-        self._component.send(m.ParamExtAck(name, data, known, result))
+            return type(value)(max(low, min(high, value)))
+        return value

@@ -13,10 +13,10 @@ from typing import ClassVar
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavType
 from aerokit.mavlink.signing import SigningKey
+from aerokit.protocols.servers.files import FileTree
 from aerokit.sim.autopilot import SimulatedBattery
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandHandler, CommandServer
-from aerokit.sim.ftp import FileTree
 from aerokit.sim.logs import SimulatedLog
 from aerokit.sim.motion import (
     GRAVITY_M_S2,

@@ -13,8 +13,8 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavFrame, MavMissionResult, MavMissionType, MavSeverity
 from aerokit.mavlink.message import Message
 from aerokit.missions import MissionItem
+from aerokit.protocols.servers.missions import AnyItem, AnyRequest, item_from, item_message_float, item_message_int
 from aerokit.sim.channel import Channel
-from aerokit.sim.missions import AnyItem, AnyRequest, item_from, item_message_float, item_message_int
 from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.mission_items import as_downloaded, checksum, stored
 from aerokit.sim.vehicle import sender_of
@@ -179,7 +179,6 @@ class Px4MissionLink:
             self._end_upload()
 
     def on_count(self, count: m.MissionCount) -> None:
-        """Start an upload."""
         sender = sender_of(count)
         if self._state is TransferState.SENDING:
             self._warn("WPM: IGN MISSION_COUNT: Busy")

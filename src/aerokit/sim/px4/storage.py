@@ -13,8 +13,8 @@ from aerokit.mavlink.messages import AdsbVehicle, Collision, Heartbeat
 from aerokit.mavlink.signing import SigningKey
 from aerokit.parameters.pack import HEADER, MAGIC, read_entry, read_header
 from aerokit.protocols.ftp import DATA_SIZE
+from aerokit.protocols.servers.files import EINVAL, FileFault, FileHandle, FileTree
 from aerokit.sim.autopilot import VehicleSigning
-from aerokit.sim.ftp import EINVAL, FileFault, FileHandle, FileTree
 from aerokit.sim.logs import Px4LogServer, SimulatedLog
 from aerokit.sim.parameter_server import Px4ParameterServer
 from aerokit.sim.parameters import ParameterPackMount, SimParameters

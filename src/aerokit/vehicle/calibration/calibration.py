@@ -9,7 +9,6 @@ from functools import partial
 from typing import TYPE_CHECKING, Literal
 
 from aerokit._internal.arguments import checks_arguments
-from aerokit.errors import NotSupported
 from aerokit.vehicle.calibration import procedures
 from aerokit.vehicle.calibration.run import CalibrationRun
 
@@ -135,19 +134,14 @@ class CalibrationControl:
 
     def airspeed(self) -> Calibration:
         """Calibrate the airspeed sensors: sheltered from wind first; on PX4, blow into the front afterwards."""
-        return self._start(
-            "airspeed",
-            lambda run, *_: procedures.ardupilot_airspeed(run, self._parameters(), 0, 0, 1),
-            *(0, 0, 0, 0, 0, 2),
-        )
+        return self._start("airspeed", procedures.ardupilot_airspeed, 0, 0, 0, 0, 0, 2)
 
     def radio(self) -> Calibration:
         """Calibrate the remote control: writes RCn_MIN, RCn_MAX and RCn_TRIM of each channel that was moved.
 
         Both confirmations are needed: when all sticks and switches were at their ends, and when the sticks are centred.
         """
-        by_channels: Procedure = lambda run, *_: procedures.radio_by_channels(run, self._parameters())  # noqa: E731
-        return self._start("radio", by_channels, px4=by_channels)
+        return self._start("radio", procedures.radio_by_channels, px4=procedures.radio_by_channels)
 
     def escs(self, *, intent: EscIntent) -> Calibration:
         """Calibrate the ESCs. **Remove the propellers**, because the motors get full throttle.
@@ -160,27 +154,16 @@ class CalibrationControl:
         Raises:
             InvalidArgument: the intent is another text. Nothing was sent.
         """
-        return self._start(
-            "escs",
-            lambda run, *_: procedures.ardupilot_escs(run, self._parameters()),
-            *(0, 0, 0, 0, 0, 0, 1),
-        )
+        return self._start("escs", procedures.ardupilot_escs, 0, 0, 0, 0, 0, 0, 1)
 
     def _start(
         self, sensor: str, ardupilot: Procedure, *params: float, px4: Procedure = procedures.by_texts
     ) -> Calibration:
-        run = CalibrationRun(self._context, sensor, self._runs)
-        protocol = self._context.session.autopilot.calibration_protocol
-        procedure = {"acknowledgements": ardupilot, "texts": px4}.get(protocol, _not_supported)
-        return Calibration(run, procedure(run, *params))
+        """Prepare a calibration. PX4 gets ``params`` in its command, as does ArduPilot in its simplest procedures."""
+        run = CalibrationRun(self._context, sensor, self._runs, self._parameters)
+        is_px4 = self._context.session.autopilot.calibration_protocol == "texts"
+        return Calibration(run, (px4 if is_px4 else ardupilot)(run, *params))
 
 
 def _acknowledged(instruction: str) -> Procedure:
     return partial(procedures.acknowledged, instruction=instruction)
-
-
-async def _not_supported(run: CalibrationRun, *params: float) -> AsyncGenerator[CalibrationStep, None]:
-    firmware = run.session.autopilot.firmware
-    if not run.session.autopilot.calibration_protocol:
-        raise NotSupported(f"{run.what}: calibrations of {firmware} are not known; nothing was sent")
-    yield run.step(None, "")  # Unreachable; it makes this an asynchronous generator, as the others.

@@ -20,9 +20,8 @@ if TYPE_CHECKING:
 
     from aerokit.vehicle.calibration.run import CalibrationRun
     from aerokit.vehicle.calibration.values import CalibrationReport, CalibrationStep
-    from aerokit.vehicle.parameters.parameters import Parameters
 
-CANCEL_ALL = (MavCmd.PREFLIGHT_CALIBRATION, (0.0,) * 7)
+CANCEL_ALL = (MavCmd.PREFLIGHT_CALIBRATION, 0, 0, 0, 0, 0, 0, 0)
 REPORT_HZ = 4.0
 # PX4's HEARTBEAT leaves CALIBRATING before the last text arrives.
 END_GRACE_S = 3.0
@@ -79,73 +78,68 @@ async def by_texts(run: CalibrationRun, *params: float) -> AsyncGenerator[Calibr
             if report.kind == "done":
                 yield run.result()
                 return
-            if (following := _after(run, step, report)) != step:
+            if (following := _after(step, report)) != step:
                 yield (step := following)
 
 
-def _after(run: CalibrationRun, step: CalibrationStep, report: CalibrationReport) -> CalibrationStep:
+def _after(step: CalibrationStep, report: CalibrationReport) -> CalibrationStep:
     """Return the step after a report of PX4."""
-    progress, pose, remaining, instruction = step.progress, step.pose, step.remaining, step.instruction
     if report.kind == "progress":
-        progress = report.progress
-    elif report.kind == "pending":
-        remaining, pose = report.poses, report.poses[0]
+        return step.replace(progress=report.progress)
+    if report.kind == "pending":
         instruction = "place the vehicle in one of the remaining poses and keep it still"
-    elif report.kind == "detected":
-        pose, instruction = report.poses[0], report.text
-    elif report.kind == "side done":
-        remaining = tuple(other for other in remaining if other not in report.poses)
-        pose, instruction = remaining[0] if remaining else None, report.text
-    elif report.kind in ("text", "already done"):
-        instruction = report.text
-    return run.step(progress, instruction, pose, remaining)
+        return step.replace(instruction=instruction, pose=report.poses[0], remaining=report.poses)
+    if report.kind == "detected":
+        return step.replace(instruction=report.text, pose=report.poses[0])
+    if report.kind == "side done":
+        remaining = tuple(pose for pose in step.remaining if pose not in report.poses)
+        return step.replace(instruction=report.text, pose=next(iter(remaining), None), remaining=remaining)
+    if report.kind in ("text", "already done"):
+        return step.replace(instruction=report.text)
+    return step
 
 
-async def acknowledged(
-    run: CalibrationRun, *params: float, instruction: str, reboot_due: bool = False
-) -> AsyncGenerator[CalibrationStep, None]:
+async def acknowledged(run: CalibrationRun, *params: float, instruction: str) -> AsyncGenerator[CalibrationStep, None]:
     """ArduPilot: the acknowledgement is the result."""
-    run.check_disarmed()
+    run.check_ready()
     yield run.step(None, instruction)
     await run.begin(None)
     await run.start(*params)
-    yield run.result(reboot_due=reboot_due)
+    yield run.result()
 
 
-async def ardupilot_airspeed(
-    run: CalibrationRun, parameters: Parameters, *params: float
-) -> AsyncGenerator[CalibrationStep, None]:
+async def ardupilot_airspeed(run: CalibrationRun, *_: float) -> AsyncGenerator[CalibrationStep, None]:
     """ArduPilot calibrates airspeed sensors with the barometer, if there are any."""
-    run.check_disarmed()
-    if await _parameter(run, parameters, "ARSPD_TYPE") == 0:
+    run.check_ready()
+    if await _parameter(run, "ARSPD_TYPE") == 0:
         raise run.failure("no airspeed sensor is enabled (ARSPD_TYPE is 0); nothing was sent")
-    async for step in acknowledged(run, *params, instruction="cover the airspeed sensor against wind"):
+    async for step in acknowledged(run, 0, 0, 1, instruction="cover the airspeed sensor against wind"):
         yield step
 
 
-async def ardupilot_escs(run: CalibrationRun, parameters: Parameters) -> AsyncGenerator[CalibrationStep, None]:
+async def ardupilot_escs(run: CalibrationRun, *_: float) -> AsyncGenerator[CalibrationStep, None]:
     """ArduCopter calibrates ESCs while it boots, if ESC_CALIBRATION is 3."""
-    run.check_disarmed()
-    before = await _parameter(run, parameters, "ESC_CALIBRATION")
+    run.check_ready()
+    before = await _parameter(run, "ESC_CALIBRATION")
     yield run.step(None, "remove the propellers, then continue", needs_confirmation=True)
     await run.begin(None)
     try:
-        await parameters.set("ESC_CALIBRATION", 3)
+        await run.parameters().set("ESC_CALIBRATION", 3)
     except ParameterRejected:
         raise
     except BaseException:
-        await _restore(run, parameters, "ESC_CALIBRATION", before)
+        await _restore(run, "ESC_CALIBRATION", before)
         raise
     finally:
         run.finish()
     yield run.result("disconnect the battery, then connect it: the ESCs are calibrated at boot", reboot_due=True)
 
 
-async def _restore(run: CalibrationRun, parameters: Parameters, name: str, value: float) -> None:
+async def _restore(run: CalibrationRun, name: str, value: float) -> None:
     """Write back a parameter that makes the motors turn at the next boot; log a warning if that is not confirmed."""
     with anyio.CancelScope(shield=True), anyio.move_on_after(RESTORE_TIMEOUT_S), suppress(AerokitError):
         if run.context.arbiter.is_known:
-            await parameters.set(name, value)
+            await run.parameters().set(name, value)
             return
     logger.warning(
         "%s was left: %s may not be %g again; set it, or the motors get full throttle at the next boot",
@@ -153,9 +147,9 @@ async def _restore(run: CalibrationRun, parameters: Parameters, name: str, value
     )
 
 
-async def _parameter(run: CalibrationRun, parameters: Parameters, name: str) -> float:
+async def _parameter(run: CalibrationRun, name: str) -> float:
     try:
-        return (await parameters.read(name)).value
+        return (await run.parameters().read(name)).value
     except ParameterRejected:
         firmware = run.session.autopilot.firmware
         raise NotSupported(f"{run.what}: {firmware} has no parameter {name} on this vehicle") from None
@@ -163,44 +157,41 @@ async def _parameter(run: CalibrationRun, parameters: Parameters, name: str) -> 
 
 async def ardupilot_compass(run: CalibrationRun, *_: float) -> AsyncGenerator[CalibrationStep, None]:
     """ArduPilot: progress and reports of each compass; the result is accepted if all have succeeded."""
-    await run.begin((MavCmd.DO_CANCEL_MAG_CAL, (0.0,)))
+    await run.begin((MavCmd.DO_CANCEL_MAG_CAL, 0))
     percents: dict[int, int] = {}
     reports: dict[int, MagCalReport] = {}
     changes: deque[None] = deque(maxlen=1)
     mask = 0
 
-    def on_progress(message: MagCalProgress) -> None:
+    def on_message(message: MagCalProgress | MagCalReport) -> None:
         nonlocal mask
         mask |= message.cal_mask
-        if percents.get(message.compass_id) != message.completion_pct:
+        if isinstance(message, MagCalReport):
+            reports[message.compass_id] = message
+        elif percents.get(message.compass_id) == message.completion_pct:
+            return
+        else:
             percents[message.compass_id] = message.completion_pct
-            changes.append(None)
-
-    def on_report(message: MagCalReport) -> None:
-        nonlocal mask
-        mask |= message.cal_mask
-        reports[message.compass_id] = message
         changes.append(None)
 
-    bus, rates, system_id = run.session.connection.bus, run.session.rates, run.session.system_id
     with ExitStack() as ends:
         await run.start(0, 0, 0, 0, 0, command=MavCmd.DO_START_MAG_CAL)
-        for kind, sink in ((MagCalProgress, on_progress), (MagCalReport, on_report)):
-            ends.callback(bus.attach(kind, sink, system_id=system_id))
-            ends.callback(rates.request(kind, REPORT_HZ, is_optional=True))
+        for kind in (MagCalProgress, MagCalReport):
+            ends.callback(run.session.connection.bus.attach(kind, on_message, system_id=run.session.system_id))
+            ends.callback(run.session.rates.request(kind, REPORT_HZ, is_optional=True))
         yield run.step(0.0, "turn the vehicle slowly in all directions, about each of its axes")
         while not mask or any(mask >> compass & 1 and compass not in reports for compass in range(8)):
             await run.wait(lambda: changes)
             changes.clear()
             progress = min(percents.values(), default=0) / 100
             yield run.step(progress, "turn the vehicle slowly in all directions, about each of its axes")
-    failed = [report for report in reports.values() if report.cal_status != MagCalStatus.SUCCESS]
-    if failed:
-        names = "; ".join(
-            f"compass {report.compass_id} {_status_name(report.cal_status)} (fitness {report.fitness:.1f} mgauss)"
-            for report in failed
-        )
-        raise run.failure(f"{names}; the previous calibration is kept")
+    failures = [
+        f"compass {report.compass_id} {_status_name(report.cal_status)} (fitness {report.fitness:.1f} mgauss)"
+        for report in reports.values()
+        if report.cal_status != MagCalStatus.SUCCESS
+    ]
+    if failures:
+        raise run.failure(f"{'; '.join(failures)}; the previous calibration is kept")
     await run.command(MavCmd.DO_ACCEPT_MAG_CAL, 0)
     fits = tuple(
         CompassFit(report.compass_id, report.fitness, (report.ofs_x, report.ofs_y, report.ofs_z))
@@ -259,9 +250,9 @@ LOWEST_US, MIDDLE_US, HIGHEST_US = 800, 1500, 2200
 ENDED_RC = (MavResult.UNSUPPORTED,)  # ArduPilot prevents arming while it calibrates, and answers UNSUPPORTED.
 
 
-async def radio_by_channels(run: CalibrationRun, parameters: Parameters) -> AsyncGenerator[CalibrationStep, None]:
+async def radio_by_channels(run: CalibrationRun, *_: float) -> AsyncGenerator[CalibrationStep, None]:
     """Both: the travel of each channel of RC_CHANNELS becomes RCn_MIN, RCn_MAX and RCn_TRIM."""
-    run.check_disarmed()
+    run.check_ready()
     cell = run.session.telemetry.cells["rc_channels"]
     lows: dict[int, int] = {}
     highs: dict[int, int] = {}
@@ -294,9 +285,9 @@ async def radio_by_channels(run: CalibrationRun, parameters: Parameters) -> Asyn
         if not LOWEST_US <= low <= trim <= high <= HIGHEST_US or not low < MIDDLE_US < high:
             raise run.failure(f"channel {number} has {low} to {high} µs, centre {trim}; nothing was written")
         values |= {f"RC{number}_MIN": low, f"RC{number}_MAX": high, f"RC{number}_TRIM": trim}
-    async with parameters.transaction() as transaction:
+    async with run.parameters().transaction() as transaction:
         await transaction.set_many(values)
-    await run.command(*CANCEL_ALL[:1], *CANCEL_ALL[1], accepts=ENDED_RC)
+    await run.command(*CANCEL_ALL, accepts=ENDED_RC)
     yield run.result(f"{len(moved)} channels were calibrated")
 
 

@@ -6,6 +6,7 @@ import asyncio
 import logging
 import math
 from contextlib import ExitStack
+from functools import partial
 from typing import TYPE_CHECKING
 
 import anyio
@@ -27,9 +28,10 @@ from aerokit.vehicle.commanding.progress import await_progress
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
 
-    from aerokit.vehicle.calibration.values import CalibrationPose, CompassFit
+    from aerokit.vehicle.calibration.values import CompassFit
     from aerokit.vehicle.commanding.context import VehicleContext
     from aerokit.vehicle.commanding.order import SentCommand
+    from aerokit.vehicle.parameters.parameters import Parameters
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
@@ -41,18 +43,18 @@ START_TIMEOUT_S = 40.0
 MAX_CANCEL_ATTEMPTS, CANCEL_INTERVAL_S = 6, 2.5
 CONFIRM_POLL_INTERVAL_S = 0.1
 
-Cancel = tuple[int, tuple[float, ...]]
-"""The command that cancels a calibration, with its parameters."""
-
 
 class CalibrationRun:
     """One calibration. It may run on the vehicle from the first transmission until ``finish`` or a confirmed cancel."""
 
-    def __init__(self, context: VehicleContext, sensor: str, runs: list[CalibrationRun]) -> None:
-        self.context, self.session, self.sensor = context, context.session, sensor
+    def __init__(
+        self, context: VehicleContext, sensor: str, runs: list[CalibrationRun], parameters: Callable[[], Parameters]
+    ) -> None:
+        self.context, self.session, self.sensor, self.parameters = context, context.session, sensor, parameters
         self.what = f"calibrate.{sensor}"
         self._runs = runs  # those of the vehicle that may be running
-        self._cancel: Cancel | None = None
+        self.step = partial(CalibrationStep, sensor)
+        self._cancel: tuple[float, ...] | None = None
         self._why_not_cancelled = ""
         self._started_at = math.inf
         self._cancelled_at: float | None = None
@@ -63,26 +65,29 @@ class CalibrationRun:
 
     # ------------------------------------------------------------------------------- start and end
 
-    def check_disarmed(self) -> None:
-        """Raise OperationRejected unless the vehicle is known to be disarmed."""
+    def check_ready(self) -> None:
+        """Raise OperationRejected unless the vehicle is known to be disarmed, NotSupported for an unknown firmware."""
+        autopilot = self.session.autopilot
+        if not autopilot.calibration_protocol:
+            raise NotSupported(f"{self.what}: calibrations of {autopilot.firmware} are not known; nothing was sent")
         if not self.session.telemetry.is_confirmed_disarmed or not self.context.arbiter.is_known:
             state = "armed" if self.session.telemetry.is_armed else "not known to be disarmed"
             raise OperationRejected(f"{self.what}: the vehicle is {state}; nothing was sent")
 
-    async def begin(self, cancel: Cancel | None, why_not_cancelled: str = "") -> None:
+    async def begin(self, cancel: tuple[float, ...] | None, why_not_cancelled: str = "") -> None:
         """Claim the vehicle. A calibration that is being cancelled is waited for.
 
         Args:
-            cancel: the command that cancels the calibration on the vehicle; None if there is none.
+            cancel: the command that cancels the calibration on the vehicle, with its parameters; None: there is none.
             why_not_cancelled: what remains on the vehicle, if there is none.
         """
-        self.check_disarmed()
+        self.check_ready()
         await anyio.lowlevel.checkpoint()  # An abandoned iterator reports itself in the next iteration of the loop.
         for run in tuple(self._runs):
             if not run._is_abandoned:
                 raise BusyError(f"{self.what}: {run.what} is in progress; nothing was sent")
             await run.wait_cancelled()
-        self.check_disarmed()
+        self.check_ready()
         self._cancel, self._why_not_cancelled = cancel, why_not_cancelled
         self._started_at = self.session.connection.now()
         self._runs.append(self)
@@ -146,7 +151,7 @@ class CalibrationRun:
         # Notices another party, after which the cancel is not repeated.
         self._sent = self._watch.enter_context(arbiter.sending(self._watch.enter_context(arbiter.auxiliary_order())))
         if self.session.connection.is_open and arbiter.is_known:
-            self._send_cancel(self._cancel)
+            self._send_cancel(*self._cancel)
         self.session.background.start(self._confirm_cancel, "aerokit calibration")
 
     async def wait_cancelled(self) -> None:
@@ -165,10 +170,10 @@ class CalibrationRun:
                 f"{self.what}: the vehicle did not confirm the cancellation; {self.session.describe_link()}"
             )
 
-    def _send_cancel(self, cancel: Cancel) -> None:
+    def _send_cancel(self, command: float, *params: float) -> None:
         # Not into a silence; repeating it has no further effect. See docs/reliability.md.
         self._cancelled_at = self.session.connection.now()
-        self.session.commands.send_unconfirmed(cancel[0], *cancel[1])
+        self.session.commands.send_unconfirmed(int(command), *params)
 
     async def _confirm_cancel(self) -> None:
         """Send the cancel, if that was not possible before, and repeat it as docs/reliability.md says."""
@@ -186,20 +191,20 @@ class CalibrationRun:
                 if self._has_rebooted or (self._sent is not None and self._sent.end):
                     return
                 if self.context.arbiter.is_known:
-                    self._send_cancel(self._cancel)
+                    self._send_cancel(*self._cancel)
             logger.warning("%s: the vehicle did not confirm the cancellation", self.what)
         except (ConnectionClosed, LinkLost):
             pass
         finally:
             self.finish()
 
-    def _is_cancelled(self, command: int) -> bool:
+    def _is_cancelled(self, command: float) -> bool:
         """ArduPilot acknowledges; PX4 acknowledges twice with different results, so its HEARTBEAT counts."""
         if self._has_rebooted:
             return True
         assert self._cancelled_at is not None
         if command != MavCmd.PREFLIGHT_CALIBRATION:
-            return self.session.commands.accepted_at(command) >= self._cancelled_at
+            return self.session.commands.accepted_at(int(command)) >= self._cancelled_at
         status = self.session.telemetry.system_status
         return status.updated_at > self._cancelled_at and status.latest != MavState.CALIBRATING
 
@@ -226,24 +231,13 @@ class CalibrationRun:
             return "the vehicle rebooted"
         return "the vehicle was armed" if self.session.telemetry.is_armed else None
 
-    def step(
-        self,
-        progress: float | None,
-        instruction: str,
-        pose: CalibrationPose | None = None,
-        remaining: tuple[CalibrationPose, ...] = (),
-        *,
-        needs_confirmation: bool = False,
-    ) -> CalibrationStep:
-        return CalibrationStep(self.sensor, progress, instruction, pose, remaining, needs_confirmation)
-
     def result(
         self, instruction: str = "done", *, reboot_due: bool = False, compasses: tuple[CompassFit, ...] = ()
     ) -> CalibrationStep:
         """Register the end, and return the last step."""
         self.finish()
         found = CalibrationResult(compasses, reboot_due, self.session.texts_since(self._started_at))
-        return CalibrationStep(self.sensor, 1.0, instruction, result=found)
+        return self.step(1.0, instruction, result=found)
 
     def failure(self, reason: str) -> OperationRejected:
         """Return the error of a calibration that failed, with the vehicle's texts."""

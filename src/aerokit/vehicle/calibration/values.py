@@ -80,19 +80,17 @@ SIDES = {
 _SIDE = "|".join(SIDES)
 # Formats of calibration_messages.h and calibration_routines.cpp.
 _FORMATS = {
-    "started": re.compile(r"calibration started: 2 (\w+)"),
-    "done": re.compile(r"calibration done: (\w+)"),
-    "failed": re.compile(r"calibration failed: (.+)"),
-    "cancelled": re.compile(r"calibration cancelled()"),
-    "progress": re.compile(r"progress <(\d{1,3})>"),
-    "pending": re.compile(rf"pending:((?: (?:{_SIDE}))+)"),
-    "detected": re.compile(rf"({_SIDE}) orientation detected"),
-    "side done": re.compile(rf"({_SIDE}) side done, rotate to a different side"),
-    "side progress": re.compile(rf"({_SIDE}) side calibration: progress <\d{{1,3}}>"),
-    "already done": re.compile(rf"({_SIDE}) side already completed"),
+    "started": r"calibration started: 2 \w+",
+    "done": r"calibration done: \w+",
+    "failed": r"calibration failed: .+",
+    "cancelled": r"calibration cancelled",
+    "progress": r"progress <(?P<percent>\d{1,3})>",
+    "pending": rf"pending:(?P<sides>( ({_SIDE}))+)",
+    "detected": rf"(?P<sides>{_SIDE}) orientation detected",
+    "side done": rf"(?P<sides>{_SIDE}) side done, rotate to a different side",
+    "side progress": rf"(?P<sides>{_SIDE}) side calibration: progress <\d{{1,3}}>",
+    "already done": rf"(?P<sides>{_SIDE}) side already completed",
 }
-
-_WITH_POSES = ("pending", "detected", "side done", "side progress", "already done")
 
 
 class CalibrationReport(Snapshot):
@@ -109,12 +107,10 @@ def parse_report(status_text: str) -> CalibrationReport | None:
     if not status_text.startswith("[cal] "):
         return None
     text = status_text[len("[cal] ") :].strip()
-    for kind, form in _FORMATS.items():
-        if (match := form.fullmatch(text)) is None:
-            continue
-        if kind == "progress":
-            percent = int(match[1])
-            return CalibrationReport(kind, text, progress=percent / 100) if percent <= 100 else None
-        poses = tuple(SIDES[word] for word in match[1].split() if word in SIDES) if kind in _WITH_POSES else ()
-        return CalibrationReport(kind, text, poses=poses)
+    for kind, pattern in _FORMATS.items():
+        if match := re.fullmatch(pattern, text):
+            found = match.groupdict()
+            progress = int(found["percent"]) / 100 if "percent" in found else None
+            poses = tuple(SIDES[side] for side in found.get("sides", "").split())
+            return CalibrationReport(kind, text, progress, poses) if progress is None or progress <= 1 else None
     return CalibrationReport("text", text)

@@ -22,7 +22,6 @@ from aerokit.vehicle.camera.values import CameraInformation, information_of
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
-    from types import TracebackType
 
     from aerokit.connection.bus import Detach
     from aerokit.events import Event
@@ -343,8 +342,6 @@ class CameraBlock:
             raise
         operation.commit()
 
-    async def __aexit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         if self._operation is not None:
-            await self._operation.stop(is_awaited=exc is None)
+            await self._operation.stop(is_awaited=error is None)

@@ -16,8 +16,6 @@ from aerokit.vehicle.camera.orders import MAX_ORDER_ATTEMPTS
 from aerokit.vehicle.camera.values import CameraStatus, status_of
 
 if TYPE_CHECKING:
-    from types import TracebackType
-
     from typing_extensions import Self
 
     from aerokit.vehicle.camera.link import CameraLink
@@ -213,15 +211,13 @@ class PhotoInterval:
         self._new_captures.__enter__()
         await self._shutter.start_series(operation.order, self._seconds, self._count, before)
 
-    async def __aexit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         self._new_captures.__exit__()
         has_ended = 0 < self._count <= self._delivered and not self._link.is_trigger
         if self._operation is not None and has_ended:
             self._operation.discard()
         elif self._operation is not None:
-            await self._operation.stop(is_awaited=exc is None)
+            await self._operation.stop(is_awaited=error is None)
 
     def __aiter__(self) -> Self:
         return self

@@ -279,10 +279,7 @@ class ArmingActions(VehicleBase):
         """Send the command once: if only the acknowledgement was lost, a second one would reboot the vehicle again."""
         params = (1, *(0.0,) * 4, FORCE_REBOOT if force else 0)
         options: dict[str, Any] = {"attempts": 1, "attempt_timeout": REBOOT_ANSWER_S}
-        with self._arbiter.auxiliary_order() as order:
-            await self._sender.run_command(
-                order, self._session.commands.send_long, MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, *params, **options
-            )
+        await self._sender.auxiliary_command(MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, *params, **options)
 
     async def _await_reboot(self, reboots: int) -> None:
         """Poll the time since boot, frequently at first: a fast simulation soon exceeds its previous uptime."""

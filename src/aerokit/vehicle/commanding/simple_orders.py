@@ -8,12 +8,11 @@ has the command is in `aerokit.autopilots` (``unsupported_commands``), and wheth
 from __future__ import annotations
 
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from aerokit._internal.arguments import check_range
-from aerokit._internal.formatting import short_repr
 from aerokit._internal.values import Snapshot
-from aerokit.errors import CommandRejected, CommandTimeout, InvalidArgument, NotSupported, OperationTimeout
+from aerokit.errors import CommandRejected, CommandTimeout, NotSupported, OperationTimeout
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd
 from aerokit.vehicle.commanding.order import SUPERSEDED
@@ -37,27 +36,18 @@ EFFECT_POLL_S = 0.4
 class Argument(Snapshot):
     """One parameter of a command that the caller chooses.
 
-    ``name`` has the unit, as the argument of the public method. ``scale`` converts it to the unit of the command. With
-    ``above``, ``minimum`` itself is invalid. ``whole`` numbers have no fraction.
+    ``name`` has the unit, as the argument of the public method. With ``above``, ``minimum`` itself is invalid.
     """
 
     name: str
     minimum: float
     maximum: float
-    scale: float = 1.0
     above: bool = False
-    whole: bool = False
 
-    def to_wire(self, value: float) -> float:
-        """Check the value and convert it to the unit of the command.
-
-        Raises:
-            InvalidArgument: it is out of range, or has a fraction.
-        """
+    def check(self, value: float) -> float:
+        """Return the value; raise InvalidArgument if it is out of range."""
         check_range(self.name, value, self.minimum, self.maximum, above=self.above)
-        if self.whole and value != int(value):
-            raise InvalidArgument(f"{self.name} = {short_repr(value)} is not allowed: a whole number")
-        return float(value) * self.scale
+        return float(value)
 
 
 class Effect(Snapshot):
@@ -92,16 +82,9 @@ class SimpleOrder(Snapshot):
             )
 
     def wire_params(self, *values: float) -> tuple[float, ...]:
-        """Check the values of the arguments and return the parameters of the command.
-
-        Raises:
-            InvalidArgument: a value is out of range; the text names the argument.
-        """
+        """Return the parameters of the command; raise InvalidArgument if a value is out of range."""
         rest = iter(values)
-        params = tuple(param.to_wire(next(rest)) if isinstance(param, Argument) else param for param in self.params)
-        if left := tuple(rest):
-            raise TypeError(f"{self.name}: {len(left)} values too many")
-        return params
+        return tuple(param.check(next(rest)) if isinstance(param, Argument) else param for param in self.params)
 
     async def send(
         self,
@@ -111,18 +94,16 @@ class SimpleOrder(Snapshot):
         topic: Topic | None = None,
         component_id: int | None = None,
         timeout: float = EFFECT_TIMEOUT_S,
-        **options: Any,
     ) -> None:
         """Send the command and wait for its effect.
 
         Args:
             context: the vehicle.
-            values: one for each `Argument`, in order; a message that reports the effect is compared with them.
+            values: one for each `Argument`, in order. `Effect.is_reported` gets them, too.
             of: the order to a device of which this is a further command.
             topic: the device that the command is for. A newer order with the same topic ends the wait for this one.
             component_id: the target component; None: the autopilot.
             timeout: seconds after the acknowledgement until a message must report the effect.
-            options: further arguments of `CommandSender.send_long`.
 
         Raises:
             InvalidArgument: a value is out of range. Nothing was sent.
@@ -139,11 +120,47 @@ class SimpleOrder(Snapshot):
         if topic is not None and of is None:
             of = context.arbiter.of_device(topic)
         with context.arbiter.auxiliary_order(of) as order:
-            await context.sender.run_command(
-                order, context.session.commands.send_long, self.command, *params, component_id=component_id, **options
-            )
+            await context.sender.send_long(order, self.command, *params, component_id=component_id)
         if self.effect is not None:
-            await self._await_effect(context, self.effect, values, of, component_id, timeout)
+            target = context.session.component_id if component_id is None else component_id
+            await self._await_effect(context, self.effect, values, of, target, timeout)
+
+    async def send_until_text(
+        self,
+        context: VehicleContext,
+        *values: float,
+        topic: Topic,
+        is_done: Callable[[str, float], bool],
+        is_refusal: Callable[[str], bool] = lambda _: False,
+        timeout: float,
+    ) -> None:
+        """Send the command and wait for a status text that reports its effect: ``is_done(text, seconds since ack)``.
+
+        Raises as :meth:`send`; also OperationRejected if ``is_refusal(text)``.
+        """
+        order, now = context.arbiter.of_device(topic), context.session.connection.now
+        texts: list[str] = []
+        detach = context.session.telemetry.status_text.observe(
+            lambda _, text: texts.append(text.text), every_arrival=True
+        )
+
+        def trouble() -> str | None:
+            refusals = [text for text in texts if is_refusal(text)]
+            return f"the vehicle reports {refusals[0]!r}" if refusals else _superseded(order)
+
+        try:
+            await self.send(context, *values, of=order)
+            acknowledged_at = now()
+            await await_progress(
+                context.session,
+                self.name,
+                is_done=lambda: any(is_done(text, now() - acknowledged_at) for text in texts),
+                trouble=trouble,
+                describe=lambda: "no status text reported it",
+                timeout=timeout,
+            )
+        finally:
+            detach()
 
     async def _await_effect(
         self,
@@ -151,12 +168,11 @@ class SimpleOrder(Snapshot):
         effect: Effect,
         values: tuple[float, ...],
         order: Order | None,
-        component_id: int | None,
+        target: int,
         timeout: float,
     ) -> None:
         """Request the message until it reports the effect. The ack must do if the vehicle does not have the message."""
         session, message_type = context.session, getattr(m, effect.message)
-        target = session.component_id if component_id is None else component_id
         reports: list[Message] = []
         is_reported = False
         requested_at = session.connection.now()
@@ -177,35 +193,39 @@ class SimpleOrder(Snapshot):
 
         detach = session.connection.bus.attach(message_type, on_message, system_id=session.system_id)
         try:
-            if await self._is_available(context, message_type.ID, target) or reports:
+            if await _has_message(context, message_type.ID, target) or reports:
                 await await_progress(
                     session,
                     self.name,
                     is_done=is_done,
-                    trouble=lambda: SUPERSEDED if order is not None and not order.is_newest else None,
+                    trouble=lambda: _superseded(order),
                     describe=lambda: str(reports[0]) if reports else f"no {message_type.NAME} was received",
                     timeout=timeout,
                 )
         finally:
             detach()
 
-    async def _is_available(self, context: VehicleContext, message_id: int, component_id: int) -> bool:
-        """Request a message; return False if the vehicle refuses, because it does not have it."""
+
+def _superseded(order: Order | None) -> str | None:
+    return SUPERSEDED if order is not None and not order.is_newest else None
+
+
+async def _has_message(context: VehicleContext, message_id: int, component_id: int) -> bool:
+    """Request a message; return False if the vehicle refuses, because it does not have it."""
+    with suppress(CommandTimeout):  # It may have the message nevertheless.
         try:
             await context.session.commands.send_long(
                 MavCmd.REQUEST_MESSAGE, message_id, component_id=component_id, attempts=2, attempt_timeout=1.0
             )
         except CommandRejected:
             return False
-        except CommandTimeout:  # It may have the message nevertheless.
-            pass
-        return True
+    return True
 
 
 async def receive_once(
-    context: VehicleContext, message_type: type[MessageT], component_id: int | None = None, *, timeout: float = 1.0
+    context: VehicleContext, message_type: type[MessageT], component_id: int | None = None
 ) -> MessageT | None:
-    """Request one message and return it; None if the vehicle refuses or does not send it within ``timeout`` seconds."""
+    """Request one message and return it; None if the vehicle refuses or does not send it within a second."""
     session = context.session
     target = session.component_id if component_id is None else component_id
     with (
@@ -213,10 +233,10 @@ async def receive_once(
         suppress(CommandRejected, CommandTimeout, OperationTimeout),
     ):
         await session.commands.send_long(
-            MavCmd.REQUEST_MESSAGE, message_type.ID, component_id=target, attempts=1, attempt_timeout=timeout
+            MavCmd.REQUEST_MESSAGE, message_type.ID, component_id=target, attempts=1, attempt_timeout=1.0
         )
         while True:
-            message = await messages.get(timeout)
+            message = await messages.get(1.0)
             if message.received_frame is None or message.received_frame.component_id == target:
                 return message
     return None

@@ -34,7 +34,7 @@ UNITS: dict[str, FailureUnit] = {unit.name.partition("_")[2].lower(): unit for u
 INJECT_FAILURE = SimpleOrder(
     "inject_failure",
     MavCmd.INJECT_FAILURE,
-    (Argument("unit", 0, 255), Argument("kind", 0, 255), Argument("instance", 0, 16, whole=True)),
+    (Argument("unit", 0, 255), Argument("kind", 0, 255), Argument("instance", 0, 16)),
 )
 TUNE = re.compile(r"[A-Ga-gLlMmNnOoPpSsTt0-9#+.<>\- ]+")
 """Characters of QBASIC 1.1's PLAY statement, which ArduPilot and PX4 play."""
@@ -64,7 +64,7 @@ class DeviceActions(VehicleBase):
         """
         from aerokit.vehicle.devices.gripper import NUMBER, Gripper
 
-        NUMBER.to_wire(number)
+        NUMBER.check(number)
         return Gripper(self._context, number)
 
     def winch(self, number: int = 1, *, component_id: int | None = None) -> Winch:

@@ -13,12 +13,10 @@ from aerokit.errors import CommandRejected, InvalidArgument, OperationRejected
 from aerokit.mavlink.enums import MavCmd, MavComponent, MavLandedState, MotorTestThrottleType, ParachuteAction
 from aerokit.vehicle.commanding.progress import await_progress
 from aerokit.vehicle.commanding.simple_orders import Argument, Effect, SimpleOrder
-from aerokit.vehicle.devices.text_effect import await_text, collected_texts
 
 if TYPE_CHECKING:
     from aerokit.mavlink.messages import IlluminatorStatus, RelayStatus, ServoOutputRaw
     from aerokit.vehicle.commanding.context import VehicleContext
-    from aerokit.vehicle.commanding.order import Order
 
 __all__ = ["Actuators"]
 
@@ -34,27 +32,25 @@ ALL_GEARS = -1
 OUTPUTS_PER_MESSAGE = 16
 
 
-def _has_pulse(message: ServoOutputRaw, number: float, pulse_us: float) -> bool:
-    port, index = divmod(int(number) - 1, OUTPUTS_PER_MESSAGE)
-    return message.port == port and getattr(message, f"servo{index + 1}_raw") == int(pulse_us)
+def _has_pulse(message: ServoOutputRaw, number: int, pulse_us: int) -> bool:
+    port, index = divmod(number - 1, OUTPUTS_PER_MESSAGE)
+    return message.port == port and getattr(message, f"servo{index + 1}_raw") == pulse_us
 
 
-def _is_switched(message: RelayStatus, number: float, on: float) -> bool:
-    return bool(message.on >> int(number) & 1) == bool(on)
+def _is_switched(message: RelayStatus, number: int, on: bool) -> bool:
+    return bool(message.on >> number & 1) == on
 
 
-def _is_lit(message: IlluminatorStatus, on: float) -> bool:
-    return bool(message.enable) == bool(on)
+def _is_lit(message: IlluminatorStatus, on: bool) -> bool:
+    return bool(message.enable) == on
 
 
-SERVO = Argument("number", 1, 32, whole=True)
-RELAY = Argument("number", 0, 15, whole=True)
-PULSE = Argument("pulse_us", 500, 2500, whole=True)
-COUNT = Argument("count", 1, 1000, whole=True)
+SERVO = Argument("number", 1, 32)
+RELAY = Argument("number", 0, 15)
+PULSE = Argument("pulse_us", 500, 2500)
+COUNT = Argument("count", 1, 1000)
 PERIOD = Argument("period_s", 0, 60, above=True)
 ON = Argument("on", 0, 1)
-MOTOR = Argument("number", 1, 12, whole=True)
-DURATION = Argument("duration_s", 0, MAX_MOTOR_TEST_S, above=True)
 SET_SERVO = SimpleOrder("set_servo", MavCmd.DO_SET_SERVO, (SERVO, PULSE), Effect("ServoOutputRaw", _has_pulse))
 REPEAT_SERVO = SimpleOrder("repeat_servo", MavCmd.DO_REPEAT_SERVO, (SERVO, PULSE, COUNT, PERIOD))
 SET_RELAY = SimpleOrder("set_relay", MavCmd.DO_SET_RELAY, (RELAY, ON), Effect("RelayStatus", _is_switched))
@@ -63,14 +59,6 @@ LANDING_GEAR = SimpleOrder("landing_gear", MavCmd.AIRFRAME_CONFIGURATION, (ALL_G
 LIGHTS = SimpleOrder("set_lights", MavCmd.ILLUMINATOR_ON_OFF, (ON,), Effect("IlluminatorStatus", _is_lit))
 PARACHUTE = SimpleOrder("parachute", MavCmd.DO_PARACHUTE, (Argument("action", 0, 2),))
 PERCENT = MotorTestThrottleType.THROTTLE_PERCENT
-TEST_BY_SEQUENCE = SimpleOrder(
-    "test_motor", MavCmd.DO_MOTOR_TEST, (MOTOR, PERCENT, Argument("throttle_percent", 0, 100), DURATION, 1)
-)
-TEST_BY_FUNCTION = SimpleOrder(
-    "test_motor",
-    MavCmd.ACTUATOR_TEST,
-    (Argument("throttle_percent", 0, 100, scale=0.01), DURATION, 0, 0, MOTOR),
-)
 
 
 @checks_arguments
@@ -136,14 +124,12 @@ class Actuators(ReadOnly):
         """Switch a relay over and back ``count`` times (MAV_CMD_DO_REPEAT_RELAY).
 
         Returns when ArduPilot has acknowledged and begins. Never sent twice. ArduPilot only.
+        Raises as :meth:`repeat_servo`.
 
         Args:
             number: relay from 0 to 15.
             count: number of cycles, 1 to 1000.
             period_s: seconds of one cycle, above 0, at most 60.
-
-        Raises:
-            InvalidArgument, NotSupported, CommandRejected, CommandTimeout: as for ``set_servo``.
         """
         await REPEAT_RELAY.send(self._context, number, count, period_s, topic=("relay", number))
 
@@ -156,16 +142,10 @@ class Actuators(ReadOnly):
         """Set actuators by number: the first value is for "Peripheral via Actuator Set 1" (MAV_CMD_DO_SET_ACTUATOR).
 
         Returns when PX4 has acknowledged, because no message reports the values. It acknowledges also if no output has
-        this function (PWM_MAIN_FUNCn 301 to 306). PX4 only.
+        this function (PWM_MAIN_FUNCn 301 to 306). PX4 only; ArduPilot has servos. Raises as :meth:`repeat_servo`.
 
         Args:
-            values: up to six values, −1 to 1; None leaves an actuator as it is.
-
-        Raises:
-            InvalidArgument: none or more than six values, or one is out of range. Nothing was sent.
-            NotSupported: ArduPilot, which has :meth:`set_servo`. Nothing was sent.
-            CommandRejected: the vehicle refused.
-            CommandTimeout: there was no acknowledgement.
+            values: one to six values, −1 to 1; None leaves an actuator as it is.
         """
         if not 1 <= len(values) <= ACTUATORS or all(value is None for value in values):
             raise InvalidArgument(f"values = {values!r} is not allowed: one to {ACTUATORS} values, not all None")
@@ -241,44 +221,44 @@ class Actuators(ReadOnly):
             CommandTimeout: there was no acknowledgement; the motor may have turned.
             OperationTimeout: the vehicle still reports armed four seconds after the end.
         """
-        by_sequence = MavCmd.DO_MOTOR_TEST not in self._context.session.autopilot.unsupported_commands
-        row = TEST_BY_SEQUENCE if by_sequence else TEST_BY_FUNCTION
-        values: tuple[float, ...] = (number, throttle_percent, duration_s)
-        if not by_sequence:
-            values = (throttle_percent, duration_s, number)
-        row.wire_params(*values)
+        check_range("number", number, 1, 12)
+        check_range("throttle_percent", throttle_percent, 0, 100)
+        check_range("duration_s", duration_s, 0, MAX_MOTOR_TEST_S, above=True)
         session, arbiter = self._context.session, self._context.arbiter
+        start: tuple[float, ...]
+        stop: tuple[float, ...]
+        # Throttle 0 for 0 s ends a test on ArduPilot; PX4 releases the output after 0 s.
+        if MavCmd.DO_MOTOR_TEST in session.autopilot.unsupported_commands:
+            command, start = MavCmd.ACTUATOR_TEST, (throttle_percent / 100, duration_s, 0, 0, number)
+            stop = (math.nan, 0, 0, 0, number)
+        else:
+            command, start = MavCmd.DO_MOTOR_TEST, (number, PERCENT, throttle_percent, duration_s, 1)
+            stop = (number, PERCENT, 0, 0, 1)
         if not session.telemetry.is_confirmed_disarmed or not arbiter.is_known:
             state = "armed" if session.telemetry.is_armed else "not known to be disarmed"
             raise OperationRejected(f"test_motor: the vehicle is {state}; nothing was sent")
         order, spins_until = arbiter.of_device("motor test"), math.inf
         try:
-            await row.send(self._context, *values, of=order)
+            await SimpleOrder("test_motor", command, start).send(self._context, of=order)
             spins_until = session.connection.now() + duration_s
             await anyio.sleep(duration_s)
-            await self._await_test_end(order)
+            armed, ended_at = session.telemetry.armed, session.connection.now()
+            await await_progress(
+                session,
+                "test_motor",
+                is_done=lambda: armed.latest is False and armed.updated_at > ended_at,
+                trouble=lambda: None if order.is_newest else "another motor test was started",
+                describe=lambda: "the vehicle still reports armed",
+                timeout=TEST_END_TIMEOUT_S,
+            )
         except CommandRejected:
             raise
         except BaseException:
             # After its end, the stop would be another test, which arms the motors.
             is_spinning = session.connection.now() < spins_until
             if is_spinning and order.is_newest and arbiter.is_known and session.connection.is_open:
-                # Throttle 0 for 0 s ends a test on ArduPilot; PX4 releases the output after 0 s.
-                stop = (number, PERCENT, 0, 0, 1) if by_sequence else (math.nan, 0, 0, 0, number)
-                session.commands.send_unconfirmed(row.command, *stop)
+                session.commands.send_unconfirmed(command, *stop)
             raise
-
-    async def _await_test_end(self, order: Order) -> None:
-        session = self._context.session
-        armed, ended_at = session.telemetry.armed, session.connection.now()
-        await await_progress(
-            session,
-            "test_motor",
-            is_done=lambda: armed.latest is False and armed.updated_at > ended_at,
-            trouble=lambda: None if order.is_newest else "another motor test was started",
-            describe=lambda: "the vehicle still reports armed",
-            timeout=TEST_END_TIMEOUT_S,
-        )
 
     async def release_parachute(self, *, intent: ReleaseIntent) -> None:
         """Release the parachute and stop the motors; return when ArduPilot reports that it was released.
@@ -297,18 +277,14 @@ class Actuators(ReadOnly):
             CommandTimeout: there was no acknowledgement.
             OperationTimeout: no status text reported the release.
         """
-        order = self._context.arbiter.of_device("parachute")
-        with collected_texts(self._context) as texts:
-            await PARACHUTE.send(self._context, ParachuteAction.RELEASE, of=order)
-            await await_text(
-                self._context,
-                "release_parachute",
-                texts,
-                lambda text, _: text.startswith("Parachute: Released"),
-                is_refusal=lambda text: text.startswith("Parachute: "),
-                order=order,
-                timeout=PARACHUTE_TIMEOUT_S,
-            )
+        await PARACHUTE.send_until_text(
+            self._context,
+            ParachuteAction.RELEASE,
+            topic="parachute",
+            is_done=lambda text, _: text.startswith("Parachute: Released"),
+            is_refusal=lambda text: text.startswith("Parachute: "),
+            timeout=PARACHUTE_TIMEOUT_S,
+        )
 
     async def enable_parachute(self, enabled: bool = True) -> None:
         """Allow or forbid the release of the parachute until the next reboot; returns at the acknowledgement.

@@ -8,15 +8,13 @@ from aerokit._internal.arguments import checks_arguments
 from aerokit._internal.async_block import ReadOnly
 from aerokit.mavlink.enums import GripperActions, MavCmd
 from aerokit.vehicle.commanding.simple_orders import Argument, SimpleOrder
-from aerokit.vehicle.devices.text_effect import await_text, collected_texts
 
 if TYPE_CHECKING:
     from aerokit.vehicle.commanding.context import VehicleContext
 
 __all__ = ["Gripper"]
 
-NUMBER = Argument("number", 1, 8, whole=True)
-DO_GRIPPER = SimpleOrder("gripper", MavCmd.DO_GRIPPER, (NUMBER, Argument("action", 0, 1)))
+NUMBER = Argument("number", 1, 8)
 GRIP_TIMEOUT_S = 10.0
 EPM_WAIT_S = 3.0
 """An electro-permanent gripper reports only that it begins; a servo reports its end 0.5 s later."""
@@ -52,16 +50,15 @@ class Gripper(ReadOnly):
         await self._move(GripperActions.RELEASE)
 
     async def _move(self, action: GripperActions) -> None:
-        context, name = self._context, f"gripper {action.name.lower()}"
-        order = context.arbiter.of_device(("gripper", self._number))
-        with collected_texts(context) as texts:
-            await DO_GRIPPER.send(context, self._number, action, of=order)
-            if context.session.autopilot.reports_gripper_by_text:
-                await await_text(
-                    context,
-                    name,
-                    texts,
-                    lambda text, after_s: text == ENDS[action] or (text == BEGINS[action] and after_s >= EPM_WAIT_S),
-                    order=order,
-                    timeout=GRIP_TIMEOUT_S,
-                )
+        context, topic = self._context, ("gripper", self._number)
+        order = SimpleOrder(f"gripper {action.name.lower()}", MavCmd.DO_GRIPPER, (NUMBER, action))
+        if not context.session.autopilot.reports_gripper_by_text:
+            await order.send(context, self._number, topic=topic)
+            return
+        await order.send_until_text(
+            context,
+            self._number,
+            topic=topic,
+            is_done=lambda text, after_s: text == ENDS[action] or (text == BEGINS[action] and after_s >= EPM_WAIT_S),
+            timeout=GRIP_TIMEOUT_S,
+        )

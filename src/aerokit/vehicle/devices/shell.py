@@ -11,8 +11,6 @@ from aerokit.mavlink.enums import SerialControlDev, SerialControlFlag
 from aerokit.mavlink.messages import SerialControl
 
 if TYPE_CHECKING:
-    from types import TracebackType
-
     from typing_extensions import Self
 
     from aerokit.connection.bus import Subscription
@@ -60,9 +58,7 @@ class Shell(ReadOnly):
             raise
         return self
 
-    async def __aexit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         self._close()
 
     def _close(self) -> None:

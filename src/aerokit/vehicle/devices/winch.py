@@ -9,7 +9,7 @@ from aerokit._internal.async_block import ReadOnly
 from aerokit.errors import NotSupported
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavWinchStatusFlag, WinchActions
-from aerokit.vehicle.commanding.simple_orders import Argument, Effect, SimpleOrder, receive_once
+from aerokit.vehicle.commanding.simple_orders import Effect, SimpleOrder, receive_once
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -26,20 +26,6 @@ LENGTH_TOLERANCE_M = 0.1
 RATE_TOLERANCE_M_S = 0.05
 ACTION_TIMEOUT_S = 120.0
 MAX_LENGTH_M, MAX_RATE_M_S = 1000.0, 20.0
-PARAMS = (
-    Argument("number", 1, 255, whole=True),
-    Argument("action", 0, 9, whole=True),
-    Argument("length_m", -MAX_LENGTH_M, MAX_LENGTH_M),
-    Argument("rate_m_s", -MAX_RATE_M_S, MAX_RATE_M_S),
-)
-# Flags of WINCH_STATUS that report the end of an action.
-ENDS: dict[WinchActions, MavWinchStatusFlag] = {
-    _A.LOCK: _F.LOCKED,
-    _A.RETRACT: _F.FULLY_RETRACTED,
-    _A.LOAD_LINE: _F.LOAD_LINE,
-    _A.ABANDON_LINE: _F.ABANDON_LINE,
-    _A.LOAD_PAYLOAD: _F.LOAD_PAYLOAD,
-}
 
 
 @checks_arguments
@@ -120,13 +106,14 @@ class Winch(ReadOnly):
             InvalidArgument, NotSupported, CommandRejected, CommandTimeout, OperationRejected, OperationTimeout: as for
                 ``pay_out``.
         """
+        check_range("rate_m_s", rate_m_s, -MAX_RATE_M_S, MAX_RATE_M_S)
         await self._send(
             _A.RATE_CONTROL, 0, rate_m_s, lambda status: abs(status.speed - rate_m_s) <= RATE_TOLERANCE_M_S
         )
 
     async def lock(self) -> None:
         """Engage the brake, and return when WINCH_STATUS reports it locked. Raises as :meth:`retract`."""
-        await self._send_until_flag(_A.LOCK)
+        await self._send_until(_F.LOCKED, _A.LOCK)
 
     async def deliver(self) -> None:
         """Start the winch's own delivery: lower, release, retract. Returns at the acknowledgement.
@@ -153,22 +140,23 @@ class Winch(ReadOnly):
             HeartbeatTimeout: the vehicle was silent for ten seconds.
             OperationTimeout: the end was not reported in time.
         """
-        await self._send_until_flag(_A.RETRACT, timeout=timeout)
+        await self._send_until(_F.FULLY_RETRACTED, _A.RETRACT, timeout)
 
     async def load_line(self) -> None:
         """Load new line: the motor turns slowly. Returns when WINCH_STATUS reports it. Raises as :meth:`retract`."""
-        await self._send_until_flag(_A.LOAD_LINE)
+        await self._send_until(_F.LOAD_LINE, _A.LOAD_LINE)
 
     async def abandon_line(self) -> None:
         """Spool out all line and release it. Returns when WINCH_STATUS reports it. Raises as :meth:`retract`."""
-        await self._send_until_flag(_A.ABANDON_LINE)
+        await self._send_until(_F.ABANDON_LINE, _A.ABANDON_LINE)
 
     async def load_payload(self) -> None:
         """Run slowly until a payload is attached. Returns when WINCH_STATUS reports it. Raises as :meth:`retract`."""
-        await self._send_until_flag(_A.LOAD_PAYLOAD)
+        await self._send_until(_F.LOAD_PAYLOAD, _A.LOAD_PAYLOAD)
 
-    async def _send_until_flag(self, action: WinchActions, *, timeout: float = ACTION_TIMEOUT_S) -> None:
-        flag = ENDS[action]
+    async def _send_until(
+        self, flag: MavWinchStatusFlag, action: WinchActions, timeout: float = ACTION_TIMEOUT_S
+    ) -> None:
         await self._send(action, is_done=lambda status: bool(status.status & flag), timeout=timeout)
 
     async def _send(
@@ -180,16 +168,11 @@ class Winch(ReadOnly):
         timeout: float = 5.0,
         of: Order | None = None,
     ) -> None:
-        effect = None if is_done is None else Effect("WinchStatus", lambda status, *_: is_done(status))
-        order = SimpleOrder(f"winch {action.name.lower()}", MavCmd.DO_WINCH, PARAMS, effect)
-        order.wire_params(self._number, action, length_m, rate_m_s)
         self._check_supported(action)
-        await order.send(
+        params = (self._number, action, length_m, rate_m_s)
+        effect = None if is_done is None else Effect("WinchStatus", is_done)
+        await SimpleOrder(f"winch {action.name.lower()}", MavCmd.DO_WINCH, params, effect).send(
             self._context,
-            self._number,
-            action,
-            length_m,
-            rate_m_s,
             of=of,
             topic=self._topic,
             component_id=self._component_id,

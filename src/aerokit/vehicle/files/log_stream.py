@@ -12,8 +12,6 @@ from aerokit.mavlink.messages import LoggingAck, LoggingData, LoggingDataAcked
 from aerokit.vehicle.commanding.simple_orders import SimpleOrder
 
 if TYPE_CHECKING:
-    from types import TracebackType
-
     from typing_extensions import Self
 
     from aerokit.connection.bus import Subscription
@@ -115,12 +113,10 @@ class LogStream(ReadOnly):
         self._detach = session.connection.bus.attach(LoggingDataAcked, self._acknowledge, system_id=session.system_id)
         try:
             await START.send(self._context)
-        except CommandRejected:  # The stream of another station must not be stopped.
+        except BaseException as error:
             self._close()
-            raise
-        except BaseException:
-            self._close()
-            self._context.session.transfers.command_in_background(MavCmd.LOGGING_STOP)
+            if not isinstance(error, CommandRejected):  # The stream of another station must not be stopped.
+                session.transfers.command_in_background(MavCmd.LOGGING_STOP)
             raise
         return self
 
@@ -133,12 +129,10 @@ class LogStream(ReadOnly):
         session = self._context.session
         session.send(LoggingAck(session.system_id, session.component_id, message.sequence))
 
-    async def __aexit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         is_stopped = False
         try:
-            if exc is None:  # PX4 acknowledges when its last message was acknowledged (logger.cpp, stop_log_mavlink).
+            if error is None:  # PX4 acknowledges when its last message was acknowledged (logger.cpp, stop_log_mavlink).
                 await STOP.send(self._context)
                 is_stopped = True
         finally:

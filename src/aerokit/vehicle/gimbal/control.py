@@ -25,7 +25,6 @@ from aerokit.vehicle.gimbal.orders import CONFIGURE, GimbalOrders
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from types import TracebackType
 
     from typing_extensions import Self
 
@@ -75,7 +74,7 @@ class ReleaseCommand:
         async def send_until_acknowledged() -> None:
             with suppress(AerokitError):
                 if not is_sent:
-                    await self._wait_heartbeat()
+                    await self._session.wait_for_heartbeat()
                     if not self._is_meant():
                         return
                     self._send()
@@ -96,9 +95,8 @@ class ReleaseCommand:
 
     async def _confirm(self) -> None:
         with self._orders.context.arbiter.auxiliary_order() as order:
-            await self._orders.context.sender.run_command(
+            await self._orders.context.sender.send_long(
                 order,
-                self._session.commands.send_long,
                 self._command,
                 *self._params,
                 component_id=self._target,
@@ -107,10 +105,6 @@ class ReleaseCommand:
                 attempt_timeout=ATTEMPT_TIMEOUT_S,
                 is_sent=True,
             )
-
-    async def _wait_heartbeat(self) -> None:
-        armed, since = self._session.telemetry.armed, self._session.connection.now()
-        await armed.wait_until(lambda _: armed.updated_at > since)
 
     def _is_target_silent(self) -> bool:
         is_autopilot = self._target == self._session.component_id
@@ -236,19 +230,17 @@ class GimbalControl:
             raise
         return self
 
-    async def __aexit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         if self._taken is not None:
             self._end()
-            if exc is None and not self._was_raised:
+            if error is None and not self._was_raised:
                 self.raise_if_taken()
             return
         if self._is_ended:  # the block of the vehicle has ended before
             return
         release = self._release_command()
         self._end()
-        if exc is None:
+        if error is None:
             await release.send_and_wait(f"{self._orders.name}: releasing control")
         else:
             release.send_soon()

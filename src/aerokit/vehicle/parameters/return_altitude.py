@@ -8,42 +8,37 @@ from aerokit._internal.arguments import check_range
 from aerokit.errors import NotSupported, ParameterRejected, ParameterTimeout
 
 if TYPE_CHECKING:
-    from aerokit.autopilots import Autopilot
     from aerokit.vehicle.parameters.parameters import Parameters
-    from aerokit.vehicle.state.telemetry import Telemetry
+    from aerokit.vehicle.session.session import VehicleSession
 
 MAX_RETURN_ALTITUDE_M = 3000
 """Upper limit of ArduCopter's RTL_ALT. The others have none."""
 
 
-async def read_return_altitude(parameters: Parameters, autopilot: Autopilot, telemetry: Telemetry) -> float:
+async def read_return_altitude(parameters: Parameters, session: VehicleSession) -> float:
     """Read the altitude; see :meth:`aerokit.Vehicle.return_altitude`."""
-    _, value, scale = await _find(parameters, _names(autopilot, telemetry, "return_altitude"))
+    _, value, scale = await _find("return_altitude", parameters, session)
     return round(value / scale, 3)
 
 
-async def write_return_altitude(
-    parameters: Parameters, autopilot: Autopilot, telemetry: Telemetry, altitude_m: float
-) -> None:
+async def write_return_altitude(parameters: Parameters, session: VehicleSession, altitude_m: float) -> None:
     """Write the altitude; see :meth:`aerokit.Vehicle.set_return_altitude`."""
     check_range("altitude_m", altitude_m, 0, MAX_RETURN_ALTITUDE_M, above=True)
-    name, _, scale = await _find(parameters, _names(autopilot, telemetry, "set_return_altitude"))
+    name, _, scale = await _find("set_return_altitude", parameters, session)
     await parameters.set(name, altitude_m if scale == 1 else round(altitude_m * scale))
 
 
-def _names(autopilot: Autopilot, telemetry: Telemetry, action: str) -> tuple[tuple[str, float], ...]:
-    names = autopilot.return_altitude_parameters(is_vtol=telemetry.is_vtol)
+async def _find(action: str, parameters: Parameters, session: VehicleSession) -> tuple[str, float, float]:
+    """Return name, value and scale of the first parameter for the altitude that the vehicle has."""
+    autopilot = session.autopilot
+    names = autopilot.return_altitude_parameters(is_vtol=session.telemetry.is_vtol)
     if not names:
         raise NotSupported(f"{action}: {autopilot.firmware} does not climb for a return; nothing was sent")
-    return names
-
-
-async def _find(parameters: Parameters, names: tuple[tuple[str, float], ...]) -> tuple[str, float, float]:
-    """Return name, value and scale of the first of these parameters that the vehicle has."""
     answers = await parameters.probe(*(name for name, _ in names))
+    failures: list[ParameterRejected | ParameterTimeout] = []
     for name, scale in names:
         answer = answers[name]
         if not isinstance(answer, (ParameterRejected, ParameterTimeout)):
             return name, answer.value, scale
-    failures = [answer for answer in answers.values() if isinstance(answer, (ParameterRejected, ParameterTimeout))]
+        failures.append(answer)
     raise next((failure for failure in failures if isinstance(failure, ParameterTimeout)), failures[0])

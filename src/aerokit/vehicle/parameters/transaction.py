@@ -16,8 +16,6 @@ from aerokit.parameters.parameter import same_value
 from aerokit.vehicle.parameters.writing import ResolvedParameter
 
 if TYPE_CHECKING:
-    from types import TracebackType
-
     from typing_extensions import Self
 
     from aerokit.parameters import ParameterDifference
@@ -156,10 +154,8 @@ class TemporaryParameters(_Block):
             raise
         return results
 
-    async def __aexit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        await self._restore(exc)
+    async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
+        await self._restore(error)
 
 
 @checks_arguments
@@ -230,14 +226,12 @@ class Transaction(_Block):
         self._is_open = True
         return self
 
-    async def __aexit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         self._is_open = False
-        if exc is None:
+        if error is None:
             self._discard()
         else:
-            await self._restore(exc)
+            await self._restore(error)
 
 
 def _raise_first_error(results: Mapping[str, ParameterWrite]) -> None:

@@ -5,9 +5,12 @@ from __future__ import annotations
 import asyncio
 import logging
 import ssl
+import time
 from asyncio import open_connection
 from base64 import b64encode
 from contextlib import suppress
+from functools import reduce
+from operator import xor
 from typing import TYPE_CHECKING
 from urllib.parse import unquote, urlsplit
 
@@ -25,11 +28,9 @@ from aerokit.errors import (
     OperationTimeout,
 )
 from aerokit.protocols.rtcm import MAX_MESSAGE_SIZE, RtcmReader
-from aerokit.vehicle.rtk.position_report import gga_sentence
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
-    from types import TracebackType
 
     from typing_extensions import Self
 
@@ -45,6 +46,9 @@ MAX_SILENCE_S = 30.0
 """Seconds without data after which the caster is connected to again; base stations send every second or two."""
 POSITION_INTERVAL_S = 10.0
 POSITION_POLL_INTERVAL_S = 1.0
+POSITION_MAX_AGE_S = 10.0
+# GPS_FIX_TYPE → quality of GGA: 1 autonomous, 2 differential, 4 RTK fixed, 5 RTK float.
+QUALITIES = {4: 2, 5: 5, 6: 4}
 MAX_HEADER_LINES, MAX_CHUNK_SIZE, MAX_TABLE_SIZE = 100, 1 << 20, 4 << 20
 CLOSE_TIMEOUT_S = 1.0
 
@@ -156,8 +160,9 @@ class NtripClient:
     ) -> None:
         self._session, self._send, self._caster, self._timeout = session, send, caster, timeout
         self._sends_position = send_position
-        self._work = Cancellation()
-        self._ended: asyncio.Event | None = None
+        self._name = f"NTRIP {caster!r}"
+        self._work, self._ended = Cancellation(), asyncio.Event()
+        self._was_entered = False
         self._writer: asyncio.StreamWriter | None = None
         self._problem = ""
         self._oversized = self._reconnects = 0
@@ -186,9 +191,9 @@ class NtripClient:
         return f"<NtripClient {self._caster!r}, {'connected' if self.is_connected else 'not connected'}>"
 
     async def __aenter__(self) -> Self:
-        if self._ended is not None:
+        if self._was_entered:
             raise BusyError("NtripClient can be entered only once: call ntrip() again")
-        self._ended = asyncio.Event()
+        self._was_entered = True
         try:
             if self._sends_position is None:
                 self._sends_position = await self._asks_for_position()
@@ -199,16 +204,13 @@ class NtripClient:
         self._session.background.start(lambda: self._run(response), "aerokit ntrip")
         return self
 
-    async def __aexit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         self._work.cancel()
         writer = self._writer
         self._close()
         await run_shielded(self._wait_closed(writer))
 
     async def _wait_closed(self, writer: asyncio.StreamWriter | None) -> None:
-        assert self._ended is not None
         with anyio.move_on_after(CLOSE_TIMEOUT_S):
             if not self._session.is_closed:
                 await self._ended.wait()
@@ -218,7 +220,6 @@ class NtripClient:
 
     async def _run(self, response: _Response) -> None:
         """Forward corrections, and connect again, until the block ends."""
-        assert self._ended is not None
         try:
             with self._work:
                 await self._forward(response)
@@ -233,7 +234,7 @@ class NtripClient:
                         self._report(str(error))
                         continue
                     self._reconnects += 1
-                    logger.info("NTRIP %r: connected again", self._caster)
+                    logger.info("%s: connected again", self._name)
                     if await self._forward(response):
                         pause_s = MIN_RETRY_S
         except (ConnectionClosed, LinkLost) as error:
@@ -246,7 +247,6 @@ class NtripClient:
         """Send the corrections of one connection to the vehicle; return their number."""
         reader, count = RtcmReader(), 0
         reason = "the caster closed the connection"
-        writer = self._writer
         reports = asyncio.ensure_future(self._report_position()) if self._sends_position else None
         body = response.body()
         try:
@@ -268,9 +268,8 @@ class NtripClient:
             if reports is not None:
                 reports.cancel()
                 await asyncio.gather(reports, return_exceptions=True)
-            if self._writer is writer:
-                self._close()
-        self._report(f"NTRIP {self._caster!r}: {reason} after {count} messages")
+            self._close()
+        self._report(f"{self._name}: {reason} after {count} messages")
         return count
 
     def _report(self, problem: str) -> None:
@@ -287,32 +286,34 @@ class NtripClient:
         names = await self._table(response) if response.is_table else {}
         self._close()
         status = printable(response.status[:80]) or "an empty answer"
-        what = f"NTRIP {self._caster!r}"
+        reason = f"the caster answered {status!r}"
         if response.is_table or response.code == "404":
             known = f"; it has {', '.join(sorted(names)[:20])}" if names else ""
-            raise OperationRejected(f"{what}: the caster has no mount point {mount!r}{known}")
-        if response.code in ("401", "403") or "password" in status.lower():
-            raise OperationRejected(f"{what}: the caster refused the user or the password ({status})")
-        raise OperationRejected(f"{what}: the caster answered {status!r}")
+            reason = f"the caster has no mount point {mount!r}{known}"
+        elif response.code in ("401", "403") or "password" in status.lower():
+            reason = f"the caster refused the user or the password ({status})"
+        raise OperationRejected(f"{self._name}: {reason}")
 
     async def _request(self, mount: str) -> _Response:
-        caster, what = self._caster, f"NTRIP {self._caster!r}"
+        caster = self._caster
         context = ssl.create_default_context() if caster.is_encrypted else None
 
         async def exchange() -> _Response:
             reader, self._writer = await open_connection(caster.host, caster.port, ssl=context)
-            self._writer.write(caster.request(mount, self._position() if mount and self._sends_position else None))
+            self._writer.write(
+                caster.request(mount, gga_sentence(self._session) if mount and self._sends_position else None)
+            )
             return await _Response.read(reader)
 
         try:
             return await asyncio.wait_for(exchange(), self._timeout)
         except asyncio.TimeoutError:
             self._close()
-            raise OperationTimeout(f"{what}: the caster did not answer within {self._timeout:g} s") from None
+            raise OperationTimeout(f"{self._name}: the caster did not answer within {self._timeout:g} s") from None
         except (OSError, ValueError) as error:
             self._close()
             reason = getattr(error, "strerror", None) or type(error).__name__
-            raise LinkOpenError(f"{what}: the caster could not be reached: {reason}") from None
+            raise LinkOpenError(f"{self._name}: the caster could not be reached: {reason}") from None
 
     async def _asks_for_position(self) -> bool:
         """Return True if the source table says that the mount point needs GGA; False if it does not say."""
@@ -336,14 +337,36 @@ class NtripClient:
     async def _report_position(self) -> None:
         with self._session.streaming("position", "gps"):
             while (writer := self._writer) is not None:
-                if sentence := self._position():
+                if sentence := gga_sentence(self._session):
                     writer.write(sentence)
                 await anyio.sleep(POSITION_INTERVAL_S if sentence else POSITION_POLL_INTERVAL_S)
-
-    def _position(self) -> bytes | None:
-        return gga_sentence(self._session.telemetry, self._session.connection.unix_time())
 
     def _close(self) -> None:
         writer, self._writer = self._writer, None
         if writer is not None:
             writer.close()
+
+
+def gga_sentence(session: VehicleSession) -> bytes | None:
+    """Return the vehicle's position as ``$GPGGA,…`` (NMEA); None while no recent position is known."""
+    cell = session.telemetry.position
+    place = cell.latest
+    if place is None or cell.age > POSITION_MAX_AGE_S or place.altitude_amsl_m is None:
+        return None
+    receiver = next(iter(session.telemetry.cells["gps"].latest or ()), None)
+    quality = QUALITIES.get(receiver.fix_type, 1) if receiver is not None else 1
+    satellites = (receiver.satellites if receiver is not None else None) or 4
+    clock = time.strftime("%H%M%S", time.gmtime(session.connection.unix_time()))
+    fields = (
+        f"GPGGA,{clock}.00,{_angle(place.latitude_deg, 2)},{'NS'[place.latitude_deg < 0]},"
+        f"{_angle(place.longitude_deg, 3)},{'EW'[place.longitude_deg < 0]},{quality},{satellites:02d},1.0,"
+        f"{place.altitude_amsl_m:.1f},M,0.0,M,,"
+    )
+    return f"${fields}*{reduce(xor, fields.encode()):02X}\r\n".encode()
+
+
+def _angle(degrees: float, digits: int) -> str:
+    """Return degrees and minutes without a separator: 4723.86456."""
+    units = round(abs(degrees) * 60 * 100_000)
+    whole, rest = divmod(units, 60 * 100_000)
+    return f"{whole:0{digits}d}{rest // 100_000:02d}.{rest % 100_000:05d}"

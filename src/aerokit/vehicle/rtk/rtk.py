@@ -4,21 +4,59 @@ from __future__ import annotations
 
 from collections import deque
 from typing import TYPE_CHECKING
+from weakref import WeakKeyDictionary
 
 from aerokit._internal.arguments import checks_arguments
 from aerokit._internal.values import Snapshot
 from aerokit.connection.cells import Source, StateCell
 from aerokit.errors import ConnectionClosed
-from aerokit.protocols.rtcm import message_number, rtcm_messages
-from aerokit.vehicle.rtk.output import output_of
+from aerokit.protocols.rtcm import fragments, message_number, rtcm_messages
 
 if TYPE_CHECKING:
+    from aerokit.connection.connection import Connection
     from aerokit.vehicle.commanding.context import VehicleContext
     from aerokit.vehicle.rtk.ntrip import NtripClient
 
 __all__ = ["Corrections", "Rtk"]
 
 BANDWIDTH_WINDOW_S = 10.0
+# Vehicles that use the same corrections pass the same message within this time. A base station repeats equal messages
+# (1005, its position) after a second at the earliest.
+REPEAT_WINDOW_S = 0.9
+MAX_RECENT = 64
+
+
+class _SentMessages:
+    """RTCM messages that were sent on one connection, however many vehicles use it."""
+
+    def __init__(self) -> None:
+        self.sequence = 0
+        self.recent: dict[bytes, tuple[float, set[int]]] = {}
+        """Message → time of the transmission, and the senders that have passed it."""
+
+
+_SENT: WeakKeyDictionary[Connection, _SentMessages] = WeakKeyDictionary()
+
+
+def send_rtcm(connection: Connection, message: bytes, sender: object) -> int:
+    """Send one RTCM message as GPS_RTCM_DATA, which has no target and so reaches every vehicle of the connection.
+
+    Sends nothing if another sender has just sent it. Returns the number of MAVLink messages.
+    """
+    sent = _SENT.setdefault(connection, _SentMessages())
+    now, (at, senders) = connection.now(), sent.recent.get(message, (0.0, {id(sender)}))
+    if id(sender) not in senders and now - at < REPEAT_WINDOW_S:
+        senders.add(id(sender))
+        return 0
+    pieces = fragments(message, sent.sequence)
+    for piece in pieces:
+        connection.send(piece)
+    sent.sequence += 1
+    sent.recent.pop(message, None)
+    sent.recent[message] = (now, {id(sender)})
+    if len(sent.recent) > MAX_RECENT:
+        del sent.recent[next(iter(sent.recent))]
+    return len(pieces)
 
 
 class Corrections(Snapshot):
@@ -43,7 +81,6 @@ class Rtk:
 
     def __init__(self, context: VehicleContext) -> None:
         self._session = context.session
-        self._output = output_of(context.session.connection)
         self._corrections: StateCell[Corrections] = StateCell(
             "rtk.corrections", context.session.connection.now, "corrections by rtk.send or rtk.ntrip"
         )
@@ -93,7 +130,7 @@ class Rtk:
     def _send(self, message: bytes) -> None:
         if self._session.is_closed:
             raise ConnectionClosed("the block of this vehicle was left; nothing was sent")
-        self._output.send(message, self)
+        send_rtcm(self._session.connection, message, self)
         now = self._session.connection.now()
         self._messages += 1
         self._bytes += len(message)

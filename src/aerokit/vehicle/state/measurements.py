@@ -141,7 +141,6 @@ def _scaled(factor: float, x: float, y: float, z: float) -> tuple[float, float, 
 
 
 def highres_imu(message: messages.HighresImu, context: Context) -> Imu:
-    """Decode HIGHRES_IMU."""
     return Imu(
         (message.xacc, message.yacc, message.zacc),
         _scaled(RAD_DEG, message.xgyro, message.ygyro, message.zgyro),
@@ -164,7 +163,6 @@ def scaled_imu(message: messages.ScaledImu) -> Imu:
 
 
 def raw_imu(message: messages.RawImu) -> RawImu:
-    """Decode RAW_IMU."""
     return RawImu(
         (message.xacc, message.yacc, message.zacc),
         (message.xgyro, message.ygyro, message.zgyro),
@@ -178,7 +176,6 @@ def _centidegrees(value: int) -> float | None:
 
 
 def odometry(message: messages.Odometry) -> Odometry:
-    """Decode ODOMETRY."""
     w, x, y, z = message.q
     return Odometry(
         member(MavFrame, message.frame_id),
@@ -198,7 +195,6 @@ def _covariance(values: tuple[float, ...]) -> tuple[float, ...] | None:
 
 
 def air_pressure(message: messages.ScaledPressure) -> AirPressure:
-    """Decode SCALED_PRESSURE."""
     return AirPressure(
         message.press_abs * HPA_PA,
         message.press_diff * HPA_PA,
@@ -223,7 +219,6 @@ def simulation_state(message: messages.SimState) -> Position | None:
 
 
 def altitude(message: messages.Altitude) -> Altitude:
-    """Decode ALTITUDE."""
     terrain, clearance = finite(message.altitude_terrain), finite(message.bottom_clearance)
     return Altitude(
         finite(message.altitude_monotonic),
@@ -236,7 +231,6 @@ def altitude(message: messages.Altitude) -> Altitude:
 
 
 def actuator_controls(message: messages.ActuatorControlTarget) -> ActuatorControls:
-    """Decode ACTUATOR_CONTROL_TARGET."""
     return ActuatorControls(message.group_mlx, tuple(message.controls))
 
 
@@ -265,7 +259,6 @@ def aircraft(message: messages.AdsbVehicle, context: Context) -> tuple[Aircraft,
 
 
 def winch(message: messages.WinchStatus) -> WinchStatus:
-    """Decode WINCH_STATUS."""
     return WinchStatus(
         finite(message.line_length),
         finite(message.speed),

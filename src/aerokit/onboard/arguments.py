@@ -1,0 +1,129 @@
+"""Arguments of command handlers: read from the annotations of a function, checked before it is called."""
+
+from __future__ import annotations
+
+import inspect
+import math
+import types
+from collections.abc import Callable
+from enum import Enum
+from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
+
+from aerokit._internal.formatting import short_repr
+from aerokit._internal.values import Snapshot
+from aerokit.errors import InvalidArgument
+
+MAX_ARGUMENTS = 7
+
+
+class Range(Snapshot):
+    """Allowed values of a command's argument, both ends included: ``height_m: Annotated[float, Range(0, 50)]``."""
+
+    minimum: float = -math.inf
+    maximum: float = math.inf
+
+    def _check(self) -> None:
+        if not self.minimum <= self.maximum:
+            raise InvalidArgument(f"Range({self.minimum!r}, {self.maximum!r}) is empty")
+
+
+class Param(Snapshot):
+    """Number of a command's parameter, 1 to 7: ``speed_m_s: Annotated[float, Param(3)]``.
+
+    By default the arguments of a handler are the parameters in order.
+    """
+
+    number: int
+
+    def _check(self) -> None:
+        if not isinstance(self.number, int) or not 1 <= self.number <= MAX_ARGUMENTS:
+            raise InvalidArgument(f"Param({short_repr(self.number)}) is not allowed: 1 to 7")
+
+
+class CommandArgument(Snapshot):
+    """One argument of a handler."""
+
+    name: str
+    number: int
+    type: Any
+    is_optional: bool
+    range: Range
+
+    def convert(self, value: float) -> object:
+        """Convert a parameter; InvalidArgument, with the name and what is allowed, if it is not allowed."""
+        if not math.isfinite(value):
+            if self.is_optional and value != value:
+                return None
+            raise InvalidArgument(f"{self.name} = {value} is not allowed: a number")
+        if not self.range.minimum <= value <= self.range.maximum:
+            low, high = self.range.minimum, self.range.maximum
+            raise InvalidArgument(f"{self.name} = {value:g} is not allowed: {low:g} to {high:g}")
+        if self.type is float:
+            return value
+        if value != int(value):
+            raise InvalidArgument(f"{self.name} = {value:g} is not allowed: a whole number")
+        if self.type is bool:
+            if value not in (0, 1):
+                raise InvalidArgument(f"{self.name} = {value:g} is not allowed: 0 or 1")
+            return bool(value)
+        try:
+            return self.type(int(value))
+        except ValueError:
+            raise InvalidArgument(f"{self.name} = {value:g} is not allowed: a {self.type.__name__}") from None
+
+
+def arguments_of(function: Callable[..., Any]) -> tuple[CommandArgument, ...]:
+    """Return the arguments of a handler after the first one, which is the request.
+
+    Raises:
+        InvalidArgument: an annotation is missing or of another type, or there are more than seven arguments.
+    """
+    name = getattr(function, "__name__", repr(function))
+    parameters = list(inspect.signature(function).parameters.values())
+    if not parameters:
+        raise InvalidArgument(f"{name}() must accept the request as its first argument")
+    found = []
+    for number, parameter in enumerate(parameters[1:], start=1):
+        if parameter.kind not in (parameter.POSITIONAL_ONLY, parameter.POSITIONAL_OR_KEYWORD):
+            raise InvalidArgument(f"{name}(): argument {parameter.name} must be positional")
+        found.append(_argument(name, parameter.name, number, _hint(function, parameter)))
+    return tuple(found)
+
+
+def _hint(function: Callable[..., Any], parameter: inspect.Parameter) -> Any:
+    """Return the annotation of one parameter, evaluated in the scope of its function."""
+    inner = inspect.unwrap(getattr(function, "__func__", function))
+    holder = types.SimpleNamespace(__annotations__={"hint": parameter.annotation})
+    cells = zip(inner.__code__.co_freevars, inner.__closure__ or ())  # noqa: B905 - equal lengths
+    local = {name: cell.cell_contents for name, cell in cells}
+    try:
+        return get_type_hints(holder, inner.__globals__, local, include_extras=True)["hint"]
+    except NameError as error:
+        raise InvalidArgument(
+            f"the annotation of {parameter.name} of {inner.__name__}() cannot be read: {error};"
+            " define its types at the level of the module"
+        ) from None
+
+
+def _argument(function: str, name: str, number: int, hint: Any) -> CommandArgument:
+    range_ = Range()
+    if get_origin(hint) is Annotated:
+        hint, *extras = get_args(hint)
+        for extra in extras:
+            if isinstance(extra, Range):
+                range_ = extra
+            elif isinstance(extra, Param):
+                number = extra.number
+    is_optional = False
+    if get_origin(hint) in (Union, types.UnionType):
+        members = [member for member in get_args(hint) if member is not type(None)]
+        is_optional = len(members) < len(get_args(hint))
+        hint = members[0] if len(members) == 1 else None
+    is_number = hint in (float, int, bool) or (isinstance(hint, type) and issubclass(hint, Enum))
+    if not is_number:
+        raise InvalidArgument(
+            f"{function}(): argument {name} must be annotated with float, int, bool or an enum of integers"
+        )
+    if number > MAX_ARGUMENTS:
+        raise InvalidArgument(f"{function}(): a command has seven parameters, {name} would be number {number}")
+    return CommandArgument(name, number, hint, is_optional, range_)

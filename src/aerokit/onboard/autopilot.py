@@ -1,0 +1,110 @@
+"""An autopilot of the program's own: the commands that ground stations give to fly it."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from typing import TYPE_CHECKING, Any
+
+from aerokit.errors import NotSupported
+from aerokit.mavlink.enums import MavCmd
+
+if TYPE_CHECKING:
+    from aerokit.onboard.commands import CommandRequest
+    from aerokit.onboard.services import ComponentServices
+
+FORCES = (21196, 2989)
+"""Values of param 2 that force arming or disarming: that of the standard, and ArduPilot's for arming."""
+_REBOOT, _SHUTDOWN = 1, 2
+
+
+class AutopilotDriver:
+    """Base class of a program's vehicle; pass an instance to :meth:`OnboardComponent.add_autopilot`.
+
+    Override what it can do, as coroutines; other commands are UNSUPPORTED. A coroutine returns when the vehicle has
+    begun to obey. It refuses by raising an error. HEARTBEAT reports armed and mode after the coroutine has returned.
+    """
+
+    async def arm(self, force: bool) -> None:
+        """Start the motors; ``force`` skips the checks."""
+        raise NotImplementedError
+
+    async def disarm(self, force: bool) -> None:
+        """Stop the motors; ``force`` also in flight."""
+        raise NotImplementedError
+
+    async def set_mode(self, custom_mode: int) -> None:
+        """Change the flight mode."""
+        raise NotImplementedError
+
+    async def take_off(self, altitude_m: float | None) -> None:
+        """Take off to an altitude above home; None: to the default one."""
+        raise NotImplementedError
+
+    async def land(self) -> None:
+        """Land here."""
+        raise NotImplementedError
+
+    async def return_to_launch(self) -> None:
+        """Return to the launch position and land."""
+        raise NotImplementedError
+
+    async def reboot(self) -> None:
+        """Restart the vehicle's computer."""
+        raise NotImplementedError
+
+    async def shutdown(self) -> None:
+        """Switch the vehicle's computer off."""
+        raise NotImplementedError
+
+    async def terminate(self) -> None:
+        """End the flight at once, whatever happens to the vehicle."""
+        raise NotImplementedError
+
+
+def add_autopilot(
+    services: ComponentServices,
+    driver: AutopilotDriver,
+    report: Callable[[bool | None, int | None], None],
+) -> None:
+    """Serve the commands of a vehicle. ``report(armed, custom_mode)`` changes the heartbeat; None: unchanged."""
+
+    async def call(name: str, *arguments: object) -> None:
+        if getattr(type(driver), name) is getattr(AutopilotDriver, name):
+            raise NotSupported(f"this vehicle does not support {name}")
+        await services.commands.call(getattr(driver, name), *arguments)
+
+    async def arm_disarm(_: CommandRequest, is_armed: bool, force: float | None) -> None:
+        await call("arm" if is_armed else "disarm", force in FORCES)
+        report(is_armed, None)
+
+    async def set_mode(request: CommandRequest, base_mode: float | None, custom_mode: int) -> None:
+        await call("set_mode", custom_mode)
+        report(None, custom_mode)
+
+    async def take_off(request: CommandRequest) -> None:
+        altitude = request.params[6]
+        await call("take_off", altitude if altitude == altitude else None)
+
+    async def reboot(_: CommandRequest, action: int) -> None:
+        if action not in (_REBOOT, _SHUTDOWN):
+            raise NotSupported(f"action {action} is not supported")
+        await call("reboot" if action == _REBOOT else "shutdown")
+
+    async def terminate(_: CommandRequest, is_wanted: bool) -> None:
+        if is_wanted:
+            await call("terminate")
+
+    def plain(name: str) -> Callable[[CommandRequest], Awaitable[Any]]:
+        async def run(_: CommandRequest) -> None:
+            await call(name)
+
+        return run
+
+    add = services.commands.add
+    add(MavCmd.COMPONENT_ARM_DISARM, arm_disarm)
+    add(MavCmd.DO_SET_MODE, set_mode)
+    add(MavCmd.NAV_TAKEOFF, take_off)
+    add(MavCmd.NAV_LAND, plain("land"))
+    add(MavCmd.NAV_RETURN_TO_LAUNCH, plain("return_to_launch"))
+    add(MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, reboot)
+    add(MavCmd.DO_FLIGHTTERMINATION, terminate)

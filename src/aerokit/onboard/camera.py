@@ -1,0 +1,352 @@
+"""A camera for a component: the program writes what is its own, the protocol is served for it."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from aerokit._internal.rotations import quaternion_from_euler
+from aerokit._internal.values import Snapshot
+from aerokit.errors import AerokitError, InvalidArgument
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import (
+    CameraCapFlags,
+    CameraZoomType,
+    MavSeverity,
+    SetFocusType,
+    StorageStatus,
+    StorageType,
+    StorageUsageFlag,
+)
+from aerokit.mavlink.messages import CameraImageCaptured
+from aerokit.position import Position
+from aerokit.protocols.servers.camera import CameraDevice, camera_settings
+
+if TYPE_CHECKING:
+    from aerokit.connection.tasks import BackgroundTasks
+    from aerokit.onboard.host import ComponentHost
+    from aerokit.parameters import SettingValue
+    from aerokit.protocols.servers.captures import Shot
+    from aerokit.protocols.servers.host import ServerHost
+
+logger: logging.Logger = logging.getLogger("aerokit")
+
+_NOWHERE = (math.nan, math.nan, math.nan, math.nan)
+
+
+class Photo(Snapshot):
+    """A picture that a camera has taken.
+
+    ``url`` is where other programs get the file: ``mftp:///DCIM/1.jpg`` for a file of `serve_files`, or http. Angles
+    are those of the camera, in degrees, yaw from north; None if unknown.
+    """
+
+    url: str = ""
+    position: Position | None = None
+    roll_deg: float | None = None
+    pitch_deg: float | None = None
+    yaw_deg: float | None = None
+
+
+class Storage(Snapshot):
+    """Memory of a camera; sizes are in MiB (1,048,576 bytes)."""
+
+    total_mib: float
+    used_mib: float
+    available_mib: float
+    name: str = ""
+    is_ready: bool = True
+
+
+class CameraDriver:
+    """Base class of a program's camera; pass an instance to :meth:`OnboardComponent.add_camera`.
+
+    Override what the camera can do, as coroutines; the capabilities that it reports follow from that. An error of a
+    method is the result of the command, and a status text. The methods are called one at a time for each command.
+
+    Args:
+        vendor: at most 32 bytes.
+        model: at most 32 bytes.
+        resolution: width and height of a picture, in pixels.
+        focal_length_mm: NaN if unknown.
+        sensor_mm: width and height of the sensor; NaN if unknown.
+        streams: addresses of video streams, ``rtsp://192.168.0.10:8554/main``.
+        has_modes: True if the camera takes pictures and videos only in the mode for them (:meth:`set_mode`).
+        definition: camera definition file (XML) with the settings that PARAM_EXT serves; None: no settings.
+        gimbal_id: component id of the gimbal that carries it; 0: none.
+    """
+
+    def __init__(
+        self,
+        *,
+        vendor: str = "aerokit",
+        model: str = "camera",
+        resolution: tuple[int, int] = (0, 0),
+        focal_length_mm: float = math.nan,
+        sensor_mm: tuple[float, float] = (math.nan, math.nan),
+        streams: Sequence[str] = (),
+        has_modes: bool = False,
+        definition: bytes | None = None,
+        gimbal_id: int = 0,
+    ) -> None:
+        for name, text in (("vendor", vendor), ("model", model)):
+            if len(text.encode()) > 32:
+                raise InvalidArgument(f"{name} = {text!r} is not allowed: at most 32 bytes")
+        self.vendor, self.model, self.resolution = vendor, model, resolution
+        self.focal_length_mm, self.sensor_mm = focal_length_mm, sensor_mm
+        self.streams, self.has_modes = tuple(streams), has_modes
+        self.definition, self.gimbal_id = definition, gimbal_id
+        self.zoom_percent: float = math.nan
+        """Zoom to report; assign it when it changes."""
+        self.focus_percent: float = math.nan
+        """Focus to report; assign it when it changes."""
+
+    async def take_photo(self, index: int) -> Photo:
+        """Take a picture and return it; ``index`` is its number, from 0."""
+        raise NotImplementedError
+
+    async def start_video(self) -> None:
+        """Begin to record."""
+        raise NotImplementedError
+
+    async def stop_video(self) -> None:
+        """End the recording."""
+        raise NotImplementedError
+
+    async def set_mode(self, mode: int) -> None:
+        """Change the CAMERA_MODE: 0 image, 1 video. Called only with ``has_modes``."""
+
+    async def zoom_to(self, percent: float) -> None:
+        """Zoom to a share of the range, 0 to 100."""
+        raise NotImplementedError
+
+    async def zoom_at(self, rate: float) -> None:
+        """Zoom continuously: -1 (wide) to 1 (tele), 0 stops."""
+        raise NotImplementedError
+
+    async def focus_to(self, percent: float) -> None:
+        """Focus at a share of the range, 0 to 100."""
+        raise NotImplementedError
+
+    async def focus_at(self, rate: float) -> None:
+        """Focus continuously: -1 (near) to 1 (far), 0 stops."""
+        raise NotImplementedError
+
+    async def focus_distance(self, metres: float) -> None:
+        """Focus at a distance, above 0."""
+        raise NotImplementedError
+
+    async def autofocus(self) -> None:
+        """Focus automatically."""
+        raise NotImplementedError
+
+    async def track(self, place: tuple[float, ...]) -> None:
+        """Track a point (x, y, radius), a rectangle (left, top, right, bottom), shares of the image, or nothing ()."""
+        raise NotImplementedError
+
+    async def switch_stream(self, number: int, on: bool) -> None:
+        """Start or stop a video stream; numbers begin at 1."""
+
+    def storage(self) -> Storage | None:
+        """Return the memory; None if there is none."""
+        return None
+
+    async def format_storage(self) -> None:
+        """Erase all pictures and videos."""
+        raise NotImplementedError
+
+    async def reset_settings(self) -> None:
+        """Restore the default settings."""
+
+    def on_setting(self, name: str, value: SettingValue) -> None:
+        """Called when another program has changed a setting of the definition file."""
+
+
+def _has(camera: CameraDriver, name: str) -> bool:
+    """Return True if the program's class overrides a method."""
+    return getattr(type(camera), name) is not getattr(CameraDriver, name)
+
+
+def capabilities_of(camera: CameraDriver) -> int:
+    """Return the CAMERA_CAP_FLAGS of what the program's class overrides."""
+    flags = CameraCapFlags(0)
+    if _has(camera, "take_photo"):
+        flags |= CameraCapFlags.CAPTURE_IMAGE
+    if _has(camera, "start_video"):
+        flags |= CameraCapFlags.CAPTURE_VIDEO
+    if camera.has_modes:
+        flags |= CameraCapFlags.HAS_MODES
+    else:
+        flags |= CameraCapFlags.CAN_CAPTURE_IMAGE_IN_VIDEO_MODE | CameraCapFlags.CAN_CAPTURE_VIDEO_IN_IMAGE_MODE
+    if _has(camera, "zoom_to") or _has(camera, "zoom_at"):
+        flags |= CameraCapFlags.HAS_BASIC_ZOOM
+    if any(_has(camera, name) for name in ("focus_to", "focus_at", "focus_distance", "autofocus")):
+        flags |= CameraCapFlags.HAS_BASIC_FOCUS
+    if camera.streams:
+        flags |= CameraCapFlags.HAS_VIDEO_STREAM
+    if _has(camera, "track"):
+        flags |= CameraCapFlags.HAS_TRACKING_POINT | CameraCapFlags.HAS_TRACKING_RECTANGLE
+    return int(flags)
+
+
+_STEP_PERCENT = 10.0
+_AUTO = (SetFocusType.AUTO, SetFocusType.AUTO_SINGLE, SetFocusType.AUTO_CONTINUOUS)
+
+
+class CameraAdapter(CameraDevice):
+    """Serves the camera protocol for a program's camera."""
+
+    def __init__(
+        self, camera: CameraDriver, host: ComponentHost, tasks: BackgroundTasks, call: Callable[..., Any]
+    ) -> None:
+        self.vendor, self.model, self.resolution = camera.vendor, camera.model, camera.resolution
+        self.focal_length_mm, self.sensor_mm = camera.focal_length_mm, camera.sensor_mm
+        self.streams, self.capabilities = camera.streams, capabilities_of(camera)
+        self._camera, self._host, self._tasks, self._call = camera, host, tasks, call
+        self.set_up_captures()
+        self.running_streams = set(range(1, len(self.streams) + 1))
+        self._format_known = _has(camera, "format_storage")
+
+    @property
+    def host(self) -> ServerHost:
+        return self._host
+
+    @property
+    def zoom(self) -> float:
+        return self._camera.zoom_percent
+
+    @property
+    def focus(self) -> float:
+        return self._camera.focus_percent
+
+    @property
+    def gimbal_device_id(self) -> int:
+        return self._camera.gimbal_id
+
+    @property
+    def free_mib(self) -> float:
+        storage = self._camera.storage()
+        return 0.0 if storage is None else storage.available_mib
+
+    def has_space(self) -> bool:
+        storage = self._camera.storage()
+        return storage is None or (storage.is_ready and storage.available_mib > 0)
+
+    def expose(self, done: Callable[[Shot | None], None]) -> None:
+        time_boot_ms, unix_time = self._host.time_boot_ms, self._host.connection.unix_time()
+
+        async def take() -> None:
+            shot = None
+            try:
+                photo = await self._call(self._camera.take_photo, len(self.captures.images))
+                shot = _shot(photo, time_boot_ms, unix_time)
+            except Exception as error:
+                if not isinstance(error, AerokitError):
+                    logger.error("take_photo failed", exc_info=error)
+                self._host.send_text(MavSeverity.WARNING, f"take_photo: {error or type(error).__name__}")
+            finally:
+                done(shot)
+
+        self._tasks.start(take, "aerokit photo")
+
+    def store_image(self, image: CameraImageCaptured) -> str | None:
+        return image.file_url
+
+    def storage(self, number: int) -> list[m.StorageInformation]:
+        found = self._camera.storage()
+        if found is None or number not in (0, 1):
+            return []
+        return [
+            m.StorageInformation(
+                time_boot_ms=self._host.time_boot_ms,
+                storage_id=1,
+                storage_count=1,
+                status=StorageStatus.READY if found.is_ready else StorageStatus.NOT_SUPPORTED,
+                total_capacity=found.total_mib,
+                used_capacity=found.used_mib,
+                available_capacity=found.available_mib,
+                read_speed=math.nan,
+                write_speed=math.nan,
+                type=StorageType.OTHER,
+                name=found.name,
+                storage_usage=StorageUsageFlag.SET | StorageUsageFlag.PHOTO | StorageUsageFlag.VIDEO,
+            )
+        ]
+
+    async def start_video(self) -> None:
+        await self._call(self._camera.start_video)
+
+    async def stop_video(self) -> None:
+        await self._call(self._camera.stop_video)
+
+    async def set_mode(self, mode: int) -> None:
+        await self._call(self._camera.set_mode, mode)
+
+    async def set_zoom(self, kind: int, value: float) -> bool:
+        camera = self._camera
+        return await self._move(kind, value, self.zoom, camera.zoom_to, camera.zoom_at)
+
+    async def set_focus(self, kind: int, value: float) -> bool:
+        camera = self._camera
+        if kind in _AUTO and _has(camera, "autofocus"):
+            await self._call(camera.autofocus)
+            return True
+        if kind == SetFocusType.METERS and value > 0 and _has(camera, "focus_distance"):
+            await self._call(camera.focus_distance, value)
+            return True
+        return await self._move(kind, value, self.focus, camera.focus_to, camera.focus_at)
+
+    async def _move(
+        self, kind: int, value: float, now: float, to: Callable[[float], Any], at: Callable[[float], Any]
+    ) -> bool:
+        """Move zoom or focus. The numbers of CAMERA_ZOOM_TYPE are those of SET_FOCUS_TYPE."""
+        if kind == CameraZoomType.STEP and math.isfinite(now):
+            kind, value = CameraZoomType.RANGE, max(0.0, min(100.0, now + value * _STEP_PERCENT))
+        low, move = (0.0, to) if kind == CameraZoomType.RANGE else (-1.0, at)
+        high = 100.0 if kind == CameraZoomType.RANGE else 1.0
+        is_possible = kind in (CameraZoomType.RANGE, CameraZoomType.CONTINUOUS) and low <= value <= high
+        if is_possible and _has(self._camera, move.__name__):
+            await self._call(move, value)
+            return True
+        return False
+
+    async def switch_stream(self, numbers: set[int], *, on: bool) -> None:
+        for number in sorted(numbers):
+            await self._call(self._camera.switch_stream, number, on)
+
+    async def track(self, place: tuple[float, ...]) -> None:
+        await self._call(self._camera.track, place)
+
+    async def format_storage(self) -> None:
+        await self._call(self._camera.format_storage)
+
+    async def reset_settings(self) -> None:
+        await self._call(self._camera.reset_settings)
+
+    def publish_settings(self) -> None:
+        """Send CAMERA_SETTINGS to all."""
+        self._host.send(camera_settings(self))
+
+
+def _shot(photo: Photo, time_boot_ms: int, unix_time: float) -> Shot:
+    """Return the content of CAMERA_IMAGE_CAPTURED."""
+    if not isinstance(photo, Photo):
+        raise InvalidArgument(f"take_photo returned {photo!r}, not a Photo")
+    place = photo.position
+    angles = (photo.roll_deg, photo.pitch_deg, photo.yaw_deg)
+    known = [math.radians(angle) for angle in angles if angle is not None]
+    shot = partial(
+        CameraImageCaptured,
+        time_boot_ms,
+        round(unix_time * 1e6),
+        0,
+        0 if place is None else round(place.latitude_deg * 1e7),
+        0 if place is None else round(place.longitude_deg * 1e7),
+        0 if place is None or place.altitude_amsl_m is None else round(place.altitude_amsl_m * 1000),
+        0 if place is None or place.altitude_relative_m is None else round(place.altitude_relative_m * 1000),
+        _NOWHERE if len(known) < 3 else quaternion_from_euler(*known),
+    )
+    return lambda **fields: shot(**{"file_url": photo.url, **fields})

@@ -1,0 +1,248 @@
+"""Commands of a component: handlers that are coroutines, with progress, cancellation and results."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import logging
+import math
+from collections.abc import Awaitable, Callable
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from aerokit._internal.arguments import checks_arguments
+from aerokit._internal.values import Snapshot
+from aerokit.errors import AerokitError, BusyError, InvalidArgument, NotSupported
+from aerokit.mavlink.enums import MavCmd, MavFrame, MavResult, MavSeverity
+from aerokit.onboard.arguments import CommandArgument, arguments_of
+from aerokit.position import Position
+from aerokit.protocols.servers.commands import CommandDispatcher, Outcome, RunningCommands
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from aerokit.connection.tasks import BackgroundTasks
+    from aerokit.onboard.host import ComponentHost
+    from aerokit.protocols.servers.commands import CommandHandler, CommandProgress, ReceivedCommand, RunningCommand
+
+logger: logging.Logger = logging.getLogger("aerokit")
+
+_ABSOLUTE = frozenset((MavFrame.GLOBAL, MavFrame.GLOBAL_INT))
+_RELATIVE = frozenset((MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT))
+
+
+class CommandResult(Snapshot):
+    """Result of a command handler: MAV_RESULT, and two numbers whose meaning depends on the command."""
+
+    result: int = MavResult.ACCEPTED.value
+    progress: int = 0
+    detail: int = 0
+    """``result_param2`` of COMMAND_ACK."""
+
+
+@checks_arguments
+class CommandRequest:
+    """A command that a handler executes."""
+
+    def __init__(self, command: ReceivedCommand, report: Callable[[int], None]) -> None:
+        self._command, self._report = command, report
+
+    @property
+    def command(self) -> int:
+        """MAV_CMD."""
+        return self._command.command
+
+    @property
+    def sender(self) -> tuple[int, int]:
+        """System id and component id of the sender."""
+        return self._command.sender
+
+    @property
+    def params(self) -> tuple[float, ...]:
+        """Parameters 1 to 7; positions are in degrees, whatever message brought them."""
+        numbers = list(self._command.params)
+        if self._command.frame is not None and self._command.frame not in (MavFrame.MISSION, MavFrame.LOCAL_NED):
+            numbers[4:6] = (number / 1e7 for number in numbers[4:6])
+        return tuple(numbers)
+
+    @property
+    def position(self) -> Position:
+        """Position of the command, with the altitude above home or above mean sea level.
+
+        Raises:
+            InvalidArgument: latitude or longitude is missing or out of range, or the frame is not global.
+        """
+        frame = self._command.altitude_frame
+        latitude, longitude, altitude = self.params[4:]
+        known = altitude if math.isfinite(altitude) else None
+        if frame in _ABSOLUTE:
+            return Position(latitude, longitude, altitude_amsl_m=known)
+        if frame in _RELATIVE:
+            return Position(latitude, longitude, altitude_relative_m=known)
+        raise InvalidArgument(f"frame {frame} is not allowed: a global frame")
+
+    def report_progress(self, percent: int) -> None:
+        """Send IN_PROGRESS with this percentage (0 to 100) now, and from then on."""
+        if not 0 <= percent <= 100:
+            raise InvalidArgument(f"percent = {percent} is not allowed: 0 to 100")
+        self._report(percent)
+
+    def __repr__(self) -> str:
+        return f"<CommandRequest {command_name(self.command)} from {self.sender[0]}/{self.sender[1]}>"
+
+
+def command_name(command: int) -> str:
+    """Return the name of a MAV_CMD, or its number."""
+    return MavCmd(command).name if command in MavCmd.__members__.values() else f"command {command}"
+
+
+def outcome_of(value: object) -> Outcome:
+    """Convert what a handler has returned: None is ACCEPTED."""
+    if value is None or value is True:
+        return Outcome(MavResult.ACCEPTED)
+    if isinstance(value, CommandResult):
+        return Outcome(value.result, value.progress, value.detail)
+    if isinstance(value, int) and value is not False:
+        return Outcome(int(value))
+    return Outcome(MavResult.FAILED)
+
+
+def result_of(error: BaseException) -> int:
+    """Return the MAV_RESULT for an error of a handler."""
+    if isinstance(error, NotSupported):
+        return MavResult.UNSUPPORTED
+    if isinstance(error, BusyError):
+        return MavResult.TEMPORARILY_REJECTED
+    if isinstance(error, (InvalidArgument, ValueError, PermissionError)):
+        return MavResult.DENIED
+    return MavResult.FAILED
+
+
+class ComponentCommands:
+    """Commands of one component. Handlers run as tasks that end with the component."""
+
+    def __init__(self, host: ComponentHost, tasks: BackgroundTasks) -> None:
+        self.uses_threads = False
+        """True to call plain functions in threads, for blocking programs."""
+        self.handlers: dict[int, CommandHandler] = {}
+        """MAV_CMD → handler; protocol servers add their own."""
+        self.server: CommandDispatcher = CommandDispatcher(host, self.handlers)
+        self._running = RunningCommands(host, self.server)
+        self._host, self._tasks = host, tasks
+        host.knows_command = self.handlers.__contains__
+
+    def add(self, command: int, function: Callable[..., Any]) -> None:
+        """Register a handler.
+
+        Raises:
+            InvalidArgument: the command has a handler, or the function's arguments cannot be read.
+        """
+        if command in self.handlers:
+            raise InvalidArgument(f"{command_name(command)} already has a handler")
+        self.handlers[command] = partial(self._execute, function, arguments_of(function))
+
+    def add_guarded(self, handlers: Mapping[int, CommandHandler]) -> None:
+        """Register handlers of a protocol server that call the program; an error of the program is the result."""
+
+        def guard(handler: CommandHandler) -> CommandHandler:
+            def guarded(command: ReceivedCommand) -> int | CommandProgress | None:
+                try:
+                    return handler(command)
+                except Exception as error:
+                    self._explain(command_name(command.command), error)
+                    return result_of(error)
+
+            return guarded
+
+        self.handlers.update({command: guard(handler) for command, handler in handlers.items()})
+
+    async def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Call a function of the program: a coroutine function, or a plain one, in a thread if ``uses_threads``."""
+        if inspect.iscoroutinefunction(function) or not self.uses_threads:
+            found = function(*arguments)
+        else:
+            found = await asyncio.to_thread(function, *arguments)
+        return await found if inspect.isawaitable(found) else found
+
+    def add_raw(self, command: int, function: Callable[[ReceivedCommand], Awaitable[int]]) -> None:
+        """Register a coroutine function of a protocol server, which checks the parameters itself."""
+
+        async def run(request: CommandRequest) -> int:
+            return await function(request._command)
+
+        self.handlers[command] = partial(self._execute, run, ())
+
+    def cancel_all(self) -> None:
+        self._running.cancel_all()
+
+    def _execute(
+        self, function: Callable[..., Any], arguments: tuple[CommandArgument, ...], command: ReceivedCommand
+    ) -> None:
+        task: list[asyncio.Task[Any]] = []
+        is_cancelled = False
+
+        def cancel() -> None:
+            nonlocal is_cancelled
+            if task:
+                task[0].cancel()
+            elif not is_cancelled:  # the task has not begun yet
+                is_cancelled = True
+                if inspect.iscoroutine(answer):
+                    answer.close()
+                self._running.finish(started, Outcome(MavResult.CANCELLED))
+
+        running = self._running.start(command, cancel)
+        if running is None:
+            return
+        started = running  # not None, also for the closure
+        loop = asyncio.get_running_loop() if self.uses_threads else None
+
+        def report(percent: int) -> None:
+            if loop is None:
+                self._running.report(started, percent)
+            else:  # called in a thread
+                loop.call_soon_threadsafe(self._running.report, started, percent)
+
+        request = CommandRequest(command, report)
+        try:
+            values = [argument.convert(request.params[argument.number - 1]) for argument in arguments]
+            answer = self.call(function, request, *values) if self.uses_threads else function(request, *values)
+        except Exception as error:
+            self._fail(running, function, error)
+            return
+        if not inspect.isawaitable(answer):
+            self._running.finish(running, outcome_of(answer))
+            return
+
+        async def run() -> None:
+            if is_cancelled:
+                return
+            current = asyncio.current_task()
+            assert current is not None
+            task.append(current)
+            await self._finish(running, function, answer)
+
+        self._tasks.start(run, f"aerokit {command_name(command.command)}")
+
+    async def _finish(self, running: RunningCommand, function: Callable[..., Any], answer: Awaitable[Any]) -> None:
+        try:
+            outcome = outcome_of(await answer)
+        except asyncio.CancelledError:
+            self._running.finish(running, Outcome(MavResult.CANCELLED))
+            raise
+        except Exception as error:
+            self._fail(running, function, error)
+        else:
+            self._running.finish(running, outcome)
+
+    def _fail(self, running: RunningCommand, function: Callable[..., Any], error: Exception) -> None:
+        """Answer with the result for an error, and explain it in a status text."""
+        name = getattr(function, "__name__", "run")
+        name = command_name(running.command.command) if name == "run" else name
+        self._explain(name, error)
+        self._running.finish(running, Outcome(result_of(error)))
+
+    def _explain(self, name: str, error: Exception) -> None:
+        if not isinstance(error, AerokitError):
+            logger.error("the handler %s of a command failed", name, exc_info=error)
+        self._host.send_text(MavSeverity.WARNING, f"{name}: {error or type(error).__name__}")

@@ -1,0 +1,422 @@
+"""``OnboardComponent``: this program as a MAVLink component: heartbeat, commands, parameters, files, messages."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable, Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
+
+import anyio
+
+from aerokit._internal.arguments import checks_arguments
+from aerokit.connection.tasks import BackgroundTasks
+from aerokit.errors import InvalidArgument
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import (
+    CompMetadataType,
+    MavCmd,
+    MavModeFlag,
+    MavSeverity,
+    MavState,
+    MavType,
+)
+from aerokit.mavlink.enums import MavProtocolCapability as Can
+from aerokit.mavlink.message import Message
+from aerokit.onboard.events import EventSender, answer_pings
+from aerokit.onboard.files import DirectoryFiles
+from aerokit.onboard.host import ComponentHost
+from aerokit.onboard.identity import PARAMETER_PATH, Identity, IdentityMessages
+from aerokit.onboard.missions import ComponentMissions
+from aerokit.onboard.parameters import ComponentParameters
+from aerokit.onboard.services import ComponentServices
+from aerokit.protocols.servers.ftp import SessionFtpServer
+
+if TYPE_CHECKING:
+    from aerokit.connection.connection import Connection
+    from aerokit.onboard.autopilot import AutopilotDriver
+    from aerokit.onboard.camera import CameraDriver
+    from aerokit.onboard.devices import WinchDriver
+    from aerokit.onboard.gimbal import GimbalDriver
+    from aerokit.onboard.sources import ComponentSources
+
+HEARTBEAT_INTERVAL_S = 1.0
+MAX_UNSENT_BYTES = 8192
+"""Bursts of files pause while more bytes wait in the link."""
+MAX_METADATA_BYTES = 1 << 20
+MAVLINK_VERSION = 3
+
+MetadataKind = Literal["commands", "peripherals", "events", "actuators"]
+HandlerT = TypeVar("HandlerT", bound=Callable[..., Any])
+
+
+@checks_arguments
+class OnboardComponent:
+    """This program as one MAVLink component, returned by :func:`aerokit.component`.
+
+    It sends its own heartbeat, executes commands, and offers parameters, files, missions and messages. Requests for
+    anything else get the standard's answers: UNSUPPORTED, DENIED, DOES_NOT_EXIST.
+    """
+
+    def __init__(
+        self,
+        connection: Connection,
+        *,
+        system_id: int,
+        component_id: int,
+        heartbeat: m.Heartbeat,
+        identity: Identity,
+        parameters_file: Path | None,
+        bytewise: bool,
+        accepts: Iterable[int] | None,
+    ) -> None:
+        self._host = ComponentHost(connection, system_id, component_id, accepts)
+        self._heartbeat = heartbeat
+        self._tasks = BackgroundTasks(connection.fail)
+        self.parameters: ComponentParameters = ComponentParameters(self._host, parameters_file, bytewise=bytewise)
+        """Parameters that this component offers."""
+        self._services = ComponentServices(self._host, self._tasks, self.parameters)
+        self._commands, self._streams = self._services.commands, self._services.streams
+        self._commands.handlers[MavCmd.REQUEST_AUTOPILOT_CAPABILITIES] = lambda command: self._streams.answer_with(
+            m.AutopilotVersion.ID, command
+        )
+        self._memory = self._services.memory
+        self._identity = IdentityMessages(self._host, identity, self._memory)
+        self._streams.builders.update(self._identity.builders())
+        self._ftp: SessionFtpServer[DirectoryFiles] | None = None
+        self._events = EventSender(self._host)
+        self._missions: ComponentMissions | None = None
+        self._sources: ComponentSources | None = None
+        answer_pings(self._host)
+        if bytewise:
+            self._identity.capabilities |= Can.PARAM_ENCODE_BYTEWISE
+        else:
+            self._identity.capabilities |= Can.PARAM_ENCODE_C_CAST
+        self._identity.offer(CompMetadataType.PARAMETER, PARAMETER_PATH, self.parameters.json)
+        self._serve(None, is_writable=False)
+
+    def _start(self) -> None:
+        self._send_heartbeat()
+
+    async def _aclose(self) -> None:
+        """Cancel running commands, answer them, and stop."""
+        self._commands.cancel_all()
+        try:
+            await self._tasks.aclose()
+            with anyio.CancelScope(shield=True):
+                await self.parameters.aclose()
+        finally:
+            if self._ftp is not None:
+                self._ftp.close()
+            self._host.close()
+
+    def _use_threads(self) -> None:
+        """Call plain functions of the program in threads, because it is a blocking program."""
+        self._commands.uses_threads = True
+
+    # ------------------------------------------------------------------------------------ state
+
+    @property
+    def connection(self) -> Connection:
+        """The connection, for subscriptions and for further components on the same link."""
+        return self._host.connection
+
+    @property
+    def system_id(self) -> int:
+        """System id of this component."""
+        return self._host.system_id
+
+    @property
+    def component_id(self) -> int:
+        """Component id (MAV_COMPONENT)."""
+        return self._host.component_id
+
+    @property
+    def state(self) -> int:
+        """MAV_STATE of the heartbeat: ACTIVE unless :meth:`set_state` was called."""
+        return self._heartbeat.system_status
+
+    @property
+    def time_boot_ms(self) -> int:
+        """Milliseconds since the component started, for messages."""
+        return self._host.time_boot_ms
+
+    def set_state(self, state: int, *, base_mode: int = 0, custom_mode: int = 0) -> None:
+        """Change what the heartbeat reports, and send it at once.
+
+        Args:
+            state: MAV_STATE: ACTIVE, STANDBY, CALIBRATING, CRITICAL …
+            base_mode: MAV_MODE_FLAG.
+            custom_mode: mode number of this component, 0 to 4294967295.
+
+        Raises:
+            InvalidArgument: a value is out of range.
+        """
+        if state not in MavState.__members__.values():
+            raise InvalidArgument(f"state = {state} is not allowed: a MAV_STATE, 0 to 8")
+        before = self._heartbeat
+        heartbeat = m.Heartbeat(before.type, before.autopilot, base_mode, custom_mode, state, MAVLINK_VERSION)
+        heartbeat.encode()
+        self._heartbeat = heartbeat
+        self._host.send(heartbeat)
+
+    def _send_heartbeat(self) -> None:
+        self._host.send(self._heartbeat)
+        self._host.call_later(HEARTBEAT_INTERVAL_S, self._send_heartbeat)
+
+    # --------------------------------------------------------------------------------- commands
+
+    def command(self, command: int) -> Callable[[HandlerT], HandlerT]:
+        """Decorator: execute a MAV_CMD by a function or coroutine function.
+
+        Its first argument is the :class:`~aerokit.onboard.CommandRequest`, the others are the command's parameters in
+        order, or as :class:`~aerokit.onboard.Param` says. They are annotated with float, int, bool or an enum, with
+        ``| None`` if the parameter may be missing, and with ``Annotated[float, Range(0, 50)]``. A command with other
+        values is DENIED, and the function is not called.
+
+        While a coroutine runs, the sender gets IN_PROGRESS. COMMAND_CANCEL cancels it (CANCELLED). It returns None for
+        ACCEPTED, a MAV_RESULT or a :class:`~aerokit.onboard.CommandResult`. Errors are the result and a status text:
+        InvalidArgument and ValueError are DENIED, BusyError is TEMPORARILY_REJECTED, NotSupported is UNSUPPORTED,
+        others are FAILED. A second command of the same kind is TEMPORARILY_REJECTED meanwhile; a repeated transmission
+        is not executed again.
+
+        Raises:
+            InvalidArgument: the command has a handler, or the function's arguments cannot be read.
+        """
+
+        def register(function: HandlerT) -> HandlerT:
+            self._commands.add(command, function)
+            return function
+
+        return register
+
+    # --------------------------------------------------------------------------------- messages
+
+    def message(
+        self, message_type: type[Message], *, hz: float = 0.0
+    ) -> Callable[[Callable[[], Message | None]], Callable[[], Message | None]]:
+        """Decorator: send a message that a function returns, on request and at the intervals that others set.
+
+        The function returns None while it has no values. ``hz`` is the rate at which it is sent to all from the start,
+        0 to 200; 0: only on request.
+
+        Raises:
+            InvalidArgument: ``hz`` is out of range, or the message has a function already.
+        """
+
+        def register(function: Callable[[], Message | None]) -> Callable[[], Message | None]:
+            self._services.add_message(message_type, function, hz)
+            return function
+
+        return register
+
+    def send(self, message: Message) -> None:
+        """Send a message as this component, to its target or to all.
+
+        Raises:
+            InvalidArgument: a field is out of range; nothing was sent.
+            ConnectionClosed, LinkLost: the connection has ended.
+        """
+        self.connection.raise_if_ended()
+        self._host.send(message)
+
+    def send_text(self, text: str, *, severity: int = MavSeverity.INFO.value) -> None:
+        """Send a status text (STATUSTEXT) to all: ASCII, at most 254 characters; the rest is cut.
+
+        Raises:
+            InvalidArgument: ``severity`` is not a MAV_SEVERITY, 0 to 7.
+        """
+        if not 0 <= severity <= 7:
+            raise InvalidArgument(f"severity = {severity} is not allowed: 0 (EMERGENCY) to 7 (DEBUG)")
+        self._host.send_text(severity, text)
+
+    def send_event(self, event_id: int, arguments: bytes = b"", *, severity: int = MavSeverity.INFO.value) -> None:
+        """Send an event (EVENT) to all; receivers that missed it get it again on request.
+
+        Args:
+            event_id: id in the component's event metadata: component id << 24, plus a number.
+            arguments: at most 40 bytes.
+            severity: MAV_SEVERITY, 0 to 7.
+
+        Raises:
+            InvalidArgument: a value is out of range.
+        """
+        self._events.send(event_id, arguments, severity)
+
+    # ------------------------------------------------------------------------- files and missions
+
+    def serve_files(self, directory: str | Path, *, writable: bool = False) -> None:
+        """Offer the files of one directory by MAVFTP; nothing outside it can be reached, not even by links.
+
+        Files are read and written on the event loop, in blocks of 239 bytes: use a local disk.
+
+        Args:
+            directory: existing directory.
+            writable: True to let every sender write, rename and remove files there.
+
+        Raises:
+            InvalidArgument: it is not a directory, or a directory is served already.
+        """
+        root = Path(directory)
+        if not root.is_dir():
+            raise InvalidArgument(f"directory = {str(directory)!r} is not an existing directory")
+        if self._ftp is not None and self._ftp.files.has_root:
+            raise InvalidArgument("serve_files was called twice")
+        self._serve(root, is_writable=writable)
+
+    def _serve(self, root: Path | None, *, is_writable: bool) -> None:
+        files = DirectoryFiles(root, self._memory, is_writable=is_writable)
+        if self._ftp is None:
+            congested = self._is_congested
+            self._ftp = SessionFtpServer(self._host, files, is_congested=congested)
+            self._identity.capabilities |= Can.FTP
+        else:
+            self._ftp.files = files
+
+    def set_metadata(self, kind: MetadataKind, content: bytes) -> None:
+        """Offer a metadata file (JSON) by MAVFTP, and list it in the general metadata.
+
+        https://mavlink.io/en/services/component_information.html
+
+        Args:
+            kind: ``"commands"``, ``"peripherals"``, ``"events"`` or ``"actuators"``. The file of the parameters follows
+                from them.
+            content: the file, at most 1 MiB.
+
+        Raises:
+            InvalidArgument: the file is larger, or the kind is another one.
+        """
+        if len(content) > MAX_METADATA_BYTES:
+            raise InvalidArgument(f"content has {len(content)} bytes, at most {MAX_METADATA_BYTES} are allowed")
+        self._identity.offer(CompMetadataType[kind.upper()], f"/{kind}.json", lambda: content)
+
+    def _is_congested(self) -> bool:
+        return self.connection.unsent_bytes > MAX_UNSENT_BYTES
+
+    @property
+    def missions(self) -> ComponentMissions:
+        """Missions, fences and rally points that other programs upload and download; served from the first use on."""
+        if self._missions is None:
+            self._missions = ComponentMissions(self._host, self._tasks, self._commands)
+            self._streams.builders[m.MissionCurrent.ID] = self._missions._build_current
+            self._identity.capabilities |= Can.MISSION_INT | Can.MISSION_FENCE | Can.MISSION_RALLY
+        return self._missions
+
+    # ---------------------------------------------------------------------------- ready-made parts
+
+    def add_autopilot(self, driver: AutopilotDriver) -> None:
+        """Execute a ground station's commands by a program's vehicle: arm, mode, take-off, landing, return, reboot.
+
+        The component should have component id 1, a vehicle's ``type``, and ``autopilot=MavAutopilot.GENERIC``.
+        HEARTBEAT follows: armed after ``arm``, the mode after ``set_mode``. Send telemetry by :meth:`message`.
+
+        Args:
+            driver: an instance of the program's class, see :class:`~aerokit.onboard.AutopilotDriver`.
+
+        Raises:
+            InvalidArgument: one of the commands has a handler.
+        """
+        from aerokit.onboard.autopilot import add_autopilot  # Imported here because few components are one.
+
+        add_autopilot(self._services, driver, self._report_flight)
+
+    def _report_flight(self, is_armed: bool | None, custom_mode: int | None) -> None:
+        before = self._heartbeat
+        flags = before.base_mode | MavModeFlag.CUSTOM_MODE_ENABLED
+        if is_armed is not None:
+            flags = flags & ~MavModeFlag.SAFETY_ARMED | (MavModeFlag.SAFETY_ARMED if is_armed else 0)
+        mode = before.custom_mode if custom_mode is None else custom_mode
+        self.set_state(before.system_status, base_mode=int(flags), custom_mode=mode)
+
+    def add_camera(self, camera: CameraDriver) -> None:
+        """Serve the camera protocol: photos, series, videos, storage, streams, zoom, focus, tracking, settings.
+
+        https://mavlink.io/en/services/camera.html
+
+        Args:
+            camera: an instance of the program's class, see :class:`~aerokit.onboard.CameraDriver`.
+
+        Raises:
+            InvalidArgument: the component has a camera, or its definition file and parameters exclude each other.
+            FileFormatError: the definition file is damaged.
+        """
+        from aerokit.onboard.parts import add_camera  # Imported here because few components have one.
+
+        add_camera(self._services, camera)
+
+    def add_gimbal(self, gimbal: GimbalDriver) -> None:
+        """Serve the gimbal protocol v2, as gimbal device and gimbal manager in one component.
+
+        https://mavlink.io/en/services/gimbal_v2.html
+
+        Args:
+            gimbal: an instance of the program's class, see :class:`~aerokit.onboard.GimbalDriver`.
+
+        Raises:
+            InvalidArgument: the component has a gimbal.
+        """
+        from aerokit.onboard.parts import add_gimbal  # Imported here because few components have one.
+
+        add_gimbal(self._services, gimbal)
+
+    def add_winch(self, winch: WinchDriver) -> None:
+        """Execute DO_WINCH by a program's winch, and send WINCH_STATUS at 5 Hz.
+
+        Raises:
+            InvalidArgument: the component has a winch.
+        """
+        from aerokit.onboard.devices import add_winch  # Imported here because few components have one.
+
+        add_winch(self._services, winch)
+
+    def add_gripper(self, grab: Callable[[], Awaitable[Any]], release: Callable[[], Awaitable[Any]]) -> None:
+        """Execute DO_GRIPPER by two coroutine functions, which return when the gripper has moved.
+
+        Raises:
+            InvalidArgument: the component has a gripper.
+        """
+        from aerokit.onboard.devices import add_gripper  # Imported here because few components have one.
+
+        add_gripper(self._services, grab, release)
+
+    def add_arm_authorizer(self, authorize: Callable[[int], Any]) -> None:
+        """Answer ARM_AUTHORIZATION_REQUEST (https://mavlink.io/en/services/arm_authorization.html).
+
+        Args:
+            authorize: function or coroutine function of the vehicle's system id. It returns for how many seconds (at
+                most 255) arming is allowed, or raises an error, whose text is sent as status text: DENIED. It may also
+                return a :class:`~aerokit.onboard.CommandResult` with a MAV_ARM_AUTH_DENIED_REASON as ``detail``.
+
+        Raises:
+            InvalidArgument: the component has an arm authorizer.
+        """
+        from aerokit.onboard.devices import add_arm_authorizer  # Imported here because few components are one.
+
+        add_arm_authorizer(self._services, authorize)
+
+    @property
+    def sources(self) -> ComponentSources:
+        """Sends measurements to the autopilot: obstacles, traffic, landing targets, GNSS corrections."""
+        from aerokit.onboard.sources import ComponentSources  # Imported here because few components measure.
+
+        if self._sources is None:
+            self._sources = ComponentSources(self._host)
+        return self._sources
+
+    async def serve_forever(self) -> None:
+        """Wait until the connection ends, and raise its error.
+
+        Raises:
+            ConnectionClosed, LinkLost: the connection has ended.
+        """
+        ended = anyio.Event()
+        detach = self.connection.on_end(lambda _: ended.set())
+        try:
+            await ended.wait()
+        finally:
+            detach()
+        self.connection.raise_if_ended()
+
+    def __repr__(self) -> str:
+        kind = self._heartbeat.type
+        name = MavType(kind).name if kind in MavType.__members__.values() else kind
+        return f"<OnboardComponent {self.system_id}/{self.component_id}, {name}>"

@@ -1,0 +1,165 @@
+"""Winch, gripper and arm authorizer of a component."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Awaitable, Callable
+from typing import TYPE_CHECKING, Any
+
+from aerokit._internal.values import Snapshot
+from aerokit.errors import InvalidArgument, NotSupported
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import GripperActions, MavArmAuthDeniedReason, MavCmd, MavResult, MavSeverity, WinchActions
+from aerokit.onboard.commands import CommandResult, result_of
+
+if TYPE_CHECKING:
+    from aerokit.onboard.commands import CommandRequest
+    from aerokit.onboard.services import ComponentServices
+
+Authorize = Callable[[int], "float | Awaitable[float]"]
+
+MAX_AUTHORIZATION_S = 255
+_TEMPERATURE_UNKNOWN = 0x7FFF
+
+
+class WinchReport(Snapshot):
+    """State of a winch for WINCH_STATUS; None for unknown values. ``flags`` are MAV_WINCH_STATUS_FLAG bits."""
+
+    length_m: float | None = None
+    speed_m_s: float | None = None
+    tension_kg: float | None = None
+    flags: int = 0
+
+
+class WinchDriver:
+    """Base class of a program's winch; pass an instance to :meth:`OnboardComponent.add_winch`.
+
+    Override what the winch can do, as coroutines; other actions are UNSUPPORTED. A coroutine returns when the action
+    has ended: the sender gets IN_PROGRESS meanwhile, and can cancel it.
+    """
+
+    async def relax(self) -> None:
+        """Let the line run freely."""
+        raise NotImplementedError
+
+    async def pay_out(self, length_m: float, rate_m_s: float) -> None:
+        """Wind the line out (positive length) or in, at this rate, which is above 0."""
+        raise NotImplementedError
+
+    async def set_rate(self, rate_m_s: float) -> None:
+        """Wind out (positive) or in at this rate until the next command."""
+        raise NotImplementedError
+
+    async def lock(self) -> None:
+        """Lock the line in its storage position."""
+        raise NotImplementedError
+
+    async def deliver(self) -> None:
+        """Lower the payload, detach it and retract the line."""
+        raise NotImplementedError
+
+    async def hold(self) -> None:
+        """Stop and hold the line."""
+        raise NotImplementedError
+
+    async def retract(self) -> None:
+        """Retract the line completely."""
+        raise NotImplementedError
+
+    async def load_line(self) -> None:
+        """Load the line onto the drum."""
+        raise NotImplementedError
+
+    async def abandon_line(self) -> None:
+        """Let the line run out completely."""
+        raise NotImplementedError
+
+    async def load_payload(self) -> None:
+        """Lower the hook so that a payload can be attached."""
+        raise NotImplementedError
+
+    def report(self) -> WinchReport:
+        """Return the state; called at 5 Hz."""
+        return WinchReport()
+
+
+_WINCH_CALLS: dict[int, str] = {
+    WinchActions.RELAXED: "relax",
+    WinchActions.RELATIVE_LENGTH_CONTROL: "pay_out",
+    WinchActions.RATE_CONTROL: "set_rate",
+    WinchActions.LOCK: "lock",
+    WinchActions.DELIVER: "deliver",
+    WinchActions.HOLD: "hold",
+    WinchActions.RETRACT: "retract",
+    WinchActions.LOAD_LINE: "load_line",
+    WinchActions.ABANDON_LINE: "abandon_line",
+    WinchActions.LOAD_PAYLOAD: "load_payload",
+}
+STATUS_HZ = 5.0
+
+
+def add_winch(services: ComponentServices, winch: WinchDriver) -> None:
+    """Serve DO_WINCH and WINCH_STATUS."""
+
+    async def do_winch(
+        _: CommandRequest, instance: float | None, action: int, length: float | None, rate: float | None
+    ) -> None:
+        name = _WINCH_CALLS.get(action, "")
+        if not name or getattr(type(winch), name) is getattr(WinchDriver, name):
+            raise NotSupported(f"this winch does not support action {action}")
+        arguments = {"pay_out": (length, rate), "set_rate": (rate,)}.get(name, ())
+        if None in arguments:
+            raise InvalidArgument("length and rate are required")
+        if name == "pay_out" and rate is not None and rate <= 0:
+            raise InvalidArgument(f"rate = {rate:g} is not allowed: above 0")
+        await services.commands.call(getattr(winch, name), *arguments)
+
+    def status() -> m.WinchStatus:
+        report, nan = winch.report(), math.nan
+        numbers = (report.length_m, report.speed_m_s, report.tension_kg)
+        length, speed, tension = (nan if number is None else number for number in numbers)
+        time_us = round(services.host.connection.unix_time() * 1e6)
+        return m.WinchStatus(time_us, length, speed, tension, nan, nan, _TEMPERATURE_UNKNOWN, report.flags)
+
+    services.commands.add(MavCmd.DO_WINCH, do_winch)
+    services.add_message(m.WinchStatus, status, STATUS_HZ)
+
+
+def add_gripper(
+    services: ComponentServices,
+    grab: Callable[[], Awaitable[Any]],
+    release: Callable[[], Awaitable[Any]],
+) -> None:
+    """Serve DO_GRIPPER."""
+
+    async def do_gripper(_: CommandRequest, instance: float | None, action: GripperActions) -> None:
+        if action == GripperActions.RELEASE:
+            await services.commands.call(release)
+        elif action == GripperActions.GRAB:
+            await services.commands.call(grab)
+        else:
+            raise NotSupported(f"this gripper does not support {action.name}")
+
+    services.commands.add(MavCmd.DO_GRIPPER, do_gripper)
+
+
+def add_arm_authorizer(services: ComponentServices, authorize: Authorize) -> None:
+    """Serve ARM_AUTHORIZATION_REQUEST."""
+
+    async def arm_authorization(request: CommandRequest, system_id: int) -> CommandResult:
+        try:
+            # PX4 sends 0 for itself (ArmAuthorization.cpp).
+            seconds = await services.commands.call(authorize, system_id or request.sender[0])
+        except Exception as error:
+            services.host.send_text(MavSeverity.WARNING, f"arming denied: {error or type(error).__name__}")
+            result = result_of(error)
+            reason = MavArmAuthDeniedReason.NONE if result == MavResult.DENIED else MavArmAuthDeniedReason.GENERIC
+            return CommandResult(MavResult.DENIED, detail=reason)
+        if isinstance(seconds, CommandResult):
+            return seconds
+        if not 0 < seconds <= MAX_AUTHORIZATION_S:
+            raise ValueError(f"the authorizer returned {seconds!r}, not 1 to {MAX_AUTHORIZATION_S} seconds")
+        # The standard has the seconds in `progress`; PX4 reads them from `result_param2` (ArmAuthorization.cpp).
+        return CommandResult(MavResult.ACCEPTED, progress=math.ceil(seconds), detail=math.ceil(seconds))
+
+    services.commands.add(MavCmd.ARM_AUTHORIZATION_REQUEST, arm_authorization)

@@ -1,0 +1,78 @@
+"""Events of a component (https://mavlink.io/en/services/events.html), PING and TIMESYNC."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import TYPE_CHECKING
+
+from aerokit.errors import InvalidArgument
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import MavSeverity
+from aerokit.protocols.servers.host import Channel, sender_of
+
+if TYPE_CHECKING:
+    from aerokit.onboard.host import ComponentHost
+
+MAX_STORED_EVENTS = 64
+SEQUENCE_INTERVAL_S = 5.0
+MAX_ARGUMENT_BYTES = 40
+_UNAVAILABLE = 0  # MAV_EVENT_ERROR_REASON_UNAVAILABLE
+
+
+class EventSender:
+    """Sends EVENT, and sends the last 64 events again on request."""
+
+    def __init__(self, host: ComponentHost) -> None:
+        self._host = host
+        self._sequence = -1
+        self._sent: deque[m.Event] = deque(maxlen=MAX_STORED_EVENTS)
+        host.on(m.RequestEvent, self._on_request)
+
+    def send(self, event_id: int, arguments: bytes, severity: int) -> None:
+        if not 0 <= event_id <= 0xFFFFFFFF:
+            raise InvalidArgument(f"event_id = {event_id} is not allowed: 0 to 4294967295")
+        if len(arguments) > MAX_ARGUMENT_BYTES:
+            raise InvalidArgument(f"arguments has {len(arguments)} bytes, at most {MAX_ARGUMENT_BYTES} fit")
+        if not MavSeverity.EMERGENCY <= severity <= MavSeverity.DEBUG:
+            raise InvalidArgument(f"severity = {severity} is not allowed: 0 (EMERGENCY) to 7 (DEBUG)")
+        is_first = self._sequence < 0
+        self._sequence = (self._sequence + 1) & 0xFFFF
+        levels = severity << 4 | severity
+        time_ms, data = self._host.time_boot_ms, bytes(arguments).ljust(MAX_ARGUMENT_BYTES, b"\0")
+        event = m.Event(0, 0, event_id, time_ms, self._sequence, levels, data)
+        self._sent.append(event)
+        self._host.send(event)
+        if is_first:
+            self._host.call_later(SEQUENCE_INTERVAL_S, self._send_sequence)
+
+    def _send_sequence(self) -> None:
+        """Announce the last sequence number, so that receivers notice lost events."""
+        self._host.send(m.CurrentEventSequence(self._sequence, 0))
+        self._host.call_later(SEQUENCE_INTERVAL_S, self._send_sequence)
+
+    def _on_request(self, request: m.RequestEvent, channel: Channel) -> None:
+        count = (request.last_sequence - request.first_sequence & 0xFFFF) + 1
+        wanted = {request.first_sequence + number & 0xFFFF for number in range(min(count, MAX_STORED_EVENTS))}
+        found = [event for event in self._sent if event.sequence in wanted]
+        for event in found:
+            self._host.send(event, channel)
+        if not found:
+            oldest = self._sent[0].sequence if self._sent else 0
+            system, component = channel
+            error = m.ResponseEventError(system, component, request.first_sequence, oldest, _UNAVAILABLE)
+            self._host.send(error, channel)
+
+
+def answer_pings(host: ComponentHost) -> None:
+    """Answer PING requests and TIMESYNC requests."""
+
+    def on_ping(ping: m.Ping, channel: Channel) -> None:
+        if ping.target_system == 0 and ping.target_component == 0:  # else it is the answer to another component
+            host.send(m.Ping(ping.time_usec, ping.seq, *sender_of(ping)), channel)
+
+    def on_timesync(message: m.Timesync, channel: Channel) -> None:
+        if message.tc1 == 0:
+            host.send(m.Timesync(int(host.now * 1e9), message.ts1, *channel), channel)
+
+    host.on(m.Ping, on_ping)
+    host.on(m.Timesync, on_timesync)

@@ -1,0 +1,165 @@
+"""A gimbal device with its gimbal manager for a component."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from aerokit._internal.values import Snapshot
+from aerokit.errors import InvalidArgument
+from aerokit.mavlink.enums import GimbalDeviceCapFlags as Can
+from aerokit.mavlink.enums import GimbalManagerFlags as Flags
+from aerokit.position import Position
+from aerokit.protocols.servers.gimbal import ALL_CAPABILITIES, Angles, GimbalMount, Place
+
+if TYPE_CHECKING:
+    from aerokit.onboard.host import ComponentHost
+    from aerokit.protocols.servers.host import ServerHost
+
+STATUS_INTERVAL_S = 1.0
+_FULL_TURN_DEG = (-180.0, 180.0)
+
+
+class GimbalTarget(Snapshot):
+    """Target of a gimbal: angles or rates, in degrees and degrees per second.
+
+    Roll and pitch are relative to the horizon; yaw is relative to the vehicle's nose, or to north if ``yaw_locked``.
+    ``angles`` is None for rates, ``rates`` is None for angles.
+    """
+
+    angles: tuple[float, float, float] | None
+    rates: tuple[float, float, float] | None
+    yaw_locked: bool
+    is_retracted: bool = False
+
+
+class GimbalDriver:
+    """Base class of a program's gimbal; pass an instance to :meth:`OnboardComponent.add_gimbal`.
+
+    Override :meth:`point` and :meth:`attitude`. Only the program in control can point it: others are DENIED, as the
+    protocol says (DO_GIMBAL_MANAGER_CONFIGURE).
+
+    Args:
+        vendor: at most 32 bytes.
+        model: at most 32 bytes.
+        roll_deg: smallest and greatest angle.
+        pitch_deg: smallest and greatest angle.
+        yaw_deg: smallest and greatest angle.
+        max_rate_deg_s: rate for a full deflection of manual control.
+        attitude_hz: rate of GIMBAL_DEVICE_ATTITUDE_STATUS, 0 to 100.
+    """
+
+    def __init__(
+        self,
+        *,
+        vendor: str = "aerokit",
+        model: str = "gimbal",
+        roll_deg: tuple[float, float] = (0.0, 0.0),
+        pitch_deg: tuple[float, float] = (-90.0, 30.0),
+        yaw_deg: tuple[float, float] = _FULL_TURN_DEG,
+        max_rate_deg_s: float = 60.0,
+        attitude_hz: float = 10.0,
+    ) -> None:
+        for name, (low, high) in (("roll_deg", roll_deg), ("pitch_deg", pitch_deg), ("yaw_deg", yaw_deg)):
+            if not -360.0 <= low <= high <= 360.0:
+                raise InvalidArgument(f"{name} = ({low}, {high}) is not allowed: a smallest and a greatest angle")
+        if not max_rate_deg_s > 0 or not 0 <= attitude_hz <= 100:
+            raise InvalidArgument("max_rate_deg_s must be above 0, attitude_hz 0 to 100")
+        self.vendor, self.model = vendor, model
+        self.limits_deg = (roll_deg, pitch_deg, yaw_deg)
+        self.max_rate_deg_s, self.attitude_hz = max_rate_deg_s, attitude_hz
+
+    def point(self, target: GimbalTarget) -> None:
+        """Begin to turn to a target, within the limits. Called on the event loop: return at once."""
+        raise NotImplementedError
+
+    def attitude(self) -> tuple[float, float, float]:
+        """Return the current roll and pitch (from the horizon) and yaw (from the vehicle's nose) in degrees."""
+        raise NotImplementedError
+
+    def heading(self) -> float:
+        """Return the heading of the vehicle in degrees; 0 if unknown."""
+        return 0.0
+
+    def look_at(self, position: Position | None) -> None:
+        """Begin to point at a position, None: ahead. Override it if the gimbal can; otherwise it is UNSUPPORTED."""
+        raise NotImplementedError
+
+
+class GimbalAdapter(GimbalMount):
+    """Serves the gimbal protocol for a program's gimbal."""
+
+    def __init__(self, gimbal: GimbalDriver, host: ComponentHost) -> None:
+        self.vendor, self.model = gimbal.vendor, gimbal.model
+        roll, pitch, yaw = gimbal.limits_deg
+        self.limits = tuple((math.radians(low), math.radians(high)) for low, high in (roll, pitch, yaw))
+        self.slew_rad_s = math.radians(gimbal.max_rate_deg_s)
+        self.can_point_at_positions = type(gimbal).look_at is not GimbalDriver.look_at
+        self.capabilities = ALL_CAPABILITIES
+        for axis, limits in ((_ROLL, roll), (_PITCH, pitch), (_YAW, yaw)):
+            if limits[0] == limits[1]:
+                self.capabilities &= ~axis
+        if yaw == _FULL_TURN_DEG:
+            self.capabilities |= Can.SUPPORTS_INFINITE_YAW
+        self._gimbal, self._host = gimbal, host
+        self._is_locked = False
+
+    @property
+    def host(self) -> ServerHost:
+        return self._host
+
+    @property
+    def device_id(self) -> int:
+        return self._host.component_id
+
+    @property
+    def is_yaw_locked(self) -> bool:
+        return self._is_locked
+
+    def angles(self) -> Angles:
+        roll, pitch, yaw = map(math.radians, self._gimbal.attitude())
+        return (roll, pitch, yaw)
+
+    def heading(self) -> float:
+        return math.radians(self._gimbal.heading())
+
+    def point(self, angles: Angles, flags: int, *, locked: bool) -> None:
+        limited = [max(low, min(high, angle)) for angle, (low, high) in zip(angles, self.limits, strict=True)]
+        if locked:
+            limited[2] = angles[2]  # the limits are relative to the nose
+        roll, pitch, yaw = map(math.degrees, limited)
+        retracted = bool(flags & Flags.RETRACT)
+        self._apply(GimbalTarget((roll, pitch, yaw), None, locked, retracted), flags)
+
+    def turn(self, rates: Angles, flags: int, *, locked: bool) -> None:
+        limit = self.slew_rad_s
+        roll, pitch, yaw = (math.degrees(max(-limit, min(limit, rate))) for rate in rates)
+        self._apply(GimbalTarget(None, (roll, pitch, yaw), locked), flags)
+
+    def _apply(self, target: GimbalTarget, flags: int) -> None:
+        self._gimbal.point(target)
+        self.flags, self._is_locked = flags, target.yaw_locked
+
+    def look_at(self, place: Place | None) -> None:
+        if place is None:
+            position = None
+        else:
+            position = Position(place[0] / 1e7, place[1] / 1e7, altitude_amsl_m=place[2])
+        self._gimbal.look_at(position)
+        self.flags, self._is_locked = 0, position is not None
+        self._followed = 0
+
+    def follow(self, system_id: int) -> None:
+        self._followed = system_id
+
+    def update_followed(self, system_id: int, place: Place) -> None:
+        if system_id == self._followed:
+            self.look_at(place)
+            self._followed = system_id
+
+    _followed = 0
+
+
+_ROLL = Can.HAS_ROLL_AXIS | Can.HAS_ROLL_LOCK | Can.HAS_ROLL_FOLLOW
+_PITCH = Can.HAS_PITCH_AXIS | Can.HAS_PITCH_LOCK | Can.HAS_PITCH_FOLLOW
+_YAW = Can.HAS_YAW_AXIS | Can.HAS_YAW_LOCK | Can.HAS_YAW_FOLLOW

@@ -1,0 +1,130 @@
+"""``ComponentHost``: one component on a connection, for which the protocol servers work."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING, Any
+
+from aerokit.errors import AerokitError
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.protocols.servers.host import sender_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    from aerokit.connection.bus import Detach
+    from aerokit.connection.connection import Connection
+    from aerokit.mavlink.message import Message
+    from aerokit.protocols.servers.host import Channel, Handler
+
+logger: logging.Logger = logging.getLogger("aerokit")
+
+TEXT_SIZE = 50
+MAX_TEXT_SIZE = 254
+"""Characters of a status text; the rest is cut."""
+_COMMANDS = (m.CommandLong.ID, m.CommandInt.ID)
+
+
+class ComponentHost:
+    """Delivers messages that are addressed to one component of a connection, and sends its messages.
+
+    A channel is the (system id, component id) of the sender. ``accepts`` are the system ids whose messages are
+    processed; None: all. ``knows_command`` decides whether a command to all components is for this one.
+    """
+
+    def __init__(
+        self, connection: Connection, system_id: int, component_id: int, accepts: Iterable[int] | None
+    ) -> None:
+        self.connection = connection
+        self.system_id = system_id
+        self.component_id = component_id
+        self.knows_command: Callable[[int], bool] = lambda _: True
+        self._accepts = None if accepts is None else frozenset(accepts)
+        own = (system_id, component_id) == (connection.source_system, connection.source_component)
+        self._encoder = None if own else FrameEncoder(system_id, component_id)
+        self._started_at = connection.now()
+        self._detachments: list[Detach] = []
+        self._text_id = 0
+        self._is_closed = False
+
+    @property
+    def now(self) -> float:
+        """Loop time in seconds."""
+        return self.connection.now()
+
+    @property
+    def time_boot_ms(self) -> int:
+        """Milliseconds since the component started."""
+        return int((self.now - self._started_at) * 1000.0) & 0xFFFFFFFF
+
+    def on(self, message_class: type[Message], handler: Handler) -> None:
+        """Call a handler with messages that are addressed to this component or to all, and their sender."""
+
+        def on_message(message: Message) -> None:
+            sender = sender_of(message)
+            if not self._is_closed and self._is_addressed(message, sender):
+                self._guarded(lambda: handler(message, sender))
+
+        self._detachments.append(self.connection.bus.attach(message_class, on_message))
+
+    def _is_addressed(self, message: Message, sender: tuple[int, int]) -> bool:
+        system, component = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
+        if sender == (self.system_id, self.component_id) or sender[0] == 0:
+            return False
+        if self._accepts is not None and sender[0] not in self._accepts:
+            return False
+        if system not in (0, self.system_id) or component not in (0, self.component_id):
+            return False
+        return component != 0 or message.ID not in _COMMANDS or self.knows_command(message.command)  # type: ignore[attr-defined]
+
+    def send(self, message: Message, channel: Channel = None) -> None:
+        """Send to a system, or to all if ``channel`` is None. Does nothing after the end of the connection."""
+        if self._is_closed or not self.connection.is_open:
+            return
+        to = None if channel is None else channel[0]
+        if self._encoder is None:
+            self.connection.send(message, to=to)
+        else:
+            self.connection.send_as(self._encoder, message, to=to)
+
+    def send_text(self, severity: int, text: str) -> None:
+        """Send a STATUSTEXT to all; more than 50 characters are sent in chunks."""
+        data = "".join(char if char.isprintable() else " " for char in text)
+        data = data.encode("ascii", "replace").decode()[:MAX_TEXT_SIZE]
+        if len(data) <= TEXT_SIZE:
+            self.send(m.Statustext(severity, data, 0, 0))
+            return
+        self._text_id = self._text_id % 0xFFFF + 1
+        for number, start in enumerate(range(0, len(data), TEXT_SIZE)):
+            self.send(m.Statustext(severity, data[start : start + TEXT_SIZE], self._text_id, number))
+        if len(data) % TEXT_SIZE == 0:  # a full last chunk is followed by an empty one
+            self.send(m.Statustext(severity, "", self._text_id, len(data) // TEXT_SIZE))
+
+    def call_at(self, when: float, action: Callable[[], None]) -> None:
+        """Call a function at a loop time, unless the component has ended."""
+
+        def alarm() -> None:
+            if not self._is_closed:
+                self._guarded(action)
+
+        self.connection.deadlines.set(alarm, when)
+
+    def call_later(self, delay: float, action: Callable[[], None]) -> None:
+        self.call_at(self.now + delay, action)
+
+    def close(self) -> None:
+        """Stop processing and sending."""
+        self._is_closed = True
+        for detach in self._detachments:
+            detach()
+        self._detachments.clear()
+
+    def _guarded(self, action: Callable[[], Any]) -> None:
+        """Run a server's code: an error in it is logged, and the component continues."""
+        try:
+            action()
+        except AerokitError as error:
+            logger.warning("component %d/%d: %s", self.system_id, self.component_id, error)
+        except Exception:
+            logger.exception("component %d/%d: unexpected error", self.system_id, self.component_id)

@@ -1,0 +1,150 @@
+"""Missions, fences and rally points of a component."""
+
+from __future__ import annotations
+
+import inspect
+import logging
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING, Any
+
+from aerokit._internal.arguments import checks_arguments
+from aerokit.errors import AerokitError, InvalidArgument
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import MavCmd, MavMissionResult, MavMissionType, MavSeverity
+from aerokit.missions import MissionItem
+from aerokit.missions.check import check_items
+from aerokit.protocols.servers.missions import MissionServer
+
+if TYPE_CHECKING:
+    from aerokit.connection.tasks import BackgroundTasks
+    from aerokit.mavlink.message import Message
+    from aerokit.onboard.commands import CommandRequest, ComponentCommands
+    from aerokit.onboard.host import ComponentHost
+
+logger: logging.Logger = logging.getLogger("aerokit")
+
+_NAMES = {"mission": MavMissionType.MISSION, "fence": MavMissionType.FENCE, "rally": MavMissionType.RALLY}
+
+
+@checks_arguments
+class ComponentMissions:
+    """Missions, fences and rally points that other programs upload to this component.
+
+    By default every valid list is accepted and stored. :meth:`on_upload` sets a function that decides.
+    """
+
+    def __init__(self, host: ComponentHost, tasks: BackgroundTasks, commands: ComponentCommands) -> None:
+        self._host, self._tasks, self._commands = host, tasks, commands
+        self._server = MissionServer(host, self._judge, on_set_current=self._set_current)
+        self._on_upload: Callable[[str, tuple[MissionItem, ...]], Any] | None = None
+        self._on_current: Callable[[int], object] | None = None
+        commands.add(MavCmd.DO_SET_MISSION_CURRENT, self._current_command)
+
+    def items(self, kind: str = "mission") -> tuple[MissionItem, ...]:
+        """Return the items of ``"mission"``, ``"fence"`` or ``"rally"``; InvalidArgument for other kinds."""
+        return self._server.lists[_type_of(kind)]
+
+    def replace(self, items: Sequence[MissionItem], kind: str = "mission") -> None:
+        """Replace a list from this program.
+
+        Raises:
+            InvalidArgument: there is no such kind.
+        """
+        self._server.replace(_type_of(kind), items)
+
+    def on_upload(
+        self, function: Callable[[str, tuple[MissionItem, ...]], Any]
+    ) -> Callable[[str, tuple[MissionItem, ...]], Any]:
+        """Decorator: ``function(kind, items)`` decides about every upload, before it is stored and acknowledged.
+
+        It refuses a list by raising InvalidArgument (INVALID, and a status text) or by returning a MAV_MISSION_RESULT.
+        It may be a coroutine function. An empty list is a request to clear.
+        """
+        self._on_upload = function
+        return function
+
+    def on_set_current(self, function: Callable[[int], object]) -> Callable[[int], object]:
+        """Decorator: ``function(index)`` continues the mission at an item. Without it, such requests are refused."""
+        self._on_current = function
+        return function
+
+    @property
+    def current(self) -> int:
+        """Index of the current item, as MISSION_CURRENT reports it."""
+        return self._server.current
+
+    def set_current(self, index: int) -> None:
+        """Report the item that is executed now (MISSION_CURRENT).
+
+        Raises:
+            InvalidArgument: there is no such item.
+        """
+        if not 0 <= index < len(self.items()):
+            raise InvalidArgument(f"index = {index} is not allowed: 0 to {len(self.items()) - 1}")
+        self._server.current = index
+        self._host.send(self._server.current_message())
+
+    def report_reached(self, index: int) -> None:
+        """Report that an item was reached (MISSION_ITEM_REACHED)."""
+        self._host.send(m.MissionItemReached(index))
+
+    def _build_current(self, _: object) -> Iterable[Message]:
+        return [self._server.current_message()]
+
+    def _judge(self, mission_type: int, items: tuple[MissionItem, ...], answer: Callable[[int], None]) -> None:
+        kind = next(name for name, number in _NAMES.items() if number == mission_type)
+        function = self._on_upload
+        try:
+            check_items(items, mission_type)
+            verdict: Any = None
+            if function is not None:
+                in_thread = self._commands.uses_threads
+                verdict = self._commands.call(function, kind, items) if in_thread else function(kind, items)
+        except Exception as error:
+            answer(self._refused(kind, error))
+            return
+        if not inspect.isawaitable(verdict):
+            answer(_result_of(verdict))
+            return
+
+        async def wait() -> None:
+            result = int(MavMissionResult.OPERATION_CANCELLED)
+            try:
+                result = _result_of(await verdict)
+            except Exception as error:
+                result = self._refused(kind, error)
+            finally:
+                answer(result)
+
+        self._tasks.start(wait, "aerokit mission upload")
+
+    def _refused(self, kind: str, error: Exception) -> int:
+        if not isinstance(error, AerokitError):
+            logger.error("on_upload of the component failed", exc_info=error)
+        self._host.send_text(MavSeverity.WARNING, f"{kind} refused: {error or type(error).__name__}")
+        is_invalid = isinstance(error, ValueError)
+        return MavMissionResult.INVALID if is_invalid else MavMissionResult.ERROR
+
+    def _set_current(self, index: int) -> bool:
+        if self._on_current is None:
+            return False
+        try:
+            self._on_current(index)
+        except Exception as error:
+            self._refused("set_current", error)
+            return False
+        return True
+
+    def _current_command(self, request: CommandRequest, index: int) -> None:
+        if not self._server.set_current(index):
+            raise InvalidArgument(f"item {index} is not possible")
+
+
+def _result_of(verdict: object) -> int:
+    return int(verdict) if isinstance(verdict, int) and not isinstance(verdict, bool) else MavMissionResult.ACCEPTED
+
+
+def _type_of(kind: str) -> int:
+    if kind not in _NAMES:
+        raise InvalidArgument(f"kind = {kind!r} is not allowed: 'mission', 'fence' or 'rally'")
+    return _NAMES[kind]

@@ -1,0 +1,142 @@
+"""``aerokit.component``: this program as a MAVLink component, for the duration of an ``async with`` block."""
+
+from __future__ import annotations
+
+from contextlib import AsyncExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from aerokit._internal.arguments import checked
+from aerokit._internal.async_block import async_block
+from aerokit.connection.opening import open_connection
+from aerokit.errors import BusyError, InvalidArgument
+from aerokit.mavlink.dialect import STANDARD
+from aerokit.mavlink.enums import MavAutopilot, MavState, MavType
+from aerokit.mavlink.messages import Heartbeat
+from aerokit.onboard.component import MAVLINK_VERSION, OnboardComponent
+from aerokit.onboard.identity import Identity
+
+if TYPE_CHECKING:
+    import os
+    from collections.abc import AsyncIterator, Iterable, Sequence
+
+    from aerokit.connection.connection import Connection
+    from aerokit.mavlink.dialect import Dialect
+    from aerokit.mavlink.signing import Signing
+    from aerokit.transport.link import Link
+    from aerokit.transport.sockets import PeerFilter
+
+
+@checked
+@async_block
+async def component(
+    address: str | Link | Sequence[str | Link] | None = None,
+    *,
+    connection: Connection | None = None,
+    system_id: int = 1,
+    component_id: int = 191,
+    type: int = MavType.ONBOARD_CONTROLLER.value,  # noqa: A002 - the name of the field in HEARTBEAT
+    autopilot: int = MavAutopilot.INVALID.value,
+    identity: Identity = Identity(),  # noqa: B008 - it is immutable
+    parameters_file: str | os.PathLike[str] | None = None,
+    bytewise: bool = True,
+    accepts: Iterable[int] | None = None,
+    baud: int = 57600,
+    dialect: Dialect = STANDARD,
+    mavlink_version: int = 2,
+    signing: Signing | None = None,
+    record: str | os.PathLike[str] | None = None,
+    reconnect: bool = False,
+    peers: PeerFilter | None = None,
+    may_move: bool = False,
+) -> AsyncIterator[OnboardComponent]:
+    """Be a MAVLink component for the duration of the ``async with`` block: a payload, a camera, a companion computer.
+
+    Runs in the current asyncio loop. Other programs get answers while the loop runs, also while your block waits. When
+    the block ends, running commands are cancelled and answered, and the heartbeat stops.
+
+    Args:
+        address: a connection string, a link or a list of them, as for :func:`aerokit.open_connection`.
+        connection: an open connection, instead of an address: for several components, or a component beside a ground
+            station, on one link. The arguments after ``accepts`` are not allowed then.
+        system_id: own system id, 1 to 255: that of the vehicle that carries the component.
+        component_id: own component id (MAV_COMPONENT), 1 to 255.
+        type: MAV_TYPE of the heartbeat: ONBOARD_CONTROLLER, CAMERA, GIMBAL, WINCH, GRIPPER …
+        autopilot: MAV_AUTOPILOT of the heartbeat; INVALID for everything that is not a flight controller.
+        identity: vendor, model and versions that the component reports.
+        parameters_file: JSON file that keeps the parameters; it is replaced atomically after each change. None: the
+            parameters start with their defaults.
+        bytewise: True to encode integers in PARAM_VALUE bytewise, as PX4 does; False to cast them to float, as
+            ArduPilot does. The component announces it; clients that judge by the autopilot expect bytewise.
+        accepts: system ids whose messages are processed; None: all. Without signing, senders can claim any id.
+        baud: bits per second of a serial link whose address has none.
+        dialect: the messages that are decoded.
+        mavlink_version: version of sent messages, 1 or 2.
+        signing: key that signs sent frames; received frames without its signature are refused.
+        record: ``.tlog`` file for all traffic.
+        reconnect: True to reopen a lost link instead of ending the connection.
+        peers: IP addresses and networks to accept, for links with an open port.
+        may_move: True to accept a silent sender from another IP address.
+
+    Raises:
+        InvalidArgument: an argument is wrong; nothing was opened.
+        BusyError: the connection has a component with these ids already.
+        LinkOpenError: the link or the recording could not be opened.
+        FileFormatError, OSError: ``parameters_file`` cannot be read.
+    """
+    heartbeat = _heartbeat(type, autopilot)
+    if not 1 <= system_id <= 255 or not 1 <= component_id <= 255:
+        raise InvalidArgument(f"system_id, component_id = {system_id}, {component_id} are not allowed: 1 to 255 each")
+    if (address is None) == (connection is None):
+        raise InvalidArgument("pass either an address or connection=…")
+    own = (baud, mavlink_version, record, reconnect, peers, may_move, signing)
+    if connection is not None and own != (57600, 2, None, False, None, False, None):
+        raise InvalidArgument("the connection is open: pass the arguments of the link to open_connection")
+    async with AsyncExitStack() as stack:
+        if connection is None:
+            assert address is not None
+            connection = await stack.enter_async_context(
+                open_connection(
+                    address,
+                    source_system=system_id,
+                    source_component=component_id,
+                    baud=baud,
+                    dialect=dialect,
+                    mavlink_version=mavlink_version,
+                    signing=signing,
+                    record=record,
+                    reconnect=reconnect,
+                    peers=peers,
+                    may_move=may_move,
+                    heartbeat=None,
+                )
+            )
+        connection.raise_if_ended()
+        key = (system_id, component_id)
+        if key in connection.components:
+            raise BusyError(f"this connection has a component {system_id}/{component_id} already")
+        found = OnboardComponent(
+            connection,
+            system_id=system_id,
+            component_id=component_id,
+            heartbeat=heartbeat,
+            identity=identity,
+            parameters_file=None if parameters_file is None else Path(parameters_file),
+            bytewise=bytewise,
+            accepts=accepts,
+        )
+        connection.components.add(key)
+        try:
+            found._start()
+            yield found
+        finally:
+            connection.components.discard(key)
+            await found._aclose()
+
+
+def _heartbeat(type_: int, autopilot: int) -> Heartbeat:
+    """Return the first heartbeat of a component."""
+    for name, value in (("type", type_), ("autopilot", autopilot)):
+        if not 0 <= value <= 255:
+            raise InvalidArgument(f"{name} = {value} is not allowed: 0 to 255")
+    return Heartbeat(type_, autopilot, 0, 0, MavState.ACTIVE, MAVLINK_VERSION)

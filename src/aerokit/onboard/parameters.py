@@ -1,0 +1,291 @@
+"""Parameters of a component: typed, with ranges and metadata, served by PARAM and PARAM_EXT."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from aerokit._internal.arguments import checks_arguments
+from aerokit._internal.files import read_text, write_atomically
+from aerokit.errors import AerokitError, FileFormatError, InvalidArgument
+from aerokit.mavlink.enums import MavParamError, MavParamExtType, MavSeverity, ParamAck
+from aerokit.parameters import ParameterMetadata, check_name
+from aerokit.parameters.parameter import checked_setting, settings_equal, to_float32
+from aerokit.protocols.servers.parameters import TypedExtendedServer, TypedParameterServer
+
+if TYPE_CHECKING:
+    from aerokit.onboard.host import ComponentHost
+
+logger: logging.Logger = logging.getLogger("aerokit")
+
+LIST_RATE_HZ = 200.0
+MAX_COMPONENT_PARAMETERS = 1000
+
+ParameterValue = int | float | str
+OnSet = Callable[[ParameterValue], object]
+
+_TYPES: dict[type, MavParamExtType] = {
+    int: MavParamExtType.INT32,
+    float: MavParamExtType.REAL32,
+    str: MavParamExtType.CUSTOM,
+}
+
+
+class _Row:
+    def __init__(self, metadata: ParameterMetadata, type_: MavParamExtType, default: ParameterValue) -> None:
+        self.metadata, self.type, self.default, self.value = metadata, type_, default, default
+        self.on_set: OnSet | None = None
+
+
+@checks_arguments
+class ComponentParameters(Mapping[str, ParameterValue]):
+    """Parameters that this component offers: name → value. Other programs read and set them by MAVLink.
+
+    Numbers are served by PARAM, texts and numbers by PARAM_EXT. A value that is out of range, of another type or
+    refused by ``on_set`` is not stored, and the sender gets the reason: PARAM_ERROR, or PARAM_EXT_ACK.
+    """
+
+    def __init__(self, host: ComponentHost, path: Path | None, *, bytewise: bool) -> None:
+        self._host, self._path = host, path
+        self._rows: dict[str, _Row] = {}
+        self._stored: dict[str, Any] = _read(path)
+        self._is_dirty = False
+        self._saving: asyncio.Task[None] | None = None
+        self._classic = TypedParameterServer(host, _Store(self), bytewise=bytewise, list_rate_hz=LIST_RATE_HZ)
+        self._extended: TypedExtendedServer | None = None
+        self._is_excluded = False
+
+    def add(
+        self,
+        name: str,
+        default: int | float | str,
+        *,
+        minimum: float | None = None,
+        maximum: float | None = None,
+        unit: str = "",
+        description: str = "",
+        values: Mapping[float, str] | None = None,
+        read_only: bool = False,
+        reboot_required: bool = False,
+        on_set: Callable[..., object] | None = None,
+    ) -> None:
+        """Offer a parameter. The type of ``default`` is its type: int (32 bits), float (32 bits) or str (128 bytes).
+
+        Args:
+            name: 1 to 16 ASCII characters without spaces.
+            default: value until another program or :meth:`set` changes it, or the file has one.
+            minimum: smallest allowed number; None: the minimum of the type.
+            maximum: greatest allowed number; None: the maximum of the type.
+            unit: for the metadata, ``"m/s"``.
+            description: for the metadata.
+            values: names of the allowed numbers; others are refused.
+            read_only: True if only this program can change it.
+            reboot_required: for the metadata.
+            on_set: called in the loop with a value that another program sets, before it is stored. It refuses the
+                value by raising InvalidArgument.
+
+        Raises:
+            InvalidArgument: the name is invalid or taken, the default is not allowed, or there are 1000 parameters.
+        """
+        check_name(name)
+        if self._is_excluded:
+            raise InvalidArgument("a component has either parameters or the settings of a camera definition")
+        if name in self._rows:
+            raise InvalidArgument(f"parameter {name} was added twice")
+        if len(self._rows) >= MAX_COMPONENT_PARAMETERS:
+            raise InvalidArgument(f"a component has at most {MAX_COMPONENT_PARAMETERS} parameters")
+        if isinstance(default, bool) or type(default) not in _TYPES:
+            raise InvalidArgument(f"default = {default!r} of {name} is not allowed: an int, a float or a str")
+        metadata = ParameterMetadata(
+            name,
+            short_description=description,
+            unit=unit,
+            minimum=_as_stored(minimum, default),
+            maximum=_as_stored(maximum, default),
+            default=None if isinstance(default, str) else default,
+            values={} if values is None else dict(values),
+            reboot_required=reboot_required,
+            read_only=read_only,
+        )
+        row = _Row(metadata, _TYPES[type(default)], default)
+        row.value = row.default = self._checked(row, default)
+        row.on_set = on_set
+        if name in self._stored and not read_only:
+            try:
+                row.value = self._checked(row, self._stored[name])
+            except InvalidArgument as error:
+                logger.warning("%s: the default is used: %s", self._path, error)
+        self._rows[name] = row
+        if self._extended is None:  # not before, because a camera may serve its own settings by PARAM_EXT
+            self._extended = TypedExtendedServer(self._host, _Store(self))
+
+    def _give_way(self) -> None:
+        """Leave PARAM_EXT to the settings of a camera definition."""
+        if self._rows:
+            raise InvalidArgument("a component has either parameters or the settings of a camera definition")
+        self._is_excluded = True
+
+    def set(self, name: str, value: int | float | str) -> None:
+        """Change a value from this program, and announce it. ``on_set`` is not called.
+
+        Raises:
+            InvalidArgument: there is no such parameter, or the value is not allowed.
+        """
+        row = self._row(name)
+        self._store(name, self._checked(row, value))
+        self._classic.publish(name)
+
+    def metadata(self, name: str) -> ParameterMetadata:
+        """Return unit, range and description of a parameter; InvalidArgument if there is none of this name."""
+        return self._row(name).metadata
+
+    def __getitem__(self, name: str) -> ParameterValue:
+        return self._rows[name].value
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._rows)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def _row(self, name: str) -> _Row:
+        if name not in self._rows:
+            raise InvalidArgument(
+                f"this component has no parameter {name!r}; it has: {', '.join(self._rows) or 'none'}"
+            )
+        return self._rows[name]
+
+    def _checked(self, row: _Row, value: object) -> ParameterValue:
+        metadata, name = row.metadata, row.metadata.name
+        if isinstance(value, bool):
+            raise InvalidArgument(f"{name} = {value!r} is not allowed: a number")
+        checked = checked_setting(name, value, row.type)
+        if isinstance(checked, str):
+            return checked
+        if isinstance(checked, bytes):
+            raise InvalidArgument(f"{name} = {value!r} is not allowed: a text")
+        if metadata.values and checked not in metadata.values:
+            raise InvalidArgument(f"{name} = {checked:g} is not allowed: {', '.join(map(str, metadata.values))}")
+        problem = metadata.replace(read_only=False, values={}).problem(checked)
+        if problem is not None:
+            raise InvalidArgument(problem)
+        return checked
+
+    def _store(self, name: str, value: ParameterValue) -> None:
+        row = self._rows[name]
+        if settings_equal(row.value, value):
+            return
+        row.value = value
+        if self._path is not None:
+            self._is_dirty = True
+            if self._saving is None:
+                self._saving = asyncio.get_running_loop().create_task(self._save(self._path))
+
+    def _text(self) -> str:
+        values = {name: row.value for name, row in self._rows.items() if not row.metadata.read_only}
+        return json.dumps({**self._stored, **values}, indent=1) + "\n"
+
+    async def _save(self, path: Path) -> None:
+        """Write the file in a thread, because a memory card may need seconds, until it has the last change."""
+        try:
+            while self._is_dirty:
+                self._is_dirty = False
+                write = partial(write_atomically, path, self._text())
+                await asyncio.get_running_loop().run_in_executor(None, write)
+        except OSError as error:
+            logger.error("the parameters of the component could not be saved: %s", error)
+            self._host.send_text(MavSeverity.ERROR, f"parameters could not be saved: {error.strerror}")
+        finally:
+            self._saving = None
+
+    async def aclose(self) -> None:
+        """Wait until the file has the last change."""
+        if self._saving is not None:
+            await self._saving
+
+    def json(self) -> bytes:
+        """Return the parameter metadata file (https://mavlink.io/en/services/component_information.html)."""
+        rows = [row for row in self._rows.values() if row.type != MavParamExtType.CUSTOM]
+        return json.dumps({"version": 1, "parameters": [_metadata_entry(row) for row in rows]}).encode()
+
+
+class _Store:
+    """The parameters, as the protocol servers use them."""
+
+    def __init__(self, parameters: ComponentParameters) -> None:
+        self._parameters = parameters
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(self._parameters._rows)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._parameters._rows
+
+    def __getitem__(self, name: str) -> ParameterValue:
+        return self._parameters._rows[name].value
+
+    def type(self, name: str) -> MavParamExtType:
+        return self._parameters._rows[name].type
+
+    def problem(self, name: str, value: object, type: int) -> tuple[int, int] | None:  # noqa: A002
+        row = self._parameters._rows[name]
+        if row.metadata.read_only:
+            return MavParamError.READ_ONLY, ParamAck.FAILED
+        if type != row.type:
+            return MavParamError.TYPE_MISMATCH, ParamAck.VALUE_UNSUPPORTED
+        try:
+            checked = self._parameters._checked(row, value)
+            if row.on_set is not None:
+                row.on_set(checked)
+        except InvalidArgument as error:
+            self._parameters._host.send_text(MavSeverity.WARNING, str(error))
+            return MavParamError.VALUE_OUT_OF_RANGE, ParamAck.VALUE_UNSUPPORTED
+        except Exception as error:
+            if not isinstance(error, AerokitError):
+                logger.error("on_set of parameter %s failed", name, exc_info=error)
+            self._parameters._host.send_text(MavSeverity.WARNING, f"{name}: {error or 'the value was refused'}")
+            return MavParamError.VALUE_OUT_OF_RANGE, ParamAck.FAILED
+        return None
+
+    def store(self, name: str, value: object) -> None:
+        self._parameters._store(name, self._parameters._checked(self._parameters._rows[name], value))
+
+
+def _as_stored(limit: float | None, default: ParameterValue) -> float | None:
+    """Round a limit as values are, so that the limit itself is allowed."""
+    return to_float32(limit) if limit is not None and isinstance(default, float) else limit
+
+
+def _metadata_entry(row: _Row) -> dict[str, Any]:
+    metadata = row.metadata
+    entry: dict[str, Any] = {
+        "name": metadata.name,
+        "type": "Int32" if row.type == MavParamExtType.INT32 else "Float",
+        "default": row.default,
+        "shortDesc": metadata.short_description or metadata.name,
+        "units": metadata.unit,
+        "min": metadata.minimum,
+        "max": metadata.maximum,
+        "rebootRequired": metadata.reboot_required,
+        "values": [{"value": value, "description": text} for value, text in metadata.values.items()],
+    }
+    return {key: value for key, value in entry.items() if value not in (None, "", [])}
+
+
+def _read(path: Path | None) -> dict[str, Any]:
+    """Return the stored values; empty if there is no file yet."""
+    if path is None or not path.exists():
+        return {}
+    try:
+        content = json.loads(read_text(path))
+    except ValueError as error:
+        raise FileFormatError(f"{path} is not a file of parameters: {error}") from None
+    if not isinstance(content, dict):
+        raise FileFormatError(f"{path} is not a file of parameters: it is not a JSON object")
+    return content

@@ -1,0 +1,61 @@
+"""``ComponentServices``: the protocol servers of one component, which its parts share."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING
+
+from aerokit.errors import InvalidArgument
+from aerokit.mavlink.message import Message
+from aerokit.onboard.commands import ComponentCommands
+from aerokit.protocols.servers.files import FileTree
+from aerokit.protocols.servers.intervals import MessageStreams
+
+if TYPE_CHECKING:
+    from aerokit.connection.tasks import BackgroundTasks
+    from aerokit.onboard.host import ComponentHost
+    from aerokit.onboard.parameters import ComponentParameters
+
+logger: logging.Logger = logging.getLogger("aerokit")
+
+MAX_STREAMS = 64
+MIN_STREAM_INTERVAL_S = 0.005
+
+
+class ComponentServices:
+    """Commands, streams, parameters and files in memory of one component."""
+
+    def __init__(self, host: ComponentHost, tasks: BackgroundTasks, parameters: ComponentParameters) -> None:
+        self.host, self.tasks, self.parameters = host, tasks, parameters
+        self.commands: ComponentCommands = ComponentCommands(host, tasks)
+        self.streams: MessageStreams = MessageStreams(
+            host, min_interval_s=MIN_STREAM_INTERVAL_S, max_streams=MAX_STREAMS
+        )
+        self.commands.handlers.update(self.streams.commands())
+        self.memory: FileTree = FileTree()
+
+    def add_message(self, message_type: type[Message], function: Callable[[], Message | None], hz: float) -> None:
+        """Send a message on request, and at a rate; InvalidArgument for a rate above 200 Hz or a second function."""
+        if not 0.0 <= hz <= 1.0 / MIN_STREAM_INTERVAL_S:
+            raise InvalidArgument(f"hz = {hz} is not allowed: 0 to {1.0 / MIN_STREAM_INTERVAL_S:g}")
+        if message_type.ID in self.streams.builders:
+            raise InvalidArgument(f"{message_type.NAME} already has a function")
+
+        is_failing = False
+
+        def build(_: object) -> Iterable[Message]:
+            nonlocal is_failing
+            try:
+                message = function()
+            except Exception:
+                if not is_failing:  # one line in the log, not one for each message
+                    logger.exception("the function for %s failed", message_type.NAME)
+                is_failing = True
+                return []
+            is_failing = False
+            return [] if message is None else [message]
+
+        self.streams.builders[message_type.ID] = build
+        if hz > 0:
+            self.streams.stream(message_type.ID, 1.0 / hz)

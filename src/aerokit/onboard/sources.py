@@ -1,0 +1,186 @@
+"""Measurements that a component sends to an autopilot: obstacles, traffic, landing targets, GNSS corrections."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from aerokit._internal.arguments import checks_arguments
+from aerokit.errors import InvalidArgument
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import AdsbFlags, LandingTargetType, MavFrame
+from aerokit.protocols.rtcm import fragments, rtcm_messages
+
+if TYPE_CHECKING:
+    from aerokit.onboard.host import ComponentHost
+    from aerokit.position import Position
+
+MAX_DISTANCES = 72
+_NOT_MEASURED = 0xFFFF
+
+
+@checks_arguments
+class ComponentSources:
+    """Sends measurements as this component. Each call sends one message to all; call it at the sensor's rate."""
+
+    def __init__(self, host: ComponentHost) -> None:
+        self._host = host
+        self._rtcm_sequence = 0
+
+    def _time_us(self) -> int:
+        return round(self._host.connection.unix_time() * 1e6)
+
+    def send_obstacles(
+        self,
+        distances_m: Sequence[float | None],
+        *,
+        increment_deg: float,
+        first_deg: float = 0.0,
+        min_m: float,
+        max_m: float,
+        sensor_type: int = 0,
+    ) -> None:
+        """Send the distances to obstacles around the vehicle (OBSTACLE_DISTANCE), clockwise from above.
+
+        Args:
+            distances_m: at most 72 distances; None where nothing was measured, infinity where nothing is in range.
+            increment_deg: angle between two distances, above 0.
+            first_deg: direction of the first distance from the nose.
+            min_m: smallest distance that the sensor measures, 0 to 655 m.
+            max_m: greatest distance that the sensor measures, at most 655 m.
+            sensor_type: MAV_DISTANCE_SENSOR: 0 laser, 1 ultrasound, 2 infrared, 3 radar.
+
+        Raises:
+            InvalidArgument: a value is out of range.
+            ConnectionClosed, LinkLost: the connection has ended.
+        """
+        if not 0 < len(distances_m) <= MAX_DISTANCES:
+            raise InvalidArgument(f"distances_m has {len(distances_m)} values, 1 to {MAX_DISTANCES} are allowed")
+        if not 0 <= min_m < max_m <= 655:
+            raise InvalidArgument(f"min_m, max_m = {min_m}, {max_m} are not allowed: 0 to 655, min below max")
+        if not 0 < increment_deg <= 360:
+            raise InvalidArgument(f"increment_deg = {increment_deg} is not allowed: above 0, at most 360")
+        far = round(max_m * 100) + 1
+        values = [_centimetres(distance, far) for distance in distances_m]
+        values += [_NOT_MEASURED] * (MAX_DISTANCES - len(values))
+        limits, increment = (round(min_m * 100), round(max_m * 100)), min(255, round(increment_deg))
+        frame = MavFrame.BODY_FRD
+        self._send(
+            m.ObstacleDistance(
+                self._time_us(), sensor_type, values, increment, *limits, increment_deg, first_deg, frame
+            )
+        )
+
+    def send_traffic(
+        self,
+        icao: int,
+        position: Position,
+        *,
+        callsign: str = "",
+        heading_deg: float | None = None,
+        speed_m_s: float | None = None,
+        climb_m_s: float | None = None,
+        squawk: int | None = None,
+        emitter_type: int = 0,
+        age_s: int = 0,
+    ) -> None:
+        """Send an aircraft that a receiver has detected (ADSB_VEHICLE).
+
+        Args:
+            icao: ICAO address, 0 to 16777215.
+            position: position with its altitude above mean sea level, if known.
+            callsign: at most 8 characters.
+            heading_deg: course over ground from north, 0 to 360.
+            speed_m_s: horizontal speed, 0 to 655.
+            climb_m_s: vertical speed, positive up, -327 to 327.
+            squawk: transponder code, 0 to 7777.
+            emitter_type: ADSB_EMITTER_TYPE.
+            age_s: seconds since the last contact, 0 to 255.
+
+        Raises:
+            InvalidArgument: a value is out of range.
+            ConnectionClosed, LinkLost: the connection has ended.
+        """
+        flags = AdsbFlags.VALID_COORDS
+        altitude = position.altitude_amsl_m
+        for value, flag in (
+            (altitude, AdsbFlags.VALID_ALTITUDE),
+            (heading_deg, AdsbFlags.VALID_HEADING),
+            (speed_m_s, AdsbFlags.VALID_VELOCITY),
+            (climb_m_s, AdsbFlags.VERTICAL_VELOCITY_VALID),
+            (squawk, AdsbFlags.VALID_SQUAWK),
+            (callsign or None, AdsbFlags.VALID_CALLSIGN),
+        ):
+            flags |= flag if value is not None else AdsbFlags(0)
+        if len(callsign) > 8:
+            raise InvalidArgument(f"callsign = {callsign!r} is not allowed: at most 8 characters")
+        self._send(
+            m.AdsbVehicle(
+                icao,
+                round(position.latitude_deg * 1e7),
+                round(position.longitude_deg * 1e7),
+                1,  # ADSB_ALTITUDE_TYPE_GEOMETRIC
+                round((altitude or 0.0) * 1000),
+                round((heading_deg or 0.0) * 100),
+                round((speed_m_s or 0.0) * 100),
+                round((climb_m_s or 0.0) * 100),
+                callsign,
+                emitter_type,
+                age_s,
+                int(flags),
+                squawk or 0,
+            )
+        )
+
+    def send_landing_target(
+        self, right_deg: float, down_deg: float, distance_m: float, *, target_number: int = 0
+    ) -> None:
+        """Send the direction of a landing beacon from the camera or receiver (LANDING_TARGET), in the body frame.
+
+        Args:
+            right_deg: angle to the right of straight down, -90 to 90.
+            down_deg: angle towards the tail from straight down, -90 to 90: positive is behind, as image y is.
+            distance_m: distance to the beacon, 0 or more.
+            target_number: number of the beacon, 0 to 255.
+
+        Raises:
+            InvalidArgument: a value is out of range.
+            ConnectionClosed, LinkLost: the connection has ended.
+        """
+        for name, angle in (("right_deg", right_deg), ("down_deg", down_deg)):
+            if not -90 <= angle <= 90:
+                raise InvalidArgument(f"{name} = {angle} is not allowed: -90 to 90")
+        if not 0 <= distance_m < math.inf:
+            raise InvalidArgument(f"distance_m = {distance_m} is not allowed: 0 or more")
+        angles = (math.radians(right_deg), math.radians(down_deg))
+        kind = LandingTargetType.LIGHT_BEACON
+        frame = MavFrame.BODY_FRD
+        self._send(m.LandingTarget(self._time_us(), target_number, frame, *angles, distance_m, 0.0, 0.0, type=kind))
+
+    def send_corrections(self, rtcm: bytes) -> None:
+        """Send GNSS corrections (RTCM 3) in GPS_RTCM_DATA messages.
+
+        Args:
+            rtcm: whole RTCM messages, of at most 720 bytes each.
+
+        Raises:
+            InvalidArgument: a message is incomplete, damaged or longer; nothing was sent.
+            ConnectionClosed, LinkLost: the connection has ended.
+        """
+        for message in rtcm_messages(rtcm):
+            for piece in fragments(message, self._rtcm_sequence):
+                self._send(piece)
+            self._rtcm_sequence += 1
+
+    def _send(self, message: m.ObstacleDistance | m.AdsbVehicle | m.LandingTarget | m.GpsRtcmData) -> None:
+        self._host.connection.raise_if_ended()
+        self._host.send(message)
+
+
+def _centimetres(distance_m: float | None, far: int) -> int:
+    if distance_m is None or math.isnan(distance_m):
+        return _NOT_MEASURED
+    if distance_m < 0:
+        raise InvalidArgument(f"distances_m has {distance_m}: 0 or more, or None")
+    return far if math.isinf(distance_m) else min(far, round(distance_m * 100))

@@ -1,0 +1,221 @@
+"""Commands of the camera protocol (https://mavlink.io/en/services/camera.html)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import CameraCapFlags, CameraMode, MavCmd, MavResult
+from aerokit.protocols.servers.camera import AsyncHandler, CameraDevice, camera_settings
+from aerokit.protocols.servers.commands import ReceivedCommand, whole
+
+if TYPE_CHECKING:
+    from aerokit.protocols.servers.commands import CommandHandler
+    from aerokit.protocols.servers.intervals import MessageStreams
+
+_CAN_ALWAYS_CAPTURE = CameraCapFlags.CAN_CAPTURE_IMAGE_IN_VIDEO_MODE
+_CAN_ALWAYS_RECORD = CameraCapFlags.CAN_CAPTURE_VIDEO_IN_IMAGE_MODE
+
+
+def camera_commands(camera: CameraDevice) -> dict[int, AsyncHandler]:
+    """Return handlers by MAV_CMD."""
+    pictures, videos, settings = _Pictures(camera), _Videos(camera), _Settings(camera)
+    return {
+        MavCmd.IMAGE_START_CAPTURE: pictures.start,
+        MavCmd.IMAGE_STOP_CAPTURE: pictures.stop,
+        MavCmd.DO_DIGICAM_CONTROL: pictures.control,
+        MavCmd.STORAGE_FORMAT: pictures.format,
+        MavCmd.VIDEO_START_CAPTURE: videos.start,
+        MavCmd.VIDEO_STOP_CAPTURE: videos.stop,
+        MavCmd.VIDEO_START_STREAMING: lambda command: videos.stream(command, runs=True),
+        MavCmd.VIDEO_STOP_STREAMING: lambda command: videos.stream(command, runs=False),
+        MavCmd.SET_CAMERA_MODE: settings.set_mode,
+        MavCmd.SET_CAMERA_ZOOM: settings.set_zoom,
+        MavCmd.SET_CAMERA_FOCUS: settings.set_focus,
+        MavCmd.SET_CAMERA_SOURCE: settings.set_source,
+        MavCmd.RESET_CAMERA_SETTINGS: settings.reset,
+        MavCmd.CAMERA_TRACK_POINT: lambda command: camera.tracking.track_point(command),
+        MavCmd.CAMERA_TRACK_RECTANGLE: lambda command: camera.tracking.track_rectangle(command),
+        MavCmd.CAMERA_STOP_TRACKING: lambda command: camera.tracking.stop(command),
+    }
+
+
+def legacy_requests(streams: MessageStreams) -> dict[int, CommandHandler]:
+    """Return handlers of the older requests that REQUEST_MESSAGE supersedes."""
+    wanted: dict[int, int] = {
+        MavCmd.REQUEST_CAMERA_INFORMATION: m.CameraInformation.ID,
+        MavCmd.REQUEST_CAMERA_SETTINGS: m.CameraSettings.ID,
+        MavCmd.REQUEST_CAMERA_CAPTURE_STATUS: m.CameraCaptureStatus.ID,
+        MavCmd.REQUEST_STORAGE_INFORMATION: m.StorageInformation.ID,
+        MavCmd.REQUEST_VIDEO_STREAM_INFORMATION: m.VideoStreamInformation.ID,
+        MavCmd.REQUEST_VIDEO_STREAM_STATUS: m.VideoStreamStatus.ID,
+        MavCmd.REQUEST_CAMERA_IMAGE_CAPTURE: m.CameraImageCaptured.ID,
+    }
+
+    def handler(message_id: int) -> CommandHandler:
+        return lambda command: streams.answer_with(message_id, replace(command, param2=command.param1))
+
+    return {command: handler(message_id) for command, message_id in wanted.items()}
+
+
+class _Pictures:
+    """Commands for images, series of images and the memory card."""
+
+    def __init__(self, camera: CameraDevice) -> None:
+        self._camera = camera
+        self._last_number = 0
+
+    async def start(self, command: ReceivedCommand) -> int:
+        """Take images if param 1 is 0 or 1 (this camera). A repeated sequence number (param 4) takes no image."""
+        camera, captures = self._camera, self._camera.captures
+        interval = command.param2 if math.isfinite(command.param2) else 0.0
+        count, number = whole(command.param3), whole(command.param4)
+        in_wrong_mode = _has_wrong_mode(camera, CameraMode.VIDEO, _CAN_ALWAYS_CAPTURE)
+        if not camera.can(CameraCapFlags.CAPTURE_IMAGE):
+            return MavResult.UNSUPPORTED
+        if not _is_own(command.param1) or interval < 0 or count < 0 or in_wrong_mode:
+            return MavResult.DENIED
+        if count == 1 and number > 0 and number == self._last_number:
+            return MavResult.ACCEPTED
+        if captures.is_busy:
+            return MavResult.TEMPORARILY_REJECTED
+        if not camera.has_space():
+            return MavResult.FAILED
+        self._last_number = number if count == 1 else 0
+        captures.take_series(interval, count)
+        return MavResult.ACCEPTED
+
+    async def stop(self, command: ReceivedCommand) -> int:
+        if not _is_own(command.param1):
+            return MavResult.DENIED
+        self._camera.captures.stop()
+        return MavResult.ACCEPTED
+
+    async def control(self, command: ReceivedCommand) -> int:
+        """DO_DIGICAM_CONTROL of the older protocol; param 5 is 1 to take an image."""
+        if command.x == 1:
+            self._camera.captures.take()
+        return MavResult.ACCEPTED
+
+    async def format(self, command: ReceivedCommand) -> int:
+        """Param 2 is 1 to format, param 3 is 1 to reset the image log."""
+        camera, captures = self._camera, self._camera.captures
+        if not _is_own(command.param1):
+            return MavResult.DENIED
+        if captures.is_busy or captures.is_recording:
+            return MavResult.TEMPORARILY_REJECTED
+        if command.param2 == 1.0:
+            await camera.format_storage()
+        if command.param3 == 1.0:
+            captures.clear()
+        return MavResult.ACCEPTED
+
+
+class _Videos:
+    """Commands for recording and streaming."""
+
+    def __init__(self, camera: CameraDevice) -> None:
+        self._camera = camera
+
+    async def start(self, command: ReceivedCommand) -> int:
+        """Param 2 is the rate of CAMERA_CAPTURE_STATUS during the recording, in Hz."""
+        camera, captures = self._camera, self._camera.captures
+        if not camera.can(CameraCapFlags.CAPTURE_VIDEO):
+            return MavResult.UNSUPPORTED
+        if _has_wrong_mode(camera, CameraMode.IMAGE, _CAN_ALWAYS_RECORD) or command.param2 < 0:
+            return MavResult.DENIED
+        if captures.is_recording:
+            return MavResult.TEMPORARILY_REJECTED
+        if camera.free_mib <= 0:
+            return MavResult.FAILED
+        await camera.start_video()
+        captures.record(1.0 / command.param2 if command.param2 else 0.0)
+        return MavResult.ACCEPTED
+
+    async def stop(self, _: ReceivedCommand) -> int:
+        if self._camera.captures.is_recording:
+            await self._camera.stop_video()
+            self._camera.captures.stop_recording()
+            self._camera.host.send(self._camera.captures.status())
+        return MavResult.ACCEPTED
+
+    async def stream(self, command: ReceivedCommand, *, runs: bool) -> int:
+        """Param 1 is the stream; 0 selects all."""
+        camera, number = self._camera, whole(command.param1)
+        available = range(1, len(camera.streams) + 1)
+        if not available or number not in (0, *available):
+            return MavResult.DENIED if available else MavResult.UNSUPPORTED
+        chosen = set(available) if number == 0 else {number}
+        await camera.switch_stream(chosen, on=runs)
+        if runs:
+            camera.running_streams |= chosen
+        else:
+            camera.running_streams -= chosen
+        return MavResult.ACCEPTED
+
+
+class _Settings:
+    """Commands for mode, zoom and focus; each of them sends CAMERA_SETTINGS."""
+
+    def __init__(self, camera: CameraDevice) -> None:
+        self._camera = camera
+
+    async def set_mode(self, command: ReceivedCommand) -> int:
+        camera, mode = self._camera, whole(command.param2)
+        if not camera.can(CameraCapFlags.HAS_MODES):
+            return MavResult.UNSUPPORTED
+        modes = {
+            CameraMode.IMAGE: CameraCapFlags.CAPTURE_IMAGE,
+            CameraMode.VIDEO: CameraCapFlags.CAPTURE_VIDEO,
+            CameraMode.IMAGE_SURVEY: CameraCapFlags.HAS_IMAGE_SURVEY_MODE,
+        }
+        if mode not in modes or not camera.can(modes[CameraMode(mode)]):
+            return MavResult.DENIED
+        if camera.captures.is_busy or camera.captures.is_recording:
+            return MavResult.TEMPORARILY_REJECTED
+        await camera.set_mode(mode)
+        camera.mode = mode
+        return self._send_settings()
+
+    async def set_zoom(self, command: ReceivedCommand) -> int:
+        camera = self._camera
+        if not camera.can(CameraCapFlags.HAS_BASIC_ZOOM):
+            return MavResult.UNSUPPORTED
+        if not await camera.set_zoom(whole(command.param1), command.param2):
+            return MavResult.DENIED
+        return self._send_settings()
+
+    async def set_focus(self, command: ReceivedCommand) -> int:
+        camera = self._camera
+        if not camera.can(CameraCapFlags.HAS_BASIC_FOCUS):
+            return MavResult.UNSUPPORTED
+        if not await camera.set_focus(whole(command.param1), command.param2):
+            return MavResult.DENIED
+        return self._send_settings()
+
+    async def set_source(self, command: ReceivedCommand) -> int:
+        source = whole(command.param2)
+        if not await self._camera.set_source(source):
+            return MavResult.DENIED
+        self._camera.source = source
+        return MavResult.ACCEPTED
+
+    async def reset(self, command: ReceivedCommand) -> int:
+        if command.param1 == 1.0:
+            await self._camera.reset_settings()
+        return self._send_settings()
+
+    def _send_settings(self) -> int:
+        self._camera.host.send(camera_settings(self._camera))
+        return MavResult.ACCEPTED
+
+
+def _is_own(device: float) -> bool:
+    """Return True if param 1 selects this camera: 0 (all), 1 (the only one), or NaN, which MAVSDK sends."""
+    return math.isnan(device) or device in (0.0, 1.0)
+
+
+def _has_wrong_mode(camera: CameraDevice, wrong: int, unless: int) -> bool:
+    return camera.can(CameraCapFlags.HAS_MODES) and camera.mode == wrong and not camera.can(unless)

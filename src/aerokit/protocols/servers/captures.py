@@ -1,0 +1,233 @@
+"""Images, videos and tracking of a camera server."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Protocol
+
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import CameraCapFlags, CameraTrackingMode, MavResult
+from aerokit.mavlink.enums import CameraTrackingStatusFlags as Flags
+from aerokit.mavlink.enums import CameraTrackingTargetData as Target
+from aerokit.mavlink.messages import CameraCaptureStatus, CameraImageCaptured
+
+if TYPE_CHECKING:
+    from aerokit.protocols.servers.commands import ReceivedCommand
+    from aerokit.protocols.servers.host import ServerHost
+
+_IDLE, _CAPTURING, _WAITING, _WAITING_AND_CAPTURING = 0, 1, 2, 3
+_UNLIMITED = -1
+
+MIN_STATUS_INTERVAL_S = 0.02
+"""Least time between two CAMERA_CAPTURE_STATUS, whatever rate a client asks for."""
+
+# Creates CAMERA_IMAGE_CAPTURED from the keywords image_index, capture_result and file_url.
+Shot = Callable[..., CameraImageCaptured]
+
+
+class ImagingDevice(Protocol):
+    """The camera, as its captures and its tracking use it; see `CameraDevice`."""
+
+    shutter_s: float
+    max_images: int
+
+    @property
+    def host(self) -> ServerHost: ...
+
+    @property
+    def free_mib(self) -> float: ...
+
+    def can(self, *flags: int) -> bool: ...
+
+    def expose(self, done: Callable[[Shot | None], None]) -> None: ...
+
+    def failed_shot(self) -> Shot: ...
+
+    def store_image(self, image: CameraImageCaptured) -> str | None: ...
+
+    async def track(self, place: tuple[float, ...]) -> None: ...
+
+
+class Captures:
+    """Series of images, videos, and the image log. An image begins when the device has finished the one before."""
+
+    def __init__(self, camera: ImagingDevice) -> None:
+        self._camera = camera
+        self.images: list[CameraImageCaptured] = []
+        """Images since the image log was last cleared, by image index."""
+        self.interval_s: float = 0.0
+        """Interval of the series."""
+        self._remaining = 0
+        self._is_open = False
+        self._is_late = False
+        self._series = 0
+        self._recording_since = math.nan
+
+    def switch_off(self) -> None:
+        """Abort everything, as a power cut does; images stay."""
+        self._remaining, self._is_open, self._is_late, self._recording_since = 0, False, False, math.nan
+        self._series += 1
+
+    @property
+    def is_busy(self) -> bool:
+        """True while an image is being taken or a series runs."""
+        return self._is_open or self._remaining != 0
+
+    @property
+    def is_recording(self) -> bool:
+        return not math.isnan(self._recording_since)
+
+    def take(self) -> None:
+        self.take_series(0.0, 1)
+
+    def take_series(self, interval_s: float, count: int) -> None:
+        """Take an image every ``interval_s`` seconds, the first at once; ``count`` 0 continues until `stop`."""
+        self.interval_s = interval_s if count != 1 else 0.0
+        self._remaining = count or _UNLIMITED
+        self._series += 1
+        self._open(self._series)
+
+    def stop(self) -> None:
+        """End a series; the current image is completed."""
+        self._remaining = 0
+
+    def clear(self) -> None:
+        """Clear the image log; the next index is 0."""
+        self.images.clear()
+
+    def _open(self, series: int) -> None:
+        camera = self._camera
+        if series != self._series or self._remaining == 0:
+            return
+        if self._is_open:
+            self._is_late = True
+            return
+        self._remaining = max(_UNLIMITED, self._remaining - 1) if self._remaining > 0 else _UNLIMITED
+        self._is_open = True
+        camera.expose(lambda shot: self._finish(series, shot))
+        if self._remaining:
+            wait = max(self.interval_s, camera.shutter_s)
+            camera.host.call_later(wait, lambda: self._open(series))
+
+    def _finish(self, series: int, shot: Shot | None) -> None:
+        """Log and announce an image. ``shot`` is None if the device could not take it."""
+        if series != self._series:
+            return
+        self._is_open = False
+        camera, index = self._camera, len(self.images)
+        url = None if shot is None else camera.store_image(shot(image_index=index, capture_result=1))
+        make = camera.failed_shot() if shot is None else shot
+        if url is None:
+            self.stop()
+            image = make(image_index=index, capture_result=0)
+        else:
+            image = make(image_index=index, capture_result=1, file_url=url)
+            self.images.append(image)
+            del self.images[: len(self.images) - camera.max_images]
+        camera.host.send(image)
+        if not self._remaining:
+            camera.host.send(self.status())
+        elif self._is_late:
+            self._is_late = False
+            self._open(series)
+
+    def record(self, status_interval_s: float) -> None:
+        """Note the start of a video; sends CAMERA_CAPTURE_STATUS at this interval, or never for 0."""
+        self._recording_since = self._camera.host.now
+        self._camera.host.send(self.status())
+        if 0.0 < status_interval_s < math.inf:
+            self._send_status_every(self._recording_since, max(MIN_STATUS_INTERVAL_S, status_interval_s))
+
+    def stop_recording(self) -> float:
+        """Note the end of the video and return its length in seconds; 0 if there was none."""
+        if not self.is_recording:
+            return 0.0
+        seconds = self._camera.host.now - self._recording_since
+        self._recording_since = math.nan
+        return seconds
+
+    def _send_status_every(self, recording: float, interval_s: float) -> None:
+        def send_status() -> None:
+            if self._recording_since == recording:
+                self._camera.host.send(self.status())
+                self._send_status_every(recording, interval_s)
+
+        self._camera.host.call_later(interval_s, send_status)
+
+    def status(self) -> CameraCaptureStatus:
+        camera = self._camera
+        is_series = self._remaining != 0 and self.interval_s > 0.0
+        busy = (_WAITING_AND_CAPTURING if self._is_open else _WAITING) if is_series else int(self._is_open)
+        recording_s = camera.host.now - self._recording_since if self.is_recording else 0.0
+        return CameraCaptureStatus(
+            time_boot_ms=camera.host.time_boot_ms,
+            image_status=busy,
+            video_status=int(self.is_recording),
+            image_interval=self.interval_s if is_series else 0.0,
+            recording_time_ms=round(recording_s * 1000),
+            available_capacity=camera.free_mib,
+            image_count=len(self.images),
+        )
+
+
+_UNKNOWN = math.nan
+
+
+class Tracking:
+    """Tracking of a point or a rectangle in the image; call ``lose()`` to lose the target."""
+
+    def __init__(self, camera: ImagingDevice) -> None:
+        self._camera = camera
+        self.reset()
+
+    def reset(self) -> None:
+        self.mode: CameraTrackingMode = CameraTrackingMode.NONE
+        self.place: tuple[float, ...] = ()
+        """x, y and radius of a point; or left, top, right and bottom of a rectangle; shares of the image."""
+        self.is_lost: bool = False
+
+    def lose(self) -> None:
+        """Lose the target."""
+        self.is_lost = True
+
+    async def track_point(self, command: ReceivedCommand) -> int:
+        place = (command.param1, command.param2, command.param3)
+        return await self._track(CameraCapFlags.HAS_TRACKING_POINT, CameraTrackingMode.POINT, place)
+
+    async def track_rectangle(self, command: ReceivedCommand) -> int:
+        place = (command.param1, command.param2, command.param3, command.param4)
+        return await self._track(CameraCapFlags.HAS_TRACKING_RECTANGLE, CameraTrackingMode.RECTANGLE, place)
+
+    async def _track(self, capability: int, mode: CameraTrackingMode, place: tuple[float, ...]) -> int:
+        if not self._camera.can(capability):
+            return MavResult.UNSUPPORTED
+        if not all(0.0 <= share <= 1.0 for share in place):
+            return MavResult.DENIED
+        await self._camera.track(place)
+        self.mode = mode
+        self.place = place
+        self.is_lost = False
+        return MavResult.ACCEPTED
+
+    async def stop(self, _: ReceivedCommand) -> int:
+        if not self._camera.can(CameraCapFlags.HAS_TRACKING_POINT, CameraCapFlags.HAS_TRACKING_RECTANGLE):
+            return MavResult.UNSUPPORTED
+        await self._camera.track(())
+        self.reset()
+        return MavResult.ACCEPTED
+
+    @property
+    def flags(self) -> int:
+        """CAMERA_TRACKING_STATUS_FLAGS."""
+        if self.mode == CameraTrackingMode.NONE:
+            return 0
+        return Flags.ERROR if self.is_lost else Flags.ACTIVE
+
+    def image_status(self) -> m.CameraTrackingImageStatus:
+        is_point = self.mode == CameraTrackingMode.POINT
+        x, y, radius = self.place if is_point else (_UNKNOWN,) * 3
+        is_rectangle = self.mode == CameraTrackingMode.RECTANGLE
+        left, top, right, bottom = self.place if is_rectangle else (_UNKNOWN,) * 4
+        mode = int(self.mode)
+        return m.CameraTrackingImageStatus(self.flags, mode, Target.IN_STATUS, x, y, radius, left, top, right, bottom)

@@ -1,0 +1,246 @@
+"""Commands: COMMAND_LONG and COMMAND_INT with their acknowledgement (https://mavlink.io/en/services/command.html)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from aerokit.mavlink.enums import MavFrame, MavResult
+from aerokit.mavlink.messages import CommandAck, CommandCancel, CommandInt, CommandLong
+from aerokit.protocols.servers.host import Channel, ServerHost, sender_of
+
+
+@dataclass(frozen=True)
+class ReceivedCommand:
+    """A command received as COMMAND_LONG or COMMAND_INT.
+
+    ``x`` and ``y`` are params 5 and 6 as sent; positions are in degrees in COMMAND_LONG, in degrees times 1e7 in
+    COMMAND_INT.
+    """
+
+    command: int
+    param1: float
+    param2: float
+    param3: float
+    param4: float
+    x: float
+    y: float
+    z: float
+    frame: int | None
+    """MAV_FRAME of a COMMAND_INT; None for COMMAND_LONG."""
+    channel: Channel
+    sender: tuple[int, int]
+    confirmation: int = 0
+    """Number of earlier transmissions of this COMMAND_LONG."""
+
+    @property
+    def is_long(self) -> bool:
+        """True if it was sent as COMMAND_LONG."""
+        return self.frame is None
+
+    @property
+    def params(self) -> tuple[float, float, float, float, float, float, float]:
+        """Params 1 to 7 as sent."""
+        return (self.param1, self.param2, self.param3, self.param4, self.x, self.y, self.z)
+
+    def place(self) -> tuple[int, int]:
+        """Return latitude and longitude in degrees times 1e7."""
+        scale = 1e7 if self.is_long else 1
+        return (whole(self.x * scale), whole(self.y * scale))
+
+    @property
+    def altitude_frame(self) -> int:
+        """MAV_FRAME of ``z``; a COMMAND_LONG is relative to home."""
+        return MavFrame.GLOBAL_RELATIVE_ALT if self.frame is None else self.frame
+
+
+@dataclass(frozen=True)
+class CommandProgress:
+    """Answer to a command that takes time: IN_PROGRESS with each percentage, then ``result``."""
+
+    percents: tuple[int, ...]
+    interval_s: float
+    result: int = MavResult.ACCEPTED
+    finish: Callable[[], None] | None = None
+    """Called right before the result is sent."""
+
+
+# Returns a MAV_RESULT, a CommandProgress, or None if it sends the acknowledgement itself.
+CommandHandler = Callable[[ReceivedCommand], "int | CommandProgress | None"]
+
+
+class CommandDispatcher:
+    """Dispatches commands to handlers and sends COMMAND_ACK to the sender.
+
+    Messages that a handler sends precede the acknowledgement. A command without a handler is UNSUPPORTED. ``refusal``
+    returns the MAV_RESULT of a command to refuse before its handler is called, else None.
+    """
+
+    def __init__(
+        self,
+        host: ServerHost,
+        handlers: dict[int, CommandHandler],
+        refusal: Callable[[ReceivedCommand], int | None] = lambda _: None,
+    ) -> None:
+        self._host = host
+        self._handlers = handlers
+        self._refusal = refusal
+        host.on(CommandLong, self._on_long)
+        host.on(CommandInt, self._on_int)
+
+    def _on_long(self, message: CommandLong, channel: Channel) -> None:
+        numbers = (message.param1, message.param2, message.param3, message.param4)
+        place = (message.param5, message.param6, message.param7)
+        sender, confirmation = sender_of(message), message.confirmation
+        self.execute(ReceivedCommand(message.command, *numbers, *place, None, channel, sender, confirmation))
+
+    def _on_int(self, message: CommandInt, channel: Channel) -> None:
+        numbers = (message.param1, message.param2, message.param3, message.param4)
+        place = (message.x, message.y, message.z)
+        self.execute(ReceivedCommand(message.command, *numbers, *place, message.frame, channel, sender_of(message)))
+
+    def execute(self, command: ReceivedCommand) -> None:
+        """Refuse a command, or dispatch it."""
+        if (refused := self._refusal(command)) is not None:
+            self.answer(command, refused)
+            return
+        self.dispatch(command)
+
+    def dispatch(self, command: ReceivedCommand) -> None:
+        """Call the handler and answer."""
+        answer = self.handle(command)
+        if isinstance(answer, CommandProgress):
+            self.report(command, answer, lambda: self.answer(command, answer.result))
+        elif answer is not None:
+            self.answer(command, answer)
+
+    def handle(self, command: ReceivedCommand) -> int | CommandProgress | None:
+        """Call the handler."""
+        handler = self._handlers.get(command.command)
+        return MavResult.UNSUPPORTED if handler is None else handler(command)
+
+    def report(self, command: ReceivedCommand, progress: CommandProgress, answer: Callable[[], None]) -> None:
+        """Send IN_PROGRESS with each percentage, then call ``finish`` and ``answer``."""
+        for number, percent in enumerate(progress.percents):
+            self._host.call_later(
+                number * progress.interval_s,
+                lambda percent=percent: self.answer(command, MavResult.IN_PROGRESS, percent),  # type: ignore[misc]
+            )
+
+        def finish() -> None:
+            if progress.finish is not None:
+                progress.finish()
+            answer()
+
+        self._host.call_later(max(1, len(progress.percents)) * progress.interval_s, finish)
+
+    def answer(self, command: ReceivedCommand, result: int, progress: int = 0, detail: int = 0) -> None:
+        """Send an acknowledgement; ``detail`` is its ``result_param2``."""
+        system, component = command.sender
+        ack = CommandAck(command.command, result, progress, detail, system, component)
+        self._host.send(ack, command.channel)
+
+
+MAX_RUNNING_COMMANDS = 16
+"""Commands that a component executes at once; further ones are TEMPORARILY_REJECTED."""
+PROGRESS_DELAY_S = 0.1
+"""Seconds before the first IN_PROGRESS, so that a quick command is acknowledged once."""
+PROGRESS_INTERVAL_S = 0.5
+UNKNOWN_PROGRESS = 255
+
+
+RESULT_MAX_AGE_S = 5.0
+"""Seconds for which a result is sent again instead of executing a repeated command."""
+
+
+class Outcome(NamedTuple):
+    """Result of a command: fields of COMMAND_ACK."""
+
+    result: int
+    progress: int = 0
+    detail: int = 0
+
+
+class RunningCommand:
+    """A command that is being executed; ``cancel`` is called by COMMAND_CANCEL."""
+
+    def __init__(self, command: ReceivedCommand, cancel: Callable[[], None]) -> None:
+        self.command = command
+        self.progress: int = UNKNOWN_PROGRESS
+        """Percent; 255 if unknown."""
+        self.cancel = cancel
+
+
+class RunningCommands:
+    """Commands that take time: IN_PROGRESS while they run, COMMAND_CANCEL, and at most one of each MAV_CMD.
+
+    A repeated transmission (COMMAND_LONG with a confirmation) never executes a command twice: it is answered by
+    IN_PROGRESS, or by the result if the command ended at most five seconds ago. Another command with the same MAV_CMD
+    is TEMPORARILY_REJECTED while the first one runs, as is every command above ``MAX_RUNNING_COMMANDS``.
+    """
+
+    def __init__(self, host: ServerHost, server: CommandDispatcher) -> None:
+        self._host = host
+        self._server = server
+        self._running: dict[int, RunningCommand] = {}
+        self._ended: dict[int, tuple[ReceivedCommand, Outcome, float]] = {}
+        host.on(CommandCancel, self._on_cancel)
+
+    def __len__(self) -> int:
+        return len(self._running)
+
+    def start(self, command: ReceivedCommand, cancel: Callable[[], None]) -> RunningCommand | None:
+        """Register a command. None if it must not be executed; it has been answered then."""
+        running = self._running.get(command.command)
+        if running is not None and _is_repeated(command, running.command):
+            self._server.answer(command, MavResult.IN_PROGRESS, running.progress)
+            return None
+        ended = self._ended.get(command.command)
+        if ended is not None and _is_repeated(command, ended[0]) and self._host.now - ended[2] <= RESULT_MAX_AGE_S:
+            self._server.answer(command, *ended[1])
+            return None
+        if running is not None or len(self._running) >= MAX_RUNNING_COMMANDS:
+            self._server.answer(command, MavResult.TEMPORARILY_REJECTED)
+            return None
+        running = self._running[command.command] = RunningCommand(command, cancel)
+        self._host.call_later(PROGRESS_DELAY_S, lambda: self._report_repeatedly(running))
+        return running
+
+    def report(self, running: RunningCommand, percent: int) -> None:
+        """Send IN_PROGRESS with this percentage now."""
+        running.progress = percent
+        if self._running.get(running.command.command) is running:
+            self._server.answer(running.command, MavResult.IN_PROGRESS, percent)
+
+    def _report_repeatedly(self, running: RunningCommand) -> None:
+        if self._running.get(running.command.command) is running:
+            self._server.answer(running.command, MavResult.IN_PROGRESS, running.progress)
+            self._host.call_later(PROGRESS_INTERVAL_S, lambda: self._report_repeatedly(running))
+
+    def finish(self, running: RunningCommand, outcome: Outcome) -> None:
+        """Send the result."""
+        command = running.command
+        if self._running.get(command.command) is running:
+            del self._running[command.command]
+            self._ended[command.command] = (command, outcome, self._host.now)
+            self._server.answer(command, *outcome)
+
+    def cancel_all(self) -> None:
+        """Cancel everything that runs, at the end of the component."""
+        for running in tuple(self._running.values()):
+            running.cancel()
+
+    def _on_cancel(self, message: CommandCancel, _: Channel) -> None:
+        running = self._running.get(message.command)
+        if running is not None:
+            running.cancel()
+
+
+def _is_repeated(command: ReceivedCommand, first: ReceivedCommand) -> bool:
+    return command.confirmation > 0 and (command.sender, command.params) == (first.sender, first.params)
+
+
+def whole(value: float) -> int:
+    """Return a parameter as an integer; 0 for NaN (unset) and for values beyond 32 bits."""
+    return int(value) if value == value and abs(value) < 2**31 else 0

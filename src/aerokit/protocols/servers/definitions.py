@@ -1,0 +1,105 @@
+"""PARAM_EXT server whose settings a camera definition file defines.
+
+https://mavlink.io/en/services/camera_def.html
+"""
+
+from __future__ import annotations
+
+from aerokit.errors import InvalidArgument
+from aerokit.mavlink.enums import ParamAck
+from aerokit.parameters import CameraDefinition, SettingValue
+from aerokit.parameters.parameter import setting_bytes, setting_value, settings_equal
+from aerokit.protocols.servers.host import ServerHost
+from aerokit.protocols.servers.parameters import ExtendedParameterServer
+
+_ZEROS: dict[str, SettingValue] = {"bool": False, "float": 0.0, "double": 0.0, "string": "", "custom": ""}
+
+
+class DefinedParameterServer(ExtendedParameterServer):
+    """Settings that a camera definition defines.
+
+    Write-only settings are not listed. The answer to a value that the definition does not allow is VALUE_UNSUPPORTED,
+    to setting a read-only or excluded setting FAILED.
+    """
+
+    def __init__(self, host: ServerHost, definition: CameraDefinition) -> None:
+        self.definition = definition
+        self.values: dict[str, SettingValue] = {}
+        """Current values; assign them at any time."""
+        self.slow: dict[str, float] = {}
+        """Name → seconds that setting the parameter takes; the answer is IN_PROGRESS until then."""
+        self._pending: set[str] = set()
+        super().__init__(host, self)
+        self.reset()
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the settings that are listed."""
+        return [name for name, setting in self.definition.settings.items() if not setting.write_only]
+
+    def reset(self) -> None:
+        """Restore all defaults."""
+        for name, setting in self.definition.settings.items():
+            self.values[name] = _ZEROS.get(setting.type, 0) if setting.default is None else setting.default
+
+    def refresh(self) -> None:
+        """Called before a value is sent or set; overridden to update values that the device changes."""
+
+    def can_set(self, name: str) -> bool:
+        """Return True if a setting can be changed now; otherwise the answer is FAILED."""
+        return True
+
+    def on_set(self, name: str, value: SettingValue) -> None:
+        """Called when the value of a setting has changed."""
+
+    def limited(self, name: str, value: SettingValue) -> SettingValue:
+        """Return the value to check and store instead of a received one."""
+        return value
+
+    def restart(self) -> None:
+        """Drop pending changes, as a reboot does."""
+        super().restart()
+        self._pending.clear()
+
+    def value(self, name: str) -> tuple[SettingValue, int]:
+        self.refresh()
+        return self.values[name], self.definition.settings[name].wire_type
+
+    def set(self, name: str, data: bytes, kind: int) -> tuple[int, bytes, int]:
+        own = self.definition.settings.get(name)
+        if own is None:
+            return ParamAck.VALUE_UNSUPPORTED, data, kind
+        result, value = self._verdict(name, setting_value(data, kind), kind)
+        if result == ParamAck.ACCEPTED and name in self.slow and name not in self._pending:
+            self._pending.add(name)
+            self._host.call_later(self.slow[name], lambda: self._finish_slow(name, value))
+        if name in self._pending:
+            result = ParamAck.IN_PROGRESS
+        elif result == ParamAck.ACCEPTED:
+            self._store(name, value)
+        return result, setting_bytes(self.values[name], own.wire_type), own.wire_type
+
+    def _verdict(self, name: str, value: SettingValue, kind: int) -> tuple[ParamAck, SettingValue]:
+        self.refresh()
+        own, definition = self.definition.settings[name], self.definition
+        if own.read_only or not self.can_set(name) or definition.excluded_by(name, self.values):
+            return ParamAck.FAILED, value
+        if kind != own.wire_type:
+            return ParamAck.VALUE_UNSUPPORTED, value
+        value = self.limited(name, value)
+        try:
+            return ParamAck.ACCEPTED, definition.checked(name, value, self.values)
+        except InvalidArgument:
+            return ParamAck.VALUE_UNSUPPORTED, value
+
+    def _store(self, name: str, value: SettingValue) -> None:
+        is_new = not settings_equal(self.values[name], value)
+        self.values[name] = value
+        if is_new:
+            self.on_set(name, value)
+
+    def _finish_slow(self, name: str, value: SettingValue) -> None:
+        self._pending.discard(name)
+        self._store(name, value)
+        kind = self.definition.settings[name].wire_type
+        self.acknowledge(name, setting_bytes(self.values[name], kind), kind, ParamAck.ACCEPTED)

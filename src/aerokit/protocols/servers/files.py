@@ -1,0 +1,347 @@
+"""Files that a MAVFTP server offers: an interface, and a tree of files in memory."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import Protocol
+
+from typing_extensions import Self
+
+ENOENT, EEXIST, ENOTDIR, EISDIR = 2, 17, 20, 21
+# Linux's numbers, which the firmwares send on every platform.
+EINVAL, ENFILE, EFBIG, ENOSPC, EROFS, ENOTEMPTY = 22, 23, 27, 28, 30, 39
+
+# Name and size in bytes; None for a folder.
+Entry = tuple[str, int | None]
+
+
+class FileFault(Exception):
+    """Error of a file system; ``errno`` is Linux's number."""
+
+    def __init__(self, errno: int) -> None:
+        super().__init__(f"errno {errno}")
+        self.errno = errno
+
+
+class FileHandle(ABC):
+    """A file opened by a client. Methods raise FileFault on failure."""
+
+    @abstractmethod
+    def read(self, offset: int, size: int) -> bytes:
+        """Return up to ``size`` bytes; empty at the end."""
+
+    def write(self, offset: int, data: bytes) -> None:
+        raise FileFault(EROFS)
+
+    def close(self) -> None:  # noqa: B027 - most subclasses need no cleanup
+        """Close the file; an upload takes effect now."""
+
+
+class FileSystem(Protocol):
+    """The files that a MAVFTP server offers. Paths use ``/``; methods raise FileFault on failure."""
+
+    def __contains__(self, path: str) -> bool: ...
+
+    def size(self, path: str) -> int:
+        """Return the size of a file in bytes."""
+        ...
+
+    def open(self, path: str, *, writing: bool = False, create: bool = False) -> FileHandle:
+        """Open a file; ``create`` creates a missing file and empties an existing one."""
+        ...
+
+    def entries(self, path: str) -> list[Entry]:
+        """Return the entries of a folder."""
+        ...
+
+    def truncate(self, path: str, size: int) -> None: ...
+
+    def remove_file(self, path: str) -> None: ...
+
+    def rename(self, path: str, to: str) -> None: ...
+
+    def make_folder(self, path: str) -> None: ...
+
+    def remove_folder(self, path: str) -> None: ...
+
+
+class UploadedFile(FileHandle):
+    """A file that a client writes in blocks, in any order; it takes effect when it is closed."""
+
+    def __init__(self) -> None:
+        self.content: bytearray = bytearray()
+
+    def read(self, offset: int, size: int) -> bytes:
+        raise FileFault(EINVAL)
+
+    def write(self, offset: int, data: bytes) -> None:
+        end = max(offset + len(data), self.announced_size(data) if offset == 0 else 0)
+        self.content.extend(bytes(max(0, end - len(self.content))))
+        self.content[offset : offset + len(data)] = data
+
+    def announced_size(self, data: bytes) -> int:
+        """Return the file size that the first block announces; 0 if it announces none."""
+        return 0
+
+
+class Mount(ABC):
+    """Generated files whose paths begin with a common prefix such as ``@PARAM``."""
+
+    is_listed = False
+    """True if the mount appears in the root folder and its files can be listed."""
+
+    @abstractmethod
+    def size(self, path: str) -> int:
+        """Return the size reported on opening, perhaps an estimate; raises FileFault if there is no such file."""
+
+    @abstractmethod
+    def open(self, path: str, *, writing: bool) -> FileHandle:
+        """Open a file; raises FileFault on failure."""
+
+    def entries(self) -> list[Entry]:
+        """Return the files; raises FileFault if the mount cannot be listed."""
+        raise FileFault(ENOENT)
+
+
+class TextMount(Mount):
+    """Read-only text files, such as ArduPilot's ``@SYS``. Opening a file reports a size of 100,000 bytes."""
+
+    is_listed = True
+    _PLACEHOLDER = 100_000
+
+    def __init__(self, texts: dict[str, str]) -> None:
+        self._texts = texts
+
+    def size(self, path: str) -> int:
+        if path not in self._texts:
+            raise FileFault(ENOENT)
+        return self._PLACEHOLDER
+
+    def open(self, path: str, *, writing: bool) -> FileHandle:
+        if writing:
+            raise FileFault(EROFS)
+        if path not in self._texts:
+            raise FileFault(ENOENT)
+        return _Opened(None, _File(self._texts[path].encode()))
+
+    def entries(self) -> list[Entry]:
+        return [(name, self._PLACEHOLDER) for name in self._texts]
+
+
+class _File:
+    """File content, or a function that creates it on first access."""
+
+    def __init__(self, content: bytes | Callable[[], bytes] = b"", size: int | None = None) -> None:
+        self._make = content if callable(content) else None
+        self._content = bytearray() if callable(content) else bytearray(content)
+        self._size = size
+
+    @property
+    def content(self) -> bytearray:
+        if self._make is not None:
+            self._content, self._make = bytearray(self._make()), None
+        return self._content
+
+    @property
+    def size(self) -> int:
+        """Size in bytes; does not create the content if the size was given."""
+        return self._size if self._make is not None and self._size is not None else len(self.content)
+
+
+_Folder = dict[str, "_File | _Folder"]
+
+
+class _Opened(FileHandle):
+    def __init__(self, tree: FileTree | None, file: _File) -> None:
+        self._tree = tree
+        self._file = file
+
+    def read(self, offset: int, size: int) -> bytes:
+        return bytes(self._file.content[offset : offset + size])
+
+    def write(self, offset: int, data: bytes) -> None:
+        if self._tree is None:
+            raise FileFault(EROFS)
+        content = self._file.content
+        self._tree.claim(max(0, offset + len(data) - len(content)))
+        if offset > len(content):
+            content.extend(bytes(offset - len(content)))
+        content[offset : offset + len(data)] = data
+
+
+class FileTree:
+    """Folders and files. Leading slashes, empty parts and ``.`` in paths are ignored.
+
+    ``free_bytes`` is the remaining space; None is unlimited.
+    """
+
+    def __init__(self, *, free_bytes: int | None = None) -> None:
+        self.free_bytes = free_bytes
+        self.mounts: dict[str, Mount] = {}
+        """Prefix such as ``"@PARAM"`` → mount."""
+        self._root: _Folder = {}
+
+    def put(self, path: str, content: bytes | Callable[[], bytes], *, size: int | None = None) -> Self:
+        """Create or replace a file, and its folders. A function creates the content when it is first read."""
+        folder = self._root
+        *above, name = _parts(path)
+        for part in above:
+            inner = folder.setdefault(part, {})
+            if not isinstance(inner, dict):
+                raise FileFault(ENOTDIR)
+            folder = inner
+        folder[name] = _File(content, size)
+        return self
+
+    def append(self, path: str, data: bytes) -> None:
+        """Append to a file; open handles see the new content."""
+        self._file(path).content.extend(data)
+
+    def get(self, path: str) -> bytes:
+        """Return the content of a file; raises FileFault if it does not exist."""
+        return bytes(self._file(path).content)
+
+    def __contains__(self, path: str) -> bool:
+        try:
+            self._find(path)
+        except FileFault:
+            return False
+        return True
+
+    def mounted(self, path: str) -> tuple[Mount, str] | None:
+        """Return the mount of a path and the rest of the path; None outside mounts."""
+        bare = path[1:] if path.startswith("/") else path
+        for prefix, mount in self.mounts.items():
+            if bare.startswith(prefix):
+                return mount, bare[len(prefix) :].removeprefix("/")
+        return None
+
+    def size(self, path: str) -> int:
+        """Return the size of a file in bytes; 4096 for a folder."""
+        if (inside := self.mounted(path)) is not None:
+            return inside[0].size(inside[1])
+        node = self._find(path)
+        return 4096 if isinstance(node, dict) else node.size
+
+    def open(self, path: str, *, writing: bool = False, create: bool = False) -> FileHandle:
+        """Open a file; ``create`` creates a missing file and empties an existing one."""
+        if (inside := self.mounted(path)) is not None:
+            return inside[0].open(inside[1], writing=writing)
+        if create:
+            self._create(path)
+        return _Opened(self, self._file(path))
+
+    def _create(self, path: str) -> None:
+        folder, name = self._parent(path)
+        node = folder.get(name)
+        if isinstance(node, dict):
+            raise FileFault(EISDIR)
+        if node is None:
+            self.claim(0)
+            folder[name] = _File()
+        else:
+            self.claim(-node.size)
+            node.content.clear()
+
+    def truncate(self, path: str, size: int) -> None:
+        """Cut a file to this size, or pad it with zeros."""
+        content = self._file(path).content
+        self.claim(size - len(content))
+        del content[size:]
+        content.extend(bytes(size - len(content)))
+
+    def remove_file(self, path: str) -> None:
+        folder, name = self._parent(path)
+        self.claim(-self._file(path).size)
+        del folder[name]
+
+    def rename(self, path: str, to: str) -> None:
+        """Move a file or folder; replaces an existing file."""
+        node = self._find(path)
+        folder, name = self._parent(to)
+        existing = folder.get(name)
+        if isinstance(existing, dict) and (existing or not isinstance(node, dict)):
+            raise FileFault(ENOTEMPTY if isinstance(node, dict) else EISDIR)
+        if isinstance(existing, _File) and isinstance(node, dict):
+            raise FileFault(ENOTDIR)
+        if isinstance(node, dict) and _contains(node, folder):
+            raise FileFault(EINVAL)
+        old_folder, old_name = self._parent(path)
+        del old_folder[old_name]
+        folder[name] = node
+
+    def claim(self, size: int) -> None:
+        """Reserve free bytes; a negative size releases them. Raises FileFault if there are not enough."""
+        if self.free_bytes is None:
+            return
+        if size >= 0 and (size > self.free_bytes or self.free_bytes == 0):
+            raise FileFault(ENOSPC)
+        self.free_bytes -= size
+
+    def entries(self, path: str) -> list[Entry]:
+        """Return the entries of a folder, oldest first."""
+        if (inside := self.mounted(path)) is not None:
+            if inside[1]:
+                raise FileFault(ENOENT)
+            return inside[0].entries()
+        folder = self._find(path)
+        if not isinstance(folder, dict):
+            raise FileFault(ENOTDIR)
+        return [(name, None if isinstance(node, dict) else node.size) for name, node in folder.items()]
+
+    def make_folder(self, path: str) -> None:
+        """Create a folder; its parent folder must exist."""
+        folder, name = self._parent(path)
+        if name in folder:
+            raise FileFault(EEXIST)
+        self.claim(0)
+        folder[name] = {}
+
+    def remove_folder(self, path: str) -> None:
+        folder, name = self._parent(path)
+        node = self._find(path)
+        if not isinstance(node, dict):
+            raise FileFault(ENOTDIR)
+        if node:
+            raise FileFault(ENOTEMPTY)
+        del folder[name]
+
+    def _find(self, path: str) -> _File | _Folder:
+        node: _File | _Folder = self._root
+        for part in _parts(path):
+            if not isinstance(node, dict):
+                raise FileFault(ENOTDIR)
+            if part not in node:
+                raise FileFault(ENOENT)
+            node = node[part]
+        return node
+
+    def _file(self, path: str) -> _File:
+        node = self._find(path)
+        if isinstance(node, dict):
+            raise FileFault(EISDIR)
+        return node
+
+    def _parent(self, path: str) -> tuple[_Folder, str]:
+        parts = _parts(path)
+        if not parts:
+            raise FileFault(EEXIST)
+        folder = self._find("/".join(parts[:-1]))
+        if not isinstance(folder, dict):
+            raise FileFault(ENOTDIR)
+        return folder, parts[-1]
+
+
+def _parts(path: str) -> list[str]:
+    parts: list[str] = []
+    for part in path.split("/"):
+        if part == "..":
+            del parts[-1:]
+        elif part not in ("", "."):
+            parts.append(part)
+    return parts
+
+
+def _contains(folder: _Folder, other: _Folder) -> bool:
+    return folder is other or any(_contains(node, other) for node in folder.values() if isinstance(node, dict))

@@ -1,0 +1,420 @@
+"""MAVFTP: a server with sessions (https://mavlink.io/en/services/ftp.html)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Generic, TypeVar
+
+from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
+from aerokit.mavlink.messages import FileTransferProtocol
+from aerokit.protocols.ftp import DATA_SIZE
+from aerokit.protocols.servers.files import EFBIG, EINVAL, FileFault, FileHandle, FileSystem
+from aerokit.protocols.servers.ftp_packets import FtpPacket, crc32, leaves, path_in
+from aerokit.protocols.servers.host import Channel, ServerHost
+
+FilesT = TypeVar("FilesT", bound=FileSystem)
+
+
+class FtpRequestServer(Generic[FilesT]):
+    """Receives MAVFTP requests; subclasses answer them."""
+
+    is_enabled = True
+    """False to answer nothing, like a component without MAVFTP."""
+
+    def __init__(self, host: ServerHost, files: FilesT) -> None:
+        self.files = files
+        self._host = host
+        host.on(FileTransferProtocol, self._on_message)
+
+    @property
+    def open_sessions(self) -> int:
+        """Number of sessions that have an open file and have not timed out."""
+        raise NotImplementedError
+
+    def restart(self) -> None:
+        raise NotImplementedError
+
+    def receive(self, request: FtpPacket, channel: Channel) -> None:
+        """Handle one request; the answer is sent now or later."""
+        raise NotImplementedError
+
+    def _on_message(self, message: FileTransferProtocol, channel: Channel) -> None:
+        if self.is_enabled:
+            self.receive(FtpPacket.parse(message), channel)
+
+
+_REPLY_KEPT = 4
+_BURST_BYTES = 35_000
+_BURST_BLOCKS = 24
+_CRC_BLOCK = 65_536
+_CRC_BLOCKS_AT_ONCE = 8
+_CRC_PAUSE_S = 0.002
+_MAX_SIZE = 0xFFFFFFFF
+
+Op = MavFtpOpcode
+
+
+@dataclass(eq=False)
+class _Session:
+    """An open file."""
+
+    number: int
+    file: FileHandle
+    path: str
+    size: int
+    burst: FtpPacket | None = field(default=None, repr=False)
+    """Sequence number and offset of the next block."""
+    burst_sent: int = 0
+    """Bytes that the burst has sent."""
+
+
+@dataclass(eq=False)
+class FtpPeer:
+    """State for one client."""
+
+    channel: Channel
+    sessions: dict[int, _Session] = field(default_factory=dict)
+    used_at: float = 0.0
+    errno: int = 0
+    """Error of the latest failure."""
+    reply: FtpPacket | None = None
+    checksum: FtpPacket | None = None
+    """CalcFileCRC32 request that is being executed."""
+
+
+class SessionFtpServer(FtpRequestServer[FilesT]):
+    """MAVFTP server with several sessions for each client, and immediate answers.
+
+    A session is closed when its client has sent nothing for ``session_timeout_s``. A burst sends ``burst`` blocks every
+    ``burst_interval_s`` seconds, and none while ``is_congested()``. It ends after 35 kB, so that the client must
+    request the next one: a stranger cannot make a server send a whole file by one request. A small reply is sent again
+    if its sequence number is repeated.
+    """
+
+    burst: int = _BURST_BLOCKS
+    max_clients: ClassVar[int] = 16
+    max_sessions: ClassVar[int] = 4
+    """Sessions of one client."""
+    session_timeout_s: ClassVar[float] = 10.0
+    list_prefix: ClassVar[tuple[bytes, ...]] = ()
+    """Lines before the entries of each folder."""
+
+    def __init__(
+        self,
+        host: ServerHost,
+        files: FilesT,
+        *,
+        burst_interval_s: float = 0.005,
+        is_congested: Callable[[], bool] = lambda: False,
+    ) -> None:
+        super().__init__(host, files)
+        self.burst_interval_s = burst_interval_s
+        self._is_congested = is_congested
+        self._peers: dict[Hashable, FtpPeer] = {}
+
+    @property
+    def open_sessions(self) -> int:
+        """Number of open files."""
+        return sum(len(peer.sessions) for peer in self._peers.values())
+
+    def restart(self) -> None:
+        """Drop all sessions without closing their files, as a power cut does."""
+        self._peers.clear()
+
+    def close(self) -> None:
+        """Close all files."""
+        for peer in self._peers.values():
+            with suppress(FileFault):
+                self._close_all(peer)
+        self._peers.clear()
+
+    def _key(self, request: FtpPacket, channel: Channel) -> Hashable:
+        """Return the key of the client."""
+        return request.client
+
+    def _is_repeated(self, request: FtpPacket, last: FtpPacket) -> bool:
+        """Return True if the last reply answers this request. MAVProxy begins each operation with number 0."""
+        same = request.client == last.client and request.opcode == last.request_opcode
+        return same and request.sequence + 1 == last.sequence
+
+    def _new_number(self, peer: FtpPeer, request: FtpPacket) -> int:
+        """Return the number of a new session: the one that the client wants, as MAVProxy does, or the first free."""
+        if request.session and request.session not in peer.sessions:
+            return request.session
+        return next(number for number in range(self.max_sessions) if number not in peer.sessions)
+
+    def _fault(self, peer: FtpPeer, request: FtpPacket, fault: FileFault) -> FtpPacket:
+        """Return the answer to a request that failed."""
+        return request.refuse_errno(fault.errno)
+
+    def _peer(self, request: FtpPacket, channel: Channel) -> FtpPeer | None:
+        """Return the state of a client; None if there are too many clients with open files."""
+        key = self._key(request, channel)
+        if key not in self._peers and len(self._peers) >= self.max_clients:
+            idle = [other for other, peer in self._peers.items() if not peer.sessions and peer.checksum is None]
+            if not idle:
+                return None
+            del self._peers[idle[0]]
+        peer = self._peers.setdefault(key, FtpPeer(channel))
+        peer.channel = channel
+        return peer
+
+    def receive(self, request: FtpPacket, channel: Channel) -> None:
+        peer = self._peer(request, channel)
+        if peer is None:
+            self._host.send(request.refuse(MavFtpErr.NOSESSIONSAVAILABLE).message(), channel)
+            return
+        peer.used_at = self._host.now
+        if request.size > DATA_SIZE:
+            self._reply(peer, request.refuse(MavFtpErr.INVALIDDATASIZE))
+        elif (last := peer.reply) is not None and self._is_repeated(request, last):
+            self._host.send(last.message(), channel)
+        else:
+            self._answer(peer, request)
+
+    def _answer(self, peer: FtpPeer, request: FtpPacket) -> None:
+        handler = _HANDLERS.get(request.opcode)
+        try:
+            if handler is None:
+                answer: FtpPacket | None = request.refuse(MavFtpErr.UNKNOWNCOMMAND)
+            else:
+                answer = handler(self, peer, request)
+        except FileFault as fault:
+            answer = self._fault(peer, request, fault)
+        peer.reply = None
+        if answer is None:
+            return
+        if answer.opcode == Op.NAK:
+            answer = self._refusal(peer, request, answer).replace(offset=request.offset)
+        self._reply(peer, answer)
+
+    def _refusal(self, peer: FtpPeer, request: FtpPacket, answer: FtpPacket) -> FtpPacket:
+        return answer
+
+    def _reply(self, peer: FtpPeer, answer: FtpPacket) -> None:
+        if answer.size <= _REPLY_KEPT and answer.data[:1] != bytes([MavFtpErr.NOSESSIONSAVAILABLE]):
+            peer.reply = answer
+        self._host.send(answer.message(), peer.channel)
+
+    def _none(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
+        return request.acknowledge(request.data[: request.size], offset=request.offset)
+
+    def _terminate(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
+        session = peer.sessions.pop(request.session, None)
+        if session is None:
+            return request.refuse(MavFtpErr.INVALIDSESSION)
+        session.burst = None
+        session.file.close()
+        return request.acknowledge(offset=request.offset)
+
+    def _reset(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
+        self._close_all(peer)
+        return request.acknowledge(offset=request.offset)
+
+    def _close_all(self, peer: FtpPeer) -> None:
+        sessions = list(peer.sessions.values())
+        peer.sessions.clear()
+        fault = None
+        for session in sessions:
+            session.burst = None
+            try:
+                session.file.close()
+            except FileFault as error:
+                fault = error
+        if fault is not None:
+            raise fault
+
+    def _open(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
+        if len(peer.sessions) >= self.max_sessions:
+            return request.refuse(MavFtpErr.NOSESSIONSAVAILABLE)
+        path = path_in(request.data[: request.size])
+        if leaves(path):
+            return request.refuse(MavFtpErr.FILEPROTECTED)
+        reading = request.opcode == Op.OPENFILERO
+        size = self._size(path, reading=reading)
+        if size > _MAX_SIZE:
+            raise FileFault(EFBIG)
+        create = request.opcode == Op.CREATEFILE or (not reading and path not in self.files)
+        file = self.files.open(path, writing=not reading, create=create)
+        number = self._new_number(peer, request)
+        session = peer.sessions[number] = _Session(number, file, path, size)
+        self._watch(peer, session)
+        return request.acknowledge(size.to_bytes(4, "little"), offset=request.offset, session=number)
+
+    def _size(self, path: str, *, reading: bool) -> int:
+        try:
+            return self.files.size(path)
+        except FileFault:
+            if reading:
+                raise
+            return 0
+
+    def _watch(self, peer: FtpPeer, session: _Session) -> None:
+        """Schedule the time-out that closes the session."""
+
+        def close_if_due() -> None:
+            if peer.sessions.get(session.number) is not session:
+                return
+            if self._host.now < (end := peer.used_at + self.session_timeout_s):
+                self._host.call_at(end, close_if_due)
+                return
+            peer.reply = None
+            del peer.sessions[session.number]
+            session.burst = None
+            with suppress(FileFault):
+                session.file.close()
+
+        self._host.call_at(peer.used_at + self.session_timeout_s, close_if_due)
+
+    def _read(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
+        session = peer.sessions.get(request.session)
+        if session is None:
+            return request.refuse(MavFtpErr.INVALIDSESSION)
+        if request.offset >= session.size:
+            return request.refuse(MavFtpErr.EOF)
+        return request.acknowledge(session.file.read(request.offset, request.size), offset=request.offset)
+
+    def _write(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
+        session = peer.sessions.get(request.session)
+        if session is None:
+            return request.refuse(MavFtpErr.INVALIDSESSION)
+        session.file.write(request.offset, request.data[: request.size])
+        return request.acknowledge(request.size.to_bytes(4, "little"), offset=request.offset)
+
+    def _start_burst(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket | None:
+        session = peer.sessions.get(request.session)
+        if session is None:
+            return request.refuse(MavFtpErr.INVALIDSESSION)
+        is_running = session.burst is not None
+        session.burst, session.burst_sent = request.replace(sequence=request.sequence + 1 & 0xFFFF), 0
+        if not is_running:
+            self._host.call_later(self.burst_interval_s, lambda: self._send_blocks(peer, session))
+        return None
+
+    def _send_blocks(self, peer: FtpPeer, session: _Session) -> None:
+        for number in range(0 if self._is_congested() else self.burst):
+            if session.burst is None:
+                return
+            self._send_block(peer, session, session.burst, may_end=number == self.burst - 1)
+        if session.burst is None:
+            return
+        self._host.call_later(self.burst_interval_s, lambda: self._send_blocks(peer, session))
+
+    def _send_block(self, peer: FtpPeer, session: _Session, burst: FtpPacket, *, may_end: bool) -> None:
+        own = session.number
+        answer = burst.acknowledge(offset=burst.offset, session=own).replace(sequence=burst.sequence)
+        refusal = burst.refuse(MavFtpErr.EOF).replace(sequence=burst.sequence, offset=burst.offset, session=own)
+        try:
+            data = b"" if burst.offset >= session.size else session.file.read(burst.offset, DATA_SIZE)
+        except FileFault as fault:
+            data, peer.errno = b"", fault.errno
+            refusal = refusal.replace(data=bytes([MavFtpErr.FAILERRNO, peer.errno]), size=2)
+        if not data:
+            session.burst = None
+            self._reply(peer, refusal)
+            return
+        session.burst_sent += len(data)
+        complete = may_end and session.burst_sent > _BURST_BYTES
+        self._reply(peer, answer.replace(data=data, size=len(data), burst_complete=complete))
+        following = burst.replace(sequence=burst.sequence + 1 & 0xFFFF, offset=burst.offset + len(data))
+        session.burst = None if complete else following
+
+    def _list(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
+        path = path_in(request.data[: request.size])
+        if leaves(path):
+            return request.refuse(MavFtpErr.FILEPROTECTED)
+        entries = self.files.entries(path)
+        listing = b""
+        for text in [*self.list_prefix, *map(_line, entries)][request.offset :]:
+            if len(listing) + len(text) + 1 > DATA_SIZE:
+                break
+            listing += text + b"\0"
+        if not listing:
+            return request.refuse(MavFtpErr.EOF)
+        return request.acknowledge(listing, offset=request.offset)
+
+    def _change(self, request: FtpPacket, change: Callable[[str], None]) -> FtpPacket:
+        path = path_in(request.data[: request.size])
+        if leaves(path):
+            return request.refuse(MavFtpErr.FILEPROTECTED)
+        change(path)
+        return request.acknowledge(offset=request.offset)
+
+    def _remove_file(self, _: FtpPeer, request: FtpPacket) -> FtpPacket:
+        return self._change(request, self.files.remove_file)
+
+    def _remove_folder(self, _: FtpPeer, request: FtpPacket) -> FtpPacket:
+        return self._change(request, self.files.remove_folder)
+
+    def _make_folder(self, _: FtpPeer, request: FtpPacket) -> FtpPacket:
+        return self._change(request, self.files.make_folder)
+
+    def _truncate(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
+        return self._change(request, lambda path: self.files.truncate(path, request.offset))
+
+    def _rename(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
+        first, _, rest = request.data[: request.size].partition(b"\0")
+        if len(first) + 2 >= request.size:
+            return self._fault(peer, request, FileFault(EINVAL))
+        path, to = path_in(first), path_in(rest)
+        if leaves(path) or leaves(to):
+            return request.refuse(MavFtpErr.FILEPROTECTED)
+        self.files.rename(path, to)
+        return request.acknowledge(offset=request.offset)
+
+    def _crc32(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket | None:
+        """Compute a checksum in slices, so that a large file does not keep the host from its other work."""
+        path = path_in(request.data[: request.size])
+        if leaves(path):
+            return request.refuse(MavFtpErr.FILEPROTECTED)
+        is_repeated = peer.checksum is not None and peer.checksum.sequence == request.sequence
+        if not is_repeated:
+            peer.checksum = request
+            self._continue_crc32(peer, request, self.files.open(path), 0, 0)
+        return None
+
+    def _continue_crc32(self, peer: FtpPeer, request: FtpPacket, file: FileHandle, offset: int, checksum: int) -> None:
+        data = b"?"
+        try:
+            for _ in range(_CRC_BLOCKS_AT_ONCE):
+                if not (data := file.read(offset, _CRC_BLOCK)):
+                    break
+                checksum, offset = crc32(data, checksum), offset + len(data)
+            answer = request.acknowledge(checksum.to_bytes(4, "little"), offset=request.offset)
+        except FileFault as fault:
+            data, answer = b"", self._fault(peer, request, fault)
+        if peer.checksum is request and data:
+            self._host.call_later(_CRC_PAUSE_S, lambda: self._continue_crc32(peer, request, file, offset, checksum))
+            return
+        with suppress(FileFault):
+            file.close()
+        if peer.checksum is request:  # otherwise a newer request has replaced it
+            peer.checksum, peer.used_at = None, self._host.now
+            self._reply(peer, answer)
+
+
+def _line(entry: tuple[str, int | None]) -> bytes:
+    name, size = entry
+    return (f"D{name}" if size is None else f"F{name}\t{size}").encode()
+
+
+_HANDLERS: dict[int, Callable[[SessionFtpServer[Any], FtpPeer, FtpPacket], FtpPacket | None]] = {
+    Op.NONE: lambda server, peer, request: server._none(peer, request),
+    Op.TERMINATESESSION: lambda server, peer, request: server._terminate(peer, request),
+    Op.RESETSESSION: lambda server, peer, request: server._reset(peer, request),
+    Op.LISTDIRECTORY: lambda server, peer, request: server._list(peer, request),
+    Op.OPENFILERO: lambda server, peer, request: server._open(peer, request),
+    Op.READFILE: lambda server, peer, request: server._read(peer, request),
+    Op.CREATEFILE: lambda server, peer, request: server._open(peer, request),
+    Op.WRITEFILE: lambda server, peer, request: server._write(peer, request),
+    Op.REMOVEFILE: lambda server, peer, request: server._remove_file(peer, request),
+    Op.CREATEDIRECTORY: lambda server, peer, request: server._make_folder(peer, request),
+    Op.REMOVEDIRECTORY: lambda server, peer, request: server._remove_folder(peer, request),
+    Op.OPENFILEWO: lambda server, peer, request: server._open(peer, request),
+    Op.TRUNCATEFILE: lambda server, peer, request: server._truncate(peer, request),
+    Op.RENAME: lambda server, peer, request: server._rename(peer, request),
+    Op.CALCFILECRC: lambda server, peer, request: server._crc32(peer, request),
+    Op.BURSTREADFILE: lambda server, peer, request: server._start_burst(peer, request),
+}

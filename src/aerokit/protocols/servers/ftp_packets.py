@@ -1,0 +1,72 @@
+"""MAVFTP packets, and checksums of files (https://mavlink.io/en/services/ftp.html)."""
+
+from __future__ import annotations
+
+import zlib
+
+from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
+from aerokit.mavlink.messages import FileTransferProtocol
+from aerokit.protocols.ftp import FtpMessage
+from aerokit.protocols.servers.files import EEXIST, ENOENT, FileSystem
+from aerokit.protocols.servers.host import sender_of
+
+
+class FtpPacket(FtpMessage):
+    """Payload of a FILE_TRANSFER_PROTOCOL message, and its client. ``data`` of a request always has 239 bytes."""
+
+    client: tuple[int, int] = (0, 0)
+    """System and component id of the client."""
+
+    @classmethod
+    def parse(cls, message: FileTransferProtocol) -> FtpPacket:
+        return cls.decode(message.payload, cut=False).replace(client=sender_of(message))
+
+    def message(self) -> FileTransferProtocol:
+        return FileTransferProtocol(0, *self.client, self.encode())
+
+    def acknowledge(self, data: bytes = b"", *, offset: int = 0, session: int | None = None) -> FtpPacket:
+        """Return the ACK of this request."""
+        session = self.session if session is None else session
+        sequence, opcode = self.sequence + 1 & 0xFFFF, MavFtpOpcode.ACK
+        return FtpPacket(
+            sequence,
+            opcode,
+            session,
+            len(data),
+            self.opcode,
+            offset=offset & 0xFFFFFFFF,
+            data=data,
+            client=self.client,
+        )
+
+    def refuse(self, code: int, errno: int | None = None) -> FtpPacket:
+        """Return the NAK of this request."""
+        data = bytes([code]) if errno is None else bytes([code, errno])
+        return self.acknowledge(data).replace(opcode=MavFtpOpcode.NAK)
+
+    def refuse_errno(self, errno: int) -> FtpPacket:
+        """Return the NAK for an errno; MAVFTP has separate error codes for EEXIST and ENOENT."""
+        own = {EEXIST: MavFtpErr.FILEEXISTS, ENOENT: MavFtpErr.FILENOTFOUND}.get(errno)
+        return self.refuse(MavFtpErr.FAILERRNO, errno) if own is None else self.refuse(own)
+
+
+def path_in(data: bytes) -> str:
+    return data.partition(b"\0")[0].decode("utf-8", "replace")
+
+
+def crc32(data: bytes, start: int = 0) -> int:
+    """Return the checksum of CalcFileCRC32: CRC32 without the inversions before and after."""
+    return zlib.crc32(data, start ^ 0xFFFFFFFF) ^ 0xFFFFFFFF
+
+
+def read_crc32(files: FileSystem, path: str, block: int) -> int:
+    """Return the checksum of a file, read in blocks; raises FileFault if it cannot be read."""
+    file, checksum, offset = files.open(path), 0, 0
+    while data := file.read(offset, block):
+        checksum, offset = crc32(data, checksum), offset + len(data)
+    file.close()
+    return checksum
+
+
+def leaves(path: str) -> bool:
+    return ".." in path.split("/")

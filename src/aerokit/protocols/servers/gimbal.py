@@ -1,0 +1,337 @@
+"""Gimbal protocol v2: a gimbal device with its manager (https://mavlink.io/en/services/gimbal_v2.html)."""
+
+from __future__ import annotations
+
+import math
+
+from aerokit._internal.rotations import euler_from_quaternion, quaternion_from_euler
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import (
+    GimbalDeviceCapFlags,
+    GimbalDeviceFlags,
+    GimbalManagerCapFlags,
+    MavCmd,
+    MavFrame,
+    MavResult,
+)
+from aerokit.mavlink.enums import GimbalManagerFlags as Flags
+from aerokit.protocols.servers.commands import CommandHandler, ReceivedCommand, whole
+from aerokit.protocols.servers.host import Channel, ServerHost, sender_of
+from aerokit.protocols.servers.intervals import Builder
+
+_Can = GimbalDeviceCapFlags
+ALL_CAPABILITIES = (
+    _Can.HAS_RETRACT | _Can.HAS_NEUTRAL
+    | _Can.HAS_ROLL_AXIS | _Can.HAS_ROLL_LOCK
+    | _Can.HAS_PITCH_AXIS | _Can.HAS_PITCH_LOCK
+    | _Can.HAS_YAW_AXIS | _Can.HAS_YAW_FOLLOW | _Can.HAS_YAW_LOCK
+    | _Can.SUPPORTS_YAW_IN_EARTH_FRAME
+)  # fmt: skip
+_FIRMWARE = 1 << 24
+
+
+Owner = tuple[int, int]
+Angles = tuple[float, float, float]
+Place = tuple[int, int, float]  # latitude and longitude in degrees times 1e7, altitude above mean sea level in metres
+_NOBODY: Owner = (0, 0)
+
+
+class GimbalMount:
+    """A gimbal device with its gimbal manager: its state, and methods that the protocol calls.
+
+    Angles are in radians: roll and pitch from the horizon, yaw from the vehicle's nose or, if locked, from north.
+    """
+
+    vendor: str = "aerokit"
+    model: str = "gimbal"
+    capabilities: int = ALL_CAPABILITIES
+    """GIMBAL_DEVICE_CAP_FLAGS."""
+    can_point_at_positions: bool = True
+    limits: tuple[tuple[float, float], ...]
+    """Minimum and maximum of roll, pitch and yaw in radians."""
+    slew_rad_s: float
+    primary: Owner = _NOBODY
+    """System and component id of the component in control; zeros if none."""
+    secondary: Owner = _NOBODY
+    """System and component id of the component in secondary control; zeros if none."""
+    flags: int = 0
+    """GIMBAL_MANAGER_FLAGS of the latest command."""
+
+    @property
+    def host(self) -> ServerHost:
+        """The component."""
+        raise NotImplementedError
+
+    @property
+    def device_id(self) -> int:
+        """Component id of the gimbal, by which commands select it."""
+        raise NotImplementedError
+
+    @property
+    def is_yaw_locked(self) -> bool:
+        """True if the yaw is fixed relative to north."""
+        raise NotImplementedError
+
+    def angles(self) -> Angles:
+        """Return roll and pitch (from the horizon) and yaw (from the vehicle's nose)."""
+        raise NotImplementedError
+
+    def angles_from_north(self) -> Angles:
+        """Return roll, pitch and yaw from north."""
+        roll, pitch, yaw = self.angles()
+        return (roll, pitch, math.remainder(yaw + self.heading(), math.tau))
+
+    def heading(self) -> float:
+        """Return the heading of the vehicle; 0 if unknown."""
+        return 0.0
+
+    def home_altitude_m(self) -> float:
+        """Return the altitude of home above mean sea level; 0 if unknown."""
+        return 0.0
+
+    def point(self, angles: Angles, flags: int, *, locked: bool) -> None:
+        """Turn to angles; yaw is relative to north if ``locked``, otherwise to the nose."""
+        raise NotImplementedError
+
+    def turn(self, rates: Angles, flags: int, *, locked: bool) -> None:
+        """Turn at these rates in radians per second."""
+        raise NotImplementedError
+
+    def look_at(self, place: Place | None) -> None:
+        """Point at a position; None points ahead again."""
+        raise NotImplementedError
+
+    def follow(self, system_id: int) -> None:
+        """Point at another vehicle once its position is received."""
+        raise NotImplementedError
+
+    def update_followed(self, system_id: int, place: Place) -> None:
+        """Update the position of the followed vehicle."""
+
+    def set_control(self, primary: Owner, secondary: Owner) -> None:
+        """Set primary and secondary control; a change is announced at once."""
+        if (primary, secondary) != (self.primary, self.secondary):
+            self.primary = primary
+            self.secondary = secondary
+            self.host.send(gimbal_manager_status(self))
+
+    def is_in_control(self, sender: Owner) -> bool:
+        """Return True if this sender is in control."""
+        return sender in (self.primary, self.secondary) and sender != _NOBODY
+
+
+def gimbal_manager_status(gimbal: GimbalMount) -> m.GimbalManagerStatus:
+    device = gimbal.device_id
+    return m.GimbalManagerStatus(gimbal.host.time_boot_ms, _flags(gimbal), device, *gimbal.primary, *gimbal.secondary)
+
+
+def _flags(gimbal: GimbalMount) -> int:
+    """Return GIMBAL_MANAGER_FLAGS; roll and pitch are always relative to the horizon."""
+    flags = gimbal.flags & (Flags.RETRACT | Flags.NEUTRAL) | Flags.ROLL_LOCK | Flags.PITCH_LOCK
+    if gimbal.is_yaw_locked:
+        return flags | Flags.YAW_LOCK | Flags.YAW_IN_EARTH_FRAME
+    return flags | Flags.YAW_IN_VEHICLE_FRAME
+
+
+def _attitude_status(gimbal: GimbalMount) -> m.GimbalDeviceAttitudeStatus:
+    is_from_north = gimbal.is_yaw_locked
+    angles = gimbal.angles_from_north() if is_from_north else gimbal.angles()
+    return m.GimbalDeviceAttitudeStatus(
+        target_system=0,
+        target_component=0,
+        time_boot_ms=gimbal.host.time_boot_ms,
+        flags=_flags(gimbal) | GimbalDeviceFlags.ACCEPTS_YAW_IN_EARTH_FRAME,
+        q=quaternion_from_euler(*angles),
+        angular_velocity_x=math.nan,
+        angular_velocity_y=math.nan,
+        angular_velocity_z=math.nan,
+        failure_flags=0,
+        delta_yaw=gimbal.heading(),
+        delta_yaw_velocity=math.nan,
+        gimbal_device_id=0,
+    )
+
+
+def _device_information(gimbal: GimbalMount) -> m.GimbalDeviceInformation:
+    (roll_min, roll_max), (pitch_min, pitch_max), (yaw_min, yaw_max) = gimbal.limits
+    return m.GimbalDeviceInformation(
+        time_boot_ms=gimbal.host.time_boot_ms,
+        vendor_name=gimbal.vendor,
+        model_name=gimbal.model,
+        custom_name="",
+        firmware_version=_FIRMWARE,
+        hardware_version=_FIRMWARE,
+        uid=gimbal.device_id,
+        cap_flags=gimbal.capabilities,
+        custom_cap_flags=0,
+        roll_min=roll_min,
+        roll_max=roll_max,
+        pitch_min=pitch_min,
+        pitch_max=pitch_max,
+        yaw_min=yaw_min,
+        yaw_max=yaw_max,
+    )
+
+
+def _manager_information(gimbal: GimbalMount) -> m.GimbalManagerInformation:
+    capabilities = int(gimbal.capabilities)
+    if gimbal.can_point_at_positions:
+        capabilities |= GimbalManagerCapFlags.CAN_POINT_LOCATION_GLOBAL
+    limits = (end for axis in gimbal.limits for end in axis)
+    return m.GimbalManagerInformation(gimbal.host.time_boot_ms, capabilities, gimbal.device_id, *limits)
+
+
+_UNCHANGED, _SENDER, _RELEASE = -1, -2, -3
+_RETRACTED_ANGLES = (0.0, 0.0, 0.0)
+_ABSOLUTE = frozenset({MavFrame.GLOBAL, MavFrame.GLOBAL_INT})
+
+
+class GimbalRequests:
+    """Handles the commands and messages to one gimbal."""
+
+    def __init__(self, gimbal: GimbalMount) -> None:
+        self._gimbal = gimbal
+
+    def _is_mine(self, device_id: float) -> bool:
+        return whole(device_id) in (0, self._gimbal.device_id)
+
+    def configure(self, command: ReceivedCommand) -> int:
+        """Set primary (params 1, 2) and secondary control (3, 4): an id, -1 unchanged, -2 the sender, -3 release."""
+        gimbal, sender = self._gimbal, command.sender
+        numbers = [command.param1, command.param2, command.param3, command.param4]
+        if not self._is_mine(command.z) or not all(_RELEASE <= number <= 255 for number in numbers):
+            return MavResult.DENIED
+        primary = _owner(gimbal.primary, (int(numbers[0]), int(numbers[1])), sender)
+        secondary = _owner(gimbal.secondary, (int(numbers[2]), int(numbers[3])), sender)
+        gimbal.set_control(primary, secondary)
+        return MavResult.ACCEPTED
+
+    def pitch_and_yaw(self, command: ReceivedCommand) -> int:
+        """Apply angles in degrees or rates in degrees per second; NaN means not given."""
+        if not self._is_mine(command.z) or not self._gimbal.is_in_control(command.sender):
+            return MavResult.DENIED
+        pitch, yaw, pitch_rate, yaw_rate = map(
+            math.radians, (command.param1, command.param2, command.param3, command.param4)
+        )
+        done = self.apply(whole(command.x), (0.0, pitch, yaw), (0.0, pitch_rate, yaw_rate))
+        return MavResult.ACCEPTED if done else MavResult.DENIED
+
+    def look_at(self, command: ReceivedCommand) -> int:
+        """Point at a position; the altitude of a COMMAND_LONG is above mean sea level."""
+        gimbal = self._gimbal
+        if not gimbal.can_point_at_positions:
+            return MavResult.UNSUPPORTED
+        if not self._is_mine(command.param1) or not gimbal.is_in_control(command.sender):
+            return MavResult.DENIED
+        frame = MavFrame.GLOBAL if command.is_long else command.altitude_frame
+        altitude = command.z
+        if frame not in _ABSOLUTE:
+            altitude += gimbal.home_altitude_m()
+        gimbal.look_at((*command.place(), altitude))
+        return MavResult.ACCEPTED
+
+    def follow(self, command: ReceivedCommand) -> int:
+        """Follow the vehicle whose system id is param 1."""
+        gimbal = self._gimbal
+        if not gimbal.can_point_at_positions:
+            return MavResult.UNSUPPORTED
+        if not self._is_mine(command.param2) or not gimbal.is_in_control(command.sender):
+            return MavResult.DENIED
+        gimbal.follow(whole(command.param1))
+        return MavResult.ACCEPTED
+
+    def on_global_position(self, message: m.GlobalPositionInt, _: Channel) -> None:
+        """Update the target if the message comes from the followed vehicle."""
+        self._gimbal.update_followed(sender_of(message)[0], (message.lat, message.lon, message.alt * 1e-3))
+
+    def look_ahead(self, command: ReceivedCommand) -> int:
+        gimbal = self._gimbal
+        if not gimbal.can_point_at_positions:
+            return MavResult.UNSUPPORTED
+        if not self._is_mine(command.param1) or not gimbal.is_in_control(command.sender):
+            return MavResult.DENIED
+        gimbal.look_at(None)
+        return MavResult.ACCEPTED
+
+    def apply(self, flags: int, angles: Angles, rates: Angles) -> bool:
+        """Apply the angles, or the rates if an angle is NaN; return False if both contain NaN."""
+        gimbal = self._gimbal
+        locked = bool(flags & (Flags.YAW_LOCK | Flags.YAW_IN_EARTH_FRAME))
+        if flags & (Flags.RETRACT | Flags.NEUTRAL):
+            gimbal.point(_RETRACTED_ANGLES, flags, locked=False)
+        elif not any(map(math.isnan, angles)):
+            gimbal.point(angles, flags, locked=locked)
+        elif not any(map(math.isnan, rates)):
+            gimbal.turn(rates, flags, locked=locked)
+        else:
+            return False
+        return True
+
+    def on_attitude(self, message: m.GimbalManagerSetAttitude, _: Channel) -> None:
+        if self._is_mine(message.gimbal_device_id) and self._gimbal.is_in_control(sender_of(message)):
+            self._apply_attitude(message)
+
+    def on_device_attitude(self, message: m.GimbalDeviceSetAttitude, _: Channel) -> None:
+        """Apply the set-point of another manager, such as an autopilot, unless a third component is in control."""
+        if self._gimbal.primary in ((0, 0), sender_of(message)):
+            self._apply_attitude(message)
+
+    def _apply_attitude(self, message: m.GimbalManagerSetAttitude | m.GimbalDeviceSetAttitude) -> None:
+        has_angles = not any(map(math.isnan, message.q))
+        angles = euler_from_quaternion(*message.q) if has_angles else (math.nan,) * 3
+        rates = (message.angular_velocity_x, message.angular_velocity_y, message.angular_velocity_z)
+        self.apply(message.flags, (angles[0], angles[1], angles[2]), rates)
+
+    def on_pitch_and_yaw(self, message: m.GimbalManagerSetPitchyaw, _: Channel) -> None:
+        if self._is_mine(message.gimbal_device_id) and self._gimbal.is_in_control(sender_of(message)):
+            self.apply(message.flags, (0.0, message.pitch, message.yaw), (0.0, message.pitch_rate, message.yaw_rate))
+
+    def on_manual_control(self, message: m.GimbalManagerSetManualControl, _: Channel) -> None:
+        """Apply angles, or rates from -1 to 1 as shares of the slew rate."""
+        gimbal = self._gimbal
+        if self._is_mine(message.gimbal_device_id) and gimbal.is_in_control(sender_of(message)):
+            rates = (0.0, message.pitch_rate * gimbal.slew_rad_s, message.yaw_rate * gimbal.slew_rad_s)
+            self.apply(message.flags, (0.0, message.pitch, message.yaw), rates)
+
+
+def _owner(before: Owner, wanted: tuple[int, int], sender: Owner) -> Owner:
+    """Return the component in control after one pair of params; (0, 0) is none."""
+    if _SENDER in wanted:
+        return sender
+    if _RELEASE in wanted:
+        return (0, 0) if before == sender else before
+    if _UNCHANGED in wanted:
+        return before
+    return wanted
+
+
+def gimbal_commands(gimbal: GimbalMount) -> dict[int, CommandHandler]:
+    """Return handlers by MAV_CMD."""
+    control = GimbalRequests(gimbal)
+    return {
+        MavCmd.DO_GIMBAL_MANAGER_CONFIGURE: control.configure,
+        MavCmd.DO_GIMBAL_MANAGER_PITCHYAW: control.pitch_and_yaw,
+        MavCmd.DO_SET_ROI_LOCATION: control.look_at,
+        MavCmd.DO_SET_ROI_SYSID: control.follow,
+        MavCmd.DO_SET_ROI_NONE: control.look_ahead,
+    }
+
+
+def gimbal_builders(gimbal: GimbalMount) -> dict[int, Builder]:
+    """Return builders by message id."""
+    return {
+        m.GimbalDeviceInformation.ID: lambda _: [_device_information(gimbal)],
+        m.GimbalDeviceAttitudeStatus.ID: lambda _: [_attitude_status(gimbal)],
+        m.GimbalManagerInformation.ID: lambda _: [_manager_information(gimbal)],
+        m.GimbalManagerStatus.ID: lambda _: [gimbal_manager_status(gimbal)],
+    }
+
+
+def listen_for_gimbal(gimbal: GimbalMount) -> None:
+    """Register handlers of the other messages."""
+    host, control = gimbal.host, GimbalRequests(gimbal)
+    host.on(m.GimbalManagerSetAttitude, control.on_attitude)
+    host.on(m.GimbalManagerSetPitchyaw, control.on_pitch_and_yaw)
+    host.on(m.GimbalManagerSetManualControl, control.on_manual_control)
+    host.on(m.GimbalDeviceSetAttitude, control.on_device_attitude)
+    host.on(m.GlobalPositionInt, control.on_global_position)

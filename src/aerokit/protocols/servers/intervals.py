@@ -1,0 +1,107 @@
+"""Messages on request: REQUEST_MESSAGE, and streams set by SET_MESSAGE_INTERVAL.
+
+https://mavlink.io/en/mavgen_python/howto_requestmessages.html
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+from aerokit.mavlink.enums import MavCmd, MavResult
+from aerokit.mavlink.message import Message
+from aerokit.mavlink.messages import MessageInterval
+from aerokit.protocols.servers.commands import CommandHandler, ReceivedCommand, whole
+from aerokit.protocols.servers.host import Channel, ServerHost
+
+# Returns the current messages of one id; the argument is the REQUEST_MESSAGE command, None for a stream.
+Builder = Callable[["ReceivedCommand | None"], "Iterable[Message]"]
+
+
+class MessageStreams:
+    """Sends the messages that ``builders`` returns by message id, once or periodically.
+
+    A stream with an interval below ``min_interval_s`` is sent at that interval. At most ``max_streams`` run.
+    """
+
+    def __init__(self, host: ServerHost, *, min_interval_s: float = 0.0, max_streams: int | None = None) -> None:
+        self.builders: dict[int, Builder] = {}
+        self._host = host
+        self._min_interval_s = min_interval_s
+        self._max_streams = max_streams
+        self._streams: dict[tuple[Channel, int], _Stream] = {}
+
+    def commands(self) -> dict[int, CommandHandler]:
+        """Return the handlers by MAV_CMD."""
+        return {
+            MavCmd.REQUEST_MESSAGE: self._request_message,
+            MavCmd.SET_MESSAGE_INTERVAL: self._set_interval,
+            MavCmd.GET_MESSAGE_INTERVAL: self._get_interval,
+        }
+
+    def clear(self) -> None:
+        """Stop all streams."""
+        self._streams.clear()
+
+    def stream(self, message_id: int, interval_s: float, channel: Channel = None) -> bool:
+        """Stream messages of this id on one channel, or on all if None; an interval of 0 stops the stream.
+
+        Returns False if there are too many streams already.
+        """
+        key = (channel, message_id)
+        if interval_s <= 0.0:
+            self._streams.pop(key, None)
+            return True
+        interval_s = max(interval_s, self._min_interval_s)
+        before = self._streams.get(key)
+        if before is None and self._max_streams is not None and len(self._streams) >= self._max_streams:
+            return False
+        if before is None or before.interval_s != interval_s:
+            self._streams[key] = _Stream(interval_s)
+            self._send_stream(key, self._streams[key])
+        return True
+
+    def _send_stream(self, key: tuple[Channel, int], stream: _Stream) -> None:
+        if self._streams.get(key) is not stream:  # Replaced by another stream, perhaps with the same interval.
+            return
+        channel, message_id = key
+        try:
+            for message in self.builders[message_id](None):
+                self._host.send(message, channel)
+        finally:  # an error of a builder, which the host reports, does not end the stream
+            self._host.call_later(stream.interval_s, lambda: self._send_stream(key, stream))
+
+    def answer_with(self, message_id: int, command: ReceivedCommand) -> int:
+        """Send the requested messages; return DENIED for an unknown id, FAILED if there is no message."""
+        builder = self.builders.get(message_id)
+        if builder is None:
+            return MavResult.DENIED
+        messages = list(builder(command))
+        for message in messages:
+            self._host.send(message, command.channel)
+        return MavResult.ACCEPTED if messages else MavResult.FAILED
+
+    def _request_message(self, command: ReceivedCommand) -> int:
+        return self.answer_with(whole(command.param1), command)
+
+    def _set_interval(self, command: ReceivedCommand) -> int:
+        """Set or stop a stream. 0 (default rate) stops it as -1 does, because streams have no default rate."""
+        message_id = whole(command.param1)
+        if message_id not in self.builders:
+            return MavResult.DENIED
+        self._streams.pop((None, message_id), None)
+        is_possible = self.stream(message_id, whole(command.param2) / 1e6, command.channel)
+        return MavResult.ACCEPTED if is_possible else MavResult.TEMPORARILY_REJECTED
+
+    def _get_interval(self, command: ReceivedCommand) -> int:
+        message_id = whole(command.param1)
+        if message_id not in self.builders:
+            return MavResult.DENIED
+        of_all = self._streams.get((None, message_id), _Stream(0.0))
+        interval = self._streams.get((command.channel, message_id), of_all).interval_s
+        self._host.send(MessageInterval(message_id, round(interval * 1e6) or -1), command.channel)
+        return MavResult.ACCEPTED
+
+
+class _Stream:
+    def __init__(self, interval_s: float) -> None:
+        self.interval_s = interval_s

@@ -1,0 +1,288 @@
+"""Missions, fences and rally points: messages of items, and a server (https://mavlink.io/en/services/mission.html)."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from aerokit.errors import InvalidArgument
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import MavMissionResult, MavMissionType
+from aerokit.missions import MissionItem
+from aerokit.missions.wire import from_wire, to_wire, to_wire_float
+from aerokit.protocols.servers.host import Channel, ServerHost, sender_of
+
+AnyItem = m.MissionItemInt | m.MissionItem
+AnyRequest = m.MissionRequestInt | m.MissionRequest
+
+
+def item_from(message: AnyItem) -> MissionItem:
+    """Convert a MISSION_ITEM_INT or MISSION_ITEM to an item; does not scale ``x`` and ``y``."""
+    numbers = (
+        message.param1,
+        message.param2,
+        message.param3,
+        message.param4,
+        message.x,
+        message.y,
+        message.z,
+    )
+    return MissionItem(message.command, message.frame, *numbers, autocontinue=bool(message.autocontinue))
+
+
+def item_message_int(
+    item: MissionItem, seq: int, to: tuple[int, int], mission_type: int, *, current: bool
+) -> m.MissionItemInt:
+    system, component = to
+    return to_wire(
+        item,
+        seq,
+        target_system=system,
+        target_component=component,
+        mission_type=mission_type,
+        current=current,
+    )
+
+
+def item_message_float(
+    item: MissionItem,
+    place: tuple[float, float],
+    seq: int,
+    to: tuple[int, int],
+    mission_type: int,
+    current: int = 0,
+) -> m.MissionItem:
+    """Create a MISSION_ITEM; ``place`` becomes ``x`` and ``y``."""
+    head = (*to, seq, item.frame, item.command, current, int(item.autocontinue))
+    numbers = (item.param1, item.param2, item.param3, item.param4)
+    return m.MissionItem(*head, *numbers, *place, item.z, mission_type)
+
+
+ITEM_RETRY_INTERVAL_S = 0.5
+TRANSFER_TIMEOUT_S = 5.0
+MAX_ITEMS = 2000
+_TYPES = (MavMissionType.MISSION, MavMissionType.FENCE, MavMissionType.RALLY)
+_R = MavMissionResult
+
+# Decides about an uploaded list: (MAV_MISSION_TYPE, items, answer); ``answer`` takes the MAV_MISSION_RESULT.
+Judge = Callable[[int, tuple[MissionItem, ...], Callable[[int], None]], None]
+
+
+@dataclass(eq=False)
+class _Upload:
+    client: tuple[int, int]
+    channel: Channel
+    mission_type: int
+    count: int
+    received_at: float
+    items: list[MissionItem] = field(default_factory=list)
+    uses_int: bool = True
+    is_judged: bool = False
+    """True while ``judge`` decides."""
+
+
+class MissionServer:
+    """Stores missions, fences and rally points; downloads need no state, and one upload runs at a time.
+
+    An upload replaces a list as a whole after ``judge`` has accepted it. Items are requested again every half second;
+    an upload without progress for five seconds ends with OPERATION_CANCELLED. Another client is DENIED meanwhile.
+    """
+
+    def __init__(
+        self,
+        host: ServerHost,
+        judge: Judge,
+        *,
+        on_set_current: Callable[[int], bool] = lambda _: False,
+        capacity: int = MAX_ITEMS,
+    ) -> None:
+        self.lists: dict[int, tuple[MissionItem, ...]] = dict.fromkeys(_TYPES, ())
+        """MAV_MISSION_TYPE → items."""
+        self.current: int = 0
+        """Index of the current item of the mission."""
+        self._host = host
+        self._judge = judge
+        self._on_set_current = on_set_current
+        self._capacity = capacity
+        self._upload: _Upload | None = None
+        host.on(m.MissionRequestList, self._on_request_list)
+        host.on(m.MissionRequestInt, self._on_request)
+        host.on(m.MissionRequest, self._on_request)
+        host.on(m.MissionCount, self._on_count)
+        host.on(m.MissionItemInt, self._on_item)
+        host.on(m.MissionItem, self._on_item)
+        host.on(m.MissionAck, self._on_ack)
+        host.on(m.MissionClearAll, self._on_clear)
+        host.on(m.MissionSetCurrent, self._on_set_current_message)
+
+    @property
+    def transfer_is_open(self) -> bool:
+        """True during an upload."""
+        return self._upload is not None
+
+    def opaque_id(self, mission_type: int) -> int:
+        """Return a checksum of a list; 0 if it is empty."""
+        items = self.lists.get(mission_type, ())
+        data = b"".join(self._item(item, seq, (0, 0), mission_type).encode() for seq, item in enumerate(items))
+        return (zlib.crc32(data) or 1) if items else 0
+
+    def current_message(self) -> m.MissionCurrent:
+        mission = self.lists[MavMissionType.MISSION]
+        fence, rally = self.opaque_id(MavMissionType.FENCE), self.opaque_id(MavMissionType.RALLY)
+        total = len(mission)
+        return m.MissionCurrent(
+            self.current, total, mission_id=self.opaque_id(0), fence_id=fence, rally_points_id=rally
+        )
+
+    def replace(self, mission_type: int, items: Sequence[MissionItem]) -> None:
+        """Replace a list."""
+        self.lists[mission_type] = tuple(items)
+        if mission_type == MavMissionType.MISSION:
+            self.current = 0
+
+    def set_current(self, seq: int) -> bool:
+        """Ask the component to continue at an item, and announce it; False if it is refused."""
+        if not 0 <= seq < len(self.lists[MavMissionType.MISSION]) or not self._on_set_current(seq):
+            return False
+        self.current = seq
+        self._host.send(self.current_message())
+        return True
+
+    def _item(self, item: MissionItem, seq: int, to: tuple[int, int], mission_type: int) -> m.MissionItemInt:
+        whole = item.replace(x=round(item.x), y=round(item.y))
+        return item_message_int(whole, seq, to, mission_type, current=seq == self.current and mission_type == 0)
+
+    def _acknowledge(self, to: tuple[int, int], kind: int, result: int, channel: Channel, opaque_id: int = 0) -> None:
+        self._host.send(m.MissionAck(*to, result, kind, opaque_id), channel)
+
+    def _on_request_list(self, request: m.MissionRequestList, channel: Channel) -> None:
+        kind, to = request.mission_type, sender_of(request)
+        if kind not in self.lists:
+            self._acknowledge(to, kind, _R.UNSUPPORTED, channel)
+            return
+        self._host.send(m.MissionCount(*to, len(self.lists[kind]), kind, self.opaque_id(kind)), channel)
+
+    def _on_request(self, request: AnyRequest, channel: Channel) -> None:
+        kind, to, seq = request.mission_type, sender_of(request), request.seq
+        items = self.lists.get(kind, ())
+        if not 0 <= seq < len(items):
+            self._acknowledge(to, kind, _R.INVALID_SEQUENCE, channel)
+        elif isinstance(request, m.MissionRequestInt):
+            self._host.send(self._item(items[seq], seq, to, kind), channel)
+        else:
+            current = seq == self.current and kind == MavMissionType.MISSION
+            system, component = to
+            self._host.send(
+                to_wire_float(
+                    items[seq],
+                    seq,
+                    target_system=system,
+                    target_component=component,
+                    mission_type=kind,
+                    current=current,
+                ),
+                channel,
+            )
+
+    def _on_count(self, count: m.MissionCount, channel: Channel) -> None:
+        client, kind = sender_of(count), count.mission_type
+        before = self._upload
+        if kind not in self.lists:
+            self._acknowledge(client, kind, _R.UNSUPPORTED, channel)
+        elif before is not None and (before.client != client or before.is_judged):
+            self._acknowledge(client, kind, _R.DENIED, channel)
+        elif count.count > self._capacity:
+            self._upload = None
+            self._acknowledge(client, kind, _R.NO_SPACE, channel)
+        else:
+            self._upload = upload = _Upload(client, channel, kind, count.count, self._host.now)
+            if count.count:
+                self._request_item(upload)
+            else:
+                self._finish(upload)
+
+    def _request_item(self, upload: _Upload) -> None:
+        """Request the next item, and again until it arrives."""
+        seq = len(upload.items)
+        request = m.MissionRequestInt if upload.uses_int else m.MissionRequest
+        self._host.send(request(*upload.client, seq, upload.mission_type), upload.channel)
+
+        def check() -> None:
+            if self._upload is not upload or len(upload.items) != seq:
+                return
+            if self._host.now - upload.received_at >= TRANSFER_TIMEOUT_S:
+                self._end(upload, _R.OPERATION_CANCELLED)
+            else:
+                self._request_item(upload)
+
+        self._host.call_later(ITEM_RETRY_INTERVAL_S, check)
+
+    def _on_item(self, message: AnyItem, channel: Channel) -> None:
+        upload = self._upload
+        if upload is None or sender_of(message) != upload.client or upload.is_judged:
+            return
+        if message.mission_type != upload.mission_type or message.seq != len(upload.items):
+            return  # a late copy; the expected item is requested again
+        upload.received_at, upload.uses_int = self._host.now, isinstance(message, m.MissionItemInt)
+        upload.items.append(from_wire(message))
+        if len(upload.items) < upload.count:
+            self._request_item(upload)
+        else:
+            self._finish(upload)
+
+    def _finish(self, upload: _Upload) -> None:
+        upload.is_judged = True
+
+        def answer(result: int) -> None:
+            if self._upload is upload:
+                if result == _R.ACCEPTED:
+                    self.replace(upload.mission_type, upload.items)
+                self._end(upload, result)
+
+        try:
+            self._judge(upload.mission_type, tuple(upload.items), answer)
+        except InvalidArgument:
+            answer(_R.INVALID)
+
+    def _end(self, upload: _Upload, result: int) -> None:
+        self._upload = None
+        kind = upload.mission_type
+        opaque_id = self.opaque_id(kind) if result == _R.ACCEPTED else 0
+        self._acknowledge(upload.client, kind, result, upload.channel, opaque_id)
+
+    def _on_ack(self, ack: m.MissionAck, channel: Channel) -> None:
+        """End the client's own upload; the end of a download needs nothing."""
+        upload = self._upload
+        if upload is not None and sender_of(ack) == upload.client and not upload.is_judged and ack.type != _R.ACCEPTED:
+            self._upload = None
+
+    def _on_clear(self, request: m.MissionClearAll, channel: Channel) -> None:
+        client, kind = sender_of(request), request.mission_type
+        if kind not in (*self.lists, MavMissionType.ALL):
+            self._acknowledge(client, kind, _R.UNSUPPORTED, channel)
+        elif self._upload is not None:
+            self._acknowledge(client, kind, _R.DENIED, channel)
+        elif kind == MavMissionType.ALL:
+            self._clear([each for each in _TYPES if self.lists[each]], client, kind, channel)
+        else:
+            self._clear([kind], client, kind, channel)
+
+    def _clear(self, kinds: list[int], client: tuple[int, int], answered: int, channel: Channel) -> None:
+        """Empty these lists one after the other, each with the consent of ``judge``."""
+        if not kinds:
+            self._acknowledge(client, answered, _R.ACCEPTED, channel)
+            return
+
+        def answer(result: int) -> None:
+            if result != _R.ACCEPTED:
+                self._acknowledge(client, answered, result, channel)
+                return
+            self.replace(kinds[0], ())
+            self._clear(kinds[1:], client, answered, channel)
+
+        self._judge(kinds[0], (), answer)
+
+    def _on_set_current_message(self, request: m.MissionSetCurrent, channel: Channel) -> None:
+        if not self.set_current(request.seq):
+            self._host.send(self.current_message(), channel)

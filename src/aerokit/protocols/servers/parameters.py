@@ -1,0 +1,260 @@
+"""Parameters: PARAM_* and PARAM_EXT_*, served from one list.
+
+https://mavlink.io/en/services/parameter.html, https://mavlink.io/en/services/parameter_ext.html
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import MavParamError, MavParamExtType, ParamAck
+from aerokit.parameters import Parameter, ParameterType, SettingValue
+from aerokit.parameters.encoding import UNKNOWN_INDEX, value_message, value_of
+from aerokit.parameters.parameter import setting_bytes, setting_value, settings_equal
+from aerokit.protocols.servers.host import Channel, ServerHost, sender_of
+
+MAX_LISTS = 8
+"""Lists that a component sends at once; it ignores further requests."""
+
+
+class NamedList(Protocol):
+    """Parameters that are listed; the position of a name is its index."""
+
+    @property
+    def names(self) -> Sequence[str]: ...
+
+
+class ParameterLists:
+    """Sends lists: ``list_rate_hz`` parameters a second, in groups of ``burst``. A new request restarts a list."""
+
+    burst: int = 5
+    starts_at_once: bool = False
+    """True to send the first group at once, False to send it after the time of one group."""
+
+    def __init__(self, host: ServerHost, parameters: NamedList, *, list_rate_hz: float) -> None:
+        self.list_rate_hz = list_rate_hz
+        self._host = host
+        self._listed = parameters
+        self._lists: dict[Channel, int] = {}
+        self._list_number = 0
+
+    @property
+    def running_lists(self) -> int:
+        """Number of channels on which a list is being sent."""
+        return len(self._lists)
+
+    def restart(self) -> None:
+        """Drop all lists, as a reboot does."""
+        self._lists.clear()
+
+    def start_list(self, channel: Channel) -> None:
+        """Send all parameters on a channel; restarts a running list."""
+        self._list_number += 1
+        self._lists[channel] = number = self._list_number
+        if self.starts_at_once:
+            self._send_from(0, channel, number)
+        else:
+            self._host.call_later(self.burst / self.list_rate_hz, lambda: self._send_from(0, channel, number))
+
+    def stop_list(self, channel: Channel) -> None:
+        self._lists.pop(channel, None)
+
+    def _send_from(self, index: int, channel: Channel, number: int) -> None:
+        if self._lists.get(channel) != number:
+            return
+        names, end = self._listed.names, index + self.burst
+        for position, name in enumerate(names[index:end], start=index):
+            self.send(name, position, channel)
+        if end >= len(names):
+            self.stop_list(channel)
+            return
+        self._host.call_later(self.burst / self.list_rate_hz, lambda: self._send_from(end, channel, number))
+
+    def send(self, name: str, index: int, channel: Channel) -> None:
+        """Send a value on one channel, or on all if ``channel`` is None."""
+        raise NotImplementedError
+
+
+class ParameterProtocolServer(ParameterLists):
+    """Receives PARAM_REQUEST_LIST, PARAM_REQUEST_READ and PARAM_SET; subclasses answer them."""
+
+    def __init__(self, host: ServerHost, parameters: NamedList, *, list_rate_hz: float) -> None:
+        super().__init__(host, parameters, list_rate_hz=list_rate_hz)
+        host.on(m.ParamRequestList, self._on_list)
+        host.on(m.ParamRequestRead, self._on_read)
+        host.on(m.ParamSet, self._on_set)
+
+    def _on_list(self, request: m.ParamRequestList, channel: Channel) -> None:
+        raise NotImplementedError
+
+    def _on_read(self, request: m.ParamRequestRead, channel: Channel) -> None:
+        raise NotImplementedError
+
+    def _on_set(self, request: m.ParamSet, channel: Channel) -> None:
+        raise NotImplementedError
+
+    def value_message(self, name: str, index: int) -> m.ParamValue:
+        raise NotImplementedError
+
+    def send(self, name: str, index: int, channel: Channel) -> None:
+        """Send a PARAM_VALUE on one channel, or on all if ``channel`` is None."""
+        self._host.send(self.value_message(name, index), channel)
+
+    def send_error(self, to: tuple[int, int], name: str, index: int, code: int, channel: Channel) -> None:
+        self._host.send(m.ParamError(*to, name, index, code), channel)
+
+
+class TypedStore(NamedList, Protocol):
+    """Typed parameters of a component."""
+
+    def __contains__(self, name: object) -> bool: ...
+
+    def __getitem__(self, name: str) -> SettingValue: ...
+
+    def type(self, name: str) -> MavParamExtType: ...
+
+    def problem(self, name: str, value: SettingValue, type: int) -> tuple[int, int] | None:  # noqa: A002
+        """Return MAV_PARAM_ERROR and PARAM_ACK for a value that must not be stored, else None."""
+        ...
+
+    def store(self, name: str, value: SettingValue) -> None:
+        """Store a value that has no `problem`."""
+        ...
+
+
+class TypedParameterServer(ParameterProtocolServer):
+    """PARAM server of a component with typed parameters; the value is encoded bytewise, or cast to a float.
+
+    A refused PARAM_SET is answered by PARAM_ERROR and by the value that remains (PARAM_VALUE), for clients that do not
+    know PARAM_ERROR. Parameters whose type does not fit into PARAM_VALUE are left out: texts and 64-bit numbers.
+    """
+
+    def __init__(self, host: ServerHost, store: TypedStore, *, bytewise: bool = True, list_rate_hz: float) -> None:
+        self.bytewise = bytewise
+        self._store = store
+        super().__init__(host, self, list_rate_hz=list_rate_hz)
+
+    @property
+    def names(self) -> list[str]:
+        """Parameters that fit into PARAM_VALUE."""
+        return [name for name in self._store.names if _fits(self._store.type(name))]
+
+    def value_message(self, name: str, index: int) -> m.ParamValue:
+        value, type_ = self._store[name], ParameterType(self._store.type(name))
+        assert isinstance(value, (int, float))
+        place = None if index == UNKNOWN_INDEX else index
+        return value_message(Parameter(name, value, type_, index=place), len(self.names), bytewise=self.bytewise)
+
+    def publish(self, name: str) -> None:
+        """Send a value that has changed to all."""
+        if _fits(self._store.type(name)):
+            self.send(name, self.names.index(name), None)
+
+    def _on_list(self, request: m.ParamRequestList, channel: Channel) -> None:
+        if channel in self._lists or len(self._lists) < MAX_LISTS:
+            self.start_list(channel)
+
+    def _on_read(self, request: m.ParamRequestRead, channel: Channel) -> None:
+        names, index = self.names, request.param_index
+        name = request.param_id if index < 0 else names[index] if index < len(names) else ""
+        if name in names:
+            self.send(name, names.index(name), channel)
+        else:
+            self.send_error(sender_of(request), name, index, MavParamError.DOES_NOT_EXIST, channel)
+
+    def _on_set(self, request: m.ParamSet, channel: Channel) -> None:
+        name, names, store = request.param_id, self.names, self._store
+        if name not in names:
+            self.send_error(sender_of(request), name, -1, MavParamError.DOES_NOT_EXIST, channel)
+            return
+        value = value_of(request, bytewise=self.bytewise)
+        # A cast value needs no type, and ArduPilot's clients send all values as REAL32.
+        problem = store.problem(name, value, request.param_type if self.bytewise else store.type(name))
+        if problem is not None:
+            self.send_error(sender_of(request), name, names.index(name), problem[0], channel)
+            self.send(name, names.index(name), channel)
+            return
+        before = store[name]
+        store.store(name, value)
+        is_new = not settings_equal(before, store[name])
+        self.send(name, names.index(name), channel if not is_new else None)
+
+
+def _fits(type_: MavParamExtType) -> bool:
+    """Return True if the four bytes of PARAM_VALUE can hold values of this type."""
+    return type_ <= MavParamExtType.INT32 or type_ == MavParamExtType.REAL32
+
+
+class ExtendedParameterServer(ParameterLists):
+    """Receives PARAM_EXT_REQUEST_LIST, PARAM_EXT_REQUEST_READ and PARAM_EXT_SET; subclasses have the values.
+
+    A list is sent at a hundred parameters a second, one list at a time.
+    """
+
+    burst: int = 1
+    starts_at_once: bool = True
+
+    def __init__(self, host: ServerHost, parameters: NamedList, *, list_rate_hz: float = 100.0) -> None:
+        super().__init__(host, parameters, list_rate_hz=list_rate_hz)
+        host.on(m.ParamExtRequestList, self._on_list)
+        host.on(m.ParamExtRequestRead, self._on_read)
+        host.on(m.ParamExtSet, self._on_set)
+
+    def value(self, name: str) -> tuple[SettingValue, int]:
+        """Return value and MAV_PARAM_EXT_TYPE."""
+        raise NotImplementedError
+
+    def set(self, name: str, data: bytes, kind: int) -> tuple[int, bytes, int]:
+        """Set a value; return PARAM_ACK, and the value and type to report."""
+        raise NotImplementedError
+
+    def _on_list(self, _: m.ParamExtRequestList, channel: Channel) -> None:
+        self._lists.clear()
+        self.start_list(channel)
+
+    def _on_read(self, request: m.ParamExtRequestRead, channel: Channel) -> None:
+        names = self._listed.names
+        if 0 <= request.param_index < len(names):
+            self.send(names[request.param_index], request.param_index, channel)
+        elif request.param_index < 0 and request.param_id in names:
+            self.send(request.param_id, names.index(request.param_id), channel)
+
+    def send(self, name: str, index: int, channel: Channel) -> None:
+        value, kind = self.value(name)
+        names = self._listed.names
+        self._host.send(m.ParamExtValue(name, setting_bytes(value, kind), kind, len(names), index), channel)
+
+    def _on_set(self, request: m.ParamExtSet, _: Channel) -> None:
+        result, data, kind = self.set(request.param_id, request.param_value, request.param_type)
+        self.acknowledge(request.param_id, data, kind, result)
+
+    def acknowledge(self, name: str, data: bytes, kind: int, result: int) -> None:
+        """Send PARAM_EXT_ACK to all, because other clients read changes from it."""
+        known = kind if kind in MavParamExtType.__members__.values() else int(MavParamExtType.CUSTOM)
+        self._host.send(m.ParamExtAck(name, data, known, result))
+
+
+class TypedExtendedServer(ExtendedParameterServer):
+    """PARAM_EXT server of a component with typed parameters, texts included."""
+
+    def __init__(self, host: ServerHost, store: TypedStore) -> None:
+        super().__init__(host, store)
+        self._store = store
+
+    def value(self, name: str) -> tuple[SettingValue, int]:
+        return self._store[name], self._store.type(name)
+
+    def set(self, name: str, data: bytes, kind: int) -> tuple[int, bytes, int]:
+        store = self._store
+        if name not in store:
+            return ParamAck.VALUE_UNSUPPORTED, data, kind
+        value = setting_value(data, kind)
+        if isinstance(store[name], str) and value == b"":
+            value = ""
+        problem = store.problem(name, value, kind)
+        if problem is None:
+            store.store(name, value)
+        result = ParamAck.ACCEPTED if problem is None else problem[1]
+        return result, setting_bytes(store[name], store.type(name)), store.type(name)

@@ -1,0 +1,93 @@
+"""Hand-written parts of the blocking component."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from aerokit.sync.blocks import BlockingContext, ConnectionTwin, TwinOf
+from aerokit.sync.loop_thread import LoopThread
+
+if TYPE_CHECKING:
+    from contextlib import AbstractAsyncContextManager
+
+    from aerokit.mavlink.message import Message
+    from aerokit.onboard.component import OnboardComponent
+    from aerokit.sync.loop_thread import OpenContext
+
+FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
+ComponentT = TypeVar("ComponentT", bound="ComponentTwin")
+
+
+class ComponentTwin(TwinOf["OnboardComponent"], BlockingContext):
+    """Component as a context manager, which also closes the connection that was opened for it."""
+
+    _opened_by = "component"
+
+    def __init__(self, loop: LoopThread, held: OpenContext[OnboardComponent], *, owns_loop: bool) -> None:
+        super().__init__(loop, held.value)
+        self._held, self._owns_loop = held, owns_loop
+
+    def command(self, command: int) -> Callable[[FunctionT], FunctionT]:
+        """Decorator: execute a MAV_CMD by a plain function, in a thread.
+
+        Arguments and results are those of `aerokit.onboard.OnboardComponent.command`. COMMAND_CANCEL cannot stop a
+        thread: the sender gets CANCELLED, and the function runs on to its end.
+
+        Raises:
+            InvalidArgument: the command has a handler, or the function's arguments cannot be read.
+        """
+
+        def register(function: FunctionT) -> FunctionT:
+            self._loop.call(self.aio.command(command), function)
+            return function
+
+        return register
+
+    def message(self, message_type: type[Message], *, hz: float = 0.0) -> Callable[[FunctionT], FunctionT]:
+        """Decorator: send a message that a function returns, on request and at the intervals that others set.
+
+        The function runs on the loop's thread and must return at once; None while it has no values.
+
+        Args:
+            message_type: the message.
+            hz: rate at which it is sent to all from the start, 0 to 200; 0: only on request.
+
+        Raises:
+            InvalidArgument: ``hz`` is out of range, or the message has a function already.
+        """
+
+        def register(function: FunctionT) -> FunctionT:
+            self._loop.call(self.aio.message(message_type, hz=hz), function)
+            return function
+
+        return register
+
+    def close(self) -> None:
+        """Cancel running commands, stop the heartbeat and end the loop thread. Idempotent."""
+        try:
+            self._held.close()
+        finally:
+            if self._owns_loop:
+                self._loop.close()
+
+
+def opened_component(
+    twin: type[ComponentT],
+    open_async: Callable[..., AbstractAsyncContextManager[Any]],
+    address: Any,
+    connection: Any,
+    **options: Any,
+) -> ComponentT:
+    """Open a component on a new loop thread, or on that of a connection."""
+    is_shared = isinstance(connection, ConnectionTwin)
+    loop = connection._loop if is_shared else LoopThread()
+    try:
+        link = connection.aio if is_shared else connection
+        held: OpenContext[Any] = loop.open_context(open_async(address, connection=link, **options))
+        loop.call(held.value._use_threads)
+    except BaseException:
+        if not is_shared:
+            loop.close()
+        raise
+    return twin(loop, held, owns_loop=not is_shared)

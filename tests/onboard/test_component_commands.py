@@ -1,0 +1,205 @@
+"""Commands to a component: arguments, progress, cancellation, errors, repeated transmissions."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Annotated
+
+import pytest
+from onboard_peers import autopilot_and_client, payload_and_station
+
+from aerokit.errors import BusyError, CommandRejected, InvalidArgument
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import MavCmd, MavFrame, MavResult, MavType
+from aerokit.onboard import CommandRequest, Param, Range
+
+pytestmark = pytest.mark.anyio
+
+Height = Annotated[float, Range(0, 50)]
+
+
+async def test_command_calls_handler_with_arguments() -> None:
+    calls: list[tuple[object, ...]] = []
+    async with autopilot_and_client() as (node, vehicle):
+
+        @node.command(MavCmd.USER_1)
+        async def drop(
+            request: CommandRequest,
+            height_m: Height,
+            is_armed: bool,
+            kind: MavType,
+            speed: Annotated[float | None, Param(7)],
+        ) -> None:
+            calls.append((request.sender, height_m, is_armed, kind, speed))
+
+        await vehicle.command(MavCmd.USER_1, 12.5, 1, MavType.WINCH, 0, 0, 0, float("nan"))
+    assert calls == [((255, 190), 12.5, True, MavType.WINCH, None)]
+
+
+@pytest.mark.parametrize("params", [(51.0,), (float("nan"),), (1.0, 2.0), (1.0, 1.0, 0.5), (1.0, 0.0, 254.0)])
+async def test_command_with_other_values_is_denied(params: tuple[float, ...]) -> None:
+    async with payload_and_station() as (payload, station):
+
+        @payload.command(MavCmd.USER_1)
+        async def drop(_: CommandRequest, height_m: Height, is_armed: bool, kind: MavType) -> None:
+            raise AssertionError
+
+        with station.collecting(m.Statustext) as texts:
+            ack = await station.command(MavCmd.USER_1, *params)
+    assert ack.result == MavResult.DENIED
+    assert "is not allowed" in texts[0].text
+
+
+async def test_running_command_reports_progress_and_is_not_started_twice() -> None:
+    started = 0
+    async with payload_and_station() as (payload, station):
+
+        @payload.command(MavCmd.USER_1)
+        async def drop(request: CommandRequest) -> None:
+            nonlocal started
+            started += 1
+            await asyncio.sleep(0.3)
+            request.report_progress(40)
+            await asyncio.sleep(1.0)
+
+        with station.collecting(m.CommandAck) as acks:
+            station.connection.send(station.command_long(MavCmd.USER_1, 1))
+            await asyncio.sleep(0.4)
+            station.connection.send(station.command_long(MavCmd.USER_1, 1, confirmation=1))
+            await asyncio.sleep(0.1)
+            station.connection.send(station.command_long(MavCmd.USER_1, 2))
+            await asyncio.sleep(2.0)
+            station.connection.send(station.command_long(MavCmd.USER_1, 1, confirmation=2))
+            await asyncio.sleep(1.0)
+    results = [(ack.result, ack.progress) for ack in acks]
+    progress = MavResult.IN_PROGRESS
+    rejected, accepted = (MavResult.TEMPORARILY_REJECTED, 0), (MavResult.ACCEPTED, 0)
+    assert results == [
+        (progress, 255),
+        (progress, 40),
+        (progress, 40),
+        rejected,
+        (progress, 40),
+        (progress, 40),
+        accepted,
+        accepted,
+    ]
+    assert started == 1
+
+
+async def test_cancelled_command_ends_with_cancelled() -> None:
+    was_cancelled = False
+    async with payload_and_station() as (payload, station):
+
+        @payload.command(MavCmd.USER_2)
+        async def lower(_: CommandRequest) -> None:
+            nonlocal was_cancelled
+            try:
+                await asyncio.sleep(60.0)
+            except asyncio.CancelledError:
+                was_cancelled = True
+                raise
+
+        await station.command(MavCmd.USER_2)
+        with station.connection.subscribe(m.CommandAck, capacity=100) as acks:
+            station.connection.send(m.CommandCancel(*station.target, MavCmd.USER_2))
+            ack = await acks.get(1.0)
+    assert (ack.result, was_cancelled) == (MavResult.CANCELLED, True)
+
+
+async def test_command_cancelled_before_its_task_begins_is_not_executed() -> None:
+    calls = 0
+    async with payload_and_station() as (payload, station):
+
+        @payload.command(MavCmd.USER_2)
+        async def lower(_: CommandRequest) -> None:
+            nonlocal calls
+            calls += 1
+
+        with station.collecting(m.CommandAck) as acks:
+            station.connection.send(station.command_long(MavCmd.USER_2))
+            station.connection.send(m.CommandCancel(*station.target, MavCmd.USER_2))
+            await asyncio.sleep(1.0)
+    assert ([ack.result for ack in acks], calls) == ([MavResult.CANCELLED], 0)
+
+
+@pytest.mark.parametrize(
+    ("error", "result"),
+    [
+        (InvalidArgument("too high"), MavResult.DENIED),
+        (BusyError("loading"), MavResult.TEMPORARILY_REJECTED),
+        (RuntimeError("jammed"), MavResult.FAILED),
+    ],
+)
+async def test_error_of_handler_is_result_and_text(error: Exception, result: MavResult) -> None:
+    async with payload_and_station() as (payload, station):
+
+        @payload.command(MavCmd.USER_3)
+        async def lift(_: CommandRequest) -> None:
+            raise error
+
+        with station.collecting(m.Statustext) as texts:
+            ack = await station.command(MavCmd.USER_3)
+    assert ack.result == result
+    assert texts[0].text == f"lift: {error}"
+
+
+async def test_unknown_command_is_unsupported_unless_broadcast() -> None:
+    async with payload_and_station() as (_, station):
+        ack = await station.command(MavCmd.NAV_TAKEOFF)
+        with station.collecting(m.CommandAck) as acks:
+            station.connection.send(m.CommandLong(1, 0, MavCmd.NAV_LAND, 0, 0, 0, 0, 0, 0, 0, 0))
+            await asyncio.sleep(1.0)
+    assert ack.result == MavResult.UNSUPPORTED
+    assert acks == []
+
+
+async def test_position_of_command_int_is_in_degrees() -> None:
+    found: list[CommandRequest] = []
+    async with payload_and_station() as (payload, station):
+
+        @payload.command(MavCmd.DO_SET_ROI_LOCATION)
+        def look(request: CommandRequest) -> None:
+            found.append(request)
+
+        head = (*station.target, MavFrame.GLOBAL_RELATIVE_ALT, MavCmd.DO_SET_ROI_LOCATION, 0, 0)
+        command = m.CommandInt(*head, 0.0, 0.0, 0.0, 0.0, 473977420, 85455940, 30.0)
+        await station.ask(command, m.CommandAck)
+    position = found[0].position
+    assert (position.latitude_deg, position.altitude_relative_m) == (47.397742, 30.0)
+
+
+async def test_end_of_block_cancels_running_command() -> None:
+    async with payload_and_station() as (payload, station):
+
+        @payload.command(MavCmd.USER_1)
+        async def drop(_: CommandRequest) -> None:
+            await asyncio.sleep(60.0)
+
+        await station.command(MavCmd.USER_1)
+        with station.connection.subscribe(m.CommandAck, capacity=100) as acks:
+            await payload._aclose()
+            ack = await acks.get(1.0)
+    assert ack.result == MavResult.CANCELLED
+
+
+async def test_client_gets_result_of_long_command() -> None:
+    async with autopilot_and_client() as (node, vehicle):
+
+        @node.command(MavCmd.USER_1)
+        async def drop(_: CommandRequest) -> int:
+            await asyncio.sleep(20.0)
+            return MavResult.DENIED
+
+        with pytest.raises(CommandRejected) as raised:
+            await vehicle.command(MavCmd.USER_1)
+    assert raised.value.result == MavResult.DENIED
+
+
+async def test_handler_without_annotation_is_refused() -> None:
+    async with payload_and_station() as (payload, _):
+        with pytest.raises(InvalidArgument, match="annotated"):
+
+            @payload.command(MavCmd.USER_1)
+            async def drop(_: CommandRequest, height_m) -> None:  # type: ignore[no-untyped-def]
+                pass

@@ -1,0 +1,181 @@
+"""Parameters, files and missions of a component, with aerokit's own client as peer."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+from onboard_peers import autopilot_and_client, payload_and_station
+
+from aerokit.errors import AerokitError, FileError, InvalidArgument
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import MavParamError, MavParamExtType, ParamAck
+from aerokit.missions import Mission, MissionItem, waypoint
+from aerokit.position import Position
+
+pytestmark = pytest.mark.anyio
+
+
+async def test_parameters_are_listed_read_and_set() -> None:
+    async with autopilot_and_client() as (node, vehicle):
+        node.parameters.add("WINCH_SPEED", 1.5, minimum=0.1, maximum=3.0, unit="m/s")
+        node.parameters.add("WINCH_MODE", -5_000_000)
+        node.parameters.add("WINCH_NAME", "north")
+        table = await vehicle.parameters.download()
+        assert {name: table[name].value for name in table} == {"WINCH_SPEED": 1.5, "WINCH_MODE": -5_000_000}
+        await vehicle.parameters.set("WINCH_SPEED", 3.0)
+        assert node.parameters["WINCH_SPEED"] == 3.0
+
+
+async def test_parameter_out_of_range_is_refused() -> None:
+    async with autopilot_and_client() as (node, vehicle):
+        node.parameters.add("WINCH_SPEED", 1.5, minimum=0.1, maximum=3.0, unit="m/s")
+        await vehicle.parameters.download()
+        with pytest.raises(AerokitError, match="WINCH_SPEED"):
+            await vehicle.parameters.set("WINCH_SPEED", 3.5)
+        assert node.parameters["WINCH_SPEED"] == 1.5
+
+
+@pytest.mark.parametrize(("bytewise", "expected"), [(False, 7), (True, 1)])
+async def test_integer_sent_as_float_is_accepted_only_if_cast(bytewise: bool, expected: int) -> None:
+    async with payload_and_station(bytewise=bytewise) as (payload, station):
+        payload.parameters.add("SPOOL", 1)
+        value = await station.ask(m.ParamSet(*station.target, "SPOOL", 7.0, 9), m.ParamValue)
+    assert payload.parameters["SPOOL"] == expected
+    assert type(payload.parameters["SPOOL"]) is int
+    assert value.param_type == 6
+
+
+async def test_parameter_is_refused_by_on_set() -> None:
+    def check(value: object) -> None:
+        raise InvalidArgument("not while the line is out")
+
+    async with payload_and_station() as (payload, station):
+        payload.parameters.add("SPOOL", 1, on_set=check)
+        request = m.ParamSet(*station.target, "SPOOL", 2e-45, 6)
+        error = await station.ask(request, m.ParamError)
+    assert error.error == MavParamError.VALUE_OUT_OF_RANGE
+    assert payload.parameters["SPOOL"] == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "kind", "result"),
+    [
+        ("NAME", b"south", MavParamExtType.CUSTOM, ParamAck.ACCEPTED),
+        ("NAME", b"\x01\x00\x00\x00", MavParamExtType.INT32, ParamAck.VALUE_UNSUPPORTED),
+        ("SERIAL", b"x", MavParamExtType.CUSTOM, ParamAck.FAILED),
+        ("OTHER", b"x", MavParamExtType.CUSTOM, ParamAck.VALUE_UNSUPPORTED),
+    ],
+)
+async def test_extended_parameter_set_is_acknowledged(name: str, value: bytes, kind: int, result: int) -> None:
+    async with payload_and_station() as (payload, station):
+        payload.parameters.add("NAME", "north")
+        payload.parameters.add("SERIAL", "4711", read_only=True)
+        ack = await station.ask(m.ParamExtSet(*station.target, name, value, kind), m.ParamExtAck)
+    assert ack.param_result == result
+    assert payload.parameters["NAME"] == ("south" if result == ParamAck.ACCEPTED else "north")
+
+
+async def test_parameters_survive_in_file(tmp_path: Path) -> None:
+    path = tmp_path / "payload.json"
+    async with payload_and_station(parameters_file=path) as (payload, station):
+        payload.parameters.add("SPEED", 1.0)
+        await station.ask(m.ParamSet(*station.target, "SPEED", 2.5, 9), m.ParamValue)
+    assert json.loads(path.read_text()) == {"SPEED": 2.5}
+    async with payload_and_station(parameters_file=path) as (payload, _):
+        payload.parameters.add("SPEED", 1.0)
+        assert payload.parameters["SPEED"] == 2.5
+
+
+async def test_metadata_describes_parameters() -> None:
+    async with autopilot_and_client() as (node, vehicle):
+        node.parameters.add("SPEED", 1.0, minimum=0.0, maximum=3.0, unit="m/s", description="Speed of the line")
+        metadata = await vehicle.component(1).metadata("parameter")
+    assert metadata["parameters"] == [
+        {
+            "name": "SPEED",
+            "type": "Float",
+            "default": 1.0,
+            "shortDesc": "Speed of the line",
+            "units": "m/s",
+            "min": 0.0,
+            "max": 3.0,
+            "rebootRequired": False,
+        }
+    ]
+
+
+async def test_files_are_listed_read_and_written(tmp_path: Path) -> None:
+    (tmp_path / "logs").mkdir()
+    (tmp_path / "logs" / "a.txt").write_bytes(b"0123456789" * 5000)
+    async with autopilot_and_client() as (node, vehicle):
+        node.serve_files(tmp_path, writable=True)
+        assert await vehicle.files.read("/logs/a.txt") == b"0123456789" * 5000
+        await vehicle.files.write("/logs/b.bin", bytes(range(256)) * 10)
+        await vehicle.files.rename("/logs/b.bin", "/logs/c.bin")
+        names = [entry.name for entry in await vehicle.files.list("/logs")]
+    assert names == ["a.txt", "c.bin"]
+    assert (tmp_path / "logs" / "c.bin").read_bytes() == bytes(range(256)) * 10
+
+
+@pytest.mark.skipif(os.name == "nt", reason="needs links and pipes")
+@pytest.mark.parametrize("path", ["/../secret", "/link", "/folder/secret", "/pipe", "/logs/../../secret"])
+async def test_nothing_outside_the_directory_is_read(tmp_path: Path, path: str) -> None:
+    root = tmp_path / "root"
+    (root / "logs").mkdir(parents=True)
+    (tmp_path / "secret").write_text("key")
+    (root / "link").symlink_to(tmp_path / "secret")
+    (root / "folder").symlink_to(tmp_path)
+    os.mkfifo(root / "pipe")
+    async with autopilot_and_client() as (node, vehicle):
+        node.serve_files(root, writable=True)
+        with pytest.raises(FileError):
+            await vehicle.files.read(path)
+        with pytest.raises(FileError):
+            await vehicle.files.write(path, b"overwritten")
+        assert [entry.name for entry in await vehicle.files.list("/")] == ["general.json", "logs", "parameter.json"]
+    assert (tmp_path / "secret").read_text() == "key"
+
+
+async def test_directory_is_read_only_by_default(tmp_path: Path) -> None:
+    (tmp_path / "a").write_text("1")
+    async with autopilot_and_client() as (node, vehicle):
+        node.serve_files(tmp_path)
+        with pytest.raises(FileError):
+            await vehicle.files.write("/b", b"2")
+        with pytest.raises(FileError):
+            await vehicle.files.remove("/a")
+    assert os.listdir(tmp_path) == ["a"]
+
+
+MISSION = Mission([waypoint(Position(47.3977, 8.5456, altitude_relative_m=20.0)) for _ in range(30)])
+
+
+async def test_mission_is_uploaded_and_downloaded() -> None:
+    uploads: list[tuple[str, int]] = []
+    async with autopilot_and_client() as (node, vehicle):
+
+        @node.missions.on_upload
+        async def check(kind: str, items: tuple[MissionItem, ...]) -> None:
+            uploads.append((kind, len(items)))
+
+        await vehicle.mission.upload(MISSION)
+        assert (await vehicle.mission.download()).matches(MISSION)
+        assert len(node.missions.items()) == 30
+        await vehicle.mission.clear()
+        assert node.missions.items() == ()
+    assert uploads == [("mission", 30), ("mission", 0)]
+
+
+async def test_mission_refused_by_program_is_not_stored() -> None:
+    async with autopilot_and_client() as (node, vehicle):
+
+        @node.missions.on_upload
+        def check(kind: str, items: tuple[MissionItem, ...]) -> None:
+            raise InvalidArgument("no missions today")
+
+        with pytest.raises(AerokitError):
+            await vehicle.mission.upload(MISSION)
+        assert node.missions.items() == ()

@@ -1,0 +1,320 @@
+"""Camera, gimbal, winch, gripper, arm authorizer and sources, with aerokit's own client as peer."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from pathlib import Path
+
+import pytest
+from onboard_peers import autopilot_and_client, device_and_client, payload_and_station
+
+from aerokit.errors import AerokitError, BusyError, CommandRejected, InvalidArgument, OperationRejected
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import MavArmAuthDeniedReason, MavCmd, MavModeFlag, MavResult, MavType, MavWinchStatusFlag
+from aerokit.onboard import (
+    AutopilotDriver,
+    CameraDriver,
+    GimbalDriver,
+    GimbalTarget,
+    Photo,
+    Storage,
+    WinchDriver,
+    WinchReport,
+)
+from aerokit.position import Position
+from aerokit.protocols.rtcm import crc24q
+from aerokit.sim.components.camera_body import own_definition
+
+pytestmark = pytest.mark.anyio
+
+
+class Eye(CameraDriver):
+    def __init__(self, **arguments: object) -> None:
+        super().__init__(vendor="Acme", model="Eye", **arguments)  # type: ignore[arg-type]
+        self.zoom_percent = 0.0
+        self.calls: list[object] = []
+        self.error: Exception | None = None
+        self.delay_s = 0.1
+
+    async def take_photo(self, index: int) -> Photo:
+        await asyncio.sleep(self.delay_s)
+        if self.error is not None:
+            raise self.error
+        place = Position(47.3977, 8.5456, altitude_amsl_m=500.0, altitude_relative_m=20.0)
+        return Photo(f"mftp:///{index}.jpg", place, 0.0, -90.0, 45.0)
+
+    async def start_video(self) -> None:
+        self.calls.append("start")
+
+    async def stop_video(self) -> None:
+        self.calls.append("stop")
+
+    async def zoom_to(self, percent: float) -> None:
+        self.zoom_percent = percent
+
+    async def track(self, place: tuple[float, ...]) -> None:
+        self.calls.append(len(place))
+
+    def storage(self) -> Storage:
+        return Storage(1000.0, 10.0, 990.0, "SD")
+
+    def on_setting(self, name: str, value: object) -> None:
+        self.calls.append((name, value))
+
+
+async def test_photo_has_position_and_attitude() -> None:
+    async with device_and_client(100, MavType.CAMERA) as (component, vehicle):
+        component.add_camera(Eye())
+        capture = await vehicle.camera.take_photo()
+        assert capture.place is not None
+        assert (capture.success, capture.file_url, capture.place.altitude_relative_m) == (True, "mftp:///0.jpg", 20.0)
+        assert capture.pitch_deg == pytest.approx(-90, abs=0.1)
+        assert capture.roll_deg is not None
+
+
+async def test_failed_photo_is_reported_as_failed() -> None:
+    eye = Eye()
+    eye.error = RuntimeError("the lens cap is on")
+    async with device_and_client(100, MavType.CAMERA) as (component, vehicle):
+        component.add_camera(eye)
+        with pytest.raises(AerokitError), vehicle.subscribe(m.Statustext, capacity=10) as texts:
+            await vehicle.camera.take_photo()
+        assert texts.get_nowait().text == "take_photo: the lens cap is on"  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("delay_s", [0.1, 1.3])
+async def test_series_waits_for_slow_camera(delay_s: float) -> None:
+    eye = Eye()
+    eye.delay_s = delay_s
+    async with device_and_client(100, MavType.CAMERA) as (component, vehicle):
+        component.add_camera(eye)
+        await vehicle.camera.wait_found()
+        async with vehicle.camera.photo_interval(0.5, count=4) as captures:
+            indices = [(await anext(aiter(captures))).index for _ in range(4)]
+    assert indices == [0, 1, 2, 3]
+
+
+async def test_video_zoom_tracking_and_storage_call_the_program() -> None:
+    eye = Eye()
+    async with device_and_client(100, MavType.CAMERA) as (component, vehicle):
+        component.add_camera(eye)
+        await vehicle.camera.start_video()
+        await vehicle.camera.stop_video()
+        await vehicle.camera.zoom_to(30.0)
+        await vehicle.camera.track_point(0.5, 0.5, radius=0.1)
+        (storage,) = await vehicle.camera.load_storage()
+    assert eye.calls == ["start", "stop", 3]
+    assert eye.zoom_percent == 30.0
+    assert (storage.total_mib, storage.available_mib) == (1000.0, 990.0)
+
+
+async def test_call_without_method_is_not_supported() -> None:
+    async with device_and_client(100, MavType.CAMERA) as (component, vehicle):
+        component.add_camera(Eye())
+        await vehicle.camera.wait_found()
+        with pytest.raises(AerokitError):
+            await vehicle.camera.focus_to(50.0)
+        with pytest.raises(CommandRejected) as raised:
+            await vehicle.component(100).command(MavCmd.STORAGE_FORMAT, 1, 1)
+    assert raised.value.result == MavResult.UNSUPPORTED
+
+
+async def test_settings_of_definition_file_are_served() -> None:
+    eye = Eye(definition=own_definition())
+    async with device_and_client(100, MavType.CAMERA) as (component, vehicle):
+        component.add_camera(eye)
+        settings = vehicle.component(100).settings
+        await settings.download()
+        await settings.set("CAM_MODE", 1)
+        with pytest.raises(InvalidArgument, match="either"):
+            component.parameters.add("SPEED", 1.0)
+    assert eye.calls == [("CAM_MODE", 1)]
+
+
+class Head(GimbalDriver):
+    def __init__(self) -> None:
+        super().__init__(pitch_deg=(-90.0, 20.0), yaw_deg=(-160.0, 160.0))
+        self.targets: list[GimbalTarget] = []
+
+    def point(self, target: GimbalTarget) -> None:
+        self.targets.append(target)
+
+    def attitude(self) -> tuple[float, float, float]:
+        latest = self.targets[-1] if self.targets else None
+        return (0.0, 0.0, 0.0) if latest is None or latest.angles is None else latest.angles
+
+
+async def test_gimbal_points_within_its_limits() -> None:
+    head = Head()
+    async with device_and_client(154, MavType.GIMBAL) as (component, vehicle):
+        component.add_gimbal(head)
+        await vehicle.gimbals.discover()
+        async with vehicle.gimbal.control():
+            await vehicle.gimbal.point(pitch_deg=-45.0, yaw_deg=30.0)
+        information = await vehicle.gimbal.information()
+    angles = head.targets[0].angles
+    assert angles is not None
+    assert [round(angle, 3) for angle in angles] == [0, -45, 30]
+    assert information.pitch_deg is not None
+    assert [round(angle) for angle in information.pitch_deg] == [-90, 20]
+
+
+async def test_gimbal_denies_program_that_is_not_in_control() -> None:
+    head = Head()
+    async with payload_and_station(component_id=154, type=MavType.GIMBAL) as (component, station):
+        component.add_gimbal(head)
+        ack = await station.command(MavCmd.DO_GIMBAL_MANAGER_PITCHYAW, -30, 0, math.nan, math.nan, 0, 0, 154)
+        place = await station.command(MavCmd.DO_SET_ROI_LOCATION)
+    assert (ack.result, place.result) == (MavResult.DENIED, MavResult.UNSUPPORTED)
+    assert head.targets == []
+
+
+async def test_error_of_gimbal_is_result_of_command() -> None:
+    class Jammed(Head):
+        def point(self, target: GimbalTarget) -> None:
+            raise RuntimeError("jammed")
+
+    async with payload_and_station(component_id=154, type=MavType.GIMBAL) as (component, station):
+        component.add_gimbal(Jammed())
+        await station.command(MavCmd.DO_GIMBAL_MANAGER_CONFIGURE, 255, 190, -1, -1, 0, 0, 154)
+        ack = await station.command(MavCmd.DO_GIMBAL_MANAGER_PITCHYAW, -30, 0, math.nan, math.nan, 0, 0, 154)
+    assert ack.result == MavResult.FAILED
+
+
+class Spool(WinchDriver):
+    def __init__(self) -> None:
+        self.length_m, self.flags = 0.0, int(MavWinchStatusFlag.HEALTHY)
+
+    async def pay_out(self, length_m: float, rate_m_s: float) -> None:
+        await asyncio.sleep(abs(length_m) / rate_m_s)
+        self.length_m += length_m
+
+    async def retract(self) -> None:
+        self.length_m, self.flags = 0.0, self.flags | MavWinchStatusFlag.FULLY_RETRACTED
+
+    def report(self) -> WinchReport:
+        return WinchReport(length_m=self.length_m, speed_m_s=0.0, flags=self.flags)
+
+
+async def test_winch_pays_out_and_retracts() -> None:
+    spool = Spool()
+    async with device_and_client(169, MavType.WINCH) as (component, vehicle):
+        component.add_winch(spool)
+        winch = vehicle.winch(component_id=169)
+        await winch.pay_out(4.0, rate_m_s=1.0)
+        assert spool.length_m == 4.0
+        await winch.retract()
+        with pytest.raises(CommandRejected):
+            await winch.relax()
+    assert spool.length_m == 0.0
+
+
+class Model(AutopilotDriver):
+    def __init__(self) -> None:
+        self.calls: list[object] = []
+
+    async def arm(self, force: bool) -> None:
+        if not force:
+            raise BusyError("the batteries are cold")
+        self.calls.append("arm")
+
+    async def disarm(self, force: bool) -> None:
+        self.calls.append("disarm")
+
+    async def set_mode(self, custom_mode: int) -> None:
+        self.calls.append(custom_mode)
+
+    async def take_off(self, altitude_m: float | None) -> None:
+        self.calls.append(altitude_m)
+
+
+async def test_autopilot_executes_commands_and_reports_them_in_heartbeat() -> None:
+    model = Model()
+    async with autopilot_and_client() as (node, vehicle):
+        node.add_autopilot(model)
+        with pytest.raises(OperationRejected, match="cold"):
+            await vehicle.arm()
+        await vehicle.arm(force=True)
+        await vehicle.command(MavCmd.DO_SET_MODE, 1, 7)
+        await vehicle.command(MavCmd.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 12.5)
+        heartbeat = await vehicle.message(m.Heartbeat).wait_until(lambda beat: beat.custom_mode == 7, timeout=5)
+        with pytest.raises(CommandRejected) as raised:
+            await vehicle.command(MavCmd.NAV_LAND)
+        await vehicle.disarm()
+    assert model.calls == ["arm", 7, 12.5, "disarm"]
+    assert heartbeat.base_mode & MavModeFlag.SAFETY_ARMED
+    assert raised.value.result == MavResult.UNSUPPORTED
+
+
+async def test_gripper_grabs_and_releases() -> None:
+    moves: list[str] = []
+
+    async def grab() -> None:
+        moves.append("grab")
+
+    async def release() -> None:
+        moves.append("release")
+
+    async with payload_and_station() as (component, station):
+        component.add_gripper(grab, release)
+        results = [(await station.command(MavCmd.DO_GRIPPER, 1, action)).result for action in (1, 0, 7)]
+    assert moves == ["grab", "release"]
+    assert results == [MavResult.ACCEPTED, MavResult.ACCEPTED, MavResult.DENIED]
+
+
+@pytest.mark.parametrize(
+    ("system_id", "expected"),
+    [
+        (1, (MavResult.ACCEPTED, 30, 30)),
+        (2, (MavResult.DENIED, 0, MavArmAuthDeniedReason.NONE)),
+        (0, (MavResult.DENIED, 0, MavArmAuthDeniedReason.NONE)),  # the sender itself, system 255
+    ],
+)
+async def test_arm_authorizer_allows_or_denies(system_id: int, expected: tuple[int, int, int]) -> None:
+    async def authorize(system: int) -> float:
+        if system != 1:
+            raise ValueError("no flight plan")
+        return 30.0
+
+    async with payload_and_station() as (component, station):
+        component.add_arm_authorizer(authorize)
+        ack = await station.command(MavCmd.ARM_AUTHORIZATION_REQUEST, system_id)
+    assert (ack.result, ack.progress, ack.result_param2) == expected
+
+
+async def test_sources_send_their_messages() -> None:
+    async with payload_and_station() as (component, station):
+        with station.collecting(m.ObstacleDistance, m.AdsbVehicle, m.LandingTarget, m.GpsRtcmData) as received:
+            sources = component.sources
+            sources.send_obstacles([1.5, None, math.inf], increment_deg=5.0, min_m=0.2, max_m=10.0)
+            sources.send_traffic(0x4B1234, Position(47.4, 8.5, altitude_amsl_m=900.0), callsign="HBABC")
+            sources.send_landing_target(2.0, -3.0, 4.5)
+            message = bytes([0xD3, 0, 194]) + bytes(194)
+            sources.send_corrections(message + crc24q(message).to_bytes(3, "big"))
+            await asyncio.sleep(0.1)
+    obstacles, traffic, target, *corrections = received
+    assert obstacles.distances[:4] == (150, 0xFFFF, 1001, 0xFFFF)
+    assert (traffic.ICAO_address, traffic.callsign, traffic.altitude) == (0x4B1234, "HBABC", 900_000)
+    assert (target.distance, round(math.degrees(target.angle_y))) == (4.5, -3)
+    assert [piece.len for piece in corrections] == [180, 20]
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [{"distances_m": []}, {"distances_m": [-1.0]}, {"max_m": 700.0}, {"increment_deg": 0.0}],
+)
+async def test_invalid_obstacles_are_refused(arguments: dict[str, object]) -> None:
+    valid = {"distances_m": [1.0], "increment_deg": 5.0, "min_m": 0.2, "max_m": 10.0}
+    async with payload_and_station() as (component, _):
+        with pytest.raises(InvalidArgument):
+            component.sources.send_obstacles(**{**valid, **arguments})  # type: ignore[arg-type]
+
+
+async def test_pictures_are_read_from_the_component(tmp_path: Path) -> None:
+    (tmp_path / "0.jpg").write_bytes(b"picture")
+    async with device_and_client(100, MavType.CAMERA) as (component, vehicle):
+        component.serve_files(tmp_path)
+        component.add_camera(Eye())
+        capture = await vehicle.camera.take_photo()
+        assert await vehicle.camera.read_picture(capture) == b"picture"

@@ -1,0 +1,84 @@
+"""`aerokit.sync.component`: plain functions run in threads, and progress reaches the sender."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Annotated
+
+import pytest
+
+import aerokit.sync
+from aerokit.errors import CommandRejected, InvalidArgument
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import MavAutopilot, MavCmd, MavResult, MavType
+from aerokit.onboard import CameraDriver, CommandRequest, Photo, Range
+
+
+@contextmanager
+def autopilot_and_client() -> Iterator[tuple[aerokit.sync.OnboardComponent, aerokit.sync.Vehicle]]:
+    kind, generic = MavType.QUADROTOR, MavAutopilot.GENERIC
+    with aerokit.sync.component("udpin:127.0.0.1:0", component_id=1, type=kind, autopilot=generic) as node:
+        port = node.aio.connection.link.address.rpartition(":")[2]
+        with aerokit.sync.connect(f"udpout:127.0.0.1:{port}", rates={}) as vehicle:
+            yield node, vehicle
+
+
+def test_plain_function_runs_in_thread_and_reports_progress() -> None:
+    threads: list[int | None] = []
+    with autopilot_and_client() as (node, vehicle):
+
+        @node.command(MavCmd.USER_1)
+        def drop(request: CommandRequest, height_m: Annotated[float, Range(0, 50)]) -> None:
+            threads.append(threading.get_ident())
+            request.report_progress(50)
+            if height_m == 13:
+                raise ValueError("unlucky height")
+
+        with vehicle.subscribe(m.CommandAck, capacity=100) as acks:
+            vehicle.command(MavCmd.USER_1, 12)
+            while (ack := acks.get(timeout=5)).command != MavCmd.USER_1:
+                pass
+            assert (ack.result, ack.progress) == (MavResult.IN_PROGRESS, 50)
+        with pytest.raises(CommandRejected) as raised:
+            vehicle.command(MavCmd.USER_1, 13)
+    assert raised.value.result == MavResult.DENIED
+    assert len(set(threads) - {threading.get_ident()}) >= 1
+
+
+def test_parameters_and_missions_are_used_from_the_program() -> None:
+    with autopilot_and_client() as (node, vehicle):
+        node.parameters.add("SPEED", 1.5, maximum=3.0)
+        assert vehicle.parameters.get("SPEED") == 1.5
+        vehicle.parameters.set("SPEED", 2.0)
+        assert (node.parameters["SPEED"], list(node.parameters), len(node.parameters)) == (2.0, ["SPEED"], 1)
+        with pytest.raises(InvalidArgument):
+            node.parameters.set("SPEED", 4.0)
+        assert node.missions.items() == ()
+
+
+class Slow(CameraDriver):
+    def take_photo(self, index: int) -> Photo:  # type: ignore[override]
+        time.sleep(0.2)
+        return Photo(url=f"mftp:///{index}.jpg")
+
+
+def test_camera_of_blocking_program_takes_photo_in_thread() -> None:
+    with autopilot_and_client() as (node, vehicle):
+        node.add_camera(Slow())
+        with vehicle.subscribe(m.CameraImageCaptured, capacity=5) as captures:
+            vehicle.command(MavCmd.IMAGE_START_CAPTURE, 0, 0, 1, 1)
+            assert captures.get(timeout=5).file_url == "mftp:///0.jpg"
+
+
+def test_second_component_shares_the_connection() -> None:
+    with (
+        aerokit.sync.open_connection("udpin:127.0.0.1:0") as connection,
+        aerokit.sync.component(connection=connection, component_id=100) as first,
+        aerokit.sync.component(connection=connection, component_id=101) as second,
+    ):
+        assert (first.component_id, second.component_id, connection.is_open) == (100, 101, True)
+        first.set_state(5)
+        assert first.state == 5
