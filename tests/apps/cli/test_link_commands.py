@@ -205,3 +205,11 @@ def test_record_invalid_arguments_create_no_file(
     assert text in printed
     assert "[ADDRESS] FILE" in printed
     assert list(Path().iterdir()) == []
+
+
+def test_status_of_recording_says_so() -> None:
+    from aerokit.apps.cli.status import _link_line
+
+    counts = {"frames": 3, "frames_lost": 0, "seconds": 1.0, "bad_bytes": 0, "bytes": 9, "unknown_messages": 0}
+    assert _link_line({"address": "replay:crash.tlog", **counts}).startswith("replay:crash.tlog (a recording, not a")
+    assert "recording" not in _link_line({"address": "udpin:0.0.0.0:14550", **counts})

@@ -146,8 +146,9 @@ async def test_set_mode_silent_vehicle_times_out(grounded: Flight) -> None:
 
 
 async def test_disarm_in_the_air_is_refused_and_forced(flying: Flight) -> None:
-    with pytest.raises(CommandRejected):
+    with pytest.raises(CommandRejected) as caught:
         await flying.vehicle.disarm()
+    assert caught.value.reasons == ("the vehicle is not on the ground (landed state IN_AIR)",)
     assert flying.vehicle.is_armed
     await flying.vehicle.disarm(force=True)
     assert not flying.copter.is_armed

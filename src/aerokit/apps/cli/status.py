@@ -102,8 +102,10 @@ def _component_line(heartbeat: Heartbeat, system_id: int, component_id: int) -> 
 
 def _link_line(record: Mapping[str, Any]) -> str:
     total = record["frames"] + record["frames_lost"]
+    is_recording = record["address"].startswith("replay:")
     parts = [
-        f"{record['address']}: {record['frames']} frames in {record['seconds']:.1f} s",
+        f"{record['address']}{' (a recording, not a vehicle)' if is_recording else ''}:"
+        f" {record['frames']} frames in {record['seconds']:.1f} s",
         f"{_percent(record['frames_lost'], total)} lost",
     ]
     if record["bad_bytes"]:
