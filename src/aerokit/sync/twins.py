@@ -4224,7 +4224,7 @@ class Vehicle(VehicleTwin):
             NotSupported: this firmware tunes by a pilot's sticks, in its mode AUTOTUNE. Nothing was sent.
             OperationRejected: the mode changed, or another party disarmed the vehicle.
             CommandRejected: PX4 has no such module, or the tuning failed.
-            CommandTimeout: an answer is missing; PX4 may go on tuning.
+            CommandTimeout: an answer is missing, or the program has paused; PX4 may go on tuning.
             OperationTimeout: it was not done in time; PX4 may go on tuning.
         """
         self._loop.run(self.aio.autotune, timeout=timeout, on_progress=on_progress)
@@ -4626,7 +4626,7 @@ class Vehicle(VehicleTwin):
         Args:
             target: another vehicle, of this connection or of any other; an asynchronous iterable of positions; or a
                 function that returns the latest position, or None, called on the event loop ten times a second. The
-                velocity of positions is computed from two of them.
+                velocity of positions is computed from two different ones; above 100 m/s it is a jump, and counts as 0.
             distance_m: distance along the ground to keep, 0 to 1000.
             bearing_deg: direction from the target in which to stay, 0–360 clockwise from north; None: where the vehicle
                 is when it begins.
@@ -4637,7 +4637,7 @@ class Vehicle(VehicleTwin):
             max_distance_m: if the target is farther away than this many metres, the vehicle holds.
 
         Raises:
-            InvalidArgument: an argument is out of range.
+            InvalidArgument: an argument is out of range, or the target is the vehicle itself.
             NotSupported: this type of vehicle takes no position set-points, or it flies on its wings.
         """
         return FollowStream(
@@ -5005,7 +5005,7 @@ class Vehicle(VehicleTwin):
             CommandRejected: the vehicle refused the mode.
             CommandTimeout: there was no acknowledgement.
             OperationRejected: a parameter makes the vehicle ignore the target (nothing else was sent), or the mode
-                changed meanwhile.
+                changed or another order was given meanwhile.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the target was not seen in time (the landing was not ordered), or the vehicle was not
                 down in time.

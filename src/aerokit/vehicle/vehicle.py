@@ -216,7 +216,7 @@ class Vehicle(
             CommandRejected: the vehicle refused the mode.
             CommandTimeout: there was no acknowledgement.
             OperationRejected: a parameter makes the vehicle ignore the target (nothing else was sent), or the mode
-                changed meanwhile.
+                changed or another order was given meanwhile.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the target was not seen in time (the landing was not ordered), or the vehicle was not
                 down in time.

@@ -173,6 +173,18 @@ def test_target_of_camera_angles_is_at_its_height() -> None:
     assert (target.forward_m, target.right_m, target.down_m) == pytest.approx((10.0, 0.0, 10.0))
 
 
+async def test_landing_target_needs_recent_local_position() -> None:
+    """With an old one the target would move along with a vehicle that has moved since."""
+    async with open_px4(px4()) as flight:
+        await flight.take_off()
+        async with flight.vehicle.external.landing_target() as stream:
+            flight.px4.faults.lose(m.LocalPositionNed, times=1_000_000)
+            await anyio.sleep(5.0)
+            with pytest.raises(ValueUnknownError, match="too old"):
+                stream.send(v.TargetMeasurement(2.0, 1.0, 10.0))
+        assert not flight.wire.all(m.LandingTarget)
+
+
 WRONG: list[tuple[str, Any]] = [
     ("odometry", v.OdometryMeasurement((math.nan, 0.0, 0.0), LEVEL)),
     ("odometry", v.OdometryMeasurement((0.0, 0.0, 0.0), (1.0, 1.0, 1.0, 1.0))),
@@ -183,6 +195,10 @@ WRONG: list[tuple[str, Any]] = [
     ("odometry", v.SpeedMeasurement(0.0, 0.0, 0.0)),
     ("gps", v.GpsMeasurement(91.0, 0.0, 0.0)),
     ("gps", v.GpsMeasurement(0.0, 0.0, 0.0, unix_time_s=0.0)),
+    ("gps", v.GpsMeasurement(0.0, 0.0, 0.0, (0.0, math.nan, 0.0))),
+    ("gps", v.GpsMeasurement(0.0, 0.0, 0.0, hdop=math.nan)),
+    ("gps", v.GpsMeasurement(0.0, 0.0, 0.0, speed_accuracy_m_s=math.inf)),
+    ("gps", v.GpsMeasurement(0.0, 0.0, 0.0, yaw_deg=math.nan)),
     ("obstacles", v.ObstacleSectors((), 0.1, 10.0)),
     ("obstacles", v.ObstacleSectors((1.0,) * 73, 0.1, 10.0)),
     ("obstacles", v.ObstacleSectors((-1.0,), 0.1, 10.0)),
@@ -190,6 +206,7 @@ WRONG: list[tuple[str, Any]] = [
     ("range_finder", v.RangeMeasurement(1.0, 0.1, 7.0, "sideways")),  # type: ignore[arg-type]
     ("landing_target", v.TargetMeasurement(0.0, 0.0, 0.0)),
     ("optical_flow", v.FlowMeasurement(0.0, 0.0, 0.0)),
+    ("optical_flow", v.FlowMeasurement(0.0, 0.0, 0.1, (math.nan, 0.0, 0.0))),
 ]
 
 

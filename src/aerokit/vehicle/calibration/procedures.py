@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING
 
-from aerokit.errors import NotSupported, OperationTimeout, ParameterRejected
+import anyio
+
+from aerokit.errors import AerokitError, NotSupported, OperationTimeout, ParameterRejected
 from aerokit.mavlink.enums import AccelcalVehiclePos, MagCalStatus, MavCmd, MavResult, MavState
 from aerokit.mavlink.messages import CommandLong, MagCalProgress, MagCalReport
+from aerokit.vehicle.calibration.run import logger
 from aerokit.vehicle.calibration.values import CalibrationPose, CompassFit, parse_report
 
 if TYPE_CHECKING:
@@ -22,6 +25,8 @@ CANCEL_ALL = (MavCmd.PREFLIGHT_CALIBRATION, 0, 0, 0, 0, 0, 0, 0)
 REPORT_HZ = 4.0
 # PX4's HEARTBEAT leaves CALIBRATING before the last text arrives.
 END_GRACE_S = 3.0
+# A cancelled call ends within two seconds.
+RESTORE_TIMEOUT_S = 1.5
 # ArduPilot repeats its request every second; one that arrives sooner after a confirmation was sent before it.
 POSE_REPEAT_S = 2.0
 POSES = {
@@ -115,14 +120,31 @@ async def ardupilot_airspeed(run: CalibrationRun, *_: float) -> AsyncGenerator[C
 async def ardupilot_escs(run: CalibrationRun, *_: float) -> AsyncGenerator[CalibrationStep, None]:
     """ArduCopter calibrates ESCs while it boots, if ESC_CALIBRATION is 3."""
     run.check_ready()
-    await _parameter(run, "ESC_CALIBRATION")
+    before = await _parameter(run, "ESC_CALIBRATION")
     yield run.step(None, "remove the propellers, then continue", needs_confirmation=True)
     await run.begin(None)
     try:
         await run.parameters().set("ESC_CALIBRATION", 3)
+    except ParameterRejected:
+        raise
+    except BaseException:
+        await _restore(run, "ESC_CALIBRATION", before)
+        raise
     finally:
         run.finish()
     yield run.result("disconnect the battery, then connect it: the ESCs are calibrated at boot", reboot_due=True)
+
+
+async def _restore(run: CalibrationRun, name: str, value: float) -> None:
+    """Write back a parameter that makes the motors turn at the next boot; log a warning if that is not confirmed."""
+    with anyio.CancelScope(shield=True), anyio.move_on_after(RESTORE_TIMEOUT_S), suppress(AerokitError):
+        if run.context.arbiter.is_known:
+            await run.parameters().set(name, value)
+            return
+    logger.warning(
+        "%s was left: %s may not be %g again; set it, or the motors get full throttle at the next boot",
+        *(run.what, name, value),
+    )
 
 
 async def _parameter(run: CalibrationRun, name: str) -> float:

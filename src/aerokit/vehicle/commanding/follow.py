@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 from collections.abc import AsyncIterable, Callable
 from typing import TYPE_CHECKING, Any
@@ -15,7 +16,7 @@ from aerokit.connection.tasks import Cancellation
 from aerokit.errors import InvalidArgument, NotSupported, OperationRejected, OperationTimeout
 from aerokit.position import Position
 from aerokit.vehicle.commanding.follow_target import FollowTarget, HasTelemetry
-from aerokit.vehicle.commanding.progress import POSITION_MAX_AGE_S
+from aerokit.vehicle.commanding.progress import POSITION_MAX_AGE_S, VehiclePosition
 from aerokit.vehicle.commanding.setpoints import ZERO, PositionSetpoint, SetpointEncoder
 from aerokit.vehicle.commanding.streams import SteeringStream
 
@@ -34,6 +35,10 @@ MIN_COURSE_SPEED_M_S = 0.5
 """Ground speed from which a movement has a direction."""
 MIN_INTERVAL_S = 0.05
 """Seconds between two positions from which a velocity can be computed."""
+OVERDUE = 1.5
+"""Part of the last interval after which a target without another position has stopped."""
+MAX_TARGET_SPEED_M_S = 100.0
+"""A greater speed between two positions is a jump of the target's position."""
 POLL_INTERVAL_S = 0.1
 
 
@@ -55,11 +60,15 @@ class FollowPlace(Snapshot):
 
 
 class TargetState(Snapshot):
-    """Position of the target with its velocity (north, east, down in m/s), and when it was known."""
+    """Position of the target with its velocity (north, east, down in m/s).
+
+    ``at`` is when it was last known to be there, ``since`` when it was there first.
+    """
 
     position: Position
     velocity: tuple[float, float, float]
     at: float
+    since: float
 
 
 class FollowedTarget:
@@ -68,6 +77,7 @@ class FollowedTarget:
     def __init__(self, target: FollowTarget, now: Callable[[], float]) -> None:
         self._target, self._now = target, now
         self.latest: TargetState | None = None
+        self._interval_s = 0.0
 
     def read(self) -> TargetState | None:
         """Read a vehicle or call the function; return the latest state."""
@@ -83,21 +93,36 @@ class FollowedTarget:
             return
         at = self._now() - position.age
         speeds = ZERO if velocity is None else (velocity.north_m_s, velocity.east_m_s, velocity.down_m_s)
-        self.latest = TargetState(position.latest.replace(altitude_relative_m=None), speeds, at)
+        self.latest = TargetState(position.latest.replace(altitude_relative_m=None), speeds, at, at)
 
     def add(self, position: object) -> None:
-        """Process a position that the program supplied. An unchanged one counts as new."""
+        """Process a position that the program supplied. An unchanged one counts as new.
+
+        The velocity is that between two different positions, because a program may be asked more often than its target
+        reports. It becomes zero when the next position is overdue, and if the target has jumped.
+
+        Raises:
+            InvalidArgument: it is no position.
+        """
         if not isinstance(position, Position):
             raise InvalidArgument(f"position = {short_repr(position)} is not allowed: a Position")
-        before, now, velocity = self.latest, self._now(), ZERO
-        if before is not None:
-            there, seconds = before.position, now - before.at
-            if seconds < MIN_INTERVAL_S:
-                return
-            speed, bearing = there.distance_to(position) / seconds, math.radians(there.bearing_to(position))
-            down = (there.altitude_amsl_m or 0.0) - (position.altitude_amsl_m or 0.0)
-            velocity = (speed * math.cos(bearing), speed * math.sin(bearing), down / seconds)
-        self.latest = TargetState(position, velocity, now)
+        before, now = self.latest, self._now()
+        if before is not None and now - before.at < MIN_INTERVAL_S:
+            return
+        if before is None:
+            self.latest = TargetState(position, ZERO, now, now)
+        elif position == before.position:
+            is_moving = now - before.since <= OVERDUE * self._interval_s
+            self.latest = TargetState(position, before.velocity if is_moving else ZERO, now, before.since)
+        else:
+            seconds = self._interval_s = now - before.since
+            there = before.position
+            distance, bearing = there.distance_to(position), math.radians(there.bearing_to(position))
+            down = VehiclePosition.height_above(there, position)
+            is_jump = math.hypot(distance, down) > MAX_TARGET_SPEED_M_S * seconds
+            north, east = distance * math.cos(bearing), distance * math.sin(bearing)
+            velocity = ZERO if is_jump else (north / seconds, east / seconds, down / seconds)
+            self.latest = TargetState(position, velocity, now, now)
 
 
 @checks_arguments
@@ -128,9 +153,11 @@ class FollowStream(SteeringStream[TargetState]):
     ) -> None:
         check_range("max_distance_m", max_distance_m, place.distance_m, math.inf)
         autopilot = context.session.autopilot
+        if getattr(target, "telemetry", None) is context.session.telemetry:
+            raise InvalidArgument("target is not allowed: the vehicle itself, which would flee from itself")
         if not (autopilot.setpoints.global_position and autopilot.setpoints.velocity):
             raise NotSupported(f"follow: {autopilot.firmware} does not support position set-points; nothing was sent")
-        nowhere = TargetState(Position(0.0, 0.0), ZERO, -math.inf)
+        nowhere = TargetState(Position(0.0, 0.0), ZERO, -math.inf, -math.inf)
         super().__init__(context, self._encode_place, nowhere, RATE_HZ, valid_for_s, MAX_LAG_S)
         self._target, self._tracker = target, FollowedTarget(target, self._now)
         self._encode_position = SetpointEncoder(context).position
@@ -173,6 +200,7 @@ class FollowStream(SteeringStream[TargetState]):
             with self._context.flight_cleanup.preparing(mode) as self._prepared_order:
                 self._value = await self._first_state()
                 self._choose_place(self._value.position)
+                self._take(self._value)  # Raises for an invalid place; an earlier flight of the program then holds.
             return await super().__aenter__()
         except BaseException:
             self._stop_reading()
@@ -235,7 +263,8 @@ class FollowStream(SteeringStream[TargetState]):
             if state is not None:
                 self._take(state)
                 self._set_at = state.at
-        except Exception as error:
+        # CancelledError: of a task whose result the function returns.
+        except (Exception, asyncio.CancelledError) as error:
             self._end_reason = f"the position of the target raised {error!r}"
         super()._tick(due)
 
@@ -248,7 +277,7 @@ class FollowStream(SteeringStream[TargetState]):
 
     def _encode_place(self, state: TargetState) -> Message:
         """Return the place at this moment: the target moves on between two of its positions."""
-        seconds = max(0.0, min(self._now() - state.at, self._valid_for_s))
+        seconds = max(0.0, min(self._now() - state.since, self._valid_for_s))
         north_m_s, east_m_s, down_m_s = state.velocity
         if math.hypot(north_m_s, east_m_s) >= MIN_COURSE_SPEED_M_S:
             self._course_deg = math.degrees(math.atan2(east_m_s, north_m_s))

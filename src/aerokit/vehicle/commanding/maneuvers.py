@@ -11,7 +11,7 @@ from aerokit.mavlink.enums import MavCmd, MavDoRepositionFlags, MavType, MavVtol
 from aerokit.position import travel_target
 from aerokit.vehicle.commanding.context import VehicleBase
 from aerokit.vehicle.commanding.follow_target import FollowTarget
-from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M, MAX_SILENCE_S, await_progress
+from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M, MAX_SILENCE_S, POSITION_MAX_AGE_S, await_progress
 
 if TYPE_CHECKING:
     from aerokit.autopilots import Mode
@@ -197,7 +197,7 @@ class ManeuverActions(VehicleBase):
                 )
         elif turns is not None:
             raise InvalidArgument(f"turns = {turns!r} is not allowed without radius_m")
-        center = self.telemetry.position.value if target is None else travel_target(target)
+        center = self.telemetry.position.fresh(POSITION_MAX_AGE_S) if target is None else travel_target(target)
         if radius_m is None:
             counter, command = None, int(MavCmd.DO_REPOSITION)
             params: tuple[float, ...] = (-1.0, float(MavDoRepositionFlags.CHANGE_MODE), 0.0, math.nan)
@@ -231,7 +231,7 @@ class ManeuverActions(VehicleBase):
         Args:
             target: another vehicle, of this connection or of any other; an asynchronous iterable of positions; or a
                 function that returns the latest position, or None, called on the event loop ten times a second. The
-                velocity of positions is computed from two of them.
+                velocity of positions is computed from two different ones; above 100 m/s it is a jump, and counts as 0.
             distance_m: distance along the ground to keep, 0 to 1000.
             bearing_deg: direction from the target in which to stay, 0–360 clockwise from north; None: where the vehicle
                 is when it begins.
@@ -242,7 +242,7 @@ class ManeuverActions(VehicleBase):
             max_distance_m: if the target is farther away than this many metres, the vehicle holds.
 
         Raises:
-            InvalidArgument: an argument is out of range.
+            InvalidArgument: an argument is out of range, or the target is the vehicle itself.
             NotSupported: this type of vehicle takes no position set-points, or it flies on its wings.
         """
         from aerokit.vehicle.commanding.follow import FollowPlace, FollowStream

@@ -12,8 +12,17 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 import anyio
 
 from aerokit._internal.arguments import check_range, checks_arguments
-from aerokit.errors import AerokitError, BusyError, OperationRejected, ParameterTimeout, SetpointStreamStopped
+from aerokit.errors import (
+    AerokitError,
+    BusyError,
+    OperationRejected,
+    OperationTimeout,
+    ParameterTimeout,
+    SetpointStreamStopped,
+)
 from aerokit.parameters import Parameter
+from aerokit.vehicle.commanding.arbiter import STEERING
+from aerokit.vehicle.commanding.order import SUPERSEDED
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
@@ -247,7 +256,13 @@ class SteeringStream(ValueStream[ValueT]):
             self._stop(f"the vehicle has been silent for {self._session.heartbeat_age:.1f} s")
             raise self._stopped
         elif not self._session.telemetry.is_confirmed_disarmed:
-            await self._context.flight_cleanup.hold()
+            cleanup, mode = self._context.flight_cleanup, self._context.sender.mode_for("hold", "hold")
+            order = self._context.arbiter.order(mode)
+            try:
+                await cleanup.stop_in(mode, order)
+            except (anyio.get_cancelled_exc_class(), OperationTimeout):  # The hold may have been lost.
+                cleanup.hold_in_background(order)
+                raise
 
     async def _enter(self, mode: Mode, order: Order) -> None:
         """Change the mode. ArduPilot takes values once it is in the mode; PX4 enters the mode once it receives them."""
@@ -284,17 +299,22 @@ class SteeringStream(ValueStream[ValueT]):
 
 
 class TakeoverCheck:
-    """Refuses to order a mode if another party has changed the mode since an earlier moment of the same call."""
+    """Refuses to order a mode if another party has changed the mode since an earlier moment of the same call, or the
+    program has given a newer order.
+    """
 
     def __init__(self, context: VehicleContext, wanted: Mode) -> None:
         session = context.session
         self._telemetry, self._wanted = session.telemetry, wanted
         self._before = session.telemetry.mode.latest
+        self._arbiter, self._order = context.arbiter, context.arbiter.latest(STEERING)
         is_vtol = session.telemetry.is_vtol
         self._take_off, self._hold = (session.autopilot.mode_for(p, is_vtol=is_vtol) for p in ("take_off", "hold"))
 
     def raise_if_changed(self, what: str) -> None:
-        """Raise OperationRejected if the mode has changed, except by the end of a take-off."""
+        """Raise OperationRejected if the mode has changed, except by the end of a take-off, or an order was given."""
+        if self._arbiter.latest(STEERING) is not self._order:
+            raise OperationRejected(f"{what}: {SUPERSEDED} before anything was ordered")
         before, mode = self._before, self._telemetry.mode.latest
         if before is None or mode in (before, self._wanted) or (before, mode) == (self._take_off, self._hold):
             return

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import anyio
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 
 POLL_INTERVAL_S, ANSWER_TIMEOUT_S = 1.0, 1.0
 """PX4 reports the result for two seconds; the command would start another tuning after that."""
+MAX_ANSWER_AGE_S = 1.5
+"""An older answer does not show that PX4 is still tuning: the program, or its event loop, has paused."""
 TUNED_PERCENT = 95
 """Progress from which PX4 waits for disarming, to save its new gains."""
 
@@ -41,7 +44,7 @@ class TuningActions(VehicleBase):
             NotSupported: this firmware tunes by a pilot's sticks, in its mode AUTOTUNE. Nothing was sent.
             OperationRejected: the mode changed, or another party disarmed the vehicle.
             CommandRejected: PX4 has no such module, or the tuning failed.
-            CommandTimeout: an answer is missing; PX4 may go on tuning.
+            CommandTimeout: an answer is missing, or the program has paused; PX4 may go on tuning.
             OperationTimeout: it was not done in time; PX4 may go on tuning.
         """
         if not self.autopilot.tunes_by_command:
@@ -62,6 +65,8 @@ class TuningActions(VehicleBase):
                     percent = answer.progress
                     await anyio.sleep(POLL_INTERVAL_S if percent < TUNED_PERCENT else 0)
                     self._sender.raise_if_ended(order)
+                    if percent < TUNED_PERCENT and self.connection.now() - _received_at(answer) > MAX_ANSWER_AGE_S:
+                        raise CommandTimeout("autotune: the program has paused; PX4 may go on tuning")
         finally:
             detach()
 
@@ -76,3 +81,8 @@ class TuningActions(VehicleBase):
                     return answer
             await anyio.sleep(POLL_INTERVAL_S / 20)
         raise CommandTimeout("autotune: MAV_CMD_DO_AUTOTUNE_ENABLE was not acknowledged; PX4 may go on tuning")
+
+
+def _received_at(answer: CommandAck) -> float:
+    frame = answer.received_frame
+    return math.inf if frame is None else frame.received_at

@@ -10,7 +10,7 @@ import anyio
 from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit._internal.async_block import ReadOnly
 from aerokit.errors import CommandRejected, InvalidArgument, OperationRejected
-from aerokit.mavlink.enums import MavCmd, MavComponent, MotorTestThrottleType, ParachuteAction
+from aerokit.mavlink.enums import MavCmd, MavComponent, MavLandedState, MotorTestThrottleType, ParachuteAction
 from aerokit.vehicle.commanding.progress import await_progress
 from aerokit.vehicle.commanding.simple_orders import Argument, Effect, SimpleOrder
 
@@ -171,7 +171,9 @@ class Actuators(ReadOnly):
             CommandTimeout: there was no acknowledgement.
         """
         LANDING_GEAR.check_supported(self._context)
-        if self._context.vehicle_position.is_on_ground() or self._context.session.telemetry.is_confirmed_disarmed:
+        telemetry = self._context.session.telemetry
+        # The last report counts, however old: it stands on its gear until another one was received.
+        if telemetry.landed_state.latest == MavLandedState.ON_GROUND or telemetry.is_confirmed_disarmed:
             raise OperationRejected("raise_landing_gear: the vehicle is disarmed or on the ground; nothing was sent")
         await LANDING_GEAR.send(self._context, 1, topic="landing gear")
 

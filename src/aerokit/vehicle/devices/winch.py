@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
     from aerokit.connection.cells import StateCell
     from aerokit.vehicle.commanding.context import VehicleContext
+    from aerokit.vehicle.commanding.order import Order, Topic
     from aerokit.vehicle.state.measurements import WinchStatus
 
 __all__ = ["Winch"]
@@ -39,6 +40,10 @@ class Winch(ReadOnly):
 
     def __init__(self, context: VehicleContext, number: int, component_id: int | None) -> None:
         self._context, self._number, self._component_id = context, number, component_id
+
+    @property
+    def _topic(self) -> Topic:
+        return ("winch", self._number, self._component_id)
 
     @property
     def status(self) -> StateCell[WinchStatus]:
@@ -78,6 +83,7 @@ class Winch(ReadOnly):
         check_range("length_m", length_m, -MAX_LENGTH_M, MAX_LENGTH_M)
         check_range("rate_m_s", rate_m_s, 0, MAX_RATE_M_S, above=True)
         self._check_supported(_A.RELATIVE_LENGTH_CONTROL)
+        order = self._context.arbiter.of_device(self._topic)  # A newer order during the question ends this one.
         start = await receive_once(self._context, m.WinchStatus, self._component_id)
         goal_m = None if start is None else start.line_length + length_m
         await self._send(
@@ -86,6 +92,7 @@ class Winch(ReadOnly):
             rate_m_s,
             None if goal_m is None else lambda status: abs(status.line_length - goal_m) <= LENGTH_TOLERANCE_M,
             timeout=timeout,
+            of=order,
         )
 
     async def set_rate(self, rate_m_s: float) -> None:
@@ -159,13 +166,15 @@ class Winch(ReadOnly):
         rate_m_s: float = 0.0,
         is_done: Callable[[m.WinchStatus], bool] | None = None,
         timeout: float = 5.0,
+        of: Order | None = None,
     ) -> None:
         self._check_supported(action)
         params = (self._number, action, length_m, rate_m_s)
         effect = None if is_done is None else Effect("WinchStatus", is_done)
         await SimpleOrder(f"winch {action.name.lower()}", MavCmd.DO_WINCH, params, effect).send(
             self._context,
-            topic=("winch", self._number, self._component_id),
+            of=of,
+            topic=self._topic,
             component_id=self._component_id,
             timeout=timeout,
         )

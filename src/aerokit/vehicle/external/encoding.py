@@ -9,6 +9,7 @@ from aerokit._internal.arguments import check_finite, check_range
 from aerokit.errors import InvalidArgument, ValueUnknownError
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import GpsInputIgnoreFlags, MavFrame
+from aerokit.vehicle.commanding.progress import POSITION_MAX_AGE_S
 from aerokit.vehicle.external.values import Quaternion, RangeDirection, Vector
 from aerokit.vehicle.state.movement import Attitude
 
@@ -27,6 +28,7 @@ MAX_SECTORS, UNKNOWN_DISTANCE = 72, 0xFFFF
 MAX_CENTIMETRES = 0xFFFE
 # GPS time began on 1980-01-06 and is 18 leap seconds ahead of UTC since 2017.
 GPS_EPOCH_S, LEAP_SECONDS, SECONDS_PER_WEEK = 315_964_800, 18, 604_800
+GPS_NUMBERS = ("hdop", "vdop", "horizontal_accuracy_m", "vertical_accuracy_m", "speed_accuracy_m_s", "yaw_deg")
 # MAV_SENSOR_ORIENTATION.
 ORIENTATIONS: dict[RangeDirection, int] = {"forward": 0, "right": 2, "back": 4, "left": 6, "up": 24, "down": 25}
 # MAV_ESTIMATOR_TYPE, and the MAV_DISTANCE_SENSOR and its covariance for "unknown".
@@ -122,6 +124,9 @@ class MeasurementEncoder:
         for name, limit in (("latitude_deg", 90), ("longitude_deg", 180)):
             check_range(name, getattr(value, name), -limit, limit)
         check_finite("altitude_amsl_m", value.altitude_amsl_m)
+        for name in GPS_NUMBERS:
+            check_finite(name, getattr(value, name) or 0.0)
+        check_finite("velocity_m_s", *(value.velocity_m_s or ()))
         check_range("fix", value.fix, 0, 8)
         check_range("satellites", value.satellites, 0, 255)
         check_range("instance", value.instance, 0, 255)
@@ -220,14 +225,14 @@ class MeasurementEncoder:
 
     def optical_flow(self, value: v.FlowMeasurement) -> tuple[Message, ...]:
         """Return OPTICAL_FLOW_RAD, or OPTICAL_FLOW with rates in whole radians per interval, as ArduPilot reads it."""
-        check_finite("flow", value.x_rad, value.y_rad)
+        check_finite("flow", value.x_rad, value.y_rad, *(value.gyro_rad or ()))
         check_range("interval_s", value.interval_s, 0, 10, above=True)
         check_range("quality", value.quality, 0, 255)
         time = self._time_us(value.measured_at)
         distance = -1.0 if value.distance_m is None else value.distance_m
         check_finite("distance_m", distance)
         if self._session.autopilot.external.flow_in_radians:
-            gyro = value.gyro_rad or UNKNOWN_VECTOR
+            gyro = UNKNOWN_VECTOR if value.gyro_rad is None else value.gyro_rad
             interval_us = round(value.interval_s * 1e6)
             flow = (value.x_rad, value.y_rad, *gyro)
             return (m.OpticalFlowRad(time, 0, interval_us, *flow, 0, value.quality, 0, distance),)
@@ -240,9 +245,9 @@ class MeasurementEncoder:
 
     def _in_local_frame(self, offset: Vector, *, is_level: bool) -> Vector:
         telemetry = self._session.telemetry
-        attitude, here = telemetry.attitude.latest, telemetry.local_position.latest
-        if attitude is None or here is None:
-            raise ValueUnknownError("landing target: the vehicle's attitude or local position is unknown")
+        if max(telemetry.attitude.age, telemetry.local_position.age) > POSITION_MAX_AGE_S:
+            raise ValueUnknownError("landing target: the vehicle's attitude or local position is unknown, or too old")
+        attitude, here = telemetry.attitude.value, telemetry.local_position.value
         if is_level:
             attitude = Attitude(0.0, 0.0, attitude.yaw_deg)
         north, east, down = rotate(attitude.quaternion, offset)

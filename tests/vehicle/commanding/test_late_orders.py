@@ -1,0 +1,207 @@
+"""Orders that wait before they are sent: a newer order, a silence or a pause in the meantime."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Coroutine
+from contextlib import suppress
+from itertools import count, pairwise
+
+import anyio
+import anyio.lowlevel
+import pytest
+from flight_harness import Flight, block_loop, in_the_air, open_px4
+
+from aerokit import Position, StickInput, TargetMeasurement, VelocitySetpoint
+from aerokit import messages as m
+from aerokit.errors import CommandTimeout, InvalidArgument, OperationRejected, SetpointStreamStopped, ValueUnknownError
+from aerokit.mavlink.enums import CopterMode
+from aerokit.mavlink.enums import MavCmd as C
+from aerokit.sim import SimulatedCopter
+
+pytestmark = pytest.mark.anyio
+
+Fly = Callable[[Flight], Coroutine[None, None, None]]
+
+
+async def test_land_while_sticks_read_parameters_stands() -> None:
+    async with in_the_air(latency_s=0.6) as flight, anyio.create_task_group() as tasks:
+
+        async def land() -> None:
+            await anyio.sleep(1.0)
+            with suppress(CommandTimeout):  # The link is slow; the vehicle lands.
+                await flight.vehicle.set_mode("LAND")
+
+        tasks.start_soon(land)
+        with pytest.raises(OperationRejected, match="another order"):
+            async with flight.vehicle.sticks():
+                pass
+        await anyio.sleep(3.0)
+        assert flight.vehicle.mode_name == "LAND"
+        assert not flight.wire.all(m.ManualControl)
+
+
+async def test_loiter_without_target_needs_recent_position() -> None:
+    async with in_the_air() as flight:
+        flight.copter.faults.drop_outgoing = 100000
+        await anyio.sleep(20)
+        with pytest.raises(ValueUnknownError):
+            await flight.vehicle.loiter()
+        assert not flight.wire.commands(C.DO_REPOSITION)
+
+
+async def test_autotune_is_not_started_again_after_pause() -> None:
+    async with open_px4() as flight:
+        await flight.take_off()
+        asyncio.get_running_loop().call_later(2.5, block_loop, 20.0)
+        with pytest.raises(CommandTimeout, match="may go on tuning"):
+            await flight.vehicle.autotune()
+        sent = [at for at, each in flight.wire.sent if getattr(each, "command", 0) == C.DO_AUTOTUNE_ENABLE]
+        assert max(late - early for early, late in pairwise(sent)) < 3
+
+
+async def test_follow_slow_function_gives_no_velocity_peaks() -> None:
+    """A function that returns the latest of positions which arrive once a second."""
+    async with in_the_air() as flight:
+        here = flight.vehicle.position.value
+        began = anyio.current_time()
+
+        def latest() -> Position:
+            return here.offset(north_m=5.0 * int(anyio.current_time() - began))
+
+        async with flight.vehicle.follow(latest, distance_m=10) as following:
+            await following.fly(6)
+        speeds = [each.vx for each in flight.wire.all(m.SetPositionTargetGlobalInt)]
+        assert max(speeds) == pytest.approx(5.0, abs=1.0)
+
+
+async def test_follow_jump_of_target_is_no_velocity() -> None:
+    async with in_the_air() as flight:
+        here = flight.vehicle.position.value
+        numbers = count()
+        jump = lambda: here.offset(north_m=300.0 if next(numbers) >= 20 else 0.0)  # noqa: E731
+        async with flight.vehicle.follow(jump, distance_m=10) as following:
+            await following.fly(4)
+        speeds = [abs(each.vx) for each in flight.wire.all(m.SetPositionTargetGlobalInt)]
+        places = [each.lat_int for each in flight.wire.all(m.SetPositionTargetGlobalInt)]
+        assert max(speeds) < 100
+        assert max(places) <= here.offset(north_m=320).latitude_deg * 1e7
+
+
+async def test_follow_target_without_altitude_is_no_descent() -> None:
+    async with in_the_air() as flight:
+        here = flight.vehicle.position.value
+        numbers = count()
+
+        def place() -> Position:
+            return here if next(numbers) < 20 else here.replace(altitude_amsl_m=None)
+
+        async with flight.vehicle.follow(place, distance_m=10, height_m=5) as following:
+            await following.fly(4)
+        assert max(abs(each.vz) for each in flight.wire.all(m.SetPositionTargetGlobalInt)) < 1
+
+
+async def test_follow_invalid_first_place_holds_the_earlier_flight() -> None:
+    async with in_the_air() as flight:
+        here = flight.vehicle.position.value
+        going = asyncio.ensure_future(flight.vehicle.go_to(here.offset(north_m=500)))
+        await anyio.sleep(3)
+        high = here.replace(altitude_amsl_m=200_000.0, altitude_relative_m=None)
+        with pytest.raises(InvalidArgument):
+            async with flight.vehicle.follow(lambda: high, height_m=5):
+                pass
+        with pytest.raises(OperationRejected):
+            await going
+        await anyio.sleep(3)
+        assert flight.vehicle.mode_name == "BRAKE"
+
+
+async def test_follow_own_vehicle_is_refused() -> None:
+    async with in_the_air() as flight:
+        with pytest.raises(InvalidArgument, match="target"):
+            async with flight.vehicle.follow(flight.vehicle) as following:
+                await following.fly(10)
+        assert not flight.wire.all(m.SetPositionTargetGlobalInt)
+
+
+async def test_follow_function_that_raises_cancellation_holds() -> None:
+    async with in_the_air() as flight:
+        here = flight.vehicle.position.value
+        numbers = count()
+
+        def latest() -> Position:
+            if next(numbers) >= 10:
+                raise asyncio.CancelledError  # as Task.result() of a task that was cancelled
+            return here
+
+        with pytest.raises(SetpointStreamStopped, match="CancelledError"):
+            async with flight.vehicle.follow(latest) as following:
+                await following.fly(5)
+        await anyio.sleep(3)
+        assert flight.vehicle.mode_name == "BRAKE"
+
+
+async def test_land_on_newer_order_before_first_sight_stands() -> None:
+    simulated = SimulatedCopter(boot_time_s=0.0, parameters={"PLND_ENABLED": 1.0, "PLND_TYPE": 1.0})
+    async with in_the_air(copter=simulated) as flight:
+        going = asyncio.ensure_future(flight.vehicle.go_to(flight.vehicle.position.value.offset(north_m=30)))
+        await anyio.sleep(1)
+        sees = asyncio.Event()
+        target = lambda: TargetMeasurement(0.0, 0.0, 10.0) if sees.is_set() else None  # noqa: E731
+        landing = asyncio.ensure_future(flight.vehicle.land_on(target))
+        await anyio.sleep(1)
+        going.cancel()
+        going = asyncio.ensure_future(flight.vehicle.go_to(flight.vehicle.position.value.offset(east_m=200)))
+        await anyio.sleep(1)
+        sees.set()
+        with pytest.raises(OperationRejected, match="another order was given before anything was ordered"):
+            await landing
+        assert not [each for each in flight.wire.mode_orders() if each == CopterMode.LAND]
+        going.cancel()
+
+
+async def test_terminated_flight_gets_no_mode_afterwards() -> None:
+    async with in_the_air() as flight:
+
+        async def fly() -> None:
+            with suppress(SetpointStreamStopped, OperationRejected):
+                async with flight.vehicle.guided.velocity() as stream:
+                    await stream.fly(VelocitySetpoint(1, 0, 0), 20)
+
+        task = asyncio.ensure_future(fly())
+        await anyio.sleep(2)
+        flight.wire.clear()
+        terminating = asyncio.ensure_future(flight.vehicle.terminate(intent="terminate flight"))
+        await anyio.lowlevel.checkpoint()
+        task.cancel()
+        await asyncio.wait([task, terminating])
+        await anyio.sleep(5)
+        assert not flight.wire.mode_orders()
+
+
+async def _fly_sticks(flight: Flight) -> None:
+    async with flight.vehicle.sticks() as sticks:
+        await sticks.move(StickInput(forward=0.5), 1.0)
+        flight.copter.faults.drop_incoming = 3
+
+
+async def _fly_velocity(flight: Flight) -> None:
+    async with flight.vehicle.guided.velocity() as stream:
+        await stream.fly(VelocitySetpoint(3, 0, 0), 2.0)
+        flight.copter.faults.drop_incoming = 3
+
+
+@pytest.mark.parametrize("fly", [_fly_sticks, _fly_velocity])
+async def test_lost_hold_of_left_block_survives_cancellation(
+    fly: Callable[[Flight], Coroutine[None, None, None]],
+) -> None:
+    async with in_the_air() as flight:
+        task = asyncio.ensure_future(fly(flight))
+        while not flight.copter.faults.drop_incoming:  # noqa: ASYNC110
+            await anyio.sleep(0.05)
+        await anyio.sleep(0.1)
+        task.cancel()
+        await asyncio.wait([task])
+        assert task.cancelled()
+        await anyio.sleep(5.0)
+        assert flight.vehicle.mode_name == "BRAKE"
