@@ -79,3 +79,27 @@ def test_connect_loads_only_required_modules() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"
+
+
+def test_messages_are_imported_before_link_opens() -> None:
+    code = """
+import asyncio, sys
+from aerokit.connection.opening import open_connection
+from aerokit.errors import LinkOpenError
+from aerokit.transport.link import memory_link_pair
+
+link, _ = memory_link_pair()
+async def refuse(receiver):
+    print('aerokit.mavlink.messages.common_more' in sys.modules)
+    raise LinkOpenError('as ordered')
+link.open = refuse
+async def main():
+    try:
+        async with open_connection(link):
+            pass
+    except LinkOpenError:
+        pass
+asyncio.run(main())
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "True\n"

@@ -27,6 +27,7 @@ from aerokit.missions import (
     Mission,
     Plan,
     format_plan,
+    format_waypoints,
     return_to_launch,
     take_off,
     waypoint,
@@ -157,6 +158,13 @@ def test_page_commands_flight(browser: Any, copters: tuple[list[SimulatedCopter]
         wait_done(page, "arm")
         assert (first.is_armed, second.is_armed) == (True, False)
         order(page, "take_off", {"altitude_m": "20"})
+        disarm = page.locator("button[data-order='disarm']")
+        page.locator("button[data-order='disarm'][disabled]").wait_for()
+        seen = set()
+        while not page.locator(".toast.done", has_text="take off to 20 m: done").count():
+            if true_point(first).altitude_m > 1:
+                seen.add((disarm.is_disabled(), disarm.locator("small").inner_text()))
+        assert seen == {(True, "Land first")}
         wait_done(page, "Vehicle 1: take off to 20 m: done")
         values_have_units(page)
         order(page, "mission/start")
@@ -216,6 +224,8 @@ def test_page_sets_parameter_after_confirmation(browser: Any, copters: tuple[lis
         page.locator(".vehicle", has_text="2 ArduCopter").click()
         page.get_by_role("tab", name="Parameters").click()
         page.fill("input[type=search]", "wpnav_speed")
+        page.locator("tr", has_text="WPNAV_SPEED_UP").wait_for()
+        page.fill("input[type=search]", "wp_spd_up")  # its other name
         page.locator("tr", has_text="WPNAV_SPEED_UP").click()
         page.fill("dialog input[name=value]", "321")
         assert "Vehicle 2" in page.locator("dialog").inner_text()
@@ -322,10 +332,29 @@ def test_page_shows_why_vehicle_is_not_ready(browser: Any, copters: tuple[list[S
         page.locator("#readiness.good", has_text="Ready to arm").wait_for(timeout=30_000)
 
 
+def test_disarm_needs_known_ground(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
+    expected = {"ON_GROUND": "", "TAKEOFF": "Land first", "LANDING": "Land first", "IN_AIR": "Land first"}
+    with serving(copters[1]) as server, opened(browser, server["page"]) as page:
+        obstacles = """async ([landed, age, type, link]) => {
+            const { obstacle } = await import("/static/readiness.js");
+            const states = { armed: { value: true, age_s: 0 }, landed_state: { value: landed, age_s: age } };
+            const vehicle = { states, link: { state: link }, vehicle_type: type, missing_for_flight: [] };
+            return obstacle("disarm", vehicle, { isOpen: true });
+        }"""
+        for landed, text in expected.items():
+            assert page.evaluate(obstacles, [landed, 0, 2, "connected"]) == text
+        assert page.evaluate(obstacles, ["ON_GROUND", 10, 2, "connected"]) == "Unknown if landed"
+        assert page.evaluate(obstacles, ["ON_GROUND", 0, 2, "silent"]) == "Silent"
+        assert page.evaluate(obstacles, [None, 0, 10, "connected"]) == ""  # a rover has no landed state
+
+
 def test_page_words_errors_for_people(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
     said = {
         "take_off: the vehicle is not armed: arm() comes first": "The vehicle is not armed: “Arm” comes first",
         "MAV_CMD_NAV_TAKEOFF was refused: FAILED": "The vehicle refused (failed)",
+        "MAV_CMD_COMPONENT_ARM_DISARM was refused: FAILED\n  - not on the ground": (
+            "The vehicle refused (failed)\n  - not on the ground"
+        ),
         "x.plan: line 3: no JSON": "x.plan: line 3: no JSON",
     }
     with serving(copters[1]) as server, opened(browser, server["page"]) as page:
@@ -353,17 +382,20 @@ def test_page_uploads_dropped_plan_after_confirmation(browser: Any, copters: tup
     with serving(address) as server, opened(browser, server["page"]) as page:
         page.locator(".vehicle", has_text="2 ArduCopter").click()
         page.evaluate(DROP, ["notes.plan", "no JSON"])
-        page.locator(".toast.failed", has_text="notes.plan is not a .plan file").wait_for()
+        page.locator(".toast.failed", has_text="notes.plan: line 1: expected 'QGC WPL 110', found 'no JSON'").wait_for()
         page.evaluate(DROP, ["field.plan", format_plan(plan)])
-        text = page.locator("dialog").inner_text()
+        text = page.locator("dialog[open]").inner_text()
         assert "Vehicle 2" in text
         assert "get 2 mission items, 1 fence area from field.plan" in text
         page.click("dialog .yes")
         wait_done(page, "upload field.plan (2 items)")
         page.get_by_role("tab", name="Mission").click()
         page.locator("#panel tr", has_text="waypoint").wait_for()
-        page.evaluate(DROP, ["broken.plan", format_plan(plan).replace('"version": 2', '"version": 7')])
+        page.evaluate(DROP, ["field.waypoints", format_waypoints(plan.mission)])
+        assert "get 2 mission items from field.waypoints" in page.locator("dialog[open]").inner_text()
         page.click("dialog .yes")
+        wait_done(page, "upload field.waypoints (2 items)")
+        page.evaluate(DROP, ["broken.plan", format_plan(plan).replace('"version": 2', '"version": 7')])
         page.locator(".toast.failed", has_text="broken.plan").wait_for()
         picture(page, "uploaded")
 
@@ -397,6 +429,27 @@ def test_page_on_phone_without_token_and_read_only(browser: Any, copters: tuple[
         assert page.locator("#orders button:enabled").count() == 0
         assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
         picture(page, "phone")
+
+
+def test_page_without_token_asks_at_once(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
+    with serving(copters[1]) as server, opened(browser, server["url"], 1280, 800) as page:
+        page.locator("#server", has_text="no token").wait_for()
+        arm = page.locator("button[data-order='arm']")
+        assert (arm.is_disabled(), arm.locator("small").inner_text()) == (True, "No token")
+        page.fill("#notice input", server["token"])
+        page.click("#notice button")
+        page.locator("#notice").wait_for(state="hidden")
+        page.locator("button[data-order='arm']:enabled").wait_for()
+        picture(page, "token")
+        widths = page.locator("#orders button").evaluate_all("all => all.map(e => e.getBoundingClientRect().width)")
+        assert max(widths) < 2.5 * min(widths)
+        panel = page.locator("#side").bounding_box()
+        page.evaluate(
+            "document.getElementById('toasts').append(Object.assign(document.createElement('button'),"
+            " { className: 'toast', textContent: 'x'.repeat(300) }))"
+        )
+        toast = page.locator("#toasts").bounding_box()
+        assert toast["x"] + toast["width"] <= panel["x"]
 
 
 def test_page_after_server_end_shows_banner(browser: Any) -> None:

@@ -466,6 +466,6 @@ async def test_target_or_mission_too_far_away_is_rejected() -> None:
         with pytest.raises(InvalidArgument, match=r"targets\['north/2'\] = .*max_distance_m"):
             await stage.fleet.go_to({"north/1": near, "north/2": far})
         mission = Mission([waypoint(-47.0, -81.0, altitude_relative_m=20.0)])
-        with pytest.raises(InvalidArgument, match=r"missions\['north/2'\] = .*max_distance_m"):
+        with pytest.raises(InvalidArgument, match=r"missions\['north/2'\], item 0 = .*max_distance_m"):
             await stage.fleet.upload({"north/2": mission})
         assert stage.orders_to("north/1") == stage.orders_to("north/2") == []

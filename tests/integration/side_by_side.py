@@ -292,7 +292,7 @@ class _Runner:
 
 async def run(vehicle: Vehicle, calls: list[Call], speedup: float) -> list[Step]:
     """Run the calls one after another. PX4 receives heartbeats more often than its 2.5 s limit at any speed."""
-    idle = ("DISARM_DELAY", 0.0) if vehicle.autopilot.runs_prearm_checks else ("COM_DISARM_PRFLT", -1.0)
+    idle = ("DISARM_DELAY", 0.0) if vehicle.autopilot.home_is_item_0 else ("COM_DISARM_PRFLT", -1.0)
     await vehicle.parameters.set(*idle)  # off: a real vehicle takes longer to come to rest
     steps: list[Step] = []
     async with anyio.create_task_group() as tasks:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+import math
 import os
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial, wraps
@@ -245,3 +246,10 @@ def check_range(name: str, value: float, minimum: float, maximum: float, *, abov
     if not is_allowed:
         low = f"above {minimum:g}" if above else f"{minimum:g}"
         raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: {low} to {maximum:g}")
+
+
+def check_finite(name: str, *values: float) -> None:
+    """Raise InvalidArgument unless all values are finite numbers."""
+    for value in values:
+        if not isinstance(value, (int, float)) or not math.isfinite(value):
+            raise InvalidArgument(f"{name}: {value!r} is not a finite number")

@@ -231,6 +231,7 @@ class ArduCopter(ArduPilot):
     """ArduCopter: multicopters and helicopters."""
 
     firmware = "ArduCopter"
+    mission_needs_take_off = True  # ModeAuto::init, "Auto: Missing Takeoff Cmd"
     unsupported_commands: frozenset[int] = NOT_ON_COPTER
     modes: ModeTable = COPTER
     purposes: ClassVar[Mapping[str, str]] = {

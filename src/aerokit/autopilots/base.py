@@ -105,11 +105,8 @@ class SetpointRules(Snapshot):
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the supported kinds."""
-        kinds = (
-            *("local_position", "global_position", "velocity", "acceleration", "attitude"),
-            *("attitude_rate", "trajectory"),
-        )
-        return tuple(kind.replace("_", " ") for kind in kinds if getattr(self, kind))
+        kinds = "local_position global_position velocity acceleration attitude attitude_rate trajectory"
+        return tuple(kind.replace("_", " ") for kind in kinds.split() if getattr(self, kind))
 
 
 class StickRules(Snapshot):
@@ -265,12 +262,16 @@ class Autopilot:
     gimbals: GimbalRules = GimbalRules()
     is_surface_vehicle = False
     """True for vehicles that drive, or swim on the surface, for which altitudes are meaningless."""
+    mission_needs_take_off = False
+    """True if a mission is refused on the ground unless its first navigation command is a take-off."""
     mode_when_landed: ClassVar[str | None] = None
     """Mode to which the vehicle changes after landing; None if it stays in the landing mode."""
     unarmable_modes: frozenset[str] = frozenset()
     """Modes in which the autopilot refuses to arm, or disarms at once."""
     prearm_depends_on_mode = False
     """True if the pre-arm bit of SYS_STATUS is about the current mode only."""
+    modes_with_rc: frozenset[str] | None = None
+    """Modes that require an RC receiver, or MANUAL_CONTROL; None if its health bit is about arming in any mode."""
     camera_by_trigger_only = False
     """True if the autopilot's own camera supports only DO_DIGICAM_CONTROL and DO_TRIGGER_CONTROL."""
     video_addresses_camera = False

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Literal, TypeAlias
 
 from aerokit._internal.values import Snapshot
@@ -48,7 +49,7 @@ class ExternalRules(Snapshot):
     - ``origin_is_final``: it refuses another origin of the local frame once it has one
     """
 
-    kinds: tuple[tuple[ExternalKind, ExternalRule], ...] = ()
+    kinds: Mapping[ExternalKind, ExternalRule] = {}
     ned_frame: int = MavFrame.LOCAL_NED
     has_mocap: bool = True
     has_vision_speed: bool = True
@@ -56,10 +57,6 @@ class ExternalRules(Snapshot):
     target_is_local: bool = False
     constant_position_at_rest: bool = False
     origin_is_final: bool = False
-
-    def find(self, kind: ExternalKind) -> ExternalRule | None:
-        """Return the rule for a kind; None if the autopilot does not accept it."""
-        return dict(self.kinds).get(kind)
 
 
 def _external_navigation(what: str) -> ExternalRule:
@@ -71,18 +68,18 @@ def _external_navigation(what: str) -> ExternalRule:
 _GPS_ALONE = (("EK3_SRC1_POSXY", (3.0,)), ("EK3_SRC2_POSXY", (0.0, 3.0)), ("GPS2_TYPE", (0.0,)))
 
 ARDUPILOT_EXTERNAL = ExternalRules(
-    kinds=(
-        ("odometry", _external_navigation("POSXY")),
-        ("vision_position", _external_navigation("POSXY")),
-        ("motion_capture", _external_navigation("POSXY")),
-        ("vision_speed", _external_navigation("VELXY")),
-        ("gps", ExternalRule(((("GPS1_TYPE", "GPS_TYPE"), (14.0,)),), _GPS_ALONE)),
-        ("obstacles", ExternalRule(((("PRX1_TYPE", "PRX_TYPE"), (2.0,)),))),
-        ("obstacle_points", ExternalRule(((("PRX1_TYPE", "PRX_TYPE"), (2.0,)),))),
-        ("range_finder", ExternalRule(((("RNGFND1_TYPE",), (10.0,)),))),
-        ("landing_target", ExternalRule(((("PLND_ENABLED",), (1.0,)), (("PLND_TYPE",), (1.0,))))),
-        ("optical_flow", ExternalRule(((("FLOW_TYPE",), (5.0,)),))),
-    ),
+    kinds={
+        "odometry": _external_navigation("POSXY"),
+        "vision_position": _external_navigation("POSXY"),
+        "motion_capture": _external_navigation("POSXY"),
+        "vision_speed": _external_navigation("VELXY"),
+        "gps": ExternalRule(((("GPS1_TYPE", "GPS_TYPE"), (14.0,)),), _GPS_ALONE),
+        "obstacles": ExternalRule(((("PRX1_TYPE", "PRX_TYPE"), (2.0,)),)),
+        "obstacle_points": ExternalRule(((("PRX1_TYPE", "PRX_TYPE"), (2.0,)),)),
+        "range_finder": ExternalRule(((("RNGFND1_TYPE",), (10.0,)),)),
+        "landing_target": ExternalRule(((("PLND_ENABLED",), (1.0,)), (("PLND_TYPE",), (1.0,)))),
+        "optical_flow": ExternalRule(((("FLOW_TYPE",), (5.0,)),)),
+    },
     ned_frame=MavFrame.LOCAL_FRD,  # GCS_Common.cpp, handle_odometry: the only frame; the estimator reads it as NED
     origin_is_final=True,  # GCS_Common.cpp, set_ekf_origin
 )
@@ -99,16 +96,16 @@ _VISION_ALONE = (
 _VISION = ExternalRule(((("EKF2_EV_CTRL",), _EV_ANY),), _VISION_ALONE)
 
 PX4_EXTERNAL = ExternalRules(
-    kinds=(
-        ("odometry", _VISION),
-        ("vision_position", _VISION),
-        ("motion_capture", _VISION),
-        ("vision_speed", ExternalRule(((("EKF2_EV_CTRL",), _EV_VELOCITY),))),
-        ("obstacles", ExternalRule()),
-        ("range_finder", ExternalRule()),
-        ("landing_target", ExternalRule()),
-        ("optical_flow", ExternalRule(((("EKF2_OF_CTRL",), (1.0,)),))),
-    ),
+    kinds={
+        "odometry": _VISION,
+        "vision_position": _VISION,
+        "motion_capture": _VISION,
+        "vision_speed": ExternalRule(((("EKF2_EV_CTRL",), _EV_VELOCITY),)),
+        "obstacles": ExternalRule(),
+        "range_finder": ExternalRule(),
+        "landing_target": ExternalRule(),
+        "optical_flow": ExternalRule(((("EKF2_OF_CTRL",), (1.0,)),)),
+    },
     has_mocap=False,  # EKF2.hpp subscribes to vehicle_visual_odometry only
     has_vision_speed=False,
     flow_in_radians=True,

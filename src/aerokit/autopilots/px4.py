@@ -110,6 +110,12 @@ class Px4(Autopilot):
     unknown_currents_ca: frozenset[int] = frozenset((-1, -100))  # inside PX4, −1 A means "unknown"
     reposition_purpose: Purpose = "hold"
     prearm_depends_on_mode = True
+    # Commander.cpp repeats the failing checks as texts (measured with 1.17 in simulation).
+    runs_prearm_checks = True
+    # mode_requirements.cpp; the bit of the receiver is about these modes also in other modes (modeCheck.cpp).
+    modes_with_rc: frozenset[str] | None = frozenset(
+        ("MANUAL", "ALTCTL", "POSCTL", "POSITION_SLOW", "ALTITUDE_CRUISE", "ACRO", "STABILIZED", "RATTITUDE", "SIMPLE")
+    )
     calibration_protocol = "texts"
     camera_by_trigger_only = True
     arming_mode: ClassVar[str | None] = "LOITER"

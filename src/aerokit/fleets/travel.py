@@ -279,8 +279,10 @@ class Missions(SelectionBase):
         members = self._require_available(missions)
         for name, mission in missions.items():
             mission.check(home_is_item_0=members[name].vehicle.autopilot.home_is_item_0)
-            positions = filter(None, (item.position for item in mission.to_items()))
-            members[name].vehicle._position.check_reach(f"missions[{name!r}]", positions, max_distance_m)
+            positions = [item.position for item in mission.to_items()]
+            members[name].vehicle._position.check_reach(
+                f"missions[{name!r}]", positions, max_distance_m, are_items=True
+            )
         self._context.missions.clear()
         if self._context.min_distance_m is not None:
             deconfliction = self.compare_missions(missions)

@@ -79,8 +79,12 @@ class ParameterMetadata(Snapshot):
             return f"{self.name} can only be read"
         low, high = self.minimum, self.maximum
         inside = (low is None or value >= low) and (high is None or value <= high)
-        if value in self.values or inside:
+        has_range = low is not None or high is not None
+        if value in self.values or (inside and (has_range or not self.values or self.bitmask)):
             return None
+        if not has_range:
+            known = ", ".join(f"{number:g} {text}" for number, text in self.values.items())
+            return f"{self.name} = {value:g} is none of the documented values: {known}"
         bounds = f"{'' if low is None else f'{low:g}'}..{'' if high is None else f'{high:g}'}"
         return f"{self.name} = {value:g} is not in {bounds} {self.unit}".rstrip()
 

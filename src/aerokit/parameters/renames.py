@@ -104,11 +104,7 @@ class Renamed(Snapshot):
     @property
     def warning(self) -> str:
         """Text of the warning for the user."""
-        new = self.rename.new
-        if self.requested in self.rename.old_names:
-            text = f"{self.requested} is called {self.name} by this vehicle's firmware"
-        else:
-            text = f"{self.requested} is still called {self.name} by this vehicle's firmware"
+        text = f"{self.requested} is called {self.name} by this vehicle's firmware"
         if not self._has_other_units:
             pass
         elif self.rename.is_inverted:
@@ -116,7 +112,9 @@ class Renamed(Snapshot):
         elif self.rename.divisor != 1:
             old, other = sorted((self.requested, self.name), key=lambda name: name not in self.rename.old_names)
             text += f"; values were converted ({old} = {self.rename.divisor} × {other})"
-        return text + f". Use {new}, its name since ArduPilot {self.rename.since}."
+        if self.name in self.rename.old_names:
+            return f"{text}. The firmware, perhaps a -dev version, is older than the change in {self.rename.since}."
+        return f"{text}. Use {self.rename.new}, its name since ArduPilot {self.rename.since}."
 
     def _convert(self, value: float, source: str) -> int | float:
         if not self._has_other_units:

@@ -85,7 +85,6 @@ class Setpoint:
 
     @classmethod
     def of(cls, message: PositionTarget) -> Setpoint:
-        """Decode a message."""
         mask = message.type_mask
         return cls(
             mask,

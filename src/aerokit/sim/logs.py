@@ -23,12 +23,17 @@ from aerokit.mavlink.messages import (
 from aerokit.sim.channel import Channel
 from aerokit.sim.vehicle import SimulatedVehicle
 
+SAMPLE_LOG = b"aerokit simulator: sample log, contains no flight\n"
+"""Begin of each simulated log."""
 _BLOCK = 90
 
 
 @dataclass(frozen=True)
 class SimulatedLog:
-    """A flight log. Its content is pseudo-random, derived from ``seed``, or from size and time without a seed."""
+    """A sample of a flight log, without a flight.
+
+    Its content is `SAMPLE_LOG`, followed by pseudo-random bytes derived from ``seed``, or from size and time.
+    """
 
     size: int
     time_utc: int = 1_790_000_000
@@ -39,7 +44,7 @@ class SimulatedLog:
     def make(self) -> bytes:
         """Return the content; of two logs with the same seed, the longer starts with the shorter."""
         words = -(-self.size // 4)
-        return random.Random(self._noise).randbytes(4 * words)[: self.size]
+        return (SAMPLE_LOG + random.Random(self._noise).randbytes(4 * words))[: self.size]
 
     def grown(self, count: int, time_utc: int) -> SimulatedLog:
         """Return this log extended by ``count`` bytes."""
@@ -86,7 +91,6 @@ class LogServer:
         return bool(self._outgoing)
 
     def restart(self) -> None:
-        """Abort the transfer."""
         self._transfer += 1
         self._outgoing.clear()
 

@@ -88,7 +88,6 @@ def wrap_pi(angle: float) -> float:
 
 
 def _clamp(value: float, limit: float) -> float:
-    """Limit the absolute value."""
     if value > limit:
         return limit
     return value if value > -limit else -limit

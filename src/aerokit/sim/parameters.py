@@ -127,7 +127,6 @@ class SimParameters:
         return self._indices[name]
 
     def type(self, name: str) -> int:
-        """Return the MAV_PARAM_TYPE."""
         return self.row(name).type
 
     def default(self, name: str) -> float:

@@ -671,9 +671,9 @@ class FollowStream(BlockTwin["AsyncFollowStream"]):
     mode, nothing more is sent. ``fly`` and leaving the block then raise :class:`SetpointStreamStopped`.
 
     Entering raises:
-        OperationRejected: the vehicle is not flying. Nothing was sent.
-        OperationTimeout: no position of the target was known within ``valid_for_s``. Nothing was sent.
-        InvalidArgument: a height is wanted, and the target has no altitude. Nothing was sent.
+        OperationRejected: the vehicle is not flying (nothing was sent), or its altitude is unknown (it holds).
+        OperationTimeout: no position of the target was known within ``valid_for_s``. The vehicle holds.
+        InvalidArgument: a height is wanted, and the target has no altitude. The vehicle holds.
     """
 
     @property
@@ -737,12 +737,7 @@ class StickStream(BlockTwin["AsyncStickStream"]):
         self._loop.call(self.aio.set, sticks)
 
     def move(self, sticks: StickInput, duration_s: float) -> None:
-        """Keep the sticks in one position for ``duration_s`` seconds.
-
-        Raises:
-            InvalidArgument: a position is out of range.
-            SetpointStreamStopped: the stream ended meanwhile.
-        """
+        """Keep the sticks in one position for ``duration_s`` seconds. Raises as :meth:`set`."""
         self._loop.run(self.aio.move, sticks, duration_s)
 
 
@@ -1006,7 +1001,7 @@ class GimbalRates(BlockTwin["AsyncGimbalRates"]):
 
     @property
     def is_running(self) -> bool:
-        """True while rates are being sent."""
+        """True while values are being sent."""
         return self.aio.is_running
 
     def set(self, pitch_deg_s: float = 0.0, yaw_deg_s: float = 0.0) -> None:
@@ -1024,18 +1019,7 @@ class GimbalRates(BlockTwin["AsyncGimbalRates"]):
         self._loop.call(self.aio.set, pitch_deg_s, yaw_deg_s)
 
     def turn(self, pitch_deg_s: float, yaw_deg_s: float, duration_s: float) -> None:
-        """Feed one pair of rates for a time.
-
-        Args:
-            pitch_deg_s: degrees per second, −720 to 720; positive is up.
-            yaw_deg_s: degrees per second, −720 to 720; positive is to the right.
-            duration_s: time in seconds.
-
-        Raises:
-            InvalidArgument: a rate is out of range.
-            SetpointStreamStopped: the stream has stopped.
-            GimbalTaken: your program had control and lost it.
-        """
+        """Feed one pair of rates for ``duration_s`` seconds. Rates are as for :meth:`set`. Raises as :meth:`set`."""
         self._loop.run(self.aio.turn, pitch_deg_s, yaw_deg_s, duration_s)
 
 
@@ -1087,12 +1071,8 @@ class Gimbal(TwinOf["AsyncGimbal"]):
             InvalidArgument: the tolerance is out of range. Nothing was sent.
             NotSupported: the manager supports it for its first gimbal only. Nothing was sent.
             ValueUnknownError: the target needs home or the vehicle's altitude, which is unknown. Nothing was sent.
-            CommandRejected: the manager refused.
-            CommandTimeout: there was no answer.
-            GimbalTaken: your program had control and lost it.
-            OperationRejected: another order was given meanwhile, or the vehicle rebooted.
-            OperationTimeout: the gimbal did not reach the direction in time; the text has the last attitude.
-            HeartbeatTimeout: the vehicle fell silent.
+
+        Otherwise raises as :meth:`neutral`.
         """
         self._loop.run(self.aio.look_at, target, wait=wait, tolerance_deg=tolerance_deg, timeout=timeout)
 
@@ -1117,12 +1097,8 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         Raises:
             InvalidArgument: the system id or the tolerance is out of range. Nothing was sent.
             NotSupported: the manager does not support it. Nothing was sent.
-            CommandRejected: the manager refused.
-            CommandTimeout: there was no answer.
-            GimbalTaken: your program had control and lost it.
-            OperationRejected: another order was given meanwhile, or the vehicle rebooted.
-            OperationTimeout: the gimbal did not reach the direction in time; the text has the last attitude.
-            HeartbeatTimeout: the vehicle fell silent.
+
+        Otherwise raises as :meth:`neutral`.
         """
         self._loop.run(self.aio.look_at_system, system_id, wait=wait, tolerance_deg=tolerance_deg, timeout=timeout)
 
@@ -1166,12 +1142,8 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         Raises:
             InvalidArgument: an angle is out of range, or beyond the limits of the gimbal if :meth:`information` was
                 called before. Nothing was sent.
-            CommandRejected: the manager refused.
-            CommandTimeout: there was no answer.
-            GimbalTaken: your program had control and lost it.
-            OperationRejected: another order was given meanwhile, or the vehicle rebooted.
-            OperationTimeout: the gimbal did not reach the direction in time; the text has the last attitude.
-            HeartbeatTimeout: the vehicle fell silent.
+
+        Otherwise raises as :meth:`neutral`.
         """
         self._loop.run(
             self.aio.point,
@@ -1210,12 +1182,8 @@ class Gimbal(TwinOf["AsyncGimbal"]):
 
         Raises:
             NotSupported: the manager would accept the order but not execute it (PX4). Nothing was sent.
-            CommandRejected: the manager refused.
-            CommandTimeout: there was no answer.
-            GimbalTaken: your program had control and lost it.
-            OperationRejected: another order was given meanwhile, or the vehicle rebooted.
-            OperationTimeout: the gimbal did not reach the direction in time; the text has the last attitude.
-            HeartbeatTimeout: the vehicle fell silent.
+
+        Otherwise raises as :meth:`neutral`.
         """
         self._loop.run(self.aio.retract, wait=wait, timeout=timeout)
 
@@ -2635,7 +2603,8 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
     def wait_finished(self, *, timeout: float | None = None, max_silence_s: float | None = MAX_SILENCE_S) -> None:
         """Wait until the mission has been flown to its end; if it ends with a landing, until the vehicle has landed.
 
-        A :meth:`pause` by another task does not end the wait. Cancelling this call does not stop the vehicle.
+        A :meth:`pause` by another task does not end the wait. Cancelling this call does not stop the vehicle, and no
+        command is sent when it fails.
 
         Args:
             timeout: seconds to wait; None for no limit.
@@ -2644,7 +2613,9 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         Raises:
             OperationRejected: the vehicle no longer flies the mission: a pilot, a failsafe or another order changed the
                 mode, or it disarmed on the way. ``reasons`` has what the vehicle reported.
-            OperationTimeout: not finished in time.
+            OperationTimeout: not finished in time; or the armed vehicle has not moved for 12 s after a descent at more
+                than 3 m/s that ended on the ground; or it has not moved for 60 s at a take-off or at a waypoint without
+                a hold, which requires that the items were uploaded or downloaded.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
         """
         self._loop.run(self.aio.wait_finished, timeout=timeout, max_silence_s=max_silence_s)
@@ -3087,30 +3058,21 @@ class Camera(TwinOf["AsyncCamera"]):
     def track_rectangle(self, left: float, top: float, right: float, bottom: float, *, status_hz: float = 5.0) -> None:
         """Track the object in a rectangle of the image (MAV_CMD_CAMERA_TRACK_RECTANGLE) until :meth:`stop_tracking`.
 
+        An empty rectangle is invalid. Raises as :meth:`track_point`.
+
         Args:
             left: 0 to 1.
             top: 0 to 1.
             right: 0 to 1, right of ``left``.
             bottom: 0 to 1, below ``top``.
             status_hz: rate of ``camera.tracking``, above 0 to 50.
-
-        Raises:
-            InvalidArgument: an argument is out of range, or the rectangle is empty. Nothing was sent.
-            NotSupported: the camera cannot track a rectangle. Nothing was sent.
-            CommandRejected: the camera refused.
-            CommandTimeout: the camera did not answer.
-            OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.track_rectangle, left, top, right, bottom, status_hz=status_hz)
 
     def stop_tracking(self) -> None:
         """Stop tracking (MAV_CMD_CAMERA_STOP_TRACKING).
 
-        Raises:
-            NotSupported: the camera cannot track. Nothing was sent.
-            CommandRejected: the camera refused.
-            CommandTimeout: the camera did not answer.
-            OperationTimeout: no camera was found.
+        Raises as :meth:`reset_settings`, and NotSupported if the camera cannot track.
         """
         self._loop.run(self.aio.stop_tracking)
 
@@ -3155,17 +3117,10 @@ class Camera(TwinOf["AsyncCamera"]):
     def focus_step(self, steps: int) -> None:
         """Focus farther by a number of the camera's own steps, nearer if negative (MAV_CMD_SET_CAMERA_FOCUS).
 
-        Not retried if unanswered, because the step could be made twice.
+        Not retried if unanswered, because the step could be made twice. Raises as :meth:`zoom_step`.
 
         Args:
             steps: −100 to 100.
-
-        Raises:
-            InvalidArgument: ``steps`` is out of range. Nothing was sent.
-            NotSupported: the camera cannot be focused. Nothing was sent.
-            CommandRejected: the camera refused.
-            CommandTimeout: the camera did not answer; it may have moved.
-            OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.focus_step, steps)
 
@@ -3180,11 +3135,7 @@ class Camera(TwinOf["AsyncCamera"]):
     def auto_focus(self, kind: AutoFocus = "auto") -> None:
         """Start the camera's auto focus: ``"auto"`` by its own rules, ``"single"`` once, ``"continuous"`` from now on.
 
-        Raises:
-            NotSupported: the camera cannot be focused. Nothing was sent.
-            CommandRejected: the camera refused.
-            CommandTimeout: the camera did not answer.
-            OperationTimeout: no camera was found.
+        Raises as :meth:`reset_settings`, and NotSupported if the camera cannot be focused.
         """
         self._loop.run(self.aio.auto_focus, kind)
 
@@ -4511,36 +4462,6 @@ class Vehicle(VehicleTwin):
         """
         self._loop.run(self.aio.stop_looking)
 
-    def set_airspeed(self, airspeed_m_s: float) -> None:
-        """Change the airspeed of a fixed wing in m/s, above 0 (MAV_CMD_DO_CHANGE_SPEED, SPEED_TYPE_AIRSPEED).
-
-        Returns at the acknowledgement, because no message reports the setting; VFR_HUD has what the
-        vehicle measures.
-        ArduPlane applies it in GUIDED and AUTO, within AIRSPEED_MIN and AIRSPEED_MAX, and refuses it otherwise. PX4
-        applies it in modes that navigate, and accepts it always.
-
-        Raises:
-            InvalidArgument: out of range. Nothing was sent.
-            NotSupported: this vehicle has no wings: use ``set_speed``. Nothing was sent.
-            CommandRejected: the vehicle refused.
-            CommandTimeout: there was no acknowledgement.
-        """
-        self._loop.run(self.aio.set_airspeed, airspeed_m_s)
-
-    def set_climb_speed(self, climb_m_s: float) -> None:
-        """Change the speed of climbs in m/s, above 0 (MAV_CMD_DO_CHANGE_SPEED, SPEED_TYPE_CLIMB_SPEED).
-
-        Returns at the acknowledgement, because no message reports the setting. ArduCopter applies it in GUIDED, AUTO
-        and RTL until the mode changes, and refuses it otherwise. PX4 would take it for the cruise speed.
-
-        Raises:
-            InvalidArgument: out of range. Nothing was sent.
-            NotSupported: this firmware has no such command. Nothing was sent.
-            CommandRejected: the vehicle refused.
-            CommandTimeout: there was no acknowledgement.
-        """
-        self._loop.run(self.aio.set_climb_speed, climb_m_s)
-
     def orbit(
         self,
         center: Position | Home,
@@ -4577,14 +4498,9 @@ class Vehicle(VehicleTwin):
             max_silence_s: raise when no heartbeat was received for this long; None: no limit.
 
         Raises:
-            InvalidArgument: an argument is out of range. Nothing was sent.
             NotSupported: this type of vehicle has no way to do it. Nothing was sent.
-            ValueUnknownError: position or home is needed here and not known.
-            OperationRejected: it is not flying, or the mode changed or it disarmed on the way.
-            CommandRejected: the vehicle refused.
-            CommandTimeout: there was no acknowledgement.
-            HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
-            OperationTimeout: it was not done in time, or does not move.
+
+        Otherwise raises as :meth:`go_to`.
         """
         self._loop.run(
             self.aio.orbit,
@@ -4759,6 +4675,30 @@ class Vehicle(VehicleTwin):
             OperationTimeout: it did not reach the state in time.
         """
         self._loop.run(self.aio.transition_to, state, timeout=timeout)
+
+    def set_airspeed(self, airspeed_m_s: float) -> None:
+        """Change the airspeed of a fixed wing in m/s, above 0 (MAV_CMD_DO_CHANGE_SPEED, SPEED_TYPE_AIRSPEED).
+
+        Returns at the acknowledgement, because no message reports the setting; VFR_HUD has what the vehicle measures.
+        ArduPlane applies it in GUIDED and AUTO, within AIRSPEED_MIN and AIRSPEED_MAX, and refuses it otherwise. PX4
+        applies it in modes that navigate, and accepts it always. ``set_speed`` changes the ground speed.
+
+        Raises:
+            InvalidArgument: out of range. Nothing was sent.
+            NotSupported: this firmware cannot change this speed, or has no wings. Nothing was sent.
+            CommandRejected: the vehicle refused.
+            CommandTimeout: there was no acknowledgement.
+        """
+        self._loop.run(self.aio.set_airspeed, airspeed_m_s)
+
+    def set_climb_speed(self, climb_m_s: float) -> None:
+        """Change the speed of climbs in m/s, above 0 (MAV_CMD_DO_CHANGE_SPEED, SPEED_TYPE_CLIMB_SPEED).
+
+        Returns at the acknowledgement, because no message reports the setting. ArduCopter applies it in GUIDED, AUTO
+        and RTL until the mode changes, and refuses it otherwise. PX4 would take it for the cruise speed. Raises as
+        :meth:`set_airspeed`.
+        """
+        self._loop.run(self.aio.set_climb_speed, climb_m_s)
 
     def go_to(
         self,

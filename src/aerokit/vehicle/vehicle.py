@@ -13,7 +13,6 @@ from aerokit.vehicle.commanding.flight import FlightActions, ModeActions
 from aerokit.vehicle.commanding.maneuvers import ManeuverActions
 from aerokit.vehicle.commanding.messaging import MessagingActions
 from aerokit.vehicle.commanding.progress import MAX_SILENCE_S
-from aerokit.vehicle.commanding.speeds import SpeedActions
 from aerokit.vehicle.commanding.termination import TerminationActions
 from aerokit.vehicle.commanding.travel import LookActions, TravelActions
 from aerokit.vehicle.commanding.tuning import TuningActions
@@ -57,7 +56,6 @@ class Vehicle(
     FlightActions,
     TravelActions,
     ManeuverActions,
-    SpeedActions,
     LookActions,
     ArmingActions,
     ModeActions,

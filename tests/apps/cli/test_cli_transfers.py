@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 import threading
@@ -9,12 +10,17 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from flight_harness import open_flight
 from served_copter import served
 
 from aerokit.apps.cli import main
+from aerokit.apps.cli.mission import upload_parts
 from aerokit.apps.cli.terminal import progress_bar
+from aerokit.errors import InvalidArgument
+from aerokit.missions import Mission, Plan, take_off, waypoint
 from aerokit.protocols.exchange import TransferProgress
 from aerokit.sim import SimulatedCopter
+from aerokit.testing import run_virtual
 
 WAYPOINTS = """QGC WPL 110
 0\t1\t0\t16\t0\t0\t0\t0\t47.397742\t8.545594\t488\t1
@@ -153,6 +159,36 @@ def test_mission_check_of_invalid_file_fails(old: str, new: str, capsys: pytest.
     assert capsys.readouterr().err.startswith("aerokit: ")
 
 
+def test_mission_check_warns_of_unknown_command_and_missing_take_off(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("m.waypoints").write_text(WAYPOINTS.replace("\t3\t22\t", "\t3\t9999\t"))
+    assert main(["mission", "check", "m.waypoints"]) == 0
+    out = capsys.readouterr().out
+    assert "warning: mission item 0: command 9999 is not a MAV_CMD" in out
+    assert "warning: the mission does not begin with a take-off" in out
+    assert out.endswith("m.waypoints has no errors, but 2 warnings\n")
+
+
+def test_mission_check_of_plan_without_problems_has_no_warnings(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("m.waypoints").write_text(WAYPOINTS)
+    assert main(["mission", "check", "m.waypoints"]) == 0
+    assert capsys.readouterr().out.endswith("m.waypoints has no errors\n")
+
+
+def test_mission_upload_of_far_item_names_item_and_option() -> None:
+    async def scenario() -> None:
+        async with open_flight() as flight:
+            await flight.vehicle.wait_ready()
+            options = argparse.Namespace(patience=10.0, max_distance_m=100_000.0, json=True)
+            far = waypoint(17.398, 8.5456, altitude_relative_m=10)
+            plan = Plan(Mission([take_off(altitude_relative_m=10), far]))
+            with pytest.raises(InvalidArgument, match=r"^mission item 1 = 17\.39.*greater --max-distance-m"):
+                await upload_parts(flight.vehicle, plan, options)
+            options.max_distance_m = 1e8
+            await upload_parts(flight.vehicle, plan, options)
+
+    run_virtual(scenario())
+
+
 def test_mission_upload_show_download_and_clear(run: Run) -> None:
     Path("m.waypoints").write_text(WAYPOINTS)
     code, out, _ = run("mission", "upload", "m.waypoints")
@@ -171,7 +207,8 @@ def test_mission_upload_show_download_and_clear(run: Run) -> None:
 def test_mission_start_on_disarmed_vehicle_is_refused(run: Run) -> None:
     code, _, err = run("mission", "start")
     assert code == 5
-    assert "not armed" in err
+    assert "not armed; nothing was sent. `aerokit fly FILE`" in err
+    assert "arm()" not in err
 
 
 # ---------------------------------------------------------------------------------- files, logs
@@ -193,7 +230,7 @@ def test_files_actions_round_trip(run: Run) -> None:
     assert "no such file" in err
 
 
-def test_logs_get_downloads_newest_log(run: Run) -> None:
+def test_logs_get_downloads_newest_log_without_flight(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
     code, out, _ = run("logs", "list")
     assert code == 0
     newest, size, *_ = out.splitlines()[-1].split()
@@ -204,6 +241,8 @@ def test_logs_get_downloads_newest_log(run: Run) -> None:
     assert log.stat().st_size == int(size)
     assert f"{int(newest):05}" in log.name
     assert run("logs", "get", "4711")[0] == 2
+    assert main(["report", str(log)]) == 6
+    assert "is a sample of aerokit's simulator and contains no flight" in capsys.readouterr().err
 
 
 def test_logs_erase_without_yes_erases_nothing(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -134,6 +134,15 @@ def test_fly_mission_start_refusal_disarms(copter: SimulatedCopter, capsys: pyte
     assert not copter.is_armed
 
 
+def test_fly_mission_without_take_off_is_not_armed(copter: SimulatedCopter, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("m.waypoints").write_text(MISSION.replace("1\t0\t3\t22", "1\t0\t3\t178"))  # DO_CHANGE_SPEED
+    assert run_with(copter, FLY) == [2]
+    out, err = capsys.readouterr()
+    assert "does not begin with a take-off" in err
+    assert "arming" not in out
+    assert not copter.is_armed
+
+
 def test_fly_unsupported_interrupt_action_sends_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     assert run_with(SimulatedSub(boot_time_s=0.0, home=HOME), FLY) == [5]
     assert "choose land or hold or nothing; nothing was sent" in capsys.readouterr().err

@@ -121,6 +121,23 @@ def test_fly_mission_changed_during_question_is_not_flown(
     assert (copter.is_armed, copter.is_landed) == (False, True)
 
 
+def test_fly_fall_ends_with_error_and_sends_nothing(
+    copter: SimulatedCopter, capsys: pytest.CaptureFixture[str]
+) -> None:
+    async def scenario() -> int:
+        async with simulated_link(copter) as link:
+            flight = asyncio.create_task(run_on(link, "fly", "m.waypoints", "--yes"))
+            await wait_until(lambda: copter.altitude_m > 8)
+            copter.faults.motor_failed = True
+            with anyio.fail_after(60):
+                return await flight
+
+    assert run_virtual(scenario()) == 4
+    out, err = capsys.readouterr()
+    assert "it accepted the order and has not moved for 12 s, after it descended" in err
+    assert "failed: mission.wait_finished" in out
+
+
 class FullDisk(io.StringIO):
     def write(self, text: str) -> int:
         raise OSError(28, "No space left on device")

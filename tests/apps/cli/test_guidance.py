@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import select
@@ -19,7 +20,7 @@ from cli_harness import HOME, MISSION, run_on, run_with
 from aerokit import messages as m
 from aerokit.apps.cli import main
 from aerokit.apps.cli.main import COMMANDS, GROUPS, RUN
-from aerokit.apps.cli.output import near_names, plain_warnings, suggestion
+from aerokit.apps.cli.output import NotInstalled, import_extra, near_names, plain_warnings, suggestion
 from aerokit.mavlink.tlog import read_tlog
 from aerokit.parameters.renames import ParameterRenamedWarning
 from aerokit.sim import SimulatedCamera, SimulatedCopter, SimulatedGimbal
@@ -300,3 +301,25 @@ def test_params_set_without_equals_sign_error_says_how(capsys: pytest.CaptureFix
     with pytest.raises(SystemExit):
         main(["params", "set", "RTL_ALT", "2000"])
     assert "'RTL_ALT' has no value: write NAME=VALUE without spaces" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("source", "requirement"),
+    [
+        ({}, "'aerokit-mavlink[monitor]'"),
+        ({"url": "file:///home/me/aerokit", "dir_info": {}}, "'aerokit-mavlink[monitor] @ file:///home/me/aerokit'"),
+        ({"url": "file:///home/me/aerokit", "dir_info": {"editable": True}}, "-e '/home/me/aerokit[monitor]'"),
+    ],
+)
+def test_missing_extra_names_command_for_this_installation(
+    source: dict[str, object], requirement: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Distribution:
+        def read_text(self, name: str) -> str:
+            assert name == "direct_url.json"
+            return json.dumps(source)
+
+    monkeypatch.setattr("importlib.metadata.distribution", lambda name: Distribution())
+    with pytest.raises(NotInstalled) as caught:
+        import_extra("no_such_module", "monitor")
+    assert str(caught.value).endswith(f" -m pip install {requirement}")

@@ -13,7 +13,7 @@ from flight_harness import Wire
 from aerokit import messages as m
 from aerokit.apps.cli import main
 from aerokit.apps.cli.output import TIMED_OUT
-from aerokit.mavlink.enums import MavCmd
+from aerokit.mavlink.enums import CopterMode, MavCmd
 from aerokit.mavlink.signing import SigningKey
 from aerokit.mavlink.tlog import read_tlog
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
@@ -65,6 +65,26 @@ def test_status_prints_what_is_missing_for_flight(capsys: pytest.CaptureFixture[
     assert run_with(SimulatedCopter(boot_time_s=600.0), ["status"]) == [0]
     assert "missing  " in (out := capsys.readouterr().out)
     assert "ready  " not in out
+
+
+@pytest.mark.parametrize(("mode", "is_for_flight_only"), [(CopterMode.STABILIZE, True), (CopterMode.GUIDED, False)])
+def test_status_without_gps_names_mode_that_allows_arming(
+    mode: CopterMode, is_for_flight_only: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copter = SimulatedCopter(boot_time_s=0.0)
+
+    async def scenario() -> None:
+        async with simulated_link(copter) as link:
+            await anyio.sleep(10)
+            copter.set_mode(mode)
+            copter.faults.gps_lost = True
+            await anyio.sleep(20)
+            assert await run_on(link, "status", "--seconds", "8") == 0
+
+    run_virtual(scenario())
+    out = capsys.readouterr().out
+    assert ("missing  for autonomous flight; STABILIZE allows arming:\n" in out) is is_for_flight_only
+    assert "the estimator has no absolute horizontal position" in out
 
 
 def test_status_of_ready_vehicle_says_so(capsys: pytest.CaptureFixture[str]) -> None:
@@ -185,3 +205,11 @@ def test_record_invalid_arguments_create_no_file(
     assert text in printed
     assert "[ADDRESS] FILE" in printed
     assert list(Path().iterdir()) == []
+
+
+def test_status_of_recording_says_so() -> None:
+    from aerokit.apps.cli.status import _link_line
+
+    counts = {"frames": 3, "frames_lost": 0, "seconds": 1.0, "bad_bytes": 0, "bytes": 9, "unknown_messages": 0}
+    assert _link_line({"address": "replay:crash.tlog", **counts}).startswith("replay:crash.tlog (a recording, not a")
+    assert "recording" not in _link_line({"address": "udpin:0.0.0.0:14550", **counts})

@@ -344,3 +344,21 @@ async def test_large_plan_is_taken_and_too_large_one_refused() -> None:
         assert len(json.dumps(plan)) > MAX_BODY_SIZE
         assert answer.status_code == 200
         assert (await stage.submit("mission/upload", {"plan": {"x": "y" * MAX_PLAN_SIZE}})).status_code == 413
+
+
+async def test_plan_is_checked_in_either_format_and_nothing_is_sent() -> None:
+    waypoints = "QGC WPL 110\n0\t1\t0\t16\t0\t0\t0\t0\t-35\t149\t584\t1\n1\t0\t3\t22\t0\t0\t0\t0\t0\t0\t15\t1\n"
+    async with open_stage(open_reading=True) as stage:
+        stage.flight.wire.clear()
+        assert (await stage.client.post("/api/plan", json={"plan": waypoints})).status_code == 401
+        answer = await stage.client.post("/api/plan", json={"plan": waypoints, "name": "a.waypoints"}, headers=BEARER)
+        assert answer.json() == {"mission_items": 1, "fence_areas": 0, "rally_points": 0}
+        broken = await stage.client.post(
+            "/api/plan", json={"plan": waypoints.replace("-35", "x"), "name": "a.waypoints"}, headers=BEARER
+        )
+        assert (broken.status_code, broken.json()["error"]) == (400, "FileFormatError")
+        assert broken.json()["detail"].startswith("a.waypoints: line 2: ")
+        assert not stage.flight.wire.all(MissionCount)
+        uploaded = await stage.submit("mission/upload", {"plan": waypoints, "name": "a.waypoints"})
+        assert uploaded.json()["arguments"]["mission_items"] == 1
+        assert len(await stage.flight.vehicle.mission.download()) == 1

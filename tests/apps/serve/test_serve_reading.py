@@ -10,6 +10,7 @@ from pathlib import Path
 import anyio
 import httpx
 import pytest
+from flight_harness import open_flight
 from serve_stage import HOST, TOKEN, Socket, open_stage
 from starlette.applications import Starlette
 from starlette.routing import Mount, Route, WebSocketRoute
@@ -20,6 +21,7 @@ from aerokit.apps.serve.app import STATIC
 from aerokit.apps.serve.failsafe import ground_station_failsafe
 from aerokit.apps.serve.stream import MAX_ANONYMOUS_SOCKETS, MAX_QUEUED_MESSAGES, MAX_SOCKETS
 from aerokit.errors import InvalidArgument
+from aerokit.mavlink.enums import MavCmd
 from aerokit.missions import (
     Fence,
     FenceCircle,
@@ -360,3 +362,31 @@ async def test_parameters_have_metadata(tmp_path: Path) -> None:
         assert (found["unit"], found["minimum"], found["maximum"]) == ("cm", 200, 8000)
         assert (found["short_description"], found["description"]) == ("RTL altitude", "<b>How high</b>")
         assert "unit" not in rows["RTL_SPEED"]
+
+
+async def test_failing_checks_are_requested_once_per_change() -> None:
+    async with open_flight() as flight:
+        await flight.vehicle.wait_ready()
+        flight.copter.faults.prearm_failures.append("Compass not healthy")
+        await flight.vehicle.sensors.wait_until(lambda sensors: sensors.prearm_checks_pass is False)
+        flight.wire.clear()
+        async with make_app(flight.vehicle, token=TOKEN) as app, Socket(app) as socket:
+
+            async def missing() -> list[str]:
+                socket.sent.clear()
+                await socket.next("state")
+                return list((await socket.next("state"))["vehicles"][0]["missing_for_flight"])
+
+            await anyio.sleep(2)
+            assert "Compass not healthy" in await missing()
+            await anyio.sleep(20)
+            assert len(flight.wire.commands(MavCmd.RUN_PREARM_CHECKS)) == 1
+            flight.copter.faults.prearm_failures.clear()
+            await flight.vehicle.sensors.wait_until(lambda sensors: sensors.prearm_checks_pass is True)
+            flight.copter.faults.prearm_failures.append("Gyros inconsistent")
+            await flight.vehicle.sensors.wait_until(lambda sensors: sensors.prearm_checks_pass is False)
+            await anyio.sleep(2)
+            reasons = await missing()
+            assert "Gyros inconsistent" in reasons
+            assert "Compass not healthy" not in reasons
+            assert len(flight.wire.commands(MavCmd.RUN_PREARM_CHECKS)) == 2

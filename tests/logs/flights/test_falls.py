@@ -14,18 +14,24 @@ from aerokit.apps.cli import main
 from aerokit.logs.flights.failsafes import evidence_in_texts
 from aerokit.logs.flights.falls import falls
 from aerokit.logs.flights.flight import FlightLog, LoggedText
+from aerokit.logs.report.statistics import fall_measurements, findings
 from aerokit.testing import open_flight, run_virtual
 
 ARMED_S, DISARMED_S = 1.0, 40.0
 
 
 def descending(
-    sink_m_s: Callable[[float], float], *, end_s: float = 60.0, ground_m: float = 0.0, texts: tuple[str, ...] = ()
+    sink_m_s: Callable[[float], float],
+    *,
+    end_s: float = 60.0,
+    ground_m: float = 0.0,
+    texts: tuple[str, ...] = (),
+    disarmed_s: float = DISARMED_S,
 ) -> FlightLog:
     """Return a flight that hovers at 30 m, sinks from second 10 on with ``sink_m_s(height)``, and stops at
     ``ground_m``.
     """
-    flight = FlightLog(Path("flight.tlog"), ends_at=end_s, armed=[(ARMED_S, min(DISARMED_S, end_s))])
+    flight = FlightLog(Path("flight.tlog"), ends_at=end_s, armed=[(ARMED_S, min(disarmed_s, end_s))])
     height_m = 30.0
     for step in range(int(end_s * 10)):
         is_above = height_m > ground_m
@@ -75,6 +81,33 @@ def test_touchdown_below_six_m_s_is_hard_landing() -> None:
     assert (fall.title, fall.sink_m_s) == ("Hard landing", 4.5)
 
 
+def test_fall_of_vehicle_that_stays_armed_is_found() -> None:
+    (fall,) = falls(descending(free_fall, end_s=600.0, disarmed_s=590.0))
+    assert (fall.title, fall.has_impact) == ("Fall", True)
+    assert falls(descending(free_fall, end_s=600.0, disarmed_s=600.0)) == [fall]
+
+
+def test_measurements_of_fall_are_those_of_the_descent() -> None:
+    flight = descending(free_fall)
+    (fall,) = falls(flight)
+    assert fall_measurements(flight, fall) == []
+    for step in range(600):
+        is_falling = fall.begins_s <= step / 10 < fall.time_s - 0.3
+        flight.air.add(step / 10, 0.0, 100.0 if is_falling else 40.0)
+        flight.attitude.add(step / 10, 62.0 if is_falling else 0.0, 0.0, 0.0)
+        flight.attitude_target.add(step / 10, 0.0, 0.0, 0.0)
+    assert fall_measurements(flight, fall) == [
+        "throttle up to 100 %, so look at motors, propellers and battery",
+        "tilt up to 62°",
+        "attitude up to 62° off its set-point, so look at the attitude charts",
+    ]
+    assert findings(flight)[1].startswith("Measured in the descent: throttle up to 100 %")
+
+
+def test_hover_for_minutes_after_fast_descent_is_no_fall() -> None:
+    assert falls(descending(lambda height_m: 8.0, ground_m=10.0, end_s=600.0, disarmed_s=590.0)) == []
+
+
 def test_crash_text_of_firmware_makes_hard_landing_a_fall() -> None:
     (fall,) = falls(descending(lambda height_m: 4.5, texts=("Crash: Disarming: AngErr=82>30, Accel=1.2<3.0",)))
     assert fall.title == "Fall"
@@ -122,6 +155,9 @@ def test_report_of_crash_begins_and_ends_with_fall(
     html = log.with_suffix(".html").read_text(encoding="utf-8")
     assert f'<p class="finding">{first}</p>' in html
     assert "No failsafe was reported" in html
+    assert "max ground speed" in html
+    assert '"name":"fall"' in html.replace('": "', '":"')
+    assert '"name":"failsafe"' not in html.replace('": "', '":"')
 
 
 @pytest.mark.parametrize(

@@ -101,6 +101,14 @@ async def test_block_left_warns_program_that_armed(caplog: pytest.LogCaptureFixt
     assert "vehicle 1 was left: in LOITER, still armed, " in caplog.text
 
 
+async def test_block_left_after_landing_says_on_the_ground(caplog: pytest.LogCaptureFixture) -> None:
+    with pytest.raises(ZeroDivisionError):
+        async with in_the_air() as flight:
+            await flight.vehicle.land()
+            raise ZeroDivisionError
+    assert "vehicle 1 was left: on the ground in LAND, still armed, " in caplog.text
+
+
 async def test_orders_before_disarming_do_not_count(caplog: pytest.LogCaptureFixture) -> None:
     with pytest.raises(ZeroDivisionError):
         async with open_flight() as flight:

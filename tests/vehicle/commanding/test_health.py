@@ -11,6 +11,7 @@ from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd, MavResult, MavSeverity
 from aerokit.mavlink.messages import Statustext, SysStatus
 from aerokit.sim import SimulatedCopter, SimulatedPx4
+from aerokit.sim.px4.modes import POSITION
 
 pytestmark = pytest.mark.anyio
 
@@ -145,8 +146,9 @@ async def test_set_mode_silent_vehicle_times_out(grounded: Flight) -> None:
 
 
 async def test_disarm_in_the_air_is_refused_and_forced(flying: Flight) -> None:
-    with pytest.raises(CommandRejected):
+    with pytest.raises(CommandRejected) as caught:
         await flying.vehicle.disarm()
+    assert caught.value.reasons == ("the vehicle is not on the ground (landed state IN_AIR)",)
     assert flying.vehicle.is_armed
     await flying.vehicle.disarm(force=True)
     assert not flying.copter.is_armed
@@ -292,3 +294,24 @@ async def test_state_older_than_five_seconds_is_missing_for_flight(grounded: Fli
     assert grounded.vehicle.missing_for_flight() == []
     await anyio.sleep(1.5)
     assert any("no SYS_STATUS for" in reason for reason in grounded.vehicle.missing_for_flight())
+
+
+async def test_px4_why_not_armable_names_failing_check_and_not_rc() -> None:
+    async with open_px4() as flight:
+        await flight.vehicle.wait_ready()
+        flight.px4.faults.prearm_failures.append("Compass not healthy")
+        await anyio.sleep(2.0)
+        assert await flight.vehicle.why_not_armable() == [
+            "Preflight Fail: Compass not healthy",
+            "the vehicle's pre-arm checks do not pass (SYS_STATUS)",
+        ]
+        assert len(flight.wire.commands(MavCmd.RUN_PREARM_CHECKS)) == 1
+        assert not flight.wire.commands(ARM)
+
+
+async def test_px4_mode_with_sticks_names_missing_rc_receiver() -> None:
+    async with open_px4() as flight:
+        await flight.vehicle.wait_ready()
+        flight.px4.switch_to(POSITION)
+        await anyio.sleep(2.0)
+        assert "RC receiver (missing) is not healthy (SYS_STATUS)" in await flight.vehicle.why_not_armable()

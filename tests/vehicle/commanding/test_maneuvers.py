@@ -16,6 +16,7 @@ from flight_harness import Wire, in_the_air, now, open_flight
 
 import aerokit
 from aerokit import messages as m
+from aerokit.connection.cells import Source
 from aerokit.errors import (
     CommandRejected,
     CommandTimeout,
@@ -24,7 +25,7 @@ from aerokit.errors import (
     OperationRejected,
     SetpointStreamStopped,
 )
-from aerokit.mavlink.enums import MavCmd, MavVtolState
+from aerokit.mavlink.enums import CopterMode, MavCmd, MavVtolState
 from aerokit.sim import (
     SimulatedCopter,
     SimulatedPlane,
@@ -312,6 +313,21 @@ async def test_follow_holds_when_the_target_is_too_far_away() -> None:
         with pytest.raises(SetpointStreamStopped, match="max_distance_m = 1000"):
             async with flight.vehicle.follow(lambda: next(places, far)) as following:
                 await following.fly(5)
+
+
+async def test_follow_without_own_altitude_holds() -> None:
+    async with in_the_air() as flight:
+        cell = flight.vehicle.telemetry.position
+        here = cell.value
+        cell.set(
+            aerokit.Position(here.latitude_deg, here.longitude_deg, altitude_relative_m=10.0),
+            Source(1, 1, "GLOBAL_POSITION_INT"),
+        )
+        flight.wire.clear()
+        with pytest.raises(OperationRejected, match="altitude above sea level is unknown"):
+            async with flight.vehicle.follow(lambda: here):
+                pass
+        assert flight.wire.mode_orders() == [CopterMode.BRAKE]
 
 
 async def test_follow_function_that_raises_stops_it() -> None:

@@ -441,7 +441,7 @@ async def test_rates_stay_with_their_gimbal() -> None:
 async def test_stale_rates_stop_the_stream() -> None:
     gimbal = SimulatedGimbal()
     async with with_gimbals(gimbal) as flight, flight.vehicle.gimbal.control():
-        with pytest.raises(SetpointStreamStopped, match="no new rates came for"):
+        with pytest.raises(SetpointStreamStopped, match="no new pair of rates was supplied for"):
             async with flight.vehicle.gimbal.rates(-5.0, 0.0, valid_for_s=1.0):
                 await anyio.sleep(3.0)
         assert math.degrees(gimbal.angles()[1]) == pytest.approx(-5.5, abs=1.0)
@@ -547,7 +547,7 @@ async def test_rates_are_validated_and_entered_once() -> None:
                 gimbal.rates(**wrong)  # type: ignore[arg-type]
         assert not flight.wire.commands(PITCHYAW)
         stream = gimbal.rates()
-        with pytest.raises(SetpointStreamStopped, match="inside the `async with`"):
+        with pytest.raises(SetpointStreamStopped, match="inside its `async with`"):
             stream.set(1.0, 1.0)
         async with stream:
             with pytest.raises(InvalidArgument):

@@ -24,7 +24,7 @@ from aerokit.errors import (
 from aerokit.mavlink.enums import CopterMode, MavCmd, MissionState
 from aerokit.missions import Mission, MissionItem
 from aerokit.missions.actions import jump
-from aerokit.missions.navigation import return_to_launch
+from aerokit.missions.navigation import return_to_launch, waypoint
 from aerokit.sim.ardupilot.mission_run import MissionRun
 
 pytestmark = pytest.mark.anyio
@@ -117,6 +117,62 @@ async def test_wait_finished_continues_through_pause() -> None:
         await mission.start(1)  # from another task
         assert not mission._tracker.is_complete
         await mission.wait_finished(timeout=60)
+
+
+async def test_wait_finished_reports_fall_of_armed_vehicle() -> None:
+    async with armed(open_flight) as flight:
+        assert isinstance(flight, Flight)
+        mission = flight.vehicle.mission
+        await mission.start()
+        await reaches(flight, 1)
+        flight.copter.faults.motor_failed = True
+        flight.wire.clear()
+        started = now()
+        with pytest.raises(
+            OperationTimeout, match=r"not moved for 12 s, after it descended \d.* at up to .*at item 1 of"
+        ):
+            await mission.wait_finished()
+        assert now() - started < 20
+        assert flight.vehicle.is_armed
+        assert not flight.wire.commands(MavCmd.COMPONENT_ARM_DISARM)
+        assert not flight.wire.commands(MavCmd.DO_SET_MODE)
+
+
+@pytest.mark.parametrize("opened", [open_flight, open_px4])
+async def test_wait_finished_reports_vehicle_that_does_not_move(opened: Any) -> None:
+    async with armed(opened) as flight:
+        simulated = flight.copter if isinstance(flight, Flight) else flight.px4
+        simulated.faults.motor_failed = True  # before the take-off
+        await flight.vehicle.mission.start()
+        started = now()
+        with pytest.raises(OperationTimeout, match=r"has not moved for 6\d s; at item 0 of"):
+            await flight.vehicle.mission.wait_finished()
+        assert now() - started < 75
+
+
+async def test_wait_finished_continues_through_hold_of_minutes() -> None:
+    async with armed(open_flight) as flight:
+        mission = flight.vehicle.mission
+        first, second, *_ = short_mission(flight)
+        assert second.position is not None
+        await mission.upload(Mission([first, waypoint(second.position, hold_s=80)]))
+        await mission.start()
+        started = now()
+        await mission.wait_finished()
+        assert now() - started > 80
+
+
+async def test_wait_finished_continues_through_pause_of_minutes() -> None:
+    async with armed(open_flight) as flight:
+        mission = flight.vehicle.mission
+        await mission.start()
+        await reaches(flight, 1)
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(mission.wait_finished)
+            await mission.pause()
+            await anyio.sleep(80)
+            await mission.resume()
+        assert mission.progress.value.state == 5
 
 
 async def test_px4_pause_resume_and_second_flight() -> None:

@@ -10,7 +10,7 @@ from aerokit import events
 from aerokit.apps.cli.arguments import add_record, number, vehicle_kind
 from aerokit.apps.cli.completion import kinds, offer
 from aerokit.apps.cli.connecting import add_vehicle, connect_to, default_address, signing_of
-from aerokit.apps.cli.mission import PARTS, emit_items, read_plan, upload_parts
+from aerokit.apps.cli.mission import PARTS, add_max_distance, begins_with_take_off, emit_items, read_plan, upload_parts
 from aerokit.apps.cli.output import (
     DONE,
     FAILED,
@@ -98,7 +98,13 @@ class PlanFlight(SupervisedFlight):
                 f"{vehicle.autopilot.firmware} has no mode for --on-interrupt {wanted}: choose"
                 f" {' or '.join(possible)}; nothing was sent"
             )
-        self._plan.mission.check(home_is_item_0=vehicle.autopilot.home_is_item_0)
+        mission = self._plan.mission
+        mission.check(home_is_item_0=vehicle.autopilot.home_is_item_0)
+        if vehicle.autopilot.mission_needs_take_off and not begins_with_take_off(mission.items):
+            raise InvalidArgument(
+                f"the mission does not begin with a take-off: {vehicle.autopilot.firmware} on the ground refuses to"
+                " start it; nothing was sent"
+            )
 
     def _has_mode_for(self, purpose: str) -> bool:
         mode_for = self._vehicle.autopilot.mode_for
@@ -172,6 +178,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         metavar="S",
         help="seconds to wait until the vehicle is ready to arm (120)",
     )
+    add_max_distance(command)
     simulated = command.add_argument_group("simulated")
     simulated.add_argument(
         "--sim", action="store_true", help="fly on a simulated vehicle at the planned home; does not ask"

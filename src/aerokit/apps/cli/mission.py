@@ -6,12 +6,14 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from aerokit.apps.cli.arguments import writable_file
+from aerokit.apps.cli.arguments import number, writable_file
 from aerokit.apps.cli.completion import offer
 from aerokit.apps.cli.connecting import add_action, command_action, connected
 from aerokit.apps.cli.output import DONE, add_force, check_not_existing, emit, suggestion
 from aerokit.apps.cli.terminal import progress_bar
-from aerokit.errors import InvalidArgument
+from aerokit.errors import InvalidArgument, OperationRejected
+from aerokit.mavlink.enums import MavAutopilot, MavCmd, MavType
+from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -20,6 +22,14 @@ if TYPE_CHECKING:
     from aerokit.vehicle.vehicle import Vehicle
 
 PARTS = ("mission", "fence", "rally")
+_TAKE_OFFS = (MavCmd.NAV_TAKEOFF, MavCmd.NAV_TAKEOFF_LOCAL, MavCmd.NAV_VTOL_TAKEOFF)
+_COPTERS = frozenset(
+    {
+        *(MavType.QUADROTOR, MavType.COAXIAL, MavType.HELICOPTER, MavType.HEXAROTOR, MavType.OCTOROTOR),
+        *(MavType.TRICOPTER, MavType.DODECAROTOR, MavType.DECAROTOR),
+    }
+)
+_STANDARD_COMMANDS = frozenset(int(command) for command in MavCmd)
 
 
 def read_plan(path: str) -> Plan:
@@ -38,6 +48,28 @@ def read_plan(path: str) -> Plan:
     for part in PARTS:
         getattr(plan, part).check()
     return plan
+
+
+def begins_with_take_off(items: Sequence[MissionItem]) -> bool:
+    """Return True if the first navigation command is a take-off; a delay may precede it, as in AP_Mission."""
+    steers = (item.command for item in items if item.command < MavCmd.NAV_LAST and item.command != MavCmd.NAV_DELAY)
+    return next(steers, None) in _TAKE_OFFS
+
+
+def plan_warnings(plan: Plan) -> list[str]:
+    """Return what a vehicle will probably refuse, although the plan can be sent."""
+    names = [(part, getattr(plan, part).to_items()) for part in PARTS]
+    warnings = [
+        f"{part} item {index}: command {item.command} is not a MAV_CMD; a vehicle that does not know it refuses it"
+        for part, items in names
+        for index, item in enumerate(items)
+        if item.command not in _STANDARD_COMMANDS
+    ]
+    mission = plan.mission.items
+    may_be_arducopter = plan.vehicle_type in _COPTERS and plan.firmware_type != MavAutopilot.PX4
+    if mission and may_be_arducopter and not begins_with_take_off(mission):
+        warnings.append("the mission does not begin with a take-off: an ArduCopter on the ground refuses to start it")
+    return warnings
 
 
 def emit_part(options: argparse.Namespace, part: str, items: int, state: str, text: str) -> None:
@@ -61,14 +93,27 @@ def emit_items(options: argparse.Namespace, part: str, items: Sequence[MissionIt
 
 
 async def upload_parts(vehicle: Vehicle, plan: Plan, options: argparse.Namespace) -> None:
-    """Upload the parts that the plan contains. Other parts on the vehicle stay unchanged."""
+    """Upload the parts that the plan contains. Other parts on the vehicle stay unchanged.
+
+    Raises:
+        InvalidArgument: a position is farther away than ``--max-distance-m``. The text names its item.
+    """
     for part in PARTS:
         content = getattr(plan, part)
         count = len(content.to_items())
         if count == 0:
             continue
         with progress_bar(part, None) as show:  # counts items or, over MAVFTP, bytes
-            await getattr(vehicle, part).upload(content, idle_timeout_s=options.patience, on_progress=show)
+            try:
+                await getattr(vehicle, part).upload(
+                    content,
+                    idle_timeout_s=options.patience,
+                    max_distance_m=options.max_distance_m,
+                    on_progress=show,
+                )
+            except InvalidArgument as error:
+                text = str(error).replace("a greater max_distance_m", "a greater --max-distance-m")
+                raise InvalidArgument(text.replace("plan, item", f"{part} item")) from None
         emit_part(options, part, count, "uploaded", f"{part}: {count} items uploaded to vehicle {vehicle.system_id}")
 
 
@@ -97,15 +142,35 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         "Upload the mission, fence and rally points in a file. Parts that are not in the file stay unchanged.",
     )
     upload.add_argument("file", help=".plan (QGroundControl), or a file that begins with QGC WPL 110")
+    add_max_distance(upload)
     check = add_action(actions, "check", _check, "Check a file without a vehicle.", connects=False)
     check.add_argument("file")
     _add_parts(add_action(actions, "clear", _clear, "Clear the vehicle's mission, fence or rally points."))
-    start = command_action("mission start", "mission started", lambda vehicle, _: vehicle.mission.start())
+    start = command_action("mission start", "mission started", _start_mission)
     pause = command_action("mission pause", "mission paused", lambda vehicle, _: vehicle.mission.pause())
     resume = command_action("mission resume", "mission resumed", lambda vehicle, _: vehicle.mission.resume())
     add_action(actions, "start", start, "Start the mission.")
     add_action(actions, "pause", pause, "Pause the mission and hold.")
     add_action(actions, "resume", resume, "Resume the mission.")
+
+
+def add_max_distance(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--max-distance-m",
+        type=number(1, 1e8),
+        default=MAX_DISTANCE_M,
+        metavar="M",
+        help="refuse a plan with a position farther than this from the vehicle (100000)",
+    )
+
+
+async def _start_mission(vehicle: Vehicle, _: argparse.Namespace) -> None:
+    if not vehicle.is_armed:
+        raise OperationRejected(
+            "mission start: the vehicle is not armed; nothing was sent. `aerokit fly FILE` uploads a mission, arms the"
+            " vehicle and starts it"
+        )
+    await vehicle.mission.start()
 
 
 def _add_parts(action: argparse.ArgumentParser) -> None:
@@ -166,8 +231,12 @@ async def _check(options: argparse.Namespace) -> int:
     plan = read_plan(options.file)
     for part in PARTS:
         emit_items(options, part, getattr(plan, part).to_items(), "in the file")
+    warnings = plan_warnings(plan)
+    for warning in warnings:
+        emit(options, "warning", {"text": warning}, f"warning: {warning}")
     if not options.json:
-        print(f"{options.file} has no errors")
+        found = f", but {len(warnings)} warning{'' if len(warnings) == 1 else 's'}" if warnings else ""
+        print(f"{options.file} has no errors{found}")
     return DONE
 
 

@@ -170,8 +170,22 @@ def import_extra(module: str, extra: str) -> Any:
         return import_module(module)
     except ModuleNotFoundError as error:
         raise NotInstalled(
-            f"{error.name} is required, but not installed: {sys.executable} -m pip install 'aerokit-mavlink[{extra}]'"
+            f"{error.name} is required, but not installed: {sys.executable} -m pip install {_requirement(extra)}"
         ) from None
+
+
+def _requirement(extra: str) -> str:
+    """Return the argument of pip that adds an extra to this installation, wherever it was installed from."""
+    from importlib.metadata import PackageNotFoundError, distribution
+
+    try:
+        source = json.loads(distribution("aerokit-mavlink").read_text("direct_url.json") or "{}")
+    except (PackageNotFoundError, ValueError):
+        source = {}
+    url = source.get("url", "")
+    if url.startswith("file://") and source.get("dir_info", {}).get("editable"):
+        return f"-e '{url.removeprefix('file://')}[{extra}]'"
+    return f"'aerokit-mavlink[{extra}]{f' @ {url}' if url else ''}'"
 
 
 def near_names(name: str, known: Iterable[str], count: int = 1) -> list[str]:

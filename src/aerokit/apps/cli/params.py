@@ -7,17 +7,28 @@ import fnmatch
 import sys
 from typing import TYPE_CHECKING
 
+from aerokit.apps.cli import connecting
 from aerokit.apps.cli.arguments import assignment, writable_file
 from aerokit.apps.cli.completion import assignments, offer, parameter_names
-from aerokit.apps.cli.connecting import add_action, connected
+from aerokit.apps.cli.connecting import add_action
 from aerokit.apps.cli.output import DONE, FAILED, add_force, check_not_existing, emit, suggestion
+from aerokit.apps.cli.params_metadata import (
+    about,
+    about_text,
+    add_metadata,
+    check_values,
+    load_given,
+    metadata_for_check,
+    reboot_note,
+)
 from aerokit.apps.cli.terminal import progress_bar
 from aerokit.errors import ParameterRejected, ParameterTimeout
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
+    from contextlib import AbstractAsyncContextManager
 
-    from aerokit.parameters import Parameter, ParameterTable
+    from aerokit.parameters import Metadata, Parameter, ParameterTable
     from aerokit.vehicle.parameters.parameters import ParameterWrite
     from aerokit.vehicle.vehicle import Vehicle
 
@@ -34,9 +45,11 @@ def _add_reading(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -
     listing = add_action(actions, "list", _list, "List parameters with their values.")
     pattern = listing.add_argument("pattern", nargs="?", default="*", help="part of the names, or 'BATT_*' (all)")
     offer(pattern, parameter_names)
+    add_metadata(listing)
     listing.add_argument("--changed", action="store_true", help="only those that differ from their default")
     get = add_action(actions, "get", _get, "Read single parameters.")
     offer(get.add_argument("names", nargs="+", metavar="NAME"), parameter_names)
+    add_metadata(get)
     save = add_action(actions, "save", _save, "Save all parameters to a file.")
     save.add_argument("file", type=writable_file)
     add_force(save)
@@ -48,11 +61,22 @@ def _add_reading(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -
 def _add_writing(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     set_ = add_action(actions, "set", _set, "Set parameters. The vehicle confirms each value.")
     offer(set_.add_argument("values", nargs="+", type=assignment, metavar="NAME=VALUE"), assignments)
+    add_metadata(set_, checks=True)
     load = add_action(actions, "load", _load, "Set all parameters in a file that differ on the vehicle.")
     load.add_argument("file")
+    add_metadata(load, checks=True)
+
+
+def connected(options: argparse.Namespace, *, changes: bool = False) -> AbstractAsyncContextManager[Vehicle]:
+    """Connect as in :func:`aerokit.apps.cli.connecting.connected`."""
+    # Importing this while connected would block the event loop.
+    import aerokit.vehicle.parameters.parameters  # noqa: F401
+
+    return connecting.connected(options, changes=changes)
 
 
 async def _list(options: argparse.Namespace) -> int:
+    metadata = load_given(options)
     async with connected(options) as vehicle:
         table = await _download(vehicle, options)
     if options.changed:
@@ -60,7 +84,7 @@ async def _list(options: argparse.Namespace) -> int:
     pattern = options.pattern.upper()
     pattern = pattern if any(mark in pattern for mark in "*?[") else f"*{pattern}*"
     found = [value for name, value in table.items() if fnmatch.fnmatch(name, pattern)]
-    _emit_parameters(options, found)
+    _emit_parameters(options, found, metadata)
     if not found and options.pattern != "*":
         hint = suggestion(options.pattern.strip("*"), table, 3)
         print(f"aerokit: none of {len(table)} parameters matches {options.pattern!r}{hint}", file=sys.stderr)
@@ -69,9 +93,10 @@ async def _list(options: argparse.Namespace) -> int:
 
 
 async def _get(options: argparse.Namespace) -> int:
+    metadata = load_given(options)
     async with connected(options) as vehicle:
         for name in options.names:
-            _emit_parameters(options, [await _read(vehicle, name, options)])
+            _emit_parameters(options, [await _read(vehicle, name, options)], metadata)
     return DONE
 
 
@@ -95,30 +120,42 @@ async def _diff(options: argparse.Namespace) -> int:
         await _download(vehicle, options)
         differences = await vehicle.parameters.diff(wanted, idle_timeout_s=options.patience)
     for difference in differences:
-        emit(options, "parameter_difference", difference.to_dict(), str(difference))
+        sides = f"vehicle {_side(difference.before)}, file {_side(difference.after)}"
+        emit(options, "parameter_difference", difference.to_dict(), f"{difference.name:16} {sides}")
     record = {"file": options.file, "parameters": len(wanted), "different": len(differences)}
     emit(options, "comparison", record, f"{len(differences)} of {len(wanted)} parameters differ")
     return DONE if not differences else FAILED
 
 
 async def _set(options: argparse.Namespace) -> int:
+    given = load_given(options)
+    if not options.force:
+        check_values(given, dict(options.values))
     async with connected(options, changes=True) as vehicle:
+        if given is None:
+            given = await metadata_for_check(vehicle, None, options)
+            check_values(given, dict(options.values))
         results = await vehicle.parameters.set_many(dict(options.values), idle_timeout_s=options.patience)
-    return _emit_results(options, results.values(), vehicle)
+    return _emit_results(options, results.values(), vehicle, given)
 
 
 async def _load(options: argparse.Namespace) -> int:
     from aerokit.parameters import read_parameter_file
 
-    wanted = read_parameter_file(options.file)
+    wanted, given = read_parameter_file(options.file), load_given(options)
     async with connected(options, changes=True) as vehicle:
         await _download(vehicle, options)
+        metadata = await metadata_for_check(vehicle, given, options)
+        if metadata is not None:
+            # A backup may have unusual values that the vehicle has already.
+            differences = await vehicle.parameters.diff(wanted, idle_timeout_s=options.patience)
+            check_values(metadata, {one.name: one.after for one in differences if one.after is not None})
         with progress_bar("parameters", "parameter") as show:
             results = await vehicle.parameters.upload(wanted, idle_timeout_s=options.patience, on_progress=show)
     if options.json:
-        return _emit_results(options, results.values(), vehicle)
+        return _emit_results(options, results.values(), vehicle, metadata)
     changed = [result for result in results.values() if result.outcome != "unchanged"]
-    code = _emit_results(options, changed, vehicle)
+    code = _emit_results(options, changed, vehicle, metadata)
     print(f"{len(results)} parameters in {options.file}, {len(changed)} of them differed")
     return code
 
@@ -132,8 +169,7 @@ async def _read(vehicle: Vehicle, name: str, options: argparse.Namespace) -> Par
     try:
         return await vehicle.parameters.read(name, idle_timeout_s=options.patience)
     except (ParameterRejected, ParameterTimeout) as error:
-        if hint := _hint(name, error, vehicle):
-            print(f"aerokit: could not read parameter {name!r}{hint}", file=sys.stderr)
+        error.args = (f"{error}{_hint(name, error, vehicle)}",)
         raise
 
 
@@ -149,18 +185,25 @@ def _hint(name: str, error: Exception, vehicle: Vehicle) -> str:
     )
 
 
-def _emit_parameters(options: argparse.Namespace, parameters: Iterable[Parameter]) -> None:
+def _emit_parameters(options: argparse.Namespace, parameters: Iterable[Parameter], metadata: Metadata | None) -> None:
     for parameter in parameters:
         is_changed = parameter.default is not None and parameter.default != parameter.value
         default = f"  (default {_text(parameter.default)})" if is_changed else ""
-        text = f"{parameter.name:16} {_text(parameter.value):<12}{default}".rstrip()
-        emit(options, "parameter", _record(parameter), text)
+        facts = about(metadata, parameter)
+        described = f"  {about_text(facts)}".rstrip()
+        text = f"{parameter.name:16} {_text(parameter.value):<12}{default}{described}".rstrip()
+        emit(options, "parameter", {**_record(parameter), **facts}, text)
 
 
-def _emit_results(options: argparse.Namespace, results: Iterable[ParameterWrite], vehicle: Vehicle) -> int:
+def _emit_results(
+    options: argparse.Namespace, results: Iterable[ParameterWrite], vehicle: Vehicle, metadata: Metadata | None
+) -> int:
     """Print a line for each result. Return FAILED if a value differs from the requested one by more than rounding."""
     code = DONE
     for result in results:
+        if result.error is None and result.outcome != "unchanged":
+            due = reboot_note(metadata, result.name, result.value)
+            result = result.replace(note="; ".join(filter(None, (result.note, due))))
         if result.error is None:
             text = f"{result.name:16} {_text(result.value):<12} {result.outcome} {result.note}".rstrip()
         else:
@@ -175,6 +218,10 @@ def _record(parameter: Parameter | ParameterWrite) -> dict[str, object]:
     # the key "type" is reserved for the type of the record
     fields = parameter.to_dict()
     return {("value_type" if name == "type" else name): value for name, value in fields.items()}
+
+
+def _side(value: float | None) -> str:
+    return "does not have it" if value is None else _text(value)
 
 
 def _text(value: float | None) -> str:

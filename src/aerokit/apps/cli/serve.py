@@ -183,7 +183,7 @@ def _emit_serving(options: argparse.Namespace, app: ServeApp, port: int) -> None
     page = url if options.read_only and _is_loopback(options.host) else f"{url}#token={app.token}"
     source = f"{options.sim} simulated" if options.sim else options.address
     record = {"url": url, "page": page, "token": app.token, "source": source, "read_only": options.read_only}
-    emit(options, "serving", record, f"{source} on {page}")
+    emit(options, "serving", record, f"{source}: open {page} in a browser; Ctrl-C stops")
     if not _is_loopback(options.host):
         print(
             "aerokit: warning: other machines can connect, and the traffic is not encrypted, including the token"

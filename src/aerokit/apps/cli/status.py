@@ -71,8 +71,19 @@ def _vehicle_lines(vehicle: Vehicle, missing: Sequence[str]) -> list[str]:
         f"  GPS      {'; '.join(map(_gps, vehicle.gps.latest or ())) or _UNKNOWN}",
         f"  battery  {'; '.join(map(_battery, vehicle.batteries.latest or ())) or _UNKNOWN}",
         f"  link     {_link(vehicle, frame)}",
-        *(_aligned("missing", missing) if missing else _aligned("ready", ["no reason against arming is reported"])),
+        *_readiness(vehicle, missing),
     ]
+
+
+def _readiness(vehicle: Vehicle, missing: Sequence[str]) -> list[str]:
+    if not missing:
+        return _aligned("ready", ["no reason against arming is reported"])
+    sensors = vehicle.sensors.latest
+    can_arm = sensors is not None and sensors.prearm_checks_pass is True
+    is_about_estimates = all(text.startswith("the estimator has no ") for text in missing)
+    # ArduCopter arms in STABILIZE without a position, for example.
+    note = [f"for autonomous flight; {vehicle.mode_name} allows arming:"] if can_arm and is_about_estimates else []
+    return _aligned("missing", [*note, *missing])
 
 
 def _component_line(heartbeat: Heartbeat, system_id: int, component_id: int) -> tuple[dict[str, Any], str]:
@@ -91,8 +102,10 @@ def _component_line(heartbeat: Heartbeat, system_id: int, component_id: int) -> 
 
 def _link_line(record: Mapping[str, Any]) -> str:
     total = record["frames"] + record["frames_lost"]
+    is_recording = record["address"].startswith("replay:")
     parts = [
-        f"{record['address']}: {record['frames']} frames in {record['seconds']:.1f} s",
+        f"{record['address']}{' (a recording, not a vehicle)' if is_recording else ''}:"
+        f" {record['frames']} frames in {record['seconds']:.1f} s",
         f"{_percent(record['frames_lost'], total)} lost",
     ]
     if record["bad_bytes"]:

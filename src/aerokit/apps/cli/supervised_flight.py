@@ -275,7 +275,8 @@ class FlightReport:
         lines = [
             f"\n{vehicle.autopilot.firmware} {version or '(unknown version)'},"
             f" armed for {_duration(self._armed_s)}{self._rehearsal()}:"
-            f" flown {self._flown_m:.0f} m, max height {self._highest_m:.1f} m, max speed {self._fastest_m_s:.1f} m/s",
+            f" flown {self._flown_m:.0f} m, max height {self._highest_m:.1f} m,"
+            f" max ground speed {self._fastest_m_s:.1f} m/s",
             *(
                 f"battery {battery.id + 1}: {_number(battery.voltage_v, 'V')},"
                 f" {_number(battery.remaining_percent, '%')} left"

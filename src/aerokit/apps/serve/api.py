@@ -13,7 +13,15 @@ from starlette.responses import Response
 
 from aerokit import __version__
 from aerokit._internal.formatting import to_jsonable
-from aerokit.apps.serve.orders import ORDERS, SET_PARAMETER, OrderRecord, OrderRunner, OrderType
+from aerokit.apps.serve.orders import (
+    ORDERS,
+    SET_PARAMETER,
+    UPLOAD,
+    OrderRecord,
+    OrderRunner,
+    OrderType,
+    parse_plan_body,
+)
 from aerokit.apps.serve.requests import (
     HttpProblem,
     json_response,
@@ -25,6 +33,7 @@ from aerokit.apps.serve.requests import (
 )
 from aerokit.errors import ParameterRejected
 from aerokit.mavlink.enums import EkfStatusFlags, EstimatorStatusFlags, MavPowerStatus, MavSysStatusSensor
+from aerokit.parameters.renames import other_names
 from aerokit.vehicle.vehicle import overview
 
 if TYPE_CHECKING:
@@ -151,11 +160,12 @@ def _operation(operation: Operation) -> dict[str, Any]:
     }
     if not operation.is_open:
         found["security"] = [{"token": []}] if is_order else [{"token": []}, {}]
-    if operation.order is not None:
+    if is_order:
         found["responses"]["202"] = {"description": "running (wait=false)", "content": _json(answer)}
+    if (kind := operation.order or operation.body) is not None:
         found["requestBody"] = {
-            "required": any(argument.is_required for argument in operation.order.arguments.values()),
-            "content": _json(_body(operation.order)),
+            "required": any(argument.is_required for argument in kind.arguments.values()),
+            "content": _json(_body(kind)),
         }
     return found
 
@@ -180,7 +190,7 @@ def _parameters(operation: Operation) -> Iterable[dict[str, Any]]:
 def _failures(operation: Operation) -> dict[str, Any]:
     if operation.is_open:
         return {}
-    left_out = set() if operation.order is not None else {"413", "415"}
+    left_out = set() if operation.order or operation.body else {"413", "415"}
     problem = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
     return {
         status: {"description": text, "content": problem}
@@ -231,7 +241,10 @@ Handler = Callable[["Request"], Awaitable[Response]]
 
 @dataclass(frozen=True)
 class Operation:
-    """One method of one path. ``name`` is its operationId, ``order`` the type of its body."""
+    """One method of one path.
+
+    ``name`` is its operationId, ``order`` the order that it gives; ``body`` an order with the same body, not given.
+    """
 
     method: str
     path: str
@@ -239,6 +252,7 @@ class Operation:
     summary: str
     handler: Handler
     order: OrderType | None = None
+    body: OrderType | None = None
     query: tuple[str, ...] = ()
     is_open: bool = False
     """True if the operation needs no token, because it reveals nothing about vehicles."""
@@ -282,6 +296,7 @@ class HttpApi:
                 self._list_orders,
             ),
             get("/api/orders/{key}", "order", "One order, by its Idempotency-Key", self._order),
+            Operation("POST", "/api/plan", "plan", "Check a plan; sends nothing", self._check_plan, body=UPLOAD),
             *(self._order_operation("POST", f"{one}/{kind.name}", kind) for kind in ORDERS),
             self._order_operation("PUT", named, SET_PARAMETER),
         )
@@ -304,7 +319,7 @@ class HttpApi:
 
     def _order_operation(self, method: str, path: str, kind: OrderType) -> Operation:
         name = kind.name.replace("/", "_")
-        return Operation(method, path, name, kind.summary, partial(self._run_order, kind), kind, ("wait",))
+        return Operation(method, path, name, kind.summary, partial(self._run_order, kind), kind, query=("wait",))
 
     async def _about(self, request: Request) -> Response:
         return json_response({"aerokit": __version__, "bits": _BITS, **self._settings})
@@ -357,6 +372,18 @@ class HttpApi:
             for vehicle, kind in tuple(self._plans):
                 if vehicle.system_id == message["system_id"]:
                     del self._plans[vehicle, kind]
+
+    async def _check_plan(self, request: Request) -> Response:
+        self._access.check(request.headers, needs_token=True)  # large plans take time to parse
+        arguments = await read_body(request, UPLOAD.max_body_size)
+        UPLOAD.check(arguments)
+        _, _, plan = parse_plan_body(arguments)
+        counts = {
+            "mission_items": len(plan.mission),
+            "fence_areas": len(plan.fence.polygons) + len(plan.fence.circles),
+            "rally_points": len(plan.rally),
+        }
+        return json_response(counts)
 
     async def _parameters(self, request: Request) -> Response:
         vehicle, is_new = self._vehicle_of(request), self._is_refresh(request)
@@ -423,12 +450,13 @@ def _items(items: Iterable[MissionItem]) -> list[dict[str, Any]]:
 
 def _parameter(parameter: Parameter, metadata: Metadata | None) -> dict[str, Any]:
     known = None if metadata is None else metadata.get(parameter.name)
+    fields = {**to_jsonable(parameter), "other_names": other_names(parameter.name)}
     if known is None:
-        return dict(to_jsonable(parameter))
+        return fields
     default = known.default if parameter.default is None else parameter.default
     about = {name: to_jsonable(getattr(known, name)) for name in _METADATA}
     about |= {"default": to_jsonable(default), "meaning": known.describe(parameter.value)}
-    return {**to_jsonable(parameter), **about}
+    return {**fields, **about}
 
 
 async def _wait_ended(record: OrderRecord, timeout_s: float | None) -> None:

@@ -97,13 +97,27 @@ async def _upload(vehicle: Vehicle, values: dict[str, Any]) -> None:
         await vehicle.rally.upload(plan.rally)
 
 
-def _read_plan(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    from aerokit.missions import parse_plan
+def parse_plan_body(values: Mapping[str, Any]) -> tuple[str, str, Plan]:
+    """Return name, text and plan of a request body: an object of a .plan file, or the text of either format.
 
-    text = json.dumps(values["plan"])
-    name = values.get("name")
+    Raises:
+        FileFormatError: neither format; the text names the position of the error.
+        InvalidArgument: an item cannot be sent.
+    """
+    from aerokit.missions import Plan, parse_plan, parse_waypoints
+
+    content, name = values["plan"], values.get("name")
     name = name[:100] if isinstance(name, str) else "plan"
-    plan = parse_plan(text, name)
+    text = content if isinstance(content, str) else json.dumps(content)
+    is_plan = text.lstrip("\ufeff \t\r\n").startswith("{") or not isinstance(content, str)
+    plan = parse_plan(text, name) if is_plan else Plan(parse_waypoints(text, name))
+    for part in (plan.mission, plan.fence, plan.rally):
+        part.check()
+    return name, text, plan
+
+
+def _read_plan(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    name, text, plan = parse_plan_body(values)
     counts = {
         "mission_items": len(plan.mission),
         "fence_items": len(plan.fence.to_items()),
@@ -130,10 +144,22 @@ _MODE = {"mode": OrderArgument(("string", "integer"), "the autopilot's name or n
 _ITEM = {"item": OrderArgument("integer", "first item, counted from 0 (0)")}
 _VALUE = {"value": OrderArgument("number", "finite", True)}
 _PLAN = {
-    "plan": OrderArgument("object", "content of a QGroundControl .plan file", True),
+    "plan": OrderArgument(
+        ("object", "string"),
+        "content of a QGroundControl .plan file; or the text of one, or of a QGC WPL 110 file",
+        True,
+    ),
     "name": OrderArgument("string", "name of the file, for the list of orders"),
 }
 
+UPLOAD = OrderType(
+    "mission/upload",
+    "Replace the mission; the fence and rally points too, if the plan has them",
+    _upload,
+    _PLAN,
+    parse=_read_plan,
+    max_body_size=MAX_PLAN_SIZE,
+)
 ORDERS = (
     OrderType("arm", "Arm the motors: propellers may start to turn", lambda v, a: v.arm()),
     OrderType("disarm", "Stop the motors, on the ground", lambda v, a: v.disarm(), is_safe=True),
@@ -143,14 +169,7 @@ ORDERS = (
     OrderType("land", "Land at the current position", lambda v, a: v.land(), is_safe=True),
     OrderType("return_to_launch", "Return to the launch position", lambda v, a: v.return_to_launch(), is_safe=True),
     OrderType("mode", "Change the flight mode", lambda v, a: v.set_mode(a["mode"]), _MODE),
-    OrderType(
-        "mission/upload",
-        "Replace the mission; the fence and rally points too, if the plan has them",
-        _upload,
-        _PLAN,
-        parse=_read_plan,
-        max_body_size=MAX_PLAN_SIZE,
-    ),
+    UPLOAD,
     OrderType("mission/start", "Fly the mission", lambda v, a: v.mission.start(**a), _ITEM),
     OrderType("mission/pause", "Pause the mission", lambda v, a: v.mission.pause(), is_safe=True),
     OrderType("mission/resume", "Resume the mission", lambda v, a: v.mission.resume()),

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
+import math
 from collections import deque
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import anyio
@@ -15,7 +18,7 @@ from aerokit.apps.serve.failsafe import ground_station_failsafe
 from aerokit.apps.serve.requests import HttpProblem
 from aerokit.connection.connection import Connection
 from aerokit.connection.tasks import BackgroundTasks
-from aerokit.errors import InvalidArgument
+from aerokit.errors import AerokitError, InvalidArgument
 from aerokit.events import Event, LinkReport, LinkState, StatusTextReceived
 from aerokit.vehicle.connect import vehicles_on
 from aerokit.vehicle.vehicle import Vehicle, overview
@@ -39,10 +42,15 @@ MIN_TRACK_STEP_M = 0.5
 TRACK_GAP_S = 3.0
 PREARM_TEXT_MAX_AGE_S = 35.0
 """Maximum age in seconds of a text about a failed arming check. ArduPilot repeats these texts every 30 s."""
+MIN_CHECK_INTERVAL_S = 5.0
+"""Minimum seconds between two requests to run the arming checks, for a vehicle whose readiness alternates."""
 
 
 class ServedVehicles:
-    """Follows the vehicles of a source, and keeps their recent events, texts and tracks. Requests nothing from them.
+    """Follows the vehicles of a source, and keeps their recent events, texts and tracks.
+
+    Requests only the reasons for not arming: once, when a disarmed vehicle begins to report that its checks fail, and
+    when its failing sensors change.
 
     ``source``: a connection, whose vehicles are added as they appear; one vehicle; or a mapping from system id
     to vehicle, which may grow.
@@ -52,6 +60,8 @@ class ServedVehicles:
         self.events: deque[dict[str, Any]] = deque(maxlen=MAX_EVENTS)
         self._texts: dict[int, deque[dict[str, Any]]] = {}
         self._tracks: dict[int, list[tuple[Position, bool]]] = {}
+        self._checked: dict[Vehicle, tuple[str, ...]] = {}
+        self._checked_at: dict[Vehicle, float] = {}
         self._listeners: list[Listener] = []
         self._attached: dict[Connection, list[Detach]] = {}
         self._count = 0
@@ -71,6 +81,7 @@ class ServedVehicles:
             raise InvalidArgument(f"source = {source!r} is not a connection, a vehicle or a mapping of vehicles")
         self._attach_new()
         self._background.start(self._record_tracks, "aerokit serve tracks")
+        self._background.start(self._request_reasons, "aerokit serve checks")
 
     @property
     def vehicles(self) -> Mapping[int, Vehicle]:
@@ -163,6 +174,21 @@ class ServedVehicles:
                     silent.discard(system_id)
             await anyio.sleep(TRACK_INTERVAL_S)
 
+    async def _request_reasons(self) -> None:
+        while True:
+            for vehicle in tuple(self._vehicles.values()):
+                failing = _failing_checks(vehicle)
+                now = vehicle.connection.now()
+                if failing is None:
+                    self._checked.pop(vehicle, None)
+                elif (
+                    failing != self._checked.get(vehicle)
+                    and now - self._checked_at.get(vehicle, -math.inf) >= MIN_CHECK_INTERVAL_S
+                ):
+                    self._checked[vehicle], self._checked_at[vehicle] = failing, now
+                    self._background.start(partial(_run_checks, vehicle), "aerokit serve check")
+            await anyio.sleep(TRACK_INTERVAL_S)
+
     def _state_of(self, vehicle: Vehicle) -> dict[str, Any]:
         """Return the overview of a vehicle, with the conditions missing for flight and the mission progress.
 
@@ -182,7 +208,22 @@ class ServedVehicles:
         missing = vehicle.missing_for_flight()
         if not missing or vehicle.link_state.latest is not LinkState.CONNECTED:
             return missing
-        since = vehicle.connection.unix_time() - PREARM_TEXT_MAX_AGE_S
+        # Texts from before the newest check may describe problems that are solved.
+        age_s = min(vehicle.connection.now() - self._checked_at.get(vehicle, -math.inf), PREARM_TEXT_MAX_AGE_S)
+        since = vehicle.connection.unix_time() - age_s
         recent = [entry["text"] for entry in self.texts(vehicle.system_id) if entry["time_unix_s"] >= since]
         reasons = (vehicle.autopilot.arming_reason(text) for text in recent)
         return list(dict.fromkeys([*filter(None, reasons), *missing]))
+
+
+def _failing_checks(vehicle: Vehicle) -> tuple[str, ...] | None:
+    """Return the failing sensors of a disarmed vehicle whose arming checks do not pass, else None."""
+    sensors = vehicle.sensors.latest
+    if vehicle.link_state.latest is not LinkState.CONNECTED or vehicle.armed.latest is not False or sensors is None:
+        return None
+    return tuple(sensors.failing) if sensors.prearm_checks_pass is False else None
+
+
+async def _run_checks(vehicle: Vehicle) -> None:
+    with contextlib.suppress(AerokitError):  # the state shows a vehicle that does not answer
+        await vehicle.why_not_armable()

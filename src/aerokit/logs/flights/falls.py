@@ -53,7 +53,8 @@ def falls(flight: FlightLog) -> list[Fall]:
     """Return the falls and hard landings of a flight, the oldest first; none without heights and sink rates.
 
     A descent counts if the vehicle sank at more than 3 m/s, was stopped within 0.6 s, and then stayed at that height
-    until it was disarmed, or if the autopilot reported a crash; also a log that ends in such a descent near the ground.
+    until it was disarmed, or for 30 s less than 3 m above home while it remained armed, or if the autopilot reported a
+    crash; also a log that ends in such a descent near the ground.
     """
     if not flight.armed:
         return []
@@ -92,13 +93,13 @@ def _fall(flight: FlightLog, begin_s: float, end_s: float, sink_m_s: float, has_
 
 
 def _stays(flight: FlightLog, time_s: float, height_m: float) -> bool:
-    """Return True if the vehicle stays at this height until it is disarmed, so that it is on the ground."""
+    """Return True if the vehicle stays at this height until it is disarmed, or near home's height while it is armed."""
     disarmed_s = next((end for begin, end in flight.armed if begin <= time_s < end), time_s)
-    if disarmed_s > time_s + _DISARM_TIMEOUT_S:
-        return False
-    if disarmed_s >= flight.duration_s and height_m > _NEAR_HOME_HEIGHT_M:
-        return False  # the log ends while it is armed: it may hover
-    heights = flight.track.between("altitude_relative_m", time_s + _IMPACT_S, disarmed_s)
+    until_s = min(disarmed_s, time_s + _DISARM_TIMEOUT_S)
+    is_armed = until_s < disarmed_s or disarmed_s >= flight.duration_s
+    if is_armed and height_m > _NEAR_HOME_HEIGHT_M:
+        return False  # it may hover
+    heights = flight.track.between("altitude_relative_m", time_s + _IMPACT_S, until_s)
     return all(abs(height - height_m) <= _SAME_HEIGHT_M for height in heights)
 
 

@@ -30,6 +30,10 @@ _NO_UTC = "no GNSS time in the log: times count from power-on, which is shown as
 _A_YEAR_S = 365 * 86_400.0
 _MAX_UNIX_S = 4_102_444_800.0  # the year 2100; `aerokit.mavlink.tlog` has the same limit
 
+SIMULATED_LOG = b"aerokit simulator: sample log"
+"""Begin of the logs of `aerokit.sim`."""
+RECORD_ONE = "record a simulated flight with `--record FILE.tlog`"
+
 
 def opened_bin(path: Path, on_percent: Callable[[float], object] | None = None) -> Any:
     """Return a ``DFReader_binary``; close it with :func:`close_bin`.
@@ -38,7 +42,10 @@ def opened_bin(path: Path, on_percent: Callable[[float], object] | None = None) 
         FileFormatError: the file is not an ArduPilot log, or its formats are damaged.
     """
     with path.open("rb") as file:
-        if file.read(2) != _MAGIC:
+        head = file.read(len(SIMULATED_LOG))
+        if head == SIMULATED_LOG:
+            raise FileFormatError(f"{path} is a sample of aerokit's simulator and contains no flight; {RECORD_ONE}")
+        if not head.startswith(_MAGIC):
             raise FileFormatError(f"{path} is not an ArduPilot log: it does not begin with A3 95")
     kind = import_module("pymavlink.DFReader").DFReader_binary
     reader = kind.__new__(kind)  # call __init__ separately, so that the file can be closed if __init__ raises

@@ -333,14 +333,18 @@ def _fence(flight: FlightLog) -> list[dict[str, Any]]:
 
 
 def _failsafe_markers(flight: FlightLog, places: Sequence[tuple[float, float]]) -> list[dict[str, Any]]:
-    found, names = [], []
-    events: list[Failsafe | Fall] = [*failsafes(flight), *falls(flight)]
-    for event in events:
-        row = flight.track.index_at(event.time_s)
-        if row >= 0 and places[row][0] == places[row][0]:
-            found.append(places[row])
-            names.append(f"{event.title}, {clock(event.time_s)}")
-    return [_marker("failsafe", found, "x", _FAILSAFE, 12, names)] if found else []
+    events: dict[str, Sequence[Failsafe | Fall]] = {"failsafe": failsafes(flight), "fall": falls(flight)}
+    markers = []
+    for legend, symbol in (("failsafe", "x"), ("fall", "triangle-down")):
+        found, names = [], []
+        for event in events[legend]:
+            row = flight.track.index_at(event.time_s)
+            if row >= 0 and places[row][0] == places[row][0]:
+                found.append(places[row])
+                names.append(f"{event.title}, {clock(event.time_s)}")
+        if found:
+            markers.append(_marker(legend, found, symbol, _FAILSAFE, 12, names))
+    return markers
 
 
 def _marker(

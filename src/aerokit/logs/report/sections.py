@@ -64,7 +64,7 @@ def _heights(flight: FlightLog) -> Section:
             line("actual", flight.track, relative),
         ],
     )
-    explanation = "In all charts, background colours are modes, as in the map, and red lines are failsafes."
+    explanation = "In all charts, background colours are modes, as in the map, and red lines are failsafes and falls."
     return _with_parts(Section("Height", explanation=explanation, missing="The log contains no heights."), chart)
 
 

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 _STEP_M = 1.0
 _A_YEAR_S = 365 * 86_400.0
 _MAX_LISTED = 5
+# A hovering multicopter needs 20 to 60 % throttle, and ArduCopter and PX4 limit the tilt to 30 and 45 degrees.
+_HIGH_THROTTLE_PERCENT, _HIGH_TILT_DEG, _HIGH_ATTITUDE_ERROR_DEG = 90.0, 50.0, 20.0
 
 
 class FlightStatistics(Snapshot):
@@ -164,8 +166,35 @@ def _path_length(north_east: list[tuple[float, float]], rows: list[int]) -> floa
 
 
 def findings(flight: FlightLog) -> list[str]:
-    """Return a sentence for each fall and hard landing; empty for most flights."""
-    return [f"{fall_text(fall)}." for fall in falls(flight)]
+    """Return sentences about each fall and hard landing; empty for most flights."""
+    sentences = []
+    for fall in falls(flight):
+        sentences.append(f"{fall_text(fall)}.")
+        if measured := fall_measurements(flight, fall):
+            sentences.append(f"Measured in the descent: {'; '.join(measured)}.")
+    return sentences
+
+
+def fall_measurements(flight: FlightLog, fall: Fall) -> list[str]:
+    """Return unusual values in the descent that hint at a cause: high throttle, tilt, and attitude error."""
+    span_s = fall.begins_s, fall.time_s - 0.2  # without the impact
+    found = []
+    throttle = _max(list(flight.air.between("throttle_percent", *span_s)))
+    if throttle is not None and throttle >= _HIGH_THROTTLE_PERCENT:
+        found.append(f"throttle up to {throttle:.0f} %, so look at motors, propellers and battery")
+    tilt = _max([abs(x) for name in ("roll_deg", "pitch_deg") for x in flight.attitude.between(name, *span_s)])
+    if tilt is not None and tilt >= _HIGH_TILT_DEG:
+        found.append(f"tilt up to {tilt:.0f}°")
+    error = _max([abs(x) for name in ("roll_deg", "pitch_deg") for x in _attitude_errors(flight, name, *span_s)])
+    if error is not None and error >= _HIGH_ATTITUDE_ERROR_DEG:
+        found.append(f"attitude up to {error:.0f}° off its set-point, so look at the attitude charts")
+    return found
+
+
+def _attitude_errors(flight: FlightLog, name: str, begin_s: float, end_s: float) -> Iterator[float]:
+    times, values = flight.attitude_target.times, flight.attitude_target[name]
+    for row in range(bisect_left(times, begin_s), bisect_right(times, end_s)):
+        yield math.remainder(values[row] - flight.attitude.at(name, times[row]), 360)
 
 
 def fall_text(fall: Fall) -> str:
@@ -195,13 +224,13 @@ def _flight_sentence(flight: FlightLog, statistics: FlightStatistics) -> str:
         return f"Never armed: {span(flight.duration_s)} on the ground."
     parts = [f"{span(statistics.armed_s)} armed"]
     if statistics.distance_m is not None:
-        parts.append(f"{length(statistics.distance_m)} flown")
+        parts.append(f"{length(statistics.distance_m)} flown over ground")
     if statistics.max_height_m is not None:
         parts.append(f"max height {number(statistics.max_height_m)} m above home")
     if statistics.max_distance_m is not None:
         parts.append(f"max distance {length(statistics.max_distance_m)} from home")
     if statistics.max_speed_m_s is not None:
-        parts.append(f"max speed {number(statistics.max_speed_m_s)} m/s")
+        parts.append(f"max ground speed {number(statistics.max_speed_m_s)} m/s")
     if statistics.end_distance_m is not None:
         parts.append(f"ended {length(statistics.end_distance_m)} from home")
     return ", ".join(parts) + "."

@@ -135,7 +135,6 @@ class CopterGuided(CopterModeBase):
         copter.yaw.default()
 
     def update(self, dt: float) -> None:
-        """Run the controller of the submode."""
         copter = self.vehicle
         self.is_taking_off = False
         if self._is_paused:

@@ -35,7 +35,6 @@ class ArduPilotExternal:
         self.wind: tuple[float, float] | None = None  # Speed in m/s, and direction in degrees that it comes from.
 
     def listen(self) -> None:
-        """Register the handlers."""
         vehicle = self._vehicle
         for kind in _EXTERNAL_NAVIGATION:
             vehicle.on(kind, self._on_navigation)
@@ -53,12 +52,8 @@ class ArduPilotExternal:
         if self._vehicle.now - self._target_at > _TARGET_TIMEOUT_S:
             return (0.0, 0.0)
         motion = self._vehicle.motion
-        north, east = (
-            _APPROACH_PER_S * (self._target[0] - motion.north),
-            _APPROACH_PER_S * (self._target[1] - motion.east),
-        )
-        speed = math.hypot(north, east)
-        share = 1.0 if speed <= _MAX_APPROACH_M_S else _MAX_APPROACH_M_S / speed
+        north, east = self._target[0] - motion.north, self._target[1] - motion.east
+        share = min(_APPROACH_PER_S, _MAX_APPROACH_M_S / max(math.hypot(north, east), 1e-6))
         return (north * share, east * share)
 
     def _on_navigation(self, message: Message, _: Channel) -> None:

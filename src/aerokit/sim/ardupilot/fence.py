@@ -193,7 +193,6 @@ class ArduPilotFence(Generic[HostT]):
         return before ^ self.enabled
 
     def command(self, command: ReceivedCommand) -> int:
-        """Execute MAV_CMD_DO_FENCE_ENABLE."""
         kinds = whole(command.param2) or _ALL
         if command.param1 == 1.0:
             if not self.present & kinds:

@@ -256,7 +256,6 @@ class ArduPilotGimbal:
         return m.GimbalManagerInformation(self._vehicle.time_boot_ms, _CAPABILITIES, _DEVICE_ID, *limits)
 
     def manager_status(self) -> m.GimbalManagerStatus | None:
-        """Return GIMBAL_MANAGER_STATUS."""
         if not self.is_fitted:
             return None
         flags = GimbalManagerFlags.ROLL_LOCK | GimbalManagerFlags.PITCH_LOCK

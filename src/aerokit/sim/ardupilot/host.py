@@ -351,11 +351,9 @@ class ArduPilotHost(SimulatedAutopilot):
         raise NotImplementedError
 
     def available_modes(self) -> list[m.AvailableModes]:
-        """Return AVAILABLE_MODES with ArduPilot's numbers and names."""
         raise NotImplementedError
 
     def announce_parameter(self, name: str) -> None:
-        """Broadcast PARAM_VALUE."""
         raise NotImplementedError
 
     def send_home(self, channel: Channel | None = None) -> None:

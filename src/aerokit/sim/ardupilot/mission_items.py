@@ -68,7 +68,6 @@ _NAN_ALLOWED: dict[int, tuple[int, ...]] = {
 
 
 def command_name(command: int) -> str:
-    """Return the name of a command in status texts."""
     return STORED_COMMANDS.get(command, _UNKNOWN).name or _UNKNOWN.name
 
 

@@ -29,7 +29,6 @@ class ItemList:
 
     @property
     def count(self) -> int:
-        """Number of items in MISSION_COUNT."""
         raise NotImplementedError
 
     def items(self) -> list[MissionItem]:
@@ -41,7 +40,6 @@ class ItemList:
         raise NotImplementedError
 
     def begin(self, count: int) -> None:
-        """Start an upload of ``count`` items."""
         raise NotImplementedError
 
     def begin_update(self) -> None:

@@ -81,7 +81,6 @@ class ArduPilotRadio:
         self._overrides.clear()
 
     def listen(self) -> None:
-        """Register the handler of RC_CHANNELS_OVERRIDE."""
         self._vehicle.on(m.RcChannelsOverride, self._on_override)
 
     def _override_time(self) -> float:

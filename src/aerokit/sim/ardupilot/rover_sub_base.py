@@ -69,7 +69,6 @@ class GuidedSetpoints:
         """Called for a message that is ignored because it contains an acceleration."""
 
     def steer(self, message: SetAttitudeTarget) -> None:
-        """Execute SET_ATTITUDE_TARGET."""
         raise NotImplementedError
 
     def is_complete(self, target: GuidedTarget) -> bool:
@@ -124,7 +123,6 @@ class RoverSubVehicle(ArduPilotVehicle):
 
     @property
     def is_at_rest(self) -> bool:
-        """True if the vehicle does not move."""
         raise NotImplementedError
 
     @property
@@ -205,7 +203,6 @@ class RoverSubAuto(MissionMode):
         """Send a text, if the firmware does, because there is no mission."""
 
     def travel(self, place: Ned, *, stops: bool) -> None:
-        """Move towards a place for one tick."""
         raise NotImplementedError
 
     def has_arrived(self, place: Ned) -> bool:

@@ -87,7 +87,6 @@ class ArduPilotStorage:
             self.files.remove_file(f"{LOG_FOLDER}/{name}")
 
     def _apply(self, name: str, value: float) -> None:
-        """Apply a parameter of an uploaded file."""
         parameters = self._vehicle.parameters
         if name not in self._vehicle.faults.read_only_parameters:
             parameters[name] = rounded(self.parameters.clamped(name, value), parameters.type(name))

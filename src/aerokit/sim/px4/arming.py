@@ -151,9 +151,9 @@ class Px4Arming:
         self.is_terminated: bool = False
         """True from DO_FLIGHTTERMINATION, which stops the motors, until a restart."""
         self._is_logging = False
+        self._reported_failures: list[str] = []
 
     def reasons(self) -> list[str]:
-        """Return the texts of the failed checks."""
         px4 = self._px4
         reasons = list(px4.faults.prearm_failures)
         if not px4.is_ready:
@@ -167,6 +167,13 @@ class Px4Arming:
     def report_reasons(self) -> None:
         for reason in self.reasons():
             self._px4.send_text(MavSeverity.CRITICAL, reason)
+
+    def report_changes(self) -> None:
+        """Report the failed checks when the failures of `Faults` have changed while the vehicle is disarmed."""
+        failures = list(self._px4.faults.prearm_failures)
+        if self._px4.is_ready and not self._px4.is_armed and failures != self._reported_failures:
+            self._reported_failures = failures
+            self.report_reasons()
 
     @property
     def is_possible(self) -> bool:

@@ -145,7 +145,6 @@ def refusal_by_place(command: ReceivedCommand, *, checks_frame: bool) -> int | N
 
 
 def set_mode(px4: Px4Vehicle, base_mode: int, mode: Px4Mode) -> int:
-    """Handle DO_SET_MODE and SET_MODE."""
     if not base_mode & MavModeFlag.CUSTOM_MODE_ENABLED:
         px4.send_text(MavSeverity.CRITICAL, "Unsupported base mode")
         return MavResult.TEMPORARILY_REJECTED
@@ -222,7 +221,6 @@ class _Flight:
         return self._change(modes.RTL, "Returning to launch")
 
     def start_mission(self, command: ReceivedCommand) -> int:
-        """Change to MISSION and arm."""
         px4 = self._px4
         if not px4.mission.is_valid:
             px4.send_text(MavSeverity.CRITICAL, "Mission start denied! No valid mission")
@@ -316,7 +314,6 @@ class _Flight:
         return result
 
     def terminate(self, command: ReceivedCommand) -> int:
-        """Terminate the flight if param 1 is 1."""
         if command.param1 != 1.0 or not self._px4.is_armed:
             return MavResult.DENIED
         self._px4.terminate()

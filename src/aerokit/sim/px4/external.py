@@ -45,7 +45,6 @@ class Px4External:
 
     @property
     def has_gps(self) -> bool:
-        """True if the estimator uses GPS."""
         is_used = int(self._px4.parameters["EKF2_GPS_CTRL"]) & _GPS_POSITION
         return bool(is_used) and not self._px4.faults.gps_lost
 
@@ -67,11 +66,9 @@ class Px4External:
         return MavResult.ACCEPTED
 
     def _on_vision(self, message: Message, _: Channel) -> None:
-        if isinstance(message, m.Odometry) and not math.isfinite(message.x):
-            self.latest[type(message)] = message
-            return
         self.latest[type(message)] = message
-        self._vision_at = self._px4.now
+        if not isinstance(message, m.Odometry) or math.isfinite(message.x):
+            self._vision_at = self._px4.now
 
     def _on_sensor(self, message: Message, _: Channel) -> None:
         self.latest[type(message)] = message
@@ -99,11 +96,9 @@ class PrecisionLanding:
         self._searches = 0
 
     def enter(self) -> None:
-        """Start a landing."""
         self._search_from, self._searches = None, 0
 
     def update(self) -> None:
-        """Set the target of the motion for the next tick."""
         px4, motion, limits = self._px4, self._px4.motion, self._px4.parameters
         target = px4.external.target
         if target is None or self._searches > limits["PLD_MAX_SRCH"]:

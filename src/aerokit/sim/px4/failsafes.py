@@ -287,6 +287,7 @@ class Px4Failsafes:
         self._watch_station()
         self._watch_battery()
         if not self._px4.is_armed:
+            self._px4.arming.report_changes()
             self._reset()
             return
         self._update(self._active_failures())

@@ -39,7 +39,6 @@ class Px4Orbit:
         return True
 
     def update(self) -> None:
-        """Set the target of the motion for the next tick."""
         motion = self._px4.motion
         north, east = motion.north - self.middle[0], motion.east - self.middle[1]
         angle, distance = math.atan2(east, north), math.hypot(north, east)
@@ -54,7 +53,6 @@ class Px4Orbit:
         motion.face(angle + math.pi)
 
     def status(self) -> m.OrbitExecutionStatus:
-        """Return ORBIT_EXECUTION_STATUS."""
         px4 = self._px4
         place = px4.frame.to_global(*self.middle, self.down)
         return m.OrbitExecutionStatus(
@@ -117,7 +115,6 @@ class Px4Flight:
         return self._vehicle.parameters["MPC_XY_VEL_MAX"]
 
     def enter(self, mode: Px4Mode) -> None:
-        """Start a mode."""
         self.speed_m_s = self.cruise_speed_m_s
         self.heading = None
         self._phase = "climb"
@@ -134,7 +131,6 @@ class Px4Flight:
         self.target = motion.place
 
     def update(self) -> None:
-        """Set the target of the motion for the next tick."""
         vehicle = self._vehicle
         mode = vehicle.mode
         self.lifts_off = (
@@ -213,7 +209,6 @@ class Px4Flight:
             motion.face(math.atan2(motion.velocity_east, motion.velocity_north))
 
     def descend(self) -> None:
-        """Descend vertically."""
         self._vehicle.motion.seek_velocity(0.0, 0.0, self.descent_speed_m_s)
 
     @property

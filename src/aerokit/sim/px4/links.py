@@ -43,7 +43,6 @@ class Px4Events:
         self._next = _INITIAL_SEQUENCE
 
     def current(self) -> CurrentEventSequence:
-        """Return CURRENT_EVENT_SEQUENCE."""
         return CurrentEventSequence((self._next - 1) & 0xFFFF, 0)
 
     def send_for(self, text: str) -> None:

@@ -125,7 +125,6 @@ class Px4ManualFlight:
         return self._thrust > 1.0
 
     def update(self) -> None:
-        """Set the target of the motion for the next tick."""
         px4, sticks = self._px4, self._px4.sticks
         max_rate = math.radians(px4.parameters["MPC_MAN_Y_MAX"])
         px4.motion.limits.turn_rate_rad_s = max_rate

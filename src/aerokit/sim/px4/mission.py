@@ -149,7 +149,6 @@ class Px4Mission:
 
     @property
     def count(self) -> int:
-        """Number of items."""
         return len(self._px4.missions.commands)
 
     @property
@@ -212,7 +211,6 @@ class Px4Mission:
         self.reached, self._repeats = -1, 0
 
     def set_current(self, seq: int) -> None:
-        """Fly this item next."""
         self.current = seq
         self._jumps.clear()
         if self._px4.mode == MISSION:

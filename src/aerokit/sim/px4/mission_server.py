@@ -179,7 +179,6 @@ class Px4MissionLink:
             self._end_upload()
 
     def on_count(self, count: m.MissionCount) -> None:
-        """Start an upload."""
         sender = sender_of(count)
         if self._state is TransferState.SENDING:
             self._warn("WPM: IGN MISSION_COUNT: Busy")

@@ -74,7 +74,6 @@ class Px4Gimbal:
 
     @property
     def flags(self) -> int:
-        """GIMBAL_DEVICE_FLAGS."""
         locks = self._flags & (Flags.ROLL_LOCK | Flags.PITCH_LOCK)
         return locks | (GimbalDeviceFlags.YAW_LOCK if self.is_from_north else GimbalDeviceFlags.YAW_IN_VEHICLE_FRAME)
 

@@ -101,7 +101,6 @@ class Px4PlaneFlight(Px4Flight):
         super().enter(mode)
 
     def update(self) -> None:
-        """Set the target of the motion for the next tick."""
         plane = self._plane
         mode, mission = plane.mode, plane.mission
         self.lifts_off: bool = mode == modes.TAKEOFF or (mode == modes.MISSION and mission.wants_up)

@@ -20,6 +20,7 @@ from aerokit._internal.values import Snapshot
 from aerokit.errors import AerokitError, FileFormatError, InvalidArgument
 from aerokit.position import Position
 from aerokit.vehicle.camera.values import finite_or_none, place_of
+from aerokit.vehicle.state.movement import Attitude
 
 if TYPE_CHECKING:
     import os
@@ -143,14 +144,7 @@ def _angles(roll: float, pitch: float, yaw: float) -> tuple[float | None, float 
 def _quaternion_of(roll: float | None, pitch: float | None, yaw: float | None) -> Quaternion | None:
     if roll is None or pitch is None or yaw is None:
         return None
-    halves = (math.radians(angle) / 2 for angle in (roll, pitch, yaw))
-    (cr, sr), (cp, sp), (cy, sy) = ((math.cos(half), math.sin(half)) for half in halves)
-    return (
-        cr * cp * cy + sr * sp * sy,
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-    )
+    return Attitude(roll, pitch, yaw).quaternion
 
 
 def _euler(quaternion: Quaternion) -> tuple[float, float, float]:

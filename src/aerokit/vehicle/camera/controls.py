@@ -95,17 +95,10 @@ class LensMixin(CameraMixin):
     async def focus_step(self, steps: int) -> None:
         """Focus farther by a number of the camera's own steps, nearer if negative (MAV_CMD_SET_CAMERA_FOCUS).
 
-        Not retried if unanswered, because the step could be made twice.
+        Not retried if unanswered, because the step could be made twice. Raises as :meth:`zoom_step`.
 
         Args:
             steps: −100 to 100.
-
-        Raises:
-            InvalidArgument: ``steps`` is out of range. Nothing was sent.
-            NotSupported: the camera cannot be focused. Nothing was sent.
-            CommandRejected: the camera refused.
-            CommandTimeout: the camera did not answer; it may have moved.
-            OperationTimeout: no camera was found.
         """
         check_range("steps", steps, -100, 100)
         await self._set("focus_step", HAS_FOCUS, FOCUS, SetFocusType.STEP, steps, attempts=1)
@@ -123,11 +116,7 @@ class LensMixin(CameraMixin):
     async def auto_focus(self, kind: AutoFocus = "auto") -> None:
         """Start the camera's auto focus: ``"auto"`` by its own rules, ``"single"`` once, ``"continuous"`` from now on.
 
-        Raises:
-            NotSupported: the camera cannot be focused. Nothing was sent.
-            CommandRejected: the camera refused.
-            CommandTimeout: the camera did not answer.
-            OperationTimeout: no camera was found.
+        Raises as :meth:`reset_settings`, and NotSupported if the camera cannot be focused.
         """
         await self._set("auto_focus", HAS_FOCUS, FOCUS, AUTO_FOCUS_TYPES[kind], 0)
 
@@ -218,19 +207,14 @@ class TrackingMixin(CameraMixin):
     ) -> None:
         """Track the object in a rectangle of the image (MAV_CMD_CAMERA_TRACK_RECTANGLE) until :meth:`stop_tracking`.
 
+        An empty rectangle is invalid. Raises as :meth:`track_point`.
+
         Args:
             left: 0 to 1.
             top: 0 to 1.
             right: 0 to 1, right of ``left``.
             bottom: 0 to 1, below ``top``.
             status_hz: rate of ``camera.tracking``, above 0 to 50.
-
-        Raises:
-            InvalidArgument: an argument is out of range, or the rectangle is empty. Nothing was sent.
-            NotSupported: the camera cannot track a rectangle. Nothing was sent.
-            CommandRejected: the camera refused.
-            CommandTimeout: the camera did not answer.
-            OperationTimeout: no camera was found.
         """
         for name, value in zip(EDGE_NAMES, (left, top, right, bottom), strict=True):
             check_range(name, value, 0, 1)
@@ -247,11 +231,7 @@ class TrackingMixin(CameraMixin):
     async def stop_tracking(self) -> None:
         """Stop tracking (MAV_CMD_CAMERA_STOP_TRACKING).
 
-        Raises:
-            NotSupported: the camera cannot track. Nothing was sent.
-            CommandRejected: the camera refused.
-            CommandTimeout: the camera did not answer.
-            OperationTimeout: no camera was found.
+        Raises as :meth:`reset_settings`, and NotSupported if the camera cannot track.
         """
         await self._link.require_capability("stop_tracking", "has_tracking_point", "has_tracking_rectangle")
         try:

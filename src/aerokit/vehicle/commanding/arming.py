@@ -18,7 +18,7 @@ from aerokit.errors import (
     OperationRejected,
     OperationTimeout,
 )
-from aerokit.mavlink.enums import MavCmd, MavSeverity
+from aerokit.mavlink.enums import MavCmd, MavLandedState, MavSeverity
 from aerokit.mavlink.messages import Statustext
 from aerokit.vehicle.commanding.cleanup import ARM_WATCH_S
 from aerokit.vehicle.commanding.context import VehicleBase
@@ -177,8 +177,20 @@ class ArmingActions(VehicleBase):
         self._arm_cleanup.stop()
         started = self.connection.now()
         with self._arbiter.auxiliary_order(ends_flight=True) as order:
-            await self._sender.send_arm(order, False, force=force)
+            try:
+                await self._sender.send_arm(order, False, force=force)
+            except CommandRejected as error:
+                # ArduCopter refuses to disarm in the air without a status text (AP_Arming_Copter.cpp, disarm).
+                raise self._session.with_reasons(error, started, self._in_flight()) from None
             await self._await_armed(False, order, started, timeout, max_silence_s)
+
+    def _in_flight(self) -> tuple[str, ...]:
+        """Return the landed state as a reason, if it is one of flight."""
+        landed = self.telemetry.landed_state.latest
+        for state in (MavLandedState.IN_AIR, MavLandedState.TAKEOFF, MavLandedState.LANDING):
+            if landed == state:
+                return (f"the vehicle is not on the ground (landed state {state.name})",)
+        return ()
 
     async def _await_armed(
         self, armed: bool, order: Order, started: float, timeout: float, max_silence_s: float | None
@@ -279,10 +291,7 @@ class ArmingActions(VehicleBase):
         """Send the command once: if only the acknowledgement was lost, a second one would reboot the vehicle again."""
         params = (1, *(0.0,) * 4, FORCE_REBOOT if force else 0)
         options: dict[str, Any] = {"attempts": 1, "attempt_timeout": REBOOT_ANSWER_S}
-        with self._arbiter.auxiliary_order() as order:
-            await self._sender.run_command(
-                order, self._session.commands.send_long, MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, *params, **options
-            )
+        await self._sender.auxiliary_command(MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, *params, **options)
 
     async def _await_reboot(self, reboots: int) -> None:
         """Poll the time since boot, frequently at first: a fast simulation soon exceeds its previous uptime."""

@@ -124,7 +124,7 @@ class FlightCleanup:
     async def stop_in(self, mode: Mode, order: Order) -> None:
         """Order the vehicle to hold even if it is in the hold mode: PX4 in LOITER may be flying to a place."""
         if self._holds_by_reposition:
-            await self._sender.follow_up_command(order, *STOP_HERE)
+            await self._sender.send_long(order, *STOP_HERE)
             await self._sender.ensure_mode(mode, order)
         else:
             await self._sender.change_mode(mode, order, reported_since=order.given_at)
@@ -133,9 +133,8 @@ class FlightCleanup:
         """Wait for the acknowledgement of :meth:`_send_hold`; resend the hold if none arrives."""
         by_mode = (MavCmd.DO_SET_MODE, *self._session.autopilot.mode_order(mode).params)
         command, *params = STOP_HERE if self._holds_by_reposition else by_mode
-        await self._sender.run_command(
+        await self._sender.send_long(
             order,
-            self._session.commands.send_long,
             int(command),
             *params,
             modes=() if self._holds_by_reposition else (mode,),
@@ -186,7 +185,7 @@ class FlightCleanup:
                 if is_sent:
                     await self._confirm_hold(mode, order)
                     return
-                await self._wait_for_heartbeat()
+                await self._session.wait_for_heartbeat()
                 if not order.end and not self._session.telemetry.is_confirmed_disarmed:
                     with self._task.spared():  # This task gives the newer order itself.
                         order = self._arbiter.order(*order.modes, mode)
@@ -199,11 +198,6 @@ class FlightCleanup:
                 if not order.end:
                     logger.warning("the vehicle does not hold after an abandoned flight: %s", error)
                 return
-
-    async def _wait_for_heartbeat(self) -> None:
-        """Wait for a HEARTBEAT that describes the vehicle's state."""
-        armed, since = self._session.telemetry.armed, self._session.connection.now()
-        await armed.wait_until(lambda _: armed.updated_at > since, description="the next HEARTBEAT")
 
     @property
     def is_hold_pending(self) -> bool:

@@ -15,6 +15,9 @@ ACCELERATION_M_S2 = 1.0
 MIN_SPEED_M_S = 0.1
 """Speed to which a vehicle slows down, so that it arrives."""
 
+MIN_TOLERANCE_M, TOLERANCE_SHARE = 5.0, 0.3
+"""A vehicle is on its circle within this part of the radius, and at least within this many metres."""
+
 Vector = tuple[float, float]
 """Metres north and east."""
 
@@ -100,9 +103,9 @@ class PathFlight:
         if self._flown_m >= length:
             self.is_on_path, self._speed, self._flown_m = True, 0.0, length
         share = self._flown_m / length if length else 1.0
-        place = tuple(begin + share * part for begin, part in zip(self._from, way, strict=True))
-        velocity = tuple(self._speed * part / length if length else 0.0 for part in way)
-        return self._setpoint((place[0], place[1]), place[2], (velocity[0], velocity[1], velocity[2]), (0.0, 0.0))
+        north, east, down = (begin + share * part for begin, part in zip(self._from, way, strict=True))
+        north_m_s, east_m_s, down_m_s = (self._speed * part / length if length else 0.0 for part in way)
+        return self._setpoint((north, east), down, (north_m_s, east_m_s, down_m_s), (0.0, 0.0))
 
     def _advance_on_path(self, seconds: float) -> TrajectorySetpoint:
         _, tangent, _ = self._path.at(self._phase)
@@ -119,27 +122,22 @@ class PathFlight:
 
     def _accelerate(self, seconds: float, left_m: float) -> None:
         braking = math.sqrt(2 * ACCELERATION_M_S2 * max(0.0, left_m))
-        wanted = min(self._speed + ACCELERATION_M_S2 * seconds, self._speed_m_s, max(braking, MIN_SPEED_M_S))
-        self._speed = wanted
+        self._speed = min(self._speed + ACCELERATION_M_S2 * seconds, self._speed_m_s, max(braking, MIN_SPEED_M_S))
 
     def _setpoint(
         self, place: Vector, down: float, velocity: tuple[float, float, float], acceleration: Vector
     ) -> TrajectorySetpoint:
-        return TrajectorySetpoint(
-            self._centre[0] + place[0],
-            self._centre[1] + place[1],
-            self._centre[2] + down,
-            *velocity,
-            *acceleration,
-            yaw_deg=self._heading(place, velocity[:2]),
-        )
+        north, east, centre_down = self._centre
+        where, yaw_deg = (north + place[0], east + place[1], centre_down + down), self._heading(place, velocity[:2])
+        return TrajectorySetpoint(*where, *velocity, *acceleration, yaw_deg=yaw_deg)
 
 
 class TurnCounter:
     """Counts turns around a centre, while the vehicle is reported near the circle and flies it in the right sense."""
 
-    def __init__(self, radius_m: float, tolerance_m: float, *, clockwise: bool) -> None:
-        self._radius_m, self._tolerance_m, self._way = radius_m, tolerance_m, 1 if clockwise else -1
+    def __init__(self, radius_m: float, *, clockwise: bool) -> None:
+        self._radius_m, self._way = radius_m, 1 if clockwise else -1
+        self._tolerance_m = max(MIN_TOLERANCE_M, TOLERANCE_SHARE * radius_m)
         self._bearing: float | None = None
         self.rounds: float = 0.0
         self.is_there: bool = False

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from aerokit.mavlink.enums import MavLandedState
 from aerokit.vehicle.commanding.arbiter import CommandArbiter
 from aerokit.vehicle.commanding.cleanup import ArmCleanup, FlightCleanup
 from aerokit.vehicle.commanding.health import Health
@@ -54,8 +55,11 @@ class VehicleContext:
         disarmed = "disarmed" if telemetry.is_confirmed_disarmed else "possibly armed"
         position = telemetry.position.latest
         height = None if position is None else position.altitude_relative_m
+        # A copter in LAND disarms some seconds after the touchdown.
+        has_landed = telemetry.is_armed and telemetry.landed_state.latest == MavLandedState.ON_GROUND
+        where = "on the ground in" if has_landed else "in"
         return (
-            f"{'holding in' if mode is not None and mode == hold else 'in'} {telemetry.mode_name},"
+            f"{'holding in' if mode is not None and mode == hold else where} {telemetry.mode_name},"
             f" {'still armed' if telemetry.is_armed else disarmed},"
             f"{'' if height is None else f' {height:.1f} m above home,'}"
             f" last heartbeat {self.session.heartbeat_age:.1f} s ago"

@@ -130,14 +130,7 @@ class FlightActions(VehicleBase):
         if plan.command is not None:
             is_rising = self._rises_from_here()
             with self._session.streaming("position", "landed_state"):
-                await self._sender.run_command(
-                    order,
-                    self._session.commands.send_long,
-                    plan.command,
-                    *plan.params,
-                    modes=order.modes,
-                    is_done=is_rising,
-                )
+                await self._sender.send_long(order, plan.command, *plan.params, modes=order.modes, is_done=is_rising)
 
     def _rises_from_here(self) -> Callable[[], bool]:
         """Return a function that is true once new messages show a climb; earlier ones may describe the last flight."""
@@ -239,13 +232,11 @@ class FlightActions(VehicleBase):
                 and self._position.altitude_relative() < -MAX_SURFACE_DEPTH_M
             )
 
-        stays = self._sender.stays_in(order, *order.modes)
+        stays = self._sender.stays_until_disarmed(order)
 
         def trouble() -> str | None:
             if is_over() and is_deep() and self.connection.now() > accepted_at + MODE_GRACE_S:
                 return f"the mode changed to {self.telemetry.mode_name} at {self._position.altitude_relative():.1f} m"
-            if order.has_lost_mode and armed.updated_at < order.mode_lost_at:
-                return None  # The next HEARTBEAT may report that it has landed and disarmed.
             return stays()
 
         depth = () if self.autopilot.mode_when_landed is None else ("position",)

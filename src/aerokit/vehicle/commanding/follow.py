@@ -13,17 +13,13 @@ from aerokit._internal.formatting import short_repr
 from aerokit._internal.values import Snapshot
 from aerokit.connection.tasks import Cancellation
 from aerokit.errors import InvalidArgument, NotSupported, OperationRejected, OperationTimeout
-from aerokit.mavlink.enums import MavFrame
-from aerokit.mavlink.messages import SetPositionTargetGlobalInt
 from aerokit.position import Position
 from aerokit.vehicle.commanding.follow_target import FollowTarget, HasTelemetry
 from aerokit.vehicle.commanding.progress import POSITION_MAX_AGE_S
-from aerokit.vehicle.commanding.setpoints import IGNORE_ACCELERATION, IGNORE_YAW, IGNORE_YAW_RATE
+from aerokit.vehicle.commanding.setpoints import ZERO, PositionSetpoint, SetpointEncoder
 from aerokit.vehicle.commanding.streams import SteeringStream
 
 if TYPE_CHECKING:
-    from types import TracebackType
-
     from typing_extensions import Self
 
     from aerokit.autopilots import Mode
@@ -31,7 +27,6 @@ if TYPE_CHECKING:
     from aerokit.vehicle.commanding.context import VehicleContext
 
 __all__ = ["FollowStream"]
-
 
 RATE_HZ, MAX_LAG_S = 10.0, 1.0
 MAX_DISTANCE_M = 1000.0
@@ -51,8 +46,7 @@ class FollowPlace(Snapshot):
     height_m: float | None
     face_target: bool
 
-    def check(self) -> None:
-        """Raise InvalidArgument if a value is out of range."""
+    def _check(self) -> None:
         check_range("distance_m", self.distance_m, 0, MAX_DISTANCE_M)
         if self.bearing_deg is not None:
             check_range("bearing_deg", self.bearing_deg, 0, 360)
@@ -75,20 +69,12 @@ class FollowedTarget:
         self._target, self._now = target, now
         self.latest: TargetState | None = None
 
-    async def read_iterable(self) -> None:
-        """Read an asynchronous iterable to its end."""
-        assert isinstance(self._target, AsyncIterable)
-        async for position in self._target:
-            self.add(position)
-
     def read(self) -> TargetState | None:
         """Read a vehicle or call the function; return the latest state."""
         if isinstance(self._target, HasTelemetry):
             self._read_vehicle(self._target.telemetry)
-        elif not isinstance(self._target, AsyncIterable):
-            position = self._target()
-            if position is not None:
-                self.add(position)
+        elif not isinstance(self._target, AsyncIterable) and (position := self._target()) is not None:
+            self.add(position)
         return self.latest
 
     def _read_vehicle(self, telemetry: Any) -> None:
@@ -96,27 +82,20 @@ class FollowedTarget:
         if position.latest is None or not math.isfinite(position.age):
             return
         at = self._now() - position.age
-        speeds = (0.0, 0.0, 0.0) if velocity is None else (velocity.north_m_s, velocity.east_m_s, velocity.down_m_s)
+        speeds = ZERO if velocity is None else (velocity.north_m_s, velocity.east_m_s, velocity.down_m_s)
         self.latest = TargetState(position.latest.replace(altitude_relative_m=None), speeds, at)
 
     def add(self, position: object) -> None:
-        """Process a position that the program supplied. An unchanged one counts as new.
-
-        Raises:
-            InvalidArgument: it is no position.
-        """
+        """Process a position that the program supplied. An unchanged one counts as new."""
         if not isinstance(position, Position):
             raise InvalidArgument(f"position = {short_repr(position)} is not allowed: a Position")
-        before, now = self.latest, self._now()
-        if before is not None and now - before.at < MIN_INTERVAL_S:
-            return
-        velocity = (0.0, 0.0, 0.0)
+        before, now, velocity = self.latest, self._now(), ZERO
         if before is not None:
-            seconds = now - before.at
-            there = before.position
-            distance, bearing = there.distance_to(position), math.radians(there.bearing_to(position))
+            there, seconds = before.position, now - before.at
+            if seconds < MIN_INTERVAL_S:
+                return
+            speed, bearing = there.distance_to(position) / seconds, math.radians(there.bearing_to(position))
             down = (there.altitude_amsl_m or 0.0) - (position.altitude_amsl_m or 0.0)
-            speed = distance / seconds
             velocity = (speed * math.cos(bearing), speed * math.sin(bearing), down / seconds)
         self.latest = TargetState(position, velocity, now)
 
@@ -132,9 +111,9 @@ class FollowStream(SteeringStream[TargetState]):
     mode, nothing more is sent. ``fly`` and leaving the block then raise :class:`SetpointStreamStopped`.
 
     Entering raises:
-        OperationRejected: the vehicle is not flying. Nothing was sent.
-        OperationTimeout: no position of the target was known within ``valid_for_s``. Nothing was sent.
-        InvalidArgument: a height is wanted, and the target has no altitude. Nothing was sent.
+        OperationRejected: the vehicle is not flying (nothing was sent), or its altitude is unknown (it holds).
+        OperationTimeout: no position of the target was known within ``valid_for_s``. The vehicle holds.
+        InvalidArgument: a height is wanted, and the target has no altitude. The vehicle holds.
     """
 
     _NAME, _VALUE = "following", "position of the target"
@@ -147,14 +126,14 @@ class FollowStream(SteeringStream[TargetState]):
         valid_for_s: float,
         max_distance_m: float,
     ) -> None:
-        place.check()
         check_range("max_distance_m", max_distance_m, place.distance_m, math.inf)
         autopilot = context.session.autopilot
         if not (autopilot.setpoints.global_position and autopilot.setpoints.velocity):
             raise NotSupported(f"follow: {autopilot.firmware} does not support position set-points; nothing was sent")
-        nowhere = TargetState(Position(0.0, 0.0), (0.0, 0.0, 0.0), -math.inf)
+        nowhere = TargetState(Position(0.0, 0.0), ZERO, -math.inf)
         super().__init__(context, self._encode_place, nowhere, RATE_HZ, valid_for_s, MAX_LAG_S)
         self._target, self._tracker = target, FollowedTarget(target, self._now)
+        self._encode_position = SetpointEncoder(context).position
         self._place, self._max_distance_m = place, max_distance_m
         self._reading: Cancellation | None = None
         self._end_reason = ""
@@ -187,9 +166,7 @@ class FollowStream(SteeringStream[TargetState]):
 
     async def __aenter__(self) -> Self:
         self._raise_if_entered()
-        position = self._context.vehicle_position
-        if not self._session.telemetry.is_armed or position.is_on_ground():
-            raise OperationRejected("follow: the vehicle is not flying: call take_off() first; nothing was sent")
+        self._context.vehicle_position.check_flying("follow")
         mode = self._wanted_mode()
         self._start_reading()
         try:
@@ -201,21 +178,21 @@ class FollowStream(SteeringStream[TargetState]):
             self._stop_reading()
             raise
 
-    async def __aexit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, exc_type: object, exc: BaseException | None, traceback: object) -> None:
         self._stop_reading()
         await super().__aexit__(exc_type, exc, traceback)
 
     def _start_reading(self) -> None:
-        if isinstance(self._target, HasTelemetry) or not isinstance(self._target, AsyncIterable):
+        target = self._target
+        if isinstance(target, HasTelemetry) or not isinstance(target, AsyncIterable):
             return
         scope = self._reading = Cancellation()
 
         async def read() -> None:
             with scope:
                 try:
-                    await self._tracker.read_iterable()
+                    async for position in target:
+                        self._tracker.add(position)
                     self._end_reason = "the positions of the target ended"
                 except Exception as error:
                     self._end_reason = f"the positions of the target raised {error!r}"
@@ -231,7 +208,7 @@ class FollowStream(SteeringStream[TargetState]):
         while (state := self._tracker.read()) is None or self._now() - state.at > self._valid_for_s:
             if self._now() > until or self._end_reason:
                 why = self._end_reason or f"no position of the target was known within {self._valid_for_s:g} s"
-                raise OperationTimeout(f"follow: {why}; nothing was sent")
+                raise OperationTimeout(f"follow: {why}; a hold was ordered")
             await anyio.sleep(POLL_INTERVAL_S)
         return state
 
@@ -241,9 +218,11 @@ class FollowStream(SteeringStream[TargetState]):
         self._bearing_deg = target.bearing_to(here) if self._place.bearing_deg is None else self._place.bearing_deg
         self._course_deg = here.bearing_to(target)
         if self._place.height_m is None:
-            self._own_altitude_m = here.altitude_amsl_m or 0.0
+            if here.altitude_amsl_m is None:
+                raise OperationRejected("follow: the vehicle's altitude above sea level is unknown; a hold was ordered")
+            self._own_altitude_m = here.altitude_amsl_m
         elif target.altitude_amsl_m is None and target.altitude_relative_m is None:
-            raise InvalidArgument("height_m is not allowed: the target has no altitude; nothing was sent")
+            raise InvalidArgument("height_m is not allowed: the target has no altitude; a hold was ordered")
 
     # ------------------------------------------------------------------------------ the stream
 
@@ -255,7 +234,7 @@ class FollowStream(SteeringStream[TargetState]):
             state = self._tracker.read()
             if state is not None:
                 self._take(state)
-                self._set_at = max(state.at, -math.inf)
+                self._set_at = state.at
         except Exception as error:
             self._end_reason = f"the position of the target raised {error!r}"
         super()._tick(due)
@@ -283,20 +262,5 @@ class FollowStream(SteeringStream[TargetState]):
         if self._place.height_m is None:
             place = place.replace(altitude_amsl_m=self._own_altitude_m, altitude_relative_m=None)
             down_m_s = 0.0
-        latitude, longitude, altitude, is_relative = self._context.vehicle_position.global_target(place)
-        yaw = math.remainder(bearing + math.pi, 2 * math.pi)
-        mask = IGNORE_ACCELERATION | IGNORE_YAW_RATE | (0 if self._place.face_target else IGNORE_YAW)
-        return SetPositionTargetGlobalInt(
-            int(self._now() * 1000) & 0xFFFFFFFF,
-            self._session.system_id,
-            self._session.component_id,
-            MavFrame.GLOBAL_RELATIVE_ALT_INT if is_relative else MavFrame.GLOBAL_INT,
-            mask,
-            latitude,
-            longitude,
-            altitude,
-            *(north_m_s, east_m_s, down_m_s),
-            *(0.0, 0.0, 0.0),
-            yaw if self._place.face_target else 0.0,
-            0.0,
-        )
+        yaw_deg = math.degrees(math.remainder(bearing + math.pi, 2 * math.pi)) if self._place.face_target else None
+        return self._encode_position(PositionSetpoint(place, yaw_deg), (north_m_s, east_m_s, down_m_s))

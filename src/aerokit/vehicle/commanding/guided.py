@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from aerokit._internal.arguments import check_kind, checks_arguments
 from aerokit.errors import NotSupported
+from aerokit.vehicle.commanding.progress import StallDetector
 from aerokit.vehicle.commanding.setpoints import (
     AccelerationSetpoint,
     ActuatorSetpoint,
@@ -26,7 +27,7 @@ from aerokit.vehicle.commanding.setpoints import (
     VelocitySetpoint,
     wants_motion,
 )
-from aerokit.vehicle.commanding.streams import StallWatch, SteeringStream
+from aerokit.vehicle.commanding.streams import SteeringStream
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -67,7 +68,7 @@ class Guided:
         max_lag_s: float = 0.5,
     ) -> SetpointStream[VelocitySetpoint]:
         """Stream velocities over ground (SET_POSITION_TARGET_LOCAL_NED)."""
-        return self._stream("velocity", self._encode.velocity, initial, rate_hz, valid_for_s, max_lag_s)
+        return self._stream("velocity", self._encode.local, initial, rate_hz, valid_for_s, max_lag_s)
 
     def body_velocity(
         self,
@@ -89,7 +90,7 @@ class Guided:
         max_lag_s: float = 0.5,
     ) -> SetpointStream[AccelerationSetpoint]:
         """Stream accelerations (SET_POSITION_TARGET_LOCAL_NED)."""
-        return self._stream("acceleration", self._encode.acceleration, initial, rate_hz, valid_for_s, max_lag_s)
+        return self._stream("acceleration", self._encode.local, initial, rate_hz, valid_for_s, max_lag_s)
 
     def local_position(
         self,
@@ -100,7 +101,7 @@ class Guided:
         max_lag_s: float = 0.5,
     ) -> SetpointStream[LocalPositionSetpoint]:
         """Stream positions in the local frame (SET_POSITION_TARGET_LOCAL_NED)."""
-        return self._stream("local position", self._encode.local_position, initial, rate_hz, valid_for_s, max_lag_s)
+        return self._stream("local position", self._encode.local, initial, rate_hz, valid_for_s, max_lag_s)
 
     def position(
         self,
@@ -148,7 +149,7 @@ class Guided:
         max_lag_s: float = 0.5,
     ) -> SetpointStream[TrajectorySetpoint]:
         """Stream local positions with velocity and acceleration feed-forward (SET_POSITION_TARGET_LOCAL_NED)."""
-        return self._stream("trajectory", self._encode.trajectory, initial, rate_hz, valid_for_s, max_lag_s)
+        return self._stream("trajectory", self._encode.local, initial, rate_hz, valid_for_s, max_lag_s)
 
     def actuators(
         self,
@@ -211,7 +212,7 @@ class SetpointStream(SteeringStream[SetpointT]):
         is_place = isinstance(initial, (PositionSetpoint, LocalPositionSetpoint))
         self._is_costly = is_place and context.session.autopilot.setpoints.position_restarts_path
         self._left, self._sent_at = INITIAL_REPEATS, -math.inf
-        self._stall = StallWatch(context, lambda: self._mode is not None and wants_motion(self._value, context))
+        self._stall = StallDetector(context.session)
 
     def set(self, setpoint: SetpointT) -> None:
         """Replace the set-point; it is sent at the next tick and resent until ``valid_for_s`` has passed.
@@ -247,4 +248,6 @@ class SetpointStream(SteeringStream[SetpointT]):
             self._left, self._sent_at = self._left - 1, self._now()
 
     def _why_stop(self, lag: float) -> str | None:
+        if self._mode is None or not wants_motion(self._value, self._context):
+            self._stall = StallDetector(self._session)
         return super()._why_stop(lag) or self._stall()

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 
 import anyio
 
+from aerokit.autopilots.telemetry import SENSORS
 from aerokit.errors import CommandRejected, CommandTimeout
 from aerokit.events import LinkRestored, LinkState
-from aerokit.mavlink.enums import MavCmd
+from aerokit.mavlink.enums import MavCmd, MavSysStatusSensor
 
 if TYPE_CHECKING:
     from aerokit.autopilots import Mode
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 TEXTS_S = 1.0
 # Older values do not describe the present state.
 HEALTH_MAX_AGE_S = 5.0
+RC_RECEIVER = SENSORS[MavSysStatusSensor.RC_RECEIVER]
 
 
 class Health:
@@ -114,15 +116,22 @@ class Health:
         """Return failing sensors, failing pre-arm checks and missing estimates.
 
         If the vehicle reports that it can be armed, a failing sensor is not required (PX4: no RC receiver). In a mode
-        that does not allow arming, PX4 evaluates the requirements of that mode, which say nothing about arming.
+        that does not allow arming, PX4 evaluates the requirements of that mode, which say nothing about arming. PX4
+        also reports the receiver as failing in modes that do not require it.
         """
         failing: list[str] = []
         sensors, estimator = self._telemetry.sensors.latest, self._telemetry.estimator.latest
         says_nothing = self._autopilot.prearm_depends_on_mode and self.unarmable_mode()
         if sensors is not None and sensors.prearm_checks_pass is not True and not says_nothing:
-            failing += [f"{name} is not healthy (SYS_STATUS)" for name in sensors.failing]
+            failing += [f"{name} is not healthy (SYS_STATUS)" for name in sensors.failing if self._is_required(name)]
             if sensors.prearm_checks_pass is False:
                 failing.append("the vehicle's pre-arm checks do not pass (SYS_STATUS)")
         if estimator is not None:
             failing += [f"the estimator has no {name} ({estimator.message})" for name in estimator.missing]
         return failing
+
+    def _is_required(self, sensor: str) -> bool:
+        """Return False for an RC receiver that the present mode does not require."""
+        mode, modes_with_rc = self._telemetry.mode.latest, self._autopilot.modes_with_rc
+        is_other_mode = mode is not None and modes_with_rc is not None and mode.name not in modes_with_rc
+        return not (is_other_mode and sensor.startswith(RC_RECEIVER))

@@ -1,4 +1,4 @@
-"""Manoeuvres: orbit, figure eight, loiter, VTOL transition."""
+"""Manoeuvres: orbit, figure eight, loiter, follow, VTOL transition; airspeed and climb speed."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit.errors import InvalidArgument, NotSupported
-from aerokit.mavlink.enums import MavCmd, MavDoRepositionFlags, MavType, MavVtolState, OrbitYawBehaviour
+from aerokit.mavlink.enums import MavCmd, MavDoRepositionFlags, MavType, MavVtolState, OrbitYawBehaviour, SpeedType
 from aerokit.position import travel_target
 from aerokit.vehicle.commanding.context import VehicleBase
 from aerokit.vehicle.commanding.follow_target import FollowTarget
@@ -16,12 +16,12 @@ from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M, MAX_SILENCE_S, a
 if TYPE_CHECKING:
     from aerokit.autopilots import Mode
     from aerokit.position import Home, Position
-    from aerokit.vehicle.commanding.closed_paths import TurnCounter
     from aerokit.vehicle.commanding.follow import FollowStream
 
 Facing = Literal["center", "ahead", "initial", "free"]
 FlightState = Literal["fixed_wing", "multicopter"]
 
+SPEED_ARGUMENTS = {SpeedType.AIRSPEED: "airspeed_m_s", SpeedType.CLIMB_SPEED: "climb_m_s"}
 YAW_BEHAVIOURS: dict[str, OrbitYawBehaviour] = {
     "center": OrbitYawBehaviour.HOLD_FRONT_TO_CIRCLE_CENTER,
     "ahead": OrbitYawBehaviour.HOLD_FRONT_TANGENT_TO_CIRCLE,
@@ -30,19 +30,12 @@ YAW_BEHAVIOURS: dict[str, OrbitYawBehaviour] = {
 }
 VTOL_STATES: dict[str, MavVtolState] = {"fixed_wing": MavVtolState.FW, "multicopter": MavVtolState.MC}
 MAX_RADIUS_M, MAX_SPEED_M_S, MAX_ROUNDS = 10_000, 50, 1000
-MIN_TOLERANCE_M, TOLERANCE_SHARE = 5.0, 0.3
-"""A vehicle is on its circle within this part of the radius, at least within so many metres."""
-
-
-def _turn_counter(radius_m: float, *, clockwise: bool) -> TurnCounter:
-    from aerokit.vehicle.commanding.closed_paths import TurnCounter
-
-    return TurnCounter(radius_m, max(MIN_TOLERANCE_M, TOLERANCE_SHARE * radius_m), clockwise=clockwise)
+MAX_SET_SPEED_M_S, KEEP_THROTTLE = 1000, -1.0
 
 
 @checks_arguments
 class ManeuverActions(VehicleBase):
-    """Orbit, figure eight, loiter, VTOL transition."""
+    """Orbit, figure eight, loiter, follow, VTOL transition; airspeed and climb speed."""
 
     async def orbit(
         self,
@@ -80,32 +73,27 @@ class ManeuverActions(VehicleBase):
             max_silence_s: raise when no heartbeat was received for this long; None: no limit.
 
         Raises:
-            InvalidArgument: an argument is out of range. Nothing was sent.
             NotSupported: this type of vehicle has no way to do it. Nothing was sent.
-            ValueUnknownError: position or home is needed here and not known.
-            OperationRejected: it is not flying, or the mode changed or it disarmed on the way.
-            CommandRejected: the vehicle refused.
-            CommandTimeout: there was no acknowledgement.
-            HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
-            OperationTimeout: it was not done in time, or does not move.
+
+        Otherwise raises as :meth:`go_to`.
         """
-        from aerokit.vehicle.commanding.closed_paths import Circle
+        from aerokit.vehicle.commanding.closed_paths import Circle, TurnCounter
         from aerokit.vehicle.commanding.rounds import RoundFlight
 
         check_range("radius_m", radius_m, 0, MAX_RADIUS_M, above=True)
         check_range("speed_m_s", speed_m_s, 0, MAX_SPEED_M_S, above=True)
         if turns is not None:
             check_range("turns", turns, 0, MAX_ROUNDS, above=True)
-        counter = _turn_counter(radius_m, clockwise=clockwise)
-        flight = RoundFlight(self._context, "orbit", travel_target(center), counter, turns, timeout, max_silence_s)
+        place, counter = travel_target(center), TurnCounter(radius_m, clockwise=clockwise)
+        limits = (max_distance_m, timeout, max_silence_s)
         if self.autopilot.circles_by == "setpoints":
-            flight.check_place(max_distance_m)
+            flight = RoundFlight(self._context, "orbit", place, counter, turns, limits)
             path = Circle(radius_m, clockwise=clockwise, first_phase=flight.bearing_rad)
             await flight.by_setpoints(path, speed_m_s, facing)
-            return
-        command, params, mode = self._circling("orbit", radius_m, speed_m_s, facing, clockwise=clockwise)
-        flight.check_place(max_distance_m)
-        await flight.by_command(command, params, mode, is_held=not self._is_on_wings, circle_m=radius_m)
+        else:
+            command, params, mode = self._circling("orbit", radius_m, speed_m_s, facing, clockwise=clockwise)
+            flight = RoundFlight(self._context, "orbit", place, counter, turns, limits)
+            await flight.by_command(command, params, mode, is_held=not self._is_on_wings, circle_m=radius_m)
 
     async def figure_eight(
         self,
@@ -150,22 +138,19 @@ class ManeuverActions(VehicleBase):
             check_range("rounds", rounds, 0, MAX_ROUNDS, above=True)
             if rounds * 2 != int(rounds * 2):
                 raise InvalidArgument(f"rounds = {rounds!r} is not allowed: a multiple of a half")
-        counter = LobeCounter(major_radius_m, axis_deg)
-        flight = RoundFlight(
-            self._context, "figure_eight", travel_target(center), counter, rounds, timeout, max_silence_s
-        )
-        if not self._is_on_wings and self.autopilot.setpoints.trajectory:
-            flight.check_place(max_distance_m)
-            path = Eight(major_radius_m, minor_radius_m, axis_deg, clockwise=clockwise)
-            await flight.by_setpoints(path, speed_m_s, "ahead")
-        elif self._is_on_wings and self.autopilot.circles_by == "orbit":
-            flight.check_place(max_distance_m)
+        is_flown_by_px4 = self._is_on_wings and self.autopilot.circles_by == "orbit"
+        if not is_flown_by_px4 and (self._is_on_wings or not self.autopilot.setpoints.trajectory):
+            raise NotSupported(f"figure_eight: {self.autopilot.firmware} has no such manoeuvre; nothing was sent")
+        counter, limits = LobeCounter(major_radius_m, axis_deg), (max_distance_m, timeout, max_silence_s)
+        flight = RoundFlight(self._context, "figure_eight", travel_target(center), counter, rounds, limits)
+        if is_flown_by_px4:
             major_m = major_radius_m if clockwise else -major_radius_m
             params = (major_m, minor_radius_m, 0, math.radians(axis_deg))
             mode = self._sender.mode_for("figure_eight", "hold")
             await flight.by_command(MavCmd.DO_FIGURE_EIGHT, params, mode, is_held=False)
         else:
-            raise NotSupported(f"figure_eight: {self.autopilot.firmware} has no such manoeuvre; nothing was sent")
+            path = Eight(major_radius_m, minor_radius_m, axis_deg, clockwise=clockwise)
+            await flight.by_setpoints(path, speed_m_s, "ahead")
 
     async def loiter(
         self,
@@ -199,6 +184,7 @@ class ManeuverActions(VehicleBase):
         All else is as for :meth:`orbit`. NotSupported is raised for a radius if the vehicle hovers, InvalidArgument for
         ``turns`` without one.
         """
+        from aerokit.vehicle.commanding.closed_paths import TurnCounter
         from aerokit.vehicle.commanding.rounds import RoundFlight
 
         if turns is not None:
@@ -213,16 +199,14 @@ class ManeuverActions(VehicleBase):
             raise InvalidArgument(f"turns = {turns!r} is not allowed without radius_m")
         center = self.telemetry.position.value if target is None else travel_target(target)
         if radius_m is None:
-            counter = None
-            flags = MavDoRepositionFlags.CHANGE_MODE
-            params: tuple[float, ...] = (-1.0, float(flags), 0.0, math.nan)
-            command = int(MavCmd.DO_REPOSITION)
+            counter, command = None, int(MavCmd.DO_REPOSITION)
+            params: tuple[float, ...] = (-1.0, float(MavDoRepositionFlags.CHANGE_MODE), 0.0, math.nan)
             mode = self._sender.mode_for("loiter", self.autopilot.reposition_purpose)
         else:
-            counter = _turn_counter(radius_m, clockwise=clockwise)
+            counter = TurnCounter(radius_m, clockwise=clockwise)
             command, params, mode = self._circling("loiter", radius_m, math.nan, "free", clockwise=clockwise)
-        flight = RoundFlight(self._context, "loiter", center, counter, turns or 0.0, timeout, max_silence_s)
-        flight.check_place(max_distance_m)
+        limits = (max_distance_m, timeout, max_silence_s)
+        flight = RoundFlight(self._context, "loiter", center, counter, turns or 0.0, limits)
         stay_s, circle_m = duration_s or 0.0, radius_m or 0.0
         await flight.by_command(command, params, mode, is_held=False, stay_s=stay_s, circle_m=circle_m)
 
@@ -313,9 +297,7 @@ class ManeuverActions(VehicleBase):
         wanted, cell = VTOL_STATES[state], self.telemetry.vtol_state
         with self._arbiter.auxiliary_order() as order:
             started = self.connection.now()
-            await self._sender.run_command(
-                order, self._session.commands.send_long, MavCmd.DO_VTOL_TRANSITION, float(wanted)
-            )
+            await self._sender.send_long(order, MavCmd.DO_VTOL_TRANSITION, float(wanted))
             with self._session.streaming("vtol_state"):
                 await await_progress(
                     self._session,
@@ -325,3 +307,33 @@ class ManeuverActions(VehicleBase):
                     describe=lambda: f"MAV_VTOL_STATE is {cell.latest}",
                     timeout=timeout,
                 )
+
+    async def set_airspeed(self, airspeed_m_s: float) -> None:
+        """Change the airspeed of a fixed wing in m/s, above 0 (MAV_CMD_DO_CHANGE_SPEED, SPEED_TYPE_AIRSPEED).
+
+        Returns at the acknowledgement, because no message reports the setting; VFR_HUD has what the vehicle measures.
+        ArduPlane applies it in GUIDED and AUTO, within AIRSPEED_MIN and AIRSPEED_MAX, and refuses it otherwise. PX4
+        applies it in modes that navigate, and accepts it always. ``set_speed`` changes the ground speed.
+
+        Raises:
+            InvalidArgument: out of range. Nothing was sent.
+            NotSupported: this firmware cannot change this speed, or has no wings. Nothing was sent.
+            CommandRejected: the vehicle refused.
+            CommandTimeout: there was no acknowledgement.
+        """
+        await self._set_speed("set_airspeed", SpeedType.AIRSPEED, airspeed_m_s)
+
+    async def set_climb_speed(self, climb_m_s: float) -> None:
+        """Change the speed of climbs in m/s, above 0 (MAV_CMD_DO_CHANGE_SPEED, SPEED_TYPE_CLIMB_SPEED).
+
+        Returns at the acknowledgement, because no message reports the setting. ArduCopter applies it in GUIDED, AUTO
+        and RTL until the mode changes, and refuses it otherwise. PX4 would take it for the cruise speed. Raises as
+        :meth:`set_airspeed`.
+        """
+        await self._set_speed("set_climb_speed", SpeedType.CLIMB_SPEED, climb_m_s)
+
+    async def _set_speed(self, what: str, kind: SpeedType, speed_m_s: float) -> None:
+        check_range(SPEED_ARGUMENTS[kind], speed_m_s, 0, MAX_SET_SPEED_M_S, above=True)
+        if kind not in self.autopilot.speed_types:
+            raise NotSupported(f"{what}: {self.autopilot.firmware} has no SPEED_TYPE_{kind.name}; nothing was sent")
+        await self._sender.auxiliary_command(MavCmd.DO_CHANGE_SPEED, float(kind), speed_m_s, KEEP_THROTTLE)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from aerokit._internal import geo
 from aerokit._internal.arguments import check_range
 from aerokit.errors import HeartbeatTimeout, InvalidArgument, OperationRejected, OperationTimeout
-from aerokit.mavlink.enums import MavLandedState
+from aerokit.mavlink.enums import MavFrame, MavLandedState
 from aerokit.position import Position
 
 if TYPE_CHECKING:
@@ -31,6 +31,9 @@ STALL_TIMEOUT_S, STALL_DISTANCE_M = 12.0, 0.3
 
 FALL_SINK_M_S = 3.0
 """A faster descent is mentioned when the vehicle does not move any more; autopilots descend at 1.5 m/s by default."""
+
+FALL_STOP_S = 1.5
+"""A fast descent that ends within this time is a fall, if the vehicle then stands still on the ground."""
 
 
 async def await_progress(
@@ -131,8 +134,14 @@ class StallDetector:
         self._session = session
         self._from: Position | None = None
         self._top_m, self._max_sink_m_s = -math.inf, 0.0
+        self._fast_at = -math.inf
 
-    def __call__(self) -> str | None:
+    @property
+    def follows_fast_descent(self) -> bool:
+        """True if the vehicle stands still, and was sinking at ``FALL_SINK_M_S`` or faster right before."""
+        return self._from is not None and self._since - self._fast_at <= FALL_STOP_S
+
+    def __call__(self, timeout_s: float = STALL_TIMEOUT_S) -> str | None:
         """Return a clause about how long the vehicle has not moved; None if it moves or its position is unknown."""
         now, cell = self._session.connection.now(), self._session.telemetry.position
         here = cell.latest
@@ -141,14 +150,17 @@ class StallDetector:
         elif self._from is None or _metres(here, self._from) > STALL_DISTANCE_M:
             self._from, self._since = here, now
             self._record_descent(here)
-        elif now - self._since >= STALL_TIMEOUT_S:
+        elif now - self._since >= timeout_s:
             return f"it accepted the order and has not moved for {now - self._since:.0f} s{self._reason(here)}"
         return None
 
     def _record_descent(self, here: Position) -> None:
         velocity = self._session.telemetry.velocity.latest
         self._top_m = max(self._top_m, here.altitude_relative_m if here.altitude_relative_m is not None else -math.inf)
-        self._max_sink_m_s = max(self._max_sink_m_s, 0.0 if velocity is None else velocity.down_m_s)
+        sink_m_s = 0.0 if velocity is None else velocity.down_m_s
+        self._max_sink_m_s = max(self._max_sink_m_s, sink_m_s)
+        if sink_m_s >= FALL_SINK_M_S:
+            self._fast_at = self._since
 
     def _reason(self, here: Position) -> str:
         """Return a fast descent before the standstill, as a clause; empty if there was none."""
@@ -204,20 +216,28 @@ class VehiclePosition:
         along = geo.distance_m(here.latitude_deg, here.longitude_deg, target.latitude_deg, target.longitude_deg)
         return math.hypot(along, self.height_above(here, target))
 
-    def check_reach(self, name: str, places: Iterable[Position], max_distance_m: float) -> None:
-        """Raise InvalidArgument for a place farther away than the limit; accept all while the position is unknown."""
+    def check_reach(
+        self, name: str, places: Iterable[Position | None], max_distance_m: float, *, are_items: bool = False
+    ) -> None:
+        """Raise InvalidArgument for a place farther away than the limit; accept all while the position is unknown.
+
+        With ``are_items`` the places are those of the items of a plan, None for an item without one.
+        """
         check_range("max_distance_m", max_distance_m, 0, math.inf, above=True)
         here = self._telemetry.position.latest
         if here is None:
             return
-        for place in places:
+        for index, place in enumerate(places):
+            if place is None:
+                continue
             degrees = abs(place.latitude_deg - here.latitude_deg) + abs(place.longitude_deg - here.longitude_deg)
             if degrees * METRES_PER_DEGREE < max_distance_m:  # Missions have thousands of nearby places.
                 continue
             distance_m = self.distance_to(place)
             if distance_m > max_distance_m:
+                where = f"{name}, item {index}" if are_items else name
                 raise InvalidArgument(
-                    f"{name} = {place.latitude_deg:.7f}, {place.longitude_deg:.7f} is not allowed: it is"
+                    f"{where} = {place.latitude_deg:.7f}, {place.longitude_deg:.7f} is not allowed: it is"
                     f" {distance_m / 1000:,.0f} km away, more than max_distance_m = {max_distance_m:,.0f}; nothing was"
                     " sent. Pass a greater max_distance_m to allow it"
                 )
@@ -271,11 +291,24 @@ class VehiclePosition:
             altitude, is_relative = altitude + self.home_altitude(), False
         return round(target.latitude_deg * 1e7), round(target.longitude_deg * 1e7), altitude, is_relative
 
+    def command_place(self, target: Position) -> dict[str, Any]:
+        """Return the place as arguments of a COMMAND_INT; see :meth:`global_target`."""
+        latitude, longitude, altitude, is_relative = self.global_target(target)
+        frame = MavFrame.GLOBAL_RELATIVE_ALT_INT if is_relative else MavFrame.GLOBAL_INT
+        return {"frame": frame, "x": latitude, "y": longitude, "z": altitude}
+
     def is_on_ground(self) -> bool:
         """Return True if a vehicle that can fly was recently reported on the ground."""
         landed = self._telemetry.landed_state
         flies = self._autopilot.mode_for("take_off", is_vtol=self._telemetry.is_vtol) is not None
         return flies and landed.latest == MavLandedState.ON_GROUND and landed.age <= POSITION_MAX_AGE_S
+
+    def check_flying(self, what: str) -> None:
+        """Raise OperationRejected if the vehicle is disarmed or on the ground."""
+        if not self._telemetry.is_armed:
+            raise OperationRejected(f"{what}: the vehicle is not armed; nothing was sent")
+        if self.is_on_ground():
+            raise OperationRejected(f"{what}: the vehicle is on the ground: call take_off() first; nothing was sent")
 
     @property
     def takes_relative_altitude(self) -> bool:

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import math
-from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import anyio
 
 from aerokit._internal import geo
 from aerokit.errors import HeartbeatTimeout, OperationRejected, OperationTimeout, SetpointStreamStopped
-from aerokit.mavlink.enums import MavFrame
 from aerokit.mavlink.messages import OrbitExecutionStatus
 from aerokit.vehicle.commanding.closed_paths import PathFlight
 from aerokit.vehicle.commanding.guided import Guided
 from aerokit.vehicle.commanding.progress import POSITION_MAX_AGE_S, StallDetector, await_progress
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
 
     from aerokit.autopilots import Mode
     from aerokit.position import Position
@@ -39,7 +37,10 @@ FRAME_TIMEOUT_S = 5.0
 
 
 class RoundFlight:
-    """One flight around a place, or to it if there is no ``counter``; ``rounds`` None means until it is cancelled."""
+    """One flight around a place, or to it if there is no ``counter``; ``rounds`` None means until it is cancelled.
+
+    ``limits``: max_distance_m, timeout and max_silence_s. The constructor raises if the vehicle cannot fly there.
+    """
 
     def __init__(
         self,
@@ -48,29 +49,17 @@ class RoundFlight:
         center: Position,
         counter: TurnCounter | LobeCounter | None,
         rounds: float | None,
-        timeout: float | None,
-        max_silence_s: float | None,
+        limits: tuple[float, float | None, float | None],
     ) -> None:
         self._context, self._session, self._telemetry = context, context.session, context.session.telemetry
         self._what, self._center, self._counter = what, center, counter
         self._rounds = math.inf if rounds is None else rounds
-        self._timeout, self._max_silence_s = timeout, max_silence_s
-        self._place: dict[str, Any] = {}
+        max_distance_m, self._timeout, self._max_silence_s = limits
         self._wrong_circle = ""
-
-    def check_place(self, max_distance_m: float) -> None:
-        """Raise if the vehicle cannot fly there; nothing is sent."""
-        position = self._context.vehicle_position
-        latitude, longitude, altitude, is_relative = position.global_target(self._center)
-        position.check_reach("center", [self._center], max_distance_m)
-        if not self._telemetry.is_armed:
-            raise OperationRejected(f"{self._what}: the vehicle is not armed; nothing was sent")
-        if position.is_on_ground():
-            raise OperationRejected(
-                f"{self._what}: the vehicle is on the ground: call take_off() first; nothing was sent"
-            )
-        frame = MavFrame.GLOBAL_RELATIVE_ALT_INT if is_relative else MavFrame.GLOBAL_INT
-        self._place = {"frame": frame, "x": latitude, "y": longitude, "z": altitude}
+        position = context.vehicle_position
+        self._place = position.command_place(center)
+        position.check_reach("center", [center], max_distance_m)
+        position.check_flying(what)
 
     @property
     def bearing_rad(self) -> float:
@@ -99,11 +88,10 @@ class RoundFlight:
         order = context.arbiter.order(mode, hold)
         try:
             with context.arbiter.changing_mode():
-                await context.sender.run_command(
-                    order, self._session.commands.send_int, command, *params, modes=(mode,), **self._place
-                )
-            with cleanup.flying(order), self._session.streaming("position"), self._watching_circle(circle_m):
-                await self._await_rounds(order, mode, stay_s)
+                send = self._session.commands.send_int
+                await context.sender.run_command(order, send, command, *params, modes=(mode,), **self._place)
+            with cleanup.flying(order), self._session.streaming("position"):
+                await self._await_rounds(order, mode, stay_s, circle_m)
             if is_held:
                 await cleanup.stop_in(hold, order)
             elif circle_m:
@@ -117,45 +105,38 @@ class RoundFlight:
                 cleanup.hold_in_background(order)
             raise
 
-    @contextmanager
-    def _watching_circle(self, radius_m: float) -> Iterator[None]:
-        """Watch ORBIT_EXECUTION_STATUS: PX4 accepts a radius that it does not allow, and flies another one."""
+    async def _await_rounds(self, order: Order, mode: Mode, stay_s: float, circle_m: float) -> None:
+        session, started = self._session, self._session.connection.now()
+        stall, stays = StallDetector(session), self._context.sender.stays_in(order, mode)
 
         def on_status(status: OrbitExecutionStatus) -> None:
-            if radius_m and abs(abs(status.radius) - radius_m) > RADIUS_ERROR_M:
-                self._wrong_circle = f"it flies a circle of {abs(status.radius):.1f} m instead of {radius_m:g} m"
-            else:
-                self._wrong_circle = ""
-
-        detach = self._session.connection.bus.attach(OrbitExecutionStatus, on_status, system_id=self._session.system_id)
-        try:
-            yield
-        finally:
-            detach()
-
-    async def _await_rounds(self, order: Order, mode: Mode, stay_s: float) -> None:
-        started = self._session.connection.now()
-        stall, stays = StallDetector(self._session), self._context.sender.stays_in(order, mode)
-        wrong_until = started + CIRCLE_REPORT_S
+            """Recognise that PX4 flies another radius: it accepts one that it does not allow."""
+            flown_m = abs(status.radius)
+            is_wrong = circle_m and abs(flown_m - circle_m) > RADIUS_ERROR_M
+            self._wrong_circle = f"it flies a circle of {flown_m:.1f} m instead of {circle_m:g} m" if is_wrong else ""
 
         def trouble() -> str | None:
-            texts = self._session.texts_since(order.given_at)
-            refusal = next(filter(self._session.autopilot.is_refusal, texts), "")
-            self._wrong_circle = refusal or self._wrong_circle
-            is_late = self._session.connection.now() > wrong_until
+            refusals = filter(session.autopilot.is_refusal, session.texts_since(order.given_at))
+            if refusal := next(refusals, ""):
+                self._wrong_circle = refusal
+            is_late = session.connection.now() > started + CIRCLE_REPORT_S
             return stays() or refusal or (self._wrong_circle if is_late else None) or None
 
-        await await_progress(
-            self._session,
-            self._what,
-            is_done=lambda: self._is_flown_since(started) and not order.end,
-            trouble=trouble,
-            describe=self._describe,
-            timeout=self._timeout,
-            max_silence_s=self._max_silence_s,
-            held_for=stay_s,
-            stillness=lambda: None if not self._rounds and self._is_there else stall(),
-        )
+        detach = session.connection.bus.attach(OrbitExecutionStatus, on_status, system_id=session.system_id)
+        try:
+            await await_progress(
+                session,
+                self._what,
+                is_done=lambda: self._is_flown_since(started) and not order.end,
+                trouble=trouble,
+                describe=self._describe,
+                timeout=self._timeout,
+                max_silence_s=self._max_silence_s,
+                held_for=stay_s,
+                stillness=lambda: None if not self._rounds and self._is_there else stall(),
+            )
+        finally:
+            detach()
 
     def _is_flown_since(self, started: float) -> bool:
         is_known = self._context.vehicle_position.is_known_since(started)

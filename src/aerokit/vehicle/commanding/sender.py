@@ -69,6 +69,10 @@ class OrderSender:
                 if not sending.is_confirmed:
                     raise self._unanswered(error, order) from None
 
+    async def send_long(self, order: Order, command: int, *params: float, **options: Any) -> None:
+        """Send one command of an order as COMMAND_LONG; see :meth:`run_command`."""
+        await self.run_command(order, self._session.commands.send_long, command, *params, **options)
+
     def raise_if_ended(self, order: Order) -> None:
         """Raise OperationRejected if the order has ended, so that the rest of it is not sent."""
         if order.end:
@@ -84,9 +88,7 @@ class OrderSender:
         """Send the command to arm or disarm."""
         self._session.commands.forget_result(MavCmd.COMPONENT_ARM_DISARM)
         params = (float(armed), FORCE if force else 0)
-        await self.run_command(
-            order, self._session.commands.send_long, MavCmd.COMPONENT_ARM_DISARM, *params, armed=armed
-        )
+        await self.send_long(order, MavCmd.COMPONENT_ARM_DISARM, *params, armed=armed)
 
     # ----------------------------------------------------------------------------------- modes
 
@@ -120,9 +122,8 @@ class OrderSender:
         if base_mode is not None:
             request = request.replace(base_mode=base_mode, params=(base_mode, *request.params[1:]))
         try:
-            await self.run_command(
+            await self.send_long(
                 order,
-                self._session.commands.send_long,
                 MavCmd.DO_SET_MODE,
                 *request.params,
                 modes=(wanted,),
@@ -227,14 +228,20 @@ class OrderSender:
 
         return trouble
 
-    async def follow_up_command(self, order: Order, command: int, *params: float) -> None:
-        """Send a further command of a steering order."""
-        await self.run_command(order, self._session.commands.send_long, command, *params)
+    def stays_until_disarmed(self, order: Order) -> Callable[[], str | None]:
+        """Like :meth:`stays_in` the modes of the order, for one that ends by disarming, which may change the mode."""
+        stays, armed = self.stays_in(order, *order.modes), self._session.telemetry.armed
 
-    async def auxiliary_command(self, command: int, *params: float) -> None:
+        def trouble() -> str | None:
+            is_open = order.has_lost_mode and armed.updated_at < order.mode_lost_at
+            return None if is_open else stays()  # The next HEARTBEAT may report that it has landed and disarmed.
+
+        return trouble
+
+    async def auxiliary_command(self, command: int, *params: float, **options: Any) -> None:
         """Send a command that changes a setting and does not steer."""
         with self._arbiter.auxiliary_order() as order:
-            await self.run_command(order, self._session.commands.send_long, command, *params)
+            await self.send_long(order, command, *params, **options)
 
     # ---------------------------------------------------------------------------- raw commands
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from aerokit._internal.arguments import check_range
+from aerokit._internal.arguments import check_finite, check_range
 from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavFrame
@@ -41,6 +41,13 @@ __all__ = [
 
 IGNORE_POSITION, IGNORE_VELOCITY, IGNORE_ACCELERATION = 0x007, 0x038, 0x1C0
 IGNORE_YAW, IGNORE_YAW_RATE = 0x400, 0x800
+VECTORS = {
+    IGNORE_POSITION: ("north_m", "east_m", "down_m"),
+    IGNORE_VELOCITY: ("north_m_s", "east_m_s", "down_m_s"),
+    IGNORE_ACCELERATION: ("north_m_s2", "east_m_s2", "down_m_s2"),
+}
+"""Fields of the vectors in SET_POSITION_TARGET_LOCAL_NED, by the bits that ignore them."""
+ZERO = (0.0, 0.0, 0.0)
 IGNORE_BODY_RATES, IGNORE_ATTITUDE = 0x07, 0x80
 ACTUATORS_PER_GROUP, MAX_BODY_RATE_DEG_S = 8, 3600.0
 # Below this speed, or within this many arrival radii, a vehicle that obeys may stand still.
@@ -146,6 +153,9 @@ class TrajectorySetpoint(Snapshot):
     yaw_rate_deg_s: float | None = None
 
 
+LocalSetpoint = VelocitySetpoint | AccelerationSetpoint | LocalPositionSetpoint | TrajectorySetpoint
+
+
 def wants_motion(setpoint: object, context: VehicleContext) -> bool:
     """Return True if a vehicle that obeys this set-point must move now; False if unknown."""
     if isinstance(setpoint, (VelocitySetpoint, TrajectorySetpoint)):
@@ -157,12 +167,8 @@ def wants_motion(setpoint: object, context: VehicleContext) -> bool:
         return far_m < context.vehicle_position.distance_to(setpoint.position) < math.inf
     here = context.session.telemetry.local_position.latest
     if isinstance(setpoint, LocalPositionSetpoint) and here is not None:
-        to_go = (
-            setpoint.north_m - here.north_m,
-            setpoint.east_m - here.east_m,
-            setpoint.down_m - here.down_m,
-        )
-        return math.hypot(*to_go) > far_m
+        north_m, east_m = setpoint.north_m - here.north_m, setpoint.east_m - here.east_m
+        return math.hypot(north_m, east_m, setpoint.down_m - here.down_m) > far_m
     return False
 
 
@@ -171,11 +177,20 @@ class SetpointEncoder:
 
     def __init__(self, context: VehicleContext) -> None:
         self._session, self._position = context.session, context.vehicle_position
+        self._address = (self._session.system_id, self._session.component_id)
 
-    def velocity(self, s: VelocitySetpoint) -> Message:
-        """Return SET_POSITION_TARGET_LOCAL_NED with a velocity in MAV_FRAME_LOCAL_NED."""
-        vector = (s.north_m_s, s.east_m_s, s.down_m_s)
-        return self._local(MavFrame.LOCAL_NED, IGNORE_VELOCITY, vector, s.yaw_deg, s.yaw_rate_deg_s)
+    def local(self, s: LocalSetpoint, frame: int = MavFrame.LOCAL_NED) -> Message:
+        """Return SET_POSITION_TARGET_LOCAL_NED with the vectors that the set-point has."""
+        mask, yaw, yaw_rate = _yaw(s.yaw_deg, s.yaw_rate_deg_s)
+        vectors: list[tuple[float, float, float]] = []
+        for ignored, (north, east, down) in VECTORS.items():
+            is_given = hasattr(s, north)
+            vectors.append((getattr(s, north), getattr(s, east), getattr(s, down)) if is_given else ZERO)
+            mask |= 0 if is_given else ignored
+        position, velocity, acceleration = vectors
+        parts = (*position, *velocity, *acceleration)
+        check_finite("set-point", *parts)
+        return SetPositionTargetLocalNed(self._time_ms(), *self._address, frame, mask, *parts, yaw, yaw_rate)
 
     def body_velocity(self, s: BodyVelocitySetpoint) -> Message:
         """Return SET_POSITION_TARGET_LOCAL_NED with a velocity in MAV_FRAME_BODY_NED.
@@ -184,116 +199,44 @@ class SetpointEncoder:
         MAV_FRAME_BODY_NED ArduPilot adds each yaw to the previous target, and correcting that by telemetry
         oscillates.
         """
-        vector = (s.forward_m_s, s.right_m_s, s.down_m_s)
-        if s.yaw_deg is None or not self._session.autopilot.setpoints.body_yaw_is_relative:
-            return self._local(MavFrame.BODY_NED, IGNORE_VELOCITY, vector, s.yaw_deg, s.yaw_rate_deg_s)
-        heading = math.radians(self._session.telemetry.heading_deg.value)
-        north = s.forward_m_s * math.cos(heading) - s.right_m_s * math.sin(heading)
-        east = s.forward_m_s * math.sin(heading) + s.right_m_s * math.cos(heading)
-        vector = (north, east, s.down_m_s)
-        return self._local(MavFrame.LOCAL_NED, IGNORE_VELOCITY, vector, s.yaw_deg, s.yaw_rate_deg_s)
+        forward, right, frame = s.forward_m_s, s.right_m_s, MavFrame.BODY_NED
+        if s.yaw_deg is not None and self._session.autopilot.setpoints.body_yaw_is_relative:
+            heading, frame = math.radians(self._session.telemetry.heading_deg.value), MavFrame.LOCAL_NED
+            forward, right = (
+                forward * math.cos(heading) - right * math.sin(heading),
+                forward * math.sin(heading) + right * math.cos(heading),
+            )
+        return self.local(VelocitySetpoint(forward, right, s.down_m_s, s.yaw_deg, s.yaw_rate_deg_s), frame)
 
-    def acceleration(self, s: AccelerationSetpoint) -> Message:
-        """Return SET_POSITION_TARGET_LOCAL_NED with an acceleration in MAV_FRAME_LOCAL_NED."""
-        vector = (s.north_m_s2, s.east_m_s2, s.down_m_s2)
-        return self._local(MavFrame.LOCAL_NED, IGNORE_ACCELERATION, vector, s.yaw_deg, s.yaw_rate_deg_s)
+    def position(self, s: PositionSetpoint, velocity: tuple[float, float, float] | None = None) -> Message:
+        """Return SET_POSITION_TARGET_GLOBAL_INT, relative to home or above mean sea level.
 
-    def local_position(self, s: LocalPositionSetpoint) -> Message:
-        """Return SET_POSITION_TARGET_LOCAL_NED with a position in MAV_FRAME_LOCAL_NED."""
-        vector = (s.north_m, s.east_m, s.down_m)
-        return self._local(MavFrame.LOCAL_NED, IGNORE_POSITION, vector, s.yaw_deg, s.yaw_rate_deg_s)
-
-    def trajectory(self, s: TrajectorySetpoint) -> Message:
-        """Return SET_POSITION_TARGET_LOCAL_NED with position, velocity and acceleration in MAV_FRAME_LOCAL_NED."""
-        vectors = (
-            *(s.north_m, s.east_m, s.down_m),
-            *(s.north_m_s, s.east_m_s, s.down_m_s),
-            *(s.north_m_s2, s.east_m_s2, s.down_m_s2),
-        )
-        _check_finite("set-point", *vectors)
+        ``velocity`` is that of the place, in m/s north, east, down.
+        """
         mask, yaw, yaw_rate = _yaw(s.yaw_deg, s.yaw_rate_deg_s)
-        address = (self._session.system_id, self._session.component_id)
-        return SetPositionTargetLocalNed(self._time_ms(), *address, MavFrame.LOCAL_NED, mask, *vectors, yaw, yaw_rate)
-
-    def _local(
-        self,
-        frame: int,
-        group: int,
-        vector: tuple[float, float, float],
-        yaw_deg: float | None,
-        yaw_rate_deg_s: float | None,
-    ) -> Message:
-        """Return SET_POSITION_TARGET_LOCAL_NED whose only vector is the one of ``group``."""
-        _check_finite("set-point", *vector)
-        everything = IGNORE_POSITION | IGNORE_VELOCITY | IGNORE_ACCELERATION
-        mask, yaw, yaw_rate = _yaw(yaw_deg, yaw_rate_deg_s)
-        none = (0.0, 0.0, 0.0)
-        vectors = [vector if group == name else none for name in _GROUPS]
-        return SetPositionTargetLocalNed(
-            self._time_ms(),
-            self._session.system_id,
-            self._session.component_id,
-            frame,
-            (everything & ~group) | mask,
-            *vectors[0],
-            *vectors[1],
-            *vectors[2],
-            yaw,
-            yaw_rate,
-        )
-
-    def position(self, s: PositionSetpoint) -> Message:
-        """Return SET_POSITION_TARGET_GLOBAL_INT, relative to home or above mean sea level."""
-        mask, yaw, yaw_rate = _yaw(s.yaw_deg, s.yaw_rate_deg_s)
+        mask |= IGNORE_ACCELERATION | (IGNORE_VELOCITY if velocity is None else 0)
         latitude, longitude, altitude, is_relative = self._position.global_target(s.position)
+        frame = MavFrame.GLOBAL_RELATIVE_ALT_INT if is_relative else MavFrame.GLOBAL_INT
+        now, speeds = self._time_ms(), velocity or ZERO
         return SetPositionTargetGlobalInt(
-            self._time_ms(),
-            self._session.system_id,
-            self._session.component_id,
-            MavFrame.GLOBAL_RELATIVE_ALT_INT if is_relative else MavFrame.GLOBAL_INT,
-            IGNORE_VELOCITY | IGNORE_ACCELERATION | mask,
-            latitude,
-            longitude,
-            altitude,
-            *(0.0, 0.0, 0.0),
-            *(0.0, 0.0, 0.0),
-            yaw,
-            yaw_rate,
+            now, *self._address, frame, mask, latitude, longitude, altitude, *speeds, *ZERO, yaw, yaw_rate
         )
 
     def attitude(self, s: AttitudeSetpoint) -> Message:
         """Return SET_ATTITUDE_TARGET with attitude and thrust."""
-        _check_finite("attitude", s.roll_deg, s.pitch_deg, s.yaw_deg, s.thrust)
+        check_finite("attitude", s.roll_deg, s.pitch_deg, s.yaw_deg, s.thrust)
         check_range("thrust", s.thrust, 0, 1)
-        return SetAttitudeTarget(
-            self._time_ms(),
-            self._session.system_id,
-            self._session.component_id,
-            IGNORE_BODY_RATES,
-            Attitude(s.roll_deg, s.pitch_deg, s.yaw_deg).quaternion,
-            0.0,
-            0.0,
-            0.0,
-            s.thrust,
-        )
+        q = Attitude(s.roll_deg, s.pitch_deg, s.yaw_deg).quaternion
+        return SetAttitudeTarget(self._time_ms(), *self._address, IGNORE_BODY_RATES, q, *ZERO, s.thrust)
 
     def attitude_rate(self, s: AttitudeRateSetpoint) -> Message:
         """Return SET_ATTITUDE_TARGET with body rates and thrust."""
-        rates = (s.roll_deg_s, s.pitch_deg_s, s.yaw_deg_s)
-        for name, rate in zip(("roll_deg_s", "pitch_deg_s", "yaw_deg_s"), rates, strict=True):
-            check_range(name, rate, -MAX_BODY_RATE_DEG_S, MAX_BODY_RATE_DEG_S)
+        for name in ("roll_deg_s", "pitch_deg_s", "yaw_deg_s"):
+            check_range(name, getattr(s, name), -MAX_BODY_RATE_DEG_S, MAX_BODY_RATE_DEG_S)
         check_range("thrust", s.thrust, 0, 1)
-        return SetAttitudeTarget(
-            self._time_ms(),
-            self._session.system_id,
-            self._session.component_id,
-            IGNORE_ATTITUDE,
-            (1.0, 0.0, 0.0, 0.0),
-            math.radians(s.roll_deg_s),
-            math.radians(s.pitch_deg_s),
-            math.radians(s.yaw_deg_s),
-            s.thrust,
-        )
+        q = (1.0, 0.0, 0.0, 0.0)
+        rates = (math.radians(s.roll_deg_s), math.radians(s.pitch_deg_s), math.radians(s.yaw_deg_s))
+        return SetAttitudeTarget(self._time_ms(), *self._address, IGNORE_ATTITUDE, q, *rates, s.thrust)
 
     def actuators(self, s: ActuatorSetpoint) -> Message:
         """Return SET_ACTUATOR_CONTROL_TARGET."""
@@ -302,27 +245,16 @@ class SetpointEncoder:
             raise InvalidArgument(f"controls = {s.controls!r} is not allowed: {ACTUATORS_PER_GROUP} numbers")
         for control in s.controls:
             check_range("controls", control, -1, 1)
-        return SetActuatorControlTarget(
-            self._time_ms() * 1000, s.group, self._session.system_id, self._session.component_id, s.controls
-        )
+        return SetActuatorControlTarget(self._time_ms() * 1000, s.group, *self._address, s.controls)
 
     def _time_ms(self) -> int:
         return int(self._session.connection.now() * 1000) & 0xFFFFFFFF
-
-
-_GROUPS = (IGNORE_POSITION, IGNORE_VELOCITY, IGNORE_ACCELERATION)
 
 
 def _yaw(yaw_deg: float | None, yaw_rate_deg_s: float | None) -> tuple[int, float, float]:
     """Return type-mask bits, yaw in radians and yaw rate in radians per second."""
     if yaw_deg is not None and yaw_rate_deg_s is not None:
         raise InvalidArgument(f"yaw_deg = {yaw_deg} and yaw_rate_deg_s = {yaw_rate_deg_s} are not allowed together")
-    _check_finite("yaw", yaw_deg or 0.0, yaw_rate_deg_s or 0.0)
+    check_finite("yaw", yaw_deg or 0.0, yaw_rate_deg_s or 0.0)
     mask = (IGNORE_YAW if yaw_deg is None else 0) | (IGNORE_YAW_RATE if yaw_rate_deg_s is None else 0)
     return mask, math.radians(yaw_deg or 0.0), math.radians(yaw_rate_deg_s or 0.0)
-
-
-def _check_finite(what: str, *values: float) -> None:
-    for value in values:
-        if not math.isfinite(value):
-            raise InvalidArgument(f"{what}: {value!r} is not a finite number")

@@ -120,9 +120,7 @@ class SimpleOrder(Snapshot):
         if topic is not None and of is None:
             of = context.arbiter.of_device(topic)
         with context.arbiter.auxiliary_order(of) as order:
-            await context.sender.run_command(
-                order, context.session.commands.send_long, self.command, *params, component_id=component_id
-            )
+            await context.sender.send_long(order, self.command, *params, component_id=component_id)
         if self.effect is not None:
             target = context.session.component_id if component_id is None else component_id
             await self._await_effect(context, self.effect, values, of, target, timeout)

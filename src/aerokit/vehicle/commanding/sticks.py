@@ -104,12 +104,7 @@ class StickStream(SteeringStream[StickInput]):
         self._set(sticks)
 
     async def move(self, sticks: StickInput, duration_s: float) -> None:
-        """Keep the sticks in one position for ``duration_s`` seconds.
-
-        Raises:
-            InvalidArgument: a position is out of range.
-            SetpointStreamStopped: the stream ended meanwhile.
-        """
+        """Keep the sticks in one position for ``duration_s`` seconds. Raises as :meth:`set`."""
         check_kind("sticks", sticks, StickInput)
         await self._feed(sticks, duration_s)
 

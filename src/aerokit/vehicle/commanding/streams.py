@@ -12,13 +12,11 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 import anyio
 
 from aerokit._internal.arguments import check_range, checks_arguments
-from aerokit.errors import BusyError, OperationRejected, ParameterTimeout, SetpointStreamStopped
+from aerokit.errors import AerokitError, BusyError, OperationRejected, ParameterTimeout, SetpointStreamStopped
 from aerokit.parameters import Parameter
-from aerokit.vehicle.commanding.progress import StallDetector
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
-    from types import TracebackType
 
     from typing_extensions import Self
 
@@ -30,7 +28,7 @@ if TYPE_CHECKING:
     Probe = Callable[..., Awaitable[Mapping[str, object]]]
     """``Parameters.probe``, which is in a room above this one."""
 
-__all__ = ["MAX_RATE_HZ", "StallWatch", "SteeringStream", "TakeoverCheck", "ValueStream", "known_values"]
+__all__ = ["MAX_RATE_HZ", "SteeringStream", "TakeoverCheck", "ValueStream", "known_values"]
 
 ValueT = TypeVar("ValueT")
 
@@ -69,9 +67,8 @@ class ValueStream(Generic[ValueT]):
         self._message: Message | None = None
         self._set_at = -math.inf
         self._timer: asyncio.TimerHandle | None = None
-        self._stopped: SetpointStreamStopped | None = None
-        self._is_reported = self._was_entered = False
-        self._is_entering = False
+        self._stopped: AerokitError | None = None
+        self._is_reported = self._was_entered = self._is_entering = False
 
     @property
     def is_running(self) -> bool:
@@ -220,23 +217,15 @@ class SteeringStream(ValueStream[ValueT]):
         order.may_move = order.may_move or self._session.telemetry.is_in(mode)
         try:
             await self._enter(mode, order)
-        except OperationRejected:  # The pilot or failsafe that took over keeps control.
+        except BaseException as error:
             self._end()
-            self._release()
-            raise
-        except BaseException:
-            self._end()
-            self._hold()
+            if not isinstance(error, OperationRejected):  # The pilot or failsafe that took over keeps control.
+                self._hold()
             self._release()
             raise
         return self
 
-    async def __aexit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    async def __aexit__(self, exc_type: object, exc: BaseException | None, traceback: object) -> None:
         if self._stopped is None and (reason := self._takeover()):
             self._stop(reason, hold=False)
         if self._stopped is None:
@@ -265,23 +254,17 @@ class SteeringStream(ValueStream[ValueT]):
         if self._is_stream_before_mode:
             self._begin_sending()
             await self._feed(self._value, LEAD_TIME_S)
-            await self._feeding_initial(mode, order)
+            self._is_entering = True
+            try:
+                await self._context.sender.ensure_mode(mode, order)
+            finally:
+                self._is_entering = False
+                self._set_at = self._now()
+            self._raise_if_stopped()
         else:
             await self._context.sender.ensure_mode(mode, order)
             self._begin_sending()
         self._mode = mode
-
-    async def _feeding_initial(self, mode: Mode, order: Order) -> None:
-        """Stream the initial value during the mode change. Not a task group, so that exceptions reach the user
-        unchanged.
-        """
-        self._is_entering = True
-        try:
-            await self._context.sender.ensure_mode(mode, order)
-        finally:
-            self._is_entering = False
-            self._set_at = self._now()
-        self._raise_if_stopped()
 
     def _takeover(self) -> str | None:
         mode = self._session.telemetry.mode.latest
@@ -325,18 +308,3 @@ async def known_values(probe: Probe, *names: str) -> dict[str, float]:
         if isinstance(answer, ParameterTimeout):
             raise answer
     return {name: float(answer.value) for name, answer in answers.items() if isinstance(answer, Parameter)}
-
-
-class StallWatch:
-    """Reports a vehicle that does not move for twelve seconds although the values of a stream want it to."""
-
-    def __init__(self, context: VehicleContext, wants_motion: Callable[[], bool]) -> None:
-        self._session, self._wants_motion = context.session, wants_motion
-        self._stillness = StallDetector(context.session)
-
-    def __call__(self) -> str | None:
-        """Return how long it has not moved, as a clause; None if it moves or need not."""
-        if not self._wants_motion():
-            self._stillness = StallDetector(self._session)
-            return None
-        return self._stillness()

@@ -12,7 +12,7 @@ from aerokit.vehicle.commanding.context import VehicleBase
 from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, await_progress
 
 if TYPE_CHECKING:
-    from aerokit.vehicle.commanding.order import Order
+    pass
 
 TerminationIntent = Literal["terminate flight"]
 ShutdownIntent = Literal["shut down"]
@@ -50,7 +50,7 @@ class TerminationActions(VehicleBase):
         self._arm_cleanup.stop()
         order = self._arbiter.order(*modes, ends_flight=True)
         try:
-            await self._send_once(order, MavCmd.DO_FLIGHTTERMINATION, 1.0, modes=modes, armed=False)
+            await self._sender.send_long(order, MavCmd.DO_FLIGHTTERMINATION, 1.0, modes=modes, armed=False, **ONCE)
         except CommandTimeout as error:
             raise CommandTimeout(f"{error}; the flight may have been terminated nevertheless") from None
         armed, state = self.telemetry.armed, self.telemetry.system_status
@@ -92,11 +92,10 @@ class TerminationActions(VehicleBase):
         if not self.telemetry.is_confirmed_disarmed:
             state = "armed" if self.telemetry.is_armed else "not known to be disarmed"
             raise OperationRejected(f"shutdown: the vehicle is {state}; nothing was sent")
-        with self._arbiter.auxiliary_order() as order:
-            try:
-                await self._send_once(order, MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, SHUTDOWN)
-            except CommandTimeout as error:
-                raise CommandTimeout(f"{error}; it may have switched off nevertheless") from None
+        try:
+            await self._sender.auxiliary_command(MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, SHUTDOWN, **ONCE)
+        except CommandTimeout as error:
+            raise CommandTimeout(f"{error}; it may have switched off nevertheless") from None
         with suppress(LinkLost):
             await await_progress(
                 self._session,
@@ -107,6 +106,3 @@ class TerminationActions(VehicleBase):
                 timeout=timeout,
                 max_silence_s=None,
             )
-
-    async def _send_once(self, order: Order, command: int, *params: float, **options: Any) -> None:
-        await self._sender.run_command(order, self._session.commands.send_long, command, *params, **ONCE, **options)

@@ -79,27 +79,24 @@ class TravelActions(VehicleBase):
             OperationTimeout: the vehicle did not arrive in time, or does not move.
         """
         target = travel_target(target)
-        latitude, longitude, altitude, is_relative = self._position.global_target(target)
+        place = self._position.command_place(target)
         _check_travel(speed_m_s, heading_deg, tolerance_m, timeout)
         self._position.check_reach("target", [target], max_distance_m)
         near_m = self._position.arrival_radius_m if tolerance_m is None else tolerance_m
         self._check_can_turn(heading_deg)
-        if not self.telemetry.is_armed:
-            raise OperationRejected("go_to: the vehicle is not armed; nothing was sent")
-        if self._position.is_on_ground():
-            raise OperationRejected("go_to: the vehicle is on the ground: call take_off() first; nothing was sent")
+        self._position.check_flying("go_to")
         mode = self._sender.mode_for("go_to", self.autopilot.reposition_purpose)
         order = self._arbiter.order(mode, self._sender.mode_for("go_to", "setpoint"))
         yaw = self._reposition_yaw(heading_deg)
         under_way = False
         try:
-            resend = await self._send_there(order, latitude, longitude, altitude, is_relative, yaw, speed_m_s)
+            resend = await self._send_there(order, place, yaw, speed_m_s)
             under_way = True
             if speed_m_s is not None and not self._speeds_by_reposition:
                 # ArduPilot applies it only once the vehicle is on its way.
-                await self._sender.follow_up_command(order, MavCmd.DO_CHANGE_SPEED, 1, speed_m_s, -1)
+                await self._sender.send_long(order, MavCmd.DO_CHANGE_SPEED, 1, speed_m_s, -1)
             if heading_deg is not None and math.isnan(yaw):
-                await self._sender.follow_up_command(order, MavCmd.CONDITION_YAW, heading_deg % 360)
+                await self._sender.send_long(order, MavCmd.CONDITION_YAW, heading_deg % 360)
             with self._flight_cleanup.flying(order):
                 await self._await_arrival(target, near_m, timeout, max_silence_s, order, mode, resend)
         # The vehicle may have received the command.
@@ -112,48 +109,26 @@ class TravelActions(VehicleBase):
             raise
 
     async def _send_there(
-        self,
-        order: Order,
-        latitude: int,
-        longitude: int,
-        altitude: float,
-        is_relative: bool,
-        yaw: float,
-        speed_m_s: float | None,
+        self, order: Order, place: dict[str, Any], yaw: float, speed_m_s: float | None
     ) -> SetPositionTargetGlobalInt | None:
         """Send the order; return the message to repeat on the way, if it has no acknowledgement."""
-        frame = MavFrame.GLOBAL_RELATIVE_ALT_INT if is_relative else MavFrame.GLOBAL_INT
         speed = speed_m_s if speed_m_s is not None and self._speeds_by_reposition else -1
         params = (speed, MavDoRepositionFlags.CHANGE_MODE, 0, yaw)
-        place: dict[str, Any] = {"frame": frame, "x": latitude, "y": longitude, "z": altitude}
         modes = (self._sender.mode_for("go_to", self.autopilot.reposition_purpose),)
+        send = self._session.commands.send_int
         try:
             with self._arbiter.changing_mode():
-                await self._sender.run_command(
-                    order,
-                    self._session.commands.send_int,
-                    MavCmd.DO_REPOSITION,
-                    *params,
-                    modes=modes,
-                    **place,
-                )
+                await self._sender.run_command(order, send, MavCmd.DO_REPOSITION, *params, modes=modes, **place)
         except CommandRejected as error:
             if error.result != MavResult.UNSUPPORTED:
                 raise
             await self._sender.ensure_mode(self._sender.mode_for("go_to", "setpoint"), order)
             self._sender.raise_if_ended(order)
-            resend = self._position_target(latitude, longitude, altitude, frame)
+            address, where = (self.system_id, self.component_id), (place["x"], place["y"], place["z"])
+            resend = SetPositionTargetGlobalInt(0, *address, place["frame"], POSITION_ONLY, *where, *(0.0,) * 8)
             self.connection.send(resend)
             return resend
         return None
-
-    def _position_target(
-        self, latitude: int, longitude: int, altitude: float, frame: int
-    ) -> SetPositionTargetGlobalInt:
-        zeros = (0.0,) * 8
-        return SetPositionTargetGlobalInt(
-            0, self.system_id, self.component_id, frame, POSITION_ONLY, latitude, longitude, altitude, *zeros
-        )
 
     async def _await_arrival(
         self,
@@ -243,14 +218,12 @@ class TravelActions(VehicleBase):
         if self._turns_by_reposition:
             yaw = math.remainder(math.radians(goal), 2 * math.pi)
             params = (-1, MavDoRepositionFlags.CHANGE_MODE, 0, yaw, *(math.nan,) * 3)
-            await self._sender.run_command(
-                order, self._session.commands.send_long, MavCmd.DO_REPOSITION, *params, modes=(mode,)
-            )
+            await self._sender.send_long(order, MavCmd.DO_REPOSITION, *params, modes=(mode,))
         else:
             await self._sender.ensure_mode(mode, order)
             # An absolute heading, not an angle: a repetition does not turn it further.
             direction = (1 if heading_deg >= 0 else -1) if relative else 0
-            await self._sender.follow_up_command(order, MavCmd.CONDITION_YAW, goal, rate_deg_s, direction, 0)
+            await self._sender.send_long(order, MavCmd.CONDITION_YAW, goal, rate_deg_s, direction, 0)
         await self._await_heading(goal, tolerance_deg, timeout, max_silence_s, order, mode)
 
     async def _await_heading(
@@ -301,7 +274,7 @@ class TravelActions(VehicleBase):
         home = self.telemetry.home
         with self._arbiter.auxiliary_order() as order:
             if place is None:
-                await self._sender.run_command(order, self._session.commands.send_long, MavCmd.DO_SET_HOME, 1)
+                await self._sender.send_long(order, MavCmd.DO_SET_HOME, 1)
             else:
                 latitude, longitude, altitude, _ = self._position.global_target(point_at(place))
                 where: dict[str, Any] = {"x": latitude, "y": longitude, "z": altitude}
@@ -394,7 +367,7 @@ class LookActions(VehicleBase):
 
     async def _give(self, command: int, *params: float) -> None:
         with self._newest() as order:
-            await self._sender.run_command(order, self._session.commands.send_long, command, *params)
+            await self._sender.send_long(order, command, *params)
 
     @contextmanager
     def _newest(self) -> Iterator[Order]:
@@ -417,7 +390,7 @@ class LookActions(VehicleBase):
         """
         with self._newest() as order:
             try:
-                await self._sender.run_command(order, self._session.commands.send_long, MavCmd.DO_SET_ROI_NONE)
+                await self._sender.send_long(order, MavCmd.DO_SET_ROI_NONE)
                 return
             except CommandRejected as error:
                 if error.result != MavResult.UNSUPPORTED:

@@ -70,10 +70,9 @@ class TuningActions(VehicleBase):
         answers.clear()
         self._session.commands.send_unconfirmed(MavCmd.DO_AUTOTUNE_ENABLE, 1)
         until = self.connection.now() + ANSWER_TIMEOUT_S
-        while True:
+        while self.connection.now() < until:
             for answer in answers:
                 if answer.command == MavCmd.DO_AUTOTUNE_ENABLE and self._session.commands.is_for_us(answer):
                     return answer
-            if self.connection.now() >= until:
-                raise CommandTimeout("autotune: MAV_CMD_DO_AUTOTUNE_ENABLE was not acknowledged; PX4 may go on tuning")
             await anyio.sleep(POLL_INTERVAL_S / 20)
+        raise CommandTimeout("autotune: MAV_CMD_DO_AUTOTUNE_ENABLE was not acknowledged; PX4 may go on tuning")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from aerokit._internal.arguments import check_range
+from aerokit._internal.arguments import check_finite, check_range
 from aerokit.errors import InvalidArgument, ValueUnknownError
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import GpsInputIgnoreFlags, MavFrame
@@ -52,10 +52,10 @@ class MeasurementEncoder:
         given = value.orientation
         q = given.quaternion if isinstance(given, Attitude) else given
         position, velocity = value.position_m, value.velocity_m_s
-        _check_finite("position_m", *position)
-        _check_finite("orientation", *q)
+        check_finite("position_m", *position)
+        check_finite("orientation", *q)
         if velocity is not None:
-            _check_finite("velocity_m_s", *velocity)
+            check_finite("velocity_m_s", *velocity)
         is_north = value.frame in ("ned", "enu")
         if value.frame in ("enu", "flu"):
             q = multiply(multiply(ENU_TO_NED if is_north else FLU_TO_FRD, q), FLU_TO_FRD)
@@ -82,30 +82,30 @@ class MeasurementEncoder:
 
     def vision_position(self, value: v.PoseMeasurement) -> tuple[Message, ...]:
         """Return VISION_POSITION_ESTIMATE."""
-        attitude = value.attitude
-        angles = (attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg)
-        place = (value.north_m, value.east_m, value.down_m)
-        _check_finite("position", *place)
-        _check_finite("attitude", *angles)
-        covariance = _triangle(value.position_variance_m2, value.orientation_variance_rad2)
-        time, count = self._time_us(value.measured_at), _reset_counter(value.reset_counter)
-        roll, pitch, yaw = map(math.radians, angles)
+        time, place, covariance = self._pose(value)
+        attitude, count = value.attitude, _reset_counter(value.reset_counter)
+        roll, pitch, yaw = map(math.radians, (attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg))
         return (m.VisionPositionEstimate(time, *place, roll, pitch, yaw, covariance, count),)
 
     def motion_capture(self, value: v.PoseMeasurement) -> tuple[Message, ...]:
         """Return ATT_POS_MOCAP, or VISION_POSITION_ESTIMATE for an estimator that does not read it."""
         if not self._session.autopilot.external.has_mocap:
             return self.vision_position(value)
-        _check_finite("position", value.north_m, value.east_m, value.down_m)
-        _check_finite("attitude", value.attitude.roll_deg, value.attitude.pitch_deg, value.attitude.yaw_deg)
+        time, place, covariance = self._pose(value)
+        return (m.AttPosMocap(time, value.attitude.quaternion, *place, covariance),)
+
+    def _pose(self, value: v.PoseMeasurement) -> tuple[int, Vector, list[float]]:
+        """Check a pose; return its time stamp, place and covariance."""
+        place = (value.north_m, value.east_m, value.down_m)
+        check_finite("position", *place)
+        check_finite("attitude", value.attitude.roll_deg, value.attitude.pitch_deg, value.attitude.yaw_deg)
         covariance = _triangle(value.position_variance_m2, value.orientation_variance_rad2)
-        time, q = self._time_us(value.measured_at), value.attitude.quaternion
-        return (m.AttPosMocap(time, q, value.north_m, value.east_m, value.down_m, covariance),)
+        return self._time_us(value.measured_at), place, covariance
 
     def vision_speed(self, value: v.SpeedMeasurement) -> tuple[Message, ...]:
         """Return VISION_SPEED_ESTIMATE, or ODOMETRY without a pose."""
         speeds = (value.north_m_s, value.east_m_s, value.down_m_s)
-        _check_finite("velocity", *speeds)
+        check_finite("velocity", *speeds)
         time, count = self._time_us(value.measured_at), _reset_counter(value.reset_counter)
         variance = value.variance_m2_s2
         if self._session.autopilot.external.has_vision_speed:
@@ -121,21 +121,20 @@ class MeasurementEncoder:
         """Return GPS_INPUT."""
         for name, limit in (("latitude_deg", 90), ("longitude_deg", 180)):
             check_range(name, getattr(value, name), -limit, limit)
-        _check_finite("altitude_amsl_m", value.altitude_amsl_m)
+        check_finite("altitude_amsl_m", value.altitude_amsl_m)
         check_range("fix", value.fix, 0, 8)
         check_range("satellites", value.satellites, 0, 255)
         check_range("instance", value.instance, 0, 255)
         ignored = GpsInputIgnoreFlags
-        flags = 0
-        for known, flag in (
+        optional = (
             (value.hdop, ignored.HDOP),
             (value.vdop, ignored.VDOP),
             (value.velocity_m_s, ignored.VEL_HORIZ | ignored.VEL_VERT),
             (value.speed_accuracy_m_s, ignored.SPEED_ACCURACY),
             (value.horizontal_accuracy_m, ignored.HORIZONTAL_ACCURACY),
             (value.vertical_accuracy_m, ignored.VERTICAL_ACCURACY),
-        ):
-            flags |= flag if known is None else 0
+        )
+        flags = sum(flag for known, flag in optional if known is None)
         week, week_ms = _gps_time(value.unix_time_s)
         return (
             m.GpsInput(
@@ -181,7 +180,7 @@ class MeasurementEncoder:
         check_range("max_m", value.max_m, 0, 1e5, above=True)
         time = self._time_us(value.measured_at) // 1000 & 0xFFFFFFFF
         for point in value.points_m:
-            _check_finite("points_m", *point)
+            check_finite("points_m", *point)
         return tuple(
             m.ObstacleDistance3d(time, LASER, MavFrame.BODY_FRD, UNKNOWN_DISTANCE, *point, value.min_m, value.max_m)
             for point in value.points_m
@@ -196,21 +195,17 @@ class MeasurementEncoder:
         _check_variance(value.variance_m2)
         low, high = _centimetres("min_m", value.min_m), _centimetres("max_m", value.max_m)
         distance = _centimetres("distance_m", value.distance_m)
-        variance = (
-            NO_COVARIANCE if value.variance_m2 is None else min(NO_COVARIANCE - 1, round(value.variance_m2 * 1e4))
-        )
+        variance = NO_COVARIANCE
+        if value.variance_m2 is not None:
+            variance = min(NO_COVARIANCE - 1, round(value.variance_m2 * 1e4))
         time = self._time_us(value.measured_at) // 1000 & 0xFFFFFFFF
         place = (ORIENTATIONS[value.direction], variance)
         return (m.DistanceSensor(time, low, high, distance, LASER, 0, *place, signal_quality=value.quality or 0),)
 
     def landing_target(self, value: v.TargetMeasurement) -> tuple[Message, ...]:
-        """Return LANDING_TARGET relative to the vehicle, or in the local frame by its attitude and position.
-
-        Raises:
-            ValueUnknownError: attitude or local position are unknown and the autopilot needs them.
-        """
+        """Return LANDING_TARGET relative to the vehicle, or in the local frame by its attitude and position."""
         offset = (value.forward_m, value.right_m, value.down_m)
-        _check_finite("target", *offset)
+        check_finite("target", *offset)
         check_range("number", value.number, 0, 255)
         distance = math.hypot(*offset)
         if not distance > 0:
@@ -225,12 +220,12 @@ class MeasurementEncoder:
 
     def optical_flow(self, value: v.FlowMeasurement) -> tuple[Message, ...]:
         """Return OPTICAL_FLOW_RAD, or OPTICAL_FLOW with rates in whole radians per interval, as ArduPilot reads it."""
-        _check_finite("flow", value.x_rad, value.y_rad)
+        check_finite("flow", value.x_rad, value.y_rad)
         check_range("interval_s", value.interval_s, 0, 10, above=True)
         check_range("quality", value.quality, 0, 255)
         time = self._time_us(value.measured_at)
         distance = -1.0 if value.distance_m is None else value.distance_m
-        _check_finite("distance_m", distance)
+        check_finite("distance_m", distance)
         if self._session.autopilot.external.flow_in_radians:
             gyro = value.gyro_rad or UNKNOWN_VECTOR
             interval_us = round(value.interval_s * 1e6)
@@ -255,10 +250,9 @@ class MeasurementEncoder:
 
     def _time_us(self, measured_at: float | None) -> int:
         now = self._session.connection.now()
-        if measured_at is None:
-            return int(now * 1e6)
-        check_range("measured_at", measured_at, 0, now)
-        return int(measured_at * 1e6)
+        stamp = now if measured_at is None else measured_at
+        check_range("measured_at", stamp, 0, now)
+        return int(stamp * 1e6)
 
 
 def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
@@ -307,12 +301,6 @@ def _triangle(first: float | None, second: float | None) -> list[float]:
 def _check_variance(variance: float | None) -> None:
     if variance is not None:
         check_range("variance", variance, 0, 1e6)
-
-
-def _check_finite(name: str, *values: float) -> None:
-    for value in values:
-        if not isinstance(value, (int, float)) or not math.isfinite(value):
-            raise InvalidArgument(f"{name}: {value!r} is not a finite number")
 
 
 def _reset_counter(count: int) -> int:

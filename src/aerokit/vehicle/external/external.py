@@ -154,7 +154,7 @@ class External:
             raise InvalidArgument("origin has no altitude_amsl_m, which the local frame requires")
         cell, session = self._session.telemetry.origin, self._session
         if not cell.is_known:
-            await self._request_origin()
+            self._request_origin()
         if (present := cell.latest) is not None:
             if _are_equal(present, origin):
                 return
@@ -174,7 +174,7 @@ class External:
         cell, connection = self._session.telemetry.origin, self._session.connection
         until = connection.now() + timeout
         while (left := until - connection.now()) > 0:
-            await self._request_origin()
+            self._request_origin()
             try:
                 await cell.wait_until(lambda value: _are_equal(value, origin), timeout=min(POLL_INTERVAL_S, left))
             except OperationTimeout:
@@ -183,8 +183,7 @@ class External:
         known = f"it reports {cell.latest}" if cell.is_known else "it reports none"
         raise OperationTimeout(f"set_origin: the vehicle did not report the origin within {timeout:g} s; {known}")
 
-    async def _request_origin(self) -> None:
-        """Request GPS_GLOBAL_ORIGIN without waiting for an acknowledgement."""
+    def _request_origin(self) -> None:
         self._session.commands.send_unconfirmed(MavCmd.REQUEST_MESSAGE, GpsGlobalOrigin.ID)
 
     def _stream(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
-from collections.abc import AsyncIterable, Awaitable, Callable, Iterator
+from collections.abc import AsyncIterable, Awaitable, Callable
 from inspect import isawaitable
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -14,7 +14,6 @@ import anyio
 from aerokit._internal.arguments import check_kind, check_range
 from aerokit._internal.values import Snapshot
 from aerokit.errors import OperationTimeout, ValueUnknownError
-from aerokit.mavlink.messages import Attitude, LocalPositionNed
 from aerokit.vehicle.commanding.progress import await_progress
 from aerokit.vehicle.commanding.streams import TakeoverCheck
 from aerokit.vehicle.external.values import TargetMeasurement
@@ -63,66 +62,6 @@ class LandingReport(Snapshot):
     texts: tuple[str, ...]
 
 
-class TargetTracker:
-    """Reads the source of targets, gives each one to the stream and keeps what the report needs."""
-
-    def __init__(self, context: VehicleContext, stream: MeasurementStream[TargetMeasurement], period_s: float) -> None:
-        self._context, self._session, self._stream = context, context.session, stream
-        self._period_s = period_s
-        self.last: TargetMeasurement | None = None
-        self.seen_at = -math.inf
-        self._height_m: float | None = None
-        self._lowest_m = math.inf
-        self.climbed_m = 0.0
-        self.losses: list[TargetLoss] = []
-        self.error: Exception | None = None
-
-    async def run(self, source: TargetSource) -> None:
-        """Read the source until it ends or fails; `error` then has its exception."""
-        try:
-            if isinstance(source, AsyncIterable):
-                async for target in source:
-                    self._take(target)
-                return
-            while True:
-                found = source()
-                self._take(await found if isawaitable(found) else found)
-                await anyio.sleep(self._period_s)
-        except Exception as error:
-            self.error = error
-
-    @property
-    def now(self) -> float:
-        return self._session.connection.now()
-
-    @property
-    def height_m(self) -> float | None:
-        """Height above home; None if unknown."""
-        position = self._session.telemetry.position.latest
-        return None if position is None else position.altitude_relative_m
-
-    def watch_height(self) -> None:
-        """Keep the largest climb above the lowest height so far."""
-        height = self.height_m
-        if height is not None:
-            self._lowest_m = min(self._lowest_m, height)
-            self.climbed_m = max(self.climbed_m, height - self._lowest_m)
-
-    def _take(self, target: TargetMeasurement | None) -> None:
-        if target is None:
-            return
-        check_kind("target", target, TargetMeasurement)
-        with contextlib.suppress(ValueUnknownError):  # PX4's position was not received yet.
-            self._stream.send(target)
-            self._end_loss()
-            self.last, self.seen_at, self._height_m = target, self.now, self.height_m
-
-    def _end_loss(self) -> None:
-        gap = self.now - self.seen_at
-        if LOST_AFTER_S < gap < math.inf:
-            self.losses.append(TargetLoss(gap, self._height_m))
-
-
 async def land_on(
     context: VehicleContext,
     external: External,
@@ -134,98 +73,113 @@ async def land_on(
 ) -> LandingReport:
     """Land on a target; see :meth:`aerokit.Vehicle.land_on`."""
     check_range("acquire_timeout", acquire_timeout, 0, 3600, above=True)
-    session = context.session
-    mode = context.sender.mode_for("land_on", "precision_land")
+    session, mode = context.session, context.sender.mode_for("land_on", "precision_land")
     check = TakeoverCheck(context, mode)
+    local = ("attitude", "local_position") if session.autopilot.external.target_is_local else ()
     async with external.landing_target(rate_hz=rate_hz) as stream:
-        tracker = TargetTracker(context, stream, 1 / rate_hz)
-        reader = asyncio.get_running_loop().create_task(tracker.run(target))
-        with _positions(context, rate_hz), session.streaming("position", "landed_state"):
+        landing = TargetLanding(context, stream)
+        reader = asyncio.get_running_loop().create_task(landing.read(target, 1 / rate_hz))
+        with session.streaming(*local, hz=rate_hz), session.streaming("position", "landed_state"):
             try:
-                await _acquire(tracker, reader, acquire_timeout)
+                await landing.acquire(reader, acquire_timeout)
                 check.raise_if_changed("land_on")
                 sent_before = stream.sent
                 order = context.arbiter.order(mode)
                 await context.sender.change_mode(mode, order, reported_since=order.given_at)
-                await _await_disarmed(context, tracker, order, timeout, max_silence_s)
+                await landing.await_disarmed(order, timeout, max_silence_s)
             finally:
-                await _stop(reader)
-        unseen_s = tracker.now - tracker.seen_at
-        return LandingReport(
-            tracker.last,
-            unseen_s,
-            tuple(tracker.losses),
-            tracker.climbed_m,
-            stream.sent > sent_before,
-            session.texts_since(order.given_at),
+                reader.cancel()
+                with anyio.CancelScope(shield=True):
+                    await asyncio.wait([reader])
+        return landing.report(is_used=stream.sent > sent_before, texts=session.texts_since(order.given_at))
+
+
+class TargetLanding:
+    """Reads the source of targets, gives each one to the stream, and keeps what the report needs."""
+
+    def __init__(self, context: VehicleContext, stream: MeasurementStream[TargetMeasurement]) -> None:
+        self._context, self._session, self._stream = context, context.session, stream
+        self._last: TargetMeasurement | None = None
+        self._seen_at = -math.inf
+        self._seen_height_m: float | None = None
+        self._lowest_m, self._climbed_m = math.inf, 0.0
+        self._losses: list[TargetLoss] = []
+        self._error: Exception | None = None
+
+    async def read(self, source: TargetSource, period_s: float) -> None:
+        """Read the source until it ends or fails; the waiting methods then raise its exception."""
+        try:
+            if isinstance(source, AsyncIterable):
+                async for target in source:
+                    self._take(target)
+                return
+            while True:
+                found = source()
+                self._take(await found if isawaitable(found) else found)
+                await anyio.sleep(period_s)
+        except Exception as error:
+            self._error = error
+
+    async def acquire(self, reader: asyncio.Task[None], timeout: float) -> None:
+        """Wait for the first sight of the target, before anything is ordered."""
+        started = self._now()
+        while self._last is None:
+            self._raise_error()
+            if reader.done() or self._now() - started >= timeout:
+                waited = "" if reader.done() else f" within {timeout:g} s"
+                raise OperationTimeout(f"land_on: the target was not seen{waited}; the landing was not ordered")
+            await anyio.sleep(min(POLL_INTERVAL_S, timeout))
+
+    async def await_disarmed(self, order: Order, timeout: float | None, max_silence_s: float | None) -> None:
+        """Wait until the vehicle is on the ground and disarmed."""
+        telemetry = self._session.telemetry
+
+        def is_down() -> bool:
+            height = self._height_m()
+            if height is not None:
+                self._lowest_m = min(self._lowest_m, height)
+                self._climbed_m = max(self._climbed_m, height - self._lowest_m)
+            self._raise_error()
+            return telemetry.is_confirmed_disarmed and telemetry.armed.updated_at > order.given_at
+
+        def describe() -> str:
+            height = self._height_m()
+            where = "at an unknown height" if height is None else f"at {height:.1f} m"
+            return f"it is {where}; the target was last seen {self._now() - self._seen_at:.1f} s ago"
+
+        await await_progress(
+            self._session,
+            "land_on",
+            is_done=is_down,
+            trouble=self._context.sender.stays_until_disarmed(order),
+            describe=describe,
+            timeout=timeout,
+            max_silence_s=max_silence_s,
         )
 
+    def report(self, *, is_used: bool, texts: tuple[str, ...]) -> LandingReport:
+        """Return the report of the landing, which is over."""
+        unseen_s = self._now() - self._seen_at
+        return LandingReport(self._last, unseen_s, tuple(self._losses), self._climbed_m, is_used, texts)
 
-async def _acquire(tracker: TargetTracker, reader: asyncio.Task[None], timeout: float) -> None:
-    """Wait for the first sight of the target, before anything is ordered."""
-    started = tracker.now
-    while tracker.last is None:
-        if tracker.error is not None:
-            raise tracker.error
-        if reader.done() or tracker.now - started >= timeout:
-            waited = "" if reader.done() else f" within {timeout:g} s"
-            raise OperationTimeout(f"land_on: the target was not seen{waited}; the landing was not ordered")
-        await anyio.sleep(min(POLL_INTERVAL_S, timeout))
+    def _now(self) -> float:
+        return self._session.connection.now()
 
+    def _height_m(self) -> float | None:
+        position = self._session.telemetry.position.latest
+        return None if position is None else position.altitude_relative_m
 
-async def _await_disarmed(
-    context: VehicleContext,
-    tracker: TargetTracker,
-    order: Order,
-    timeout: float | None,
-    max_silence_s: float | None,
-) -> None:
-    telemetry = context.session.telemetry
-    stays = context.sender.stays_in(order, *order.modes)
+    def _raise_error(self) -> None:
+        if self._error is not None:
+            raise self._error
 
-    def is_down() -> bool:
-        tracker.watch_height()
-        if tracker.error is not None:
-            raise tracker.error
-        return telemetry.is_confirmed_disarmed and telemetry.armed.updated_at > order.given_at
-
-    def trouble() -> str | None:
-        if order.has_lost_mode and telemetry.armed.updated_at < order.mode_lost_at:
-            return None  # The next HEARTBEAT may report that it has landed and disarmed.
-        return stays()
-
-    def describe() -> str:
-        height = tracker.height_m
-        where = "at an unknown height" if height is None else f"at {height:.1f} m"
-        return f"it is {where}; the target was last seen {tracker.now - tracker.seen_at:.1f} s ago"
-
-    await await_progress(
-        context.session,
-        "land_on",
-        is_done=is_down,
-        trouble=trouble,
-        describe=describe,
-        timeout=timeout,
-        max_silence_s=max_silence_s,
-    )
-
-
-async def _stop(reader: asyncio.Task[None]) -> None:
-    reader.cancel()
-    with anyio.CancelScope(shield=True):
-        await asyncio.wait([reader])
-
-
-@contextlib.contextmanager
-def _positions(context: VehicleContext, rate_hz: float) -> Iterator[None]:
-    """Request attitude and local position at the rate of the targets, if the autopilot needs local targets."""
-    session = context.session
-    if not session.autopilot.external.target_is_local:
-        yield
-        return
-    releases = [session.rates.request(kind, rate_hz, is_optional=True) for kind in (Attitude, LocalPositionNed)]
-    try:
-        yield
-    finally:
-        for release in releases:
-            release()
+    def _take(self, target: TargetMeasurement | None) -> None:
+        if target is None:
+            return
+        check_kind("target", target, TargetMeasurement)
+        with contextlib.suppress(ValueUnknownError):  # PX4's position was not received yet.
+            self._stream.send(target)
+            gap = self._now() - self._seen_at
+            if LOST_AFTER_S < gap < math.inf:
+                self._losses.append(TargetLoss(gap, self._seen_height_m))
+            self._last, self._seen_at, self._seen_height_m = target, self._now(), self._height_m()

@@ -14,7 +14,6 @@ from aerokit.vehicle.commanding.streams import MAX_RATE_HZ, known_values
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from types import TracebackType
 
     from typing_extensions import Self
 
@@ -131,7 +130,7 @@ class MeasurementStream(Generic[MeasurementT]):
         source. "not used": it has none. "unknown" in all other cases, such as with a GPS beside, for sensors that are
         not a position, or without a recent report.
         """
-        rule = self._session.autopilot.external.find(self._kind)
+        rule = self._session.autopilot.external.kinds.get(self._kind)
         estimator = self._session.telemetry.estimator
         health = estimator.latest
         if rule is None or not rule.sole_source or not self._parameters or health is None:
@@ -200,41 +199,32 @@ class MeasurementStream(Generic[MeasurementT]):
         if self._was_entered:
             raise SetpointStreamStopped(f"this {self._kind} stream can be entered only once: open another one")
         self._was_entered = True
-        self._parameters = await check_external(self._session, self._kind, self._probe)
+        self._parameters = await self._check_support()
         self._answers.open()
         self._is_open = True
         return self
 
-    async def __aexit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         self._is_open, self._waiting = False, None
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
         self._answers.close()
 
-
-async def check_external(session: VehicleSession, kind: ExternalKind, probe: Probe) -> dict[str, float]:
-    """Raise unless the vehicle reads measurements of this kind; return the parameters that decide about them."""
-    autopilot = session.autopilot
-    what = kind.replace("_", " ")
-    rule = autopilot.external.find(kind)
-    if rule is None:
-        raise NotSupported(f"{what}: {autopilot.firmware} does not read such measurements by MAVLink")
-    names = [name for group, _ in rule.required for name in group]
-    values = await known_values(probe, *names, *(name for name, _ in rule.sole_source))
-    for group, allowed in rule.required:
-        found = next((name for name in group if name in values), None)
-        value = None if found is None else values[found]
-        if value not in allowed:
-            now = f"{group[0]} does not exist" if value is None else f"{found} = {value:g}"
-            choice = " or ".join(f"{each:g}" for each in allowed[:4])
-            raise OperationRejected(
-                f"{what}: {now}, so that {autopilot.firmware} ignores the measurements; set {group[0]} to {choice}"
-                " and reboot"
-            )
-    return values
+    async def _check_support(self) -> dict[str, float]:
+        """Raise unless the vehicle reads these measurements; return the parameters that decide about them."""
+        firmware, rule = self._session.autopilot.firmware, self._session.autopilot.external.kinds.get(self._kind)
+        what = self._kind.replace("_", " ")
+        if rule is None:
+            raise NotSupported(f"{what}: {firmware} does not read such measurements by MAVLink")
+        names = [name for group, _ in rule.required for name in group]
+        values = await known_values(self._probe, *names, *(name for name, _ in rule.sole_source))
+        for group, allowed in rule.required:
+            found = next((name for name in group if name in values), None)
+            if found is None or values[found] not in allowed:
+                now = f"{group[0]} does not exist" if found is None else f"{found} = {values[found]:g}"
+                choice = " or ".join(f"{each:g}" for each in allowed[:4])
+                raise OperationRejected(
+                    f"{what}: {now}, so that {firmware} ignores the measurements; set {group[0]} to {choice} and reboot"
+                )
+        return values

@@ -113,12 +113,10 @@ class LogStream(ReadOnly):
         self._detach = session.connection.bus.attach(LoggingDataAcked, self._acknowledge, system_id=session.system_id)
         try:
             await START.send(self._context)
-        except CommandRejected:  # The stream of another station must not be stopped.
+        except BaseException as error:
             self._close()
-            raise
-        except BaseException:
-            self._close()
-            self._context.session.transfers.command_in_background(MavCmd.LOGGING_STOP)
+            if not isinstance(error, CommandRejected):  # The stream of another station must not be stopped.
+                session.transfers.command_in_background(MavCmd.LOGGING_STOP)
             raise
         return self
 

@@ -74,7 +74,7 @@ class ReleaseCommand:
         async def send_until_acknowledged() -> None:
             with suppress(AerokitError):
                 if not is_sent:
-                    await self._wait_heartbeat()
+                    await self._session.wait_for_heartbeat()
                     if not self._is_meant():
                         return
                     self._send()
@@ -95,9 +95,8 @@ class ReleaseCommand:
 
     async def _confirm(self) -> None:
         with self._orders.context.arbiter.auxiliary_order() as order:
-            await self._orders.context.sender.run_command(
+            await self._orders.context.sender.send_long(
                 order,
-                self._session.commands.send_long,
                 self._command,
                 *self._params,
                 component_id=self._target,
@@ -106,10 +105,6 @@ class ReleaseCommand:
                 attempt_timeout=ATTEMPT_TIMEOUT_S,
                 is_sent=True,
             )
-
-    async def _wait_heartbeat(self) -> None:
-        armed, since = self._session.telemetry.armed, self._session.connection.now()
-        await armed.wait_until(lambda _: armed.updated_at > since)
 
     def _is_target_silent(self) -> bool:
         is_autopilot = self._target == self._session.component_id

@@ -10,7 +10,7 @@ import anyio
 from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit._internal.async_block import ReadOnly
 from aerokit.errors import BusyError, CommandRejected, CommandTimeout, InvalidArgument
-from aerokit.mavlink.enums import MavCmd, MavFrame
+from aerokit.mavlink.enums import MavCmd
 from aerokit.mavlink.messages import GimbalDeviceInformation, GimbalManagerInformation, GlobalPositionInt
 from aerokit.position import Home, Position, point_at
 from aerokit.vehicle.gimbal.control import GimbalControl
@@ -94,19 +94,14 @@ class RoiMixin(GimbalMixin):
             InvalidArgument: the tolerance is out of range. Nothing was sent.
             NotSupported: the manager supports it for its first gimbal only. Nothing was sent.
             ValueUnknownError: the target needs home or the vehicle's altitude, which is unknown. Nothing was sent.
-            CommandRejected: the manager refused.
-            CommandTimeout: there was no answer.
-            GimbalTaken: your program had control and lost it.
-            OperationRejected: another order was given meanwhile, or the vehicle rebooted.
-            OperationTimeout: the gimbal did not reach the direction in time; the text has the last attitude.
-            HeartbeatTimeout: the vehicle fell silent.
+
+        Otherwise raises as :meth:`neutral`.
         """
         check_range("tolerance_deg", tolerance_deg, 0, 45, above=True)
         orders = self._orders
         orders.check_roi()
         target = point_at(target)
-        x, y, z, is_relative = self._context.vehicle_position.global_target(target)
-        frame = MavFrame.GLOBAL_RELATIVE_ALT_INT if is_relative else MavFrame.GLOBAL_INT
+        place = self._context.vehicle_position.command_place(target)
         order = orders.begin_order()
         aim = AngleTarget(
             lambda: direction_to(self._context, target),
@@ -115,7 +110,6 @@ class RoiMixin(GimbalMixin):
         )
         with attitude_stream(orders), self._session.streaming("position"):
             since = self._now()
-            place = {"frame": frame, "x": x, "y": y, "z": z}
             await orders.send_roi(order, MavCmd.DO_SET_ROI_LOCATION, orders.roi_parameter, **place)
             if wait:
                 await wait_until_there(orders, order, f"{orders.name}: look_at", aim, since=since, timeout=timeout)
@@ -136,12 +130,8 @@ class RoiMixin(GimbalMixin):
         Raises:
             InvalidArgument: the system id or the tolerance is out of range. Nothing was sent.
             NotSupported: the manager does not support it. Nothing was sent.
-            CommandRejected: the manager refused.
-            CommandTimeout: there was no answer.
-            GimbalTaken: your program had control and lost it.
-            OperationRejected: another order was given meanwhile, or the vehicle rebooted.
-            OperationTimeout: the gimbal did not reach the direction in time; the text has the last attitude.
-            HeartbeatTimeout: the vehicle fell silent.
+
+        Otherwise raises as :meth:`neutral`.
         """
         if isinstance(system_id, bool):
             raise InvalidArgument(f"system_id = {system_id} is not allowed: 1 to 255")

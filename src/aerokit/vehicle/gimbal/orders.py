@@ -104,13 +104,8 @@ class GimbalOrders:
 
     async def send(self, order: Order | None, command: int, *params: float, is_sent: bool = False) -> None:
         with self.context.arbiter.auxiliary_order(order) as sent_order:
-            await self.context.sender.run_command(
-                sent_order,
-                self.session.commands.send_long,
-                command,
-                *params,
-                component_id=self.manager_id,
-                is_sent=is_sent,
+            await self.context.sender.send_long(
+                sent_order, command, *params, component_id=self.manager_id, is_sent=is_sent
             )
 
     def begin_order(self) -> Order:

@@ -230,12 +230,8 @@ class PointingMixin(GimbalMixin):
         Raises:
             InvalidArgument: an angle is out of range, or beyond the limits of the gimbal if :meth:`information` was
                 called before. Nothing was sent.
-            CommandRejected: the manager refused.
-            CommandTimeout: there was no answer.
-            GimbalTaken: your program had control and lost it.
-            OperationRejected: another order was given meanwhile, or the vehicle rebooted.
-            OperationTimeout: the gimbal did not reach the direction in time; the text has the last attitude.
-            HeartbeatTimeout: the vehicle fell silent.
+
+        Otherwise raises as :meth:`neutral`.
         """
         for name, value in (("pitch_deg", pitch_deg), ("yaw_deg", yaw_deg), ("roll_deg", roll_deg)):
             check_range(name, value, -360, 360)
@@ -287,12 +283,8 @@ class PointingMixin(GimbalMixin):
 
         Raises:
             NotSupported: the manager would accept the order but not execute it (PX4). Nothing was sent.
-            CommandRejected: the manager refused.
-            CommandTimeout: there was no answer.
-            GimbalTaken: your program had control and lost it.
-            OperationRejected: another order was given meanwhile, or the vehicle rebooted.
-            OperationTimeout: the gimbal did not reach the direction in time; the text has the last attitude.
-            HeartbeatTimeout: the vehicle fell silent.
+
+        Otherwise raises as :meth:`neutral`.
         """
         if not self._orders.rules.supports_retract:
             self._orders.raise_not_supported("cannot retract a gimbal")

@@ -13,6 +13,7 @@ from aerokit.position import Position
 from aerokit.vehicle.commanding.arbiter import MODE_GRACE_S
 from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, await_progress
 from aerokit.vehicle.missions.plans import VehiclePlan
+from aerokit.vehicle.missions.stalling import MissionStallDetector
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -257,7 +258,8 @@ class MissionControl(VehiclePlan["Mission"]):
     async def wait_finished(self, *, timeout: float | None = None, max_silence_s: float | None = MAX_SILENCE_S) -> None:
         """Wait until the mission has been flown to its end; if it ends with a landing, until the vehicle has landed.
 
-        A :meth:`pause` by another task does not end the wait. Cancelling this call does not stop the vehicle.
+        A :meth:`pause` by another task does not end the wait. Cancelling this call does not stop the vehicle, and no
+        command is sent when it fails.
 
         Args:
             timeout: seconds to wait; None for no limit.
@@ -266,12 +268,15 @@ class MissionControl(VehiclePlan["Mission"]):
         Raises:
             OperationRejected: the vehicle no longer flies the mission: a pilot, a failsafe or another order changed the
                 mode, or it disarmed on the way. ``reasons`` has what the vehicle reported.
-            OperationTimeout: not finished in time.
+            OperationTimeout: not finished in time; or the armed vehicle has not moved for 12 s after a descent at more
+                than 3 m/s that ended on the ground; or it has not moved for 60 s at a take-off or at a waypoint without
+                a hold, which requires that the items were uploaded or downloaded.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
         """
         vehicle_context, session = self._vehicle_context, self._session
         mode = vehicle_context.sender.mode_for("mission.wait_finished", "mission")
-        end = MissionEndDetector(vehicle_context, self._tracker, mode, self._context.caches[0].items)
+        items = (self._context.caches[0].items or ())[self._context.offset_of(0) :]
+        end = MissionEndDetector(vehicle_context, self._tracker, mode, items)
         with session.streaming("mission_current", "landed_state"):
             await await_progress(
                 session,
@@ -281,6 +286,7 @@ class MissionControl(VehiclePlan["Mission"]):
                 describe=end.describe,
                 timeout=timeout,
                 max_silence_s=max_silence_s,
+                stillness=MissionStallDetector(session, self._tracker, mode, items, lambda: self._is_paused),
             )
 
     @property
@@ -320,7 +326,7 @@ class MissionControl(VehiclePlan["Mission"]):
         seq = item + self._context.offset_of(0)
         if session.autopilot.sets_current_by_command:
             try:
-                await vehicle_context.sender.follow_up_command(
+                await vehicle_context.sender.send_long(
                     order, MavCmd.DO_SET_MISSION_CURRENT, 0 if item == 0 and not keeps_jump_counts else seq
                 )
             except CommandRejected as error:
@@ -367,9 +373,7 @@ class MissionControl(VehiclePlan["Mission"]):
             return
         try:
             with vehicle_context.arbiter.changing_mode():
-                await vehicle_context.sender.run_command(
-                    order, session.commands.send_long, MavCmd.MISSION_START, modes=(mode,)
-                )
+                await vehicle_context.sender.send_long(order, MavCmd.MISSION_START, modes=(mode,))
                 await vehicle_context.sender.await_mode(mode, order, [], timeout, order.given_at)
         except CommandRejected as error:
             if error.result != MavResult.UNSUPPORTED:

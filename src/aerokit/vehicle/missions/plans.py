@@ -78,7 +78,7 @@ class VehiclePlan(ReadOnly, Generic[PlanT]):
         """
         plan = self._checked(plan)
         places = [item.position for item in plan.to_items()]
-        self._context.vehicle_context.vehicle_position.check_reach("plan", filter(None, places), max_distance_m)
+        self._context.vehicle_context.vehicle_position.check_reach("plan", places, max_distance_m, are_items=True)
 
         async with self._transfer(idle_timeout_s, timeout, on_progress) as transfer:
             await transfer.upload(plan, method, only_changes=only_changes, verify=verify)

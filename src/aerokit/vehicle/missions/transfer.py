@@ -161,7 +161,7 @@ class PlanChannel:
         except MissionRejected as error:
             await anyio.sleep(REFUSAL_TEXT_DELAY_S)
             texts = self._context.session.texts_since(started)
-            message = f"{error}{self._describe_remains(exchange)}"
+            message = f"{error}{self._describe_remains(exchange, refused=error.item)}"
             raise MissionRejected(message, result=error.result, item=error.item, reasons=texts) from None
         except MissionTimeout as error:
             error.args = (f"{error}{self._describe_remains(exchange, is_silent=True)}",)
@@ -171,13 +171,18 @@ class PlanChannel:
                 for notice in exchange.cancellation():
                     connection.send(notice)
 
-    def _describe_remains(self, exchange: MissionExchange[Any], *, is_silent: bool = False) -> str:
+    def _describe_remains(
+        self, exchange: MissionExchange[Any], *, is_silent: bool = False, refused: int | None = None
+    ) -> str:
         if not isinstance(exchange, MissionUpload):
             return ""
         self._has_changed |= exchange.may_have_changed_items
         is_overwritten = self.mission_type in self._context.autopilot.overwrites_plans_in_place
         if is_silent and exchange.was_sent_completely:
             return "; all items were sent, but whether the vehicle accepted them is unknown: call download()"
+        if is_overwritten and self._has_changed and refused:
+            count = "only item 0 is new" if refused == 1 else f"items 0 to {refused - 1} are new"
+            return f"; on the vehicle {count} now, and later items, if it has any, are old: upload again, or clear"
         if is_overwritten and self._has_changed:
             return "; the vehicle now has some new and some old items: upload again, or clear"
         if is_overwritten and is_silent:

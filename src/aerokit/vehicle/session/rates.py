@@ -407,3 +407,23 @@ class ComponentSubscriber:
                 sink(item)
 
         return filtered
+
+
+class WatchedStream:
+    """Feed of a cell whose message is requested only while your program waits for the cell or follows it."""
+
+    pending = False
+
+    def __init__(self, cell: StateCell[Any], request: Callable[[], Detach]) -> None:
+        self._cell, self._request = cell, request
+        self._release: Detach | None = None
+
+    def catch_up(self) -> None:
+        """Do nothing: another feed decodes the message."""
+
+    def watchers_changed(self) -> None:
+        if not self._cell._is_watched and self._release is not None:
+            self._release()
+            self._release = None
+        elif self._cell._is_watched and self._release is None:
+            self._release = self._request()

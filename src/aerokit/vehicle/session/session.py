@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import anyio
@@ -34,7 +35,7 @@ from aerokit.mavlink.messages import (
     HomePosition,
 )
 from aerokit.vehicle.session.commands import CommandSender
-from aerokit.vehicle.session.rates import ComponentSubscriber, MessageRates
+from aerokit.vehicle.session.rates import ComponentSubscriber, MessageRates, WatchedStream
 from aerokit.vehicle.session.transfers import Transfers
 from aerokit.vehicle.session.watch import LinkWatch, VehicleWatch
 from aerokit.vehicle.state.field import MESSAGE_IDS
@@ -103,31 +104,6 @@ ACTION_HZ = 4.0
 """Rate in Hz of the messages that an action waits for."""
 
 RESULTS_OF_REFUSAL = (MavResult.TEMPORARILY_REJECTED, MavResult.DENIED, MavResult.FAILED)
-
-
-class WatchedStream:
-    """Feed of a cell whose message is not requested by default: it is while your program waits for it or follows it.
-
-    Reading the cell requests nothing.
-    """
-
-    pending = False
-
-    def __init__(self, cell: StateCell[Any], rates: MessageRates, message: type[Message], hz: float) -> None:
-        self._cell, self._rates, self._message, self._hz = cell, rates, message, hz
-        self._release: Callable[[], None] | None = None
-
-    def catch_up(self) -> None:
-        """Do nothing: another feed decodes the message."""
-
-    def watchers_changed(self) -> None:
-        """Request the message while the cell is watched."""
-        if not self._cell._is_watched:
-            if self._release is not None:
-                self._release()
-            self._release = None
-        elif self._release is None:
-            self._release = self._rates.request(self._message, self._hz, is_optional=True)
 
 
 class VehicleSession:
@@ -237,10 +213,10 @@ class VehicleSession:
     # ----------------------------------------------------------------------------- receiving
 
     @contextmanager
-    def streaming(self, *names: str) -> Iterator[None]:
+    def streaming(self, *names: str, hz: float = ACTION_HZ) -> Iterator[None]:
         """Request the messages of these states during the block, even if the program disabled the default rates."""
         releases = [
-            self.rates.request(message_type, ACTION_HZ, is_optional=True)
+            self.rates.request(message_type, hz, is_optional=True)
             for name in names
             for message_type in self.telemetry.required_messages(name)
         ]
@@ -249,6 +225,11 @@ class VehicleSession:
         finally:
             for release in releases:
                 release()
+
+    async def wait_for_heartbeat(self) -> None:
+        """Wait for the next HEARTBEAT, which describes the vehicle's state."""
+        armed, since = self.telemetry.armed, self.connection.now()
+        await armed.wait_until(lambda _: armed.updated_at > since, description="the next HEARTBEAT")
 
     @contextmanager
     def refusals_of(self, command: int) -> Iterator[list[CommandAck]]:
@@ -361,7 +342,8 @@ class VehicleSession:
             for source in state.sources:
                 kind = self.connection.bus.dialect.get(MESSAGE_IDS[source.message])
                 if source.watched_hz is not None and kind is not None and self.autopilot.sends(kind):
-                    cell._feed_from(*cell._feeds, WatchedStream(cell, self.rates, kind, source.watched_hz))
+                    request = partial(self.rates.request, kind, source.watched_hz, is_optional=True)
+                    cell._feed_from(*cell._feeds, WatchedStream(cell, request))
 
     def _on_link_chosen(self, event: LinkSelected) -> None:
         """Request all streams again, because an autopilot keeps separate rates for each of its ports."""

@@ -21,7 +21,7 @@ const orderList = new OrderPanel();
 const orders = new Orders(byId("orders"), {
   vehicle: selected, seenAt: () => page.atSeconds, pick: () => pick(!map.isPicking), toast, record,
 });
-const parameters = new ParameterPanel((id, parameter) => { if (!page.isReadOnly) orders.setParameter(id, parameter); });
+const parameters = new ParameterPanel((id, parameter) => { if (!page.isReadOnly && hasToken()) orders.setParameter(id, parameter); });
 
 // ------------------------------------------------------------------------------------------- panels
 
@@ -140,11 +140,11 @@ function onMap(vehicle) {
   };
 }
 
-// A .plan file dropped anywhere is uploaded to the selected vehicle, after confirmation.
+// A plan dropped anywhere is uploaded to the selected vehicle, after confirmation.
 window.addEventListener("dragover", (event) => {
   event.preventDefault();
   byId("drop").hidden = !selected() || page.isReadOnly;
-  show(byId("drop"), `Drop a .plan file to upload it to vehicle ${page.selected}`);
+  show(byId("drop"), `Drop a .plan or .waypoints file to upload it to vehicle ${page.selected}`);
 });
 window.addEventListener("dragleave", (event) => { if (!event.relatedTarget) byId("drop").hidden = true; });
 window.addEventListener("drop", (event) => {
@@ -183,8 +183,10 @@ function drawNow() {
   const plan = { items: missions.items(page.selected), current: vehicle ? currentItem(vehicle) : null };
   map.draw([...page.vehicles.values()].map(onMap), page.selected, plan, going && going.arguments, missions.fence(page.selected));
   byId("follow").setAttribute("aria-pressed", String(map.follows !== null));
+  page.hasToken = hasToken();
   orders.enable(vehicle, page);
   showServer();
+  showTokenNotice();
 }
 
 function toast(text, kind) {
@@ -256,13 +258,24 @@ function askToken(banner) {
   banner.replaceChildren(form);
 }
 
+// Reading needs no token on this machine, orders do: ask before the first one.
+function showTokenNotice() {
+  const notice = byId("notice");
+  notice.hidden = page.hasToken || page.isReadOnly || !page.isOpen;
+  if (notice.hidden || notice.firstChild) return;
+  const input = element("input", { type: "password", required: true, autocomplete: "off" });
+  input.setAttribute("aria-label", "Token");
+  notice.append(element("form", { onsubmit: (event) => { event.preventDefault(); useToken(input.value); input.value = ""; draw(); } },
+    "You can look only: orders need the token, which aerokit serve prints in its address. ", input, " ", element("button", { type: "submit" }, "Use")));
+}
+
 function showServer() {
   const isFresh = page.isOpen && performance.now() - page.receivedAt < 3000;
   const silent = [...page.vehicles.values()].filter((each) => !isConnected(each));
   const loss = page.vehicles.size === 1 ? "vehicle silent" : `${silent.length} of ${page.vehicles.size} silent`;
   const text = !page.isOpen ? "no connection" : !isFresh ? "no data" : silent.length ? loss : page.vehicles.size ? "live" : "no vehicle";
-  const isRestricted = isFresh && page.isReadOnly;
-  show(byId("server"), isRestricted ? `read-only · ${text}` : text, `pill ${text === "live" ? "good" : text === "no vehicle" ? "" : "bad"}`);
+  const limit = !isFresh ? "" : page.isReadOnly ? "read-only · " : hasToken() ? "" : "no token · ";
+  show(byId("server"), `${limit}${text}`, `pill ${text === "live" ? "good" : text === "no vehicle" ? "" : "bad"}`);
 }
 
 ask("GET", "api").then((about) => {

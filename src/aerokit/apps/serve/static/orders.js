@@ -55,21 +55,20 @@ export class Orders {
     const vehicle = this.page.vehicle();
     if (!vehicle) return;
     try {
-      const plan = JSON.parse(await file.text());
-      const count = plan.mission.items.length, fence = plan.geoFence ?? {};
-      const areas = (fence.polygons ?? []).length + (fence.circles ?? []).length, rally = (plan.rallyPoints?.points ?? []).length;
+      const plan = await file.text(), name = file.name;
+      const { mission_items: count, fence_areas: areas, rally_points: rally } = await ask("POST", "api/plan", { plan, name });
       const parts = [[count, "mission items"], [areas, "fence areas"], [rally, "rally points"]];
       const replaced = parts.filter(([each]) => each).map(([each, what]) => `${each} ${each === 1 ? what.slice(0, -1) : what}`);
       this.confirm({
-        order: "mission/upload", title: "Upload", fields: [], fixed: { name: file.name, plan },
+        order: "mission/upload", title: "Upload", fields: [], fixed: { name, plan },
         text: `get ${replaced.join(", ") || "nothing"} from ${file.name}, instead of those it has`,
         about: [
           vehicle.states.armed?.value ? "The vehicle is armed." : "",
           areas && rally ? "" : "What the file does not contain (fence, rally points) stays as it is.",
         ].filter(Boolean),
       });
-    } catch {
-      this.page.toast(`${file.name} is not a .plan file of QGroundControl.`, "failed");
+    } catch (error) {
+      this.page.toast(error instanceof Refusal ? inWords(error.problem) : `${file.name} was not checked: the server did not answer.`, "failed");
     }
   }
 

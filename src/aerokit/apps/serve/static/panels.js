@@ -14,10 +14,10 @@ export class MissionPanel {
     this.body = element("tbody", {});
     this.note = element("span", { class: "note" });
     const load = element("button", { type: "button", onclick: () => this.load(this.vehicle, true) }, "Read from vehicle");
-    const file = element("input", { type: "file", accept: ".plan,.json", hidden: true, onchange: () => { if (file.files[0]) upload(file.files[0]); file.value = ""; } });
-    const choose = element("button", { type: "button", onclick: () => file.click() }, "Upload a .plan …");
+    const file = element("input", { type: "file", accept: ".plan,.json,.waypoints,.txt", hidden: true, onchange: () => { if (file.files[0]) upload(file.files[0]); file.value = ""; } });
+    const choose = element("button", { type: "button", onclick: () => file.click() }, "Upload a plan …");
     this.node = element("div", {}, element("div", { class: "bar" }, choose, load, file), this.note,
-      element("p", { class: "note" }, "You can also drop a .plan file of QGroundControl anywhere on this page."), element("table", {}, this.body));
+      element("p", { class: "note" }, "A .plan or .waypoints file. You can also drop it anywhere on this page."), element("table", {}, this.body));
   }
 
   // {polygons, circles, rally} of a vehicle
@@ -130,9 +130,10 @@ export class ParameterPanel {
       const name = element("button", { type: "button", class: "link", title: "Set …" }, each.name);
       const facts = [changedFrom(each), range(each)].filter(Boolean).join(" · ");
       const node = element("tr", { class: "clickable", onclick: () => this.setParameter(this.vehicle, each) },
-        element("td", {}, name, about ? element("div", { class: "detail" }, about) : null),
+        element("td", {}, name, each.other_names?.length ? element("div", { class: "detail" }, `other versions: ${each.other_names.join(", ")}`) : null, about ? element("div", { class: "detail" }, about) : null),
         element("td", { class: "number" }, withUnit(each, each.value), element("div", { class: "detail" }, meaning(each) || facts, meaning(each) && facts ? ` · ${facts}` : "")));
-      return { node, text: `${each.name} ${about ?? ""} ${each.description ?? ""}`.toUpperCase() };
+      const names = [each.name, ...(each.other_names ?? [])].join(" ");
+      return { node, text: `${names} ${about ?? ""} ${each.description ?? ""}`.toUpperCase() };
     });
     this.body.replaceChildren(...this.rows.map((each) => each.node));
     this.filter();

@@ -12,11 +12,11 @@ const MAX_REASONS = 4;
 // What the page calls the library's actions.
 const TITLES = {
   arm: "Arm", take_off: "Take off", go_to: "Go to …", hold: "Hold", land: "Land", return_to_launch: "Return", disarm: "Disarm",
-  start: "Start mission", pause: "Pause", resume: "Resume", upload: "Upload a .plan …", set_mode: "Mode …",
+  start: "Start mission", pause: "Pause", resume: "Resume", upload: "Upload a plan …", set_mode: "Mode …",
 };
 
 const valueOf = (vehicle, name) => (vehicle.states[name] || {}).value;
-const MAX_LANDED_AGE_S = 3; // an older state must not keep anyone from landing or disarming
+const MAX_LANDED_AGE_S = 3; // an older state must not keep anyone from landing
 const landedState = (vehicle) => (vehicle.states.landed_state?.age_s < MAX_LANDED_AGE_S ? valueOf(vehicle, "landed_state") : undefined);
 export const isConnected = (vehicle) => vehicle.link.state === "connected";
 
@@ -24,8 +24,9 @@ export const isConnected = (vehicle) => vehicle.link.state === "connected";
 export function obstacle(order, vehicle, page) {
   if (!page.isOpen) return "No connection";
   if (page.isReadOnly) return "Read-only";
+  if (page.hasToken === false) return "No token";
   if (!vehicle) return "No vehicle";
-  if (!isConnected(vehicle)) return SAFE_ORDERS.has(order) ? "" : "Silent";
+  if (!isConnected(vehicle)) return SAFE_ORDERS.has(order) && order !== "disarm" ? "" : "Silent";
   const isArmed = valueOf(vehicle, "armed"), landed = landedState(vehicle);
   const isOnGround = landed === "ON_GROUND", isFlying = FLYING.has(landed);
   const mission = valueOf(vehicle, "mission_current"), isSurface = SURFACE_TYPES.has(vehicle.vehicle_type);
@@ -33,7 +34,8 @@ export function obstacle(order, vehicle, page) {
     case "arm":
       if (isArmed) return "Armed";
       return vehicle.missing_for_flight.length && valueOf(vehicle, "sensors")?.prearm_checks_pass === false ? "Not ready" : "";
-    case "disarm": return isArmed === false ? "Disarmed" : landed === "IN_AIR" ? "Land first" : "";
+    case "disarm": // motors that stop in the air make the vehicle fall, so only where it is known to stand
+      return isArmed === false ? "Disarmed" : isSurface || isOnGround ? "" : isFlying ? "Land first" : "Unknown if landed";
     case "take_off": return isSurface ? "Does not fly" : isArmed === false ? "Arm first" : isFlying ? "Flying" : "";
     case "go_to": return isArmed === false ? "Arm first" : isOnGround && !isSurface ? "Take off first" : "";
     case "hold": case "land": case "return_to_launch": return isArmed === false && isOnGround ? "Not flying" : "";

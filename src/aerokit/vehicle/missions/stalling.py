@@ -1,0 +1,83 @@
+"""Detection of a vehicle that has stopped in the middle of its mission."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from aerokit.mavlink.enums import MavCmd, MavLandedState, MissionState
+from aerokit.vehicle.commanding.progress import StallDetector
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from aerokit.autopilots.modes import Mode
+    from aerokit.missions.item import MissionItem
+    from aerokit.vehicle.missions.context import MissionTracker
+    from aerokit.vehicle.session.session import VehicleSession
+
+MISSION_STALL_TIMEOUT_S = 60.0
+"""Longer than ``STALL_TIMEOUT_S``, because obstacle avoidance and strong wind may stop a vehicle between waypoints."""
+
+GROUND_HEIGHT_M = 3.0
+"""Below this height above home, a vehicle that stands still after a fast descent counts as fallen."""
+
+_TAKEOFFS = (MavCmd.NAV_TAKEOFF, MavCmd.NAV_VTOL_TAKEOFF)
+_WAYPOINTS = (MavCmd.NAV_WAYPOINT, MavCmd.NAV_SPLINE_WAYPOINT)
+
+
+class MissionStallDetector:
+    """Reports a fall, and an item at which the vehicle should move and does not.
+
+    A fall is a standstill of 12 s right after a fast descent, on the ground or at an item without a hold. Without a
+    descent, only an item without a hold counts, after ``MISSION_STALL_TIMEOUT_S``, while the vehicle is in its mission
+    mode and not paused. Items are known after an upload or a download. A disarmed vehicle is never reported.
+    """
+
+    def __init__(
+        self,
+        session: VehicleSession,
+        tracker: MissionTracker,
+        mode: Mode,
+        items: Sequence[MissionItem] | None,
+        is_paused: Callable[[], bool],
+    ) -> None:
+        self._session, self._tracker, self._mode = session, tracker, mode
+        self._items, self._is_paused = items or (), is_paused
+        self._stall = StallDetector(session)
+        # Item of the last call that should move the vehicle, and the time since when.
+        self._item: int | None = None
+        self._moving_since = session.connection.now()
+
+    def __call__(self) -> str | None:
+        """Return a clause about the standstill; None if the vehicle moves, may stand still, or is disarmed."""
+        progress, current = self._tracker.progress.latest, self._tracker.current.latest
+        is_paused = self._is_paused() or (progress is not None and progress.state == MissionState.PAUSED)
+        if is_paused or not self._session.telemetry.is_armed:
+            self._stall = StallDetector(self._session)
+            return None
+        should_move = self._should_move(current)
+        still = self._stall()
+        if still is not None and self._stall.follows_fast_descent and (should_move or self._is_on_ground):
+            return still
+        if not should_move or current != self._item:
+            self._item = current if should_move else None
+            self._moving_since = self._session.connection.now()
+            return None
+        is_late = self._session.connection.now() - self._moving_since >= MISSION_STALL_TIMEOUT_S
+        return self._stall(MISSION_STALL_TIMEOUT_S) if is_late else None
+
+    def _should_move(self, current: int | None) -> bool:
+        """Return True if the vehicle flies its mission, and the current item has no hold."""
+        is_known = current is not None and current < len(self._items)
+        if not is_known or self._tracker.is_complete or not self._session.telemetry.is_in(self._mode):
+            return False
+        item = self._items[current or 0]
+        return item.command in _TAKEOFFS or (item.command in _WAYPOINTS and not item.param1 > 0)
+
+    @property
+    def _is_on_ground(self) -> bool:
+        telemetry = self._session.telemetry
+        here = telemetry.position.latest
+        height_m = None if here is None else here.altitude_relative_m
+        is_low = height_m is not None and height_m < GROUND_HEIGHT_M
+        return is_low or telemetry.landed_state.latest == MavLandedState.ON_GROUND
