@@ -334,6 +334,7 @@ def clients(session: nox.Session) -> None:
     session.run("python", "tests/clients/fly.py", *session.posargs)
     session.run("python", "tests/clients/with_mavsdk_camera.py")
     session.run("python", "tests/clients/with_mavsdk_component.py")
+    session.run("python", "tests/clients/with_mavproxy_component.py")
 
 
 @nox.session

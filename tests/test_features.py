@@ -1,10 +1,12 @@
-"""docs/features.md has an equivalent, or a reason, for each client call of MAVSDK."""
+"""docs/features.md and features-onboard.md have an equivalent, or a reason, for each call of MAVSDK."""
 
 from __future__ import annotations
 
 import ast
 import importlib.util
+import inspect
 import re
+from collections.abc import Iterator
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
@@ -14,11 +16,13 @@ import pytest
 from for_each import for_each
 
 import aerokit
-from aerokit import missions
+from aerokit import messages, missions, onboard
 from aerokit.sim import SimulatedCamera, SimulatedCopter, simulated_link
 from aerokit.testing import run_virtual
+from aerokit.transport import memory_link_pair
 
-PAGE = Path(__file__).parent.parent / "docs" / "features.md"
+DOCS = Path(__file__).parent.parent / "docs"
+PAGE, ONBOARD_PAGE = DOCS / "features.md", DOCS / "features-onboard.md"
 ROW = re.compile(r"^\| `(\w+)\.(\w+)` \| (.*) \|$", re.M)
 CALLS = {
     "action": """
@@ -106,19 +110,60 @@ CALLS = {
     """,
 }
 """Calls of MAVSDK 4.1 by plugin; ``get_`` and ``subscribe_`` of one thing are one call. The wheel lacks ``core``."""
+SERVER_CALLS = {
+    "action_server": """
+        subscribe_arm_disarm subscribe_flight_mode_change subscribe_takeoff subscribe_land subscribe_reboot
+        subscribe_shutdown subscribe_terminate set_allow_takeoff set_armable set_disarmable set_allowable_flight_modes
+        get_allowable_flight_modes set_armed_state set_flight_mode set_flight_mode_internal
+    """,
+    "arm_authorizer_server": "subscribe_arm_authorization accept_arm_authorization reject_arm_authorization",
+    "camera_server": """
+        set_information set_video_streaming set_in_progress subscribe_take_photo subscribe_start_video
+        subscribe_stop_video subscribe_start_video_streaming subscribe_stop_video_streaming subscribe_set_mode
+        subscribe_storage_information subscribe_capture_status subscribe_format_storage subscribe_reset_settings
+        subscribe_zoom_in_start subscribe_zoom_out_start subscribe_zoom_stop subscribe_zoom_range set_zoom_factor
+        subscribe_focus_in_start subscribe_focus_out_start subscribe_focus_stop subscribe_focus_range
+        subscribe_focus_in_step subscribe_focus_out_step subscribe_focus_meters subscribe_focus_auto
+        subscribe_focus_auto_single subscribe_focus_auto_continuous subscribe_tracking_point_command
+        subscribe_tracking_rectangle_command subscribe_tracking_off_command set_tracking_rectangle_status
+        set_tracking_off_status set_position set_attitude_quaternion set_field_of_view
+    """,
+    "component_metadata_server": "set_metadata",
+    "ftp_server": "set_root_dir",
+    "mission_raw_server": """
+        subscribe_incoming_mission subscribe_current_item_changed subscribe_clear_all set_current_item_complete
+    """,
+    "param_server": """
+        set_protocol provide_param_int provide_param_float provide_param_custom retrieve_param_int
+        retrieve_param_float retrieve_param_custom retrieve_all_params subscribe_changed_param_int
+        subscribe_changed_param_float subscribe_changed_param_custom
+    """,
+    "server_utility": "send_status_text",
+    "telemetry_server": """
+        publish_position publish_home publish_attitude publish_visual_flight_rules_hud publish_raw_gps
+        publish_battery publish_sys_status publish_extended_sys_state publish_status_text publish_odometry
+        publish_position_velocity_ned publish_ground_truth publish_imu publish_scaled_imu publish_raw_imu
+        publish_unix_epoch_time publish_distance_sensor
+    """,
+}
+"""Server calls of MAVSDK 4.1 by plugin; ``respond_`` belongs to ``subscribe_``."""
+UNNAMED = {"subscribe_capture_status", "get_allowable_flight_modes", "set_protocol"}
+"""Server calls without a named equivalent, because nothing is to be called."""
 PENDING: set[str] = set()
 """Names on the page that are not built yet. Remove a name when it exists; a test fails otherwise."""
 MIN_FULL = 235
 
 
-def rows() -> list[tuple[str, str, str]]:
-    return ROW.findall(PAGE.read_text(encoding="utf-8"))
+def rows(page: Path = PAGE) -> list[tuple[str, str, str]]:
+    return ROW.findall(page.read_text(encoding="utf-8"))
 
 
-def test_every_call_has_one_row() -> None:
-    listed = [(plugin, call) for plugin, call, _ in rows()]
+@pytest.mark.parametrize(("page", "calls"), [(PAGE, CALLS), (ONBOARD_PAGE, SERVER_CALLS)], ids=lambda given: "")
+def test_every_call_has_one_row(page: Path, calls: dict[str, str]) -> None:
+    listed = [(plugin, call) for plugin, call, _ in rows(page)]
     assert len(listed) == len(set(listed))
-    assert set(listed) == {(plugin, call) for plugin, calls in CALLS.items() for call in calls.split()}
+    assert set(listed) == {(plugin, call) for plugin, names in calls.items() for call in names.split()}
+    assert f"makes {len(listed)} rows" in page.read_text(encoding="utf-8")
 
 
 def names_in(answer: str) -> list[str]:
@@ -153,10 +198,53 @@ def missing() -> set[str]:
 def exists(roots: dict[str, Any], name: str) -> bool:
     root, _, rest = name.partition(".")
     try:
-        attrgetter(rest)(roots[root])
+        _ = attrgetter(rest)(roots[root]) if rest else roots[root]
     except (AttributeError, KeyError):
         return False
     return True
+
+
+def calls_in(answer: str) -> Iterator[ast.expr]:
+    """Parse the code of a row; ``…`` stands for further arguments."""
+    for code in re.findall(r"`([^`]+)`", answer):
+        text = code.replace(", …", "").replace("(…, ", "(").replace("=…", "=0").replace("[…]", "[]").replace("…", "")
+        yield ast.parse(text, mode="eval").body
+
+
+def wrong_in(roots: dict[str, Any], answer: str) -> list[str]:
+    """Return attributes that do not exist, and calls whose arguments have other names, in the code of a row."""
+    wrong = []
+    for node in (node for expression in calls_in(answer) for node in ast.walk(expression)):
+        if isinstance(node, ast.Attribute) and not exists(roots, ast.unparse(node)):
+            wrong.append(ast.unparse(node))
+        elif isinstance(node, ast.Call) and exists(roots, name := ast.unparse(node.func)):
+            root, _, rest = name.partition(".")
+            known = inspect.signature(attrgetter(rest)(roots[root]) if rest else roots[root]).parameters
+            wrong.extend(f"{name}({word.arg}=)" for word in node.keywords if word.arg not in known)
+    return wrong
+
+
+def test_rows_of_components_name_attributes_and_arguments_that_exist() -> None:
+    async def check() -> None:
+        near, _ = memory_link_pair()
+        async with aerokit.component(near) as component:
+            roots: dict[str, Any] = {
+                "component": component,
+                "camera": onboard.CameraDriver(),
+                "autopilot": onboard.AutopilotDriver(),
+                "messages": messages,
+                "CameraDriver": onboard.CameraDriver,
+            }
+            wrong = {call: found for _, call, answer in rows(ONBOARD_PAGE) if (found := wrong_in(roots, answer))}
+            assert wrong == {}
+            assert wrong_in(roots, "`camera.fly()`, `CameraDriver(lens=1)`") == [
+                "camera.fly",
+                "CameraDriver(lens=)",
+            ]
+
+    run_virtual(check())
+    unnamed = {call for *_, call, answer in rows(ONBOARD_PAGE) if "`" not in answer}
+    assert unnamed == UNNAMED
 
 
 @for_each("plugin, call, answer", rows())
@@ -189,7 +277,12 @@ def test_calls_are_those_of_installed_mavsdk() -> None:
             for node in classes[0].body
             if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)) and not node.name.startswith("_")
         }
-        if not plugin.endswith("_server") and plugin != "server_utility":
+        if plugin in SERVER_CALLS:
+            expected = set(SERVER_CALLS[plugin].split())
+            answers = {name.replace("respond_", "subscribe_") for name in methods if name.startswith("respond_")}
+            assert answers <= expected
+            assert expected == {name for name in methods if not name.startswith("respond_")} - {"destroy"}
+        elif plugin != "mavlink_direct_server":  # a client of any ids, as `mavlink_direct`
             assert set(CALLS[plugin].split()) == {*map(partial(one_name, methods), methods)} - {"destroy"}
 
 

@@ -133,6 +133,21 @@ def test_station_flies_and_the_program_sees_it() -> None:
     run_virtual(run())
 
 
+@pytest.mark.parametrize(("way", "seen"), [(through_a_hub, [1, 192]), (through_a_program, [1])], ids=["hub", "share"])
+def test_component_of_a_station_is_seen_only_through_a_hub(way: Any, seen: list[int]) -> None:
+    """docs/hub.md: a program does not see its stations, so that none can take the place of its vehicle."""
+
+    async def run() -> None:
+        async with (
+            way(SimulatedCopter(boot_time_s=0.0)) as (program, station),
+            aerokit.component(connection=station.connection, component_id=192),
+        ):
+            await asyncio.sleep(3)
+            assert [part.component_id for part in program.components.value] == seen
+
+    run_virtual(run())
+
+
 # ------------------------------------------------------------------------------ forwarding
 
 

@@ -6,12 +6,13 @@ import json
 import os
 from pathlib import Path
 
+import anyio
 import pytest
-from onboard_peers import autopilot_and_client, payload_and_station
+from onboard_peers import autopilot_and_client, device_and_client, payload_and_station
 
 from aerokit.errors import AerokitError, FileError, InvalidArgument
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavParamError, MavParamExtType, ParamAck
+from aerokit.mavlink.enums import MavParamError, MavParamExtType, MavType, ParamAck
 from aerokit.missions import Mission, MissionItem, waypoint
 from aerokit.position import Position
 
@@ -27,6 +28,24 @@ async def test_parameters_are_listed_read_and_set() -> None:
         assert {name: table[name].value for name in table} == {"WINCH_SPEED": 1.5, "WINCH_MODE": -5_000_000}
         await vehicle.parameters.set("WINCH_SPEED", 3.0)
         assert node.parameters["WINCH_SPEED"] == 3.0
+
+
+@pytest.mark.parametrize("has_version", [True, False])
+async def test_parameters_of_a_companion_are_downloaded_at_once(has_version: bool) -> None:
+    async with device_and_client(191, MavType.ONBOARD_CONTROLLER) as (companion, vehicle):
+        companion.parameters.add("WINCH_SPEED", 1.5)
+        if not has_version:
+            companion._streams.builders.pop(m.AutopilotVersion.ID)  # REQUEST_MESSAGE is DENIED
+        asked: list[m.CommandLong] = []
+        detach = companion.connection.attach((m.CommandLong,), asked.append)
+        before = anyio.current_time()
+        for _ in range(2):
+            table = await vehicle.component(191).parameters.download(refresh=True)
+            assert table["WINCH_SPEED"].value == 1.5
+        assert anyio.current_time() - before < 1.0
+        assert [c.param1 for c in asked if c.target_component == 191] == [m.AutopilotVersion.ID]
+        for function in detach:
+            function()
 
 
 async def test_parameter_out_of_range_is_refused() -> None:

@@ -62,9 +62,7 @@ class AutopilotDriver:
 
 
 def add_autopilot(
-    services: ComponentServices,
-    driver: AutopilotDriver,
-    report: Callable[[bool | None, int | None], None],
+    services: ComponentServices, driver: AutopilotDriver, report: Callable[[bool | None, int | None], None]
 ) -> None:
     """Serve the commands of a vehicle. ``report(armed, custom_mode)`` changes the heartbeat; None: unchanged."""
 

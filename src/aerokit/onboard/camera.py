@@ -23,13 +23,13 @@ from aerokit.mavlink.enums import (
 )
 from aerokit.mavlink.messages import CameraImageCaptured
 from aerokit.position import Position
-from aerokit.protocols.servers.camera import CameraDevice, camera_settings
+from aerokit.protocols.servers.camera_device import CameraDevice
 
 if TYPE_CHECKING:
     from aerokit.connection.tasks import BackgroundTasks
     from aerokit.onboard.host import ComponentHost
     from aerokit.parameters import SettingValue
-    from aerokit.protocols.servers.captures import Shot
+    from aerokit.protocols.servers.camera_device import Shot
     from aerokit.protocols.servers.host import ServerHost
 
 logger: logging.Logger = logging.getLogger("aerokit")
@@ -208,7 +208,6 @@ class CameraAdapter(CameraDevice):
         self._camera, self._host, self._tasks, self._call = camera, host, tasks, call
         self.set_up_captures()
         self.running_streams = set(range(1, len(self.streams) + 1))
-        self._format_known = _has(camera, "format_storage")
 
     @property
     def host(self) -> ServerHost:
@@ -325,10 +324,6 @@ class CameraAdapter(CameraDevice):
 
     async def reset_settings(self) -> None:
         await self._call(self._camera.reset_settings)
-
-    def publish_settings(self) -> None:
-        """Send CAMERA_SETTINGS to all."""
-        self._host.send(camera_settings(self))
 
 
 def _shot(photo: Photo, time_boot_ms: int, unix_time: float) -> Shot:

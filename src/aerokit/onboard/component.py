@@ -12,14 +12,7 @@ from aerokit._internal.arguments import checks_arguments
 from aerokit.connection.tasks import BackgroundTasks
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import (
-    CompMetadataType,
-    MavCmd,
-    MavModeFlag,
-    MavSeverity,
-    MavState,
-    MavType,
-)
+from aerokit.mavlink.enums import CompMetadataType, MavCmd, MavModeFlag, MavSeverity, MavState, MavType
 from aerokit.mavlink.enums import MavProtocolCapability as Can
 from aerokit.mavlink.message import Message
 from aerokit.onboard.events import EventSender, answer_pings

@@ -126,9 +126,7 @@ def add_winch(services: ComponentServices, winch: WinchDriver) -> None:
 
 
 def add_gripper(
-    services: ComponentServices,
-    grab: Callable[[], Awaitable[Any]],
-    release: Callable[[], Awaitable[Any]],
+    services: ComponentServices, grab: Callable[[], Awaitable[Any]], release: Callable[[], Awaitable[Any]]
 ) -> None:
     """Serve DO_GRIPPER."""
 

@@ -10,16 +10,7 @@ from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
-from aerokit.protocols.servers.files import (
-    EFBIG,
-    EINVAL,
-    EISDIR,
-    ENOENT,
-    EROFS,
-    Entry,
-    FileFault,
-    FileHandle,
-)
+from aerokit.protocols.servers.files import EFBIG, EINVAL, EISDIR, ENOENT, EROFS, Entry, FileFault, FileHandle
 
 if TYPE_CHECKING:
     from aerokit.protocols.servers.files import FileTree

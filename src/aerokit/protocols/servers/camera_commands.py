@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import CameraCapFlags, CameraMode, MavCmd, MavResult
-from aerokit.protocols.servers.camera import AsyncHandler, CameraDevice, camera_settings
+from aerokit.protocols.servers.camera import AsyncHandler, camera_settings
+from aerokit.protocols.servers.camera_device import CameraDevice
 from aerokit.protocols.servers.commands import ReceivedCommand, whole
 
 if TYPE_CHECKING:

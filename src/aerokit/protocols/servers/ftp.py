@@ -342,15 +342,6 @@ class SessionFtpServer(FtpRequestServer[FilesT]):
         change(path)
         return request.acknowledge(offset=request.offset)
 
-    def _remove_file(self, _: FtpPeer, request: FtpPacket) -> FtpPacket:
-        return self._change(request, self.files.remove_file)
-
-    def _remove_folder(self, _: FtpPeer, request: FtpPacket) -> FtpPacket:
-        return self._change(request, self.files.remove_folder)
-
-    def _make_folder(self, _: FtpPeer, request: FtpPacket) -> FtpPacket:
-        return self._change(request, self.files.make_folder)
-
     def _truncate(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
         return self._change(request, lambda path: self.files.truncate(path, request.offset))
 
@@ -409,9 +400,9 @@ _HANDLERS: dict[int, Callable[[SessionFtpServer[Any], FtpPeer, FtpPacket], FtpPa
     Op.READFILE: lambda server, peer, request: server._read(peer, request),
     Op.CREATEFILE: lambda server, peer, request: server._open(peer, request),
     Op.WRITEFILE: lambda server, peer, request: server._write(peer, request),
-    Op.REMOVEFILE: lambda server, peer, request: server._remove_file(peer, request),
-    Op.CREATEDIRECTORY: lambda server, peer, request: server._make_folder(peer, request),
-    Op.REMOVEDIRECTORY: lambda server, peer, request: server._remove_folder(peer, request),
+    Op.REMOVEFILE: lambda server, _, request: server._change(request, server.files.remove_file),
+    Op.CREATEDIRECTORY: lambda server, _, request: server._change(request, server.files.make_folder),
+    Op.REMOVEDIRECTORY: lambda server, _, request: server._change(request, server.files.remove_folder),
     Op.OPENFILEWO: lambda server, peer, request: server._open(peer, request),
     Op.TRUNCATEFILE: lambda server, peer, request: server._truncate(peer, request),
     Op.RENAME: lambda server, peer, request: server._rename(peer, request),

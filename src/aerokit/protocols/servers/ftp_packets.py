@@ -29,14 +29,7 @@ class FtpPacket(FtpMessage):
         session = self.session if session is None else session
         sequence, opcode = self.sequence + 1 & 0xFFFF, MavFtpOpcode.ACK
         return FtpPacket(
-            sequence,
-            opcode,
-            session,
-            len(data),
-            self.opcode,
-            offset=offset & 0xFFFFFFFF,
-            data=data,
-            client=self.client,
+            sequence, opcode, session, len(data), self.opcode, offset=offset & 0xFFFFFFFF, data=data, client=self.client
         )
 
     def refuse(self, code: int, errno: int | None = None) -> FtpPacket:

@@ -216,13 +216,18 @@ class GimbalRequests:
         done = self.apply(whole(command.x), (0.0, pitch, yaw), (0.0, pitch_rate, yaw_rate))
         return MavResult.ACCEPTED if done else MavResult.DENIED
 
+    def _refusal(self, device_id: float, command: ReceivedCommand) -> int | None:
+        """Return the answer to a command that the gimbal cannot or must not execute, else None."""
+        if not self._gimbal.can_point_at_positions:
+            return MavResult.UNSUPPORTED
+        is_allowed = self._is_mine(device_id) and self._gimbal.is_in_control(command.sender)
+        return None if is_allowed else MavResult.DENIED
+
     def look_at(self, command: ReceivedCommand) -> int:
         """Point at a position; the altitude of a COMMAND_LONG is above mean sea level."""
         gimbal = self._gimbal
-        if not gimbal.can_point_at_positions:
-            return MavResult.UNSUPPORTED
-        if not self._is_mine(command.param1) or not gimbal.is_in_control(command.sender):
-            return MavResult.DENIED
+        if (refusal := self._refusal(command.param1, command)) is not None:
+            return refusal
         frame = MavFrame.GLOBAL if command.is_long else command.altitude_frame
         altitude = command.z
         if frame not in _ABSOLUTE:
@@ -232,12 +237,9 @@ class GimbalRequests:
 
     def follow(self, command: ReceivedCommand) -> int:
         """Follow the vehicle whose system id is param 1."""
-        gimbal = self._gimbal
-        if not gimbal.can_point_at_positions:
-            return MavResult.UNSUPPORTED
-        if not self._is_mine(command.param2) or not gimbal.is_in_control(command.sender):
-            return MavResult.DENIED
-        gimbal.follow(whole(command.param1))
+        if (refusal := self._refusal(command.param2, command)) is not None:
+            return refusal
+        self._gimbal.follow(whole(command.param1))
         return MavResult.ACCEPTED
 
     def on_global_position(self, message: m.GlobalPositionInt, _: Channel) -> None:
@@ -245,12 +247,9 @@ class GimbalRequests:
         self._gimbal.update_followed(sender_of(message)[0], (message.lat, message.lon, message.alt * 1e-3))
 
     def look_ahead(self, command: ReceivedCommand) -> int:
-        gimbal = self._gimbal
-        if not gimbal.can_point_at_positions:
-            return MavResult.UNSUPPORTED
-        if not self._is_mine(command.param1) or not gimbal.is_in_control(command.sender):
-            return MavResult.DENIED
-        gimbal.look_at(None)
+        if (refusal := self._refusal(command.param1, command)) is not None:
+            return refusal
+        self._gimbal.look_at(None)
         return MavResult.ACCEPTED
 
     def apply(self, flags: int, angles: Angles, rates: Angles) -> bool:

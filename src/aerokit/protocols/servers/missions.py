@@ -19,15 +19,7 @@ AnyRequest = m.MissionRequestInt | m.MissionRequest
 
 def item_from(message: AnyItem) -> MissionItem:
     """Convert a MISSION_ITEM_INT or MISSION_ITEM to an item; does not scale ``x`` and ``y``."""
-    numbers = (
-        message.param1,
-        message.param2,
-        message.param3,
-        message.param4,
-        message.x,
-        message.y,
-        message.z,
-    )
+    numbers = (message.param1, message.param2, message.param3, message.param4, message.x, message.y, message.z)
     return MissionItem(message.command, message.frame, *numbers, autocontinue=bool(message.autocontinue))
 
 
@@ -36,22 +28,12 @@ def item_message_int(
 ) -> m.MissionItemInt:
     system, component = to
     return to_wire(
-        item,
-        seq,
-        target_system=system,
-        target_component=component,
-        mission_type=mission_type,
-        current=current,
+        item, seq, target_system=system, target_component=component, mission_type=mission_type, current=current
     )
 
 
 def item_message_float(
-    item: MissionItem,
-    place: tuple[float, float],
-    seq: int,
-    to: tuple[int, int],
-    mission_type: int,
-    current: int = 0,
+    item: MissionItem, place: tuple[float, float], seq: int, to: tuple[int, int], mission_type: int, current: int = 0
 ) -> m.MissionItem:
     """Create a MISSION_ITEM; ``place`` becomes ``x`` and ``y``."""
     head = (*to, seq, item.frame, item.command, current, int(item.autocontinue))

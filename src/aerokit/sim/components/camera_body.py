@@ -12,8 +12,8 @@ from aerokit.mavlink.enums import CameraCapFlags, CameraMode, CameraSource, MavT
 from aerokit.mavlink.messages import CameraImageCaptured, CameraTrackingGeoStatus, StorageInformation
 from aerokit.parameters import parse_definition
 from aerokit.parameters.definition import CameraDefinition
-from aerokit.protocols.servers.camera import CameraDevice, camera_builders
-from aerokit.protocols.servers.captures import Shot
+from aerokit.protocols.servers.camera import camera_builders
+from aerokit.protocols.servers.camera_device import CameraDevice, Shot
 from aerokit.protocols.servers.files import FileTree
 from aerokit.protocols.servers.host import ServerHost
 from aerokit.protocols.servers.intervals import Builder

@@ -17,6 +17,7 @@ from aerokit.autopilots import Autopilot, AutopilotVersion
 from aerokit.connection.cells import Source, StateCell
 from aerokit.errors import FileFormatError, FileTimeout, InvalidArgument, OperationRejected
 from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import MavCmd
 from aerokit.vehicle.session.rates import ComponentSubscriber, MessageRates
 from aerokit.vehicle.session.transfers import Transfers
 
@@ -67,6 +68,7 @@ class ComponentSession:
             background=session.background,
             describe=self.describe_link,
             round_trip_s=lambda: session.link_watch.round_trip_s,
+            request_version=self._request_version,
         )
         autopilot, source = (
             self.transfers.autopilot,
@@ -80,6 +82,10 @@ class ComponentSession:
 
     def at_close(self, *functions: Detach) -> None:
         self._session.at_close(*functions)
+
+    async def _request_version(self) -> None:
+        version = m.AutopilotVersion.ID
+        await self.commands.send_long(MavCmd.REQUEST_MESSAGE, version, component_id=self.component_id)
 
     def describe_link(self) -> str:
         received_at = self.connection.last_heartbeat_at(self.system_id, self.component_id)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Protocol, TypeVar
 import anyio
 
 from aerokit.connection.exchanges import run_exchange
-from aerokit.errors import AerokitError, ConnectionClosed, OperationTimeout
+from aerokit.errors import AerokitError, CommandRejected, CommandTimeout, ConnectionClosed, OperationTimeout
 from aerokit.protocols.exchange import RoundTrip
 
 if TYPE_CHECKING:
@@ -57,6 +57,7 @@ class Transfers:
         describe: Callable[[], str],
         round_trip_s: Callable[[], float | None] = lambda: None,
         send_command: Callable[..., Awaitable[object]] | None = None,
+        request_version: Callable[[], Awaitable[object]] | None = None,
     ) -> None:
         self.connection = connection
         self.began_at: float = connection.now()
@@ -68,7 +69,8 @@ class Transfers:
         self.round_trip: RoundTrip = RoundTrip()
         """Round trip measured by previous transfers, initially by TIMESYNC."""
         self.is_closed: bool = False
-        self._send_command = send_command
+        self._is_version_unavailable = False
+        self._send_command, self._request_version = send_command, request_version
         self._version, self._describe, self._round_trip_s = version, describe, round_trip_s
 
     async def run(self, exchange: Exchange[ResultT], *, timeout: float | None = None) -> ResultT:
@@ -136,10 +138,13 @@ class Transfers:
 
     async def capabilities(self) -> int | None:
         """Return the MAV_PROTOCOL_CAPABILITY bits of the autopilot; None if it does not send them within a few
-        seconds.
+        seconds. A component that does not send them is requested once.
         """
-        if not self._version.is_known:
-            with anyio.move_on_after(VERSION_TIMEOUT_S):
+        if not self._version.is_known and not self._is_version_unavailable:
+            with anyio.move_on_after(VERSION_TIMEOUT_S), suppress(CommandRejected, CommandTimeout):
+                if self._request_version is not None:
+                    await self._request_version()
                 await self._version.wait_until(lambda _: True)
+            self._is_version_unavailable = self._request_version is not None and not self._version.is_known
         version = self._version.latest
         return None if version is None else version.capabilities

@@ -1,13 +1,14 @@
-"""Images, videos and tracking of a camera server."""
+"""A camera as its protocol servers see it: the device, its images, videos and tracking."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Protocol
+from functools import partial
+from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import CameraCapFlags, CameraTrackingMode, MavResult
+from aerokit.mavlink.enums import CameraCapFlags, CameraMode, CameraSource, CameraTrackingMode, MavResult
 from aerokit.mavlink.enums import CameraTrackingStatusFlags as Flags
 from aerokit.mavlink.enums import CameraTrackingTargetData as Target
 from aerokit.mavlink.messages import CameraCaptureStatus, CameraImageCaptured
@@ -26,33 +27,135 @@ MIN_STATUS_INTERVAL_S = 0.02
 Shot = Callable[..., CameraImageCaptured]
 
 
-class ImagingDevice(Protocol):
-    """The camera, as its captures and its tracking use it; see `CameraDevice`."""
+_NOWHERE = (math.nan, math.nan, math.nan, math.nan)
 
-    shutter_s: float
-    max_images: int
+
+class CameraDevice:
+    """A camera: its state, and methods that the protocol calls. Subclasses execute them.
+
+    Methods that are refused raise an error; the command is answered with it.
+    """
+
+    vendor: str = "aerokit"
+    model: str = "camera"
+    firmware_version: int = 1 << 24
+    definition_version: int = 0
+    definition_uri: str = ""
+    resolution: tuple[int, int] = (0, 0)
+    sensor_mm: tuple[float, float] = (math.nan, math.nan)
+    focal_length_mm: float = math.nan
+    streams: tuple[str, ...] = ()
+    stream_size: tuple[int, int] = (1920, 1080)
+    stream_hz: float = 30.0
+    stream_bits_s: int = 4_000_000
+    thermal_celsius: tuple[float, float] | None = None
+    capabilities: int = 0
+    """CAMERA_CAP_FLAGS."""
+    max_images: int = 10_000
+    """Images that the image log holds."""
+    shutter_s: float = 0.0
+    """Least time between two images of a series."""
+    mode: int = CameraMode.IMAGE
+    source: int = CameraSource.DEFAULT
 
     @property
-    def host(self) -> ServerHost: ...
+    def host(self) -> ServerHost:
+        """The component."""
+        raise NotImplementedError
+
+    def set_up_captures(self) -> None:
+        """Create the parts; call it once."""
+        self.captures: Captures = Captures(self)
+        self.tracking: Tracking = Tracking(self)
+        self.running_streams: set[int] = set()
+        """Numbers of the active streams, starting at 1."""
+
+    def can(self, *flags: int) -> bool:
+        """Return True if the camera has one of these CAMERA_CAP_FLAGS."""
+        return any(self.capabilities & flag for flag in flags)
 
     @property
-    def free_mib(self) -> float: ...
+    def zoom(self) -> float:
+        """Zoom in percent; NaN if unknown."""
+        return math.nan
 
-    def can(self, *flags: int) -> bool: ...
+    @property
+    def focus(self) -> float:
+        """Focus in percent; NaN if unknown."""
+        return math.nan
 
-    def expose(self, done: Callable[[Shot | None], None]) -> None: ...
+    @property
+    def free_mib(self) -> float:
+        """Free space for images and videos."""
+        return math.inf
 
-    def failed_shot(self) -> Shot: ...
+    @property
+    def gimbal_device_id(self) -> int:
+        """Component id of the gimbal that carries the camera; 0 if there is none."""
+        return 0
 
-    def store_image(self, image: CameraImageCaptured) -> str | None: ...
+    def expose(self, done: Callable[[Shot | None], None]) -> None:
+        """Take an image; call ``done`` when it is taken, with None if it failed."""
+        raise NotImplementedError
 
-    async def track(self, place: tuple[float, ...]) -> None: ...
+    def failed_shot(self) -> Shot:
+        """Return the content of CAMERA_IMAGE_CAPTURED for an image that could not be taken."""
+        return partial(CameraImageCaptured, self.host.time_boot_ms, 0, 0, 0, 0, 0, 0, _NOWHERE, file_url="")
+
+    def has_space(self) -> bool:
+        """Return True if another image fits."""
+        return self.free_mib > 0
+
+    def store_image(self, image: CameraImageCaptured) -> str | None:
+        """Write the file of an image and return its URL; None if it cannot be stored."""
+        return ""
+
+    def storage(self, number: int) -> list[m.StorageInformation]:
+        """Return STORAGE_INFORMATION of a storage, or of all for 0."""
+        return []
+
+    def tracked_place(self) -> list[m.CameraTrackingGeoStatus]:
+        """Return CAMERA_TRACKING_GEO_STATUS; empty if unknown."""
+        return []
+
+    async def start_video(self) -> None:
+        """Begin to record."""
+
+    async def stop_video(self) -> None:
+        """End the recording."""
+
+    async def set_mode(self, mode: int) -> None:
+        """Set the CAMERA_MODE, which the protocol has checked."""
+
+    async def set_zoom(self, kind: int, value: float) -> bool:
+        """Apply SET_CAMERA_ZOOM; return False if type or value is not supported."""
+        return False
+
+    async def set_focus(self, kind: int, value: float) -> bool:
+        """Apply SET_CAMERA_FOCUS; return False if type or value is not supported."""
+        return False
+
+    async def set_source(self, source: int) -> bool:
+        """Show another sensor (CAMERA_SOURCE); return False if there is none."""
+        return source == CameraSource.DEFAULT
+
+    async def switch_stream(self, numbers: set[int], *, on: bool) -> None:
+        """Start or stop video streams."""
+
+    async def track(self, place: tuple[float, ...]) -> None:
+        """Track a point (x, y, radius), a rectangle (left, top, right, bottom) or nothing (empty)."""
+
+    async def format_storage(self) -> None:
+        """Erase images and videos."""
+
+    async def reset_settings(self) -> None:
+        """Restore the default settings."""
 
 
 class Captures:
     """Series of images, videos, and the image log. An image begins when the device has finished the one before."""
 
-    def __init__(self, camera: ImagingDevice) -> None:
+    def __init__(self, camera: CameraDevice) -> None:
         self._camera = camera
         self.images: list[CameraImageCaptured] = []
         """Images since the image log was last cleared, by image index."""
@@ -177,7 +280,7 @@ _UNKNOWN = math.nan
 class Tracking:
     """Tracking of a point or a rectangle in the image; call ``lose()`` to lose the target."""
 
-    def __init__(self, camera: ImagingDevice) -> None:
+    def __init__(self, camera: CameraDevice) -> None:
         self._camera = camera
         self.reset()
 
