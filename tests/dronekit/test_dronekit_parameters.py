@@ -275,7 +275,7 @@ def test_old_parameter_names_work_on_new_firmware(fc: FlightController) -> None:
     fc.parameters.values = {"LOIT_SPEED": 500.0, "MOT_SPIN_MIN": 0.125, "GPS1_TYPE": 1.0}
     with connected(fc, wait_ready=["parameters"]) as vehicle:
         for name, value, new in [
-            ("WPNAV_LOIT_SPEED", 500, "LOIT_SPEED_MS"),
+            ("WPNAV_LOIT_SPEED", 500, "LOIT_SPEED"),
             ("THR_MIN", 125, "MOT_SPIN_MIN"),
             ("GPS_TYPE", 1, "GPS1_TYPE"),
         ]:
