@@ -11,11 +11,13 @@ from typing import Any
 
 import pytest
 
+import aerokit
+
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
 HAS_MAVSDK = importlib.util.find_spec("mavsdk") is not None
 AIMS = {
-    "decode_skip": 10.0,
-    "decode_typed": 6.0,
+    "decode_skip": 50.0 if aerokit.wire_implementation == "c" else 10.0,
+    "decode_typed": 18.0 if aerokit.wire_implementation == "c" else 6.0,
     "command_rtt_pymavlink": 0.667,
     "command_rtt_mavsdk": 1.667,
     "import": 0.667,

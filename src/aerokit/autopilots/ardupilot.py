@@ -201,7 +201,7 @@ class ArduPilot(Autopilot):
             *("ODOMETRY", "HIL_STATE_QUATERNION", "ACTUATOR_CONTROL_TARGET"),
         )
     )
-    highres_imu_field_ut = 1e-4
+    highres_imu_field_ut: float = 1e-4
     unsupported_commands: frozenset[int] = NOT_ON_ARDUPILOT
     reports_gripper_by_text = True
     winch_actions: frozenset[int] = frozenset((0, 1, 2))

@@ -444,11 +444,11 @@ class Autopilot:
 
     unsupported_commands: frozenset[int] = frozenset()
     """MAV_CMDs without a handler in the firmware. Actions that need one raise NotSupported before anything is sent."""
-    reports_gripper_by_text = False
+    reports_gripper_by_text: bool = False
     """True if a gripper is acknowledged at once and its end reported by status text; otherwise the ack comes then."""
-    highres_imu_field_ut = 100.0
+    highres_imu_field_ut: float = 100.0
     """Microtesla for 1 in the magnetic field of HIGHRES_IMU, which is in gauss, but not on ArduPilot."""
-    has_shell = False
+    has_shell: bool = False
     """True if SERIAL_CONTROL reaches a system shell."""
     winch_actions: frozenset[int] = frozenset(range(10))
     """WINCH_ACTIONS that MAV_CMD_DO_WINCH (42600) supports."""

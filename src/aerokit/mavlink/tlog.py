@@ -43,6 +43,7 @@ _compiled: Any = None if wire is None else wire.tlog_records
 
 
 def _records(file: BinaryIO) -> Iterator[tuple[float, bytes]]:
+    begin: int
     data, begin, ended, earliest = b"", 0, False, 0
     end: int | None
     while True:

@@ -95,10 +95,15 @@ class CameraDriver:
         for name, text in (("vendor", vendor), ("model", model)):
             if len(text.encode()) > 32:
                 raise InvalidArgument(f"{name} = {text!r} is not allowed: at most 32 bytes")
-        self.vendor, self.model, self.resolution = vendor, model, resolution
-        self.focal_length_mm, self.sensor_mm = focal_length_mm, sensor_mm
-        self.streams, self.has_modes = tuple(streams), has_modes
-        self.definition, self.gimbal_id = definition, gimbal_id
+        self.vendor: str = vendor
+        self.model: str = model
+        self.resolution: tuple[int, int] = resolution
+        self.focal_length_mm: float = focal_length_mm
+        self.sensor_mm: tuple[float, float] = sensor_mm
+        self.streams: tuple[str, ...] = tuple(streams)
+        self.has_modes: bool = has_modes
+        self.definition: bytes | None = definition
+        self.gimbal_id: int = gimbal_id
         self.zoom_percent: float = math.nan
         """Zoom to report; assign it when it changes."""
         self.focus_percent: float = math.nan

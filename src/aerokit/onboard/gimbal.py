@@ -65,9 +65,11 @@ class GimbalDriver:
                 raise InvalidArgument(f"{name} = ({low}, {high}) is not allowed: a smallest and a greatest angle")
         if not max_rate_deg_s > 0 or not 0 <= attitude_hz <= 100:
             raise InvalidArgument("max_rate_deg_s must be above 0, attitude_hz 0 to 100")
-        self.vendor, self.model = vendor, model
-        self.limits_deg = (roll_deg, pitch_deg, yaw_deg)
-        self.max_rate_deg_s, self.attitude_hz = max_rate_deg_s, attitude_hz
+        self.vendor: str = vendor
+        self.model: str = model
+        self.limits_deg: tuple[tuple[float, float], ...] = (roll_deg, pitch_deg, yaw_deg)
+        self.max_rate_deg_s: float = max_rate_deg_s
+        self.attitude_hz: float = attitude_hz
 
     def point(self, target: GimbalTarget) -> None:
         """Begin to turn to a target, within the limits. Called on the event loop: return at once."""

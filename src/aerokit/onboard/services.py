@@ -27,7 +27,9 @@ class ComponentServices:
     """Commands, streams, parameters and files in memory of one component."""
 
     def __init__(self, host: ComponentHost, tasks: BackgroundTasks, parameters: ComponentParameters) -> None:
-        self.host, self.tasks, self.parameters = host, tasks, parameters
+        self.host: ComponentHost = host
+        self.tasks: BackgroundTasks = tasks
+        self.parameters: ComponentParameters = parameters
         self.commands: ComponentCommands = ComponentCommands(host, tasks)
         self.streams: MessageStreams = MessageStreams(
             host, min_interval_s=MIN_STREAM_INTERVAL_S, max_streams=MAX_STREAMS

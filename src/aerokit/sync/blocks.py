@@ -203,7 +203,8 @@ class BlockTwin(TwinOf[BlockT]):
         return self
 
     def __exit__(self, exc_type: Any, exc: Any, traceback: Any) -> None:
-        self._loop.run(self.aio.__aexit__, exc_type, exc, traceback)
+        exit_block: Any = self.aio.__aexit__  # the blocks name its parameters differently
+        self._loop.run(exit_block, exc_type, exc, traceback)
 
 
 class StreamTwin(BlockTwin["SetpointStream[T]"], Generic[T]):

@@ -116,7 +116,7 @@ async def test_failed_compass_raises_with_fitness(monkeypatch: pytest.MonkeyPatc
 
 async def test_ardupilot_accelerometer_confirms_each_pose_once() -> None:
     async with stage(SimulatedCopter) as (_, vehicle, wire):
-        poses = []
+        poses, step = [], None
         async for step in vehicle.calibrate.accelerometer():
             if step.needs_confirmation:
                 poses.append(step.pose)
@@ -130,6 +130,7 @@ async def test_ardupilot_accelerometer_confirms_each_pose_once() -> None:
             Pose.BACK,
         ]
         assert [params[0] for params in orders(wire, MavCmd.ACCELCAL_VEHICLE_POS)] == [1, 2, 3, 4, 5, 6]
+        assert step is not None
         assert step.result is not None
         assert step.result.reboot_due
 

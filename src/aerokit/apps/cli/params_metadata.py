@@ -111,7 +111,7 @@ def about(metadata: Metadata | None, parameter: Parameter) -> dict[str, object]:
     # Metadata under another name may have another unit.
     known = None if metadata is None else metadata.get(parameter.name)
     if known is None:
-        return dict.fromkeys(("unit", "minimum", "maximum", "meaning"))
+        return {"unit": None, "minimum": None, "maximum": None, "meaning": None}
     has_names = parameter.value in known.values or known.bitmask
     meaning = known.describe(parameter.value) if has_names else None
     return {"unit": known.unit or None, "minimum": known.minimum, "maximum": known.maximum, "meaning": meaning}

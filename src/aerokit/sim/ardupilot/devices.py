@@ -22,10 +22,11 @@ class ArduPilotDevices:
 
     def __init__(self, vehicle: ArduPilotHost) -> None:
         self._vehicle = vehicle
-        self.is_gripped = False
-        self.gear_is_up = False
-        self.chute_is_released = False
-        self.line_m = self.line_rate_m_s = 0.0
+        self.is_gripped: bool = False
+        self.gear_is_up: bool = False
+        self.chute_is_released: bool = False
+        self.line_m: float = 0.0
+        self.line_rate_m_s: float = 0.0
         self._goal_m: float | None = None
 
     def commands(self) -> dict[int, CommandHandler]:

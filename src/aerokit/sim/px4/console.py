@@ -23,7 +23,7 @@ class Px4Shell:
 
     def __init__(self, px4: SimulatedVehicle) -> None:
         self._px4, self._line = px4, b""
-        self.is_open = False
+        self.is_open: bool = False
         px4.on(m.SerialControl, self._on_input)
 
     def _on_input(self, message: m.SerialControl, channel: Channel) -> None:

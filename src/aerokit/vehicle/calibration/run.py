@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.commanding.context import VehicleContext
     from aerokit.vehicle.commanding.order import SentCommand
     from aerokit.vehicle.parameters.parameters import Parameters
+    from aerokit.vehicle.session.session import VehicleSession
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
@@ -50,10 +51,13 @@ class CalibrationRun:
     def __init__(
         self, context: VehicleContext, sensor: str, runs: list[CalibrationRun], parameters: Callable[[], Parameters]
     ) -> None:
-        self.context, self.session, self.sensor, self.parameters = context, context.session, sensor, parameters
-        self.what = f"calibrate.{sensor}"
+        self.context: VehicleContext = context
+        self.session: VehicleSession = context.session
+        self.sensor: str = sensor
+        self.parameters: Callable[[], Parameters] = parameters
+        self.what: str = f"calibrate.{sensor}"
         self._runs = runs  # those of the vehicle that may be running
-        self.step = partial(CalibrationStep, sensor)
+        self.step: partial[CalibrationStep] = partial(CalibrationStep, sensor)
         self._cancel: tuple[float, ...] | None = None
         self._why_not_cancelled = ""
         self._started_at = math.inf

@@ -80,7 +80,8 @@ class TuningActions(VehicleBase):
                 if answer.command == MavCmd.DO_AUTOTUNE_ENABLE and self._session.commands.is_for_us(answer):
                     return answer
             await anyio.sleep(POLL_INTERVAL_S / 20)
-        raise CommandTimeout("autotune: MAV_CMD_DO_AUTOTUNE_ENABLE was not acknowledged; PX4 may go on tuning")
+        link = self._session.describe_link()
+        raise CommandTimeout(f"autotune: MAV_CMD_DO_AUTOTUNE_ENABLE was not acknowledged; PX4 may go on tuning; {link}")
 
 
 def _received_at(answer: CommandAck) -> float:

@@ -133,6 +133,9 @@ class Shell(ReadOnly):
             while not text.endswith(PROMPTS):
                 text += await self.read(timeout=max(0.0, until - now()))
         except OperationTimeout:
-            raise OperationTimeout(f"shell: {command!r} was not done within {timeout:g} s; output: {text!r}") from None
+            link = self._session.describe_link()
+            raise OperationTimeout(
+                f"shell: {command!r} was not done within {timeout:g} s; output: {text!r}; {link}"
+            ) from None
         text = text.removeprefix(command).removeprefix("\n")
         return text.rpartition("\n")[0] if "\n" in text else ""

@@ -35,7 +35,7 @@ class UlogAssembler:
     """
 
     def __init__(self) -> None:
-        self.lost = 0
+        self.lost: int = 0
         """Number of messages that were not received."""
         self._next: int | None = None
         self._began = self._is_aligned = False

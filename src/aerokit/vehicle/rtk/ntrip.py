@@ -57,8 +57,10 @@ class Caster:
     """Address of a mount point, with the credentials. Its repr and texts do not contain the password."""
 
     def __init__(self, host: str, port: int, mount: str, credentials: str, is_encrypted: bool) -> None:
-        self.host, self.port, self.mount = host, port, mount
-        self.is_encrypted = is_encrypted
+        self.host: str = host
+        self.port: int = port
+        self.mount: str = mount
+        self.is_encrypted: bool = is_encrypted
         self._credentials = credentials
 
     @classmethod
