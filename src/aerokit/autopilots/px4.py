@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 from aerokit.autopilots.base import (
     NAN,
@@ -99,7 +99,7 @@ class Px4(Autopilot):
     setpoints: SetpointRules = SetpointRules(stream_before_mode=True, attitude_rate=True, trajectory=True)
     sticks: StickRules | None = StickRules(release="none")
     external: ExternalRules = PX4_EXTERNAL
-    actuators_until = (1, 14)  # removed on 2023-03-06: MavlinkReceiver.cpp, commit 27658354
+    actuators_until: tuple[int, int] | None = (1, 14)  # removed on 2023-03-06: MavlinkReceiver.cpp, commit 27658354
     reposition: Reposition | None = Reposition(relative_altitude=False, yaw=True, speed=True)
     gimbals: GimbalRules = GimbalRules(*[False] * 6)
     log_suffix = ".ulg"
@@ -153,7 +153,7 @@ class Px4(Autopilot):
     def __init__(self, vehicle_type: int) -> None:
         super().__init__(vehicle_type)
         self.is_surface_vehicle: bool = vehicle_type in (MavType.GROUND_ROVER, MavType.SURFACE_BOAT)
-        self.circles_by = None if self._cannot_fly else "orbit"
+        self.circles_by: Literal["orbit", "reposition", "setpoints"] | None = None if self._cannot_fly else "orbit"
         self.lands_after_return: bool = not self._cannot_fly and vehicle_type != MavType.FIXED_WING
         if vehicle_type == MavType.FIXED_WING or vehicle_type in VTOLS:
             # Only the fixed-wing controller has an airspeed. PX4 takes every other type for the cruise speed

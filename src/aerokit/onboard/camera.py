@@ -207,12 +207,16 @@ class CameraAdapter(CameraDevice):
     def __init__(
         self, camera: CameraDriver, host: ComponentHost, tasks: BackgroundTasks, call: Callable[..., Any]
     ) -> None:
-        self.vendor, self.model, self.resolution = camera.vendor, camera.model, camera.resolution
-        self.focal_length_mm, self.sensor_mm = camera.focal_length_mm, camera.sensor_mm
-        self.streams, self.capabilities = camera.streams, capabilities_of(camera)
+        self.vendor: str = camera.vendor
+        self.model: str = camera.model
+        self.resolution: tuple[int, int] = camera.resolution
+        self.focal_length_mm: float = camera.focal_length_mm
+        self.sensor_mm: tuple[float, float] = camera.sensor_mm
+        self.streams: tuple[str, ...] = camera.streams
+        self.capabilities: int = capabilities_of(camera)
         self._camera, self._host, self._tasks, self._call = camera, host, tasks, call
         self.set_up_captures()
-        self.running_streams = set(range(1, len(self.streams) + 1))
+        self.running_streams: set[int] = set(range(1, len(self.streams) + 1))
 
     @property
     def host(self) -> ServerHost:

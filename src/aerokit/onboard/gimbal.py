@@ -92,12 +92,15 @@ class GimbalAdapter(GimbalMount):
     """Serves the gimbal protocol for a program's gimbal."""
 
     def __init__(self, gimbal: GimbalDriver, host: ComponentHost) -> None:
-        self.vendor, self.model = gimbal.vendor, gimbal.model
+        self.vendor: str = gimbal.vendor
+        self.model: str = gimbal.model
         roll, pitch, yaw = gimbal.limits_deg
-        self.limits = tuple((math.radians(low), math.radians(high)) for low, high in (roll, pitch, yaw))
-        self.slew_rad_s = math.radians(gimbal.max_rate_deg_s)
-        self.can_point_at_positions = type(gimbal).look_at is not GimbalDriver.look_at
-        self.capabilities = ALL_CAPABILITIES
+        self.limits: tuple[tuple[float, float], ...] = tuple(
+            (math.radians(low), math.radians(high)) for low, high in (roll, pitch, yaw)
+        )
+        self.slew_rad_s: float = math.radians(gimbal.max_rate_deg_s)
+        self.can_point_at_positions: bool = type(gimbal).look_at is not GimbalDriver.look_at
+        self.capabilities: int = ALL_CAPABILITIES
         for axis, limits in ((_ROLL, roll), (_PITCH, pitch), (_YAW, yaw)):
             if limits[0] == limits[1]:
                 self.capabilities &= ~axis
@@ -148,7 +151,8 @@ class GimbalAdapter(GimbalMount):
         else:
             position = Position(place[0] / 1e7, place[1] / 1e7, altitude_amsl_m=place[2])
         self._gimbal.look_at(position)
-        self.flags, self._is_locked = 0, position is not None
+        self.flags: int = 0
+        self._is_locked = position is not None
         self._followed = 0
 
     def follow(self, system_id: int) -> None:

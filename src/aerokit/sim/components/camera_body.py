@@ -85,8 +85,9 @@ class CameraBody(SimulatedComponent, CameraDevice):
         self.picture = picture
         self.capabilities: int = capabilities | (CameraCapFlags.HAS_VIDEO_STREAM if streams else 0)
         self.capabilities |= CameraCapFlags.HAS_THERMAL_RANGE if thermal_celsius else 0
-        self.definition_version = self.definition.version
-        self.sensor_mm, self.focal_length_mm = _SENSOR_MM, FOCAL_LENGTH_MM
+        self.definition_version: int = self.definition.version
+        self.sensor_mm: tuple[float, float] = _SENSOR_MM
+        self.focal_length_mm: float = FOCAL_LENGTH_MM
         self.card: MemoryCard = MemoryCard(capacity_mib)
         self.set_up_captures()
         self.mode: int = CameraMode.IMAGE
@@ -171,7 +172,7 @@ class CameraBody(SimulatedComponent, CameraDevice):
         self.reset_lens()
         self.parameters.restart()
         self.tracking.reset()
-        self.running_streams = set(range(1, len(self.streams) + 1))
+        self.running_streams: set[int] = set(range(1, len(self.streams) + 1))
 
     def builders(self) -> dict[int, Builder]:
         return camera_builders(self)

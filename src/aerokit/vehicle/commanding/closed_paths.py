@@ -35,7 +35,8 @@ class Circle(ClosedPath):
     """A circle; the phase is the bearing from its centre in radians."""
 
     def __init__(self, radius_m: float, *, clockwise: bool, first_phase: float) -> None:
-        self._radius_m, self._way, self.first_phase = radius_m, 1 if clockwise else -1, first_phase
+        self._radius_m, self._way = radius_m, 1 if clockwise else -1
+        self.first_phase: float = first_phase
 
     def at(self, phase: float) -> tuple[Vector, Vector, Vector]:
         angle = self.first_phase + self._way * (phase - self.first_phase)
