@@ -36,6 +36,7 @@ class CasterServer:
     requests: list[str] = field(default_factory=list)
     sentences: list[str] = field(default_factory=list)
     open_connections: int = 0
+    serving: set[asyncio.Task[None]] = field(default_factory=set)
     received_sentence: asyncio.Event = field(default_factory=asyncio.Event)
 
     def url(self, mount: str = "MOUNT", credentials: str = "someone:se%3Acr%40t@") -> str:
@@ -54,15 +55,21 @@ class CasterServer:
 
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.open_connections += 1
+        task = asyncio.current_task()
+        assert task is not None
+        self.serving.add(task)
         try:
             request = (await reader.readuntil(b"\r\n\r\n")).decode()
             self.requests.append(request)
             await self._reply(request, reader, writer)
-        except (OSError, asyncio.IncompleteReadError):
+        except (OSError, asyncio.IncompleteReadError, asyncio.CancelledError):
             pass
         finally:
             self.open_connections -= 1
             writer.close()
+            with suppress(OSError):
+                await writer.wait_closed()
+            self.serving.discard(task)
 
     async def _reply(self, request: str, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         mount = request.split()[1]
@@ -100,5 +107,9 @@ async def open_caster(**settings: object) -> AsyncIterator[CasterServer]:
         yield caster
     finally:
         server.close()
+        serving = list(caster.serving)
+        for task in serving:
+            task.cancel()
+        await asyncio.gather(*serving, return_exceptions=True)
         with suppress(asyncio.CancelledError):
             await server.wait_closed()
