@@ -74,9 +74,7 @@ class CalibrationRun:
         autopilot = self.session.autopilot
         if not autopilot.calibration_protocol:
             raise NotSupported(f"{self.what}: calibrations of {autopilot.firmware} are not known; nothing was sent")
-        if not self.session.telemetry.is_confirmed_disarmed or not self.context.arbiter.is_known:
-            state = "armed" if self.session.telemetry.is_armed else "not known to be disarmed"
-            raise OperationRejected(f"{self.what}: the vehicle is {state}; nothing was sent")
+        self.session.check_disarmed(self.what, is_current=self.context.arbiter.is_known)
 
     async def begin(self, cancel: tuple[float, ...] | None, why_not_cancelled: str = "") -> None:
         """Claim the vehicle. A calibration that is being cancelled is waited for.

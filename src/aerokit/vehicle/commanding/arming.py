@@ -269,9 +269,8 @@ class ArmingActions(VehicleBase):
             LinkLost: the link went down with the vehicle (USB, TCP); connect again.
             OperationTimeout: the vehicle did not restart in time.
         """
-        if not force and not self.telemetry.is_confirmed_disarmed:
-            state = "armed" if self.telemetry.is_armed else "not known to be disarmed"
-            raise OperationRejected(f"reboot: the vehicle is {state}; nothing was sent")
+        if not force:
+            self._session.check_disarmed("reboot")
         reboots = self._session.watch.reboots
         self._session.link_watch.request_time()  # Request the time before the reboot, to compare with.
         unanswered: CommandTimeout | None = None

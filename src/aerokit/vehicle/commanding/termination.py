@@ -6,7 +6,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Literal
 
 from aerokit._internal.arguments import checks_arguments
-from aerokit.errors import CommandTimeout, LinkLost, NotSupported, OperationRejected
+from aerokit.errors import CommandTimeout, LinkLost, NotSupported
 from aerokit.mavlink.enums import MavCmd, MavState
 from aerokit.vehicle.commanding.context import VehicleBase
 from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, await_progress
@@ -89,9 +89,7 @@ class TerminationActions(VehicleBase):
         """
         if not self.autopilot.can_shut_down:
             raise NotSupported(f"shutdown: {self.autopilot.firmware} cannot be switched off; nothing was sent")
-        if not self.telemetry.is_confirmed_disarmed:
-            state = "armed" if self.telemetry.is_armed else "not known to be disarmed"
-            raise OperationRejected(f"shutdown: the vehicle is {state}; nothing was sent")
+        self._session.check_disarmed("shutdown")
         try:
             await self._sender.auxiliary_command(MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, SHUTDOWN, **ONCE)
         except CommandTimeout as error:

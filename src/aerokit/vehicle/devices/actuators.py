@@ -234,9 +234,7 @@ class Actuators(ReadOnly):
         else:
             command, start = MavCmd.DO_MOTOR_TEST, (number, PERCENT, throttle_percent, duration_s, 1)
             stop = (number, PERCENT, 0, 0, 1)
-        if not session.telemetry.is_confirmed_disarmed or not arbiter.is_known:
-            state = "armed" if session.telemetry.is_armed else "not known to be disarmed"
-            raise OperationRejected(f"test_motor: the vehicle is {state}; nothing was sent")
+        session.check_disarmed("test_motor", is_current=arbiter.is_known)
         order, spins_until = arbiter.of_device("motor test"), math.inf
         try:
             await SimpleOrder("test_motor", command, start).send(self._context, of=order)

@@ -15,6 +15,7 @@ from aerokit.errors import (
     CommandRejected,
     CommandTimeout,
     ConnectionClosed,
+    OperationRejected,
 )
 from aerokit.events import (
     ArmedChanged,
@@ -225,6 +226,15 @@ class VehicleSession:
         finally:
             for release in releases:
                 release()
+
+    def check_disarmed(self, action: str, *, is_current: bool = True) -> None:
+        """Raise OperationRejected unless the vehicle is known to be disarmed.
+
+        ``is_current`` False: its last HEARTBEAT is too old for that.
+        """
+        if not self.telemetry.is_confirmed_disarmed or not is_current:
+            state = "armed" if self.telemetry.is_armed else "not known to be disarmed"
+            raise OperationRejected(f"{action}: the vehicle is {state}; nothing was sent")
 
     async def wait_for_heartbeat(self) -> None:
         """Wait for the next HEARTBEAT, which describes the vehicle's state."""

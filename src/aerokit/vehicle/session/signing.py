@@ -8,7 +8,6 @@ import anyio
 
 from aerokit.errors import (
     NotSupported,
-    OperationRejected,
     OperationTimeout,
 )
 from aerokit.mavlink.messages import (
@@ -60,9 +59,7 @@ def _check_vehicle(session: VehicleSession) -> None:
     if session.connection.mavlink_version == 1 or (frame is not None and frame.version == 1):
         whose = "our" if session.connection.mavlink_version == 1 else "the vehicle's"
         raise NotSupported(f"setup_signing: {whose} frames are MAVLink 1, which has no signatures")
-    if not session.telemetry.is_confirmed_disarmed:
-        state = "armed" if session.telemetry.is_armed else "not known to be disarmed"
-        raise OperationRejected(f"setup_signing: the vehicle is {state}; nothing was sent")
+    session.check_disarmed("setup_signing")
 
 
 def _message(session: VehicleSession, signing: Signing | None) -> SetupSigning:
