@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit._internal.formatting import short_repr
@@ -16,10 +16,6 @@ from aerokit.fleets.action import SelectionBase
 from aerokit.fleets.members import Member
 from aerokit.fleets.policy import FleetResult
 from aerokit.vehicle.commanding.progress import ChangeSignal
-
-if TYPE_CHECKING:
-    pass
-
 
 POLL_INTERVAL_S = 0.25
 

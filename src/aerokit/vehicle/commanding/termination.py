@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from aerokit._internal.arguments import checks_arguments
 from aerokit.errors import CommandTimeout, LinkLost, NotSupported
 from aerokit.mavlink.enums import MavCmd, MavState
 from aerokit.vehicle.commanding.context import VehicleBase
 from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, await_progress
-
-if TYPE_CHECKING:
-    pass
 
 TerminationIntent = Literal["terminate flight"]
 ShutdownIntent = Literal["shut down"]
