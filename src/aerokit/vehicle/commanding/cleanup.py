@@ -218,6 +218,11 @@ class FlightCleanup:
             if self._flight is order:
                 self._flight = None
 
+    def check_no_stream(self) -> None:
+        """Raise BusyError if a set-point stream is open."""
+        if self.stop_stream is not None:
+            raise BusyError("another set-point stream is open: leave it first; nothing was sent")
+
     @contextmanager
     def preparing(self, mode: Mode) -> Iterator[Order]:
         """Give the order for this mode before the preparation of a stream, which may wait.
@@ -227,8 +232,7 @@ class FlightCleanup:
             OperationRejected: the order has ended meanwhile: it was superseded or taken over.
             HeartbeatTimeout: the vehicle is silent.
         """
-        if self.stop_stream is not None:
-            raise BusyError("another set-point stream is open: leave it first; nothing was sent")
+        self.check_no_stream()
         order = self._arbiter.order(mode)
         try:
             yield order

@@ -14,7 +14,6 @@ import anyio
 from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit.errors import (
     AerokitError,
-    BusyError,
     OperationRejected,
     OperationTimeout,
     ParameterTimeout,
@@ -210,8 +209,7 @@ class SteeringStream(ValueStream[ValueT]):
         self._raise_if_entered()
         self._take(self._value)  # Raises for an invalid value before anything is sent.
         cleanup = self._context.flight_cleanup
-        if cleanup.stop_stream is not None:
-            raise BusyError("another set-point stream is open: leave it first; nothing was sent")
+        cleanup.check_no_stream()
         mode = self._wanted_mode()
         self._was_entered = True
         cleanup.stop_stream = self._stop
