@@ -274,8 +274,10 @@ class VehiclePosition:
         """Return the altitude of home above mean sea level in metres; raise ValueUnknownError while it is unknown."""
         return self._telemetry.home.value.altitude_amsl_m
 
-    def global_target(self, target: Position) -> tuple[int, int, float, bool]:
-        """Return latitude and longitude in 1e-7 degrees, altitude in metres, and whether that is relative to home.
+    def global_target(self, target: Position) -> tuple[int, int, float, MavFrame]:
+        """Return latitude and longitude in 1e-7 degrees, altitude in metres, and the frame that the altitude is in.
+
+        The frame is MAV_FRAME_GLOBAL_RELATIVE_ALT_INT or MAV_FRAME_GLOBAL_INT.
 
         PX4 takes altitudes above mean sea level only, so an altitude relative to home requires a known home.
         """
@@ -289,12 +291,12 @@ class VehiclePosition:
         check_range("altitude", altitude, -12_000, 100_000)
         if is_relative and not self.takes_relative_altitude:
             altitude, is_relative = altitude + self.home_altitude(), False
-        return round(target.latitude_deg * 1e7), round(target.longitude_deg * 1e7), altitude, is_relative
+        frame = MavFrame.GLOBAL_RELATIVE_ALT_INT if is_relative else MavFrame.GLOBAL_INT
+        return round(target.latitude_deg * 1e7), round(target.longitude_deg * 1e7), altitude, frame
 
     def command_place(self, target: Position) -> dict[str, Any]:
         """Return the place as arguments of a COMMAND_INT; see :meth:`global_target`."""
-        latitude, longitude, altitude, is_relative = self.global_target(target)
-        frame = MavFrame.GLOBAL_RELATIVE_ALT_INT if is_relative else MavFrame.GLOBAL_INT
+        latitude, longitude, altitude, frame = self.global_target(target)
         return {"frame": frame, "x": latitude, "y": longitude, "z": altitude}
 
     def is_on_ground(self) -> bool:

@@ -215,8 +215,7 @@ class SetpointEncoder:
         """
         mask, yaw, yaw_rate = _yaw(s.yaw_deg, s.yaw_rate_deg_s)
         mask |= IGNORE_ACCELERATION | (IGNORE_VELOCITY if velocity is None else 0)
-        latitude, longitude, altitude, is_relative = self._position.global_target(s.position)
-        frame = MavFrame.GLOBAL_RELATIVE_ALT_INT if is_relative else MavFrame.GLOBAL_INT
+        latitude, longitude, altitude, frame = self._position.global_target(s.position)
         now, speeds = self._time_ms(), velocity or ZERO
         return SetPositionTargetGlobalInt(
             now, *self._address, frame, mask, latitude, longitude, altitude, *speeds, *ZERO, yaw, yaw_rate

@@ -338,14 +338,12 @@ class LookActions(VehicleBase):
             CommandTimeout: there was no acknowledgement.
             OperationRejected: the mode changed, or a newer order was given, before the acknowledgement.
         """
-        latitude, longitude, altitude, is_relative = self._position.global_target(point_at(target))
-        if not self._session.commands.is_unknown(LOCATION):
-            frame = MavFrame.GLOBAL_RELATIVE_ALT_INT if is_relative else MavFrame.GLOBAL_INT
-            if await self._set_roi_location({"frame": frame, "x": latitude, "y": longitude, "z": altitude}):
-                return
-        above_home = altitude if is_relative else altitude - self._position.home_altitude()
-        place = (latitude * 1e-7, longitude * 1e-7, above_home)
-        await self._give(MavCmd.DO_SET_ROI, 0, 0, 0, 0, *place)
+        place = self._position.command_place(point_at(target))
+        if not self._session.commands.is_unknown(LOCATION) and await self._set_roi_location(place):
+            return
+        is_relative = place["frame"] == MavFrame.GLOBAL_RELATIVE_ALT_INT
+        above_home = place["z"] if is_relative else place["z"] - self._position.home_altitude()
+        await self._give(MavCmd.DO_SET_ROI, 0, 0, 0, 0, place["x"] * 1e-7, place["y"] * 1e-7, above_home)
 
     async def _set_roi_location(self, place: dict[str, Any]) -> bool:
         """Return False for firmware that does not support the command, or no COMMAND_INT."""
