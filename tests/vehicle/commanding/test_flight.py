@@ -691,3 +691,13 @@ async def test_take_off_height_above_two_metres_counts_as_flying(
     with pytest.raises(CommandRejected) as refusal:
         await grounded.vehicle.take_off(20)
     assert (f"probably in the air, {altitude_m} m above home" in str(refusal.value)) is is_said
+
+
+async def test_set_home_with_both_altitudes_sends_amsl(flying: Flight) -> None:
+    here = flying.vehicle.position.value
+    assert here.altitude_relative_m is not None
+    assert here.altitude_amsl_m is not None
+    await flying.vehicle.set_home(here)
+    (command,) = flying.wire.commands(MavCmd.DO_SET_HOME)
+    assert isinstance(command, m.CommandInt)
+    assert (command.frame, command.z) == (5, pytest.approx(here.altitude_amsl_m))

@@ -276,7 +276,9 @@ class TravelActions(VehicleBase):
             if place is None:
                 await self._sender.send_long(order, MavCmd.DO_SET_HOME, 1)
             else:
-                latitude, longitude, altitude, _ = self._position.global_target(point_at(place))
+                # The command takes altitudes above mean sea level only.
+                amsl = point_at(place).replace(altitude_relative_m=None)
+                latitude, longitude, altitude, _ = self._position.global_target(amsl)
                 where: dict[str, Any] = {"x": latitude, "y": longitude, "z": altitude}
                 await self._sender.run_command(order, self._session.commands.send_place, MavCmd.DO_SET_HOME, 0, **where)
         requested_at = self.connection.now()
