@@ -98,18 +98,12 @@ class CalibrationRun:
 
     async def command(self, command: int, *params: float, accepts: Collection[int] = ()) -> None:
         """Send a command of the calibration and wait for its answer. ``accepts``: results that are no error."""
-        with self.context.arbiter.auxiliary_order() as order:
-            try:
-                await self.context.sender.run_command(
-                    order,
-                    self.session.commands.send_long,
-                    command,
-                    *params,
-                    attempt_timeout=START_TIMEOUT_S if command == MavCmd.PREFLIGHT_CALIBRATION else None,
-                )
-            except CommandRejected as error:
-                if error.result not in accepts:
-                    raise
+        attempt_timeout = START_TIMEOUT_S if command == MavCmd.PREFLIGHT_CALIBRATION else None
+        try:
+            await self.context.sender.auxiliary_command(command, *params, attempt_timeout=attempt_timeout)
+        except CommandRejected as error:
+            if error.result not in accepts:
+                raise
 
     async def start(self, *params: float, command: int = MavCmd.PREFLIGHT_CALIBRATION) -> None:
         """Send the command that starts the calibration; a refusal means that it does not run."""
@@ -180,7 +174,6 @@ class CalibrationRun:
     async def _confirm_cancel(self) -> None:
         """Send the cancel, if that was not possible before, and repeat it as docs/reliability.md says."""
         assert self._cancel is not None
-        armed = self.session.telemetry.armed
         try:
             for _ in range(MAX_CANCEL_ATTEMPTS):
                 if self._cancelled_at is not None:
@@ -188,8 +181,7 @@ class CalibrationRun:
                         while not self._is_cancelled(self._cancel[0]):  # noqa: ASYNC110
                             await anyio.sleep(CONFIRM_POLL_INTERVAL_S)
                         return
-                since = self.session.connection.now() if self._cancelled_at is None else self._cancelled_at
-                await armed.wait_until(lambda _: armed.updated_at > since)  # noqa: B023
+                await self.session.wait_for_heartbeat(self._cancelled_at)
                 if self._has_rebooted or (self._sent is not None and self._sent.end):
                     return
                 if self.context.arbiter.is_known:

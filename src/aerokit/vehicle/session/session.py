@@ -236,10 +236,10 @@ class VehicleSession:
             state = "armed" if self.telemetry.is_armed else "not known to be disarmed"
             raise OperationRejected(f"{action}: the vehicle is {state}; nothing was sent")
 
-    async def wait_for_heartbeat(self) -> None:
-        """Wait for the next HEARTBEAT, which describes the vehicle's state."""
-        armed, since = self.telemetry.armed, self.connection.now()
-        await armed.wait_until(lambda _: armed.updated_at > since, description="the next HEARTBEAT")
+    async def wait_for_heartbeat(self, since: float | None = None) -> None:
+        """Wait for a HEARTBEAT after ``since`` (None: the next one), which describes the vehicle's state."""
+        armed, after = self.telemetry.armed, self.connection.now() if since is None else since
+        await armed.wait_until(lambda _: armed.updated_at > after, description="the next HEARTBEAT")
 
     @contextmanager
     def refusals_of(self, command: int) -> Iterator[list[CommandAck]]:
