@@ -171,9 +171,7 @@ class StallDetector:
 
 
 def _metres(one: Position, other: Position) -> float:
-    above = [(position.altitude_relative_m, position.altitude_amsl_m) for position in (one, other)]
-    climbed = next((abs(a - b) for a, b in zip(*above, strict=True) if a is not None and b is not None), 0.0)
-    return one.distance_to(other) + climbed
+    return one.distance_to(other) + abs(VehiclePosition.height_above(one, other))
 
 
 METRES_PER_DEGREE = 112_000
