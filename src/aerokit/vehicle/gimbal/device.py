@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from contextlib import contextmanager
+from functools import partial
 from typing import TYPE_CHECKING, Literal, Protocol
 
 from aerokit._internal.values import Snapshot
 from aerokit.connection.cells import Source, StateCell
 from aerokit.mavlink.enums import GimbalDeviceErrorFlags, GimbalManagerCapFlags
 from aerokit.mavlink.messages import GimbalDeviceAttitudeStatus
-from aerokit.vehicle.session.rates import SUBSCRIPTION_HZ
+from aerokit.vehicle.session.rates import SUBSCRIPTION_HZ, WatchedStream
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -132,29 +133,6 @@ REORDER_WINDOW_MS = 5_000
 ATTITUDE_MESSAGES = "GIMBAL_DEVICE_ATTITUDE_STATUS or MOUNT_ORIENTATION"
 
 
-class _AttitudeStream:
-    """Feed of an attitude cell: requests GIMBAL_DEVICE_ATTITUDE_STATUS from the autopilot while the cell is watched."""
-
-    pending = False
-
-    def __init__(self, cell: StateCell[GimbalAttitude], session: VehicleSession) -> None:
-        self._cell, self._session = cell, session
-        self._release: Detach | None = None
-
-    def catch_up(self) -> None:
-        pass
-
-    def watchers_changed(self) -> None:
-        if not self._cell._is_watched:
-            if self._release is not None:
-                self._release()
-            self._release = None
-            return
-        source, rates = self._cell.source, self._session.rates
-        if self._release is None and (source is None or source.component_id == self._session.component_id):
-            self._release = rates.request(GimbalDeviceAttitudeStatus, SUBSCRIPTION_HZ, is_optional=True)
-
-
 class ControlBlock(Protocol):
     """Interface of the blocks that control a gimbal."""
 
@@ -193,7 +171,7 @@ class GimbalDevice:
             f"{name}.attitude", ATTITUDE_MESSAGES
         )
         if component_id in (0, context.session.component_id):  # other gimbals send their attitude without a request
-            self.attitude._feed_from(_AttitudeStream(self.attitude, context.session))
+            self.attitude._feed_from(WatchedStream(self.attitude, partial(self._request_attitude, context.session)))
         self.controllers: StateCell[GimbalControllers] = context.session.connection.new_cell(
             f"{name}.controllers", "GIMBAL_MANAGER_STATUS"
         )
@@ -205,6 +183,13 @@ class GimbalDevice:
         self._system_id = context.session.system_id
         context.session.keep(self.attitude)
         context.session.keep(self.controllers)
+
+    def _request_attitude(self, session: VehicleSession) -> Detach | None:
+        """Request GIMBAL_DEVICE_ATTITUDE_STATUS from the autopilot, unless another component sends the attitude."""
+        source = self.attitude.source
+        if source is not None and source.component_id != session.component_id:
+            return None
+        return session.rates.request(GimbalDeviceAttitudeStatus, SUBSCRIPTION_HZ, is_optional=True)
 
     @property
     def key(self) -> tuple[int, int]:

@@ -410,11 +410,14 @@ class ComponentSubscriber:
 
 
 class WatchedStream:
-    """Feed of a cell whose message is requested only while your program waits for the cell or follows it."""
+    """Feed of a cell whose message is requested only while your program waits for the cell or follows it.
+
+    ``request`` returns None if the message need not be requested now.
+    """
 
     pending = False
 
-    def __init__(self, cell: StateCell[Any], request: Callable[[], Detach]) -> None:
+    def __init__(self, cell: StateCell[Any], request: Callable[[], Detach | None]) -> None:
         self._cell, self._request = cell, request
         self._release: Detach | None = None
 
