@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from aerokit._internal.values import Snapshot
 from aerokit.mavlink.enums import AdsbAltitudeType, AdsbEmitterType, AdsbFlags, MavFrame, MavWinchStatusFlag
 from aerokit.position import Position
-from aerokit.vehicle.state.field import I16, Context, finite, member, unless
+from aerokit.vehicle.state.field import I16, Context, finite, member, scaled, unless
 from aerokit.vehicle.state.movement import place
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 __all__ = ["ActuatorControls", "AirPressure", "Aircraft", "Altitude", "Imu", "Odometry", "RawImu", "WinchStatus"]
 
 MG_M_S2, MGAUSS_UT, HPA_PA, RAD_DEG = 9.80665e-3, 0.1, 100.0, math.degrees(1)
-NO_TERRAIN_M = -1000.0
+NO_TERRAIN_M, UNKNOWN_TEMPERATURE = -1000.0, 0
 MAX_AIRCRAFT = 64
 _F = AdsbFlags
 
@@ -158,7 +158,7 @@ def scaled_imu(message: messages.ScaledImu) -> Imu:
         _scaled(MG_M_S2, message.xacc, message.yacc, message.zacc),
         _scaled(RAD_DEG / 1000, message.xgyro, message.ygyro, message.zgyro),
         _scaled(MGAUSS_UT, message.xmag, message.ymag, message.zmag),
-        _centidegrees(message.temperature),
+        scaled(message.temperature, UNKNOWN_TEMPERATURE, 100),
     )
 
 
@@ -167,12 +167,8 @@ def raw_imu(message: messages.RawImu) -> RawImu:
         (message.xacc, message.yacc, message.zacc),
         (message.xgyro, message.ygyro, message.zgyro),
         (message.xmag, message.ymag, message.zmag),
-        _centidegrees(message.temperature),
+        scaled(message.temperature, UNKNOWN_TEMPERATURE, 100),
     )
-
-
-def _centidegrees(value: int) -> float | None:
-    return value / 100 if value else None
 
 
 def odometry(message: messages.Odometry) -> Odometry:
@@ -199,7 +195,7 @@ def air_pressure(message: messages.ScaledPressure) -> AirPressure:
         message.press_abs * HPA_PA,
         message.press_diff * HPA_PA,
         message.temperature / 100,
-        _centidegrees(message.temperature_press_diff),
+        scaled(message.temperature_press_diff, UNKNOWN_TEMPERATURE, 100),
     )
 
 
