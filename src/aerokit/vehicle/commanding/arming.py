@@ -23,6 +23,7 @@ from aerokit.mavlink.messages import Statustext
 from aerokit.vehicle.commanding.cleanup import ARM_WATCH_S
 from aerokit.vehicle.commanding.context import VehicleBase
 from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, ChangeSignal, await_progress
+from aerokit.vehicle.state.status_text import CHUNK_LENGTH
 
 if TYPE_CHECKING:
     from aerokit.autopilots import Mode
@@ -36,8 +37,6 @@ POLL_INTERVAL_S = 0.1
 # MAV_STATE_BOOT and MAV_STATE_CALIBRATING.
 BOOTING = (1, 2)
 REBOOT_ANSWER_S = 3.0
-MAX_REASON_BYTES = 50
-"""Bytes of text in one STATUSTEXT."""
 MODE_READY_TIMEOUT_S = 3.0
 """Seconds that a vehicle may need to become armable after a mode change."""
 
@@ -130,8 +129,8 @@ class ArmingActions(VehicleBase):
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the vehicle accepted the command but did not arm.
         """
-        if len(reason.encode()) > MAX_REASON_BYTES:
-            raise InvalidArgument(f"reason = {short_repr(reason)} is not allowed: at most {MAX_REASON_BYTES} bytes")
+        if len(reason.encode()) > CHUNK_LENGTH:
+            raise InvalidArgument(f"reason = {short_repr(reason)} is not allowed: at most {CHUNK_LENGTH} bytes")
         wanted = self._mode_to_arm_in(mode)
         if wanted is not None:
             await self._change_to_arming_mode(wanted)
@@ -187,10 +186,9 @@ class ArmingActions(VehicleBase):
     def _in_flight(self) -> tuple[str, ...]:
         """Return the landed state as a reason, if it is one of flight."""
         landed = self.telemetry.landed_state.latest
-        for state in (MavLandedState.IN_AIR, MavLandedState.TAKEOFF, MavLandedState.LANDING):
-            if landed == state:
-                return (f"the vehicle is not on the ground (landed state {state.name})",)
-        return ()
+        if landed not in (MavLandedState.IN_AIR, MavLandedState.TAKEOFF, MavLandedState.LANDING):
+            return ()
+        return (f"the vehicle is not on the ground (landed state {MavLandedState(landed).name})",)
 
     async def _await_armed(
         self, armed: bool, order: Order, started: float, timeout: float, max_silence_s: float | None

@@ -13,6 +13,7 @@ from aerokit.mavlink.enums import FailureType, FailureUnit, MavCmd, MavSeverity
 from aerokit.mavlink.messages import PlayTune, Statustext
 from aerokit.vehicle.commanding.context import VehicleBase
 from aerokit.vehicle.commanding.simple_orders import Argument, SimpleOrder
+from aerokit.vehicle.state.status_text import CHUNK_LENGTH
 
 if TYPE_CHECKING:
     from aerokit.vehicle.devices.actuators import Actuators
@@ -39,7 +40,7 @@ INJECT_FAILURE = SimpleOrder(
 TUNE = re.compile(r"[A-Ga-gLlMmNnOoPpSsTt0-9#+.<>\- ]+")
 """Characters of QBASIC 1.1's PLAY statement, which ArduPilot and PX4 play."""
 TUNE_PART, MAX_TUNE = 30, 230
-CHUNK, MAX_TEXT_BYTES = 50, 1000
+MAX_TEXT_BYTES = 1000
 
 
 @checks_arguments
@@ -129,7 +130,7 @@ class DeviceActions(VehicleBase):
         self._text_id = self._text_id % 0xFFFF + 1
         number = MavSeverity[severity.upper()]
         for chunk, part in enumerate(_chunks(text)):
-            is_single = len(data) <= CHUNK
+            is_single = len(data) <= CHUNK_LENGTH
             self._session.send(Statustext(number, part, 0 if is_single else self._text_id, chunk))
 
     _text_id = 0
@@ -166,10 +167,10 @@ def _chunks(text: str) -> list[str]:
     """
     chunks = [""]
     for character in text:
-        if len((chunks[-1] + character).encode()) > CHUNK:
-            chunks[-1] += " " * (CHUNK - len(chunks[-1].encode()))
+        if len((chunks[-1] + character).encode()) > CHUNK_LENGTH:
+            chunks[-1] += " " * (CHUNK_LENGTH - len(chunks[-1].encode()))
             chunks.append("")
         chunks[-1] += character
-    if len(chunks) > 1 and len(chunks[-1].encode()) == CHUNK:
+    if len(chunks) > 1 and len(chunks[-1].encode()) == CHUNK_LENGTH:
         chunks.append("")
     return chunks

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 __all__ = ["StatusTextAssembler"]
 
 CHUNK_LENGTH = 50
+"""Bytes of text in one STATUSTEXT."""
 CHUNK_TIMEOUT_S = 2.0
 MAX_RECENT_TEXTS = 64
 # Maximum chunks of one text; a longer text is invalid and passed on in parts.
