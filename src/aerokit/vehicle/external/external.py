@@ -153,8 +153,6 @@ class External:
         if origin.altitude_amsl_m is None:
             raise InvalidArgument("origin has no altitude_amsl_m, which the local frame requires")
         cell, session = self._session.telemetry.origin, self._session
-        if not cell.is_known:
-            self._request_origin()
         if (present := cell.latest) is not None:
             if _are_equal(present, origin):
                 return
