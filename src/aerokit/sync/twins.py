@@ -5062,7 +5062,7 @@ class Vehicle(VehicleTwin):
 
     @property
     def calibrate(self) -> CalibrationControl:
-        """CalibrationControl of sensors, radio and ESCs, step by step."""
+        """Calibrations of sensors, radio and ESCs, step by step."""
         return self._part("calibrate", CalibrationControl)
 
     @property

@@ -282,7 +282,7 @@ class Vehicle(
 
     @cached_property
     def calibrate(self) -> CalibrationControl:
-        """CalibrationControl of sensors, radio and ESCs, step by step."""
+        """Calibrations of sensors, radio and ESCs, step by step."""
         from aerokit.vehicle.calibration.calibration import CalibrationControl
 
         return CalibrationControl(self._context, lambda: self.parameters)
