@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.parameters.transaction import TemporaryParameters, Transaction
     from aerokit.vehicle.parameters.writing import ParameterWrite
     from aerokit.vehicle.rtk.ntrip import NtripClient
-    from aerokit.vehicle.vehicle import Vehicle
+    from aerokit.vehicle.vehicle import Vehicle  # noqa: F401
 
     Block: TypeAlias = (
         CameraBlock
@@ -306,14 +306,26 @@ class ConnectionTwin(TwinOf["Connection"], BlockingContext):
                 self._loop.close()
 
 
-class VehicleTwin(TwinOf["Vehicle"], BlockingContext):
+class OpenedTwin(TwinOf[T], BlockingContext):
+    """Twin of an object whose context is open on the loop thread, which ends with it if it was started for it."""
+
+    def __init__(self, loop: LoopThread, held: OpenContext[T], *, owns_loop: bool) -> None:
+        super().__init__(loop, held.value)
+        self._held, self._owns_loop = held, owns_loop
+
+    def close(self) -> None:
+        """Close the context and end the loop thread. Idempotent."""
+        try:
+            self._held.close()
+        finally:
+            if self._owns_loop:
+                self._loop.close()
+
+
+class VehicleTwin(OpenedTwin["Vehicle"]):
     """Vehicle as a context manager, which also closes the connection that was opened for it."""
 
     _opened_by = "connect"
-
-    def __init__(self, loop: LoopThread, held: OpenContext[Vehicle], *, owns_loop: bool) -> None:
-        super().__init__(loop, held.value)
-        self._held, self._owns_loop = held, owns_loop
 
     def _part(self, name: str, twin: Callable[[LoopThread, Any], T]) -> T:
         """Return a part of the vehicle, created on the loop thread on first access."""
@@ -336,11 +348,7 @@ class VehicleTwin(TwinOf["Vehicle"], BlockingContext):
 
         Sends nothing: a vehicle in the air continues what it does. A connection passed to ``connect`` stays open.
         """
-        try:
-            self._held.close()
-        finally:
-            if self._owns_loop:
-                self._loop.close()
+        super().close()
 
     def __exit__(self, exc_type: Any, exc: Any, traceback: Any) -> None:
         holds = self.aio.is_hold_pending

@@ -5,28 +5,24 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from aerokit.sync.blocks import BlockingContext, ConnectionTwin, TwinOf
+from aerokit.sync.blocks import ConnectionTwin, OpenedTwin
 from aerokit.sync.loop_thread import LoopThread
 
 if TYPE_CHECKING:
     from contextlib import AbstractAsyncContextManager
 
     from aerokit.mavlink.message import Message
-    from aerokit.onboard.component import OnboardComponent
+    from aerokit.onboard.component import OnboardComponent  # noqa: F401
     from aerokit.sync.loop_thread import OpenContext
 
 FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
 ComponentT = TypeVar("ComponentT", bound="ComponentTwin")
 
 
-class ComponentTwin(TwinOf["OnboardComponent"], BlockingContext):
+class ComponentTwin(OpenedTwin["OnboardComponent"]):
     """Component as a context manager, which also closes the connection that was opened for it."""
 
     _opened_by = "component"
-
-    def __init__(self, loop: LoopThread, held: OpenContext[OnboardComponent], *, owns_loop: bool) -> None:
-        super().__init__(loop, held.value)
-        self._held, self._owns_loop = held, owns_loop
 
     def command(self, command: int) -> Callable[[FunctionT], FunctionT]:
         """Decorator: execute a MAV_CMD by a plain function, in a thread.
@@ -65,11 +61,7 @@ class ComponentTwin(TwinOf["OnboardComponent"], BlockingContext):
 
     def close(self) -> None:
         """Cancel running commands, stop the heartbeat and end the loop thread. Idempotent."""
-        try:
-            self._held.close()
-        finally:
-            if self._owns_loop:
-                self._loop.close()
+        super().close()
 
 
 def opened_component(

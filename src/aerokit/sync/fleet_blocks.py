@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from aerokit.errors import InvalidArgument
-from aerokit.sync.blocks import BlockingContext, ConnectionTwin, TwinOf, VehicleTwin
+from aerokit.sync.blocks import ConnectionTwin, OpenedTwin, TwinOf, VehicleTwin
 from aerokit.sync.loop_thread import LoopThread, OpenContext
 from aerokit.sync.twins import Vehicle
 from aerokit.vehicle.connect import warn_if_left_flying
@@ -15,7 +15,7 @@ from aerokit.vehicle.connect import warn_if_left_flying
 if TYPE_CHECKING:
     from contextlib import AbstractAsyncContextManager
 
-    from aerokit.fleets.fleet import Fleet as AsyncFleet
+    from aerokit.fleets.fleet import Fleet as AsyncFleet  # noqa: F401
     from aerokit.fleets.fleet import Selection as AsyncSelection
     from aerokit.fleets.members import Member
 
@@ -57,14 +57,10 @@ def _vehicle(loop: LoopThread, vehicle: Any) -> Vehicle:
     return Vehicle(loop, borrowed, owns_loop=False)
 
 
-class FleetTwin(TwinOf["AsyncFleet"], BlockingContext):
+class FleetTwin(OpenedTwin["AsyncFleet"]):
     """Fleet as a context manager, which also closes the connections that were opened for it."""
 
     _opened_by = "fleet"
-
-    def __init__(self, loop: LoopThread, held: OpenContext[AsyncFleet], *, owns_loop: bool) -> None:
-        super().__init__(loop, held.value)
-        self._held, self._owns_loop = held, owns_loop
 
     def __contains__(self, name: object) -> bool:
         return name in self.aio.members
@@ -74,11 +70,7 @@ class FleetTwin(TwinOf["AsyncFleet"], BlockingContext):
 
         Sends nothing: vehicles in the air continue what they do. Connections passed to ``fleet`` stay open.
         """
-        try:
-            self._held.close()
-        finally:
-            if self._owns_loop:
-                self._loop.close()
+        super().close()
 
     def __exit__(self, exc_type: Any, exc: Any, traceback: Any) -> None:
         left = [vehicle for vehicle in self.aio.vehicles.values() if not vehicle.is_hold_pending]
