@@ -700,4 +700,5 @@ async def test_set_home_with_both_altitudes_sends_amsl(flying: Flight) -> None:
     await flying.vehicle.set_home(here)
     (command,) = flying.wire.commands(MavCmd.DO_SET_HOME)
     assert isinstance(command, m.CommandInt)
-    assert (command.frame, command.z) == (5, pytest.approx(here.altitude_amsl_m))
+    assert command.frame == 5
+    assert command.z == pytest.approx(here.altitude_amsl_m)
