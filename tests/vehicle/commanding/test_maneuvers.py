@@ -330,6 +330,19 @@ async def test_follow_without_own_altitude_holds() -> None:
         assert flight.wire.mode_orders() == [CopterMode.BRAKE]
 
 
+async def test_follow_takes_altitude_above_sea_level_of_positions() -> None:
+    """The altitude above home of a position is that of its own vehicle, whose home may be lower."""
+    async with in_the_air() as flight:
+        here = flight.vehicle.position.value
+        assert here.altitude_amsl_m is not None
+        target = here.replace(altitude_relative_m=45.0).offset(north_m=20)
+        async with flight.vehicle.follow(lambda: target, height_m=2) as following:
+            await following.fly(1)
+        sent = flight.wire.last(m.SetPositionTargetGlobalInt)
+        assert sent.coordinate_frame == 5
+        assert sent.alt == pytest.approx(here.altitude_amsl_m + 2)
+
+
 async def test_follow_function_that_raises_stops_it() -> None:
     async with in_the_air() as flight:
         places = iter([flight.vehicle.position.value])

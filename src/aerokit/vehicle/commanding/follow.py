@@ -291,5 +291,7 @@ class FollowStream(SteeringStream[TargetState]):
         if self._place.height_m is None:
             place = place.replace(altitude_amsl_m=self._own_altitude_m, altitude_relative_m=None)
             down_m_s = 0.0
+        elif place.altitude_amsl_m is not None:  # The altitude above home may be above another vehicle's home.
+            place = place.replace(altitude_relative_m=None)
         yaw_deg = math.degrees(math.remainder(bearing + math.pi, 2 * math.pi)) if self._place.face_target else None
         return self._encode_position(PositionSetpoint(place, yaw_deg), (north_m_s, east_m_s, down_m_s))
