@@ -165,8 +165,8 @@ def wants_motion(setpoint: object, context: VehicleContext) -> bool:
     far_m = MAX_RESTING_RADII * context.session.autopilot.arrival_radius_m
     if isinstance(setpoint, PositionSetpoint):
         return far_m < context.vehicle_position.distance_to(setpoint.position) < math.inf
-    here = context.session.telemetry.local_position.latest
-    if isinstance(setpoint, LocalPositionSetpoint) and here is not None:
+    # Reading the position decodes it; other set-points, at up to 400 Hz, do not need that.
+    if isinstance(setpoint, LocalPositionSetpoint) and (here := context.session.telemetry.local_position.latest):
         north_m, east_m = setpoint.north_m - here.north_m, setpoint.east_m - here.east_m
         return math.hypot(north_m, east_m, setpoint.down_m - here.down_m) > far_m
     return False
