@@ -20,13 +20,15 @@ FilesT = TypeVar("FilesT", bound=FileSystem)
 class FtpRequestServer(Generic[FilesT]):
     """Receives MAVFTP requests; subclasses answer them."""
 
-    is_enabled = True
-    """False to answer nothing, like a component without MAVFTP."""
-
     def __init__(self, host: ServerHost, files: FilesT) -> None:
         self.files = files
         self._host = host
         host.on(FileTransferProtocol, self._on_message)
+
+    @property
+    def is_enabled(self) -> bool:
+        """False to answer nothing, like a component without MAVFTP."""
+        return True
 
     @property
     def open_sessions(self) -> int:

@@ -6,7 +6,6 @@ from collections.abc import Hashable
 from typing import ClassVar
 
 from aerokit.mavlink.enums import MavFtpErr
-from aerokit.mavlink.messages import FileTransferProtocol
 from aerokit.protocols.servers.files import EEXIST, FileFault, FileTree
 from aerokit.protocols.servers.ftp import FtpPeer, SessionFtpServer
 from aerokit.protocols.servers.ftp_packets import FtpPacket, checked_path, read_crc32
@@ -31,9 +30,9 @@ class Px4Ftp(SessionFtpServer[FileTree]):
         super().__init__(vehicle, files, burst_interval_s=burst_interval_s)
         self._vehicle = vehicle
 
-    def _on_message(self, message: FileTransferProtocol, channel: Channel) -> None:
-        if not self._vehicle.faults.no_ftp:
-            self.receive(FtpPacket.parse(message), channel)
+    @property
+    def is_enabled(self) -> bool:
+        return not self._vehicle.faults.no_ftp
 
     def _key(self, request: FtpPacket, channel: Channel) -> Hashable:
         return channel
