@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -10,12 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit._internal.rotations import quaternion_from_euler
 from aerokit._internal.values import Snapshot
-from aerokit.errors import AerokitError, InvalidArgument
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import (
     CameraCapFlags,
     CameraZoomType,
-    MavSeverity,
     SetFocusType,
     StorageStatus,
     StorageType,
@@ -31,8 +29,6 @@ if TYPE_CHECKING:
     from aerokit.parameters import SettingValue
     from aerokit.protocols.servers.camera_device import Shot
     from aerokit.protocols.servers.host import ServerHost
-
-logger: logging.Logger = logging.getLogger("aerokit")
 
 _NOWHERE = (math.nan, math.nan, math.nan, math.nan)
 
@@ -252,9 +248,7 @@ class CameraAdapter(CameraDevice):
                 photo = await self._call(self._camera.take_photo, len(self.captures.images))
                 shot = _shot(photo, time_boot_ms, unix_time)
             except Exception as error:
-                if not isinstance(error, AerokitError):
-                    logger.error("take_photo failed", exc_info=error)
-                self._host.send_text(MavSeverity.WARNING, f"take_photo: {error or type(error).__name__}")
+                self._host.report_error("take_photo", error)
             finally:
                 done(shot)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import inspect
-import logging
 import math
 from collections.abc import Awaitable, Callable
 from functools import partial
@@ -12,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit._internal.arguments import checks_arguments
 from aerokit._internal.values import Snapshot
-from aerokit.errors import AerokitError, BusyError, InvalidArgument, NotSupported
-from aerokit.mavlink.enums import MavCmd, MavFrame, MavResult, MavSeverity
+from aerokit.errors import BusyError, InvalidArgument, NotSupported
+from aerokit.mavlink.enums import MavCmd, MavFrame, MavResult
 from aerokit.onboard.arguments import CommandArgument, arguments_of
 from aerokit.position import Position
 from aerokit.protocols.servers.commands import CommandDispatcher, Outcome, RunningCommands
@@ -24,8 +23,6 @@ if TYPE_CHECKING:
     from aerokit.connection.tasks import BackgroundTasks
     from aerokit.onboard.host import ComponentHost
     from aerokit.protocols.servers.commands import CommandHandler, CommandProgress, ReceivedCommand, RunningCommand
-
-logger: logging.Logger = logging.getLogger("aerokit")
 
 _ABSOLUTE = frozenset((MavFrame.GLOBAL, MavFrame.GLOBAL_INT))
 _RELATIVE = frozenset((MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT))
@@ -149,7 +146,7 @@ class ComponentCommands:
                 try:
                     return handler(command)
                 except Exception as error:
-                    self._explain(command_name(command.command), error)
+                    self._host.report_error(command_name(command.command), error)
                     return result_of(error)
 
             return guarded
@@ -239,10 +236,5 @@ class ComponentCommands:
         """Answer with the result for an error, and explain it in a status text."""
         name = getattr(function, "__name__", "run")
         name = command_name(running.command.command) if name == "run" else name
-        self._explain(name, error)
+        self._host.report_error(name, error)
         self._running.finish(running, Outcome(result_of(error)))
-
-    def _explain(self, name: str, error: Exception) -> None:
-        if not isinstance(error, AerokitError):
-            logger.error("the handler %s of a command failed", name, exc_info=error)
-        self._host.send_text(MavSeverity.WARNING, f"{name}: {error or type(error).__name__}")

@@ -11,6 +11,7 @@ from aerokit.errors import InvalidArgument, NotSupported
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import GripperActions, MavArmAuthDeniedReason, MavCmd, MavResult, MavSeverity, WinchActions
 from aerokit.onboard.commands import CommandResult, result_of
+from aerokit.onboard.host import error_text
 
 if TYPE_CHECKING:
     from aerokit.onboard.commands import CommandRequest
@@ -149,7 +150,7 @@ def add_arm_authorizer(services: ComponentServices, authorize: Authorize) -> Non
             # PX4 sends 0 for itself (ArmAuthorization.cpp).
             seconds = await services.commands.call(authorize, system_id or request.sender[0])
         except Exception as error:
-            services.host.send_text(MavSeverity.WARNING, f"arming denied: {error or type(error).__name__}")
+            services.host.send_text(MavSeverity.WARNING, f"arming denied: {error_text(error)}")
             result = result_of(error)
             reason = MavArmAuthDeniedReason.NONE if result == MavResult.DENIED else MavArmAuthDeniedReason.GENERIC
             return CommandResult(MavResult.DENIED, detail=reason)

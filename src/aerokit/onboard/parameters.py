@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit._internal.arguments import checks_arguments
 from aerokit._internal.files import read_text, write_atomically
-from aerokit.errors import AerokitError, FileFormatError, InvalidArgument
+from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.mavlink.enums import MavParamError, MavParamExtType, MavSeverity, ParamAck
 from aerokit.parameters import ParameterMetadata, check_name
 from aerokit.parameters.parameter import checked_setting, settings_equal, to_float32
@@ -254,9 +254,7 @@ class _Store:
             self._parameters._host.send_text(MavSeverity.WARNING, str(error))
             return MavParamError.VALUE_OUT_OF_RANGE, ParamAck.VALUE_UNSUPPORTED
         except Exception as error:
-            if not isinstance(error, AerokitError):
-                logger.error("on_set of parameter %s failed", name, exc_info=error)
-            self._parameters._host.send_text(MavSeverity.WARNING, f"{name}: {error or 'the value was refused'}")
+            self._parameters._host.report_error(name, error)
             return MavParamError.VALUE_OUT_OF_RANGE, ParamAck.FAILED
         return None
 
