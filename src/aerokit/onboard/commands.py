@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 from aerokit._internal.arguments import checks_arguments
 from aerokit._internal.values import Snapshot
 from aerokit.errors import BusyError, InvalidArgument, NotSupported
-from aerokit.mavlink.enums import MavCmd, MavFrame, MavResult
+from aerokit.mavlink.enums import MavFrame, MavResult
+from aerokit.missions.item import command_name
 from aerokit.onboard.arguments import CommandArgument, arguments_of
 from aerokit.position import Position
 from aerokit.protocols.servers.commands import CommandDispatcher, Outcome, RunningCommands
@@ -86,11 +87,6 @@ class CommandRequest:
 
     def __repr__(self) -> str:
         return f"<CommandRequest {command_name(self.command)} from {self.sender[0]}/{self.sender[1]}>"
-
-
-def command_name(command: int) -> str:
-    """Return the name of a MAV_CMD, or its number."""
-    return MavCmd(command).name if command in MavCmd.__members__.values() else f"command {command}"
 
 
 def outcome_of(value: object) -> Outcome:
