@@ -151,10 +151,17 @@ class ComponentCommands:
 
     async def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Call a function of the program: a coroutine function, or a plain one, in a thread if ``uses_threads``."""
+        found = self.begin(function, *arguments)
+        return await found if inspect.isawaitable(found) else found
+
+    def begin(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Like `call`, but return the result of a plain function at once, or an awaitable."""
         if inspect.iscoroutinefunction(function) or not self.uses_threads:
-            found = function(*arguments)
-        else:
-            found = await asyncio.to_thread(function, *arguments)
+            return function(*arguments)
+        return self._call_in_thread(function, *arguments)
+
+    async def _call_in_thread(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        found = await asyncio.to_thread(function, *arguments)
         return await found if inspect.isawaitable(found) else found
 
     def add_raw(self, command: int, function: Callable[[ReceivedCommand], Awaitable[int]]) -> None:
@@ -199,7 +206,7 @@ class ComponentCommands:
         request = CommandRequest(command, report)
         try:
             values = [argument.convert(request.params[argument.number - 1]) for argument in arguments]
-            answer = self.call(function, request, *values) if self.uses_threads else function(request, *values)
+            answer = self.begin(function, request, *values)
         except Exception as error:
             self._fail(running, function, error)
             return

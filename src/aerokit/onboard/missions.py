@@ -95,8 +95,7 @@ class ComponentMissions:
             check_items(items, mission_type)
             verdict: Any = None
             if function is not None:
-                in_thread = self._commands.uses_threads
-                verdict = self._commands.call(function, kind, items) if in_thread else function(kind, items)
+                verdict = self._commands.begin(function, kind, items)
         except Exception as error:
             answer(self._refused(kind, error))
             return
