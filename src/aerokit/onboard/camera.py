@@ -21,7 +21,7 @@ from aerokit.mavlink.enums import (
 )
 from aerokit.mavlink.messages import CameraImageCaptured
 from aerokit.position import Position
-from aerokit.protocols.servers.camera_device import CameraDevice
+from aerokit.protocols.servers.camera_device import UNKNOWN_ATTITUDE, CameraDevice
 
 if TYPE_CHECKING:
     from aerokit.connection.tasks import BackgroundTasks
@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from aerokit.parameters import SettingValue
     from aerokit.protocols.servers.camera_device import Shot
     from aerokit.protocols.servers.host import ServerHost
-
-_NOWHERE = (math.nan, math.nan, math.nan, math.nan)
 
 
 class Photo(Snapshot):
@@ -345,6 +343,6 @@ def _shot(photo: Photo, time_boot_ms: int, unix_time: float) -> Shot:
         0 if place is None else round(place.longitude_deg * 1e7),
         0 if place is None or place.altitude_amsl_m is None else round(place.altitude_amsl_m * 1000),
         0 if place is None or place.altitude_relative_m is None else round(place.altitude_relative_m * 1000),
-        _NOWHERE if len(known) < 3 else quaternion_from_euler(*known),
+        UNKNOWN_ATTITUDE if len(known) < 3 else quaternion_from_euler(*known),
     )
     return lambda **fields: shot(**{"file_url": photo.url, **fields})

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavSeverity
-from aerokit.protocols.servers.host import Channel, sender_of
+from aerokit.protocols.servers.host import Channel
 
 if TYPE_CHECKING:
     from aerokit.onboard.host import ComponentHost
@@ -68,7 +68,7 @@ def answer_pings(host: ComponentHost) -> None:
 
     def on_ping(ping: m.Ping, channel: Channel) -> None:
         if ping.target_system == 0 and ping.target_component == 0:  # else it is the answer to another component
-            host.send(m.Ping(ping.time_usec, ping.seq, *sender_of(ping)), channel)
+            host.send(m.Ping(ping.time_usec, ping.seq, *channel), channel)
 
     def on_timesync(message: m.Timesync, channel: Channel) -> None:
         if message.tc1 == 0:
