@@ -15,7 +15,7 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import CompMetadataType, MavCmd, MavModeFlag, MavSeverity, MavState, MavType
 from aerokit.mavlink.enums import MavProtocolCapability as Can
 from aerokit.mavlink.message import Message
-from aerokit.onboard.events import EventSender, answer_pings
+from aerokit.onboard.events import EventSender, answer_pings, check_severity
 from aerokit.onboard.files import DirectoryFiles
 from aerokit.onboard.host import ComponentHost
 from aerokit.onboard.identity import PARAMETER_PATH, Identity, IdentityMessages
@@ -220,8 +220,7 @@ class OnboardComponent:
         Raises:
             InvalidArgument: ``severity`` is not a MAV_SEVERITY, 0 to 7.
         """
-        if not 0 <= severity <= 7:
-            raise InvalidArgument(f"severity = {severity} is not allowed: 0 (EMERGENCY) to 7 (DEBUG)")
+        check_severity(severity)
         self._host.send_text(severity, text)
 
     def send_event(self, event_id: int, arguments: bytes = b"", *, severity: int = MavSeverity.INFO.value) -> None:

@@ -19,6 +19,12 @@ MAX_ARGUMENT_BYTES = 40
 _UNAVAILABLE = 0  # MAV_EVENT_ERROR_REASON_UNAVAILABLE
 
 
+def check_severity(severity: int) -> None:
+    """Raise InvalidArgument unless it is a MAV_SEVERITY."""
+    if not MavSeverity.EMERGENCY <= severity <= MavSeverity.DEBUG:
+        raise InvalidArgument(f"severity = {severity} is not allowed: 0 (EMERGENCY) to 7 (DEBUG)")
+
+
 class EventSender:
     """Sends EVENT, and sends the last 64 events again on request."""
 
@@ -33,8 +39,7 @@ class EventSender:
             raise InvalidArgument(f"event_id = {event_id} is not allowed: 0 to 4294967295")
         if len(arguments) > MAX_ARGUMENT_BYTES:
             raise InvalidArgument(f"arguments has {len(arguments)} bytes, at most {MAX_ARGUMENT_BYTES} fit")
-        if not MavSeverity.EMERGENCY <= severity <= MavSeverity.DEBUG:
-            raise InvalidArgument(f"severity = {severity} is not allowed: 0 (EMERGENCY) to 7 (DEBUG)")
+        check_severity(severity)
         is_first = self._sequence < 0
         self._sequence = (self._sequence + 1) & 0xFFFF
         levels = severity << 4 | severity
