@@ -20,6 +20,7 @@ from aerokit.mavlink.enums import (
     StorageUsageFlag,
 )
 from aerokit.mavlink.messages import CameraImageCaptured
+from aerokit.onboard.commands import overrides
 from aerokit.position import Position
 from aerokit.protocols.servers.camera_device import UNKNOWN_ATTITUDE, CameraDevice
 
@@ -165,8 +166,7 @@ class CameraDriver:
 
 
 def _has(camera: CameraDriver, name: str) -> bool:
-    """Return True if the program's class overrides a method."""
-    return getattr(type(camera), name) is not getattr(CameraDriver, name)
+    return overrides(camera, CameraDriver, name)
 
 
 def capabilities_of(camera: CameraDriver) -> int:

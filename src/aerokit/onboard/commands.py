@@ -100,6 +100,11 @@ def outcome_of(value: object) -> Outcome:
     return Outcome(MavResult.FAILED)
 
 
+def overrides(driver: object, base: type, name: str) -> bool:
+    """Return True if the class of a driver overrides a method of its base class."""
+    return getattr(type(driver), name) is not getattr(base, name)
+
+
 def result_of(error: BaseException) -> int:
     """Return the MAV_RESULT for an error of a handler."""
     if isinstance(error, NotSupported):
