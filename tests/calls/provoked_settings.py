@@ -52,8 +52,8 @@ def _names(uri: str) -> Callable[[SimulatedCamera], None]:
 
 
 def _lacks_information(camera: SimulatedCamera) -> None:
-    camera._builders.pop(m.CameraInformation.ID)
-    camera.vehicle.call_later(5.0, lambda: camera._builders.update(camera.builders()))
+    camera._streams.builders.pop(m.CameraInformation.ID)
+    camera.vehicle.call_later(5.0, lambda: camera._streams.builders.update(camera.builders()))
 
 
 def _loses_files(camera: SimulatedCamera) -> None:

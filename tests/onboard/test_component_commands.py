@@ -50,6 +50,20 @@ async def test_command_with_other_values_is_denied(params: tuple[float, ...]) ->
     assert "is not allowed" in texts[0].text
 
 
+async def test_error_without_text_is_reported_by_its_type(caplog: pytest.LogCaptureFixture) -> None:
+    async with payload_and_station() as (payload, station):
+
+        @payload.command(MavCmd.USER_1)
+        async def drop(_: CommandRequest) -> None:
+            raise OSError
+
+        with station.collecting(m.Statustext) as texts:
+            ack = await station.command(MavCmd.USER_1)
+    assert ack.result == MavResult.FAILED
+    assert [message.text for message in texts] == ["drop: OSError"]
+    assert [record.getMessage() for record in caplog.records] == ["component 1/191: drop: OSError"]
+
+
 async def test_running_command_reports_progress_and_is_not_started_twice() -> None:
     started = 0
     async with payload_and_station() as (payload, station):

@@ -188,6 +188,18 @@ async def test_mission_is_uploaded_and_downloaded() -> None:
     assert uploads == [("mission", 30), ("mission", 0)]
 
 
+async def test_mission_id_stays_while_the_current_item_changes() -> None:
+    async with payload_and_station() as (payload, station):
+        payload.missions.replace([MissionItem(16, 6, x=number, y=number) for number in range(3)])
+        count = await station.ask(m.MissionRequestList(*station.target), m.MissionCount)
+        for index in (1, 2):
+            with station.connection.subscribe(m.MissionCurrent) as stream:
+                payload.missions.set_current(index)
+                assert (await stream.get(5.0)).mission_id == count.opaque_id != 0
+        payload.missions.replace([MissionItem(16, 6, x=1, y=1)])
+        assert (await station.ask(m.MissionRequestList(*station.target), m.MissionCount)).opaque_id != count.opaque_id
+
+
 async def test_mission_refused_by_program_is_not_stored() -> None:
     async with autopilot_and_client() as (node, vehicle):
 

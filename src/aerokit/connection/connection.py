@@ -159,11 +159,7 @@ class Connection:
             InvalidArgument: a field is out of range; nothing was sent.
             ConnectionClosed, LinkLost: the connection has ended.
         """
-        self.raise_if_ended()
-        now = 0.0 if self._encoder.signing is None else self.unix_time()
-        data = self._encoder.encode(message, now)
-        self._write(data, message, to)
-        self._observers.notify_sent(data)
+        self._send_by(self._encoder, message, to)
 
     @checked
     def write_raw(self, data: bytes) -> None:
@@ -186,11 +182,8 @@ class Connection:
 
     def send_as(self, encoder: FrameEncoder, message: Message, *, to: int | None = None) -> None:
         """Send a message of another component of this program, which has an encoder of its own. See :meth:`send`."""
-        self.raise_if_ended()
         encoder.version, encoder.signing = self._encoder.version, self._encoder.signing
-        data = encoder.encode(message, 0.0 if encoder.signing is None else self.unix_time())
-        self._write(data, message, to)
-        self._observers.notify_sent(data)
+        self._send_by(encoder, message, to)
 
     def feed(self) -> None:
         """Keep our heartbeat going for another ``fed_within_s`` seconds (see `OwnHeartbeat`).
@@ -509,6 +502,15 @@ class Connection:
         self.deadlines.close()
         self._background.cancel()
 
+    def _send_by(self, encoder: FrameEncoder, message: Message, to: int | None) -> None:
+        self.raise_if_ended()
+        data = self._encode(encoder, message)
+        self._write(data, message, to)
+        self._observers.notify_sent(data)
+
+    def _encode(self, encoder: FrameEncoder, message: Message) -> bytes:
+        return encoder.encode(message, 0.0 if encoder.signing is None else self.unix_time())
+
     def _write(self, data: bytes, message: Message | None, to: int | None) -> None:
         system_id = getattr(message, "target_system", 0) if to is None else to
         for peer in self._routes.peers_of(system_id, getattr(message, "target_component", 0), message):
@@ -517,8 +519,7 @@ class Connection:
 
     def _send_to_peer(self, message: Message, peer: Peer) -> None:
         """Number, frame and write a message to one peer, e.g. a probe over each of several links."""
-        now = 0.0 if self._encoder.signing is None else self.unix_time()
-        data = self._encoder.encode(message, now)
+        data = self._encode(self._encoder, message)
         self.link.write(data, peer)
         self._observers.record_sent(data, self._clock())
 

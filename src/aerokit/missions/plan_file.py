@@ -55,13 +55,10 @@ def write_plan_file(path: str | os.PathLike[str], plan: Plan) -> None:
 def parse_plan(text: str, name: str = "plan") -> Plan:
     """Parse the text of a file. Errors begin with ``name``."""
     document = load_json(text, name)
-    allowed = {"fileType": "Plan", "version": 1}
-    for key, value in allowed.items():  # First: another kind of file lacks most fields.
-        if _member(document.value, key) is not None:
-            document[key].one_of(value)
+    for key, allowed in (("fileType", "Plan"), ("version", 1)):  # First: another kind of file lacks most fields.
+        if (found := document.child(key)) is not None:
+            found.one_of(allowed)
     _check_required(document)
-    for key, value in allowed.items():
-        document[key].one_of(value)
     mission = document.child("mission")
     fence, rally = document.child("geoFence"), document.child("rallyPoints")
     return Plan(

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit.errors import NotSupported
 from aerokit.mavlink.enums import MavCmd
+from aerokit.onboard.commands import overrides
 
 if TYPE_CHECKING:
     from aerokit.onboard.commands import CommandRequest
@@ -67,7 +68,7 @@ def add_autopilot(
     """Serve the commands of a vehicle. ``report(armed, custom_mode)`` changes the heartbeat; None: unchanged."""
 
     async def call(name: str, *arguments: object) -> None:
-        if getattr(type(driver), name) is getattr(AutopilotDriver, name):
+        if not overrides(driver, AutopilotDriver, name):
             raise NotSupported(f"this vehicle does not support {name}")
         await services.commands.call(getattr(driver, name), *arguments)
 

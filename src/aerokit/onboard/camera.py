@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -10,20 +9,20 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit._internal.rotations import quaternion_from_euler
 from aerokit._internal.values import Snapshot
-from aerokit.errors import AerokitError, InvalidArgument
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import (
     CameraCapFlags,
     CameraZoomType,
-    MavSeverity,
     SetFocusType,
     StorageStatus,
     StorageType,
     StorageUsageFlag,
 )
 from aerokit.mavlink.messages import CameraImageCaptured
+from aerokit.onboard.commands import overrides
 from aerokit.position import Position
-from aerokit.protocols.servers.camera_device import CameraDevice
+from aerokit.protocols.servers.camera_device import UNKNOWN_ATTITUDE, CameraDevice
 
 if TYPE_CHECKING:
     from aerokit.connection.tasks import BackgroundTasks
@@ -31,10 +30,6 @@ if TYPE_CHECKING:
     from aerokit.parameters import SettingValue
     from aerokit.protocols.servers.camera_device import Shot
     from aerokit.protocols.servers.host import ServerHost
-
-logger: logging.Logger = logging.getLogger("aerokit")
-
-_NOWHERE = (math.nan, math.nan, math.nan, math.nan)
 
 
 class Photo(Snapshot):
@@ -171,8 +166,7 @@ class CameraDriver:
 
 
 def _has(camera: CameraDriver, name: str) -> bool:
-    """Return True if the program's class overrides a method."""
-    return getattr(type(camera), name) is not getattr(CameraDriver, name)
+    return overrides(camera, CameraDriver, name)
 
 
 def capabilities_of(camera: CameraDriver) -> int:
@@ -252,9 +246,7 @@ class CameraAdapter(CameraDevice):
                 photo = await self._call(self._camera.take_photo, len(self.captures.images))
                 shot = _shot(photo, time_boot_ms, unix_time)
             except Exception as error:
-                if not isinstance(error, AerokitError):
-                    logger.error("take_photo failed", exc_info=error)
-                self._host.send_text(MavSeverity.WARNING, f"take_photo: {error or type(error).__name__}")
+                self._host.report_error("take_photo", error)
             finally:
                 done(shot)
 
@@ -351,6 +343,6 @@ def _shot(photo: Photo, time_boot_ms: int, unix_time: float) -> Shot:
         0 if place is None else round(place.longitude_deg * 1e7),
         0 if place is None or place.altitude_amsl_m is None else round(place.altitude_amsl_m * 1000),
         0 if place is None or place.altitude_relative_m is None else round(place.altitude_relative_m * 1000),
-        _NOWHERE if len(known) < 3 else quaternion_from_euler(*known),
+        UNKNOWN_ATTITUDE if len(known) < 3 else quaternion_from_euler(*known),
     )
     return lambda **fields: shot(**{"file_url": photo.url, **fields})

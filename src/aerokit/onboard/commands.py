@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import inspect
-import logging
 import math
 from collections.abc import Awaitable, Callable
 from functools import partial
@@ -12,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit._internal.arguments import checks_arguments
 from aerokit._internal.values import Snapshot
-from aerokit.errors import AerokitError, BusyError, InvalidArgument, NotSupported
-from aerokit.mavlink.enums import MavCmd, MavFrame, MavResult, MavSeverity
+from aerokit.errors import BusyError, InvalidArgument, NotSupported
+from aerokit.mavlink.enums import MavFrame, MavResult
+from aerokit.missions.item import command_name
 from aerokit.onboard.arguments import CommandArgument, arguments_of
 from aerokit.position import Position
 from aerokit.protocols.servers.commands import CommandDispatcher, Outcome, RunningCommands
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from aerokit.connection.tasks import BackgroundTasks
     from aerokit.onboard.host import ComponentHost
     from aerokit.protocols.servers.commands import CommandHandler, CommandProgress, ReceivedCommand, RunningCommand
-
-logger: logging.Logger = logging.getLogger("aerokit")
 
 _ABSOLUTE = frozenset((MavFrame.GLOBAL, MavFrame.GLOBAL_INT))
 _RELATIVE = frozenset((MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT))
@@ -91,11 +89,6 @@ class CommandRequest:
         return f"<CommandRequest {command_name(self.command)} from {self.sender[0]}/{self.sender[1]}>"
 
 
-def command_name(command: int) -> str:
-    """Return the name of a MAV_CMD, or its number."""
-    return MavCmd(command).name if command in MavCmd.__members__.values() else f"command {command}"
-
-
 def outcome_of(value: object) -> Outcome:
     """Convert what a handler has returned: None is ACCEPTED."""
     if value is None or value is True:
@@ -105,6 +98,11 @@ def outcome_of(value: object) -> Outcome:
     if isinstance(value, int) and value is not False:
         return Outcome(int(value))
     return Outcome(MavResult.FAILED)
+
+
+def overrides(driver: object, base: type, name: str) -> bool:
+    """Return True if the class of a driver overrides a method of its base class."""
+    return getattr(type(driver), name) is not getattr(base, name)
 
 
 def result_of(error: BaseException) -> int:
@@ -149,7 +147,7 @@ class ComponentCommands:
                 try:
                     return handler(command)
                 except Exception as error:
-                    self._explain(command_name(command.command), error)
+                    self._host.report_error(command_name(command.command), error)
                     return result_of(error)
 
             return guarded
@@ -158,10 +156,17 @@ class ComponentCommands:
 
     async def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Call a function of the program: a coroutine function, or a plain one, in a thread if ``uses_threads``."""
+        found = self.begin(function, *arguments)
+        return await found if inspect.isawaitable(found) else found
+
+    def begin(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Like `call`, but return the result of a plain function at once, or an awaitable."""
         if inspect.iscoroutinefunction(function) or not self.uses_threads:
-            found = function(*arguments)
-        else:
-            found = await asyncio.to_thread(function, *arguments)
+            return function(*arguments)
+        return self._call_in_thread(function, *arguments)
+
+    async def _call_in_thread(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        found = await asyncio.to_thread(function, *arguments)
         return await found if inspect.isawaitable(found) else found
 
     def add_raw(self, command: int, function: Callable[[ReceivedCommand], Awaitable[int]]) -> None:
@@ -206,7 +211,7 @@ class ComponentCommands:
         request = CommandRequest(command, report)
         try:
             values = [argument.convert(request.params[argument.number - 1]) for argument in arguments]
-            answer = self.call(function, request, *values) if self.uses_threads else function(request, *values)
+            answer = self.begin(function, request, *values)
         except Exception as error:
             self._fail(running, function, error)
             return
@@ -239,10 +244,5 @@ class ComponentCommands:
         """Answer with the result for an error, and explain it in a status text."""
         name = getattr(function, "__name__", "run")
         name = command_name(running.command.command) if name == "run" else name
-        self._explain(name, error)
+        self._host.report_error(name, error)
         self._running.finish(running, Outcome(result_of(error)))
-
-    def _explain(self, name: str, error: Exception) -> None:
-        if not isinstance(error, AerokitError):
-            logger.error("the handler %s of a command failed", name, exc_info=error)
-        self._host.send_text(MavSeverity.WARNING, f"{name}: {error or type(error).__name__}")

@@ -15,7 +15,7 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import CompMetadataType, MavCmd, MavModeFlag, MavSeverity, MavState, MavType
 from aerokit.mavlink.enums import MavProtocolCapability as Can
 from aerokit.mavlink.message import Message
-from aerokit.onboard.events import EventSender, answer_pings
+from aerokit.onboard.events import EventSender, answer_pings, check_severity
 from aerokit.onboard.files import DirectoryFiles
 from aerokit.onboard.host import ComponentHost
 from aerokit.onboard.identity import PARAMETER_PATH, Identity, IdentityMessages
@@ -75,7 +75,11 @@ class OnboardComponent:
         self._memory = self._services.memory
         self._identity = IdentityMessages(self._host, identity, self._memory)
         self._streams.builders.update(self._identity.builders())
-        self._ftp: SessionFtpServer[DirectoryFiles] | None = None
+        files = DirectoryFiles(None, self._memory, is_writable=False)
+        self._ftp: SessionFtpServer[DirectoryFiles] = SessionFtpServer(
+            self._host, files, is_congested=self._is_congested
+        )
+        self._identity.capabilities |= Can.FTP
         self._events = EventSender(self._host)
         self._missions: ComponentMissions | None = None
         self._sources: ComponentSources | None = None
@@ -85,7 +89,6 @@ class OnboardComponent:
         else:
             self._identity.capabilities |= Can.PARAM_ENCODE_C_CAST
         self._identity.offer(CompMetadataType.PARAMETER, PARAMETER_PATH, self.parameters.json)
-        self._serve(None, is_writable=False)
 
     def _start(self) -> None:
         self._send_heartbeat()
@@ -98,8 +101,7 @@ class OnboardComponent:
             with anyio.CancelScope(shield=True):
                 await self.parameters.aclose()
         finally:
-            if self._ftp is not None:
-                self._ftp.close()
+            self._ftp.close()
             self._host.close()
 
     def _use_threads(self) -> None:
@@ -218,8 +220,7 @@ class OnboardComponent:
         Raises:
             InvalidArgument: ``severity`` is not a MAV_SEVERITY, 0 to 7.
         """
-        if not 0 <= severity <= 7:
-            raise InvalidArgument(f"severity = {severity} is not allowed: 0 (EMERGENCY) to 7 (DEBUG)")
+        check_severity(severity)
         self._host.send_text(severity, text)
 
     def send_event(self, event_id: int, arguments: bytes = b"", *, severity: int = MavSeverity.INFO.value) -> None:
@@ -252,18 +253,9 @@ class OnboardComponent:
         root = Path(directory)
         if not root.is_dir():
             raise InvalidArgument(f"directory = {str(directory)!r} is not an existing directory")
-        if self._ftp is not None and self._ftp.files.has_root:
+        if self._ftp.files.has_root:
             raise InvalidArgument("serve_files was called twice")
-        self._serve(root, is_writable=writable)
-
-    def _serve(self, root: Path | None, *, is_writable: bool) -> None:
-        files = DirectoryFiles(root, self._memory, is_writable=is_writable)
-        if self._ftp is None:
-            congested = self._is_congested
-            self._ftp = SessionFtpServer(self._host, files, is_congested=congested)
-            self._identity.capabilities |= Can.FTP
-        else:
-            self._ftp.files = files
+        self._ftp.files = DirectoryFiles(root, self._memory, is_writable=writable)
 
     def set_metadata(self, kind: MetadataKind, content: bytes) -> None:
         """Offer a metadata file (JSON) by MAVFTP, and list it in the general metadata.

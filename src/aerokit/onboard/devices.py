@@ -10,7 +10,8 @@ from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument, NotSupported
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import GripperActions, MavArmAuthDeniedReason, MavCmd, MavResult, MavSeverity, WinchActions
-from aerokit.onboard.commands import CommandResult, result_of
+from aerokit.onboard.commands import CommandResult, overrides, result_of
+from aerokit.onboard.host import error_text
 
 if TYPE_CHECKING:
     from aerokit.onboard.commands import CommandRequest
@@ -105,7 +106,7 @@ def add_winch(services: ComponentServices, winch: WinchDriver) -> None:
         _: CommandRequest, instance: float | None, action: int, length: float | None, rate: float | None
     ) -> None:
         name = _WINCH_CALLS.get(action, "")
-        if not name or getattr(type(winch), name) is getattr(WinchDriver, name):
+        if not name or not overrides(winch, WinchDriver, name):
             raise NotSupported(f"this winch does not support action {action}")
         arguments = {"pay_out": (length, rate), "set_rate": (rate,)}.get(name, ())
         if None in arguments:
@@ -149,7 +150,7 @@ def add_arm_authorizer(services: ComponentServices, authorize: Authorize) -> Non
             # PX4 sends 0 for itself (ArmAuthorization.cpp).
             seconds = await services.commands.call(authorize, system_id or request.sender[0])
         except Exception as error:
-            services.host.send_text(MavSeverity.WARNING, f"arming denied: {error or type(error).__name__}")
+            services.host.send_text(MavSeverity.WARNING, f"arming denied: {error_text(error)}")
             result = result_of(error)
             reason = MavArmAuthDeniedReason.NONE if result == MavResult.DENIED else MavArmAuthDeniedReason.GENERIC
             return CommandResult(MavResult.DENIED, detail=reason)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavSeverity
-from aerokit.protocols.servers.host import Channel, sender_of
+from aerokit.protocols.servers.host import Channel
 
 if TYPE_CHECKING:
     from aerokit.onboard.host import ComponentHost
@@ -17,6 +17,12 @@ MAX_STORED_EVENTS = 64
 SEQUENCE_INTERVAL_S = 5.0
 MAX_ARGUMENT_BYTES = 40
 _UNAVAILABLE = 0  # MAV_EVENT_ERROR_REASON_UNAVAILABLE
+
+
+def check_severity(severity: int) -> None:
+    """Raise InvalidArgument unless it is a MAV_SEVERITY."""
+    if not MavSeverity.EMERGENCY <= severity <= MavSeverity.DEBUG:
+        raise InvalidArgument(f"severity = {severity} is not allowed: 0 (EMERGENCY) to 7 (DEBUG)")
 
 
 class EventSender:
@@ -33,8 +39,7 @@ class EventSender:
             raise InvalidArgument(f"event_id = {event_id} is not allowed: 0 to 4294967295")
         if len(arguments) > MAX_ARGUMENT_BYTES:
             raise InvalidArgument(f"arguments has {len(arguments)} bytes, at most {MAX_ARGUMENT_BYTES} fit")
-        if not MavSeverity.EMERGENCY <= severity <= MavSeverity.DEBUG:
-            raise InvalidArgument(f"severity = {severity} is not allowed: 0 (EMERGENCY) to 7 (DEBUG)")
+        check_severity(severity)
         is_first = self._sequence < 0
         self._sequence = (self._sequence + 1) & 0xFFFF
         levels = severity << 4 | severity
@@ -68,7 +73,7 @@ def answer_pings(host: ComponentHost) -> None:
 
     def on_ping(ping: m.Ping, channel: Channel) -> None:
         if ping.target_system == 0 and ping.target_component == 0:  # else it is the answer to another component
-            host.send(m.Ping(ping.time_usec, ping.seq, *sender_of(ping)), channel)
+            host.send(m.Ping(ping.time_usec, ping.seq, *channel), channel)
 
     def on_timesync(message: m.Timesync, channel: Channel) -> None:
         if message.tc1 == 0:

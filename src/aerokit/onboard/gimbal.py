@@ -9,6 +9,7 @@ from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import GimbalDeviceCapFlags as Can
 from aerokit.mavlink.enums import GimbalManagerFlags as Flags
+from aerokit.onboard.commands import overrides
 from aerokit.position import Position
 from aerokit.protocols.servers.gimbal import ALL_CAPABILITIES, Angles, GimbalMount, Place
 
@@ -99,7 +100,7 @@ class GimbalAdapter(GimbalMount):
             (math.radians(low), math.radians(high)) for low, high in (roll, pitch, yaw)
         )
         self.slew_rad_s: float = math.radians(gimbal.max_rate_deg_s)
-        self.can_point_at_positions: bool = type(gimbal).look_at is not GimbalDriver.look_at
+        self.can_point_at_positions: bool = overrides(gimbal, GimbalDriver, "look_at")
         self.capabilities: int = ALL_CAPABILITIES
         for axis, limits in ((_ROLL, roll), (_PITCH, pitch), (_YAW, yaw)):
             if limits[0] == limits[1]:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from aerokit.errors import AerokitError
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.enums import MavSeverity
 from aerokit.protocols.servers.host import sender_of
 
 if TYPE_CHECKING:
@@ -101,6 +102,13 @@ class ComponentHost:
         if len(data) % TEXT_SIZE == 0:  # a full last chunk is followed by an empty one
             self.send(m.Statustext(severity, "", self._text_id, len(data) // TEXT_SIZE))
 
+    def report_error(self, what: str, error: Exception) -> None:
+        """Send an error of the program's code as status text, and log it unless it is an error of aerokit."""
+        text = f"{what}: {error_text(error)}"
+        if not isinstance(error, AerokitError):
+            logger.error("component %d/%d: %s", self.system_id, self.component_id, text, exc_info=error)
+        self.send_text(MavSeverity.WARNING, text)
+
     def call_at(self, when: float, action: Callable[[], None]) -> None:
         """Call a function at a loop time, unless the component has ended."""
 
@@ -128,3 +136,8 @@ class ComponentHost:
             logger.warning("component %d/%d: %s", self.system_id, self.component_id, error)
         except Exception:
             logger.exception("component %d/%d: unexpected error", self.system_id, self.component_id)
+
+
+def error_text(error: Exception) -> str:
+    """Return the text of an error, or its type if it has none."""
+    return str(error) or type(error).__name__

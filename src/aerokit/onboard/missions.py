@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import inspect
-import logging
 from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from aerokit._internal.arguments import checks_arguments
-from aerokit.errors import AerokitError, InvalidArgument
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavCmd, MavMissionResult, MavMissionType, MavSeverity
+from aerokit.mavlink.enums import MavCmd, MavMissionResult, MavMissionType
 from aerokit.missions import MissionItem
 from aerokit.missions.check import check_items
 from aerokit.protocols.servers.missions import MissionServer
@@ -20,8 +19,6 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.onboard.commands import CommandRequest, ComponentCommands
     from aerokit.onboard.host import ComponentHost
-
-logger: logging.Logger = logging.getLogger("aerokit")
 
 _NAMES = {"mission": MavMissionType.MISSION, "fence": MavMissionType.FENCE, "rally": MavMissionType.RALLY}
 
@@ -98,8 +95,7 @@ class ComponentMissions:
             check_items(items, mission_type)
             verdict: Any = None
             if function is not None:
-                in_thread = self._commands.uses_threads
-                verdict = self._commands.call(function, kind, items) if in_thread else function(kind, items)
+                verdict = self._commands.begin(function, kind, items)
         except Exception as error:
             answer(self._refused(kind, error))
             return
@@ -119,9 +115,7 @@ class ComponentMissions:
         self._tasks.start(wait, "aerokit mission upload")
 
     def _refused(self, kind: str, error: Exception) -> int:
-        if not isinstance(error, AerokitError):
-            logger.error("on_upload of the component failed", exc_info=error)
-        self._host.send_text(MavSeverity.WARNING, f"{kind} refused: {error or type(error).__name__}")
+        self._host.report_error(f"{kind} refused", error)
         is_invalid = isinstance(error, ValueError)
         return MavMissionResult.INVALID if is_invalid else MavMissionResult.ERROR
 

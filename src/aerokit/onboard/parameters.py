@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit._internal.arguments import checks_arguments
 from aerokit._internal.files import read_text, write_atomically
-from aerokit.errors import AerokitError, FileFormatError, InvalidArgument
+from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.mavlink.enums import MavParamError, MavParamExtType, MavSeverity, ParamAck
 from aerokit.parameters import ParameterMetadata, check_name
 from aerokit.parameters.parameter import checked_setting, settings_equal, to_float32
-from aerokit.protocols.servers.parameters import TypedExtendedServer, TypedParameterServer
+from aerokit.protocols.servers.parameters import TypedExtendedServer, TypedParameterServer, fits_param_value
 
 if TYPE_CHECKING:
     from aerokit.onboard.host import ComponentHost
@@ -53,6 +53,7 @@ class ComponentParameters(Mapping[str, ParameterValue]):
     def __init__(self, host: ComponentHost, path: Path | None, *, bytewise: bool) -> None:
         self._host, self._path = host, path
         self._rows: dict[str, _Row] = {}
+        self._small_names: list[str] = []
         self._stored: dict[str, Any] = _read(path)
         self._is_dirty = False
         self._saving: asyncio.Task[None] | None = None
@@ -121,6 +122,8 @@ class ComponentParameters(Mapping[str, ParameterValue]):
             except InvalidArgument as error:
                 logger.warning("%s: the default is used: %s", self._path, error)
         self._rows[name] = row
+        if fits_param_value(row.type):
+            self._small_names.append(name)
         if self._extended is None:  # not before, because a camera may serve its own settings by PARAM_EXT
             self._extended = TypedExtendedServer(self._host, _Store(self))
 
@@ -224,6 +227,10 @@ class _Store:
     def names(self) -> tuple[str, ...]:
         return tuple(self._parameters._rows)
 
+    @property
+    def small_names(self) -> list[str]:
+        return self._parameters._small_names
+
     def __contains__(self, name: object) -> bool:
         return name in self._parameters._rows
 
@@ -247,9 +254,7 @@ class _Store:
             self._parameters._host.send_text(MavSeverity.WARNING, str(error))
             return MavParamError.VALUE_OUT_OF_RANGE, ParamAck.VALUE_UNSUPPORTED
         except Exception as error:
-            if not isinstance(error, AerokitError):
-                logger.error("on_set of parameter %s failed", name, exc_info=error)
-            self._parameters._host.send_text(MavSeverity.WARNING, f"{name}: {error or 'the value was refused'}")
+            self._parameters._host.report_error(name, error)
             return MavParamError.VALUE_OUT_OF_RANGE, ParamAck.FAILED
         return None
 

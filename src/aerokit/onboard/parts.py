@@ -10,6 +10,7 @@ from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.onboard.camera import CameraAdapter, CameraDriver
+from aerokit.onboard.commands import overrides
 from aerokit.onboard.gimbal import STATUS_INTERVAL_S, GimbalAdapter, GimbalDriver
 from aerokit.parameters import parse_definition
 from aerokit.protocols.servers.camera import camera_builders
@@ -52,7 +53,7 @@ def add_camera(services: ComponentServices, camera: CameraDriver) -> CameraAdapt
         adapter.definition_version, adapter.definition_uri = definition.version, f"mftp://{DEFINITION_PATH}"
     streams.builders.update(camera_builders(adapter))
     for command, handler in camera_commands(adapter).items():
-        if command == MavCmd.STORAGE_FORMAT and type(camera).format_storage is CameraDriver.format_storage:
+        if command == MavCmd.STORAGE_FORMAT and not overrides(camera, CameraDriver, "format_storage"):
             continue
         services.commands.add_raw(command, partial(_run, handler))
     services.commands.handlers.update(legacy_requests(streams))

@@ -12,12 +12,13 @@ from aerokit.mavlink.enums import MavProtocolCapability
 from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.messages import GpsRtcmData, SetupSigning
 from aerokit.mavlink.signing import LAST_TIMESTAMP, Signing, SigningKey, timestamp_at
+from aerokit.protocols.rtcm import FRAGMENT_SIZE, MAX_FRAGMENTS
 from aerokit.protocols.servers.files import FileTree
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandHandler, CommandServer, ReceivedCommand
 from aerokit.sim.vehicle import AttachableComponent, SimulatedVehicle
 
-_CORRECTIONS_MAX_AGE_S, _FRAGMENT_SIZE = 5.0, 180
+_CORRECTIONS_MAX_AGE_S = 5.0
 
 
 class VehicleSigning:
@@ -123,7 +124,8 @@ class ReceivedCorrections:
         if sequence != self._sequence or number in self._pieces:
             self._pieces.clear()
         self._sequence, self._pieces[number] = sequence, data
-        is_ended = any(len(piece) < _FRAGMENT_SIZE for piece in self._pieces.values()) or len(self._pieces) == 4
+        is_full = len(self._pieces) == MAX_FRAGMENTS
+        is_ended = is_full or any(len(piece) < FRAGMENT_SIZE for piece in self._pieces.values())
         if is_ended and len(self._pieces) == max(self._pieces) + 1:
             self._add(b"".join(self._pieces[index] for index in range(len(self._pieces))))
             self._pieces.clear()

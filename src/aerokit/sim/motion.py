@@ -80,6 +80,7 @@ _VELOCITY_TIME_CONSTANT_S = 0.3
 _LEAN_TIME_CONSTANT_S = 0.15
 _TURN_GAIN_PER_S = 2.0
 _TERMINAL_SPEED_M_S = 25.0
+_APPROACH_PER_S, _MAX_APPROACH_M_S = 0.8, 1.5
 
 
 def wrap_pi(angle: float) -> float:
@@ -91,6 +92,12 @@ def _clamp(value: float, limit: float) -> float:
     if value > limit:
         return limit
     return value if value > -limit else -limit
+
+
+def velocity_to_landing_target(north: float, east: float) -> tuple[float, float]:
+    """Return the horizontal velocity (m/s) of a precision landing whose target is this many metres away."""
+    share = min(_APPROACH_PER_S, _MAX_APPROACH_M_S / max(math.hypot(north, east), 1e-6))
+    return (north * share, east * share)
 
 
 def approach_speed(distance: float, gain: float, deceleration: float) -> float:

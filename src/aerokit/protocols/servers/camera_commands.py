@@ -37,9 +37,9 @@ def camera_commands(camera: CameraDevice) -> dict[int, AsyncHandler]:
         MavCmd.SET_CAMERA_FOCUS: settings.set_focus,
         MavCmd.SET_CAMERA_SOURCE: settings.set_source,
         MavCmd.RESET_CAMERA_SETTINGS: settings.reset,
-        MavCmd.CAMERA_TRACK_POINT: lambda command: camera.tracking.track_point(command),
-        MavCmd.CAMERA_TRACK_RECTANGLE: lambda command: camera.tracking.track_rectangle(command),
-        MavCmd.CAMERA_STOP_TRACKING: lambda command: camera.tracking.stop(command),
+        MavCmd.CAMERA_TRACK_POINT: camera.tracking.track_point,
+        MavCmd.CAMERA_TRACK_RECTANGLE: camera.tracking.track_rectangle,
+        MavCmd.CAMERA_STOP_TRACKING: camera.tracking.stop,
     }
 
 

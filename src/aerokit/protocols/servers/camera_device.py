@@ -26,8 +26,8 @@ MIN_STATUS_INTERVAL_S = 0.02
 # Creates CAMERA_IMAGE_CAPTURED from the keywords image_index, capture_result and file_url.
 Shot = Callable[..., CameraImageCaptured]
 
-
-_NOWHERE = (math.nan, math.nan, math.nan, math.nan)
+UNKNOWN_ATTITUDE = (math.nan, math.nan, math.nan, math.nan)
+"""Quaternion of CAMERA_IMAGE_CAPTURED for an unknown attitude."""
 
 
 class CameraDevice:
@@ -100,7 +100,7 @@ class CameraDevice:
 
     def failed_shot(self) -> Shot:
         """Return the content of CAMERA_IMAGE_CAPTURED for an image that could not be taken."""
-        return partial(CameraImageCaptured, self.host.time_boot_ms, 0, 0, 0, 0, 0, 0, _NOWHERE, file_url="")
+        return partial(CameraImageCaptured, self.host.time_boot_ms, 0, 0, 0, 0, 0, 0, UNKNOWN_ATTITUDE, file_url="")
 
     def has_space(self) -> bool:
         """Return True if another image fits."""

@@ -24,6 +24,8 @@ class DefinedParameterServer(ExtendedParameterServer):
 
     def __init__(self, host: ServerHost, definition: CameraDefinition) -> None:
         self.definition = definition
+        self.names: list[str] = [name for name, setting in definition.settings.items() if not setting.write_only]
+        """Names of the settings that are listed."""
         self.values: dict[str, SettingValue] = {}
         """Current values; assign them at any time."""
         self.slow: dict[str, float] = {}
@@ -31,11 +33,6 @@ class DefinedParameterServer(ExtendedParameterServer):
         self._pending: set[str] = set()
         super().__init__(host, self)
         self.reset()
-
-    @property
-    def names(self) -> list[str]:
-        """Names of the settings that are listed."""
-        return [name for name, setting in self.definition.settings.items() if not setting.write_only]
 
     def reset(self) -> None:
         """Restore all defaults."""

@@ -11,7 +11,7 @@ from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
 from aerokit.mavlink.messages import FileTransferProtocol
 from aerokit.protocols.ftp import DATA_SIZE
 from aerokit.protocols.servers.files import EFBIG, EINVAL, FileFault, FileHandle, FileSystem
-from aerokit.protocols.servers.ftp_packets import FtpPacket, crc32, leaves, path_in
+from aerokit.protocols.servers.ftp_packets import FtpPacket, ProtectedPath, checked_path, crc32
 from aerokit.protocols.servers.host import Channel, ServerHost
 
 FilesT = TypeVar("FilesT", bound=FileSystem)
@@ -20,13 +20,15 @@ FilesT = TypeVar("FilesT", bound=FileSystem)
 class FtpRequestServer(Generic[FilesT]):
     """Receives MAVFTP requests; subclasses answer them."""
 
-    is_enabled = True
-    """False to answer nothing, like a component without MAVFTP."""
-
     def __init__(self, host: ServerHost, files: FilesT) -> None:
         self.files = files
         self._host = host
         host.on(FileTransferProtocol, self._on_message)
+
+    @property
+    def is_enabled(self) -> bool:
+        """False to answer nothing, like a component without MAVFTP."""
+        return True
 
     @property
     def open_sessions(self) -> int:
@@ -181,6 +183,8 @@ class SessionFtpServer(FtpRequestServer[FilesT]):
                 answer: FtpPacket | None = request.refuse(MavFtpErr.UNKNOWNCOMMAND)
             else:
                 answer = handler(self, peer, request)
+        except ProtectedPath:
+            answer = request.refuse(MavFtpErr.FILEPROTECTED)
         except FileFault as fault:
             answer = self._fault(peer, request, fault)
         peer.reply = None
@@ -229,9 +233,7 @@ class SessionFtpServer(FtpRequestServer[FilesT]):
     def _open(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
         if len(peer.sessions) >= self.max_sessions:
             return request.refuse(MavFtpErr.NOSESSIONSAVAILABLE)
-        path = path_in(request.data[: request.size])
-        if leaves(path):
-            return request.refuse(MavFtpErr.FILEPROTECTED)
+        path = checked_path(request.data[: request.size])
         reading = request.opcode == Op.OPENFILERO
         size = self._size(path, reading=reading)
         if size > _MAX_SIZE:
@@ -322,10 +324,7 @@ class SessionFtpServer(FtpRequestServer[FilesT]):
         session.burst = None if complete else following
 
     def _list(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
-        path = path_in(request.data[: request.size])
-        if leaves(path):
-            return request.refuse(MavFtpErr.FILEPROTECTED)
-        entries = self.files.entries(path)
+        entries = self.files.entries(checked_path(request.data[: request.size]))
         listing = b""
         for text in [*self.list_prefix, *map(_line, entries)][request.offset :]:
             if len(listing) + len(text) + 1 > DATA_SIZE:
@@ -336,10 +335,7 @@ class SessionFtpServer(FtpRequestServer[FilesT]):
         return request.acknowledge(listing, offset=request.offset)
 
     def _change(self, request: FtpPacket, change: Callable[[str], None]) -> FtpPacket:
-        path = path_in(request.data[: request.size])
-        if leaves(path):
-            return request.refuse(MavFtpErr.FILEPROTECTED)
-        change(path)
+        change(checked_path(request.data[: request.size]))
         return request.acknowledge(offset=request.offset)
 
     def _truncate(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
@@ -349,17 +345,12 @@ class SessionFtpServer(FtpRequestServer[FilesT]):
         first, _, rest = request.data[: request.size].partition(b"\0")
         if len(first) + 2 >= request.size:
             return self._fault(peer, request, FileFault(EINVAL))
-        path, to = path_in(first), path_in(rest)
-        if leaves(path) or leaves(to):
-            return request.refuse(MavFtpErr.FILEPROTECTED)
-        self.files.rename(path, to)
+        self.files.rename(checked_path(first), checked_path(rest))
         return request.acknowledge(offset=request.offset)
 
     def _crc32(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket | None:
         """Compute a checksum in slices, so that a large file does not keep the host from its other work."""
-        path = path_in(request.data[: request.size])
-        if leaves(path):
-            return request.refuse(MavFtpErr.FILEPROTECTED)
+        path = checked_path(request.data[: request.size])
         is_repeated = peer.checksum is not None and peer.checksum.sequence == request.sequence
         if not is_repeated:
             peer.checksum = request

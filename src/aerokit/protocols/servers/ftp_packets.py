@@ -61,5 +61,13 @@ def read_crc32(files: FileSystem, path: str, block: int) -> int:
     return checksum
 
 
-def leaves(path: str) -> bool:
-    return ".." in path.split("/")
+class ProtectedPath(Exception):
+    """A request whose path leads out of its folder."""
+
+
+def checked_path(data: bytes) -> str:
+    """Return the path of a request; raises ProtectedPath if it contains ``..``."""
+    path = path_in(data)
+    if ".." in path.split("/"):
+        raise ProtectedPath
+    return path

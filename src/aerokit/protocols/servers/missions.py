@@ -80,7 +80,8 @@ class MissionServer:
         capacity: int = MAX_ITEMS,
     ) -> None:
         self.lists: dict[int, tuple[MissionItem, ...]] = dict.fromkeys(_TYPES, ())
-        """MAV_MISSION_TYPE → items."""
+        """MAV_MISSION_TYPE → items; call `replace` to change them."""
+        self._opaque_ids: dict[int, int] = {}  # Kept, because MISSION_CURRENT reports them at its stream rate.
         self.current: int = 0
         """Index of the current item of the mission."""
         self._host = host
@@ -104,10 +105,12 @@ class MissionServer:
         return self._upload is not None
 
     def opaque_id(self, mission_type: int) -> int:
-        """Return a checksum of a list; 0 if it is empty."""
+        """Return a checksum of a list; 0 if it is empty. It does not depend on the current item."""
         items = self.lists.get(mission_type, ())
-        data = b"".join(self._item(item, seq, (0, 0), mission_type).encode() for seq, item in enumerate(items))
-        return (zlib.crc32(data) or 1) if items else 0
+        if items and mission_type not in self._opaque_ids:
+            messages = (_item_message(item, seq, (0, 0), mission_type, current=False) for seq, item in enumerate(items))
+            self._opaque_ids[mission_type] = zlib.crc32(b"".join(message.encode() for message in messages)) or 1
+        return self._opaque_ids[mission_type] if items else 0
 
     def current_message(self) -> m.MissionCurrent:
         mission = self.lists[MavMissionType.MISSION]
@@ -120,6 +123,7 @@ class MissionServer:
     def replace(self, mission_type: int, items: Sequence[MissionItem]) -> None:
         """Replace a list."""
         self.lists[mission_type] = tuple(items)
+        self._opaque_ids.pop(mission_type, None)
         if mission_type == MavMissionType.MISSION:
             self.current = 0
 
@@ -131,9 +135,8 @@ class MissionServer:
         self._host.send(self.current_message())
         return True
 
-    def _item(self, item: MissionItem, seq: int, to: tuple[int, int], mission_type: int) -> m.MissionItemInt:
-        whole = item.replace(x=round(item.x), y=round(item.y))
-        return item_message_int(whole, seq, to, mission_type, current=seq == self.current and mission_type == 0)
+    def _is_current(self, seq: int, mission_type: int) -> bool:
+        return seq == self.current and mission_type == MavMissionType.MISSION
 
     def _acknowledge(self, to: tuple[int, int], kind: int, result: int, channel: Channel, opaque_id: int = 0) -> None:
         self._host.send(m.MissionAck(*to, result, kind, opaque_id), channel)
@@ -151,9 +154,9 @@ class MissionServer:
         if not 0 <= seq < len(items):
             self._acknowledge(to, kind, _R.INVALID_SEQUENCE, channel)
         elif isinstance(request, m.MissionRequestInt):
-            self._host.send(self._item(items[seq], seq, to, kind), channel)
+            message = _item_message(items[seq], seq, to, kind, current=self._is_current(seq, kind))
+            self._host.send(message, channel)
         else:
-            current = seq == self.current and kind == MavMissionType.MISSION
             system, component = to
             self._host.send(
                 to_wire_float(
@@ -162,7 +165,7 @@ class MissionServer:
                     target_system=system,
                     target_component=component,
                     mission_type=kind,
-                    current=current,
+                    current=self._is_current(seq, kind),
                 ),
                 channel,
             )
@@ -268,3 +271,10 @@ class MissionServer:
     def _on_set_current_message(self, request: m.MissionSetCurrent, channel: Channel) -> None:
         if not self.set_current(request.seq):
             self._host.send(self.current_message(), channel)
+
+
+def _item_message(
+    item: MissionItem, seq: int, to: tuple[int, int], mission_type: int, *, current: bool
+) -> m.MissionItemInt:
+    whole = item.replace(x=round(item.x), y=round(item.y))
+    return item_message_int(whole, seq, to, mission_type, current=current)

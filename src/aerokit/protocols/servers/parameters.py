@@ -109,6 +109,11 @@ class ParameterProtocolServer(ParameterLists):
 class TypedStore(NamedList, Protocol):
     """Typed parameters of a component."""
 
+    @property
+    def small_names(self) -> Sequence[str]:
+        """Names of the parameters whose type `fits_param_value`; read for every PARAM_VALUE."""
+        ...
+
     def __contains__(self, name: object) -> bool: ...
 
     def __getitem__(self, name: str) -> SettingValue: ...
@@ -137,9 +142,9 @@ class TypedParameterServer(ParameterProtocolServer):
         super().__init__(host, self, list_rate_hz=list_rate_hz)
 
     @property
-    def names(self) -> list[str]:
+    def names(self) -> Sequence[str]:
         """Parameters that fit into PARAM_VALUE."""
-        return [name for name in self._store.names if _fits(self._store.type(name))]
+        return self._store.small_names
 
     def value_message(self, name: str, index: int) -> m.ParamValue:
         value, type_ = self._store[name], ParameterType(self._store.type(name))
@@ -149,7 +154,7 @@ class TypedParameterServer(ParameterProtocolServer):
 
     def publish(self, name: str) -> None:
         """Send a value that has changed to all."""
-        if _fits(self._store.type(name)):
+        if fits_param_value(self._store.type(name)):
             self.send(name, self.names.index(name), None)
 
     def _on_list(self, request: m.ParamRequestList, channel: Channel) -> None:
@@ -182,7 +187,7 @@ class TypedParameterServer(ParameterProtocolServer):
         self.send(name, names.index(name), channel if not is_new else None)
 
 
-def _fits(type_: MavParamExtType) -> bool:
+def fits_param_value(type_: MavParamExtType) -> bool:
     """Return True if the four bytes of PARAM_VALUE can hold values of this type."""
     return type_ <= MavParamExtType.INT32 or type_ == MavParamExtType.REAL32
 

@@ -9,7 +9,6 @@ import math
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavDoRepositionFlags, MavFrame, MavMountMode, MavResult, MavSeverity
-from aerokit.sim.ardupilot.devices import ArduPilotDevices
 from aerokit.sim.ardupilot.gimbal import ArduPilotGimbal
 from aerokit.sim.ardupilot.kinds import Kind, rows_of
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
@@ -43,11 +42,15 @@ def common_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
     }
     if vehicle.KIND != "sub":
         handlers[_C.DO_FOLLOW] = lambda c: _R.ACCEPTED if 0 < c.param1 <= 255 else _R.DENIED
-    for command in ArduPilotDevices(vehicle).commands():
-        handlers[command] = lambda c: vehicle.devices.commands()[c.command](c)
+    # A reboot replaces the devices, so they are looked up at each command.
+    if vehicle.KIND in ("copter", "plane"):
+        handlers[_C.AIRFRAME_CONFIGURATION] = lambda c: vehicle.devices.move_gear(c)
+        handlers[_C.DO_PARACHUTE] = lambda c: vehicle.devices.handle_chute(c)
+    if vehicle.KIND == "copter":
+        handlers[_C.DO_WINCH] = lambda c: vehicle.devices.wind(c)
     return {
         **handlers,
-        # A reboot replaces the devices, so they are looked up at each command.
+        _C.DO_GRIPPER: lambda c: vehicle.devices.grip(c),
         _C.DO_SET_SERVO: lambda c: vehicle.accessories.set_servo(c),
         _C.DO_REPEAT_SERVO: lambda c: vehicle.accessories.set_servo(c),
         _C.DO_SET_RELAY: lambda c: vehicle.accessories.set_relay(c),

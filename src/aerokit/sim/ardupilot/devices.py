@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import GripperActions, MavCmd, MavResult, MavSeverity, ParachuteAction, WinchActions
-from aerokit.sim.commands import CommandHandler, ReceivedCommand, whole
+from aerokit.mavlink.enums import GripperActions, MavResult, MavSeverity, ParachuteAction, WinchActions
+from aerokit.sim.commands import ReceivedCommand, whole
 
 if TYPE_CHECKING:
     from aerokit.sim.ardupilot.host import ArduPilotHost
 
-_C, _R = MavCmd, MavResult
+_R = MavResult
 _GRIP_S = 0.7
 _WINCH_RATE_M_S, _WINCH_STEP_S = 1.0, 0.1
 _MIN_CHUTE_ALTITUDE_M = 10.0
@@ -29,19 +29,10 @@ class ArduPilotDevices:
         self.line_rate_m_s: float = 0.0
         self._goal_m: float | None = None
 
-    def commands(self) -> dict[int, CommandHandler]:
-        """Return the handlers of the commands that this kind of vehicle has."""
-        handlers: dict[int, CommandHandler] = {_C.DO_GRIPPER: self._grip}
-        if self._vehicle.KIND in ("copter", "plane"):
-            handlers |= {_C.AIRFRAME_CONFIGURATION: self._move_gear, _C.DO_PARACHUTE: self._handle_chute}
-        if self._vehicle.KIND == "copter":
-            handlers[_C.DO_WINCH] = self._wind
-        return handlers
-
     def _is_set(self, name: str) -> bool:
         return bool(self._vehicle.parameters.get(name, 0))
 
-    def _grip(self, command: ReceivedCommand) -> int:
+    def grip(self, command: ReceivedCommand) -> int:
         """Move the servo gripper: acknowledged at once, its end is a status text (AP_Gripper_Servo.cpp)."""
         is_known = command.param2 in (GripperActions.GRAB, GripperActions.RELEASE)
         if not self._is_set("GRIP_ENABLE") or not is_known:
@@ -57,7 +48,7 @@ class ArduPilotDevices:
         self.is_gripped = grabs
         return _R.ACCEPTED
 
-    def _move_gear(self, command: ReceivedCommand) -> int:
+    def move_gear(self, command: ReceivedCommand) -> int:
         """Accept always, as the firmware does without a landing gear."""
         up = command.param2 == 1
         if self._is_set("LGR_ENABLE") and up is not self.gear_is_up:
@@ -65,7 +56,7 @@ class ArduPilotDevices:
             self._vehicle.info(f"LandingGear: {'RETRACT' if up else 'DEPLOY'}")
         return _R.ACCEPTED
 
-    def _handle_chute(self, command: ReceivedCommand) -> int:
+    def handle_chute(self, command: ReceivedCommand) -> int:
         vehicle = self._vehicle
         if command.param1 in (ParachuteAction.DISABLE, ParachuteAction.ENABLE):
             if "CHUTE_ENABLED" in vehicle.parameters:
@@ -83,7 +74,7 @@ class ArduPilotDevices:
                 vehicle.arming.disarm(force=True)
         return _R.ACCEPTED
 
-    def _wind(self, command: ReceivedCommand) -> int:
+    def wind(self, command: ReceivedCommand) -> int:
         action = whole(command.param2)
         if not self._is_set("WINCH_TYPE") or action > WinchActions.RATE_CONTROL:
             return _R.FAILED

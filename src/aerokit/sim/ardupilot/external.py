@@ -10,6 +10,7 @@ from aerokit.mavlink.message import Message
 from aerokit.sim.ardupilot.host import ArduPilotHost
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import ReceivedCommand, rotated
+from aerokit.sim.motion import velocity_to_landing_target
 
 _EXTERNAL_NAVIGATION = (m.Odometry, m.VisionPositionEstimate, m.AttPosMocap)
 _SENSORS = (
@@ -17,7 +18,7 @@ _SENSORS = (
     *(m.DistanceSensor, m.OpticalFlow),
 )
 _MAVLINK = 1
-_TARGET_TIMEOUT_S, _APPROACH_PER_S, _MAX_APPROACH_M_S = 2.0, 0.8, 1.5
+_TARGET_TIMEOUT_S = 2.0
 
 
 class ArduPilotExternal:
@@ -52,9 +53,7 @@ class ArduPilotExternal:
         if self._vehicle.now - self._target_at > _TARGET_TIMEOUT_S:
             return (0.0, 0.0)
         motion = self._vehicle.motion
-        north, east = self._target[0] - motion.north, self._target[1] - motion.east
-        share = min(_APPROACH_PER_S, _MAX_APPROACH_M_S / max(math.hypot(north, east), 1e-6))
-        return (north * share, east * share)
+        return velocity_to_landing_target(self._target[0] - motion.north, self._target[1] - motion.east)
 
     def _on_navigation(self, message: Message, _: Channel) -> None:
         if not self._vehicle.parameters.get("VISO_TYPE", 0.0):

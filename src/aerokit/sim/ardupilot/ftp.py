@@ -10,9 +10,9 @@ from functools import partial
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode, MavSeverity
 from aerokit.protocols.ftp import DATA_SIZE
 from aerokit.protocols.servers.files import EISDIR, ENOENT, Entry, FileFault, FileHandle, FileTree
+from aerokit.protocols.servers.ftp import FtpRequestServer
 from aerokit.protocols.servers.ftp_packets import FtpPacket, path_in, read_crc32
 from aerokit.sim.channel import Channel
-from aerokit.sim.ftp import FtpServer
 from aerokit.sim.vehicle import SimulatedVehicle
 
 _SESSION_TIMEOUT_S = 3.0
@@ -30,14 +30,15 @@ class _Refused(Exception):
         self.code = code
 
 
-class ArduPilotFtp(FtpServer):
+class ArduPilotFtp(FtpRequestServer[FileTree]):
     """MAVFTP with the limits of the firmware (GCS_FTP.cpp).
 
     A worker processes the queue every 2 ms. The queue holds five requests; more are lost, also during a burst. A burst
     cannot be stopped. The answer to a repeated sequence number is the last reply.
 
     The client chooses the session number. A session with an open file blocks other sessions until its client closes
-    it, or has sent nothing for 3 s. A close is always acknowledged, even if writing failed.
+    it, or has sent nothing for 3 s. A close is always acknowledged, even if writing failed. `Faults.no_ftp` turns the
+    server off.
     """
 
     burst_interval_s: float
@@ -52,6 +53,7 @@ class ArduPilotFtp(FtpServer):
         send_banner: Callable[[], None] = lambda: None,
     ) -> None:
         super().__init__(vehicle, files)
+        self._vehicle = vehicle
         self.burst_interval_s = burst_interval_s
         self._send_banner = send_banner
         self.restart()
@@ -65,6 +67,10 @@ class ArduPilotFtp(FtpServer):
         self._used_at = float("-inf")
         self._reply = FtpPacket(0, Op.NONE, _NO_SESSION)
         self._banner_wanted = False
+
+    @property
+    def is_enabled(self) -> bool:
+        return not self._vehicle.faults.no_ftp
 
     @property
     def open_sessions(self) -> int:

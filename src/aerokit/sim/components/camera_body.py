@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -13,7 +12,7 @@ from aerokit.mavlink.messages import CameraImageCaptured, CameraTrackingGeoStatu
 from aerokit.parameters import parse_definition
 from aerokit.parameters.definition import CameraDefinition
 from aerokit.protocols.servers.camera import camera_builders
-from aerokit.protocols.servers.camera_device import CameraDevice, Shot
+from aerokit.protocols.servers.camera_device import UNKNOWN_ATTITUDE, CameraDevice, Shot
 from aerokit.protocols.servers.files import FileTree
 from aerokit.protocols.servers.host import ServerHost
 from aerokit.protocols.servers.intervals import Builder
@@ -23,7 +22,6 @@ from aerokit.sim.components.gimbal import SimulatedGimbal
 from aerokit.sim.motion import quaternion_from_euler
 
 _SENSOR_MM = (6.17, 4.63)
-_NOWHERE = (math.nan, math.nan, math.nan, math.nan)
 DEFINITION_PATH = "/camera_definition.xml"
 """MAVFTP path of the camera definition."""
 CAPABILITIES = (
@@ -199,7 +197,7 @@ class CameraBody(SimulatedComponent, CameraDevice):
             0 if place is None else place.longitude_e7,
             0 if place is None else round(place.altitude_m * 1000),
             0 if pose is None else round(pose.height_m * 1000),
-            _NOWHERE if angles is None else quaternion_from_euler(*angles),
+            UNKNOWN_ATTITUDE if angles is None else quaternion_from_euler(*angles),
             file_url="",
         )
 

@@ -80,7 +80,6 @@ class SimulatedComponent:
         self._system_id = system_id
         self._vehicle: SimulatedVehicle | None = None
         self._commands: dict[int, CommandHandler] = {}
-        self._builders: dict[int, Builder] = {}
         self._streams: MessageStreams = MessageStreams(self)
 
     def commands(self) -> dict[int, CommandHandler]:
@@ -124,7 +123,7 @@ class SimulatedComponent:
         if self._vehicle is not None:
             raise InvalidArgument("the component is on another vehicle already; create one for each vehicle")
         self._vehicle = vehicle
-        self._builders = self._streams.builders = self.builders()
+        self._streams.builders = self.builders()
         self._commands = {**self._streams.commands(), **self.commands()}
         CommandServer(self, self._commands)
         self.listen()

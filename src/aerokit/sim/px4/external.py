@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavFrame, MavResult
 from aerokit.sim.commands import ReceivedCommand
-from aerokit.sim.motion import GlobalPoint
+from aerokit.sim.motion import GlobalPoint, velocity_to_landing_target
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
 _SENSORS = (m.ObstacleDistance, m.DistanceSensor, m.OpticalFlowRad)
 _VISION_TIMEOUT_S = 5.0
-_APPROACH_PER_S, _MAX_APPROACH_M_S = 0.8, 1.5
 _HORIZONTAL, _GPS_POSITION = 1, 1
 
 
@@ -106,11 +105,9 @@ class PrecisionLanding:
             return
         self._search_from = None
         north, east = target[0] - motion.north, target[1] - motion.east
-        distance = math.hypot(north, east)
-        share = min(_APPROACH_PER_S, _MAX_APPROACH_M_S / max(distance, 1e-6))
-        is_above = distance <= max(limits["PLD_HACC_RAD"], 0.05)
+        is_above = math.hypot(north, east) <= max(limits["PLD_HACC_RAD"], 0.05)
         descent = px4.flight.descent_speed_m_s if is_above else 0.0
-        motion.seek_velocity(north * share, east * share, descent)
+        motion.seek_velocity(*velocity_to_landing_target(north, east), descent)
 
     def _search(self) -> None:
         px4, motion, limits = self._px4, self._px4.motion, self._px4.parameters

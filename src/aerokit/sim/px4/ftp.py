@@ -6,10 +6,9 @@ from collections.abc import Hashable
 from typing import ClassVar
 
 from aerokit.mavlink.enums import MavFtpErr
-from aerokit.mavlink.messages import FileTransferProtocol
 from aerokit.protocols.servers.files import EEXIST, FileFault, FileTree
 from aerokit.protocols.servers.ftp import FtpPeer, SessionFtpServer
-from aerokit.protocols.servers.ftp_packets import FtpPacket, leaves, path_in, read_crc32
+from aerokit.protocols.servers.ftp_packets import FtpPacket, checked_path, read_crc32
 from aerokit.sim.channel import Channel
 from aerokit.sim.vehicle import MessageHost
 
@@ -31,9 +30,9 @@ class Px4Ftp(SessionFtpServer[FileTree]):
         super().__init__(vehicle, files, burst_interval_s=burst_interval_s)
         self._vehicle = vehicle
 
-    def _on_message(self, message: FileTransferProtocol, channel: Channel) -> None:
-        if not self._vehicle.faults.no_ftp:
-            self.receive(FtpPacket.parse(message), channel)
+    @property
+    def is_enabled(self) -> bool:
+        return not self._vehicle.faults.no_ftp
 
     def _key(self, request: FtpPacket, channel: Channel) -> Hashable:
         return channel
@@ -57,8 +56,7 @@ class Px4Ftp(SessionFtpServer[FileTree]):
         except FileFault as fault:
             peer.errno = fault.errno
             return request.refuse(MavFtpErr.FILENOTFOUND)
-        if not leaves(path_in(request.data[: request.size])):
-            peer.errno = 0
+        peer.errno = 0
         return answer
 
     def _rename(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
@@ -73,9 +71,7 @@ class Px4Ftp(SessionFtpServer[FileTree]):
             return request.refuse_errno(peer.errno)  # The firmware reports the error of an earlier failure.
 
     def _crc32(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
-        path = path_in(request.data[: request.size])
-        if leaves(path):
-            return request.refuse(MavFtpErr.FILEPROTECTED)
+        path = checked_path(request.data[: request.size])
         try:
             checksum = read_crc32(self.files, path, _CRC_BLOCK)
         except FileFault:
