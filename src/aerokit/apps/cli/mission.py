@@ -6,11 +6,13 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from aerokit._internal.files import read_text
 from aerokit.apps.cli.arguments import number, writable_file
 from aerokit.apps.cli.completion import offer
 from aerokit.apps.cli.connecting import add_action, command_action, connected
 from aerokit.apps.cli.output import DONE, add_force, check_not_existing, emit, suggestion
 from aerokit.apps.cli.terminal import progress_bar
+from aerokit.apps.plan_text import parse_plan_text
 from aerokit.errors import InvalidArgument, OperationRejected
 from aerokit.mavlink.enums import MavAutopilot, MavCmd
 from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M
@@ -33,14 +35,7 @@ def read_plan(path: str) -> Plan:
         FileFormatError: the file has neither format; the text names the position of the error.
         InvalidArgument: an item cannot be sent.
     """
-    from aerokit.missions import Plan, read_plan_file, read_waypoint_file
-
-    with open(path, "rb") as file:
-        is_plan = file.read(64).lstrip().startswith(b"{")
-    plan = read_plan_file(path) if is_plan else Plan(read_waypoint_file(path))
-    for part in PARTS:
-        getattr(plan, part).check()
-    return plan
+    return parse_plan_text(read_text(path), Path(path).name)
 
 
 def begins_with_take_off(items: Sequence[MissionItem]) -> bool:
