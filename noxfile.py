@@ -123,6 +123,14 @@ def built_wheel(session: nox.Session, **env: str) -> Path:
     return wheel
 
 
+def new_environment(session: nox.Session, name: str, *requirements: str, python: str = "python") -> Path:
+    """Create an environment in the session's temporary folder with only these requirements, and return its folder."""
+    folder = Path(session.create_tmp()).resolve() / name
+    session.run(python, "-m", "venv", "--clear", str(folder), external=True)
+    session.run(str(folder / "bin" / "pip"), "install", "-q", *requirements, external=True)
+    return folder
+
+
 @nox.session
 def wheels(session: nox.Session) -> None:
     """Build the wheel of this platform and the pure one into `dist/`, and fly the demo from each in empty environments.
@@ -141,10 +149,7 @@ def wheels(session: nox.Session) -> None:
             wheel = max(Path("dist").glob("*-abi3-*.whl"), key=lambda path: path.stat().st_mtime)
         else:
             shutil.copy(wheel, "dist")
-        empty = Path(session.create_tmp()).resolve() / f"empty-{implementation}"
-        shutil.rmtree(empty, ignore_errors=True)
-        session.run("python", "-m", "venv", str(empty))
-        session.run(str(empty / "bin" / "pip"), "install", "-q", str(wheel.resolve()), external=True)
+        empty = new_environment(session, f"empty-{implementation}", str(wheel.resolve()))
         check = f"import aerokit; assert aerokit.wire_implementation == {implementation!r}"
         with session.chdir(empty):  # where the clone is not importable
             session.run(str(empty / "bin" / "python"), "-c", check, external=True)
@@ -161,11 +166,9 @@ def is_runnable(python: str) -> bool:
 
 def run_wheel_tests(session: nox.Session, wheel: Path, version: str) -> None:
     """Run the tests of the wire with a wheel and a version of Python."""
-    folder = Path(session.create_tmp()).resolve() / f"python{version}"
-    session.run(f"python{version}", "-m", "venv", "--clear", str(folder), external=True)
+    packages = (str(wheel.resolve()), "pytest>=8.2", "pytest-timeout", "pytest-xdist", "hypothesis")
+    folder = new_environment(session, f"python{version}", *packages, python=f"python{version}")
     python = str(folder / "bin" / "python")
-    packages = ("pytest>=8.2", "pytest-timeout", "pytest-xdist", "hypothesis")
-    session.run(python, "-m", "pip", "install", "-q", str(wheel.resolve()), *packages, external=True)
     session.run(python, "-c", "import aerokit; assert aerokit.wire_implementation == 'c'", external=True)
     session.run(python, "-m", "pytest", "-q", "-n0", "tests/mavlink", external=True)
 
@@ -362,12 +365,9 @@ def release(session: nox.Session) -> None:
     session.run("python", "-m", "build", "--outdir", "dist", env={"AEROKIT_PURE": "1"})  # the others: `nox -s wheels`
     (wheel,), (sdist,) = Path("dist").glob("*.whl"), Path("dist").glob("*.tar.gz")
     session.run("twine", "check", "--strict", str(wheel), str(sdist))
-    empty = Path(session.create_tmp()).resolve() / "empty"
-    shutil.rmtree(empty, ignore_errors=True)
-    session.run("python", "-m", "venv", str(empty))
-    aerokit = str(empty / "bin" / "aerokit")
     installed = f"aerokit-mavlink @ {wheel.resolve().as_uri()}"
-    session.run(str(empty / "bin" / "pip"), "install", "-q", installed, external=True)
+    empty = new_environment(session, "empty", installed)
+    aerokit = str(empty / "bin" / "aerokit")
     with session.chdir(empty):  # where the clone is not importable
         session.run(aerokit, "--version", external=True)
         session.run(aerokit, "demo", "--speedup", "20", external=True)

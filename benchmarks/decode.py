@@ -9,7 +9,6 @@ Figures and ratios are medians over all parts of the recording. Only the ratios 
 from __future__ import annotations
 
 import json
-import statistics
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -19,6 +18,7 @@ from struct import Struct
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega
+from table import Row, higher_is_better
 
 from aerokit import wire_implementation
 from aerokit.mavlink import STANDARD, Framer, Message, read_tlog
@@ -42,7 +42,7 @@ CHUNK = 1024
 PART = 1000
 
 
-def rows(rounds: int = 7, recordings: Sequence[str] = tuple(RECORDINGS)) -> list[dict[str, Any]]:
+def rows(rounds: int = 7, recordings: Sequence[str] = tuple(RECORDINGS)) -> list[Row]:
     """Measure frames without a subscriber (``decode_skip``) and frames delivered as typed messages
     (``decode_typed``).
 
@@ -51,7 +51,7 @@ def rows(rounds: int = 7, recordings: Sequence[str] = tuple(RECORDINGS)) -> list
     compares ``decode_skip`` with the minimum in pure Python, which is parsing the header and comparing the checksum;
     ``decode_floor_typed`` does the same for ``decode_typed``, with an unpacked payload.
     """
-    table: list[dict[str, Any]] = []
+    table: list[Row] = []
     for which, name in enumerate(recordings):
         frames = frames_of(RECORDINGS[name])
         parts = [frames[begin : begin + PART] for begin in range(0, len(frames), PART)]
@@ -87,17 +87,8 @@ def in_pieces(frames: list[bytes]) -> list[bytes]:
 
 def _row(
     name: str, aerokit: list[float], peer: list[float], aim: float, peer_name: str = "pymavlink parse_buffer"
-) -> dict[str, Any]:
-    ratios = [own / other for own, other in zip(aerokit, peer, strict=True)]
-    return {
-        "name": name,
-        "aerokit": round(statistics.median(aerokit)),
-        "peer": round(statistics.median(peer)),
-        "peer_name": peer_name,
-        "unit": "frames/s",
-        "ratio": round(statistics.median(ratios), 2),
-        "aim": round(aim, 3),
-    }
+) -> Row:
+    return higher_is_better(name, aerokit, peer, peer_name, unit="frames/s", aim=aim)
 
 
 def _rates(

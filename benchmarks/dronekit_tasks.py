@@ -149,7 +149,7 @@ def latency_rows(libraries: Sequence[Library], plan: Plan) -> list[Row]:
 
             _in_turns(libraries, plan, case, measure)
             for share, name in ((0.5, "median"), (0.99, "p99")):
-                values = {who: [_quantile(found, share)] for who, found in samples.items()}
+                values = {who: [table.quantile(found, share)] for who, found in samples.items()}
                 rows += _rows(libraries, f"{case}_{name}", values, unit="µs", aim=1.0)
     return rows
 
@@ -160,11 +160,6 @@ def _delays(found: dict[str, Any]) -> list[float]:
     if not delays:
         raise RuntimeError("no listener was called")
     return delays
-
-
-def _quantile(values: list[float], share: float) -> float:
-    ordered = sorted(values)
-    return ordered[min(int(share * len(ordered)), len(ordered) - 1)]
 
 
 # ------------------------------------------------------------------------------------------ connect

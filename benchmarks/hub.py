@@ -182,7 +182,7 @@ def _latencies(quick: bool) -> list[Row]:
     if len(series) < 2:
         return rows
     for what, share in (("median", 0.5), ("p99", 0.99)):
-        own, peer = (1e6 * sorted(delays)[int(share * len(delays))] for delays in series.values())
+        own, peer = (1e6 * table.quantile(delays, share) for delays in series.values())
         rows.append(row(f"latency_{what}", own, peer, "MAVProxy --out", unit="µs", ratio=peer / own, aim=1.0))
     return rows
 

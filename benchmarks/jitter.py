@@ -19,7 +19,7 @@ from typing import Any
 
 import anyio
 from command_rtt import _free_ports
-from table import Row, faster_is_better
+from table import Row, faster_is_better, quantile
 
 import aerokit
 from aerokit import AttitudeRateSetpoint
@@ -89,8 +89,8 @@ async def _timer(rate_hz: float, seconds: float) -> list[float]:
 
 
 def _jitter_us(times: list[float], rate_hz: float) -> float:
-    errors = sorted(abs(later - earlier - 1 / rate_hz) for earlier, later in itertools.pairwise(times))
-    return 1e6 * errors[int(0.99 * len(errors))]
+    errors = [abs(later - earlier - 1 / rate_hz) for earlier, later in itertools.pairwise(times)]
+    return 1e6 * quantile(errors, 0.99)
 
 
 @contextmanager

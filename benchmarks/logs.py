@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import statistics
 import sys
 import time
 from collections.abc import Callable
@@ -26,7 +25,7 @@ from pathlib import Path
 
 import decode
 from pymavlink import mavutil
-from table import Row
+from table import Row, higher_is_better
 
 from aerokit import wire_implementation
 from aerokit.mavlink import STANDARD, Framer, read_tlog
@@ -56,21 +55,9 @@ def rows(rounds: int = 7, recording: str = next(iter(decode.RECORDINGS))) -> lis
             found.append(seen / (time.process_time() - started))
     own = rates[0]
     return [
-        _row(name, own, peer, peer_name, aim) for (name, peer_name, _, aim), peer in zip(peers, rates[1:], strict=True)
+        higher_is_better(name, own, peer, peer_name, unit="frames/s", aim=aim)
+        for (name, peer_name, _, aim), peer in zip(peers, rates[1:], strict=True)
     ]
-
-
-def _row(name: str, own: list[float], peer: list[float], peer_name: str, aim: float) -> Row:
-    ratios = [one / other for one, other in zip(own, peer, strict=True)]
-    return {
-        "name": name,
-        "aerokit": round(statistics.median(own)),
-        "peer": round(statistics.median(peer)),
-        "peer_name": peer_name,
-        "unit": "frames/s",
-        "ratio": round(statistics.median(ratios), 2),
-        "aim": aim,
-    }
 
 
 def _aerokit(path: Path) -> int:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-__all__ = ["Row", "faster_is_better", "is_missed", "printed", "row", "write"]
+__all__ = ["Row", "faster_is_better", "higher_is_better", "is_missed", "printed", "quantile", "row", "write"]
 
 Row = dict[str, Any]
 """``name``, ``aerokit`` and ``peer`` (in ``unit``), ``peer_name``, ``ratio`` (above 1: aerokit is ahead), ``aim``."""
@@ -22,6 +22,20 @@ def faster_is_better(
     """Create a row from two series of durations: their medians, and the ratio of the peer's to aerokit's."""
     own, other = statistics.median(aerokit), statistics.median(peer)
     return row(name, own, other, peer_name, unit=unit, ratio=other / own, aim=aim)
+
+
+def higher_is_better(
+    name: str, aerokit: Sequence[float], peer: Sequence[float], peer_name: str, *, unit: str, aim: float
+) -> Row:
+    """Create a row from two series of rates, measured in turns: their medians, and the median of the ratios."""
+    ratio = statistics.median(own / other for own, other in zip(aerokit, peer, strict=True))
+    return row(name, statistics.median(aerokit), statistics.median(peer), peer_name, unit=unit, ratio=ratio, aim=aim)
+
+
+def quantile(values: Sequence[float], share: float) -> float:
+    """Return the value that this share of the values does not exceed."""
+    ordered = sorted(values)
+    return ordered[min(int(share * len(ordered)), len(ordered) - 1)]
 
 
 def row(name: str, aerokit: float, peer: float, peer_name: str, *, unit: str, ratio: float, aim: float) -> Row:

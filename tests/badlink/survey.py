@@ -38,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     options = parser.parse_args(arguments)
     seeds = range(options.first_seed, options.first_seed + options.seeds)
-    without_loop_warnings: list[str] = []
+    deviations: list[str] = []
     with ProcessPoolExecutor(options.jobs) as pool:
         for radio in RADIOS:
             say(f"\n{radio.name}; {options.sizes} sizes, {options.seeds} seeds")
@@ -49,11 +49,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
                     work = (repeat(name), repeat(options.sizes), repeat(radio), repeat(loss), seeds)
                     verdicts = list(pool.map(_judge, *work, chunksize=4))
                     cells.append(_cell(verdicts))
-                    without_loop_warnings += _complaints(radio, loss, verdicts)
+                    deviations += _complaints(radio, loss, verdicts)
                 say(f"{name:26}" + "".join(f"{cell:>22}" for cell in cells))
     say("\nexact + honest errors / median time in ideals / most messages")
-    say("\n".join(without_loop_warnings) or "all as promised")
-    return int(bool(without_loop_warnings))
+    say("\n".join(deviations) or "all as promised")
+    return int(bool(deviations))
 
 
 def say(text: str) -> None:

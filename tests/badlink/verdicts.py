@@ -28,7 +28,7 @@ class Verdict:
 
     @property
     def is_exact(self) -> bool:
-        """Return True if the content is complete and there are no without_loop_warnings."""
+        """Return True if the content is complete and there are no faults."""
         return self.error is None and not self.faults
 
 

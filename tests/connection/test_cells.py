@@ -196,8 +196,8 @@ async def test_cancelled_wait_leaves_nothing_behind() -> None:
 
 
 async def test_cancellation_at_failure_logs_nothing() -> None:
-    without_loop_warnings: list[object] = []
-    asyncio.get_running_loop().set_exception_handler(lambda _, context: without_loop_warnings.append(context))
+    reported: list[object] = []
+    asyncio.get_running_loop().set_exception_handler(lambda _, context: reported.append(context))
     cell = make_cell()
     task = asyncio.create_task(cell.wait_until(lambda _: False))
     await asyncio.sleep(0)
@@ -207,7 +207,7 @@ async def test_cancellation_at_failure_logs_nothing() -> None:
         await task
     del task
     gc.collect()
-    assert without_loop_warnings == []
+    assert reported == []
 
 
 async def test_slow_reader_gets_latest_value_and_missed_count() -> None:

@@ -13,7 +13,6 @@ from typing import Any
 
 import pytest
 from dronekit_stage import Stage, on_stage
-from exhaustive import sampled
 from flight_controller import FlightController, message_of
 
 from aerokit import dronekit
@@ -356,7 +355,8 @@ ENDS = {
 }
 
 
-@pytest.mark.parametrize("end", sampled(ENDS.values(), 3), ids=ENDS)
+@pytest.mark.sampled(3)
+@pytest.mark.parametrize("end", ENDS.values(), ids=ENDS)
 def test_overrides_are_released_at_program_exit(end: str) -> None:
     program = f"""
 import time

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from exhaustive import sampled
 from pymavlink import mavutil
 from served_copter import served_copter, without_loop_warnings
 
@@ -91,7 +90,8 @@ def test_example_imports_dronekit_only(name: str) -> None:
     assert "from aerokit" not in text
 
 
-@pytest.mark.parametrize("name", sampled(EXPECTED, 3))
+@pytest.mark.sampled(3)
+@pytest.mark.parametrize("name", EXPECTED)
 def test_example(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     speedup, arguments, expected = EXPECTED[name]
     with served_copter(speedup=speedup, parameters=PARAMETERS.get(name)) as address:

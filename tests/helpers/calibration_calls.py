@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Awaitable, Callable
 from typing import Any
 
 import anyio
 from call_stage import Stage, armed, grounded
-from provoked import Do, Provocation, Table, ignored, lost, refused, stops_sending
+from provoked import Do, Provocation, Table, Trouble, ignored, later, lost, refused, stops_sending
 
 from aerokit.errors import NotSupported
 from aerokit.mavlink.enums import MavCmd
@@ -105,14 +104,14 @@ CALIBRATIONS_AWAITED: dict[str, tuple[Do, tuple[str, ...]]] = {
 }
 
 
-def _during(trouble: Callable[[Stage], object], **options: Any) -> Provocation:
-    """Something happens after the first step of a compass calibration."""
+def _during(trouble: Trouble, **options: Any) -> Provocation:
+    """Create a provocation whose disturbance happens during a compass calibration."""
 
     async def run(stage: Stage) -> None:
         async for _ in stage.vehicle.calibrate.compass():
-            trouble(stage)
+            pass
 
-    return Provocation(run, grounded, **options)
+    return later(run, trouble, place=grounded, **options)
 
 
 async def _second(stage: Stage) -> None:
@@ -148,10 +147,6 @@ def _lose_result(stage: Stage) -> None:
     simulated.send_text = lambda *_: None
 
 
-_close: Callable[[Stage], object] = lambda stage: asyncio.get_running_loop().call_later(  # noqa: E731
-    0.1, stage.vehicle.connection.close
-)
-_lose: Callable[[Stage], object] = lambda stage: asyncio.get_running_loop().call_later(0.1, lost, stage)  # noqa: E731
 _gyroscope: Callable[[Stage], Awaitable[object]] = _all_steps("gyroscope")
 CALIBRATIONS: Table = {
     ("Calibration", "OperationRejected"): Provocation(_gyroscope, armed),
@@ -163,8 +158,8 @@ CALIBRATIONS: Table = {
     ),
     ("Calibration", "HeartbeatTimeout"): _during(stops_sending),
     ("Calibration", "BusyError"): Provocation(_second, grounded),
-    ("Calibration", "ConnectionClosed"): _during(_close, alone=True),
-    ("Calibration", "LinkLost"): _during(_lose, alone=True),
+    ("Calibration", "ConnectionClosed"): _during(lambda s: s.vehicle.connection.close(), alone=True),
+    ("Calibration", "LinkLost"): _during(lost, alone=True),
     ("Calibration.cancel", "NotSupported"): Provocation(_cancel_accelerometer, grounded, alone=True),
     ("Calibration.cancel", "OperationTimeout"): Provocation(_cancel_silent, grounded, alone=True),
     ("CalibrationControl.escs", "InvalidArgument"): Provocation(_wrong_intent),

@@ -47,7 +47,6 @@ class DeviceCall(NamedTuple):
     on: tuple[str, ...] = COPTER
     place: Place = anywhere
     wrong: Give | None = None
-    is_in_table: bool = True
 
     def errors(self) -> Table:
         """Provocations of NotSupported, if one autopilot does not have it."""
@@ -389,19 +388,10 @@ def _deaf(stage: Stage) -> None:
     stage.simulated.handlers[m.SerialControl.ID] = lambda *_: None
 
 
-def _deaf_soon(do: Give) -> Give:
-    async def use(shell: Any) -> None:
-        stage_of[0].simulated.handlers[m.SerialControl.ID] = lambda *_: None
-        await do(shell)
-
-    return use
-
-
-stage_of: list[Stage] = []
-
-
-def _note(stage: Stage) -> None:
-    stage_of[:] = [stage]
+async def _run_in_deaf_shell(stage: Stage) -> None:
+    async with stage.vehicle.shell() as shell:
+        _deaf(stage)
+        await shell.run("a", timeout=1)
 
 
 def _winch_errors(name: str) -> Table:
@@ -499,9 +489,7 @@ DEVICE_ERRORS: Table = {
     ("Shell.read", "InvalidArgument"): P(lambda s: _in_shell(s, lambda shell: shell.read(timeout=-1)), on="px4"),
     ("Shell.read", "OperationTimeout"): P(lambda s: _in_shell(s, lambda shell: shell.read(timeout=1)), on="px4"),
     ("Shell.run", "InvalidArgument"): P(lambda s: _in_shell(s, lambda shell: shell.run("a", timeout=0)), on="px4"),
-    ("Shell.run", "OperationTimeout"): P(
-        lambda s: _in_shell(s, _deaf_soon(lambda shell: shell.run("a", timeout=1))), before=_note, on="px4"
-    ),
+    ("Shell.run", "OperationTimeout"): P(_run_in_deaf_shell, on="px4"),
     ("LogStream", "NotSupported"): P(_stream),
     ("LogStream", "CommandRejected"): P(_stream, before=refused(C.LOGGING_START), on="px4"),
     ("LogStream", "CommandTimeout"): P(_stream, before=ignored(C.LOGGING_START), on="px4"),

@@ -9,7 +9,6 @@ from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
 
 import pytest
-from exhaustive import sampled
 from hub_stage import COPTER, STATION, Program, SlowLink, settle, until
 from test_hub import virtual
 from test_hub_sockets import ORDER, of, to
@@ -255,7 +254,8 @@ def test_silent_sender_makes_room_in_a_full_table() -> None:
 # ------------------------------------------------------------------------------------ the rule
 
 
-@pytest.mark.parametrize("seed", sampled(range(6), 6))
+@pytest.mark.sampled(6)
+@pytest.mark.parametrize("seed", range(6))
 @virtual
 async def test_orders_reach_vehicle_despite_random_impostors(seed: int) -> None:
     """Noise, made-up senders, the vehicle's own name, numbers that go on where it is, from any port and host."""

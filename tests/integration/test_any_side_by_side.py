@@ -5,15 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from exhaustive import exhaustive, sampled
 from side_by_side import Step, differences, program, run_simulated
 
 SPEEDUP = 5.0
 
 
 @pytest.mark.exhaustive
-@pytest.mark.parametrize("seed", sampled(range(4), 4))
-@pytest.mark.parametrize("kind", ["copter", exhaustive("px4")])
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("kind", ["copter", "px4"])
 def test_program_of_one_seed_is_reproducible(kind: str, seed: int) -> None:
     first, second = (run_simulated(kind, seed, SPEEDUP) for _ in range(2))
     assert first == second

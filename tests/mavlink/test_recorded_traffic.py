@@ -7,7 +7,6 @@ from functools import cache
 from typing import Any
 
 import pytest
-from exhaustive import sampled
 from pymavlink.dialects.v20 import ardupilotmega, development
 from recorded import LONG, recording
 from wire_samples import added_peer, peer_fields, same
@@ -50,7 +49,8 @@ def message_id(raw: bytes) -> int:
     return int.from_bytes(raw[7:10], "little")
 
 
-@pytest.mark.parametrize("flight", sampled(FLIGHTS, 3))
+@pytest.mark.sampled(3)
+@pytest.mark.parametrize("flight", FLIGHTS)
 def test_recorded_frames_match_pymavlink(flight: str) -> None:
     added = added_peer()
     framer, peers = Framer(), [module.MAVLink(None) for module in (added, ardupilotmega, development)]

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from exhaustive import sampled
 
 import aerokit.sync
 from aerokit import open_connection
@@ -119,8 +118,9 @@ asyncio.run(main())
 FOREIGN = re.compile(rf'  File "{re.escape(os.path.dirname(asyncio.__file__))}.*\n.*\n( +\^+\n)?')
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("address", ["udpin:127.0.0.1:{udp}", "/dev/no-such-device", "no/such/file.tlog"])
-@pytest.mark.parametrize("program", sampled(PROGRAMS.values(), 4), ids=PROGRAMS)
+@pytest.mark.parametrize("program", PROGRAMS.values(), ids=PROGRAMS)
 def test_traceback_of_failed_open_is_short(program: str, address: str, taken: dict[str, int], tmp_path: Path) -> None:
     """At most ten lines, apart from asyncio's own."""
     file = tmp_path / "program.py"

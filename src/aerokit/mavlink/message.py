@@ -47,6 +47,19 @@ SIZES = {
     "float": 4,
     "double": 8,
 }
+# Character of each number type in formats of the module struct.
+STRUCT_CODES: dict[str, str] = {
+    "int8_t": "b",
+    "uint8_t": "B",
+    "int16_t": "h",
+    "uint16_t": "H",
+    "int32_t": "i",
+    "uint32_t": "I",
+    "int64_t": "q",
+    "uint64_t": "Q",
+    "float": "f",
+    "double": "d",
+}
 # Minimum and maximum of each integer type.
 INTEGER_RANGES = {
     "int8_t": (-(1 << 7), (1 << 7) - 1),
@@ -132,28 +145,18 @@ def offset_of(message_type: type[Message], field: str) -> int:
 
     https://mavlink.io/en/guide/serialization.html#field_reordering
     """
-    fields = [f for f in message_type.FIELDS if not f.extension]
-    fields.sort(key=lambda f: -SIZES[f.type])
     offset = 0
-    for f in (*fields, *(f for f in message_type.FIELDS if f.extension)):
-        if f.name == field:
+    for name, type_, array_length, *_ in _wire_rows(message_type):
+        if name == field:
             return offset
-        offset += SIZES[f.type] * (f.array_length or 1)
+        offset += SIZES[type_] * (array_length or 1)
     raise InvalidArgument(f"{message_type.NAME} has no field {field!r}")
 
 
-_KINDS = {
-    "int8_t": "b",
-    "uint8_t": "B",
-    "int16_t": "h",
-    "uint16_t": "H",
-    "int32_t": "i",
-    "uint32_t": "I",
-    "int64_t": "q",
-    "uint64_t": "Q",
-    "float": "f",
-    "double": "d",
-}
+def _wire_rows(message_type: type[Message]) -> list[tuple[Any, ...]]:
+    """Return the rows of ``_FIELDS`` in the order of the fields on the wire."""
+    base = sorted((row for row in message_type._FIELDS if not row[7]), key=lambda row: -SIZES[row[1]])
+    return [*base, *(row for row in message_type._FIELDS if row[7])]
 
 
 def layout_of(message_type: type[Message]) -> Any:
@@ -166,10 +169,7 @@ def layout_of(message_type: type[Message]) -> Any:
 
 
 def _new_layout(message_type: type[Message]) -> Any:
-    fields = [row for row in message_type._FIELDS if not row[7]]
-    fields.sort(key=lambda row: -SIZES[row[1]])
-    fields += [row for row in message_type._FIELDS if row[7]]
-    rows = tuple((row[0], _kind(row), row[2]) for row in fields)
+    rows = tuple((row[0], _kind(row), row[2]) for row in _wire_rows(message_type))
     numbers = message_type.ID, message_type.CRC_EXTRA, message_type.LENGTH, message_type.BASE_LENGTH
     return wire.layout(message_type, *numbers, rows)
 
@@ -178,7 +178,7 @@ def _kind(row: tuple[Any, ...]) -> str:
     kind, array_length = row[1:3]
     if kind == "char":
         return "p" if row[8:] == (True,) else "s"
-    return "p" if kind == "uint8_t" and array_length else _KINDS[kind]
+    return "p" if kind == "uint8_t" and array_length else STRUCT_CODES[kind]
 
 
 def decoder_of(message_type: type[MessageT]) -> Callable[[bytes, Frame | None], MessageT]:

@@ -11,20 +11,9 @@ from collections.abc import Iterable
 
 from aerokit.mavlink.definitions import EntryDefinition, EnumDefinition, FieldDefinition, MessageDefinition
 from aerokit.mavlink.frame import HEADER_LENGTH
+from aerokit.mavlink.message import STRUCT_CODES
 
 _WIDTH = 110
-_CODES = {
-    "int8_t": "b",
-    "uint8_t": "B",
-    "int16_t": "h",
-    "uint16_t": "H",
-    "int32_t": "i",
-    "uint32_t": "I",
-    "int64_t": "q",
-    "uint64_t": "Q",
-    "float": "f",
-    "double": "d",
-}
 # Arrays up to this length are unpacked into separate names, longer ones are sliced.
 _MAX_UNPACKED_LENGTH = 4
 
@@ -171,7 +160,7 @@ def _field_row(f: FieldDefinition) -> str:
 def _code(f: FieldDefinition) -> str:
     if f.type == "char" or (f.type == "uint8_t" and f.array_length):
         return f"{f.array_length or 1}s"
-    return f"{f.array_length or ''}{_CODES[f.type]}"
+    return f"{f.array_length or ''}{STRUCT_CODES[f.type]}"
 
 
 def _format(message: MessageDefinition) -> str:

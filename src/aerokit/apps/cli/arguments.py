@@ -90,21 +90,13 @@ port: Callable[[str], int] = integer(0, 65535, "a port number")
 system_id: Callable[[str], int] = integer(1, 255, "a system id")
 
 
-FAULTS: dict[str, str] = {
-    "gps_lost": "no GPS fix; the estimator drops its position after seven seconds",
-    "rc_lost": "the pilot's transmitter is off",
-    "motor_failed": "one motor stops, and the vehicle falls",
-    "silent": "the radio fails in both directions",
-    "frozen": "the autopilot hangs",
-    "heartbeats_stopped": "no HEARTBEAT, all other messages continue",
-    "leak": "water in the hull of a submarine",
-    "no_ftp": "no MAVFTP",
-    "loss": "share of messages from the vehicle that are lost: loss=0.2",
-    "loss_incoming": "share of messages to the vehicle that are lost: loss_incoming=0.2",
-    "prearm_failures": "a reason against arming: 'prearm_failures=Compass not healthy'",
-}
-"""Names of `aerokit.sim.Faults` that ``aerokit sim --fault`` takes → description."""
 _SHARES = ("loss", "loss_incoming")
+FAULTS: tuple[str, ...] = (
+    *("gps_lost", "rc_lost", "motor_failed", "silent", "frozen", "heartbeats_stopped", "leak", "no_ftp"),
+    *_SHARES,
+    "prearm_failures",
+)
+"""Names of `aerokit.sim.Faults` that ``aerokit sim --fault`` accepts, described in docs/simulator.md."""
 
 
 def fault(text: str) -> tuple[str, bool | float | list[str], float]:

@@ -6,13 +6,15 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from aerokit._internal.files import read_text
 from aerokit.apps.cli.arguments import number, writable_file
 from aerokit.apps.cli.completion import offer
 from aerokit.apps.cli.connecting import add_action, command_action, connected
 from aerokit.apps.cli.output import DONE, add_force, check_not_existing, emit, suggestion
 from aerokit.apps.cli.terminal import progress_bar
+from aerokit.apps.plan_text import parse_plan_text
 from aerokit.errors import InvalidArgument, OperationRejected
-from aerokit.mavlink.enums import MavAutopilot, MavCmd, MavType
+from aerokit.mavlink.enums import MavAutopilot, MavCmd
 from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M
 
 if TYPE_CHECKING:
@@ -23,13 +25,6 @@ if TYPE_CHECKING:
 
 PARTS = ("mission", "fence", "rally")
 _TAKE_OFFS = (MavCmd.NAV_TAKEOFF, MavCmd.NAV_TAKEOFF_LOCAL, MavCmd.NAV_VTOL_TAKEOFF)
-_COPTERS = frozenset(
-    {
-        *(MavType.QUADROTOR, MavType.COAXIAL, MavType.HELICOPTER, MavType.HEXAROTOR, MavType.OCTOROTOR),
-        *(MavType.TRICOPTER, MavType.DODECAROTOR, MavType.DECAROTOR),
-    }
-)
-_STANDARD_COMMANDS = frozenset(int(command) for command in MavCmd)
 
 
 def read_plan(path: str) -> Plan:
@@ -40,14 +35,7 @@ def read_plan(path: str) -> Plan:
         FileFormatError: the file has neither format; the text names the position of the error.
         InvalidArgument: an item cannot be sent.
     """
-    from aerokit.missions import Plan, read_plan_file, read_waypoint_file
-
-    with open(path, "rb") as file:
-        is_plan = file.read(64).lstrip().startswith(b"{")
-    plan = read_plan_file(path) if is_plan else Plan(read_waypoint_file(path))
-    for part in PARTS:
-        getattr(plan, part).check()
-    return plan
+    return parse_plan_text(read_text(path), Path(path).name)
 
 
 def begins_with_take_off(items: Sequence[MissionItem]) -> bool:
@@ -58,15 +46,18 @@ def begins_with_take_off(items: Sequence[MissionItem]) -> bool:
 
 def plan_warnings(plan: Plan) -> list[str]:
     """Return what a vehicle will probably refuse, although the plan can be sent."""
+    from aerokit.autopilots.ardupilot import COPTERS
+
+    standard = frozenset(MavCmd)
     names = [(part, getattr(plan, part).to_items()) for part in PARTS]
     warnings = [
         f"{part} item {index}: command {item.command} is not a MAV_CMD; a vehicle that does not know it refuses it"
         for part, items in names
         for index, item in enumerate(items)
-        if item.command not in _STANDARD_COMMANDS
+        if item.command not in standard
     ]
     mission = plan.mission.items
-    may_be_arducopter = plan.vehicle_type in _COPTERS and plan.firmware_type != MavAutopilot.PX4
+    may_be_arducopter = plan.vehicle_type in COPTERS and plan.firmware_type != MavAutopilot.PX4
     if mission and may_be_arducopter and not begins_with_take_off(mission):
         warnings.append("the mission does not begin with a take-off: an ArduCopter on the ground refuses to start it")
     return warnings

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from aerokit._internal.formatting import to_jsonable
+from aerokit.apps.plan_text import parse_plan_text
 from aerokit.apps.serve.requests import MAX_BODY_SIZE, MAX_PLAN_SIZE, HttpProblem, problem_of
 from aerokit.connection.tasks import BackgroundTasks
 from aerokit.errors import BusyError, HeartbeatTimeout, InvalidArgument
@@ -87,8 +88,6 @@ async def _set_parameter(vehicle: Vehicle, values: dict[str, Any]) -> object:
 
 async def _upload(vehicle: Vehicle, values: dict[str, Any]) -> None:
     plan: Plan = values["plan"]
-    plan.fence.check()
-    plan.rally.check()
     if plan.mission.items:
         await vehicle.mission.upload(plan.mission)
     if plan.fence.to_items():
@@ -104,16 +103,10 @@ def parse_plan_body(values: Mapping[str, Any]) -> tuple[str, str, Plan]:
         FileFormatError: neither format; the text names the position of the error.
         InvalidArgument: an item cannot be sent.
     """
-    from aerokit.missions import Plan, parse_plan, parse_waypoints
-
     content, name = values["plan"], values.get("name")
     name = name[:100] if isinstance(name, str) else "plan"
     text = content if isinstance(content, str) else json.dumps(content)
-    is_plan = text.lstrip("\ufeff \t\r\n").startswith("{") or not isinstance(content, str)
-    plan = parse_plan(text, name) if is_plan else Plan(parse_waypoints(text, name))
-    for part in (plan.mission, plan.fence, plan.rally):
-        part.check()
-    return name, text, plan
+    return name, text, parse_plan_text(text, name)
 
 
 def _read_plan(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -21,8 +21,8 @@ _GENERAL_GAP_S = 3.0
 _REACTION_TIMEOUT_S = 12.0
 _CONTEXT_S = 10.0
 _IMMEDIATE_S = 3.0
-# Kinds for which autopilots disarm.
-_DISARMING = frozenset(("crash", "thrust", "motor", "termination"))
+# Kinds of crashes and failures for which autopilots disarm.
+CRASH_KINDS: frozenset[str] = frozenset(("crash", "thrust", "motor", "termination"))
 
 
 class Failsafe(Snapshot):
@@ -192,7 +192,7 @@ def _reaction(flight: FlightLog, time_s: float, group: Sequence[FailsafeEvidence
                 return _mode_change_text(change, before, time_s) + cause, is_sure
     ended = next((end for _, end in flight.armed if time_s - 0.5 <= end <= last + 3), None)
     if ended is not None and ended < flight.duration_s:
-        is_sure = _kind(group) in _DISARMING
+        is_sure = _kind(group) in CRASH_KINDS
         cause = "" if is_sure else "; cause not logged"
         return f"disarmed {max(ended - time_s, 0):.1f} s later{cause}", is_sure
     return "", False

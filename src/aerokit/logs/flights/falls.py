@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from aerokit._internal.values import Snapshot
-from aerokit.logs.flights.failsafes import evidence_in_texts
+from aerokit.logs.flights.failsafes import CRASH_KINDS, evidence_in_texts
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -23,7 +23,6 @@ _IMPACT_S = 0.6
 _SAME_HEIGHT_M = 1.5
 _DISARM_TIMEOUT_S = 30.0
 _NEAR_HOME_HEIGHT_M = 3.0
-_CRASH_KINDS = frozenset(("crash", "thrust", "motor", "termination"))
 
 
 class Fall(Snapshot):
@@ -109,5 +108,5 @@ def _reasons(flight: FlightLog, begin_s: float, end_s: float) -> list[str]:
         "disarmed in the air" for begin, end in flight.armed if begin < begin_s and begin_s - 3 <= end <= end_s - 0.3
     ]
     texts = [text for text in flight.texts if begin_s - 3 <= text.time_s <= end_s + 5]
-    reported = [item for item in evidence_in_texts(texts) if item.kind in _CRASH_KINDS]
+    reported = [item for item in evidence_in_texts(texts) if item.kind in CRASH_KINDS]
     return reasons + list(dict.fromkeys(item.text for item in reported))[:3]

@@ -32,7 +32,6 @@ _MAX_UNIX_S = 4_102_444_800.0  # the year 2100; `aerokit.mavlink.tlog` has the s
 
 SIMULATED_LOG = b"aerokit simulator: sample log"
 """Begin of the logs of `aerokit.sim`."""
-RECORD_ONE = "record a simulated flight with `--record FILE.tlog`"
 
 
 def opened_bin(path: Path, on_percent: Callable[[float], object] | None = None) -> Any:
@@ -44,7 +43,10 @@ def opened_bin(path: Path, on_percent: Callable[[float], object] | None = None) 
     with path.open("rb") as file:
         head = file.read(len(SIMULATED_LOG))
         if head == SIMULATED_LOG:
-            raise FileFormatError(f"{path} is a sample of aerokit's simulator and contains no flight; {RECORD_ONE}")
+            raise FileFormatError(
+                f"{path} is a sample of aerokit's simulator and contains no flight; record a simulated flight with"
+                " `--record FILE.tlog`"
+            )
         if not head.startswith(_MAGIC):
             raise FileFormatError(f"{path} is not an ArduPilot log: it does not begin with A3 95")
     kind = import_module("pymavlink.DFReader").DFReader_binary

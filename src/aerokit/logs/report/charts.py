@@ -166,10 +166,11 @@ def timeline_shapes(flight: FlightLog) -> list[dict[str, Any]]:
         for name, paths in spans.items()
     ]
     found = failsafes(flight)
-    for acted, dash in ((True, "solid"), (False, "dot")):
-        paths = [f"M{failsafe.time_s:.2f},0V1" for failsafe in found if failsafe.acted is acted]
-        paths += [f"M{fall.time_s:.2f},0V1" for fall in falls(flight) if acted]
-        if paths:
+    acted: list[Failsafe | Fall] = [*(failsafe for failsafe in found if failsafe.acted), *falls(flight)]
+    others = [failsafe for failsafe in found if not failsafe.acted]
+    for events, dash in ((acted, "solid"), (others, "dot")):
+        if events:
+            paths = [f"M{event.time_s:.2f},0V1" for event in events]
             bands.append(_path(paths, line={"color": _FAILSAFE, "width": 1.5, "dash": dash}))
     return bands
 
@@ -333,11 +334,14 @@ def _fence(flight: FlightLog) -> list[dict[str, Any]]:
 
 
 def _failsafe_markers(flight: FlightLog, places: Sequence[tuple[float, float]]) -> list[dict[str, Any]]:
-    events: dict[str, Sequence[Failsafe | Fall]] = {"failsafe": failsafes(flight), "fall": falls(flight)}
+    kinds: tuple[tuple[str, str, Sequence[Failsafe | Fall]], ...] = (
+        ("failsafe", "x", failsafes(flight)),
+        ("fall", "triangle-down", falls(flight)),
+    )
     markers = []
-    for legend, symbol in (("failsafe", "x"), ("fall", "triangle-down")):
+    for legend, symbol, events in kinds:
         found, names = [], []
-        for event in events[legend]:
+        for event in events:
             row = flight.track.index_at(event.time_s)
             if row >= 0 and places[row][0] == places[row][0]:
                 found.append(places[row])

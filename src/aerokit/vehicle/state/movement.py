@@ -6,6 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from aerokit._internal import geo
+from aerokit._internal.rotations import euler_from_quaternion, quaternion_from_euler
 from aerokit._internal.values import Snapshot
 from aerokit.position import Home, Position
 from aerokit.vehicle.state.field import U16, Context, finite
@@ -98,22 +99,13 @@ class Attitude(Snapshot):
         rates_deg_s: tuple[float | None, float | None, float | None],
     ) -> Self:
         """Return the attitude of a quaternion from earth (north, east, down) to body axes, w first."""
-        roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-        pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
-        yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        roll, pitch, yaw = euler_from_quaternion(w, x, y, z)
         return cls(math.degrees(roll), math.degrees(pitch), math.degrees(yaw), *rates_deg_s)
 
     @property
     def quaternion(self) -> tuple[float, float, float, float]:
         """The same attitude as a quaternion w, x, y, z."""
-        halves = (math.radians(angle) / 2 for angle in (self.roll_deg, self.pitch_deg, self.yaw_deg))
-        (cr, sr), (cp, sp), (cy, sy) = ((math.cos(half), math.sin(half)) for half in halves)
-        return (
-            cr * cp * cy + sr * sp * sy,
-            sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-        )
+        return quaternion_from_euler(*map(math.radians, (self.roll_deg, self.pitch_deg, self.yaw_deg)))
 
 
 class Wind(Snapshot):

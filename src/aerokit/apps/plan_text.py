@@ -1,0 +1,24 @@
+"""Text of plans in either file format: .plan (QGroundControl) or QGC WPL 110."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from aerokit.missions import Plan
+
+
+def parse_plan_text(text: str, name: str) -> Plan:
+    """Parse a text in either format, and check the parts of the plan.
+
+    Raises:
+        FileFormatError: the text has neither format. The error begins with ``name`` and the position.
+        InvalidArgument: an item cannot be sent.
+    """
+    from aerokit.missions import Plan, parse_plan, parse_waypoints
+
+    is_json = text.lstrip("\ufeff \t\r\n").startswith("{")
+    plan = parse_plan(text, name) if is_json else Plan(parse_waypoints(text, name))
+    for part in (plan.mission, plan.fence, plan.rally):
+        part.check()
+    return plan
