@@ -202,7 +202,7 @@ class ManeuverActions(VehicleBase):
             check_range("radius_m", radius_m, 0, MAX_RADIUS_M, above=True)
             if not self._is_on_wings:
                 raise NotSupported(
-                    f"loiter: radius_m is not supported by this {self.autopilot.firmware} vehicle, which hovers: use orbit()"
+                    f"loiter: this {self.autopilot.firmware} vehicle hovers, so radius_m is not supported: use orbit()"
                 )
         elif turns is not None:
             raise InvalidArgument(f"turns = {turns!r} is not allowed without radius_m")

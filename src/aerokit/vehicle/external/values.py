@@ -34,8 +34,9 @@ Quaternion: TypeAlias = tuple[float, float, float, float]
 LocalFrame: TypeAlias = Literal["ned", "frd", "enu", "flu"]
 """Axes of a local frame.
 
-``ned``: north, east, down. ``frd``: forward, right, down of the vehicle at its start. ``enu`` and ``flu``: the same as in
-ROS (REP 103), with the axes east, north, up or forward, left, up. The body axes are then forward, left, up too."""
+``ned``: north, east, down. ``frd``: forward, right, down of the vehicle at its start. ``enu``: east, north, up, and
+``flu``: forward, left, up, as in ROS (REP 103); the body axes are then forward, left, up too.
+"""
 RangeDirection: TypeAlias = Literal["down", "up", "forward", "back", "left", "right"]
 
 
