@@ -282,7 +282,7 @@ class OnboardComponent:
 
     @property
     def missions(self) -> ComponentMissions:
-        """Missions, fences and rally points that other programs upload and download; served from the first access on."""
+        """Missions, fences and rally points that other programs upload and download. The first access serves them."""
         if self._missions is None:
             self._missions = ComponentMissions(self._host, self._tasks, self._commands)
             self._streams.builders[m.MissionCurrent.ID] = self._missions._build_current

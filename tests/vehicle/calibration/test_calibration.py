@@ -331,7 +331,7 @@ async def test_px4_failure_raises_with_its_texts() -> None:
 
 async def test_lost_result_of_px4_is_reported_as_unknown() -> None:
     async with stage(SimulatedPx4) as (px4, vehicle, _):
-        with pytest.raises(OperationTimeout, match="the text with its result was lost"):
+        with pytest.raises(OperationTimeout, match="its status text with the result was lost"):
             async for step in vehicle.calibrate.gyroscope():
                 if step.progress:
                     px4.send_text = lambda *_: None

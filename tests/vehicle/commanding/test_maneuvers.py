@@ -199,7 +199,7 @@ async def test_orbit_px4_flying_another_circle_is_held() -> None:
     async with hovering(simulated) as (vehicle, _):
         plan = simulated.flight.orbit.plan
         simulated.flight.orbit.plan = lambda _, *others: plan(20.0, *others)  # type: ignore[method-assign]
-        with pytest.raises(OperationRejected, match=r"it flies a circle of 20\.0 m instead of 500 m"):
+        with pytest.raises(OperationRejected, match=r"the vehicle flies a circle of 20\.0 m instead of 500 m"):
             await vehicle.orbit(vehicle.position.value, radius_m=500)
         await vehicle.mode.wait_until(lambda mode: mode.name == "LOITER", timeout=5)
 
@@ -361,9 +361,9 @@ async def test_transition_returns_in_its_state() -> None:
 
 
 async def test_transition_of_copter_is_not_supported() -> None:
-    """ArduCopter reports MAV_VTOL_STATE_MC, and is no VTOL."""
+    """ArduCopter reports MAV_VTOL_STATE_MC, and is not a VTOL."""
     async with in_the_air() as flight:
-        with pytest.raises(NotSupported, match="is no VTOL"):
+        with pytest.raises(NotSupported, match="is not a VTOL"):
             await flight.vehicle.transition_to("fixed_wing")
         assert flight.wire.commands(MavCmd.DO_VTOL_TRANSITION) == []
 
@@ -401,6 +401,6 @@ async def test_autotune_is_not_asked_again_after_a_lost_answer() -> None:
 
 async def test_autotune_of_copter_is_not_supported() -> None:
     async with in_the_air() as flight:
-        with pytest.raises(NotSupported, match="pilot's sticks"):
+        with pytest.raises(NotSupported, match="needs a pilot"):
             await flight.vehicle.autotune()
         assert flight.wire.commands(MavCmd.DO_AUTOTUNE_ENABLE) == []

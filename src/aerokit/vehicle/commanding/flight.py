@@ -36,7 +36,7 @@ IN_THE_AIR: dict[int | None, str] = {
 # Height above home from which a vehicle that sends no landed state is considered flying.
 MIN_FLYING_HEIGHT_M = 2.0
 
-# Climb that shows that a take-off command is being executed.
+# Metres of climb that show that the vehicle executes a take-off command.
 CLIMB_DETECTED_M = 0.5
 
 MODE_TIMEOUT_S = 6.0
@@ -133,7 +133,7 @@ class FlightActions(VehicleBase):
                 await self._sender.send_long(order, plan.command, *plan.params, modes=order.modes, is_done=is_rising)
 
     def _rises_from_here(self) -> Callable[[], bool]:
-        """Return a function that is true once new messages show a climb; earlier ones may describe the last flight."""
+        """Return a predicate for a climb in new messages; earlier messages may describe the previous flight."""
         here, landed = self.telemetry.position.latest, self.telemetry.landed_state
         begins_at = math.nan if here is None else self._position.altitude_relative()
         state_before = landed.latest
@@ -150,7 +150,7 @@ class FlightActions(VehicleBase):
     async def _await_altitude(
         self, altitude_m: float, timeout: float, max_silence_s: float | None, order: Order
     ) -> None:
-        """Wait for the altitude. Only the take-off's own mode and the one after it are expected."""
+        """Wait for the altitude, as long as the vehicle is in the take-off's mode or in the mode after it."""
         enough_m = altitude_m - max(0.5, 0.05 * altitude_m)
         started = self.connection.now()
 
@@ -214,7 +214,7 @@ class FlightActions(VehicleBase):
             await self._await_home(order, timeout, max_silence_s)
 
     async def _await_ground(self, what: str, order: Order, timeout: float | None, max_silence_s: float | None) -> None:
-        """Wait until messages received after the order report the ground; older ones would end the wait in the air."""
+        """Wait until messages received after the order report the ground; older messages may be wrong by now."""
         armed, landed, mode = self.telemetry.armed, self.telemetry.landed_state, self.telemetry.mode
         accepted_at = self.connection.now()
 
@@ -328,9 +328,10 @@ class ModeActions(VehicleBase):
     def taken_over(self) -> str:
         """The takeover that ended the program's last action, as a clause; empty if there was none.
 
-        "the mode changed to LOITER": by a pilot, a failsafe or another program, which HEARTBEAT does not distinguish;
-        or "a failsafe became active (MAV_STATE_CRITICAL)", which may be reported seconds before the mode changes.
-        Disarming alone, as after a landing, is no takeover. The program's next action resets it.
+        ``"the mode changed to LOITER"`` may be the work of a pilot, a failsafe or another program, because HEARTBEAT
+        does not distinguish them. ``"a failsafe became active (MAV_STATE_CRITICAL)"`` may be reported seconds before
+        the mode changes. Disarming alone, as after a landing, is not a takeover. The program's next action resets this
+        text.
         """
         order = self._arbiter.current or self._arbiter.newest
         if order is None or not order.has_lost_mode:
