@@ -312,7 +312,7 @@ class TakeoverCheck:
         self._take_off, self._hold = (session.autopilot.mode_for(p, is_vtol=is_vtol) for p in ("take_off", "hold"))
 
     def raise_if_changed(self, what: str) -> None:
-        """Raise OperationRejected if an order was given, or the mode has changed other than by the end of a take-off."""
+        """Raise OperationRejected if an order was given, or the mode has changed except by the end of a take-off."""
         if self._arbiter.latest(STEERING) is not self._order:
             raise OperationRejected(f"{what}: {SUPERSEDED} before anything was ordered")
         before, mode = self._before, self._telemetry.mode.latest

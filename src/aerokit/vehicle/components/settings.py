@@ -149,7 +149,7 @@ class Settings:
             return self.load(parse_definition(data, uri), locale=locale)
 
     def options(self, name: str) -> Mapping[str, SettingValue]:
-        """Return the options of a setting, name → value, as far as the known other settings allow them.
+        """Return the options of a setting that the known other settings allow, as a mapping of names to values.
 
         Empty without a definition, and for settings without options.
         """
@@ -225,8 +225,8 @@ class Settings:
         afterwards, and unknown settings that restrict it are read before.
 
         Raises:
-            InvalidArgument: an invalid name or value; with a definition: an option or value that is not allowed, or a
-                setting that is read-only or excluded now. Nothing was set.
+            InvalidArgument: the name or value is invalid; or, with a definition, the value is not allowed, or the
+                setting is read-only or excluded now. Nothing was set.
             ParameterRejected: the component has no such setting, or refused; ``code`` is its PARAM_ACK.
             ParameterTimeout: not confirmed, but it may have been set.
         """

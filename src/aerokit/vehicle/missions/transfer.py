@@ -98,7 +98,7 @@ class PlanChannel:
         return await self._has(MavProtocolCapability.FTP, by_default=False)
 
     async def write_file(self, items: Sequence[MissionItem]) -> None:
-        """Write the file. ArduPilot evaluates it when it is closed, without reporting the result."""
+        """Write the file. ArduPilot evaluates the file when it is closed, and does not report the result."""
         await self._context.files().write(self._path, pack_items(items, self.mission_type), **self._options)
         self._has_changed = True
 
@@ -153,7 +153,7 @@ class PlanChannel:
         connection = self._context.transfers.connection
         if self.mission_type != MavMissionType.MISSION and connection.mavlink_version == 1:
             raise NotSupported(
-                "MAVLink 1 can transfer missions only: the vehicle would take this as its mission; nothing was sent"
+                "MAVLink 1 can transfer only missions: the vehicle would use this plan as its mission; nothing was sent"
             )
         started = connection.now()
         try:
@@ -320,7 +320,7 @@ class PlanTransfer(Generic[PlanT]):
             except VerificationFailed:
                 if method == "ftp":
                     raise
-        # There is no such file, or an item was refused: the mission protocol reports which one and why.
+        # There is no such file, or an item was refused. The mission protocol then reports which item and why.
         await self._send_items(items, method, verify=True)
 
     async def _send_changes(self, items: Sequence[MissionItem], method: str, *, verify: bool) -> bool:
