@@ -45,7 +45,7 @@ class FleetAction:
         execute: called with each available member.
         timeout: seconds for each member; None: no limit.
         stagger_s: delay in seconds between the starts of consecutive members.
-        is_safe: the action ends a flight (hold, land, return): a failure does not stop the others.
+        is_safe: the action ends a flight (hold, land, return), so that a failure does not stop the others.
         holds_if_cancelled: on cancellation, members that have already finished hold, too.
     """
 

@@ -51,8 +51,8 @@ class Travel(SelectionBase):
         A fleet with a ``min_distance_m`` compares the paths first, and separates crossing paths by altitude.
 
         Args:
-            targets: member's name → target, where other members stay where they are; or a function that returns a
-                member's target.
+            targets: mapping of member names to targets; members without a target stay where they are. Or a function
+                that returns a member's target.
             speed_m_s: ground speed; None: unchanged.
             max_distance_m: reject targets farther than this from the vehicle.
             timeout: seconds for each member and leg; None: no limit.

@@ -33,8 +33,8 @@ MAX_ATTEMPTS = 4
 
 _ARM, _RELATIVE, _STEP = (0, 1.0), (3, 1.0), (0, 0.0)
 
-# MAV_CMD → effect of a repetition, and the parameter (index, value) for which it has this effect; None: always.
-# docs/reliability.md has the same table.
+# Maps MAV_CMD to the effect of a repetition, and to the parameter (index, value) with which it has this effect (None:
+# always). docs/reliability.md has the same table.
 UNREPEATABLE_COMMANDS: Mapping[int, tuple[str, tuple[int, float] | None]] = {
     MavCmd.COMPONENT_ARM_DISARM: ("arms a vehicle that a pilot has disarmed since", _ARM),
     MavCmd.CONDITION_YAW: ("turns by the same angle again", _RELATIVE),

@@ -36,7 +36,7 @@ __all__ = [
 
 ResultT = TypeVar("ResultT")
 
-# How long a vehicle may stay busy with a transfer that its ground station has dropped: ArduPilot 8 s, PX4 5 s.
+# Maximum time for which a vehicle is busy with a transfer that its ground station has dropped: ArduPilot 8 s, PX4 5 s.
 BUSY_TIMEOUT_S = 9.0
 
 BUSY_RETRY_INTERVAL_S = 1.0

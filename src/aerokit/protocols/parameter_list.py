@@ -143,7 +143,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
             self._count = min(self._count, index)
 
     def _note_count(self, count: int, is_streamed: bool) -> None:
-        # ArduPilot's stream keeps the count from its beginning, so that only a changed streamed count is news.
+        # ArduPilot's stream keeps the count from its start, so only a different count in the stream is a change.
         if count == (self._streamed_count if is_streamed else self._count):
             return
         if is_streamed:

@@ -120,7 +120,7 @@ class CaptureLog:
         return None if found is None else found.capture
 
     async def _request(self, index: int) -> bool:
-        """Request the capture once; return True if the camera answers that it has no such picture, or only newer ones."""
+        """Request the capture once; return True if the camera answers that it does not have it, or only newer ones."""
         request = self._link.requests.request
         try:
             if not self._link.is_autopilot_attached:

@@ -132,7 +132,7 @@ class LogStream(ReadOnly):
     async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         is_stopped = False
         try:
-            if error is None:  # PX4 answers only when its last message was acknowledged (logger.cpp, stop_log_mavlink).
+            if error is None:  # PX4 answers when its last message is acknowledged (logger.cpp, stop_log_mavlink)
                 await STOP.send(self._context)
                 is_stopped = True
         finally:

@@ -257,7 +257,7 @@ class Logs:
     async def _entry(
         self, log: LogEntry | int, idle_timeout_s: float, timeout: float | None, *, may_be_silent: bool
     ) -> LogEntry:
-        """Return the current entry. An unknown id is not requested: ArduPilot then lists nonexistent logs without end."""
+        """Return the current entry. Unknown ids are not requested: ArduPilot then lists nonexistent logs for ever."""
         log_id, only = (log, None) if isinstance(log, int) else (log.id, log.id)
         async with self._channel.operation(f"log {log_id}", timeout):
             entries = await self._entries(idle_timeout_s, only, MAX_UNANSWERED_REQUESTS if may_be_silent else None)
