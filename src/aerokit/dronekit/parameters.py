@@ -104,7 +104,7 @@ class ParameterDownload:
     async def _read(self, name: str) -> bool:
         """Request a parameter under all its names; return True if it was received or the vehicle reported it missing.
 
-        While the list is being sent, a missing answer proves nothing.
+        While the list is being sent, a missing answer does not show that the parameter is missing.
         """
         from aerokit.parameters.renames import other_names
 
@@ -360,7 +360,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
         self._reading.begin()
 
     def _on_value(self, message: ParamValue) -> None:
-        # aerokit's own table has stored it before, with integers as integers.
+        # The parameter table of aerokit, which stores integers as int, has processed this message before.
         self._count = message.param_count
         self._take(message.param_id)
 

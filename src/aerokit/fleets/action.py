@@ -364,13 +364,13 @@ class SelectionBase:
 
     @property
     def members(self) -> Mapping[str, Member]:
-        """Name → member, in the order in which they were given or found."""
+        """Maps names to members, in the order in which they were given or found."""
         members = self._context.members
         return dict(members) if self._names is None else {name: members[name] for name in self._names}
 
     @property
     def vehicles(self) -> Mapping[str, Vehicle]:
-        """Name → vehicle."""
+        """Maps names to vehicles."""
         return {name: member.vehicle for name, member in self.members.items()}
 
     def __len__(self) -> int:

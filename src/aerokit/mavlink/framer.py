@@ -1,9 +1,9 @@
 """`Framer`: extracts frames from bytes.
 
 The input may be datagrams or a stream cut anywhere, with noise and text between frames. The framer never raises. At
-each byte that could start a frame it follows one order: a valid checksum wins, a plausible header is waited for, and
-anything else is skipped one byte at a time, so that a valid frame after noise is found.
-https://mavlink.io/en/guide/serialization.html
+each byte that could start a frame, it applies these rules in order: a frame with a valid checksum is returned; after a
+plausible header, it waits for the rest; anything else is skipped one byte at a time, so that a valid frame after noise
+is found. https://mavlink.io/en/guide/serialization.html
 """
 
 from __future__ import annotations
@@ -258,7 +258,7 @@ class PythonFramer:
         return frames
 
     def _skip_unknown(self, data: bytes, begin: int, end: int) -> None:
-        # The sender sent this frame, so its sequence number is not lost.
+        # The frame was received, although it is unknown, so its sequence number does not count as lost.
         if self.keep_unknown:
             self._unknown.append(data[begin:end])
         if data[begin] == MAGIC_V2:

@@ -267,7 +267,7 @@ class SimulatedVehicle:
                         self.send(message, channel)
 
     def _skip_to(self, now: float) -> None:
-        """Advance the time and delay all events as much, like a program that hung."""
+        """Advance the time and delay all events equally, like a program that hung."""
         late = now - self.now
         if late <= 0:
             return

@@ -414,7 +414,7 @@ class OnboardComponent(ComponentTwin):
 
     @cached_property
     def missions(self) -> ComponentMissions:
-        """Missions, fences and rally points that other programs upload and download; served from the first access on."""
+        """Missions, fences and rally points that other programs upload and download. The first access serves them."""
         return ComponentMissions(self._loop, self._loop.call(lambda: self.aio.missions))
 
     def add_autopilot(self, driver: AutopilotDriver) -> None:

@@ -455,11 +455,13 @@ class Connection(ConnectionTwin):
 class SetpointStream(StreamTwin[SetpointT]):
     """Sends the latest set-point at a fixed rate while the ``async with`` block supplies set-points.
 
-    Entering the block changes to the set-point mode (GUIDED, OFFBOARD) with the initial set-point. Leaving it in any
-    way makes the vehicle hold. The stream stops by itself without a new set-point for ``valid_for_s``, if the event
-    loop is late by ``max_lag_s``, if the vehicle leaves the mode, disarms or falls silent, and if it should move but
-    stays in place for twelve seconds. Then ``set`` and leaving the block raise :class:`SetpointStreamStopped`. After a
-    pilot or a failsafe has changed the mode, nothing more is sent to the vehicle.
+    Entering the block changes to the set-point mode (GUIDED, OFFBOARD) with the initial set-point. Leaving the block in
+    any way makes the vehicle hold.
+
+    The stream stops by itself if there is no new set-point for ``valid_for_s``, if the event loop is late by
+    ``max_lag_s``, if the vehicle leaves the mode, disarms or falls silent, and if the vehicle should move but stays in
+    place for twelve seconds. ``set`` and leaving the block then raise :class:`SetpointStreamStopped`. If a pilot or a
+    failsafe changed the mode, nothing more is sent to the vehicle.
     """
 
     @property
@@ -488,10 +490,10 @@ class SetpointStream(StreamTwin[SetpointT]):
 class Guided(TwinOf["AsyncGuided"]):
     """Opens set-point streams: ``async with vehicle.guided.velocity() as stream: stream.set(...)``.
 
-    Every stream takes ``rate_hz`` (transmission rate of the latest set-point, 2 to 400), ``valid_for_s`` (how long a
-    set-point may be resent without a new one) and ``max_lag_s`` (how late the event loop may be). NotSupported is
-    raised for a kind that this type of vehicle does not support. Rates and seconds are in real time: a simulation at
-    ten times the speed needs ten times the rate.
+    All streams have the same arguments. ``rate_hz`` (2 to 400) is the transmission rate of the latest set-point. The
+    stream stops if it gets no new set-point for ``valid_for_s`` seconds, or if the event loop is late by ``max_lag_s``
+    seconds. NotSupported is raised for a kind of set-point that this type of vehicle does not support. Rates and
+    seconds are in real time: a simulation at ten times the speed needs ten times the rate.
     """
 
     def velocity(
@@ -606,8 +608,8 @@ class Guided(TwinOf["AsyncGuided"]):
     ) -> SetpointStream[AttitudeRateSetpoint]:
         """Stream body rates with thrust (SET_ATTITUDE_TARGET without an attitude).
 
-        ArduCopter and PX4 obey them. Nothing levels the vehicle: it keeps turning until the next set-point, or until it
-        holds, which is ordered after ``valid_for_s`` without one.
+        ArduCopter and PX4 execute them. The autopilot does not level the vehicle: it keeps turning until the next
+        set-point, or until aerokit orders a hold, after ``valid_for_s`` without a new one.
         """
         return SetpointStream(
             self._loop,
@@ -650,10 +652,10 @@ class Guided(TwinOf["AsyncGuided"]):
     ) -> SetpointStream[ActuatorSetpoint]:
         """Stream actuator controls (SET_ACTUATOR_CONTROL_TARGET).
 
-        PX4 obeys them up to version 1.13; newer ones, and ArduPilot, ignore the message.
+        PX4 executes them up to version 1.13; newer versions, and ArduPilot, ignore the message.
 
         Raises:
-            NotSupported: this firmware does not obey them, or its version is not known yet. Nothing was sent.
+            NotSupported: this firmware ignores the message, or its version is not known yet. Nothing was sent.
         """
         return SetpointStream(
             self._loop,
@@ -952,7 +954,7 @@ class GimbalControl(BlockTwin["AsyncGimbalControl"]):
         BusyError: your program already has this control in another block. Nothing was sent.
         CommandRejected: the manager refused.
         CommandTimeout: there was no answer.
-        OperationTimeout: it was accepted, but the manager does not confirm that you are in control.
+        OperationTimeout: the manager accepted the command, but does not confirm that you are in control.
     """
 
     @property
@@ -995,7 +997,8 @@ class GimbalRates(BlockTwin["AsyncGimbalRates"]):
     (GIMBAL_MANAGER_SET_PITCHYAW, or GIMBAL_MANAGER_SET_ATTITUDE to PX4). Leaving, in any way, orders a rate of zero:
     the gimbal keeps its direction. The stream stops by itself, with a rate of zero, if no new rates are set for
     ``valid_for_s``, the event loop is blocked for ``max_lag_s``, or the vehicle is silent. It stops without sending a
-    rate of zero if another order is given to the gimbal, or control is lost. Then ``set`` and leaving the block raise.
+    rate of zero if another order is given to the gimbal, or control is lost. ``set`` and leaving the block then raise
+    :class:`SetpointStreamStopped` or :class:`GimbalTaken`.
 
     Entering raises:
         InvalidArgument: a rate is out of range. Nothing was sent.
@@ -1075,7 +1078,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
 
         Raises:
             InvalidArgument: the tolerance is out of range. Nothing was sent.
-            NotSupported: the manager supports it for its first gimbal only. Nothing was sent.
+            NotSupported: the manager supports regions of interest for its first gimbal only. Nothing was sent.
             ValueUnknownError: the target needs home or the vehicle's altitude, which is unknown. Nothing was sent.
 
         Otherwise raises as :meth:`neutral`.
@@ -1134,8 +1137,8 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         Args:
             pitch_deg: from the horizon, −360 to 360: 0 is level, −90 straight down.
             yaw_deg: −360 to 360, clockwise from north (``frame="earth"``) or from the nose (``"vehicle"``).
-            roll_deg: from the horizon, −360 to 360. Other values than 0 need the mount command, which turns the camera
-                with the vehicle: a yaw from north is right only at the time of the order.
+            roll_deg: from the horizon, −360 to 360. A roll other than 0 needs the mount command, whose yaw turns with
+                the vehicle: a yaw from north is right only at the time of the order.
             frame: reference of the yaw, which the gimbal keeps afterwards.
             wait: False: return when the manager has accepted the order.
             tolerance_deg: accepted deviation in each axis, above 0 to 45.
@@ -1236,7 +1239,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         Args:
             pitch_deg_s: the first rate in degrees per second, −720 to 720; positive is up.
             yaw_deg_s: the first rate in degrees per second, −720 to 720; positive is to the right.
-            frame: whether the yaw keeps to north (``"earth"``) or turns with the vehicle (``"vehicle"``).
+            frame: ``"earth"`` if the yaw is held relative to north, ``"vehicle"`` if it turns with the vehicle.
             rate_hz: how often the latest rates are sent, 2 to 100.
             valid_for_s: stop if no new rates are set for this time.
             max_lag_s: stop if the event loop is blocked for this time.
@@ -1308,9 +1311,10 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
         return self.aio.end
 
     def command(self, command: int, *params: float, component_id: int | None = None) -> None:
-        """Send a COMMAND_LONG of this order; returns when it is acknowledged or the order's effect is reported.
+        """Send a COMMAND_LONG of this order; returns at the acknowledgement, or when the order's effect is reported.
 
-        It is not sent again after a newer order about the same subject, or after another party changed the mode.
+        The command is not sent again after a newer order about the same subject, or after another party changed the
+        mode.
 
         Args:
             command: the MAV_CMD.
@@ -1363,10 +1367,10 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
         self._loop.run(self.aio.set_mode, mode, timeout=timeout, component_id=component_id)
 
     def wait_confirmed(self, timeout: float) -> None:
-        """Wait until HEARTBEAT reports the order's effect; returns at once if it was in effect already.
+        """Wait until HEARTBEAT reports the order's effect, which may be at once.
 
         Raises:
-            CommandRejected: the vehicle accepted first and refused then, as PX4 may do.
+            CommandRejected: the vehicle first accepted and then refused, as PX4 may do.
             OperationTimeout: the effect was not reported within ``timeout`` seconds.
         """
         self._loop.run(self.aio.wait_confirmed, timeout)
@@ -1383,13 +1387,13 @@ class Files(TwinOf["AsyncFiles"]):
     Every method raises:
         InvalidArgument: a path is empty, contains NUL, cannot be encoded, or has more than 238 bytes. Nothing was sent.
         FileError: the vehicle refused; see ``code`` and ``errno``.
-        FileTimeout: it did not finish; ``missing`` has the missing ranges.
+        FileTimeout: the operation did not finish; ``missing`` has the missing ranges.
 
     :meth:`is_supported` raises none of them.
     """
 
     def is_supported(self) -> bool:
-        """Return True if the vehicle reports MAVFTP; False also if it does not answer within three seconds."""
+        """Return True if the vehicle reports MAVFTP; False if it does not, or does not answer within three seconds."""
         return self._loop.run(self.aio.is_supported)
 
     def read(
@@ -1478,7 +1482,7 @@ class Files(TwinOf["AsyncFiles"]):
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> None:
-        """Write a file. An existing file is replaced; its content is lost with the first message.
+        """Write a file. An existing file is replaced; its old content is lost as soon as the write begins.
 
         ``verify`` compares the CRC-32 afterwards, if the vehicle can compute it. It cannot for files whose names
         begin with ``@``: the vehicle evaluates them when they are closed, and does not report the result.
@@ -1571,20 +1575,20 @@ class Files(TwinOf["AsyncFiles"]):
 
 
 class LogStream(LogStreamTwin):
-    """The flight log that PX4 sends while its ``async with`` block runs (LOGGING_DATA): an async iterator over bytes.
+    """PX4's flight log, received while PX4 writes it (LOGGING_DATA): an async iterator over bytes.
 
-    Written to a file one after the other, the bytes are a valid ULog file at any time. Lost messages are marked there
-    as dropouts; ``lost`` counts them. The iterator ends with the connection. PX4 sends one such log at a time.
+    If you append all bytes to a file, it is a valid ULog file at any time. Lost messages are marked in it as dropouts;
+    ``lost`` counts them. The iterator ends with the connection. PX4 sends one such log at a time.
 
     Entering raises:
-        NotSupported: ArduPilot. Nothing was sent.
+        NotSupported: the vehicle runs ArduPilot. Nothing was sent.
         CommandRejected: PX4 streams to another station, or the port is too slow (below 5 kB/s).
-        CommandTimeout: there was no acknowledgement; the stream that may have begun is stopped.
+        CommandTimeout: there was no acknowledgement; aerokit stops the stream, which may have begun.
     """
 
     @property
     def lost(self) -> int:
-        """Number of LOGGING_DATA messages that were not received, or that the reader was too slow for."""
+        """Number of LOGGING_DATA messages that were lost, or dropped because your program read too slowly."""
         return self.aio.lost
 
 
@@ -1620,7 +1624,8 @@ class Logs(TwinOf["AsyncLogs"]):
     ) -> None:
         """Copy a log to this computer. A log that is still being written is read up to its current end.
 
-        Until it is complete it is ``<to>.part`` by MAVFTP, ``<to>.log<id>-<time>.part`` by the LOG_* messages.
+        Until the download is complete, the local file is named ``<to>.part`` (MAVFTP) or ``<to>.log<id>-<time>.part``
+        (LOG_*).
 
         Args:
             log: an entry of :meth:`list`, or its id.
@@ -1636,7 +1641,7 @@ class Logs(TwinOf["AsyncLogs"]):
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
             FileError: there is no such log, or it was requested by MAVFTP and cannot be identified.
-            FileTimeout: it did not arrive; ``missing`` has the missing ranges.
+            FileTimeout: the log did not arrive completely; ``missing`` has the missing ranges.
             OSError: the local file cannot be written.
         """
         self._loop.run(
@@ -1686,7 +1691,7 @@ class Logs(TwinOf["AsyncLogs"]):
         self._loop.run(self.aio.erase, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
     def stream(self, *, idle_timeout_s: float = IDLE_TIMEOUT_S) -> LogStream:
-        """Receive the log that PX4 writes, for the duration of an ``async with`` block (MAV_CMD_LOGGING_START).
+        """Receive the flight log while PX4 writes it, during an ``async with`` block (MAV_CMD_LOGGING_START).
 
         ``async with vehicle.logs.stream() as stream: async for data in stream: file.write(data)``
 
@@ -2064,7 +2069,7 @@ class Shell(BlockTwin["AsyncShell"]):
 
 
 class TemporaryParameters(TemporarilyTwin):
-    """Other values for the duration of a block, which yields the results; see :meth:`Parameters.temporarily`."""
+    """Sets other values for the duration of a block; see :meth:`Parameters.temporarily`."""
 
 
 class Transaction(TransactionTwin):
@@ -2108,9 +2113,9 @@ class Parameters(TwinOf["AsyncParameters"]):
     method accepts the old and the new name with either firmware, and converts the value; an old name that the vehicle
     no longer has causes an :class:`aerokit.errors.ParameterRenamedWarning` with the new one.
 
-    ArduPilot handles parameters a few times a second. While more than five are read, or if it has not answered within
-    half a second whether it has a parameter, aerokit raises that rate by SET_MESSAGE_INTERVAL of PARAM_VALUE, and
-    restores it at the end.
+    ArduPilot handles parameters a few times a second. aerokit raises this rate by SET_MESSAGE_INTERVAL of PARAM_VALUE
+    while it reads more than five parameters, or if there is no answer within half a second, and restores the rate at
+    the end.
 
     All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
     total; then OperationTimeout). You can cancel any call.
@@ -2160,18 +2165,19 @@ class Parameters(TwinOf["AsyncParameters"]):
         """Return all parameters; immediately if they were downloaded since the vehicle started.
 
         Args:
-            method: ``"ftp"`` reads one small file with the defaults (``@PARAM/param.pck``), ``"list"`` requests one
-                message for each parameter; ``"auto"`` uses the file if there is one.
+            method: ``"ftp"`` reads one small file that also has the defaults (``@PARAM/param.pck``), ``"list"``
+                requests one message for each parameter, ``"auto"`` uses the file if there is one.
             refresh: download again, even if the parameters are known or cached.
             cache: keep the list on disk, and use it while the vehicle's parameter hash is unchanged: the second connect
-                takes one request. True means the user's cache directory; or pass a path. Only PX4 has a hash; it does
-                not cover parameters that PX4 changes by itself, so they may be outdated. Off by default.
+                takes one request. True means the user's cache directory; or pass a path. Only PX4 has a hash. It does
+                not cover parameters that PX4 changes by itself, so these may be outdated. Off by default.
             idle_timeout_s: fail after this many seconds without progress.
             timeout: seconds in total.
             on_progress: called with the number of parameters, or bytes of the file, so far and in total.
 
         Raises:
-            ParameterTimeout: the list is incomplete; ``missing`` has the indices, ``table`` what has arrived.
+            ParameterTimeout: the list is incomplete; ``missing`` has the missing indices, ``table`` the parameters that
+                have arrived.
             FileError, FileTimeout, RemoteProtocolError: with ``method="ftp"`` only.
         """
         return self._loop.run(
@@ -2193,7 +2199,7 @@ class Parameters(TwinOf["AsyncParameters"]):
 
         Raises:
             InvalidArgument: the name is empty, or longer than 16 characters.
-            ParameterRejected: the vehicle reports that it has no such parameter, or answers only requests for others.
+            ParameterRejected: the vehicle reports that it has no such parameter, or answers only for other parameters.
             ParameterTimeout: there was no answer.
         """
         return self._loop.run(self.aio.read, name, idle_timeout_s=idle_timeout_s, timeout=timeout)
@@ -2270,9 +2276,9 @@ class Parameters(TwinOf["AsyncParameters"]):
 
         ``method="ftp"`` writes one file (``@PARAM/param.pck``) and reads the values back, ``"set"`` sets them one by
         one, ``"auto"`` uses the file if the vehicle supports it and there are many changes. Results are as for
-        :meth:`set_many`; parameters that the vehicle does not have end as ``"failed"`` with ParameterRejected, and
-        the others are set. If two names mean the same parameter, the vehicle's current name counts, and the other one
-        gets no result.
+        :meth:`set_many`; parameters that the vehicle does not have end as ``"failed"`` with ParameterRejected, and the
+        others are set. If two names mean the same parameter, the value under the vehicle's current name is used, and
+        the other name gets no result.
 
         Raises:
             InvalidArgument, FileFormatError: a name, a value or the file is invalid. Nothing was set.
@@ -2348,7 +2354,7 @@ class Parameters(TwinOf["AsyncParameters"]):
         """Return the parameters that differ from their default, according to MAVFTP or the metadata.
 
         Raises:
-            NotSupported: neither of them has defaults.
+            NotSupported: the defaults are unknown, because neither of the two is available.
         """
         return self._loop.run(
             self.aio.changed_from_default,
@@ -2477,9 +2483,10 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         Args:
             plan: checked before anything is sent.
             method: ``"ftp"`` (ArduPilot's ``@MISSION/…`` files), ``"items"`` (the mission protocol), or ``"auto"``.
-            only_changes: if the vehicle's plan is known from an earlier transfer, and the vehicle confirms it, send
-                nothing if it is equal, and only the items that differ if the vehicle supports that.
-            verify: read the plan back and compare, or compare PX4's checksum where that is faster. Files are always
+            only_changes: compare with the vehicle's plan, if it is known from an earlier transfer and the vehicle
+                confirms it. Send nothing if both are equal, and only the items that differ if the vehicle supports
+                that.
+            verify: read the plan back and compare it, or compare PX4's checksum if that is faster. Files are always
                 read back.
             max_distance_m: refuse a plan with a position farther than this from the vehicle, if its position is
                 known.
@@ -2497,7 +2504,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
             MissionTimeout: the vehicle stopped answering; ``missing`` has the items that it did not confirm.
             VerificationFailed: the vehicle confirmed the plan, but has different items.
             NotSupported: ``"ftp"`` was requested, but the vehicle does not support it.
-            FileError, FileTimeout: the vehicle refused or did not answer an operation on a file, with ``"ftp"``.
+            FileError, FileTimeout: with ``"ftp"``: the vehicle refused an operation on a file, or did not answer.
             OperationTimeout: not done within ``timeout``.
         """
         self._loop.run(
@@ -2525,7 +2532,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
             MissionRejected: the vehicle refused.
-            MissionTimeout: items are missing; ``missing`` has them.
+            MissionTimeout: items did not arrive; ``missing`` has their numbers.
             RemoteProtocolError: the received items are not a valid plan.
             NotSupported, FileError, FileTimeout: as for :meth:`upload`, with ``"ftp"``.
             OperationTimeout: not done within ``timeout``.
@@ -2539,7 +2546,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         )
 
     def clear(self, *, idle_timeout_s: float = 10.0, timeout: float | None = None) -> None:
-        """Clear the plan on the vehicle, and verify that. ArduPilot refuses to clear a mission that it is flying.
+        """Clear the plan on the vehicle, and verify that it is empty. ArduPilot refuses to clear a mission in flight.
 
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
@@ -2588,7 +2595,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         """Fly the mission from ``item`` on; returns when HEARTBEAT reports the mission mode.
 
         The vehicle must be armed: **it takes off** if the mission begins with a take-off. A copter on the ground needs
-        a take-off item first. If you cancel the call, aerokit orders the vehicle to hold.
+        a take-off as the first item. If you cancel the call, aerokit orders the vehicle to hold.
 
         Sends MISSION_START to ArduPilot, which then takes off from the ground. Other autopilots get a mode change.
 
@@ -2609,7 +2616,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         self._loop.run(self.aio.pause)
 
     def resume(self, *, timeout: float = 10.0) -> None:
-        """Continue the mission from the current item; also after a pilot or another order has interrupted it.
+        """Continue the mission from the current item, even after a pilot or another order has interrupted it.
 
         ArduPilot starts again from the first item if its parameter MIS_RESTART is 1. Raises as :meth:`start`.
         """
@@ -2627,10 +2634,10 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
 
         Raises:
             OperationRejected: the vehicle no longer flies the mission: a pilot, a failsafe or another order changed the
-                mode, or it disarmed on the way. ``reasons`` has what the vehicle reported.
-            OperationTimeout: not finished in time; or the armed vehicle has not moved for 12 s after a descent at more
-                than 3 m/s that ended on the ground; or it has not moved for 60 s at a take-off or at a waypoint without
-                a hold, which requires that the items were uploaded or downloaded.
+                mode, or it disarmed on the way. ``reasons`` has the vehicle's status texts.
+            OperationTimeout: the mission was not finished in time; or the armed vehicle has not moved for 12 s after a
+                descent at more than 3 m/s that ended on the ground; or it has not moved for 60 s at a take-off or at a
+                waypoint without a hold (only if the items are known from an upload or a download).
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
         """
         self._loop.run(self.aio.wait_finished, timeout=timeout, max_silence_s=max_silence_s)
@@ -2639,7 +2646,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
     def explains_mode(self) -> bool:
         """True if the vehicle holds, returns or lands because its mission has ended.
 
-        This requires that the mission was the last order, and is complete or at its last item.
+        The mission must be the last order, and must be complete or at its last item.
         """
         return self.aio.explains_mode
 
@@ -2668,9 +2675,10 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
         Args:
             plan: checked before anything is sent.
             method: ``"ftp"`` (ArduPilot's ``@MISSION/…`` files), ``"items"`` (the mission protocol), or ``"auto"``.
-            only_changes: if the vehicle's plan is known from an earlier transfer, and the vehicle confirms it, send
-                nothing if it is equal, and only the items that differ if the vehicle supports that.
-            verify: read the plan back and compare, or compare PX4's checksum where that is faster. Files are always
+            only_changes: compare with the vehicle's plan, if it is known from an earlier transfer and the vehicle
+                confirms it. Send nothing if both are equal, and only the items that differ if the vehicle supports
+                that.
+            verify: read the plan back and compare it, or compare PX4's checksum if that is faster. Files are always
                 read back.
             max_distance_m: refuse a plan with a position farther than this from the vehicle, if its position is
                 known.
@@ -2688,7 +2696,7 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
             MissionTimeout: the vehicle stopped answering; ``missing`` has the items that it did not confirm.
             VerificationFailed: the vehicle confirmed the plan, but has different items.
             NotSupported: ``"ftp"`` was requested, but the vehicle does not support it.
-            FileError, FileTimeout: the vehicle refused or did not answer an operation on a file, with ``"ftp"``.
+            FileError, FileTimeout: with ``"ftp"``: the vehicle refused an operation on a file, or did not answer.
             OperationTimeout: not done within ``timeout``.
         """
         self._loop.run(
@@ -2716,7 +2724,7 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
             MissionRejected: the vehicle refused.
-            MissionTimeout: items are missing; ``missing`` has them.
+            MissionTimeout: items did not arrive; ``missing`` has their numbers.
             RemoteProtocolError: the received items are not a valid plan.
             NotSupported, FileError, FileTimeout: as for :meth:`upload`, with ``"ftp"``.
             OperationTimeout: not done within ``timeout``.
@@ -2730,7 +2738,7 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
         )
 
     def clear(self, *, idle_timeout_s: float = 10.0, timeout: float | None = None) -> None:
-        """Clear the plan on the vehicle, and verify that. ArduPilot refuses to clear a mission that it is flying.
+        """Clear the plan on the vehicle, and verify that it is empty. ArduPilot refuses to clear a mission in flight.
 
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
@@ -2754,7 +2762,7 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
 
 
 class RallyControl(TwinOf["AsyncRallyControl"]):
-    """Rally points, alternatives to home for a return: ``await vehicle.rally.upload(RallyPoints([...]))``.
+    """Rally points, where a vehicle may return instead of home: ``await vehicle.rally.upload(RallyPoints([...]))``.
 
     PX4 calls them safe points, and uses them if RTL_TYPE is set accordingly.
     """
@@ -2776,9 +2784,10 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
         Args:
             plan: checked before anything is sent.
             method: ``"ftp"`` (ArduPilot's ``@MISSION/…`` files), ``"items"`` (the mission protocol), or ``"auto"``.
-            only_changes: if the vehicle's plan is known from an earlier transfer, and the vehicle confirms it, send
-                nothing if it is equal, and only the items that differ if the vehicle supports that.
-            verify: read the plan back and compare, or compare PX4's checksum where that is faster. Files are always
+            only_changes: compare with the vehicle's plan, if it is known from an earlier transfer and the vehicle
+                confirms it. Send nothing if both are equal, and only the items that differ if the vehicle supports
+                that.
+            verify: read the plan back and compare it, or compare PX4's checksum if that is faster. Files are always
                 read back.
             max_distance_m: refuse a plan with a position farther than this from the vehicle, if its position is
                 known.
@@ -2796,7 +2805,7 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
             MissionTimeout: the vehicle stopped answering; ``missing`` has the items that it did not confirm.
             VerificationFailed: the vehicle confirmed the plan, but has different items.
             NotSupported: ``"ftp"`` was requested, but the vehicle does not support it.
-            FileError, FileTimeout: the vehicle refused or did not answer an operation on a file, with ``"ftp"``.
+            FileError, FileTimeout: with ``"ftp"``: the vehicle refused an operation on a file, or did not answer.
             OperationTimeout: not done within ``timeout``.
         """
         self._loop.run(
@@ -2824,7 +2833,7 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
             MissionRejected: the vehicle refused.
-            MissionTimeout: items are missing; ``missing`` has them.
+            MissionTimeout: items did not arrive; ``missing`` has their numbers.
             RemoteProtocolError: the received items are not a valid plan.
             NotSupported, FileError, FileTimeout: as for :meth:`upload`, with ``"ftp"``.
             OperationTimeout: not done within ``timeout``.
@@ -2838,7 +2847,7 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
         )
 
     def clear(self, *, idle_timeout_s: float = 10.0, timeout: float | None = None) -> None:
-        """Clear the plan on the vehicle, and verify that. ArduPilot refuses to clear a mission that it is flying.
+        """Clear the plan on the vehicle, and verify that it is empty. ArduPilot refuses to clear a mission in flight.
 
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
@@ -2956,9 +2965,9 @@ class PhotoInterval(PhotoIntervalTwin):
 class Camera(TwinOf["AsyncCamera"]):
     """One camera: photos, video, lens, tracking, storage, streams (https://mavlink.io/en/services/camera.html).
 
-    ``vehicle.camera`` is the first camera; ``vehicle.camera_at(number)`` is any camera: one with its own component id
-    (100 to 105), or one attached to the autopilot (1 to 6), e.g. ArduPilot's drivers and PX4's trigger. Calls outside
-    the camera's reported capabilities are refused before anything is sent. Cells are polled only while your program
+    ``vehicle.camera`` is the first camera, ``vehicle.camera_at(number)`` any other. A camera has its own component id
+    (100 to 105), or is attached to the autopilot (1 to 6) by ArduPilot's drivers or PX4's trigger. A call that the
+    camera's reported capabilities exclude is refused before anything is sent. Cells are polled only while your program
     uses them.
     """
 
@@ -3059,7 +3068,7 @@ class Camera(TwinOf["AsyncCamera"]):
         Args:
             x: 0 (left) to 1 (right).
             y: 0 (top) to 1 (bottom).
-            radius: part of the image width, 0 (one pixel) to 1.
+            radius: radius of the object as a fraction of the image width, 0 (one pixel) to 1.
             status_hz: rate of ``camera.tracking``, above 0 to 50.
 
         Raises:
@@ -3110,7 +3119,7 @@ class Camera(TwinOf["AsyncCamera"]):
         self._loop.run(self.aio.zoom_step, steps)
 
     def zoom_to(self, percent: float) -> None:
-        """Zoom to a part of the range: 0 (widest) to 100 %; errors as for :meth:`zoom_step`."""
+        """Zoom to a percentage of the range, 0 (widest) to 100; errors as for :meth:`zoom_step`."""
         self._loop.run(self.aio.zoom_to, percent)
 
     def zoom_to_focal_length(self, millimetres: float) -> None:
@@ -3141,7 +3150,7 @@ class Camera(TwinOf["AsyncCamera"]):
         self._loop.run(self.aio.focus_step, steps)
 
     def focus_to(self, percent: float) -> None:
-        """Focus to a part of the range: 0 (nearest) to 100 %; errors as for :meth:`focus_step`."""
+        """Focus to a percentage of the range, 0 (nearest) to 100; errors as for :meth:`focus_step`."""
         self._loop.run(self.aio.focus_to, percent)
 
     def focus_at(self, metres: float) -> None:
@@ -3447,7 +3456,7 @@ class Settings(TwinOf["AsyncSettings"]):
         )
 
     def options(self, name: str) -> Mapping[str, SettingValue]:
-        """Return the options of a setting, name → value, as far as the known other settings allow them.
+        """Return the options of a setting that the known other settings allow, as a mapping of names to values.
 
         Empty without a definition, and for settings without options.
         """
@@ -3507,8 +3516,8 @@ class Settings(TwinOf["AsyncSettings"]):
         afterwards, and unknown settings that restrict it are read before.
 
         Raises:
-            InvalidArgument: an invalid name or value; with a definition: an option or value that is not allowed, or a
-                setting that is read-only or excluded now. Nothing was set.
+            InvalidArgument: the name or value is invalid; or, with a definition, the value is not allowed, or the
+                setting is read-only or excluded now. Nothing was set.
             ParameterRejected: the component has no such setting, or refused; ``code`` is its PARAM_ACK.
             ParameterTimeout: not confirmed, but it may have been set.
         """
@@ -4019,12 +4028,13 @@ class Vehicle(VehicleTwin):
             params: param1 to param7; missing ones are 0, or NaN where the command allows it.
             component_id: the target component instead of the autopilot; 0: all components, and the autopilot's ack
                 counts.
-            retries: how often it is sent again without an ack, from 0; ``confirmation`` increments each time. A
-                command that changes something is sent again only right after a HEARTBEAT that shows no other mode, no
-                failsafe, and no newer order (docs/reliability.md). None: 3 for a request that changes nothing but
-                streams, 0 for all others, because they would be executed twice if only the ack was lost.
-            attempt_timeout: seconds to wait for an ack after each transmission, above 0, and at least two measured
-                round trips; None: 1, or 4 if it is sent once.
+            retries: maximum number of retransmissions without an ack, from 0; ``confirmation`` increments each time. A
+                command that changes something is sent again only right after a HEARTBEAT, and only if the mode has not
+                changed, no failsafe is active and there is no newer order (docs/reliability.md). None: 3 for a request
+                that changes nothing but streams, 0 for all other commands, because a lost ack would cause a second
+                execution.
+            attempt_timeout: seconds to wait for an ack after each transmission, above 0. aerokit waits for at least two
+                measured round trips. None: 1, or 4 if the command is sent only once.
             progress_timeout: seconds to wait for the next ack after each IN_PROGRESS; calibrations can take long.
             on_progress: called with 0–100, or None, for each IN_PROGRESS.
 
@@ -4061,9 +4071,9 @@ class Vehicle(VehicleTwin):
     ) -> CommandAck:
         """Send any MAV_CMD as COMMAND_INT: param1 to param4, ``x``, ``y``, ``z`` in ``frame`` (MAV_FRAME).
 
-        ``x`` and ``y`` are latitude and longitude in 1e-7 degrees, or 1e-4 m in local frames; ``z`` is in metres.
-        With ``or_long``, firmware that does not support the command as COMMAND_INT gets a COMMAND_LONG with degrees;
-        this requires frame 0. All else as for :meth:`command`.
+        ``x`` and ``y`` are latitude and longitude in 1e-7 degrees, or 1e-4 m in local frames; ``z`` is in metres. With
+        ``or_long``, firmware that does not support the command as COMMAND_INT gets a COMMAND_LONG with degrees; this
+        requires frame 0. Other arguments and errors are those of :meth:`command`.
         """
         return self._loop.run(
             self.aio.command_int,
@@ -4084,8 +4094,8 @@ class Vehicle(VehicleTwin):
     def send(self, message: Message) -> None:
         """Send one message unchanged, once; never blocks. The caller sets its ``target_system``.
 
-        A steering command and SET_MODE are orders and end the action in progress, as with :meth:`command`. A set-point
-        supersedes :meth:`posted` orders about motion. Messages to another system do neither.
+        A steering command or SET_MODE is an order, and ends the action in progress, as with :meth:`command`. A
+        set-point supersedes :meth:`posted` orders about motion. A message to another system has neither effect.
 
         Raises:
             InvalidArgument: a field is out of range; nothing was sent.
@@ -4094,9 +4104,7 @@ class Vehicle(VehicleTwin):
         self._loop.call(self.aio.send, message)
 
     def note_sent(self, message: Message) -> None:
-        """Register a message that the program sent to the vehicle by ``connection.send``; it counts as sent by
-        :meth:`send`.
-        """
+        """Register a message that the program sent by ``connection.send``, as if it had called :meth:`send`."""
         self._loop.call(self.aio.note_sent, message)
 
     def posted(
@@ -4107,16 +4115,18 @@ class Vehicle(VehicleTwin):
     ) -> AbstractContextManager[PostedOrder]:
         """Open an order without waiting for its effect, so that mode, arming and take-off can be sent in one go.
 
-        Within the block its commands are sent again right after a HEARTBEAT until they are acknowledged or their
-        effect is reported. Retries end with a newer order about the same subject, with a mode that neither this order
-        nor an order of the last ten seconds explains and, for orders about motion, with disarming. An abandoned order
-        does not make the vehicle hold, and late arming is not monitored; use the actions for that.
+        Within the block, the order's commands are sent again right after a HEARTBEAT, until they are acknowledged or
+        their effect is reported. Retries end with a newer order about the same subject; with a mode that neither this
+        order nor another order of the last ten seconds explains; and, for orders about motion, with disarming. An
+        abandoned posted order does not make the vehicle hold, and late arming is not monitored; use the actions for
+        that.
 
         Args:
-            subjects: ``"mode"``, ``"motion"`` or ``"arm"``; the first one is what the order is about, and it also
-                ends orders about the others. An order about mode or motion ends the action in progress.
-            modes: the modes that it brings about.
-            armed: True if it arms, False if it disarms; required for ``"arm"``.
+            subjects: ``"mode"``, ``"motion"`` or ``"arm"``. A newer order about the first subject ends this order; this
+                order ends earlier ones about any of its subjects. An order about mode or motion also ends the action in
+                progress.
+            modes: the modes that the order leads to.
+            armed: True if the order arms the vehicle, False if it disarms it; required for ``"arm"``.
 
         Raises:
             InvalidArgument: no subject, or ``"arm"`` without ``armed``. Nothing was sent.
@@ -4132,10 +4142,10 @@ class Vehicle(VehicleTwin):
     ) -> Subscription[ItemT]:
         """Return a stream of messages or events of this vehicle, for use in a ``with`` block.
 
-        ``capacity=1`` keeps the latest only; ``missed`` counts the others. Subscribing also requests the rate: while
-        the block lasts, the autopilot is asked to send these messages at ``rate_hz`` (above 0, at most 1000), or
-        faster if another subscriber needs it. None requests the default rate of streamed messages; messages sent on
-        demand (HEARTBEAT, STATUSTEXT, acks) are not requested. For a camera or another component use
+        ``capacity=1`` keeps only the latest message; ``missed`` counts the dropped ones. For the duration of the block,
+        aerokit requests these messages from the autopilot at ``rate_hz`` (above 0, at most 1000), or faster if another
+        subscriber needs it. None requests the default rate of streamed messages; messages sent on demand (HEARTBEAT,
+        STATUSTEXT, acks) are not requested. For a camera or another component use
         ``vehicle.component(100).subscribe(...)``.
 
         Raises:
@@ -4338,9 +4348,10 @@ class Vehicle(VehicleTwin):
     def taken_over(self) -> str:
         """The takeover that ended the program's last action, as a clause; empty if there was none.
 
-        "the mode changed to LOITER": by a pilot, a failsafe or another program, which HEARTBEAT does not distinguish;
-        or "a failsafe became active (MAV_STATE_CRITICAL)", which may be reported seconds before the mode changes.
-        Disarming alone, as after a landing, is no takeover. The program's next action resets it.
+        ``"the mode changed to LOITER"`` may be the work of a pilot, a failsafe or another program, because HEARTBEAT
+        does not distinguish them. ``"a failsafe became active (MAV_STATE_CRITICAL)"`` may be reported seconds before
+        the mode changes. Disarming alone, as after a landing, is not a takeover. The program's next action resets this
+        text.
         """
         return self.aio.taken_over
 
@@ -4391,9 +4402,9 @@ class Vehicle(VehicleTwin):
             mode: the mode to arm in. None: the present mode, or one that ``take_off`` starts in if the present mode
                 does not allow arming.
             force: skip the vehicle's own arming checks. Dangerous.
-            reason: why your program arms, at most 50 bytes. Logger "aerokit" reports it at INFO, and a STATUSTEXT takes
-                it to the vehicle right before the command, where ArduPilot writes it into its flight log. PX4 logs only
-                texts that have the vehicle's own system id.
+            reason: why your program arms, at most 50 bytes. Logger "aerokit" reports it at INFO. A STATUSTEXT also
+                sends it to the vehicle right before the command, and ArduPilot writes it into its flight log. PX4 logs
+                only texts that have the vehicle's own system id.
             timeout: seconds for HEARTBEAT to report armed after the command was accepted.
             max_silence_s: raise when no heartbeat was received for this long; None: wait until ``timeout``.
 
@@ -4401,7 +4412,7 @@ class Vehicle(VehicleTwin):
             InvalidArgument: there is no such mode, it does not allow arming, or the reason is too long. Nothing was
                 sent.
             CommandRejected: the vehicle refused; ``reasons`` has its pre-arm texts, failing sensors and missing
-                estimates. Where the vehicle can run its checks on request, they are run again for this.
+                estimates. A vehicle that can run its checks on request runs them again for this.
             CommandTimeout: there was no acknowledgement, and the vehicle did not arm; the text says whether it may
                 still arm.
             OperationRejected: the vehicle is armed already in a mode other than ``mode`` (nothing was sent), or another
@@ -4450,14 +4461,14 @@ class Vehicle(VehicleTwin):
         Raises:
             OperationRejected: the vehicle is armed, or not known to be disarmed. Nothing was sent.
             CommandRejected: the vehicle refused.
-            CommandTimeout: there was no acknowledgement, and it did not reboot.
+            CommandTimeout: there was no acknowledgement, and the vehicle did not reboot.
             LinkLost: the link went down with the vehicle (USB, TCP); connect again.
             OperationTimeout: the vehicle did not restart in time.
         """
         self._loop.run(self.aio.reboot, force=force, timeout=timeout)
 
     def look_at(self, target: Position | Home) -> None:
-        """Point nose or gimbal at a place until :meth:`stop_looking`; without an altitude, at the vehicle's altitude.
+        """Point nose or gimbal at a place until :meth:`stop_looking`; a place without altitude is at the vehicle's own.
 
         Sends MAV_CMD_DO_SET_ROI_LOCATION (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_ROI_LOCATION), or
         MAV_CMD_DO_SET_ROI to old firmware.
@@ -4743,14 +4754,14 @@ class Vehicle(VehicleTwin):
         """Fly to a place and return on arrival.
 
         After a cancellation, a time-out or a silence, aerokit orders the vehicle to hold where it is, unless another
-        order was given meanwhile or another party changed the mode. After a silence it waits for the next heartbeat,
-        and orders the hold if the vehicle is still on its way. Sends MAV_CMD_DO_REPOSITION
+        order was given meanwhile or another party changed the mode. After a silence, aerokit waits for the next
+        heartbeat, and orders the hold if the vehicle is still on its way. Sends MAV_CMD_DO_REPOSITION
         (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_REPOSITION), or SET_POSITION_TARGET_GLOBAL_INT to a
         vehicle that does not support it.
 
         Args:
-            target: latitude and longitude, and an altitude above home or above mean sea level; without an altitude
-                the present one is kept, also for ``vehicle.home.value``.
+            target: latitude and longitude, and an altitude above home or above mean sea level. Without an altitude, and
+                for ``vehicle.home.value``, the vehicle keeps its present altitude.
             speed_m_s: ground speed from now on, above 0; None keeps the present one.
             heading_deg: heading on arrival, 0–360 clockwise from north; None leaves it to the autopilot.
             tolerance_m: arrival radius in metres; None: the default of the type of vehicle.
@@ -4761,7 +4772,7 @@ class Vehicle(VehicleTwin):
         Raises:
             InvalidArgument: the target is not on earth or too far away, or another argument is out of range. Nothing
                 was sent.
-            ValueUnknownError: position or home is needed here and not known.
+            ValueUnknownError: the vehicle's position or home is needed, and is not known.
             CommandRejected: the vehicle refused (outside its fence, no position, …).
             OperationRejected: the mode changed (a pilot, a failsafe) or the vehicle disarmed on the way.
             CommandTimeout: there was no acknowledgement.
@@ -4782,7 +4793,8 @@ class Vehicle(VehicleTwin):
     def set_speed(self, speed_m_s: float) -> None:
         """Change the ground speed in m/s, above 0 (MAV_CMD_DO_CHANGE_SPEED).
 
-        ArduPilot applies it only on the way in GUIDED or AUTO; ``go_to(speed_m_s=...)`` waits for that.
+        ArduPilot applies it only while the vehicle is on its way in GUIDED or AUTO; ``go_to(speed_m_s=...)`` waits for
+        that.
 
         Raises:
             InvalidArgument: out of range. Nothing was sent.
@@ -4808,7 +4820,7 @@ class Vehicle(VehicleTwin):
         Args:
             heading_deg: −360 to 360, clockwise from north; with ``relative`` an angle to turn by, negative to the
                 left.
-            relative: count from the present heading.
+            relative: True to turn by an angle from the present heading.
             rate_deg_s: turn rate in degrees per second; 0 leaves it to the autopilot. PX4 ignores it.
             tolerance_deg: accepted deviation in degrees.
             timeout: seconds until it has the heading.
@@ -4817,7 +4829,7 @@ class Vehicle(VehicleTwin):
         Raises:
             InvalidArgument: out of range. Nothing was sent.
             CommandRejected: the vehicle refused.
-            OperationRejected: the mode changed or it disarmed meanwhile.
+            OperationRejected: the mode changed or the vehicle disarmed meanwhile.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the vehicle did not reach the heading in time.
         """
@@ -4972,15 +4984,15 @@ class Vehicle(VehicleTwin):
         valid_for_s: float = 0.5,
         max_lag_s: float = 0.5,
     ) -> StickStream:
-        """Fly by stick positions of your program (MANUAL_CONTROL): ``async with vehicle.sticks() as sticks: …``.
+        """Fly by stick positions from your program (MANUAL_CONTROL): ``async with vehicle.sticks() as sticks: …``.
 
         Args:
             initial: positions while the mode is entered; None centres all sticks.
             mode: the piloted mode. By default LOITER (ArduCopter), FBWA or QLOITER (ArduPlane), MANUAL (ArduPilot
                 Rover), ALT_HOLD (ArduSub), POSCTL (PX4).
             rate_hz: transmission rate of the latest positions, 2 to 400.
-            valid_for_s: seconds for which they may be repeated without new ones.
-            max_lag_s: how late the event loop may be.
+            valid_for_s: seconds for which the latest positions are repeated; the stream stops after that.
+            max_lag_s: maximum delay of the event loop in seconds; the stream stops above it.
 
         Raises:
             InvalidArgument: a rate or a time is out of range, or the autopilot has no such mode.
@@ -4999,7 +5011,7 @@ class Vehicle(VehicleTwin):
 
     @property
     def external(self) -> External:
-        """Measurements that your program supplies: odometry, vision, GPS, obstacles, ranges; the origin; the wind."""
+        """Measurements from your program for the estimator: odometry, vision, GPS, obstacles, ranges, origin, wind."""
         return self._part("external", External)
 
     def land_on(
@@ -5013,18 +5025,17 @@ class Vehicle(VehicleTwin):
     ) -> LandingReport:
         """Land on a target that your program sees; returns on the ground, disarmed, with a report of the landing.
 
-        Streams LANDING_TARGET and uses the autopilot's own precision landing: LAND with PLND_ENABLED on ArduCopter,
-        PRECLAND on PX4. If the target is lost, the autopilot decides: ArduCopter retries or lands where it is
-        (PLND_STRICT, PLND_RET_MAX); PX4 climbs to PLD_SRCH_ALT, searches for PLD_SRCH_TOUT and then lands where it
-        is. The report says for how long the target was lost. After a cancellation the vehicle continues to land,
-        without new targets.
+        aerokit streams LANDING_TARGET, and the autopilot's own mode lands: LAND with PLND_ENABLED on ArduCopter,
+        PRECLAND on PX4. If the target is lost, the autopilot decides. ArduCopter retries, or lands where it is
+        (PLND_STRICT, PLND_RET_MAX). PX4 climbs to PLD_SRCH_ALT, searches for PLD_SRCH_TOUT, and then lands where it is.
+        The report says for how long the target was lost. After a cancellation the vehicle continues to land, without
+        new targets.
 
         Args:
-            target: a function, also a coroutine function, that returns a
-                :class:`aerokit.TargetMeasurement`, or None while the target is not visible;
-                or an asynchronous iterable of them.
+            target: a function or coroutine function that returns a :class:`aerokit.TargetMeasurement`, or None while
+                the target is not visible; or an asynchronous iterable of these.
             rate_hz: rate at which the function is called, and the highest rate of LANDING_TARGET.
-            acquire_timeout: seconds until the target must be seen first; the landing is ordered after that.
+            acquire_timeout: seconds to wait until the target is visible. The landing is ordered only then.
             timeout: seconds until the vehicle is on the ground and disarmed; None: no limit.
             max_silence_s: raise when no heartbeat was received for this long; None: no limit.
 
@@ -5033,12 +5044,12 @@ class Vehicle(VehicleTwin):
             NotSupported: this type of vehicle has no precision landing. Nothing was sent.
             CommandRejected: the vehicle refused the mode.
             CommandTimeout: there was no acknowledgement.
-            OperationRejected: a parameter makes the vehicle ignore the target (nothing else was sent), or the mode
-                changed or another order was given meanwhile.
+            OperationRejected: a parameter makes the vehicle ignore the target (the landing was not ordered); or the
+                mode changed, or another order was given, meanwhile.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
-            OperationTimeout: the target was not seen in time (the landing was not ordered), or the vehicle was not
-                down in time.
-            ParameterTimeout: the vehicle did not report these parameters.
+            OperationTimeout: the target was not visible in time (the landing was not ordered), or the vehicle was not
+                on the ground in time.
+            ParameterTimeout: the vehicle did not report the parameters that decide about this.
         """
         return self._loop.run(
             self.aio.land_on,
@@ -5102,9 +5113,9 @@ class Vehicle(VehicleTwin):
     def return_altitude(self) -> float:
         """Return the altitude above home, in metres, at which the vehicle returns to launch.
 
-        Reads RTL_ALT_M (ArduCopter 4.7; before: RTL_ALT, in centimetres), RTL_ALTITUDE (ArduPlane; ALT_HOLD_RTL before
-        4.5), Q_RTL_ALT (ArduPilot's VTOL planes, which return in QRTL) or RTL_RETURN_ALT (PX4). ArduPlane reports −1 if
-        it keeps the present altitude, ArduCopter 0.
+        Reads RTL_ALT_M (ArduCopter 4.7; before that RTL_ALT, in centimetres), RTL_ALTITUDE (ArduPlane; before 4.5
+        ALT_HOLD_RTL), Q_RTL_ALT (ArduPilot's VTOL planes, which return in QRTL) or RTL_RETURN_ALT (PX4). A vehicle that
+        returns at its present altitude reports −1 (ArduPlane) or 0 (ArduCopter).
 
         Raises:
             NotSupported: this type of vehicle does not climb for a return. Nothing was sent.
@@ -5116,8 +5127,8 @@ class Vehicle(VehicleTwin):
     def set_return_altitude(self, altitude_m: float) -> None:
         """Set the altitude of returns to launch; returns when the vehicle has confirmed the value.
 
-        Writes the parameter that :meth:`return_altitude` reads, so the value survives a reboot. A vehicle that is
-        higher than that does not descend for its return.
+        Writes the parameter that :meth:`return_altitude` reads, so the value survives a reboot. A vehicle that is above
+        this altitude returns at its own altitude.
 
         Args:
             altitude_m: metres above home, above 0, at most 3,000. Q_RTL_ALT holds whole metres only.
@@ -5245,12 +5256,12 @@ def connect(
     running asyncio loop: nothing outlives the block, and exceptions raised in the block propagate unchanged.
 
     Args:
-        address: ``"udpin:0.0.0.0:14550"``, ``"tcp:127.0.0.1:5760"``, ``"/dev/ttyACM0,57600"``, a ``.tlog`` file …; a
-            link; several of these that lead to the same vehicle (docs/how-to/several-links.md); or an open
-                connection, to use several vehicles on one link. For an open connection, pass the arguments after
-                ``rates`` to ``open_connection`` instead.
-        system_id: the vehicle's MAVLink system id, 1–255; None takes the first autopilot found.
-        timeout: seconds to wait for its first heartbeat, above 0.
+        address: ``"udpin:0.0.0.0:14550"``, ``"tcp:127.0.0.1:5760"``, ``"/dev/ttyACM0,57600"``, a ``.tlog`` file …, or a
+            link; a list of these, if several links lead to the same vehicle (docs/how-to/several-links.md); or an open
+            connection, to use several vehicles on one link. The arguments after ``rates`` are not allowed with an open
+            connection; pass them to ``open_connection``.
+        system_id: the vehicle's MAVLink system id, 1–255; None means the first autopilot found.
+        timeout: seconds to wait for the vehicle's first heartbeat, above 0.
         rates: message class → Hz (above 0, at most 1000), requested instead of the default rates; ``{}`` requests
             nothing.
         source_system: our own system id.
@@ -5278,7 +5289,7 @@ def connect(
         BusyError: this connection already has a vehicle object for this system.
         LinkOpenError: the link, a shared link or the recording could not be opened.
         LinkLost, ConnectionClosed: the link failed while waiting, or the connection was closed.
-        ConnectFailed: no heartbeat of such a vehicle arrived in time; the text says what was received instead.
+        ConnectFailed: no heartbeat of such a vehicle arrived in time; the error text says what was received instead.
     """
     return opened(
         Vehicle,

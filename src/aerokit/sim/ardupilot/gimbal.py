@@ -53,7 +53,7 @@ _FIXED_ANGLE_MODES = frozenset({MavMountMode.RETRACT, MavMountMode.NEUTRAL})
 
 @dataclass(frozen=True)
 class MountTarget:
-    """Target angles in degrees, which ``rates`` (degrees per second) change from the time ``since`` on."""
+    """Target angles in degrees at the time ``since``; later, ``rates`` (degrees per second) change them."""
 
     roll: float = 0.0
     pitch: float = 0.0

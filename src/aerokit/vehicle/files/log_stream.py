@@ -103,7 +103,7 @@ class LogStream(ReadOnly):
 
     @property
     def lost(self) -> int:
-        """Number of LOGGING_DATA messages that were not received, or were dropped because your program read too slowly."""
+        """Number of LOGGING_DATA messages that were lost, or dropped because your program read too slowly."""
         return self._assembler.lost
 
     async def __aenter__(self) -> Self:
@@ -132,7 +132,7 @@ class LogStream(ReadOnly):
     async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         is_stopped = False
         try:
-            if error is None:  # PX4 answers when its last message is acknowledged (logger.cpp, stop_log_mavlink)
+            if error is None:  # PX4 answers when its last message is acknowledged (logger.cpp)
                 await STOP.send(self._context)
                 is_stopped = True
         finally:
