@@ -246,7 +246,7 @@ async def test_accelerometer_left_says_what_remains(caplog: pytest.LogCaptureFix
             await calibration.cancel()
         assert "waits for the next pose" in caplog.text
         assert copter.calibrations.accelerometers.is_waiting
-        steps = await steps_of(vehicle.calibrate.accelerometer())  # It continues.
+        steps = await steps_of(vehicle.calibrate.accelerometer())  # The first calibration continues.
         assert steps[-1].result is not None
 
 

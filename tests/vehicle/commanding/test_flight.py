@@ -1,4 +1,4 @@
-"""Taking off, going somewhere, coming back: each action ends when the vehicle has done it."""
+"""Taking off, going somewhere, coming back: each call returns when the vehicle has completed the action."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ async def test_take_off_in_the_air_sends_nothing(flying: Flight) -> None:
 
 
 async def test_take_off_while_landing_is_rejected(flying: Flight) -> None:
-    """The take-off would be refused in the air; the mode before it would not, and the vehicle would hover."""
+    """In the air the vehicle would refuse the take-off but accept the change to GUIDED, and would hover."""
     vehicle = flying.vehicle
     await vehicle.set_mode("LAND")
     await vehicle.landed_state.wait_until(lambda state: state == MavLandedState.LANDING, timeout=10)
@@ -159,7 +159,7 @@ async def test_take_off_refused_says_why(grounded: Flight) -> None:
 
 
 async def test_take_off_state_of_last_flight_is_no_effect(grounded: Flight) -> None:
-    """TAKING_OFF was its last report before the stream ended."""
+    """TAKING_OFF was the last landed state before the stream of states ended."""
     await grounded.vehicle.wait_ready()
     await grounded.vehicle.set_mode("GUIDED")
     await grounded.vehicle.arm()
@@ -170,7 +170,7 @@ async def test_take_off_state_of_last_flight_is_no_effect(grounded: Flight) -> N
 
 
 async def test_take_off_climb_is_effect(grounded: Flight, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without a landed state: repeated while it is on the ground, confirmed once it has climbed."""
+    """Without a landed state, the command is repeated while the vehicle stands, and confirmed by its climb."""
     vehicle = grounded.vehicle
     await vehicle.wait_ready()
     await vehicle.set_mode("GUIDED")
@@ -183,7 +183,7 @@ async def test_take_off_climb_is_effect(grounded: Flight, monkeypatch: pytest.Mo
 
 
 async def test_take_off_stale_landed_state_is_ignored(grounded: Flight) -> None:
-    """Its landing was not received, nor any state since."""
+    """Neither the landing nor a later landed state was received."""
     vehicle = grounded.vehicle
     await vehicle.wait_ready()
     await vehicle.set_mode("GUIDED")
@@ -219,7 +219,7 @@ async def test_take_off_ends_when_a_pilot_takes_over(grounded: Flight) -> None:
         with pytest.raises(OperationRejected, match="mode changed to LOITER"):
             await grounded.vehicle.take_off(30.0)
     await anyio.sleep(3.0)
-    assert grounded.copter.mode.number == LOITER  # it is the pilot's now
+    assert grounded.copter.mode.number == LOITER  # the pilot's mode
 
 
 async def test_take_off_not_executed_times_out(grounded: Flight) -> None:
@@ -615,7 +615,7 @@ async def test_set_heading_absolute_and_relative(flying: Flight) -> None:
     assert (absolute.param1, absolute.param3, absolute.param4) == (90.0, 0.0, 0.0)
     assert left.param1 == pytest.approx(60.0, abs=1.5)
     assert (left.param3, left.param4) == (-1.0, 0.0)
-    assert right.param1 == pytest.approx(100.0, abs=3.0)  # a goal: sent again, it does not turn further
+    assert right.param1 == pytest.approx(100.0, abs=3.0)  # absolute: a repetition does not turn the vehicle further
     assert (right.param2, right.param3, right.param4) == (20.0, 1.0, 0.0)
 
 

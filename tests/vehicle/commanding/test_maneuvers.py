@@ -174,7 +174,7 @@ async def test_orbit_of_copter_faces_as_ordered(facing: Any) -> None:
         center = vehicle.position.value.offset(north_m=12)
         await vehicle.orbit(center, radius_m=12, speed_m_s=4, turns=0.25, facing=facing)
         yaw = math.degrees(wire.all(m.SetPositionTargetLocalNed)[-20].yaw) % 360
-        wanted = {"center": 90, "ahead": 0, "initial": 0}[facing]  # It ends west of the center.
+        wanted = {"center": 90, "ahead": 0, "initial": 0}[facing]  # The orbit ends west of the center.
         assert abs(math.remainder(yaw - wanted, 360)) < 20
 
 
@@ -331,7 +331,7 @@ async def test_follow_without_own_altitude_holds() -> None:
 
 
 async def test_follow_takes_altitude_above_sea_level_of_positions() -> None:
-    """The altitude above home of a position is that of its own vehicle, whose home may be lower."""
+    """The leader's altitude above home refers to the leader's home, which may be lower."""
     async with in_the_air() as flight:
         here = flight.vehicle.position.value
         assert here.altitude_amsl_m is not None
@@ -388,7 +388,7 @@ async def test_autotune_reports_its_progress() -> None:
 
 
 async def test_autotune_is_not_asked_again_after_a_lost_answer() -> None:
-    """PX4 takes the question for another start, once it has finished."""
+    """After the end of the tuning, PX4 takes the command that asks for the progress for another start."""
     simulated = SimulatedPx4(boot_time_s=0.0)
     async with hovering(simulated) as (vehicle, wire):
         asyncio.get_running_loop().call_later(3.5, simulated.faults.ignore, MavCmd.DO_AUTOTUNE_ENABLE)
