@@ -328,7 +328,7 @@ class ArduPlane(ArduPilot):
 
     def return_altitude_parameters(self, *, is_vtol: bool) -> tuple[tuple[str, float], ...]:
         if self._can_hover(is_vtol):
-            return (("Q_RTL_ALT", 1.0),)  # It returns in QRTL.
+            return (("Q_RTL_ALT", 1.0),)  # This vehicle returns in QRTL.
         return (("RTL_ALTITUDE", 1.0), ("ALT_HOLD_RTL", 100.0))
 
     def _can_hover(self, is_vtol: bool) -> bool:

@@ -242,7 +242,7 @@ class TrackRecorder:
         """Return the latest position, extrapolated to now by its velocity.
 
         Raises:
-            StaleValueError: it is older than two seconds.
+            StaleValueError: no position was received in the last two seconds.
         """
         now = self._vehicle.connection.now()
         if self._latest is None or now - self._latest[0] > POSITION_MAX_AGE_S:

@@ -32,13 +32,13 @@ class Endpoint(Snapshot):
     name: str = ""
     """Name of the endpoint; empty: its address."""
     only: tuple[str, ...] = ()
-    """Patterns of messages that go out here, e.g. ``("HEARTBEAT", "GPS_*")``; empty: all."""
+    """Patterns of messages that this endpoint sends, e.g. ``("HEARTBEAT", "GPS_*")``; empty: all."""
     block: tuple[str, ...] = ()
-    """Patterns of messages that do not go out here."""
+    """Patterns of messages that this endpoint does not send."""
     rates: Mapping[str, float] = {}
     """Pattern → maximum rate per sender in Hz, above 0 and at most 1000. Messages with a target are not limited."""
     read_only: bool = False
-    """True to forward nothing that is received here, not even heartbeats."""
+    """True to forward nothing that this endpoint receives, not even heartbeats."""
     signing: Signing | None = None
     """Key that signs frames sent here; frames received without its signature are refused.
 

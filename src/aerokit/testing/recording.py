@@ -17,7 +17,7 @@ from aerokit.mavlink.message import Message
 from aerokit.mavlink.tlog import read_tlog
 
 MAX_GAP_S = 60.0
-"""Longer gaps are shortened to this: during them the recording was paused, or the clock was set."""
+"""Longer gaps are shortened to this time, because the recording was paused or the clock was set."""
 
 _ITEMS = (m.MissionItemInt, m.MissionItem)
 _COMMANDS = (m.CommandLong, m.CommandInt)

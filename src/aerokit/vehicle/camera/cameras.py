@@ -184,7 +184,7 @@ class Cameras:
         self._early: list[tuple[int, Any]] = []
         self._first_link = CameraLink(context, components.component, None, on_bound=self._on_first_bound)
         self._first = Camera(self._first_link)
-        # Once `first` has returned `_first`, it always returns the same object.
+        # True once `first` has returned `_first`, which it then always returns.
         self._is_first_in_use = False
         session.keep(self.cell)
         bus = session.connection.bus

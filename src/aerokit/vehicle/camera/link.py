@@ -53,7 +53,7 @@ class CameraLink(CameraOrders):
     ) -> None:
         self._context, self._session = context, context.session
         self._component_of, self._on_bound = component_of, on_bound
-        # Another object publishes the events of this camera.
+        # True if another object publishes the events of this camera.
         self.is_muted = False
         self._component: Component | None = None
         self.number = None

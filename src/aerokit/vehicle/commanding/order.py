@@ -117,8 +117,8 @@ class Order:
     - ``mode_before`` was active when the order was given.
     - ``modes`` are the order's own modes.
     - ``expected`` modes may appear, in any sequence until ``settles_at``, because the program ordered them shortly
-    before. They are no longer accepted after an own mode was reported. With ``requires_mode_change``, that must have
-    been a change of the mode.
+      before. After a report of an own mode they are no longer accepted; with ``requires_mode_change``, that report must
+      differ from the previous mode.
     - Until ``any_until`` every mode is accepted, because the program sent a raw command with an unknown effect.
     - Any other mode is attributed to the pilot or a failsafe.
     """

@@ -158,7 +158,7 @@ class Telemetry(States):
         return latest is not None and latest.custom_mode == mode.custom_mode
 
     def texts_since(self, at: float) -> tuple[StatusText, ...]:
-        """Return the status texts received since then (64 at most), oldest first."""
+        """Return the status texts received at or after this time (64 at most), oldest first."""
         return self._texts.recent(at)
 
     # -------------------------------------------------------------------------- the machinery
