@@ -164,7 +164,7 @@ async def test_trajectory_with_velocity_lags_less_than_position(flying: Flight) 
 
 
 async def test_actuators_of_new_firmware_raise_not_supported(flying: Flight) -> None:
-    with pytest.raises(NotSupported, match=r"ArduCopter .* does not obey SET_ACTUATOR_CONTROL_TARGET"):
+    with pytest.raises(NotSupported, match=r"ArduCopter .* ignores SET_ACTUATOR_CONTROL_TARGET"):
         flying.vehicle.guided.actuators(ActuatorSetpoint((0.0,) * 8))
     assert flying.wire.setpoints() == []
 
