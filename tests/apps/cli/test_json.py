@@ -109,7 +109,6 @@ def test_json_of_fly_matches_documentation(capsys: pytest.CaptureFixture[str]) -
     SEEN.update(record["type"] for record in printed)
 
 
-@pytest.mark.exhaustive
 def test_json_of_demo_matches_documentation(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["demo", "--altitude", "3", "--side", "3", "--speedup", "50", "--json"]) == 0
     printed = records(capsys.readouterr().out)
