@@ -1813,8 +1813,8 @@ class Actuators(TwinOf["AsyncActuators"]):
     def test_motor(self, number: int, *, throttle_percent: float, duration_s: float, intent: SpinIntent) -> None:
         """Spin one motor of a disarmed vehicle, and return when it has stopped; remove the propellers.
 
-        Sent once: a copy would spin it again. If the call is cancelled or fails, aerokit orders the motor to stop at
-        once; without that, it stops after ``duration_s``. ArduCopter reports armed during the test, and the call
+        Sent once: a copy would spin it again. If the call is cancelled while the motor may turn, aerokit orders it to
+        stop at once; without that, it stops after ``duration_s``. ArduCopter reports armed during the test, and the call
         returns when it reports disarmed. PX4 acknowledges only, so the call returns after ``duration_s``.
 
         ArduPilot: MAV_CMD_DO_MOTOR_TEST. PX4: MAV_CMD_ACTUATOR_TEST, if COM_MOT_TEST_EN is 1.
@@ -4870,7 +4870,7 @@ class Vehicle(VehicleTwin):
             NotSupported: this type of vehicle has no landing mode. Nothing was sent.
             CommandRejected: the vehicle refused the mode.
             CommandTimeout: there was no acknowledgement.
-            OperationRejected: the mode changed meanwhile.
+            OperationRejected: the mode changed meanwhile, or the vehicle was disarmed in the air.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the vehicle was not on the ground in time.
         """
@@ -5004,8 +5004,8 @@ class Vehicle(VehicleTwin):
             NotSupported: this type of vehicle has no precision landing. Nothing was sent.
             CommandRejected: the vehicle refused the mode.
             CommandTimeout: there was no acknowledgement.
-            OperationRejected: a parameter makes the vehicle ignore the target (nothing else was sent), or the mode
-                changed or another order was given meanwhile.
+            OperationRejected: a parameter makes the vehicle ignore the target (nothing else was sent). Or meanwhile
+                the mode changed, another order was given, or the vehicle was disarmed in the air.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the target was not seen in time (the landing was not ordered), or the vehicle was not
                 down in time.

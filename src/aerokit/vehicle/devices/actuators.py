@@ -201,9 +201,9 @@ class Actuators(ReadOnly):
     async def test_motor(self, number: int, *, throttle_percent: float, duration_s: float, intent: SpinIntent) -> None:
         """Spin one motor of a disarmed vehicle, and return when it has stopped; remove the propellers.
 
-        Sent once: a copy would spin it again. If the call is cancelled or fails, aerokit orders the motor to stop at
-        once; without that, it stops after ``duration_s``. ArduCopter reports armed during the test, and the call
-        returns when it reports disarmed. PX4 acknowledges only, so the call returns after ``duration_s``.
+        Sent once: a copy would spin it again. If the call is cancelled while the motor may turn, aerokit orders it to
+        stop at once; without that, it stops after ``duration_s``. ArduCopter reports armed during the test, and the
+        call returns when it reports disarmed. PX4 acknowledges only, so the call returns after ``duration_s``.
 
         ArduPilot: MAV_CMD_DO_MOTOR_TEST. PX4: MAV_CMD_ACTUATOR_TEST, if COM_MOT_TEST_EN is 1.
 
@@ -235,7 +235,8 @@ class Actuators(ReadOnly):
             command, start = MavCmd.DO_MOTOR_TEST, (number, PERCENT, throttle_percent, duration_s, 1)
             stop = (number, PERCENT, 0, 0, 1)
         session.check_disarmed("test_motor", is_current=arbiter.is_known)
-        order, spins_until = arbiter.of_device("motor test"), math.inf
+        order = arbiter.of_device("motor test")
+        spins_until = order.given_at + duration_s
         try:
             await SimpleOrder("test_motor", command, start).send(self._context, of=order)
             spins_until = session.connection.now() + duration_s
