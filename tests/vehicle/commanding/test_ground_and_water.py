@@ -67,7 +67,8 @@ async def test_sub_land_ends_at_surface() -> None:
         await vehicle.land(timeout=120)
         assert vehicle.mode_name == "ALT_HOLD"
         height_m = vehicle.position.value.altitude_relative_m
-        assert height_m is not None and abs(height_m) < 1.5
+        assert height_m is not None
+        assert abs(height_m) < 1.5
         assert vehicle.is_armed
 
 
