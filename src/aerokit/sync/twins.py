@@ -1814,8 +1814,8 @@ class Actuators(TwinOf["AsyncActuators"]):
         """Spin one motor of a disarmed vehicle, and return when it has stopped; remove the propellers.
 
         Sent once: a copy would spin it again. If the call is cancelled while the motor may turn, aerokit orders it to
-        stop at once; without that, it stops after ``duration_s``. ArduCopter reports armed during the test, and the call
-        returns when it reports disarmed. PX4 acknowledges only, so the call returns after ``duration_s``.
+        stop at once; without that, it stops after ``duration_s``. ArduCopter reports armed during the test, and the
+        call returns when it reports disarmed. PX4 acknowledges only, so the call returns after ``duration_s``.
 
         ArduPilot: MAV_CMD_DO_MOTOR_TEST. PX4: MAV_CMD_ACTUATOR_TEST, if COM_MOT_TEST_EN is 1.
 
