@@ -1829,9 +1829,9 @@ class Actuators(TwinOf["AsyncActuators"]):
         ArduPilot: MAV_CMD_DO_MOTOR_TEST. PX4: MAV_CMD_ACTUATOR_TEST, if COM_MOT_TEST_EN is 1. The command is sent once,
         because a copy would spin the motor again.
 
-        The motor stops after ``duration_s``. If the call is cancelled or fails before that, aerokit orders the motor to
-        stop. ArduCopter reports armed during the test, and the call returns when it reports disarmed. PX4 reports
-        nothing about the test, so the call returns after ``duration_s``.
+        The motor stops after ``duration_s``. If the call is cancelled or fails while the motor may turn, aerokit orders
+        the motor to stop at once. ArduCopter reports armed during the test, and the call returns when it reports
+        disarmed. PX4 reports nothing about the test, so the call returns after ``duration_s``.
 
         Args:
             number: 1 to 12. ArduCopter counts motors clockwise from the front; PX4 uses the number of the output
@@ -4911,7 +4911,7 @@ class Vehicle(VehicleTwin):
             NotSupported: this type of vehicle has no landing mode. Nothing was sent.
             CommandRejected: the vehicle refused the mode.
             CommandTimeout: there was no acknowledgement.
-            OperationRejected: the mode changed meanwhile.
+            OperationRejected: the mode changed meanwhile, or the vehicle was disarmed in the air.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the vehicle was not on the ground in time.
         """
@@ -5044,8 +5044,8 @@ class Vehicle(VehicleTwin):
             NotSupported: this type of vehicle has no precision landing. Nothing was sent.
             CommandRejected: the vehicle refused the mode.
             CommandTimeout: there was no acknowledgement.
-            OperationRejected: a parameter makes the vehicle ignore the target (the landing was not ordered); or the
-                mode changed, or another order was given, meanwhile.
+            OperationRejected: a parameter makes the vehicle ignore the target (nothing else was sent); or, after the
+                start, the mode changed, another order was given, or the vehicle was disarmed in the air.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the target was not visible in time (the landing was not ordered), or the vehicle was not
                 on the ground in time.

@@ -214,8 +214,8 @@ class Vehicle(
             NotSupported: this type of vehicle has no precision landing. Nothing was sent.
             CommandRejected: the vehicle refused the mode.
             CommandTimeout: there was no acknowledgement.
-            OperationRejected: a parameter makes the vehicle ignore the target (the landing was not ordered); or the
-                mode changed, or another order was given, meanwhile.
+            OperationRejected: a parameter makes the vehicle ignore the target (nothing else was sent); or, after the
+                start, the mode changed, another order was given, or the vehicle was disarmed in the air.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the target was not visible in time (the landing was not ordered), or the vehicle was not
                 on the ground in time.

@@ -168,6 +168,7 @@ def is_running(simulated: Any) -> bool:
     return bool(simulated.calibrations.compasses.is_running)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("kind", [SimulatedCopter, SimulatedPx4])
 @pytest.mark.parametrize("how", ["break", "exception", "cancellation", "cancel"])
 async def test_leaving_loop_cancels_on_vehicle(kind: type[Any], how: str) -> None:

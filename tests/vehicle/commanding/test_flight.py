@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import anyio
 import pytest
-from flight_harness import Flight, in_the_air, now, open_flight, speed_of
+from flight_harness import Flight, in_the_air, now, open_flight, open_px4, speed_of
 
 from aerokit import Position
 from aerokit import messages as m
@@ -529,6 +530,25 @@ async def test_land_returns_on_the_ground(flying: Flight) -> None:
     await flying.vehicle.land()
     assert flying.copter.is_landed
     await flying.vehicle.armed.wait_until(lambda armed: not armed, timeout=5.0)
+
+
+@pytest.mark.parametrize("is_px4", [False, True])
+async def test_land_of_vehicle_disarmed_in_the_air_is_rejected(is_px4: bool) -> None:
+    """The firmware reports disarmed and ON_GROUND while it falls."""
+    opened: Any = open_px4() if is_px4 else open_flight()
+    async with opened as flight, anyio.create_task_group() as group:
+        await flight.take_off(60.0)
+        group.start_soon(disarm_later, flight, 3.0)
+        with pytest.raises(OperationRejected, match=r"land: it was disarmed in the air and sinks at \d"):
+            await flight.vehicle.land()
+
+
+async def disarm_later(flight: Any, seconds: float) -> None:
+    await anyio.sleep(seconds)
+    if isinstance(flight, Flight):
+        flight.copter.arming.disarm(force=True)
+    else:
+        flight.px4.arming.disarm("test", force=True)
 
 
 async def test_land_ends_when_a_pilot_takes_over(flying: Flight) -> None:

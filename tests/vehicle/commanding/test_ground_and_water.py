@@ -66,7 +66,9 @@ async def test_sub_land_ends_at_surface() -> None:
         await vehicle.go_to(Position(here.latitude_deg, here.longitude_deg, altitude_relative_m=-5), timeout=120)
         await vehicle.land(timeout=120)
         assert vehicle.mode_name == "ALT_HOLD"
-        assert abs(vehicle.position.value.altitude_relative_m or 9.0) < 1.5
+        height_m = vehicle.position.value.altitude_relative_m
+        assert height_m is not None
+        assert abs(height_m) < 1.5
         assert vehicle.is_armed
 
 

@@ -193,6 +193,7 @@ async def test_px4_attitude_rate_is_flown() -> None:
             assert math.degrees(flight.px4.motion.roll) > 5.0
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("rate_hz", [400.0, 2.0, 10.0, 40.0])
 async def test_setpoint_stream_rate_is_kept(flying: Flight, rate_hz: float) -> None:
     async with flying.vehicle.guided.velocity(rate_hz=rate_hz) as stream:
@@ -635,6 +636,7 @@ async def test_px4_entry_cancelled_before_offboard_request_keeps_pilot() -> None
         assert flight.vehicle.mode_name == "POSCTL"
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("phase", [0.0, 0.3, 0.6, 0.9])
 async def test_setpoint_stream_stops_after_silence(
     phase: float,

@@ -16,6 +16,7 @@ from aerokit.vehicle.commanding.context import VehicleBase
 from aerokit.vehicle.commanding.progress import (
     MAX_SILENCE_S,
     POSITION_MAX_AGE_S,
+    GroundCheck,
     StallDetector,
     await_progress,
 )
@@ -183,7 +184,7 @@ class FlightActions(VehicleBase):
             NotSupported: this type of vehicle has no landing mode. Nothing was sent.
             CommandRejected: the vehicle refused the mode.
             CommandTimeout: there was no acknowledgement.
-            OperationRejected: the mode changed meanwhile.
+            OperationRejected: the mode changed meanwhile, or the vehicle was disarmed in the air.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the vehicle was not on the ground in time.
         """
@@ -221,7 +222,7 @@ class FlightActions(VehicleBase):
         def is_down() -> bool:
             is_disarmed = self.telemetry.is_confirmed_disarmed and armed.updated_at > order.given_at
             is_landed = landed.latest == MavLandedState.ON_GROUND and landed.updated_at > order.given_at
-            return is_disarmed or is_landed or (is_over() and not is_deep())
+            return ground.confirms(is_disarmed or is_landed or (is_over() and not is_deep()))
 
         def is_over() -> bool:
             return self.telemetry.mode_name == self.autopilot.mode_when_landed and mode.updated_at > accepted_at
@@ -232,15 +233,14 @@ class FlightActions(VehicleBase):
                 and self._position.altitude_relative() < -MAX_SURFACE_DEPTH_M
             )
 
-        stays = self._sender.stays_until_disarmed(order)
+        stays, ground = self._sender.stays_until_disarmed(order), GroundCheck(self._session)
 
         def trouble() -> str | None:
             if is_over() and is_deep() and self.connection.now() > accepted_at + MODE_GRACE_S:
                 return f"the mode changed to {self.telemetry.mode_name} at {self._position.altitude_relative():.1f} m"
-            return stays()
+            return ground.trouble(stays)
 
-        depth = () if self.autopilot.mode_when_landed is None else ("position",)
-        with self._session.streaming("landed_state", *depth):
+        with self._session.streaming("landed_state", "position"):
             await await_progress(
                 self._session,
                 what,

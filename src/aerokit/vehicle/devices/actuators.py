@@ -206,9 +206,9 @@ class Actuators(ReadOnly):
         ArduPilot: MAV_CMD_DO_MOTOR_TEST. PX4: MAV_CMD_ACTUATOR_TEST, if COM_MOT_TEST_EN is 1. The command is sent once,
         because a copy would spin the motor again.
 
-        The motor stops after ``duration_s``. If the call is cancelled or fails before that, aerokit orders the motor to
-        stop. ArduCopter reports armed during the test, and the call returns when it reports disarmed. PX4 reports
-        nothing about the test, so the call returns after ``duration_s``.
+        The motor stops after ``duration_s``. If the call is cancelled or fails while the motor may turn, aerokit orders
+        the motor to stop at once. ArduCopter reports armed during the test, and the call returns when it reports
+        disarmed. PX4 reports nothing about the test, so the call returns after ``duration_s``.
 
         Args:
             number: 1 to 12. ArduCopter counts motors clockwise from the front; PX4 uses the number of the output
@@ -239,7 +239,8 @@ class Actuators(ReadOnly):
             command, start = MavCmd.DO_MOTOR_TEST, (number, PERCENT, throttle_percent, duration_s, 1)
             stop = (number, PERCENT, 0, 0, 1)
         session.check_disarmed("test_motor", is_current=arbiter.is_known)
-        order, spins_until = arbiter.of_device("motor test"), math.inf
+        order = arbiter.of_device("motor test")
+        spins_until = order.given_at + duration_s
         try:
             await SimpleOrder("test_motor", command, start).send(self._context, of=order)
             spins_until = session.connection.now() + duration_s

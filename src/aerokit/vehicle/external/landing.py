@@ -14,7 +14,7 @@ import anyio
 from aerokit._internal.arguments import check_kind, check_range
 from aerokit._internal.values import Snapshot
 from aerokit.errors import OperationTimeout, ValueUnknownError
-from aerokit.vehicle.commanding.progress import await_progress
+from aerokit.vehicle.commanding.progress import GroundCheck, await_progress
 from aerokit.vehicle.commanding.streams import TakeoverCheck
 from aerokit.vehicle.external.values import TargetMeasurement
 
@@ -136,7 +136,8 @@ class TargetLanding:
 
     async def await_disarmed(self, order: Order, timeout: float | None, max_silence_s: float | None) -> None:
         """Wait until the vehicle is on the ground and disarmed."""
-        telemetry = self._session.telemetry
+        telemetry, ground = self._session.telemetry, GroundCheck(self._session)
+        stays = self._context.sender.stays_until_disarmed(order)
 
         def is_down() -> bool:
             height = self._height_m()
@@ -144,7 +145,7 @@ class TargetLanding:
                 self._lowest_m = min(self._lowest_m, height)
                 self._climbed_m = max(self._climbed_m, height - self._lowest_m)
             self._raise_error()
-            return telemetry.is_confirmed_disarmed and telemetry.armed.updated_at > order.given_at
+            return ground.confirms(telemetry.is_confirmed_disarmed and telemetry.armed.updated_at > order.given_at)
 
         def describe() -> str:
             height = self._height_m()
@@ -155,7 +156,7 @@ class TargetLanding:
             self._session,
             "land_on",
             is_done=is_down,
-            trouble=self._context.sender.stays_until_disarmed(order),
+            trouble=lambda: ground.trouble(stays),
             describe=describe,
             timeout=timeout,
             max_silence_s=max_silence_s,

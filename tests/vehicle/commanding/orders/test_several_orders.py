@@ -174,7 +174,7 @@ def _judge(
     assert kind == "set-point" or not is_against_the_pilot, f"after the pilot had taken over: {about}"
 
 
-@pytest.mark.sampled(15)
+@pytest.mark.sampled(30)
 @pytest.mark.parametrize("is_px4", [False, True], ids=["ardupilot", "px4"])
 @pytest.mark.parametrize("seed", range(4 * SEEDS))
 def test_posted_orders_only_newest_is_sent(seed: int, is_px4: bool) -> None:
