@@ -181,7 +181,7 @@ class LandedStateChanged(Event):
 class MissionItemReached(Event):
     """The vehicle reached mission item ``item``, counted from 0 without home.
 
-    Autopilots may not report items that they pass without stopping.
+    Some autopilots do not report items that they pass without stopping.
     """
 
     item: int

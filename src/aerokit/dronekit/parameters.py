@@ -155,7 +155,7 @@ class ParameterValues:
         return len(self._known)
 
     def copy(self) -> dict[str, float]:
-        """Return a new dict of name → value, in the vehicle's spelling and units."""
+        """Return a new dict of values by name, in the vehicle's spelling and units."""
         return {name: float(parameter.value) for name, parameter in self._known.copy().items()}
 
     def find(self, name: str) -> ResolvedParameter | None:
@@ -213,7 +213,7 @@ WAIT_TIMEOUT_S = 30.0
 
 
 class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers):
-    """Name → value: ``vehicle.parameters['RTL_ALT']``, ``vehicle.parameters['RTL_ALT'] = 30``.
+    """Maps names to values: ``vehicle.parameters['RTL_ALT']``, ``vehicle.parameters['RTL_ALT'] = 30``.
 
     Names are upper-cased, values are floats. The list is downloaded in the background after connecting, and stays valid
     through reboots and lost links; changes that the vehicle reports are included. Reading a missing value requests only

@@ -74,7 +74,7 @@ class RouterPort(Generic[PortT]):
         """Unique number above 0."""
         self.plans: dict[int, ForwardingPlan[PortT]] = {}
         self.echoes: dict[int, int] = {}
-        """Sender → surplus of returning frames over new ones at this port."""
+        """Maps senders to the number of returning frames minus the number of new frames at this port."""
         self.loop_until: float = -math.inf
         """Returning frames are dropped until this time."""
 

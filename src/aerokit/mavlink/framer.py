@@ -37,7 +37,7 @@ _magics = re.compile(rb"\xfe|\xfd(?=\Z|.\Z|.[\x00\x01])", re.DOTALL).finditer
 _GOOD = 0  # a whole frame with a valid checksum
 _WAIT = 1  # the beginning of a plausible frame
 _IMPLAUSIBLE = 2  # the beginning of an implausible frame: wait, but examine what follows
-_UNKNOWN = 3  # a whole frame of an unknown message, if it is a frame
+_UNKNOWN = 3  # looks like a whole frame of an unknown message
 _BAD_CRC = 4
 _NOISE = 5
 

@@ -122,8 +122,8 @@ def pack_for_download(
     """Encode ``@PARAM/param.pck`` for these parameters. ``block_size``: data bytes per read. Values are not
     validated.
 
-    ``count`` 0 means all from ``start`` on. PX4 keeps a value and its default in one block; ArduPilot, and
-    ``whole_defaults=False``, only the default. InvalidArgument if ``start`` is beyond the list.
+    ``count`` 0 means all from ``start`` on. PX4 keeps a value and its default in the same block. ArduPilot
+    (``whole_defaults=False``) may separate them, but splits neither. InvalidArgument if ``start`` is beyond the list.
     """
     rows = list(_rows(parameters))
     if not 0 <= start < len(rows):

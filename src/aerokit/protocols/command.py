@@ -303,7 +303,7 @@ class CommandExchange(Exchange[CommandAck]):
         self.deadline = now + wait_s
 
     def _with_confirmation(self, confirmation: int) -> Message:
-        # COMMAND_INT has no such field.
+        # COMMAND_INT has no field `confirmation`.
         message = self._message
         if confirmation == 0 or not isinstance(message, CommandLong):
             return message

@@ -75,7 +75,7 @@ RESULTS: dict[int, str] = {
 class MissionExchange(Transfer[ResultT]):
     """A transfer with one component. Ignores messages to other systems and of other mission types.
 
-    Indices in errors are the program's, which are ``offset`` lower than those on the wire.
+    Errors contain the program's indices: those on the wire minus ``offset``.
     """
 
     def __init__(

@@ -41,7 +41,7 @@ ANSWERS_TO_SETTLE, ANSWERS_TO_SETTLE_UNCHANGED = 2, 8
 
 
 class ValueList(Transfer[ResultT], Generic[ResultT, ValueT]):
-    """Download of a list: requests it once, and missing indices, in a window, as soon as a gap appears."""
+    """Download of a list: requests the list once, then missing indices as soon as a gap appears."""
 
     list_request_name: ClassVar[str]
     noun: ClassVar[str]

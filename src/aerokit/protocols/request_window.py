@@ -17,8 +17,8 @@ DEFAULT_SIZE = 20
 MAX_GROWTH = 5
 # An answer that takes longer than QUEUED_FACTOR times the fastest one plus QUEUED_MARGIN_S has waited in a queue.
 QUEUED_FACTOR, QUEUED_MARGIN_S = 1.5, 0.02
-# When this few requests are left, those at their third attempt or later are sent twice, because otherwise the transfer
-# waits only for them on a bad radio.
+# When only this many requests are left, those at their third attempt or later are sent twice. Otherwise a transfer over
+# a bad radio would wait long for a few requests.
 FEW_LEFT, DUPLICATE_FROM_ATTEMPT = 5, 3
 # The last few requests are repeated after at most this time, or two round trips, because it costs little.
 FEW_LEFT_TIMEOUT_S = 0.5

@@ -98,7 +98,7 @@ class SimulatedVehicle:
         self.components: tuple[AttachableComponent, ...] = tuple(components)
         self.journal: VehicleJournal | None = None
         self.handlers: dict[int, Handler] = {}
-        """Message id → handler."""
+        """Handlers by message id."""
         self._observers: dict[int, list[Handler]] = {}
         self._timers: list[tuple[float, int, Callable[[], None]]] = []
         self._timer_count = 0

@@ -24,7 +24,7 @@ MAX_TIMES_WITHOUT_HARDWARE = 3
 
 MAX_HARDWARE_REQUESTS = 20
 
-# Number of frames received over both a link and the link in use that proves that both lead to the same vehicle.
+# This many frames received both over a link and over the link in use prove that both lead to the same vehicle.
 MIN_COPIES = 3
 
 

@@ -27,7 +27,7 @@ REPORT_HZ = 4.0
 END_GRACE_S = 3.0
 # A cancelled call ends within two seconds.
 RESTORE_TIMEOUT_S = 1.5
-# ArduPilot repeats its request every second. The same request soon after a confirmation was sent before ArduPilot
+# ArduPilot repeats its request every second. It sent a request that arrives this soon after our confirmation before it
 # received the confirmation.
 POSE_REPEAT_S = 2.0
 POSES = {

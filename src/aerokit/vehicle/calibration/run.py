@@ -79,7 +79,7 @@ class CalibrationRun:
         self.session.check_disarmed(self.what, is_current=self.context.arbiter.is_known)
 
     async def begin(self, cancel: tuple[float, ...] | None, why_not_cancelled: str = "") -> None:
-        """Register this calibration as the running one, after the end of one that is being cancelled.
+        """Wait for the end of a calibration that is being cancelled, then register this one as running.
 
         Args:
             cancel: the command that cancels the calibration, with its parameters; None if there is no such command.

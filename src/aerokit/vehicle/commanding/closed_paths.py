@@ -153,7 +153,7 @@ class TurnCounter:
 
 
 class LobeCounter:
-    """Counts figure eights: one for both lobes, one after the other."""
+    """Counts figure eights: two different lobes in a row are one figure."""
 
     def __init__(self, major_m: float, axis_deg: float) -> None:
         self._half_m, self._axis = major_m / 2, math.radians(axis_deg)

@@ -40,8 +40,8 @@ __all__ = ["Guided", "SetpointStream"]
 
 SetpointT = TypeVar("SetpointT")
 
-# Number of immediate transmissions of a position set-point that restarts the path, because one may be lost, and the
-# interval of further transmissions.
+# If a position set-point restarts the path, it is sent this many times at once (one may be lost), then at this
+# interval.
 INITIAL_REPEATS, REPEAT_INTERVAL_S = 3, 5.0
 
 

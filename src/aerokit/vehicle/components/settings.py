@@ -47,8 +47,8 @@ class Settings:
     from a local file. From then on you can use the names of options, and values that are out of range or excluded by
     other settings are refused before anything is sent. Without a definition, values are sent unchanged.
 
-    All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
-    total; then OperationTimeout), if they send anything. You can cancel any call.
+    Methods that send something take ``idle_timeout_s`` (they fail after this many seconds without progress) and
+    ``timeout`` (seconds in total; then they raise OperationTimeout). You can cancel any call.
     """
 
     def __init__(

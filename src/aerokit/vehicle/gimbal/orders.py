@@ -62,7 +62,7 @@ class GimbalOrders:
 
     @property
     def attitude_source(self) -> GimbalDevice:
-        """The device that reports the attitude: the placeholder while only an old mount reports one."""
+        """The device that reports the attitude; the placeholder if only an old mount (MOUNT_STATUS) reports it."""
         is_mount = self._device is None and self.registry.reporting is None
         return self.registry.placeholder if is_mount else self.device
 

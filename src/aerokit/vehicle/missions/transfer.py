@@ -195,7 +195,7 @@ PLAN_NAMES = ("mission", "fence", "rally points")
 # MISSION_CURRENT, which has the checksum, is sent at 1 Hz.
 CHECKSUM_INTERVAL_S = 1.0
 
-# A partial upload costs about as many extra messages as this number of items.
+# The extra messages of a partial upload cost about as much as this many items.
 PART_OVERHEAD_ITEMS = 4
 
 
@@ -285,7 +285,7 @@ class PlanTransfer(Generic[PlanT]):
         return has_ftp and self._cache.has_file is not False and not is_flying
 
     def _on_file_error(self, error: Exception, method: str) -> None:
-        """Use items from now on; raise the error if files were requested or have worked before."""
+        """Transfer no files from now on; raise the error if the caller chose files, or if they have worked before."""
         if method == "ftp" or (self._cache.has_file and not isinstance(error, FileError)):
             raise error
         self._cache.has_file = False

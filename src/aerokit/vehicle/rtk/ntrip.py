@@ -328,7 +328,7 @@ class NtripClient:
             self._close()
 
     async def _table(self, response: _Response) -> dict[str, bool]:
-        """Read a source table: mount point → whether it needs the position (the field ``nmea``)."""
+        """Read a source table: return its mount points, and whether each needs the position (field ``nmea``)."""
         text = b""
         with suppress(OSError, ValueError, EOFError, asyncio.TimeoutError):
             async for data in response.body():

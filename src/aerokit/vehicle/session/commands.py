@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 UNKNOWN = (MavResult.UNSUPPORTED, MavResult.COMMAND_LONG_ONLY, MavResult.COMMAND_UNSUPPORTED_MAV_FRAME)
 """MAV_RESULTs that mean that the firmware does not support a command, or not as this message."""
-# Nothing is sent again before this many measured round trips, because the answer may still arrive.
+# Nothing is repeated until this many measured round trips have passed, because the answer may still arrive.
 ROUND_TRIPS = 2
 MAX_ATTEMPT_TIMEOUT_S = 5.0
 PENDING_ACK_TIMEOUT_S = 2.0
@@ -237,7 +237,7 @@ class CommandSender:
         return self._acks_per_command.get(command, 1)
 
     def _expect_answers(self, key: _Key, count: int, earlier: Sequence[float] = ()) -> None:
-        """Record acks that may still arrive, so that the next command of this key ignores them."""
+        """Record acks that may still arrive, so that the next command with this key ignores them."""
         if expected := [*earlier, *[self._connection.now()] * count]:
             self._under_way.setdefault(key, []).extend(expected)
 

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 REBOOT_STEP_MS = 3000
 # The decreased time must persist for this long and in at least two messages, because one message may be late.
 REBOOT_CONFIRM_S = 0.2
-# The limit after an accepted reboot command: booting takes longer than this, and messages are delayed by less.
+# The limit after an accepted reboot command. A boot takes longer than this, and messages are delayed by less than this.
 MIN_REBOOT_STEP_MS = 2000
 CLOCK_SPAN_S = 5.0
 REPORT_PERIOD_S = 1.0
@@ -180,7 +180,7 @@ class VehicleWatch:
             self._note_time(frame, "time_boot_ms", int.from_bytes(frame.body[17:21], "little"))
 
     def _on_timesync(self, message: Timesync) -> None:
-        """Process answers to our requests; a vehicle without streams sends them, too."""
+        """Process answers to our TIMESYNC requests, which a vehicle without streams sends too."""
         frame = message.received_frame
         if message.tc1 != 0 and frame is not None and frame.component_id == self._component_id:
             self._note_time(frame, "TIMESYNC", message.tc1 // 1_000_000)

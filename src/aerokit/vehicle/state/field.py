@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 MESSAGE_IDS = {row[0]: message_id for message_id, row in messages.INDEX.items()}
-"""Name of a message class → message id, without importing the class."""
+"""Maps the name of a message class to the message id, without importing the class."""
 
 
 def message_type(class_name: str) -> type[Message]:
