@@ -160,7 +160,7 @@ class Px4(Autopilot):
             # even CLIMB_SPEED (navigator_main.cpp).
             self.speed_types: frozenset[int] = frozenset((SpeedType.AIRSPEED, SpeedType.GROUNDSPEED))
         if vehicle_type == MavType.FIXED_WING:
-            self.arrival_radius_m: float = 120.0  # it circles with NAV_LOITER_RAD, 80 m by default
+            self.arrival_radius_m: float = 120.0  # a plane circles with NAV_LOITER_RAD, 80 m by default
 
     def mode(self, custom_mode: int, base_mode: int, extra: Mapping[int, str] = NO_MODES) -> Mode:
         """Return the mode of these numbers. An external mode's own name takes precedence over EXTERNAL1 etc."""

@@ -223,7 +223,7 @@ class Travel(SelectionBase):
         result: FleetResult | None = None
         for leg in legs:
             missing = [name for name in leg if not self.members[name].is_available]
-            if missing:  # its position is not under control, so it may be in the path of any other
+            if missing:  # its position is not under control, so it may be in the path of any other member
                 raise OperationRejected(
                     f"{action}: {', '.join(missing)} became unavailable between two legs; the others stay in their"
                     " layers"

@@ -74,7 +74,7 @@ class PackEntry(NamedTuple):
 def unpack_parameters(data: bytes, *, start: int = 0) -> ParameterTable:
     """Decode a downloaded file. ``start`` is the index of its first parameter, as requested in the path.
 
-    If defaults were requested, every parameter has one: the file omits those that equal the value.
+    If defaults were requested, every returned parameter has one; the file omits defaults that equal the value.
 
     Raises:
         RemoteProtocolError: the file is damaged, or has another number of parameters than its header. ArduPilot sends

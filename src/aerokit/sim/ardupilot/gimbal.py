@@ -223,7 +223,7 @@ class ArduPilotGimbal:
         return MavResult.ACCEPTED
 
     def warn(self) -> None:
-        """Send the text about invalid angles. A client that sends hundredths of a degree causes it."""
+        """Send the text about invalid angles. A client that sends hundredths of a degree causes this text."""
         self._vehicle.send_text(MavSeverity.WARNING, "Mount: invalid angle targets")
 
     def attitude_status(self) -> m.GimbalDeviceAttitudeStatus | None:

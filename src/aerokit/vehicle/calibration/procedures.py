@@ -27,8 +27,8 @@ REPORT_HZ = 4.0
 END_GRACE_S = 3.0
 # A cancelled call ends within two seconds.
 RESTORE_TIMEOUT_S = 1.5
-# ArduPilot repeats its request every second. It sent a request that arrives this soon after our confirmation before it
-# received the confirmation.
+# ArduPilot repeats its request every second. If a request arrives this soon after our confirmation, ArduPilot sent it
+# before the confirmation arrived.
 POSE_REPEAT_S = 2.0
 POSES = {
     AccelcalVehiclePos.LEVEL: CalibrationPose.LEVEL,

@@ -238,7 +238,7 @@ class _PolledCell:
 
     @property
     def pending(self) -> bool:
-        # The cell asks this on every read.
+        # The cell reads this property on every access.
         self.read_at = self._now()
         return False
 

@@ -55,7 +55,8 @@ class Shutter:
         return None if message is None else status_of(message)
 
     async def baseline_status(self) -> CameraStatus | None:
-        # The status before an order shows later whether it was executed, so it is requested more often.
+        # The status before an order is needed to see later whether the order was executed, so it is requested more
+        # often.
         first_attempts = 1 if self._has_no_status else FIRST_STATUS_ATTEMPTS
         for _ in range(STATUS_ATTEMPTS if self._reports_status else first_attempts):
             status = await self.status(STATUS_TIMEOUT_S)

@@ -83,7 +83,7 @@ class Health:
         return self._session.deduplicate_reasons(*(reason for reasons in found for reason in reasons))
 
     def unarmable_mode(self) -> list[str]:
-        """Return a text if the present mode does not allow arming; an empty list otherwise."""
+        """Return a list with a text if the present mode does not allow arming, otherwise an empty list."""
         mode = self._telemetry.mode.latest
         is_unarmable = mode is not None and mode.name in self._autopilot.unarmable_modes
         return [self.unarmable_text(mode)] if mode is not None and is_unarmable else []
