@@ -33,7 +33,7 @@ FALL_SINK_M_S = 3.0
 """Minimum speed of a descent that error texts mention when the vehicle has stopped; the default descent is 1.5 m/s."""
 
 FALL_EVIDENT_S = 0.5
-"""Free fall for this time exceeds ``FALL_SINK_M_S``, also with the resistance of the air."""
+"""After falling for this time, a vehicle sinks faster than ``FALL_SINK_M_S``, even with air resistance."""
 
 FALL_STOP_S = 1.5
 """A fast descent that ends within this time is a fall, if the vehicle then stands still on the ground."""
@@ -105,7 +105,7 @@ class GroundCheck:
         self._reported_at: float | None = None
 
     def confirms(self, is_reported: bool) -> bool:
-        """Return True if the vehicle is reported to be down, and does not sink half a second later.
+        """Return True if the vehicle is reported on the ground, and does not sink half a second later.
 
         If no velocity is received, the report is accepted as it is.
         """
@@ -120,7 +120,7 @@ class GroundCheck:
         return velocity.updated_at >= self._reported_at + FALL_EVIDENT_S and self._sink_m_s() < FALL_SINK_M_S
 
     def trouble(self, before: Callable[[], str | None]) -> str | None:
-        """Return a clause if a vehicle that is reported to be down sinks, disarmed; until that report, ``before()``."""
+        """Return a clause if the vehicle is reported on the ground, but disarmed and sinking; before a report, ``before()``."""
         telemetry = self._session.telemetry
         if self._reported_at is None:
             return before()
