@@ -228,7 +228,7 @@ async def test_take_off_not_executed_times_out(grounded: Flight) -> None:
     await grounded.vehicle.set_mode("GUIDED")
     await grounded.vehicle.arm()
     started = now()
-    with pytest.raises(OperationTimeout, match=r"take_off\(10 m\): not done within 8 s; it is at -?0\.0 m"):
+    with pytest.raises(OperationTimeout, match=r"take_off\(10 m\): not done within 8 s; the vehicle is at -?0\.0 m"):
         await grounded.vehicle.take_off(10.0, timeout=8.0)
     assert 8.0 <= now() - started < 10.0
 
@@ -508,7 +508,7 @@ async def test_go_to_silent_vehicle_raises(flying: Flight) -> None:
 
 
 async def test_go_to_times_out_and_says_how_far_it_is(flying: Flight) -> None:
-    with pytest.raises(OperationTimeout, match=r"not done within 5 s; it is 1\d\d\.\d m away"):
+    with pytest.raises(OperationTimeout, match=r"not done within 5 s; the vehicle is 1\d\d\.\d m away"):
         await flying.vehicle.go_to(north_of_home(flying, 200.0), timeout=5.0)
 
 
@@ -539,7 +539,7 @@ async def test_land_of_vehicle_disarmed_in_the_air_is_rejected(is_px4: bool) -> 
     async with opened as flight, anyio.create_task_group() as group:
         await flight.take_off(60.0)
         group.start_soon(disarm_later, flight, 3.0)
-        with pytest.raises(OperationRejected, match=r"land: it was disarmed in the air and sinks at \d"):
+        with pytest.raises(OperationRejected, match=r"land: the vehicle was disarmed in the air and sinks at \d"):
             await flight.vehicle.land()
 
 
@@ -578,7 +578,7 @@ async def test_return_to_launch_ends_on_the_ground_at_home(flying: Flight) -> No
 
 async def test_return_to_launch_times_out(flying: Flight) -> None:
     await flying.vehicle.go_to(north_of_home(flying, 50.0))
-    with pytest.raises(OperationTimeout, match="return_to_launch: not done within 3 s; it is at"):
+    with pytest.raises(OperationTimeout, match="return_to_launch: not done within 3 s; the vehicle is at"):
         await flying.vehicle.return_to_launch(timeout=3.0)
     assert flying.copter.mode.number == RTL
 
@@ -642,7 +642,7 @@ async def test_set_heading_absolute_and_relative(flying: Flight) -> None:
 async def test_set_heading_not_reached_times_out(flying: Flight) -> None:
     flying.copter.faults.lose_ack(MavCmd.CONDITION_YAW)
     flying.copter.yaw.fixed = lambda *_, **__: None  # type: ignore[method-assign]
-    with pytest.raises(OperationTimeout, match=r"set_heading\(90°\): not done within 3 s; it is \d+° off"):
+    with pytest.raises(OperationTimeout, match=r"set_heading\(90°\): not done within 3 s; the heading is \d+° off"):
         await flying.vehicle.set_heading(90.0, timeout=3.0)
 
 
@@ -685,7 +685,7 @@ async def test_take_off_refused_in_air_says_so(flying: Flight) -> None:
     """The vehicle answers only FAILED; the landed state was unknown when the order was given."""
     flying.vehicle.telemetry.landed_state.forget()
     with pytest.raises(
-        CommandRejected, match=r"it is in the air, 10\.\d m above home and can only take off from the ground"
+        CommandRejected, match=r"the vehicle is in the air, 10\.\d m above home and can only take off from the ground"
     ):
         await flying.vehicle.take_off(20)
 
@@ -694,7 +694,8 @@ async def test_take_off_refused_height_shows_flight(flying: Flight, monkeypatch:
     monkeypatch.setattr(flight, "IN_THE_AIR", {})
     flying.vehicle.telemetry.landed_state.forget()
     with pytest.raises(
-        CommandRejected, match=r"it is probably in the air, 10\.\d m above home and can only take off from the ground"
+        CommandRejected,
+        match=r"the vehicle is probably in the air, 10\.\d m above home and can only take off from the ground",
     ):
         await flying.vehicle.take_off(20)
 

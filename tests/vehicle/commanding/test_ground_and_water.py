@@ -164,7 +164,7 @@ async def fall(copter: SimulatedCopter, begin: Callable[[], None]) -> None:
 
 async def test_go_to_vehicle_fell_error_names_descent() -> None:
     copter = SimulatedCopter(boot_time_s=1.0)
-    descent = r"not moved for 1[23] s, after it descended (19|20)\.\d m at up to 1\d\.\d m/s; it is"
+    descent = r"not moved for 1[23] s, after it descended (19|20)\.\d m at up to 1\d\.\d m/s; the vehicle is"
     with pytest.raises(OperationTimeout, match=descent):
         await fall(copter, lambda: setattr(copter.faults, "motor_failed", True))
 
@@ -186,7 +186,7 @@ async def test_rover_return_to_launch_ends_at_home() -> None:
         assert vehicle.is_armed
         await vehicle.set_mode("GUIDED")
         await vehicle.go_to(vehicle.position.value.offset(north_m=30), timeout=60)
-        with pytest.raises(OperationTimeout, match=r"return_to_launch: .*; it is \d+\.\d m from home"):
+        with pytest.raises(OperationTimeout, match=r"return_to_launch: .*; the vehicle is \d+\.\d m from home"):
             await vehicle.return_to_launch(timeout=2)
 
 

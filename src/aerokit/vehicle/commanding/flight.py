@@ -113,7 +113,10 @@ class FlightActions(VehicleBase):
         if state is None and not altitude > MIN_FLYING_HEIGHT_M:
             return error
         height = f", {altitude:.1f} m above home" if altitude > -math.inf else ""
-        why = f"it is {state or 'probably in the air'}{height} and can only take off from the ground; go_to() climbs"
+        why = (
+            f"the vehicle is {state or 'probably in the air'}{height} and can only take off from the ground;"
+            " go_to() climbs"
+        )
         explained = CommandRejected(f"{error}", command=error.command, result=error.result, reasons=(why,))
         explained.reasons = (*error.reasons, why)
         return explained
@@ -165,7 +168,7 @@ class FlightActions(VehicleBase):
                 f"take_off({altitude_m:g} m)",
                 is_done=is_up,
                 trouble=self._sender.stays_in(order, *order.modes),
-                describe=lambda: f"it is at {self._position.altitude_relative():.1f} m",
+                describe=lambda: f"the vehicle is at {self._position.altitude_relative():.1f} m",
                 timeout=timeout,
                 max_silence_s=max_silence_s,
                 stillness=StallDetector(self._session),
@@ -246,7 +249,7 @@ class FlightActions(VehicleBase):
                 what,
                 is_done=is_down,
                 trouble=trouble,
-                describe=lambda: f"it is at {self._position.altitude_relative():.1f} m",
+                describe=lambda: f"the vehicle is at {self._position.altitude_relative():.1f} m",
                 timeout=timeout,
                 max_silence_s=max_silence_s,
             )
@@ -267,7 +270,7 @@ class FlightActions(VehicleBase):
                 "return_to_launch",
                 is_done=is_back,
                 trouble=self._sender.stays_in(order, *order.modes),
-                describe=lambda: f"it is {self._position.distance_to(place):.1f} m from home",
+                describe=lambda: f"the vehicle is {self._position.distance_to(place):.1f} m from home",
                 timeout=timeout,
                 max_silence_s=max_silence_s,
             )

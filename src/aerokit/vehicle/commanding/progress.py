@@ -120,14 +120,14 @@ class GroundCheck:
         return velocity.updated_at >= self._reported_at + FALL_EVIDENT_S and self._sink_m_s() < FALL_SINK_M_S
 
     def trouble(self, before: Callable[[], str | None]) -> str | None:
-        """Return a clause if the vehicle is reported on the ground, but disarmed and sinking; before a report, ``before()``."""
+        """Return a clause if the vehicle is reported down, but sinks disarmed; before that report, ``before()``."""
         telemetry = self._session.telemetry
         if self._reported_at is None:
             return before()
         is_newer = telemetry.velocity.updated_at > self._reported_at
         if not is_newer or not telemetry.is_confirmed_disarmed or self._sink_m_s() < FALL_SINK_M_S:
             return None
-        return f"it was disarmed in the air and sinks at {self._sink_m_s():.1f} m/s"
+        return f"the vehicle was disarmed in the air and sinks at {self._sink_m_s():.1f} m/s"
 
     def _sink_m_s(self) -> float:
         velocity = self._session.telemetry.velocity.latest

@@ -158,7 +158,7 @@ class TravelActions(VehicleBase):
                 f"go_to({target.latitude_deg:.7f}, {target.longitude_deg:.7f})",
                 is_done=is_there,
                 trouble=self._sender.stays_in(order, mode),
-                describe=lambda: f"it is {self._position.remaining_distance(target):.1f} m away",
+                describe=lambda: f"the vehicle is {self._position.remaining_distance(target):.1f} m away",
                 timeout=timeout,
                 max_silence_s=max_silence_s,
                 held_for=0.5,
@@ -248,7 +248,7 @@ class TravelActions(VehicleBase):
                 f"set_heading({goal:g}°)",
                 is_done=lambda: heading.updated_at >= started and off() <= tolerance_deg and not order.end,
                 trouble=self._sender.stays_in(order, mode),
-                describe=lambda: f"it is {off():.0f}° off",
+                describe=lambda: f"the heading is {off():.0f}° off",
                 timeout=timeout,
                 max_silence_s=max_silence_s,
             )
