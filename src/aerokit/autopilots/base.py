@@ -448,7 +448,7 @@ class Autopilot:
     reports_gripper_by_text: bool = False
     """True if a status text reports the end of a gripper's movement, False if the acknowledgement does."""
     highres_imu_field_ut: float = 100.0
-    """Microtesla for one unit of the magnetic field in HIGHRES_IMU, which is gauss, except on ArduPilot."""
+    """Microtesla per unit of the magnetic field in HIGHRES_IMU; the unit is gauss, except on ArduPilot."""
     has_shell: bool = False
     """True if SERIAL_CONTROL reaches a system shell."""
     winch_actions: frozenset[int] = frozenset(range(10))

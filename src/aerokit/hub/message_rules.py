@@ -203,7 +203,7 @@ class TargetFields:
     def look_up(self, message_id: int) -> FieldOffsets | None:
         """Return the offsets of a message; None if it has no target, or is not in the dialect."""
         if message_id not in self._dialect.rows:
-            return None  # not stored, because noise may contain any number
+            return None  # not stored, because noise may contain any message id
         offsets = self.offsets[message_id] = _field_offsets(self._dialect[message_id])
         return offsets
 

@@ -313,8 +313,8 @@ class PythonFramer:
 
 
 def _earliest(hold: int, unknown: int, here: int) -> int:
-    """Return where the data to keep begins if a plausible frame begins at ``here``: at any earlier candidate."""
-    if unknown >= 0:  # earlier than `hold`, because it is only set if nothing is held
+    """Return the start of the data to keep: the earliest candidate for a frame, at ``here`` or before."""
+    if unknown >= 0:  # earlier than `hold`, because it is set only while `hold` is not
         return unknown
     return here if hold < 0 else hold
 

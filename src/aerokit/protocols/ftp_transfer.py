@@ -181,7 +181,7 @@ class FtpDownload(FtpExchange[int]):
 
     def _stop_bursting(self) -> None:
         self._is_bursting = False
-        # The interval between blocks shows how many fit into a round trip.
+        # The interval between blocks shows how many blocks fit into a round trip.
         if self._interval.smoothed_s and self.round_trip.smoothed_s:
             self._requests.window.widen(self.round_trip.smoothed_s / self._interval.smoothed_s)
 

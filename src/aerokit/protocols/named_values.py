@@ -130,7 +130,7 @@ class ValueList(Transfer[ResultT], Generic[ResultT, ValueT]):
 
 
 class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTimeout"]], Generic[ValueT]):
-    """Request some names, with a window of them in flight. The result has one answer for each, in the order given.
+    """Request the values of some names, several at a time. The result has one answer for each name, in the same order.
 
     After ``idle_timeout_s`` seconds without progress, the missing answers become ParameterTimeout errors.
     """

@@ -63,8 +63,8 @@ class Conversion(Snapshot):
     entries: int
     """Number of records read from the log: messages or rows."""
     written: int
-    """Number of messages, rows or points written. In an ``.mcap``, a record is one message, and each state that the
-    record changes is another. A flight table or track has rows or points for positions only.
+    """Number of messages, rows or points written. In an ``.mcap``, each record is written as one message, plus one for
+    each state that the record changes. A flight table or track has rows or points for positions only.
     """
     bytes: int
     """Total size of the written files."""

@@ -30,7 +30,7 @@ POSITION_MAX_AGE_S = 2.0
 STALL_TIMEOUT_S, STALL_DISTANCE_M = 12.0, 0.3
 
 FALL_SINK_M_S = 3.0
-"""Minimum speed of a descent that error texts mention when the vehicle has stopped; the default descent is 1.5 m/s."""
+"""Speed from which a descent is considered a fall; autopilots descend at 1.5 m/s by default."""
 
 FALL_EVIDENT_S = 0.5
 """After falling for this time, a vehicle sinks faster than ``FALL_SINK_M_S``, even with air resistance."""
