@@ -2634,7 +2634,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
 
         Raises:
             OperationRejected: the vehicle no longer flies the mission: a pilot, a failsafe or another order changed the
-                mode, or it disarmed on the way. ``reasons`` has the vehicle's status texts.
+                mode, it disarmed on the way, or it fell. ``reasons`` has the vehicle's status texts.
             OperationTimeout: the mission was not finished in time; or the armed vehicle has not moved for 12 s after a
                 descent at more than 3 m/s that ended on the ground; or it has not moved for 60 s at a take-off or at a
                 waypoint without a hold (only if the items are known from an upload or a download).
@@ -4911,7 +4911,7 @@ class Vehicle(VehicleTwin):
             NotSupported: this type of vehicle has no landing mode. Nothing was sent.
             CommandRejected: the vehicle refused the mode.
             CommandTimeout: there was no acknowledgement.
-            OperationRejected: the mode changed meanwhile, or the vehicle was disarmed in the air.
+            OperationRejected: the mode changed meanwhile, or the vehicle fell.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the vehicle was not on the ground in time.
         """
@@ -5045,7 +5045,7 @@ class Vehicle(VehicleTwin):
             CommandRejected: the vehicle refused the mode.
             CommandTimeout: there was no acknowledgement.
             OperationRejected: a parameter makes the vehicle ignore the target (nothing else was sent); or, after the
-                start, the mode changed, another order was given, or the vehicle was disarmed in the air.
+                start, the mode changed, another order was given, or the vehicle fell.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the target was not visible in time (the landing was not ordered), or the vehicle was not
                 on the ground in time.

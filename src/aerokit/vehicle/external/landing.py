@@ -14,7 +14,8 @@ import anyio
 from aerokit._internal.arguments import check_kind, check_range
 from aerokit._internal.values import Snapshot
 from aerokit.errors import OperationTimeout, ValueUnknownError
-from aerokit.vehicle.commanding.progress import GroundCheck, await_progress
+from aerokit.vehicle.commanding.ground import GroundCheck
+from aerokit.vehicle.commanding.progress import await_progress
 from aerokit.vehicle.commanding.streams import TakeoverCheck
 from aerokit.vehicle.external.values import TargetMeasurement
 
