@@ -1183,7 +1183,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         self._loop.run(self.aio.neutral, wait=wait, timeout=timeout)
 
     def retract(self, *, wait: bool = True, timeout: float = 10.0) -> None:
-        """Retract the gimbal; returns when it rests there.
+        """Retract the gimbal; returns when it rests in the retracted position.
 
         Args:
             wait: False: return when the manager has accepted the order.
@@ -1893,7 +1893,7 @@ class Gripper(TwinOf["AsyncGripper"]):
     """One gripper: ``vehicle.gripper()`` (MAV_CMD_DO_GRIPPER).
 
     PX4 acknowledges when the gripper has moved (PD_GRIPPER_EN). ArduPilot (GRIP_ENABLE) acknowledges at once and
-    reports the end by a status text. For an electro-permanent gripper it reports only the begin, and the call returns
+    reports the end by a status text. For an electro-permanent gripper it reports only the start, and the call returns
     three seconds later. Orders are sent once. The gripper may have moved after a cancelled call.
     """
 

@@ -42,7 +42,7 @@ POLL_INTERVAL_S = 0.2
 class TargetLoss(Snapshot):
     """One time during which the target was not visible.
 
-    ``height_m`` is the vehicle's height above home at its start; None if unknown.
+    ``height_m`` is the vehicle's height above home at the start of this time; None if unknown.
     """
 
     seconds: float

@@ -328,7 +328,7 @@ class MissionControl(VehiclePlan["Mission"]):
             raise InvalidArgument(f"item = {item!r} is not allowed: 0 to {last}")
 
     async def _set_current(self, item: int, timeout: float, order: Order, *, keeps_jump_counts: bool = True) -> None:
-        """Set the current item. ArduPilot's item 0 resets its jump counts, unless ``keeps_jump_counts``."""
+        """Set the current item. Item 0 also resets ArduPilot's jump counts, unless ``keeps_jump_counts``."""
         vehicle_context, session = self._vehicle_context, self._session
         seq = item + self._context.offset_of(0)
         if session.autopilot.sets_current_by_command:
