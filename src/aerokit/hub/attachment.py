@@ -196,7 +196,8 @@ class Attachment:
             self._add_port(None)
 
     def _on_down(self) -> None:
-        self._receive_burst()
+        if self._burst:  # the link was lost before the burst ended
+            self.burst_ended()
         self.is_open = False
         for peer in tuple(self._ports):
             self._forget(peer)
