@@ -40,7 +40,7 @@ _NOBODY = Sender(0, 0, -math.inf)
 class ForwardingPlan(Generic[PortT]):
     """Cached routing decision for all frames with the same message, sender, port and target."""
 
-    __slots__ = ("is_plain", "key", "message_id", "outs", "rate_limited", "reason", "sender", "target")
+    __slots__ = ("identity", "is_plain", "key", "message_id", "outs", "rate_limited", "reason", "sender", "target")
 
     def __init__(
         self,
@@ -67,6 +67,8 @@ class ForwardingPlan(Generic[PortT]):
         """True if each frame goes to `outs`, and nothing else is to be done."""
         self.sender: Sender = sender
         """The sender, in the plans of `RouterPort.streams`."""
+        self.identity: int = sender.source << 24
+        """The sender's part of the numbers in `RecentFrames`."""
 
 
 class RouterPort(Generic[PortT]):
@@ -164,15 +166,16 @@ class Router(Generic[PortT]):
         for frame in frames:
             body = frame.body
             plan = streams.get(body[4:9])
-            identity = (body[4] | body[5] << 8) << 24 | body[3] << 16 | frame.checksum
-            if plan is None or identity in newer or identity in older:
-                plan = self.route(node, frame, now)
-                if node.echoes:
-                    streams = {}
-            else:
-                newer[identity] = here
-                plan.sender.received_at = now
-            plans.append(plan)
+            if plan is not None:
+                identity = plan.identity | body[3] << 16 | frame.checksum
+                if identity not in newer and identity not in older:
+                    newer[identity] = here
+                    plan.sender.received_at = now
+                    plans.append(plan)
+                    continue
+            plans.append(self.route(node, frame, now))
+            if node.echoes:
+                streams = {}
         return plans
 
     def route(self, node: RouterPort[PortT], frame: Frame, now: float, is_late: bool = False) -> ForwardingPlan[PortT]:
