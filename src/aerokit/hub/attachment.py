@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from aerokit.connection.frame_receiver import MAX_PEERS, PeerTable
 from aerokit.hub.message_rules import Filters, MessageKind
-from aerokit.hub.port import MAX_JOINED_BYTES, UNLIMITED, EndpointCounters, Port, SigningGateway
+from aerokit.hub.port import UNLIMITED, EndpointCounters, Port, SigningGateway, joined
 from aerokit.hub.senders import IdentityGuard
 from aerokit.hub.values import EndpointStatistics
 from aerokit.mavlink.frame import MAGIC_V1, MAGIC_V2
@@ -63,7 +63,6 @@ class Attachment:
         self._is_on_link = self._is_single = self._reports_bursts = False
         self._burst: list[bytes] = []
         self._burst_peer: Peer = None
-        self._burst_bytes = 0
         self._ports: dict[Peer, Port] = {}
         self._guard = IdentityGuard(self.link, self._report_peer)
         self._peers = PeerTable(
@@ -120,16 +119,15 @@ class Attachment:
     # -------------------------------------------------------------------- called by the link
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
-        # Hot path. The datagrams of one burst of a peer are joined, up to the size that leaves in one datagram.
+        # Hot path. The datagrams of one burst of a peer are processed together.
         if self._burst:
-            self._burst_bytes += len(data)
-            if peer == self._burst_peer and self._burst_bytes <= MAX_JOINED_BYTES and data[:1] in _MAGICS:
+            if peer == self._burst_peer and data[:1] in _MAGICS:
                 self._burst.append(data)
                 return
             self._receive_burst()
         if self._reports_bursts and peer in self._peers.framers and data[:1] in _MAGICS:
             self._burst.append(data)
-            self._burst_peer, self._burst_bytes = peer, len(data)
+            self._burst_peer = peer
         else:
             self._receive(data, peer)
 
@@ -140,7 +138,8 @@ class Attachment:
     def _receive_burst(self) -> None:
         if self._burst:
             burst, self._burst = self._burst, []
-            self._receive(b"".join(burst), self._burst_peer)
+            for data in joined(burst):
+                self._receive(data, self._burst_peer)
 
     def _receive(self, data: bytes, peer: Peer) -> None:
         try:

@@ -272,19 +272,9 @@ class Port:
         counters, write, peer = self.counters, self.link.write, self.peer
         counters.frames_out += len(batch) + self.joined_frames
         self.joined_frames = 0
-        if len(batch) == 1 or self.writes_single_frames:
-            for raw in batch:
-                counters.bytes_out += len(raw)
-                write(raw, peer)
-            return
-        data = b"".join(batch)
-        counters.bytes_out += len(data)
-        if len(data) <= MAX_JOINED_BYTES:
-            if data:
-                write(data, peer)
-            return
-        for chunk in _chunks(batch):
-            write(chunk, peer)
+        for piece in batch if len(batch) == 1 or self.writes_single_frames else joined(batch):
+            counters.bytes_out += len(piece)
+            write(piece, peer)
 
     def drain(self, now: float, unix_time: float) -> None:
         """Write queued frames while the link accepts them, and drop late commands."""
@@ -316,7 +306,11 @@ class Port:
             self._on_drop(reason, frame)
 
 
-def _chunks(batch: list[bytes]) -> list[bytes]:
+def joined(batch: list[bytes]) -> list[bytes]:
+    """Join pieces to larger ones of at most `MAX_JOINED_BYTES`. Pieces that are larger themselves stay alone."""
+    whole = b"".join(batch)
+    if len(whole) <= MAX_JOINED_BYTES:
+        return [whole] if whole else []
     chunks: list[bytes] = []
     chunk: list[bytes] = []
     size = 0
