@@ -168,7 +168,8 @@ class Router(Generic[PortT]):
             plan = streams.get(body[4:9])
             if plan is not None:
                 identity = plan.identity | body[3] << 16 | frame.checksum
-                if identity not in newer and identity not in older:
+                is_new = identity not in newer and identity not in older
+                if is_new or (newer.get(identity) or older[identity])[0] == number:  # equal by chance
                     newer[identity] = here
                     plan.sender.received_at = now
                     plans.append(plan)
