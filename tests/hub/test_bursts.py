@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import random
+import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -36,20 +37,22 @@ class BurstLink(SlowLink):
     def has_peer(self, peer: Peer) -> bool:
         return peer is not None
 
-    def read(self, *datagrams: bytes, peer: Peer = PEER) -> None:
-        """Deliver one burst."""
-        for datagram in datagrams:
+    def read(self, *datagrams: bytes) -> None:
+        """Deliver one burst of a peer."""
+        self.read_from([(PEER, datagram) for datagram in datagrams])
+
+    def read_from(self, burst: Sequence[tuple[Peer, bytes]]) -> None:
+        for peer, datagram in burst:
             self.receiver.bytes_received(datagram, peer)
-        if self.receiver is not None:
-            self.receiver.burst_ended()
+        self.receiver.burst_ended()
 
 
 class LoneLink(BurstLink):
     """A link that delivers each datagram in a burst of its own."""
 
-    def read(self, *datagrams: bytes, peer: Peer = PEER) -> None:
-        for datagram in datagrams:
-            super().read(datagram, peer=peer)
+    def read_from(self, burst: Sequence[tuple[Peer, bytes]]) -> None:
+        for one in burst:
+            super().read_from([one])
 
 
 def frames_of(link: SlowLink) -> list[bytes]:
@@ -188,6 +191,17 @@ async def test_signing_link_signs_each_frame_of_a_burst() -> None:
         assert [checker.check(frame, 1e9) is None for frame in received] == [True] * 3
 
 
+@virtual
+async def test_signatures_of_a_burst_are_removed() -> None:
+    vehicles, station = BurstLink(), SlowLink()
+    signed = Endpoint(vehicles, name="a", signing=Signing(KEY))
+    async with Hub([signed, Endpoint(station, name="b")]):
+        vehicle = FrameEncoder(1, 1)
+        vehicle.signing = Signing(KEY)
+        vehicles.read(*(vehicle.encode(message, time.time()) for message in (COPTER, *telemetry(3))))
+        assert [len(frame.signature) for frame in Framer().receive(b"".join(station.written))] == [0] * 4
+
+
 # --------------------------------------------------------------------------- links that close
 
 
@@ -250,7 +264,7 @@ def damaged(chance: random.Random, raw: bytes) -> bytes:
     return raw
 
 
-def random_bursts(chance: random.Random) -> list[tuple[Peer, list[bytes]]]:
+def random_bursts(chance: random.Random) -> list[list[tuple[Peer, bytes]]]:
     """Bursts of two peers: vehicles and a station, old and new frames, copies, unknown messages and damage."""
     encoders = {
         PEER: [FrameEncoder(1, 1), FrameEncoder(1, 100), FrameEncoder(2, 1, version=1)],
@@ -266,23 +280,23 @@ def random_bursts(chance: random.Random) -> list[tuple[Peer, list[bytes]]]:
         lambda: ParamRequestList(chance.choice((0, 1, 9)), 1),
     ]
     sent: list[bytes] = [UNKNOWN]
-    bursts: list[tuple[Peer, list[bytes]]] = []
+    bursts: list[list[tuple[Peer, bytes]]] = []
     for _ in range(40):
-        peer = chance.choice((PEER, PEER, OTHER_PEER))
-        datagrams = []
+        peers, burst = chance.choice(((PEER,), (PEER, PEER, OTHER_PEER))), list[tuple[Peer, bytes]]()
         for _ in range(chance.randrange(1, 12)):
+            peer = chance.choice(peers)
             raws = [
                 chance.choice(encoders[peer]).encode(chance.choice(makers)()) for _ in range(chance.choice((1, 1, 4)))
             ]
             sent += raws
             if chance.random() < 0.05:
                 raws.append(chance.choice(sent[-20:]))
-            datagrams.append(damaged(chance, b"".join(raws)))
-        bursts.append((peer, datagrams))
+            burst.append((peer, damaged(chance, b"".join(raws))))
+        bursts.append(burst)
     return bursts
 
 
-async def outcome(link: BurstLink, bursts: Sequence[tuple[Peer, list[bytes]]], **fields: Any) -> list[object]:
+async def outcome(link: BurstLink, bursts: list[list[tuple[Peer, bytes]]], **fields: Any) -> list[object]:
     """Frames that left at each endpoint, and all counters, after these bursts."""
     one, two = BurstLink("slow:1"), SlowLink("slow:2")
     events: list[str] = []
@@ -290,8 +304,8 @@ async def outcome(link: BurstLink, bursts: Sequence[tuple[Peer, list[bytes]]], *
         hub.on_event(lambda event: events.append(f"{event.kind} {event.text}"))
         two.receiver.bytes_received(FrameEncoder(9, 1).encode(COPTER), None)
         one.read(FrameEncoder(254, 190).encode(STATION))
-        for peer, datagrams in bursts:
-            link.read(*datagrams, peer=peer)
+        for burst in bursts:
+            link.read_from(burst)
             await settle()
         return [
             *(sorted(frames_of(each)) if each is link else frames_of(each) for each in (link, one, two)),
@@ -327,7 +341,7 @@ def test_plans_of_a_burst_equal_plans_of_single_frames(seed: int) -> None:
         name, now = chance.choice("aaabcd"), stages[0].now + chance.choice((0.001, 0.1, 2.0))
         sent += [chance.choice(encoders).encode(chance.choice(makers)) for _ in range(chance.randrange(4))]
         raws = [chance.choice(sent[-12:]) for _ in range(chance.randrange(1, 9))] if sent else [UNKNOWN]
-        if chance.random() < 0.7:
+        if chance.random() < 0.4:
             raws = sent[-len(raws) :] or raws
         frames = [Frame.parse(raw) for raw in raws]
         late = [frame for frame in frames if chance.random() < 0.02]
@@ -348,7 +362,14 @@ def test_plans_of_a_burst_equal_plans_of_single_frames(seed: int) -> None:
                 other.key,
             )
             reasons.add(plan.reason)
-    assert {"", "duplicate"} <= reasons
+        one, two = stages
+        reasons |= {"echo"} if one.nodes[name].echoes else set()
+        assert one.nodes[name].echoes == two.nodes[name].echoes
+        assert one.router._recent.newer == two.router._recent.newer
+        assert [sender.received_at for sender in one.router._senders.values()] == [
+            sender.received_at for sender in two.router._senders.values()
+        ]
+    assert {"", "duplicate", "echo"} <= reasons
 
 
 def test_plans_follow_a_removed_port_within_a_burst() -> None:

@@ -144,7 +144,7 @@ class Switch:
         if len(plans) > 1 and not (len(data) <= MAX_JOINED_BYTES and all(out.joins_frames for out in outs)):
             return False
         for out in outs:
-            if not out.batch and (out.node is None or out.must_hold()):
+            if not out.batch and out.must_hold():
                 return False
         for out in outs:
             if not out.batch:
