@@ -14,6 +14,7 @@ from test_hub import KEY, ORDER, UNKNOWN, virtual
 from test_routing import TARGETS, Stage
 
 from aerokit import Signing
+from aerokit.connection.routes import ROUTE_TIMEOUT_S
 from aerokit.hub import Endpoint, Hub, HubEvent
 from aerokit.hub.port import MAX_JOINED_BYTES
 from aerokit.hub.routing import ForwardingPlan, Router
@@ -317,12 +318,14 @@ async def outcome(link: BurstLink, bursts: list[list[tuple[Peer, bytes]]], **fie
 @pytest.mark.sampled(5)
 @pytest.mark.parametrize("seed", range(20))
 def test_burst_has_the_outcome_of_single_datagrams(seed: int) -> None:
-    fields: dict[str, Any] = [{}, {"rates": {"SYSTEM_TIME": 10}}, {"block": ("STATUSTEXT",)}][seed % 3]
+    filters: tuple[dict[str, Any], ...] = {}, {"rates": {"SYSTEM_TIME": 10}}, {"block": ("STATUSTEXT",)}
 
     @virtual
     async def compare() -> None:
         bursts = random_bursts(random.Random(seed))
-        together, alone = [await outcome(link, bursts, **fields) for link in (BurstLink("s:0"), LoneLink("s:0"))]
+        together, alone = [
+            await outcome(link, bursts, **filters[seed % 3]) for link in (BurstLink("s:0"), LoneLink("s:0"))
+        ]
         assert together == alone
         assert len(together[1]) > 100  # type: ignore[arg-type]
 
@@ -380,3 +383,20 @@ def test_plans_follow_a_removed_port_within_a_burst() -> None:
     frames = [Frame.parse(encoder.encode(message)) for message in (*telemetry(2), COPTER, *telemetry(2))]
     plans = router.route_all(nodes["a"], frames, 1.0, [])
     assert [plan.outs for plan in plans] == [("b", "c"), ("b", "c"), ("b",), ("b",), ("b",)]
+
+
+def test_new_frame_offsets_an_echo_of_the_same_burst() -> None:
+    """The vehicle has moved to another radio, which repeats one of its earlier frames."""
+    stage = Stage()
+    encoder, node = FrameEncoder(1, 1), stage.nodes["c"]
+    old, *new = [encoder.encode(Statustext(6, str(number))) for number in range(4)]
+    stage.pass_on("a", old)
+    stage.now += ROUTE_TIMEOUT_S + 1
+    for raw in new[:2]:
+        stage.pass_on("c", raw)
+    stage.router.route_all(node, [Frame.parse(old)], stage.now, [])
+    assert list(node.echoes.values()) == [1]
+    node.echoes.clear()
+    stage.now += DUPLICATE_WINDOW_S + 1
+    stage.router.route_all(node, [Frame.parse(old), Frame.parse(new[2])], stage.now, [])
+    assert node.echoes == {}
