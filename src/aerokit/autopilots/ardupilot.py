@@ -247,7 +247,8 @@ class ArduCopter(ArduPilot):
     sticks: StickRules | None = StickRules()
     setpoints: SetpointRules = SetpointRules(body_yaw_is_relative=True, attitude_rate=True, trajectory=True)
     reposition: Reposition | None = Reposition(relative_altitude=True, yaw=False, speed=False)
-    # An airspeed changes the ground speed (GCS_MAVLink_Copter.cpp, handle_MAV_CMD_DO_CHANGE_SPEED).
+    # ArduCopter treats SPEED_TYPE_AIRSPEED as the ground speed (GCS_MAVLink_Copter.cpp,
+    # handle_MAV_CMD_DO_CHANGE_SPEED).
     speed_types: frozenset[int] = frozenset((SpeedType.GROUNDSPEED, SpeedType.CLIMB_SPEED))
     condition_yaw = True
     lands_after_return = True
@@ -277,7 +278,7 @@ class ArduCopter(ArduPilot):
         return TakeOff(guided, MavCmd.NAV_TAKEOFF, (0, 0, 0, 0, 0, 0, altitude_relative_m), None)
 
     def landed_state_of(self, heartbeat: Heartbeat) -> int | None:
-        # STANDBY is reported on the ground only, ACTIVE in the air only. A failsafe (CRITICAL) hides both.
+        # STANDBY means on the ground, ACTIVE in the air. During a failsafe, CRITICAL replaces both.
         return _landed_state(heartbeat)
 
     def return_altitude_parameters(self, *, is_vtol: bool) -> tuple[tuple[str, float], ...]:
@@ -327,7 +328,7 @@ class ArduPlane(ArduPilot):
 
     def return_altitude_parameters(self, *, is_vtol: bool) -> tuple[tuple[str, float], ...]:
         if self._can_hover(is_vtol):
-            return (("Q_RTL_ALT", 1.0),)  # It returns in QRTL.
+            return (("Q_RTL_ALT", 1.0),)  # This vehicle returns in QRTL.
         return (("RTL_ALTITUDE", 1.0), ("ALT_HOLD_RTL", 100.0))
 
     def _can_hover(self, is_vtol: bool) -> bool:

@@ -65,9 +65,9 @@ LEVELS = (logging.CRITICAL,) * 3 + (logging.ERROR, logging.WARNING, logging.INFO
 class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
     """A vehicle: attributes to read and to listen to, orders, parameters, missions.
 
-    Created by :func:`connect`; ``connect(…, vehicle_class=…)`` creates a subclass, which passes its one argument on and
-    may add listeners and attributes. Can be used from any thread. Callbacks run in order on a separate thread, and may
-    use the vehicle too. A context manager; :meth:`close` closes the connection.
+    Created by :func:`connect`; ``connect(…, vehicle_class=…)`` creates a subclass, whose constructor passes its one
+    argument on and may add listeners and attributes. Can be used from any thread. Callbacks run in order on a separate
+    thread, and may use the vehicle too. A context manager; :meth:`close` closes the connection.
     """
 
     def __init__(self, handler: MAVConnection) -> None:
@@ -312,7 +312,7 @@ async def _found(
 
 
 async def _request_capabilities(aio: AsyncVehicle) -> None:
-    # Old firmware needs this command; repeated until the version arrives.
+    # Old firmware needs this command; it is repeated until the version arrives.
     for _ in range(5):
         if aio.telemetry.version.is_known:
             return

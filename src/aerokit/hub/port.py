@@ -36,7 +36,7 @@ class QueuedFrame(NamedTuple):
 
 
 class FrameQueue:
-    """Queue in which newer telemetry replaces older telemetry of the same message and sender.
+    """Queue in which newer telemetry replaces older telemetry with the same message id and sender.
 
     When the queue is full, the oldest telemetry is dropped first, then the new frame.
     """

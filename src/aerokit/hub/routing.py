@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 PortT = TypeVar("PortT")
 
 MAX_PLANS = 4096
-"""Cached plans per port."""
+"""Maximum number of cached plans per port."""
 
 _SETUP_SIGNING = 256
 _RADIOS = (109, 166)
@@ -85,7 +85,7 @@ class RouterPort(Generic[PortT]):
         """Sender and message, as in a frame → plan, for broadcasts of senders that are reached by this port."""
         self.destinations: dict[tuple[PortT, ...], tuple[PortT, ...]] = {}
         self.echoes: dict[int, int] = {}
-        """Sender → surplus of returning frames over new ones at this port."""
+        """Maps senders to the number of returning frames minus the number of new frames at this port."""
         self.loop_until: float = -math.inf
         """Returning frames are dropped until this time."""
 
@@ -96,23 +96,23 @@ class RouterPort(Generic[PortT]):
 
 
 class Router(Generic[PortT]):
-    """Learns the ports at which each sender is received, and plans the destinations of frames.
+    """Learns at which ports each sender is received, and plans the destinations of frames.
 
     - A broadcast goes to all other ports. A broadcast command skips ports through which it would reach a vehicle twice.
     - A message for one component or system goes to the ports at which its target was received. It is dropped if the
       target is unknown. A message for an unknown component of a known system goes to the ports of the system.
-    - A vehicle that is received at several ports is reached by the first one until that is silent for 3.5 s, so that
-      no command arrives twice. A message for a system goes to its autopilot in this way, and also to ports with only
-      other components of the system. Ground stations that share ids all get their messages.
+    - A vehicle that is received at several ports gets messages through the first port until that is silent for 3.5 s,
+      so that no command arrives twice. A message for a system goes to its autopilot in this way, and also to ports that
+      only reach other components of it. Ground stations that share ids all get their messages.
     - A frame never goes back to its port, and is forwarded once. Copies at other ports within two seconds are
       dropped, and later copies if they prove a loop. Copies do not change routes.
     - SETUP_SIGNING, which contains a key, is not forwarded. Status messages of telemetry radios do not go to vehicles.
 
-    At most `MAX_ROUTES` senders are remembered. A new one replaces one without heartbeats, or one that was silent for
-    `PEER_TTL_S`; if there is none, messages for the new one are dropped.
+    At most `MAX_ROUTES` senders are remembered. A new sender replaces one without heartbeats, or one that was silent
+    for `PEER_TTL_S`. If there is neither, messages for the new sender are dropped.
 
-    ``period(port, message_id)`` returns the minimum interval of a message at a port in seconds: None if it does not go
-    there, 0 without a limit. The interval applies per sender, to broadcasts only.
+    ``period(port, message_id)`` returns the minimum interval of a message at a port in seconds: None if the message
+    does not go there, 0 without a limit. The interval applies per sender, to broadcasts only.
     """
 
     def __init__(self, targets: TargetFields, period: Callable[[PortT, int], float | None]) -> None:
@@ -130,7 +130,7 @@ class Router(Generic[PortT]):
         self.on_vehicle: Callable[[PortT], object] | None = None
         """Called when an autopilot is received at a port for the first time."""
         self.on_change: Callable[[HubEventKind, int, PortT, PortT | None], object] | None = None
-        """Called with the kind of event, the sender, its port and its former port (None if that was removed)."""
+        """Called with the kind of event, the sender, its port, and its former port (None: removed)."""
 
     def add(self, port: PortT) -> RouterPort[PortT]:
         self._count += 1
@@ -341,7 +341,7 @@ class Router(Generic[PortT]):
     def _ports_to(self, system_id: int, component_id: int, source: int, here: int) -> dict[int, None]:
         """Return the numbers of the ports by which a component or system is reached, for a frame of ``source``.
 
-        A sender never gets its own frame, which arrived at port ``here``, even if it is reached by another port.
+        A sender never gets its own frame (received at port ``here``), even if another port reaches the sender.
         """
         own = self._senders.get(source)
         exact = self._senders.get(system_id | component_id << 8) if component_id else None
@@ -351,8 +351,8 @@ class Router(Generic[PortT]):
         autopilots = [sender for sender in known if sender.is_autopilot]
         found: dict[int, None] = {}
         for sender in sorted(known, key=lambda sender: not sender.is_autopilot):
-            # A component at a port that is already chosen is reached there. Ports at which the autopilot is also
-            # received are skipped, because it would get the command twice.
+            # A component is already reached if one of its ports is chosen. Ports at which the autopilot is received too
+            # are skipped, because it would get the command twice.
             is_reached = sender.is_vehicle and any(sender.is_at(number) for number in found)
             if not is_reached:
                 found.update(
@@ -363,7 +363,7 @@ class Router(Generic[PortT]):
         return found
 
     def _would_be_second(self, number: int) -> bool:
-        """Return True if all autopilots received at a port are reached by other ports."""
+        """Return True if other ports reach all autopilots that are received at this port."""
         here = [sender for sender in self._senders.values() if sender.is_autopilot and sender.is_at(number)]
         return bool(here) and all(sender.number != number for sender in here)
 

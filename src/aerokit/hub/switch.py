@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 MIN_POLL_INTERVAL_S = 0.01
 MAX_POLL_INTERVAL_S = 0.08
 
-# Frames are written after this many of a burst, before its end.
+# Frames of a long burst are written each time this many have been collected.
 MAX_BURST_FRAMES = 256
 
 _message_id = attrgetter("message_id")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from aerokit.protocols.exchange import RoundTrip
 
-# Answers arrive in the order of their requests. A request is lost if this many later requests were answered before it.
+# Number of later requests whose answers show that a request was lost, because answers arrive in order.
 OVERTAKEN = 3
 
 # ArduPilot queues five requests, drops further ones, and processes them every 2 ms.
@@ -17,7 +17,7 @@ BURST_SIZE = 4
 # Pause between requests beyond a burst.
 SPACING_S = 0.002
 
-# An answer faster than this fraction of the fastest round trip belongs to an earlier sending of the request.
+# An answer that arrives within this fraction of the fastest round trip belongs to an earlier sending of the request.
 MIN_ROUND_TRIP_FRACTION = 0.5
 
 # Consecutive timeouts before requests back off, because radios lose single frames.

@@ -33,8 +33,8 @@ MAX_ATTEMPTS = 4
 
 _ARM, _RELATIVE, _STEP = (0, 1.0), (3, 1.0), (0, 0.0)
 
-# MAV_CMD → effect of a repetition, and the parameter (index, value) for which it has this effect; None: always.
-# docs/reliability.md has the same table.
+# Maps MAV_CMD to the effect of a repetition, and to the parameter (index, value) with which it has this effect (None:
+# always). docs/reliability.md has the same table.
 UNREPEATABLE_COMMANDS: Mapping[int, tuple[str, tuple[int, float] | None]] = {
     MavCmd.COMPONENT_ARM_DISARM: ("arms a vehicle that a pilot has disarmed since", _ARM),
     MavCmd.CONDITION_YAW: ("turns by the same angle again", _RELATIVE),
@@ -50,9 +50,9 @@ UNREPEATABLE_COMMANDS: Mapping[int, tuple[str, tuple[int, float] | None]] = {
     MavCmd.PREFLIGHT_CALIBRATION: ("calibrates again", None),
     MavCmd.PREFLIGHT_STORAGE: ("writes, reads or resets all parameters again", None),
     MavCmd.PREFLIGHT_REBOOT_SHUTDOWN: ("reboots again", None),
-    MavCmd.DO_FLIGHTTERMINATION: ("stops the motors of a flight that began since", None),
+    MavCmd.DO_FLIGHTTERMINATION: ("stops the motors of a flight that began meanwhile", None),
     MavCmd.START_RX_PAIR: ("starts pairing again", None),
-    MavCmd.STORAGE_FORMAT: ("erases what was stored since", None),
+    MavCmd.STORAGE_FORMAT: ("erases what was stored meanwhile", None),
     MavCmd.SET_CAMERA_ZOOM: ("zooms another step", _STEP),
     MavCmd.SET_CAMERA_FOCUS: ("focuses another step", _STEP),
     MavCmd.IMAGE_START_CAPTURE: ("takes another picture, or starts another series", None),
@@ -60,9 +60,9 @@ UNREPEATABLE_COMMANDS: Mapping[int, tuple[str, tuple[int, float] | None]] = {
     MavCmd.LOGGING_START: ("starts another log", None),
     MavCmd.DO_START_MAG_CAL: ("calibrates again", None),
     MavCmd.FIXED_MAG_CAL_YAW: ("calibrates again", None),
-    MavCmd.DO_GRIPPER: ("moves a gripper that was moved by another station since", None),
-    MavCmd.DO_PARACHUTE: ("releases a parachute that was forbidden since", (0, 2.0)),
-    MavCmd.INJECT_FAILURE: ("injects a failure that was ended since", None),
+    MavCmd.DO_GRIPPER: ("moves a gripper that another station has moved meanwhile", None),
+    MavCmd.DO_PARACHUTE: ("releases a parachute that was disabled meanwhile", (0, 2.0)),
+    MavCmd.INJECT_FAILURE: ("injects a failure again that was ended meanwhile", None),
     MavCmd.DO_WINCH: ("pays out the same length again", None),
     MavCmd.FLASH_BOOTLOADER: ("writes the bootloader again", None),
     MavCmd.PAYLOAD_CONTROL_DEPLOY: ("drops another payload", None),
@@ -303,7 +303,7 @@ class CommandExchange(Exchange[CommandAck]):
         self.deadline = now + wait_s
 
     def _with_confirmation(self, confirmation: int) -> Message:
-        # COMMAND_INT has no such field.
+        # COMMAND_INT has no field `confirmation`.
         message = self._message
         if confirmation == 0 or not isinstance(message, CommandLong):
             return message

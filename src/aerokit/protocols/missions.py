@@ -36,7 +36,7 @@ __all__ = [
 
 ResultT = TypeVar("ResultT")
 
-# How long a vehicle may stay busy with a transfer that its ground station has dropped: ArduPilot 8 s, PX4 5 s.
+# Maximum time for which a vehicle is busy with a transfer that its ground station has dropped: ArduPilot 8 s, PX4 5 s.
 BUSY_TIMEOUT_S = 9.0
 
 BUSY_RETRY_INTERVAL_S = 1.0
@@ -75,7 +75,7 @@ RESULTS: dict[int, str] = {
 class MissionExchange(Transfer[ResultT]):
     """A transfer with one component. Ignores messages to other systems and of other mission types.
 
-    Indices in errors are the program's, which are ``offset`` lower than those on the wire.
+    Errors contain the program's indices: those on the wire minus ``offset``.
     """
 
     def __init__(

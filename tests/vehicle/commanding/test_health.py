@@ -66,7 +66,7 @@ async def test_arm_refused_has_status_texts(grounded: Flight) -> None:
     assert "Arm: Compass not healthy" in caught.value.reasons
     assert "Arm: Gyros inconsistent" in caught.value.reasons
     assert "\n  - Arm: Compass not healthy" in str(caught.value)
-    assert not grounded.wire.commands(MavCmd.RUN_PREARM_CHECKS)  # It has sent a status text already.
+    assert not grounded.wire.commands(MavCmd.RUN_PREARM_CHECKS)  # The vehicle has sent a status text already.
 
 
 async def test_arm_refused_without_text_requests_checks(grounded: Flight) -> None:

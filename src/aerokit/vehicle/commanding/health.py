@@ -83,7 +83,7 @@ class Health:
         return self._session.deduplicate_reasons(*(reason for reasons in found for reason in reasons))
 
     def unarmable_mode(self) -> list[str]:
-        """Return a text if the present mode does not allow arming, else nothing."""
+        """Return a list with a text if the present mode does not allow arming, otherwise an empty list."""
         mode = self._telemetry.mode.latest
         is_unarmable = mode is not None and mode.name in self._autopilot.unarmable_modes
         return [self.unarmable_text(mode)] if mode is not None and is_unarmable else []
@@ -115,9 +115,9 @@ class Health:
     def _failing(self) -> list[str]:
         """Return failing sensors, failing pre-arm checks and missing estimates.
 
-        If the vehicle reports that it can be armed, a failing sensor is not required (PX4: no RC receiver). In a mode
-        that does not allow arming, PX4 evaluates the requirements of that mode, which say nothing about arming. PX4
-        also reports the receiver as failing in modes that do not require it.
+        If the vehicle reports that it can be armed, failing sensors are left out, because they are not required (PX4
+        without an RC receiver). In a mode that does not allow arming, PX4 evaluates the requirements of that mode,
+        which say nothing about arming. PX4 reports a missing receiver as failing even in modes that do not require it.
         """
         failing: list[str] = []
         sensors, estimator = self._telemetry.sensors.latest, self._telemetry.estimator.latest
