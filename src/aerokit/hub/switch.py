@@ -121,13 +121,16 @@ class Switch:
         """Return the frames that the sender may send, without signatures, and those of them that are out of order."""
         admitted: list[Frame] = []
         late: list[Frame] = []
+        gateway, guard, peer = port.gateway, port.guard, port.peer
         for received in frames:
-            frame = received if port.gateway is None else port.gateway.admitted(received, self.unix_time())
+            frame = received if gateway is None else gateway.admitted(received, self.unix_time())
             if frame is None:
                 continue
-            guard = port.guard
-            is_checked = guard is not None and (guard.is_shared or frame.message_id == 0)
-            if guard is not None and is_checked and not guard.admits(frame, framer, port.peer):
+            if (
+                guard is not None
+                and (guard.is_shared or not frame.message_id)
+                and not guard.admits(frame, framer, peer)
+            ):
                 port.counters.dropped["foreign"] += 1
                 continue
             admitted.append(frame)
