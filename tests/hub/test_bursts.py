@@ -33,7 +33,9 @@ OTHER_PEER = ("10.0.0.2", 14550)
 class BurstLink(SlowLink):
     """A link that reads bursts of datagrams from several peers, like ``udpin:``."""
 
-    reports_bursts = True
+    @property
+    def reports_bursts(self) -> bool:
+        return True
 
     def has_peer(self, peer: Peer) -> bool:
         return peer is not None

@@ -126,16 +126,12 @@ class Switch:
             frame = received if gateway is None else gateway.admitted(received, self.unix_time())
             if frame is None:
                 continue
-            if (
-                guard is not None
-                and (guard.is_shared or not frame.message_id)
-                and not guard.admits(frame, framer, peer)
-            ):
+            if guard is None or not (guard.is_shared or frame.message_id == 0) or guard.admits(frame, framer, peer):
+                admitted.append(frame)
+                if received in framer.late:
+                    late.append(frame)
+            else:
                 port.counters.dropped["foreign"] += 1
-                continue
-            admitted.append(frame)
-            if received in framer.late:
-                late.append(frame)
         return admitted, late
 
     def _forward_together(self, plans: list[ForwardingPlan[Port]], data: bytes) -> bool:
