@@ -723,7 +723,7 @@ class StickStream(BlockTwin["AsyncStickStream"]):
         NotSupported: this type of vehicle has no sticks. Nothing was sent.
         OperationRejected: a parameter makes the vehicle ignore the sticks, or never release them; the error text names
             it.
-        ParameterTimeout: the vehicle did not report the parameters that decide about this. Nothing else was sent.
+        ParameterTimeout: the vehicle did not report a parameter that aerokit must check first. Nothing else was sent.
         CommandRejected: the vehicle refused the mode.
         BusyError: another set-point stream is open.
     """
@@ -752,15 +752,15 @@ class MeasurementStream(MeasurementTwin[MeasurementT]):
 
     A measurement is never repeated: if your program supplies no new one, nothing is sent, and the vehicle acts as if
     its sensor had failed. Of several measurements within one period, only the newest is sent. A measurement is dropped
-    if it is older than ``valid_for_s`` when its turn comes, for example after the event loop was blocked. While the
-    vehicle is silent, all measurements are dropped. ``sent`` and ``dropped`` count them. The stream ends only with the
-    block.
+    if it is older than ``valid_for_s`` when it is due to be sent, for example after the event loop was blocked. While
+    the vehicle is silent, all measurements are dropped. ``sent`` and ``dropped`` count measurements. The stream ends
+    only with the block.
 
     Entering raises:
         NotSupported: this firmware does not read such measurements. Nothing was sent.
         OperationRejected: a parameter makes the vehicle ignore such measurements; the error text names it. No
             measurement was sent.
-        ParameterTimeout: the vehicle did not report the parameters that decide about this.
+        ParameterTimeout: the vehicle did not report a parameter that aerokit must check first.
     """
 
     @property
@@ -805,8 +805,8 @@ class External(TwinOf["AsyncExternal"]):
     """Supplies the vehicle with measurements: ``async with vehicle.external.odometry() as stream: stream.send(…)``.
 
     ``rate_hz`` (above 0, at most 400) is the maximum rate at which measurements are sent. A measurement older than
-    ``valid_for_s`` is dropped. Time stamps are those of the event loop's clock. While a stream is open, aerokit answers
-    the vehicle's TIMESYNC requests with this clock.
+    ``valid_for_s`` is dropped. Time stamps are on the event loop's clock. While a stream is open, aerokit answers the
+    vehicle's TIMESYNC requests with this clock.
     """
 
     def odometry(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[OdometryMeasurement]:
@@ -844,7 +844,7 @@ class External(TwinOf["AsyncExternal"]):
     def obstacles(self, *, rate_hz: float = 10.0, valid_for_s: float = 0.5) -> MeasurementStream[ObstacleSectors]:
         """Supply distances around the vehicle (OBSTACLE_DISTANCE).
 
-        ArduPilot needs PRX1_TYPE 2; PX4 uses them if CP_DIST is above 0.
+        ArduPilot needs PRX1_TYPE 2, PX4 needs CP_DIST above 0.
         """
         return MeasurementStream(
             self._loop,
@@ -924,9 +924,9 @@ class External(TwinOf["AsyncExternal"]):
     def set_origin(self, origin: Position, *, timeout: float = 10.0) -> None:
         """Set the origin of the estimator's local frame, and wait until GPS_GLOBAL_ORIGIN reports it.
 
-        A vehicle without GPS needs the origin to compute global positions. SET_GPS_GLOBAL_ORIGIN is sent once, because
-        it has no acknowledgement. Returns at once if the vehicle has this origin already. The vehicle may have accepted
-        the origin of a cancelled call.
+        A vehicle without GPS needs the origin to compute global positions. SET_GPS_GLOBAL_ORIGIN has no acknowledgement
+        and is sent once. Returns at once if the vehicle has this origin already. If you cancel the call, the vehicle
+        may still have accepted the origin.
 
         Args:
             origin: latitude, longitude and altitude above mean sea level.
@@ -1393,7 +1393,9 @@ class Files(TwinOf["AsyncFiles"]):
     """
 
     def is_supported(self) -> bool:
-        """Return True if the vehicle reports MAVFTP; False if it does not, or does not answer within three seconds."""
+        """Return True if the vehicle reports support for MAVFTP, False if not or without an answer within three
+        seconds.
+        """
         return self._loop.run(self.aio.is_supported)
 
     def read(
@@ -1430,8 +1432,8 @@ class Files(TwinOf["AsyncFiles"]):
         """Copy a file to this computer. It is written to ``<to>.part`` and renamed when it is complete.
 
         With ``resume``, the download continues the ``<to>.part`` of an interrupted one, unless the vehicle's file is
-        shorter. The result is verified by CRC-32 if the vehicle can compute it; if it differs, the whole file is read
-        again. Files whose names begin with ``@`` are always read completely.
+        shorter. If the vehicle can compute the CRC-32, it is compared with that of the result; if they differ, the
+        whole file is read again. Files whose names begin with ``@`` are always read completely.
 
         Raises:
             RemoteProtocolError: as for :meth:`read`.
@@ -1484,8 +1486,8 @@ class Files(TwinOf["AsyncFiles"]):
     ) -> None:
         """Write a file. An existing file is replaced; its old content is lost as soon as the write begins.
 
-        ``verify`` compares the CRC-32 afterwards, if the vehicle can compute it. It cannot for files whose names
-        begin with ``@``: the vehicle evaluates them when they are closed, and does not report the result.
+        ``verify`` compares the CRC-32 afterwards, if the vehicle can compute it. Files whose names begin with ``@`` are
+        not verified: the vehicle evaluates them when they are closed, and does not report the result.
 
         Raises:
             VerificationFailed: the vehicle acknowledged everything, but the file has other content.
@@ -1511,7 +1513,7 @@ class Files(TwinOf["AsyncFiles"]):
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> None:
-        """Copy a local file to ``path`` on the vehicle, as :meth:`write` does.
+        """Copy a local file to ``path`` on the vehicle. ``verify`` is as for :meth:`write`.
 
         Raises:
             VerificationFailed, RemoteProtocolError: as for :meth:`write`.
@@ -1577,8 +1579,8 @@ class Files(TwinOf["AsyncFiles"]):
 class LogStream(LogStreamTwin):
     """PX4's flight log, received while PX4 writes it (LOGGING_DATA): an async iterator over bytes.
 
-    If you append all bytes to a file, it is a valid ULog file at any time. Lost messages are marked in it as dropouts;
-    ``lost`` counts them. The iterator ends with the connection. PX4 sends one such log at a time.
+    If you append all bytes to a file, the file is a valid ULog file at any time. Lost messages are marked in the log as
+    dropouts; ``lost`` counts them. The iterator ends with the connection. PX4 streams its log to one station at a time.
 
     Entering raises:
         NotSupported: the vehicle runs ArduPilot. Nothing was sent.
@@ -1598,9 +1600,9 @@ class Logs(TwinOf["AsyncLogs"]):
     All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
     total; None for no limit). You can cancel any call; the vehicle then stops sending.
 
-    ArduPilot answers LOG_* messages only while disarmed, and reading a log by them ends its current log. By MAVFTP,
-    logs can also be read in flight. A log that is still being written is read up to its current end. If that exceeds
-    the size in the entry, logger "aerokit" reports it (INFO).
+    ArduPilot answers LOG_* messages only while disarmed, and ends its current log when a log is read by these messages.
+    By MAVFTP, logs can also be read in flight. A log that is still being written is read up to its current end. If it
+    is larger than its entry says, logger "aerokit" reports that (INFO).
     """
 
     def list(self, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None) -> tuple[LogEntry, ...]:
@@ -1630,17 +1632,17 @@ class Logs(TwinOf["AsyncLogs"]):
         Args:
             log: an entry of :meth:`list`, or its id.
             to: path of the local file.
-            resume: continue an interrupted download of this log to this file; by LOG_* only if the vehicle reports the
-                time of the log.
-            method: ``"ftp"``, ``"log"`` (the LOG_* messages), or ``"auto"``: the faster one for this autopilot, and the
-                other one if that fails. MAVFTP requires that the file of the log can be identified.
+            resume: continue an interrupted download of this log to this file. By LOG_* this works only if the vehicle
+                reports the time of the log.
+            method: ``"ftp"``, ``"log"`` (the LOG_* messages), or ``"auto"``: the faster of the two for this autopilot,
+                then the slower if the faster fails. MAVFTP requires that the file of the log can be identified.
             idle_timeout_s: fail after this many seconds without progress.
             timeout: seconds in total.
             on_progress: called with the bytes so far and in total.
 
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
-            FileError: there is no such log, or it was requested by MAVFTP and cannot be identified.
+            FileError: there is no such log, or ``method`` is ``"ftp"`` and the file of the log cannot be identified.
             FileTimeout: the log did not arrive completely; ``missing`` has the missing ranges.
             OSError: the local file cannot be written.
         """
@@ -1668,8 +1670,8 @@ class Logs(TwinOf["AsyncLogs"]):
 
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
-            FileError: there is no such log, or it was requested by MAVFTP and cannot be identified.
-            FileTimeout: it did not arrive; ``missing`` has the missing ranges.
+            FileError: there is no such log, or ``method`` is ``"ftp"`` and the file of the log cannot be identified.
+            FileTimeout: the log did not arrive completely; ``missing`` has the missing ranges.
         """
         return self._loop.run(
             self.aio.read,
@@ -2073,15 +2075,16 @@ class TemporaryParameters(TemporarilyTwin):
 
 
 class Transaction(TransactionTwin):
-    """Several writes, all or none.
+    """Several parameter writes, of which either all take effect or none.
 
-    Every write is verified; one that fails or is clamped raises. If the block raises, all written parameters are
-    restored as far as possible: those that could not be restored are in :class:`aerokit.errors.RollbackFailed`, and
-    are not tried again when the link returns. Otherwise the exception of the block propagates.
+    Every write is verified; a write that fails or is clamped raises. If the block raises, aerokit restores all written
+    parameters and the exception of the block propagates. If some could not be restored,
+    :class:`aerokit.errors.RollbackFailed` names them; they are not tried again when the link returns.
 
-    A value that another station has changed meanwhile stays, and a warning of logger "aerokit" names it. Other tasks
-    of your program may write meanwhile: a transaction restores the values from before its own first write. Blocks with
-    the same parameter may be nested and may overlap; an outer block that fails also undoes an inner one that succeeded.
+    A value that another station has changed meanwhile stays, and a warning of logger "aerokit" names the parameter.
+    Other tasks of your program may write at the same time: a transaction restores the values from before its own first
+    write. Blocks with the same parameter may be nested and may overlap; an outer block that fails also undoes an inner
+    block that succeeded.
     """
 
     @property
@@ -2095,7 +2098,9 @@ class Transaction(TransactionTwin):
         return self.aio.needs_reboot
 
     def set(self, name: str, value: float) -> ParameterWrite:
-        """Set one parameter; errors as for :meth:`Parameters.set`, and VerificationFailed if it is clamped."""
+        """Set one parameter; errors as for :meth:`Parameters.set`, and VerificationFailed if the vehicle clamps the
+        value.
+        """
         return self._loop.run(self.aio.set, name, value)
 
     def set_many(self, values: Mapping[str, float]) -> dict[str, ParameterWrite]:
@@ -2110,8 +2115,8 @@ class Parameters(TwinOf["AsyncParameters"]):
     :class:`aerokit.events.ParameterChanged`. A reboot clears the table.
 
     ArduPilot 4.7 renamed parameters and changed their units (``WPNAV_SPEED`` in cm/s became ``WP_SPD`` in m/s). Every
-    method accepts the old and the new name with either firmware, and converts the value; an old name that the vehicle
-    no longer has causes an :class:`aerokit.errors.ParameterRenamedWarning` with the new one.
+    method accepts the old and the new name with either firmware, and converts the value. An old name that the vehicle
+    no longer has causes an :class:`aerokit.errors.ParameterRenamedWarning`, which contains the new name.
 
     ArduPilot handles parameters a few times a second. aerokit raises this rate by SET_MESSAGE_INTERVAL of PARAM_VALUE
     while it reads more than five parameters, or if there is no answer within half a second, and restores the rate at
@@ -2168,9 +2173,9 @@ class Parameters(TwinOf["AsyncParameters"]):
             method: ``"ftp"`` reads one small file that also has the defaults (``@PARAM/param.pck``), ``"list"``
                 requests one message for each parameter, ``"auto"`` uses the file if there is one.
             refresh: download again, even if the parameters are known or cached.
-            cache: keep the list on disk, and use it while the vehicle's parameter hash is unchanged: the second connect
-                takes one request. True means the user's cache directory; or pass a path. Only PX4 has a hash. It does
-                not cover parameters that PX4 changes by itself, so these may be outdated. Off by default.
+            cache: keep the list on disk, and use it while the vehicle's parameter hash is unchanged, so that the next
+                program needs one request. True means the user's cache directory; or pass a path. Only PX4 has a hash.
+                The hash does not cover parameters that PX4 changes by itself, so these may be outdated. Off by default.
             idle_timeout_s: fail after this many seconds without progress.
             timeout: seconds in total.
             on_progress: called with the number of parameters, or bytes of the file, so far and in total.
@@ -2191,7 +2196,7 @@ class Parameters(TwinOf["AsyncParameters"]):
         )
 
     def get(self, name: str, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None) -> int | float:
-        """Request one value from the vehicle; for arguments and errors see :meth:`read`."""
+        """Request one parameter from the vehicle; for arguments and errors see :meth:`read`."""
         return self._loop.run(self.aio.get, name, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
     def read(self, name: str, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None) -> Parameter:
@@ -2215,8 +2220,8 @@ class Parameters(TwinOf["AsyncParameters"]):
         Use it to find out which of several names a firmware has; for renamed ArduPilot parameters use :meth:`get`.
 
         Returns:
-            For each name the parameter, or the error that :meth:`get` would have raised. Its ``code`` is None if the
-                vehicle did not report an error, but answered only requests for others.
+            For each name the parameter, or the error that :meth:`get` would have raised. The error's ``code`` is None
+            if the vehicle reported no error for this name, but answered requests for other names.
 
         Raises:
             InvalidArgument: a name is empty, or longer than 16 characters. Nothing was sent.
@@ -2234,7 +2239,7 @@ class Parameters(TwinOf["AsyncParameters"]):
         """Set one parameter; return the result as confirmed by the vehicle.
 
         Raises:
-            InvalidArgument: an invalid name, NaN, or a value that the parameter's type cannot represent.
+            InvalidArgument: the name is invalid, or the value is NaN or does not fit the parameter's type.
             ParameterRejected: the vehicle has no such parameter, or keeps the previous value; see ``code``.
             ParameterTimeout: not confirmed, but it may have been set.
         """
@@ -2248,9 +2253,9 @@ class Parameters(TwinOf["AsyncParameters"]):
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> dict[str, ParameterWrite]:
-        """Set several parameters concurrently; return a result for each of them: check its ``error``.
+        """Set several parameters concurrently; return a result for each of them. Check the ``error`` of each result.
 
-        Parameters that appear only when another one is set (ArduPilot's ``…_ENABLE``) are set after it.
+        A parameter that appears only after another one was set (ArduPilot's ``…_ENABLE``) is set after the other one.
 
         Raises:
             InvalidArgument: a name or value is invalid. Nothing was set.
@@ -2276,9 +2281,9 @@ class Parameters(TwinOf["AsyncParameters"]):
 
         ``method="ftp"`` writes one file (``@PARAM/param.pck``) and reads the values back, ``"set"`` sets them one by
         one, ``"auto"`` uses the file if the vehicle supports it and there are many changes. Results are as for
-        :meth:`set_many`; parameters that the vehicle does not have end as ``"failed"`` with ParameterRejected, and the
-        others are set. If two names mean the same parameter, the value under the vehicle's current name is used, and
-        the other name gets no result.
+        :meth:`set_many`; a parameter that the vehicle does not have gets the outcome ``"failed"`` and a
+        ParameterRejected, and all other parameters are set. If two names mean the same parameter, the value under the
+        vehicle's current name is used, and the other name gets no result.
 
         Raises:
             InvalidArgument, FileFormatError: a name, a value or the file is invalid. Nothing was set.
@@ -2302,9 +2307,10 @@ class Parameters(TwinOf["AsyncParameters"]):
         """Set values for the duration of an ``async with`` block and restore the previous ones at its end.
 
         They are also restored if the block raises or is cancelled, which takes up to ``idle_timeout_s`` seconds. If a
-        value cannot be set, the others are restored and its error is raised. Blocks may be nested and may overlap,
-        for the same parameter as well: it is restored to the value from before the first of them when the last one
-        ends. A value that another station has changed meanwhile stays, and a warning of logger "aerokit" names it.
+        value cannot be set, the others are restored and its error is raised. Blocks may be nested and may overlap, also
+        with the same parameter: when the last of these blocks ends, the parameter gets its value from before the first
+        block. A value that another station has changed meanwhile stays, and a warning of logger "aerokit" names the
+        parameter.
 
         Raises:
             RollbackFailed: values could not be restored; ``not_restored`` has them.
@@ -2315,7 +2321,7 @@ class Parameters(TwinOf["AsyncParameters"]):
         )
 
     def transaction(self, *, idle_timeout_s: float = IDLE_TIMEOUT_S) -> Transaction:
-        """Write several parameters, all or none: ``async with vehicle.parameters.transaction() as t: await
+        """Write all of several parameters, or none: ``async with vehicle.parameters.transaction() as t: await
         t.set(…)``.
 
         Each write is verified. If the block raises or is cancelled, or a write fails, the previous values are
@@ -2331,10 +2337,10 @@ class Parameters(TwinOf["AsyncParameters"]):
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> tuple[ParameterDifference, ...]:
-        """Compare the vehicle (``before``) with a table, a dict or a file (``after``), downloading it if needed.
+        """Compare the vehicle's parameters (``before``) with a table, a dict or a file (``after``).
 
-        Only names in ``parameters`` are compared; ``before`` is None for those that the vehicle does not have. Names
-        and units are the vehicle's.
+        The vehicle's parameters are downloaded if they are not known. Only names in ``parameters`` are compared;
+        ``before`` is None for a name that the vehicle does not have. Names and units in the result are the vehicle's.
         """
         return self._loop.run(
             self.aio.diff,
@@ -2354,7 +2360,7 @@ class Parameters(TwinOf["AsyncParameters"]):
         """Return the parameters that differ from their default, according to MAVFTP or the metadata.
 
         Raises:
-            NotSupported: the defaults are unknown, because neither of the two is available.
+            NotSupported: the defaults are unknown, because neither MAVFTP nor metadata with defaults is available.
         """
         return self._loop.run(
             self.aio.changed_from_default,
@@ -2439,16 +2445,16 @@ class CalibrationControl(TwinOf["AsyncCalibrationControl"]):
     def radio(self) -> Calibration:
         """Calibrate the remote control: write RCn_MIN, RCn_MAX and RCn_TRIM of each channel that was moved.
 
-        Two steps need a confirmation: after all sticks and switches were moved to their ends, and after the sticks were
-        centred.
+        Two steps need a confirmation: one after all sticks and switches were moved to their ends, one after the sticks
+        were centred.
         """
         return Calibration(self._loop, self._loop.call(self.aio.radio))
 
     def escs(self, *, intent: EscIntent) -> Calibration:
         """Calibrate the ESCs. **Remove the propellers**, because the motors get full throttle.
 
-        PX4 calibrates at once, while a person connects the battery. ArduCopter calibrates at the next boot, as the last
-        step says.
+        PX4 calibrates at once, while a person connects the battery. ArduCopter calibrates at its next boot; the last
+        step tells the person so.
 
         Args:
             intent: ``"propellers are removed"``.
@@ -2867,8 +2873,8 @@ class NtripClient(BlockTwin["AsyncNtripClient"]):
     bytes, which GPS_RTCM_DATA cannot carry, are dropped. Leaving the block closes the connection.
 
     Entering raises:
-        OperationRejected: the caster refused the user or the password, or has no such mount point (the text lists its
-            mount points).
+        OperationRejected: the caster refused the user or the password, or has no such mount point. The error text lists
+            the caster's mount points.
         LinkOpenError: the caster could not be reached.
         OperationTimeout: the caster did not answer in time.
         BusyError: the client was entered before; call ``ntrip()`` again.
@@ -2903,15 +2909,15 @@ class Rtk(TwinOf["AsyncRtk"]):
 
     @cached_property
     def corrections(self) -> StateCell[Corrections]:
-        """Number, bytes and bandwidth of the corrections. The age of this cell is the age of the last message."""
+        """Number, bytes and bandwidth of the corrections sent. The age of this cell is the age of the last message."""
         return StateCell(self._loop, self.aio.corrections)
 
     def send(self, rtcm: bytes) -> None:
         """Send RTCM 3 messages to the vehicle; never blocks.
 
         aerokit splits each message into GPS_RTCM_DATA. GPS_RTCM_DATA has no target and reaches all vehicles of the
-        connection. If several vehicles send the same message within 0.9 s, it is therefore transmitted once. There is
-        no acknowledgement: ``vehicle.gps`` shows whether the receiver uses the corrections.
+        connection. If you pass the same message to several vehicles within 0.9 s, aerokit therefore transmits it once.
+        There is no acknowledgement: ``vehicle.gps`` shows whether the receiver uses the corrections.
 
         Args:
             rtcm: one or more complete messages of at most 720 bytes each.
@@ -3430,7 +3436,7 @@ class Settings(TwinOf["AsyncSettings"]):
         idle_timeout_s: float = IDLE_TIMEOUT_S,
         timeout: float | None = None,
     ) -> CameraDefinition:
-        """Fetch the definition file that the camera names, and use it as :meth:`load` does.
+        """Fetch the definition file that the camera names, and use it from then on, like :meth:`load`.
 
         Args:
             uri: address of the file: ``mftp://`` is MAVFTP, ``mftp://[;comp=1]/…`` on another component; ``http://``
@@ -3456,7 +3462,8 @@ class Settings(TwinOf["AsyncSettings"]):
         )
 
     def options(self, name: str) -> Mapping[str, SettingValue]:
-        """Return the options of a setting that the known other settings allow, as a mapping of names to values.
+        """Return the options of a setting that the known values of other settings allow, as a mapping of names to
+        values.
 
         Empty without a definition, and for settings without options.
         """
@@ -3477,7 +3484,7 @@ class Settings(TwinOf["AsyncSettings"]):
         """Return all settings by name, in the component's order; immediately if they were downloaded before.
 
         Raises:
-            ParameterTimeout: the list is incomplete, or the component has none; ``table`` has the settings that
+            ParameterTimeout: the list is incomplete, or the component has no settings; ``table`` has those that
                 arrived.
         """
         return self._loop.run(
@@ -3489,7 +3496,7 @@ class Settings(TwinOf["AsyncSettings"]):
         )
 
     def get(self, name: str, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None) -> SettingValue:
-        """Request one value; for arguments and errors see :meth:`read`."""
+        """Request one setting from the component; for arguments and errors see :meth:`read`."""
         return self._loop.run(self.aio.get, name, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
     def read(self, name: str, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None) -> Setting:
@@ -3510,10 +3517,10 @@ class Settings(TwinOf["AsyncSettings"]):
         idle_timeout_s: float = IDLE_TIMEOUT_S,
         timeout: float | None = None,
     ) -> Setting:
-        """Set one setting; return it as confirmed by the component, which may have set another value.
+        """Set one setting and return the value that the component confirms, which may differ from ``value``.
 
-        With a definition, ``value`` may be the name of an option; settings that this one may change are read again
-        afterwards, and unknown settings that restrict it are read before.
+        With a definition, ``value`` may be the name of an option. Unknown settings that restrict this setting are read
+        before, and settings that it may change are read again afterwards.
 
         Raises:
             InvalidArgument: the name or value is invalid; or, with a definition, the value is not allowed, or the
@@ -3527,8 +3534,8 @@ class Settings(TwinOf["AsyncSettings"]):
 class Component(TwinOf["AsyncComponent"]):
     """One component of a vehicle: a camera, a gimbal, a companion computer, a receiver or another.
 
-    Returned by :meth:`aerokit.Vehicle.component`. It has its own commands, messages with rates, parameters and files,
-    which work like those of the autopilot. https://mavlink.io/en/services/component_information.html
+    Returned by :meth:`aerokit.Vehicle.component`. Commands, messages, rates, parameters and files of the component work
+    like those of the autopilot. https://mavlink.io/en/services/component_information.html
     """
 
     @property
@@ -3574,14 +3581,14 @@ class Component(TwinOf["AsyncComponent"]):
             timeout: seconds to wait for the address of the file.
 
         Raises:
-            NotSupported: the component has no such file, or the file is not on the vehicle.
+            NotSupported: the component has no such file, or names a file that is not stored on the vehicle.
             FileFormatError: the file is damaged.
             FileError, FileTimeout: the file cannot be read.
         """
         return self._loop.run(self.aio.metadata, kind, timeout=timeout)
 
     def fetch(self, uri: str, *, idle_timeout_s: float = 10.0) -> bytes:
-        """Return the content of a file, at most 16 MB, by an address that a component has reported.
+        """Return the content of the file at an address that a component has reported; at most 16 MB.
 
         Args:
             uri: ``mftp://path`` is on this component, ``mftp://[;comp=1]path`` on another component of the vehicle;
@@ -3604,7 +3611,7 @@ class Component(TwinOf["AsyncComponent"]):
         progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
     ) -> CommandAck:
-        """Send any MAV_CMD as COMMAND_LONG and return the ACCEPTED ack; as :meth:`aerokit.Vehicle.command`."""
+        """Send any MAV_CMD as COMMAND_LONG and return the ACCEPTED ack; see :meth:`aerokit.Vehicle.command`."""
         return self._loop.run(
             self.aio.command,
             command,
@@ -3643,9 +3650,9 @@ class Component(TwinOf["AsyncComponent"]):
         overflow: Overflow = "drop_oldest",
         rate_hz: float | None = None,
     ) -> Subscription[ItemT]:
-        """Subscribe to messages of this component and events about it, requested at ``rate_hz``.
+        """Subscribe to messages of this component, requested at ``rate_hz``, and to events about it.
 
-        As :meth:`aerokit.Vehicle.subscribe`.
+        Works like :meth:`aerokit.Vehicle.subscribe`.
         """
         return Subscription(
             self._loop,
@@ -3653,7 +3660,7 @@ class Component(TwinOf["AsyncComponent"]):
         )
 
     def message(self, message_type: type[MessageT], *, rate_hz: float | None = None) -> StateCell[MessageT]:
-        """Return a cell with the component's latest message of a type; as :meth:`aerokit.Vehicle.message`."""
+        """Return a cell with the component's latest message of a type; see :meth:`aerokit.Vehicle.message`."""
         return StateCell(self._loop, self._loop.call(self.aio.message, message_type, rate_hz=rate_hz))
 
     def rate(self, message_type: type[Message], rate_hz: float) -> AbstractContextManager[None]:
@@ -3672,7 +3679,7 @@ class Component(TwinOf["AsyncComponent"]):
 
     @cached_property
     def settings(self) -> Settings:
-        """The component's settings (PARAM_EXT). A camera definition file explains those of a camera."""
+        """The component's settings (PARAM_EXT). A camera definition file explains the settings of a camera."""
         return Settings(self._loop, self._loop.call(lambda: self.aio.settings))
 
 
@@ -5044,12 +5051,12 @@ class Vehicle(VehicleTwin):
             NotSupported: this type of vehicle has no precision landing. Nothing was sent.
             CommandRejected: the vehicle refused the mode.
             CommandTimeout: there was no acknowledgement.
-            OperationRejected: a parameter makes the vehicle ignore the target (nothing else was sent); or, after the
-                start, the mode changed, another order was given, or the vehicle fell.
+            OperationRejected: a parameter makes the vehicle ignore the target, and nothing else was sent; or the mode
+                changed, another order was given, or the vehicle fell after the start.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the target was not visible in time (the landing was not ordered), or the vehicle was not
                 on the ground in time.
-            ParameterTimeout: the vehicle did not report the parameters that decide about this.
+            ParameterTimeout: the vehicle did not report a parameter that aerokit must check first.
         """
         return self._loop.run(
             self.aio.land_on,
@@ -5114,8 +5121,8 @@ class Vehicle(VehicleTwin):
         """Return the altitude above home, in metres, at which the vehicle returns to launch.
 
         Reads RTL_ALT_M (ArduCopter 4.7; before that RTL_ALT, in centimetres), RTL_ALTITUDE (ArduPlane; before 4.5
-        ALT_HOLD_RTL), Q_RTL_ALT (ArduPilot's VTOL planes, which return in QRTL) or RTL_RETURN_ALT (PX4). A vehicle that
-        returns at its present altitude reports −1 (ArduPlane) or 0 (ArduCopter).
+        ALT_HOLD_RTL), Q_RTL_ALT (ArduPilot's VTOL planes, which return in QRTL) or RTL_RETURN_ALT (PX4). If the vehicle
+        is set to return at its present altitude, the result is −1 (ArduPlane) or 0 (ArduCopter).
 
         Raises:
             NotSupported: this type of vehicle does not climb for a return. Nothing was sent.
@@ -5127,8 +5134,8 @@ class Vehicle(VehicleTwin):
     def set_return_altitude(self, altitude_m: float) -> None:
         """Set the altitude of returns to launch; returns when the vehicle has confirmed the value.
 
-        Writes the parameter that :meth:`return_altitude` reads, so the value survives a reboot. A vehicle that is above
-        this altitude returns at its own altitude.
+        Writes the parameter that :meth:`return_altitude` reads, so the value survives a reboot. A vehicle that is
+        higher than this when the return starts keeps its height.
 
         Args:
             altitude_m: metres above home, above 0, at most 3,000. Q_RTL_ALT holds whole metres only.
@@ -5136,7 +5143,7 @@ class Vehicle(VehicleTwin):
         Raises:
             InvalidArgument: the altitude is out of range, or has a fraction that the parameter cannot hold.
             NotSupported: this type of vehicle does not climb for a return. Nothing was sent.
-            ParameterRejected: the vehicle has no such parameter, or keeps the previous value.
+            ParameterRejected: the vehicle has no such parameter, or kept the previous value.
             ParameterTimeout: not confirmed, but it may have been set.
         """
         self._loop.run(self.aio.set_return_altitude, altitude_m)
@@ -5146,7 +5153,7 @@ class Vehicle(VehicleTwin):
 
         **The key is sent unencrypted**: do this over a cable or a private link. Returns when the vehicle's frames are
         signed with the key. Every other vehicle on this connection needs the key too, or ``signing.allow_unsigned``.
-        After a cancellation the vehicle may have accepted the key nevertheless. See docs/signing.md.
+        If you cancel the call, the vehicle may still have accepted the key. See docs/signing.md.
 
         Args:
             signing: the key, as for ``connect(signing=…)``.
@@ -5155,7 +5162,7 @@ class Vehicle(VehicleTwin):
         Raises:
             NotSupported: this program or the vehicle uses MAVLink 1, which has no signatures. Nothing was sent.
             OperationRejected: the vehicle is armed, or not known to be disarmed. Nothing was sent.
-            OperationTimeout: the vehicle did not change; the text includes its status texts.
+            OperationTimeout: the vehicle did not start to use the key; the error text includes its status texts.
             BusyError: another key exchange is in progress on this connection. Nothing was sent.
         """
         self._loop.run(self.aio.setup_signing, signing, timeout=timeout)
@@ -5262,8 +5269,8 @@ def connect(
             connection; pass them to ``open_connection``.
         system_id: the vehicle's MAVLink system id, 1–255; None means the first autopilot found.
         timeout: seconds to wait for the vehicle's first heartbeat, above 0.
-        rates: message class → Hz (above 0, at most 1000), requested instead of the default rates; ``{}`` requests
-            nothing.
+        rates: rates to request instead of the default ones, as a mapping of message class to Hz (above 0, at most
+            1000). ``{}`` requests nothing.
         source_system: our own system id.
         source_component: our own component id, 0–255. 0 is not a valid component id, but some old programs use it.
         baud: baud rate of a serial link whose address has none.
@@ -5275,11 +5282,11 @@ def connect(
         reconnect: reopen a lost link, with as many attempts as it needs, instead of ending the connection.
         peers: accept datagrams and connections only from these IP addresses and networks: ``"10.0.0.7"``,
             ``["10.0.0.0/24"]``. For links with an open port: udpin, udpbcast, tcpin. None: accept all.
-        may_move: accept a silent vehicle from a new IP address even if its sequence numbers and time since boot do
-            not continue, as after a reboot with a new address. By default such an address is refused
+        may_move: accept a vehicle that fell silent and returns from a new IP address, even if its sequence numbers and
+            time since boot do not continue (for example after a reboot). By default such an address is refused
             (``RouteChangeRefused``), because it may belong to another sender.
-        heartbeat: contents and condition of our own HEARTBEAT. None: no heartbeat is sent, and the vehicle sees no
-            ground station: PX4 then sends no status texts, and a ``udpout:`` link stays silent.
+        heartbeat: contents of our own HEARTBEAT, and the condition under which it is sent. None: no heartbeat is sent,
+            so the vehicle sees no ground station. PX4 then sends no status texts, and a ``udpout:`` link stays silent.
         share: addresses at which ground stations and other programs use the same link: ``["tcpin:127.0.0.1:5760"]``
             (docs/hub.md). They should use other ids than this program. For an open connection use ``async with
             aerokit.hub.shared(connection, […])``.
@@ -5289,7 +5296,8 @@ def connect(
         BusyError: this connection already has a vehicle object for this system.
         LinkOpenError: the link, a shared link or the recording could not be opened.
         LinkLost, ConnectionClosed: the link failed while waiting, or the connection was closed.
-        ConnectFailed: no heartbeat of such a vehicle arrived in time; the error text says what was received instead.
+        ConnectFailed: no heartbeat of the requested vehicle arrived in time; the error text says what was received
+            instead.
     """
     return opened(
         Vehicle,

@@ -84,8 +84,8 @@ async def connect(
             connection; pass them to ``open_connection``.
         system_id: the vehicle's MAVLink system id, 1–255; None means the first autopilot found.
         timeout: seconds to wait for the vehicle's first heartbeat, above 0.
-        rates: message class → Hz (above 0, at most 1000), requested instead of the default rates; ``{}`` requests
-            nothing.
+        rates: rates to request instead of the default ones, as a mapping of message class to Hz (above 0, at most
+            1000). ``{}`` requests nothing.
         source_system: our own system id.
         source_component: our own component id, 0–255. 0 is not a valid component id, but some old programs use it.
         baud: baud rate of a serial link whose address has none.
@@ -97,11 +97,11 @@ async def connect(
         reconnect: reopen a lost link, with as many attempts as it needs, instead of ending the connection.
         peers: accept datagrams and connections only from these IP addresses and networks: ``"10.0.0.7"``,
             ``["10.0.0.0/24"]``. For links with an open port: udpin, udpbcast, tcpin. None: accept all.
-        may_move: accept a silent vehicle from a new IP address even if its sequence numbers and time since boot do
-            not continue, as after a reboot with a new address. By default such an address is refused
+        may_move: accept a vehicle that fell silent and returns from a new IP address, even if its sequence numbers and
+            time since boot do not continue (for example after a reboot). By default such an address is refused
             (``RouteChangeRefused``), because it may belong to another sender.
-        heartbeat: contents and condition of our own HEARTBEAT. None: no heartbeat is sent, and the vehicle sees no
-            ground station: PX4 then sends no status texts, and a ``udpout:`` link stays silent.
+        heartbeat: contents of our own HEARTBEAT, and the condition under which it is sent. None: no heartbeat is sent,
+            so the vehicle sees no ground station. PX4 then sends no status texts, and a ``udpout:`` link stays silent.
         share: addresses at which ground stations and other programs use the same link: ``["tcpin:127.0.0.1:5760"]``
             (docs/hub.md). They should use other ids than this program. For an open connection use ``async with
             aerokit.hub.shared(connection, […])``.
@@ -111,7 +111,8 @@ async def connect(
         BusyError: this connection already has a vehicle object for this system.
         LinkOpenError: the link, a shared link or the recording could not be opened.
         LinkLost, ConnectionClosed: the link failed while waiting, or the connection was closed.
-        ConnectFailed: no heartbeat of such a vehicle arrived in time; the error text says what was received instead.
+        ConnectFailed: no heartbeat of the requested vehicle arrived in time; the error text says what was received
+            instead.
     """
     _check(system_id, timeout, rates, address.bus.dialect if isinstance(address, Connection) else dialect)
     if isinstance(address, Connection):
@@ -221,7 +222,7 @@ async def _attached(
 
 
 def warn_if_left_flying(vehicle: Vehicle) -> None:
-    """Log a warning if your program leaves the block while the vehicle executes its orders."""
+    """Log a warning if the program leaves the block while the vehicle still executes the program's orders."""
     if vehicle._arbiter.may_be_executing and not vehicle.is_confirmed_disarmed:
         logger.warning("the block of vehicle %d was left: %s", vehicle.system_id, vehicle.describe_now())
 
@@ -285,7 +286,7 @@ class _Search:
         self._ended.set()
 
     def _is_alone(self, frame: Frame) -> bool:
-        """Return True once component 1 has had time to send a heartbeat, if this autopilot is another component."""
+        """Count the heartbeats of an autopilot other than component 1; return True after ``MIN_LONE_HEARTBEATS``."""
         source = (frame.system_id, frame.component_id)
         if source not in self._others and len(self._others) >= MAX_ROUTES:
             return False
@@ -307,7 +308,7 @@ class _Search:
         return found
 
     def forget(self) -> None:
-        """Close the vehicle if the caller was cancelled before it took the result."""
+        """Close the vehicle if the caller was cancelled before it received the result."""
         self._ended.set()
         if self._found is not None:
             session = self._found[0].session
@@ -328,12 +329,12 @@ async def vehicles_on(
     """Connect to every vehicle found on a connection, for the duration of the block.
 
     A vehicle that falls silent stays in the mapping: its cells have ages, and ``link_state`` reports the silence.
-    Vehicles to which this program is connected already are left out.
+    Vehicles that this program is already connected to are left out.
 
     Args:
         connection: the result of :func:`aerokit.open_connection`.
-        rates: message class → Hz, requested from each vehicle, as by :func:`aerokit.connect`; ``{}`` requests
-            nothing.
+        rates: rates to request from each vehicle, as a mapping of message class to Hz; see :func:`aerokit.connect`.
+            ``{}`` requests nothing.
         on_found: called in the loop with each new vehicle.
 
     Returns:
@@ -352,7 +353,7 @@ async def vehicles_on(
                 if on_found is not None:
                     on_found(vehicle)
                 await asyncio.Event().wait()
-        # The vehicle fell silent again, is connected already, or the connection has ended.
+        # The vehicle fell silent again, the program is connected to it already, or the connection has ended.
         except AerokitError as error:
             logger.info("system %d was not connected: %s", system_id, error)
 

@@ -47,7 +47,9 @@ GIMBAL_MESSAGE_IDS = tuple(
 )
 
 PICTURE_MESSAGE_IDS = tuple(MESSAGE_IDS[name] for name in ("CameraImageCaptured", "CameraFeedback", "CameraTrigger"))
-"""Message ids of camera triggers. Looked up by name, because only programs that use cameras need the classes."""
+"""Ids of the messages that report a picture. Looked up by name, so that programs without cameras do not import the
+classes.
+"""
 
 
 @checks_arguments
@@ -82,8 +84,8 @@ class Vehicle(
             first(PICTURE_MESSAGE_IDS, lambda: self._cameras),
         )
 
-    # Sub-objects are imported and created on first use, or when the vehicle first sends a message that they
-    # handle.
+    # A sub-object is imported and created on first use, or when the vehicle first sends a message that the sub-object
+    # handles.
 
     @property
     def components(self) -> StateCell[tuple[ComponentStatus, ...]]:
@@ -214,12 +216,12 @@ class Vehicle(
             NotSupported: this type of vehicle has no precision landing. Nothing was sent.
             CommandRejected: the vehicle refused the mode.
             CommandTimeout: there was no acknowledgement.
-            OperationRejected: a parameter makes the vehicle ignore the target (nothing else was sent); or, after the
-                start, the mode changed, another order was given, or the vehicle fell.
+            OperationRejected: a parameter makes the vehicle ignore the target, and nothing else was sent; or the mode
+                changed, another order was given, or the vehicle fell after the start.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the target was not visible in time (the landing was not ordered), or the vehicle was not
                 on the ground in time.
-            ParameterTimeout: the vehicle did not report the parameters that decide about this.
+            ParameterTimeout: the vehicle did not report a parameter that aerokit must check first.
         """
         from aerokit.vehicle.external.landing import land_on
 
@@ -297,8 +299,8 @@ class Vehicle(
         """Return the altitude above home, in metres, at which the vehicle returns to launch.
 
         Reads RTL_ALT_M (ArduCopter 4.7; before that RTL_ALT, in centimetres), RTL_ALTITUDE (ArduPlane; before 4.5
-        ALT_HOLD_RTL), Q_RTL_ALT (ArduPilot's VTOL planes, which return in QRTL) or RTL_RETURN_ALT (PX4). A vehicle that
-        returns at its present altitude reports −1 (ArduPlane) or 0 (ArduCopter).
+        ALT_HOLD_RTL), Q_RTL_ALT (ArduPilot's VTOL planes, which return in QRTL) or RTL_RETURN_ALT (PX4). If the vehicle
+        is set to return at its present altitude, the result is −1 (ArduPlane) or 0 (ArduCopter).
 
         Raises:
             NotSupported: this type of vehicle does not climb for a return. Nothing was sent.
@@ -312,8 +314,8 @@ class Vehicle(
     async def set_return_altitude(self, altitude_m: float) -> None:
         """Set the altitude of returns to launch; returns when the vehicle has confirmed the value.
 
-        Writes the parameter that :meth:`return_altitude` reads, so the value survives a reboot. A vehicle that is above
-        this altitude returns at its own altitude.
+        Writes the parameter that :meth:`return_altitude` reads, so the value survives a reboot. A vehicle that is
+        higher than this when the return starts keeps its height.
 
         Args:
             altitude_m: metres above home, above 0, at most 3,000. Q_RTL_ALT holds whole metres only.
@@ -321,7 +323,7 @@ class Vehicle(
         Raises:
             InvalidArgument: the altitude is out of range, or has a fraction that the parameter cannot hold.
             NotSupported: this type of vehicle does not climb for a return. Nothing was sent.
-            ParameterRejected: the vehicle has no such parameter, or keeps the previous value.
+            ParameterRejected: the vehicle has no such parameter, or kept the previous value.
             ParameterTimeout: not confirmed, but it may have been set.
         """
         from aerokit.vehicle.parameters.return_altitude import write_return_altitude
@@ -336,7 +338,7 @@ class Vehicle(
 
         **The key is sent unencrypted**: do this over a cable or a private link. Returns when the vehicle's frames are
         signed with the key. Every other vehicle on this connection needs the key too, or ``signing.allow_unsigned``.
-        After a cancellation the vehicle may have accepted the key nevertheless. See docs/signing.md.
+        If you cancel the call, the vehicle may still have accepted the key. See docs/signing.md.
 
         Args:
             signing: the key, as for ``connect(signing=…)``.
@@ -345,7 +347,7 @@ class Vehicle(
         Raises:
             NotSupported: this program or the vehicle uses MAVLink 1, which has no signatures. Nothing was sent.
             OperationRejected: the vehicle is armed, or not known to be disarmed. Nothing was sent.
-            OperationTimeout: the vehicle did not change; the text includes its status texts.
+            OperationTimeout: the vehicle did not start to use the key; the error text includes its status texts.
             BusyError: another key exchange is in progress on this connection. Nothing was sent.
         """
         from aerokit.vehicle.session.signing import set_up_signing

@@ -1,4 +1,6 @@
-"""``CalibrationControl``: starts the calibrations of a vehicle. ``Calibration``: iterates over the steps of one."""
+"""``CalibrationControl``: starts the calibrations of a vehicle. ``Calibration``: iterates over the steps of a
+calibration.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,7 @@ if TYPE_CHECKING:
 __all__ = ["Calibration", "CalibrationControl", "EscIntent"]
 
 EscIntent = Literal["propellers are removed"]
-"""Confirms that the motors may turn."""
+"""Text with which the caller confirms that the motors may turn."""
 
 
 class Calibration(AsyncIterator["CalibrationStep"]):
@@ -82,9 +84,10 @@ class Calibration(AsyncIterator["CalibrationStep"]):
             await self._run.wait_cancelled()
 
     def __del__(self) -> None:
-        # A loop that is left by ``break`` does not call the iterator. The blocking twin may drop it on another thread.
+        # A loop that is left by ``break`` does not call the iterator, so the iterator cancels when it is deleted. The
+        # blocking twin may delete it on another thread.
         if getattr(self, "_loop", None) is not None and not self._is_over:
-            with suppress(RuntimeError):  # the loop is closed
+            with suppress(RuntimeError):  # The event loop may be closed.
                 self._loop.call_soon_threadsafe(_abandon, self._run, self._steps)  # type: ignore[union-attr]
 
 
@@ -141,16 +144,16 @@ class CalibrationControl:
     def radio(self) -> Calibration:
         """Calibrate the remote control: write RCn_MIN, RCn_MAX and RCn_TRIM of each channel that was moved.
 
-        Two steps need a confirmation: after all sticks and switches were moved to their ends, and after the sticks were
-        centred.
+        Two steps need a confirmation: one after all sticks and switches were moved to their ends, one after the sticks
+        were centred.
         """
         return self._start("radio", procedures.radio_by_channels, px4=procedures.radio_by_channels)
 
     def escs(self, *, intent: EscIntent) -> Calibration:
         """Calibrate the ESCs. **Remove the propellers**, because the motors get full throttle.
 
-        PX4 calibrates at once, while a person connects the battery. ArduCopter calibrates at the next boot, as the last
-        step says.
+        PX4 calibrates at once, while a person connects the battery. ArduCopter calibrates at its next boot; the last
+        step tells the person so.
 
         Args:
             intent: ``"propellers are removed"``.
@@ -163,7 +166,9 @@ class CalibrationControl:
     def _start(
         self, sensor: str, ardupilot: Procedure, *params: float, px4: Procedure = procedures.by_texts
     ) -> Calibration:
-        """Prepare a calibration. ``params`` are those of the start command; some ArduPilot procedures ignore them."""
+        """Prepare a calibration. ``params`` are the parameters of the start command; some ArduPilot procedures ignore
+        them.
+        """
         run = CalibrationRun(self._context, sensor, self._runs, self._parameters)
         is_px4 = self._context.session.autopilot.calibration_protocol == "texts"
         return Calibration(run, (px4 if is_px4 else ardupilot)(run, *params))

@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
 CANCEL_ALL = (MavCmd.PREFLIGHT_CALIBRATION, 0, 0, 0, 0, 0, 0, 0)
 REPORT_HZ = 4.0
-# PX4's HEARTBEAT leaves CALIBRATING before the last text arrives.
+# Seconds to wait for the last text: PX4's HEARTBEAT leaves CALIBRATING before the text arrives.
 END_GRACE_S = 3.0
-# A cancelled call ends within two seconds.
+# Below two seconds, because a cancelled call must end within that time.
 RESTORE_TIMEOUT_S = 1.5
 # ArduPilot repeats its request every second. If a request arrives this soon after our confirmation, ArduPilot sent it
 # before the confirmation arrived.
@@ -42,7 +42,7 @@ IS_NOT_CANCELLED = "ArduPilot cannot cancel it: it waits for the next pose, and 
 
 
 async def by_texts(run: CalibrationRun, *params: float) -> AsyncGenerator[CalibrationStep, None]:
-    """PX4: detect the poses on the vehicle; the reports are ``[cal]`` status texts."""
+    """PX4: yield a step for each ``[cal]`` status text. PX4 itself detects the poses."""
     await run.begin(CANCEL_ALL)
     telemetry, now = run.session.telemetry, run.session.connection.now
     reports: deque[CalibrationReport] = deque()
@@ -101,7 +101,7 @@ def _after(step: CalibrationStep, report: CalibrationReport) -> CalibrationStep:
 
 
 async def acknowledged(run: CalibrationRun, *params: float, instruction: str) -> AsyncGenerator[CalibrationStep, None]:
-    """ArduPilot: send one command, whose acknowledgement is the result."""
+    """ArduPilot: run a calibration that consists of one command. The acknowledgement of the command is the result."""
     run.check_ready()
     yield run.step(None, instruction)
     await run.begin(None)
@@ -137,7 +137,7 @@ async def ardupilot_escs(run: CalibrationRun, *_: float) -> AsyncGenerator[Calib
 
 
 async def _restore(run: CalibrationRun, name: str, value: float) -> None:
-    """Restore a parameter that makes the motors turn at the next boot; log a warning if that is not confirmed."""
+    """Restore the parameter that starts the calibration at boot; log a warning if this is not confirmed."""
     with anyio.CancelScope(shield=True), anyio.move_on_after(RESTORE_TIMEOUT_S), suppress(AerokitError):
         if run.context.arbiter.is_known:
             await run.parameters().set(name, value)
@@ -222,7 +222,8 @@ async def ardupilot_accelerometer(run: CalibrationRun, *params: float) -> AsyncG
 
     with ExitStack() as ends:
         await run.start(*params)
-        # Attach only now: until this calibration starts, ArduPilot broadcasts the result of an earlier one.
+        # The handler is attached only now: until this calibration starts, ArduPilot broadcasts the result of an earlier
+        # one.
         ends.callback(run.session.connection.bus.attach(CommandLong, on_request, system_id=run.session.system_id))
         while True:
             await run.wait(lambda: requests)
@@ -246,11 +247,11 @@ async def ardupilot_accelerometer(run: CalibrationRun, *params: float) -> AsyncG
 
 MIN_CHANNELS, MIN_TRAVEL_US = 4, 300
 CHANNELS_TIMEOUT_S = 5.0
-# RCn_MIN and RCn_MAX have these ranges on both firmwares (RC_Channel.cpp, PX4 rc_params).
+# RCn_MIN must be between the first two values, RCn_MAX between the last two (RC_Channel.cpp, PX4 rc_params).
 LOWEST_US, MIDDLE_US, HIGHEST_US = 800, 1500, 2200
 ENDED_RC = (
     MavResult.UNSUPPORTED,
-)  # ArduPilot executes the command (it prevents arming meanwhile) and answers UNSUPPORTED.
+)  # ArduPilot answers UNSUPPORTED although it executes the command, which prevents arming meanwhile.
 
 
 async def radio_by_channels(run: CalibrationRun, *_: float) -> AsyncGenerator[CalibrationStep, None]:
@@ -297,6 +298,6 @@ async def radio_by_channels(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
 
 
 def _pulses(value: object) -> dict[int, int]:
-    """Return the pulses in µs of the channels that are received, by number from 1."""
+    """Map the number of each received channel, from 1, to its pulse width in µs."""
     pulses: tuple[int | None, ...] = getattr(value, "channels_us", ())
     return {number: pulse for number, pulse in enumerate(pulses, 1) if pulse}

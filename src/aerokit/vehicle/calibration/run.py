@@ -1,4 +1,4 @@
-"""`CalibrationRun`: one calibration on the vehicle: its start, its end, and its cancellation."""
+"""`CalibrationRun`: starts, ends and cancels one calibration on the vehicle."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ CONFIRM_POLL_INTERVAL_S = 0.1
 
 
 class CalibrationRun:
-    """One calibration, which counts as running from the first transmission until ``finish`` or a confirmed cancel."""
+    """One calibration. It counts as running from its first command until ``finish`` or a confirmed cancellation."""
 
     def __init__(
         self, context: VehicleContext, sensor: str, runs: list[CalibrationRun], parameters: Callable[[], Parameters]
@@ -56,7 +56,7 @@ class CalibrationRun:
         self.sensor: str = sensor
         self.parameters: Callable[[], Parameters] = parameters
         self.what: str = f"calibrate.{sensor}"
-        self._runs = runs  # the runs of this vehicle that may be in progress
+        self._runs = runs  # all runs of this vehicle that may be in progress
         self.step: partial[CalibrationStep] = partial(CalibrationStep, sensor)
         self._cancel: tuple[float, ...] | None = None
         self._why_not_cancelled = ""
@@ -70,7 +70,9 @@ class CalibrationRun:
     # ------------------------------------------------------------------------------- start and end
 
     def check_ready(self) -> None:
-        """Raise OperationRejected unless the vehicle is known to be disarmed, NotSupported for an unknown firmware."""
+        """Raise OperationRejected unless the vehicle is known to be disarmed, and NotSupported if its firmware is
+        unknown.
+        """
         autopilot = self.session.autopilot
         if not autopilot.calibration_protocol:
             raise NotSupported(
@@ -79,7 +81,7 @@ class CalibrationRun:
         self.session.check_disarmed(self.what, is_current=self.context.arbiter.is_known)
 
     async def begin(self, cancel: tuple[float, ...] | None, why_not_cancelled: str = "") -> None:
-        """Wait for the end of a calibration that is being cancelled, then register this one as running.
+        """Wait until no other calibration is being cancelled, then register this calibration as running.
 
         Args:
             cancel: the command that cancels the calibration, with its parameters; None if there is no such command.
@@ -88,7 +90,7 @@ class CalibrationRun:
         self.check_ready()
         await (
             anyio.lowlevel.checkpoint()
-        )  # A dropped iterator abandons its run in the next iteration of the event loop.
+        )  # When an iterator is deleted, its run is abandoned only in the next iteration of the event loop.
         for run in tuple(self._runs):
             if not run._is_abandoned:
                 raise BusyError(f"{self.what}: {run.what} is in progress; nothing was sent")
@@ -148,7 +150,7 @@ class CalibrationRun:
             self.finish()
             return
         arbiter = self.context.arbiter
-        # The arbiter ends this order when another party takes over; the cancel command is not repeated then.
+        # The arbiter ends this order when another party takes over, and the cancel command is then not repeated.
         self._sent = self._watch.enter_context(arbiter.sending(self._watch.enter_context(arbiter.auxiliary_order())))
         if self.session.connection.is_open and arbiter.is_known:
             self._send_cancel(*self._cancel)
@@ -171,12 +173,15 @@ class CalibrationRun:
             )
 
     def _send_cancel(self, command: float, *params: float) -> None:
-        # Callers send it only while the vehicle's state is known. A repeated cancel has no further effect.
+        # Callers send the cancel command only while the vehicle's state is known. Sending it again has no further
+        # effect.
         self._cancelled_at = self.session.connection.now()
         self.session.commands.send_unconfirmed(int(command), *params)
 
     async def _confirm_cancel(self) -> None:
-        """Send the cancel command, if it was not sent yet, and repeat it until the vehicle confirms it."""
+        """Send the cancel command unless it was already sent, and repeat it until the vehicle confirms the
+        cancellation.
+        """
         assert self._cancel is not None
         try:
             for _ in range(MAX_CANCEL_ATTEMPTS):
@@ -197,9 +202,9 @@ class CalibrationRun:
             self.finish()
 
     def _is_cancelled(self, command: float) -> bool:
-        """Return True if the vehicle has confirmed: ArduPilot by COMMAND_ACK, PX4 by HEARTBEAT.
+        """Return True if the vehicle has confirmed the cancellation: ArduPilot by COMMAND_ACK, PX4 by HEARTBEAT.
 
-        PX4 sends two acknowledgements with different results.
+        PX4's acknowledgements are no confirmation, because PX4 sends two with different results.
         """
         if self._has_rebooted:
             return True
@@ -217,7 +222,7 @@ class CalibrationRun:
         timeout: float = REPORT_TIMEOUT_S,
         missing: str = "the vehicle reported nothing about the calibration",
     ) -> None:
-        """Wait for the next report. Errors as for `await_progress`."""
+        """Wait for the vehicle's next report. Raises as `await_progress`."""
         await await_progress(
             self.session,
             self.what,

@@ -79,7 +79,7 @@ SIDES = {
     "down": CalibrationPose.LEVEL,
 }
 _SIDE = "|".join(SIDES)
-# Formats of calibration_messages.h and calibration_routines.cpp.
+# Formats of PX4's texts, from calibration_messages.h and calibration_routines.cpp.
 _FORMATS = {
     "started": r"calibration started: 2 \w+",
     "done": r"calibration done: \w+",
@@ -95,7 +95,7 @@ _FORMATS = {
 
 
 class CalibrationReport(Snapshot):
-    """One ``[cal]`` text of PX4. ``kind`` is a key of the formats, or ``"text"``; ``text`` has no prefix."""
+    """One ``[cal]`` text of PX4. ``kind`` is a key of ``_FORMATS``, or ``"text"``; ``text`` lacks ``[cal]``."""
 
     kind: str
     text: str

@@ -72,7 +72,7 @@ class StickStream(SteeringStream[StickInput]):
         NotSupported: this type of vehicle has no sticks. Nothing was sent.
         OperationRejected: a parameter makes the vehicle ignore the sticks, or never release them; the error text names
             it.
-        ParameterTimeout: the vehicle did not report the parameters that decide about this. Nothing else was sent.
+        ParameterTimeout: the vehicle did not report a parameter that aerokit must check first. Nothing else was sent.
         CommandRejected: the vehicle refused the mode.
         BusyError: another set-point stream is open.
     """

@@ -50,8 +50,8 @@ class ComponentStatus(Snapshot):
     """One component of the vehicle's system.
 
     ``kind`` is ``"autopilot"``, ``"camera"``, ``"gimbal"``, ``"onboard_controller"``, ``"adsb"``, ``"parachute"`` …:
-    MAV_TYPE in lower case. ``device_id`` is 1 to 6 for a camera or gimbal without its own component id, attached to
-    this component, otherwise 0. ``received_at`` is the loop time of its last message.
+    MAV_TYPE in lower case. ``device_id`` is 1 to 6 for a camera or gimbal that has no component id of its own and is
+    attached to this component, otherwise 0. ``received_at`` is the loop time of the component's last message.
     """
 
     component_id: int
@@ -76,7 +76,7 @@ class ComponentInformation(Snapshot):
 
 
 def kind_of(heartbeat: Heartbeat | None, component_id: int) -> str:
-    """Return the kind by MAV_TYPE, or by component id if the type is generic."""
+    """Return the kind of a component according to its MAV_TYPE, or to its component id if the type is generic."""
     if heartbeat is not None and is_autopilot(heartbeat):
         return "autopilot"
     if heartbeat is not None and heartbeat.type != MavType.GENERIC:
@@ -104,8 +104,8 @@ ATTEMPT_TIMEOUT_S, REQUEST_ATTEMPTS = 1.0, 3
 class Component(ReadOnly):
     """One component of a vehicle: a camera, a gimbal, a companion computer, a receiver or another.
 
-    Returned by :meth:`aerokit.Vehicle.component`. It has its own commands, messages with rates, parameters and files,
-    which work like those of the autopilot. https://mavlink.io/en/services/component_information.html
+    Returned by :meth:`aerokit.Vehicle.component`. Commands, messages, rates, parameters and files of the component work
+    like those of the autopilot. https://mavlink.io/en/services/component_information.html
     """
 
     def __init__(
@@ -170,7 +170,7 @@ class Component(ReadOnly):
             timeout: seconds to wait for the address of the file.
 
         Raises:
-            NotSupported: the component has no such file, or the file is not on the vehicle.
+            NotSupported: the component has no such file, or names a file that is not stored on the vehicle.
             FileFormatError: the file is damaged.
             FileError, FileTimeout: the file cannot be read.
         """
@@ -186,7 +186,7 @@ class Component(ReadOnly):
         raise NotSupported(f"component {self.component_id} has no {kind} metadata")
 
     async def fetch(self, uri: str, *, idle_timeout_s: float = 10.0) -> bytes:
-        """Return the content of a file, at most 16 MB, by an address that a component has reported.
+        """Return the content of the file at an address that a component has reported; at most 16 MB.
 
         Args:
             uri: ``mftp://path`` is on this component, ``mftp://[;comp=1]path`` on another component of the vehicle;
@@ -214,7 +214,7 @@ class Component(ReadOnly):
         progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
     ) -> CommandAck:
-        """Send any MAV_CMD as COMMAND_LONG and return the ACCEPTED ack; as :meth:`aerokit.Vehicle.command`."""
+        """Send any MAV_CMD as COMMAND_LONG and return the ACCEPTED ack; see :meth:`aerokit.Vehicle.command`."""
         return await self._sender.answered(
             self._session.commands.send_long,
             command,
@@ -279,14 +279,14 @@ class Component(ReadOnly):
         overflow: Overflow = "drop_oldest",
         rate_hz: float | None = None,
     ) -> Subscription[ItemT]:
-        """Subscribe to messages of this component and events about it, requested at ``rate_hz``.
+        """Subscribe to messages of this component, requested at ``rate_hz``, and to events about it.
 
-        As :meth:`aerokit.Vehicle.subscribe`.
+        Works like :meth:`aerokit.Vehicle.subscribe`.
         """
         return self._session.subscriber.subscribe(types, capacity, overflow, rate_hz)
 
     def message(self, message_type: type[MessageT], *, rate_hz: float | None = None) -> StateCell[MessageT]:
-        """Return a cell with the component's latest message of a type; as :meth:`aerokit.Vehicle.message`."""
+        """Return a cell with the component's latest message of a type; see :meth:`aerokit.Vehicle.message`."""
         return self._session.subscriber.cell(message_type, rate_hz)
 
     @contextmanager
@@ -310,7 +310,7 @@ class Component(ReadOnly):
 
     @cached_property
     def settings(self) -> Settings:
-        """The component's settings (PARAM_EXT). A camera definition file explains those of a camera."""
+        """The component's settings (PARAM_EXT). A camera definition file explains the settings of a camera."""
         from aerokit.vehicle.components.settings import Settings
 
         async def information() -> m.CameraInformation:
@@ -381,7 +381,7 @@ class Components:
                 self._on_heartbeat(heartbeat)
 
     def component(self, component_id: int) -> Component:
-        """Return the object for a component id, always the same one, whether or not it has been discovered."""
+        """Return the object for a component id, always the same object. The component need not have been discovered."""
         if not 1 <= component_id <= 255:
             raise InvalidArgument(f"component_id = {component_id} is not allowed: 1 to 255")
         if component_id not in self._by_id:

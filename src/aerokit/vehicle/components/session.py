@@ -1,4 +1,4 @@
-"""``ComponentSession``: commands, rates and transfers of one component; and reading files by their address."""
+"""``ComponentSession``: commands, rates and transfers of one component. ``fetch``: reads a file by its address."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 
 class ComponentSession:
-    """Like the session of the autopilot, with another component id. Closed with the vehicle."""
+    """Session with a component other than the autopilot. Works like `VehicleSession`, and closes with the vehicle."""
 
     def __init__(self, session: VehicleSession, component_id: int) -> None:
         self._session = session
@@ -106,10 +106,10 @@ _MAVFTP = re.compile(r"(?:mftp|mavlinkftp)://(?:\[;comp=([0-9]{1,3})\])?(.+)", r
 WEB_SCHEMES = ("http://", "https://")
 BLOCK_SIZE = 1 << 16
 
-# Limit for a whole file from the web.
+# Maximum seconds for the download of a whole file from the web.
 WEB_TIMEOUT_S = 60.0
 
-# The same number on all platforms; sockets are imported only by `transport`.
+# `socket.SHUT_RDWR` has this value on all platforms. Only `transport` may import `socket`.
 SHUT_RDWR = 2
 
 
@@ -127,7 +127,7 @@ async def fetch(uri: str, files_of: Callable[[int], Files], component_id: int, i
 
 
 async def _read_response(files: Files, path: str, idle_timeout_s: float) -> bytes:
-    # Cancelled as soon as the size is known to exceed the limit.
+    # The download is cancelled as soon as the size is known to exceed the limit.
     with anyio.CancelScope() as scope:
 
         def check_size(progress: TransferProgress) -> None:
@@ -172,7 +172,7 @@ class _WebDownload:
         return connect
 
     def _opener(self) -> OpenerDirector:
-        # Only web handlers: an address must not read a local file.
+        # Only web protocols are imported, so that an address cannot make aerokit read a local file.
         from http.client import HTTPConnection, HTTPSConnection
         from urllib import request
 
@@ -211,7 +211,7 @@ class _WebDownload:
                     content += block
                     if len(content) > MAX_FILE_SIZE:
                         raise file_too_large(self._uri)
-                if answer.length:  # the rest of Content-Length
+                if answer.length:  # bytes that Content-Length announced but that did not arrive
                     raise OSError(f"{answer.length} bytes are missing")
                 return bytes(content)
         except (InvalidArgument, FileFormatError):

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Settings"]
 
-# Standard name of the setting that CAMERA_SETTINGS also reports.
+# Standard name of the camera mode setting. CAMERA_SETTINGS also reports its value.
 MODE_SETTING = "CAM_MODE"
 
 
@@ -117,7 +117,7 @@ class Settings:
         idle_timeout_s: float = IDLE_TIMEOUT_S,
         timeout: float | None = None,
     ) -> CameraDefinition:
-        """Fetch the definition file that the camera names, and use it as :meth:`load` does.
+        """Fetch the definition file that the camera names, and use it from then on, like :meth:`load`.
 
         Args:
             uri: address of the file: ``mftp://`` is MAVFTP, ``mftp://[;comp=1]/…`` on another component; ``http://``
@@ -149,7 +149,8 @@ class Settings:
             return self.load(parse_definition(data, uri), locale=locale)
 
     def options(self, name: str) -> Mapping[str, SettingValue]:
-        """Return the options of a setting that the known other settings allow, as a mapping of names to values.
+        """Return the options of a setting that the known values of other settings allow, as a mapping of names to
+        values.
 
         Empty without a definition, and for settings without options.
         """
@@ -173,7 +174,7 @@ class Settings:
         """Return all settings by name, in the component's order; immediately if they were downloaded before.
 
         Raises:
-            ParameterTimeout: the list is incomplete, or the component has none; ``table`` has the settings that
+            ParameterTimeout: the list is incomplete, or the component has no settings; ``table`` has those that
                 arrived.
         """
         transfers = self._transfers
@@ -196,7 +197,7 @@ class Settings:
     async def get(
         self, name: str, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None
     ) -> SettingValue:
-        """Request one value; for arguments and errors see :meth:`read`."""
+        """Request one setting from the component; for arguments and errors see :meth:`read`."""
         return (await self.read(name, idle_timeout_s=idle_timeout_s, timeout=timeout)).value
 
     async def read(self, name: str, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None) -> Setting:
@@ -219,10 +220,10 @@ class Settings:
         idle_timeout_s: float = IDLE_TIMEOUT_S,
         timeout: float | None = None,
     ) -> Setting:
-        """Set one setting; return it as confirmed by the component, which may have set another value.
+        """Set one setting and return the value that the component confirms, which may differ from ``value``.
 
-        With a definition, ``value`` may be the name of an option; settings that this one may change are read again
-        afterwards, and unknown settings that restrict it are read before.
+        With a definition, ``value`` may be the name of an option. Unknown settings that restrict this setting are read
+        before, and settings that it may change are read again afterwards.
 
         Raises:
             InvalidArgument: the name or value is invalid; or, with a definition, the value is not allowed, or the
@@ -295,7 +296,7 @@ class Settings:
         return await transfers.run(exchange)
 
     async def _read_again(self, names: Iterable[str], idle_timeout_s: float) -> None:
-        # A setting that cannot be read may have changed, so its value is no longer known.
+        # A setting that cannot be read may have changed, so its previous value is discarded.
         assert self._definition is not None
         settings = self._definition.settings
         wanted = [name for name in names if name in settings and not settings[name].write_only]
@@ -319,7 +320,7 @@ class Settings:
             self._store(setting_of(message))
 
     def _on_mode(self, message: m.CameraSettings) -> None:
-        # A mode that was set by a command changes this setting, too.
+        # A command that sets the camera mode also changes this setting.
         known = self._known.get(MODE_SETTING)
         if known is not None and isinstance(known.value, int):
             self._store(known.replace(value=message.mode_id))

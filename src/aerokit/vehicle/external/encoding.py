@@ -33,7 +33,7 @@ GPS_NUMBERS = ("hdop", "vdop", "horizontal_accuracy_m", "vertical_accuracy_m", "
 ORIENTATIONS: dict[RangeDirection, int] = {"forward": 0, "right": 2, "back": 4, "left": 6, "up": 24, "down": 25}
 # MAV_ESTIMATOR_TYPE, MAV_DISTANCE_SENSOR, and the covariance of DISTANCE_SENSOR that means "unknown".
 VISION, LASER, NO_COVARIANCE = 2, 0, 255
-# Rotations between the axes of ROS (east, north, up; forward, left, up) and those of MAVLink.
+# Rotations between the axes of ROS (east, north, up; forward, left, up) and the axes of MAVLink.
 HALF = math.sqrt(0.5)
 ENU_TO_NED: Quaternion = (0.0, HALF, HALF, 0.0)
 FLU_TO_FRD: Quaternion = (0.0, 1.0, 0.0, 0.0)
@@ -42,8 +42,8 @@ FLU_TO_FRD: Quaternion = (0.0, 1.0, 0.0, 0.0)
 class MeasurementEncoder:
     """Encodes measurements for one vehicle: each method returns the messages of one measurement.
 
-    A measurement that is out of range raises InvalidArgument. Time stamps are those of the event loop's clock; by
-    `TimesyncAnswers` PX4 can convert them to its own clock.
+    A measurement that is out of range raises InvalidArgument. Time stamps are on the event loop's clock;
+    `TimesyncAnswers` lets PX4 convert them to its own clock.
     """
 
     def __init__(self, session: VehicleSession) -> None:
@@ -98,7 +98,7 @@ class MeasurementEncoder:
         return (m.AttPosMocap(time, value.attitude.quaternion, *place, covariance),)
 
     def _pose(self, value: v.PoseMeasurement) -> tuple[int, Vector, list[float]]:
-        """Check a pose; return its time stamp, place and covariance."""
+        """Check a pose; return its time stamp, its position with its orientation, and its covariance."""
         place = (value.north_m, value.east_m, value.down_m)
         check_finite("position", *place)
         check_finite("attitude", value.attitude.roll_deg, value.attitude.pitch_deg, value.attitude.yaw_deg)
@@ -106,7 +106,7 @@ class MeasurementEncoder:
         return self._time_us(value.measured_at), place, covariance
 
     def vision_speed(self, value: v.SpeedMeasurement) -> tuple[Message, ...]:
-        """Return VISION_SPEED_ESTIMATE, or ODOMETRY without a pose for an autopilot that does not read it."""
+        """Return VISION_SPEED_ESTIMATE, or ODOMETRY without a pose if the autopilot reads only ODOMETRY."""
         speeds = (value.north_m_s, value.east_m_s, value.down_m_s)
         check_finite("velocity", *speeds)
         time, count = self._time_us(value.measured_at), _reset_counter(value.reset_counter)
@@ -160,7 +160,7 @@ class MeasurementEncoder:
                 value.horizontal_accuracy_m or 0.0,
                 value.vertical_accuracy_m or 0.0,
                 value.satellites,
-                0 if value.yaw_deg is None else round(value.yaw_deg % 360 * 100) or 36000,  # 0 is "no heading"
+                0 if value.yaw_deg is None else round(value.yaw_deg % 360 * 100) or 36000,  # 0 means "no heading"
             ),
         )
 
@@ -288,7 +288,7 @@ def _normalized(q: Quaternion) -> Quaternion:
 
 
 def _triangle(first: float | None, second: float | None) -> list[float]:
-    """Return the upper triangle of a 6x6 covariance matrix with two variances, each three times on its diagonal.
+    """Return the upper triangle of a 6x6 covariance matrix whose diagonal has each of two variances three times.
 
     An unknown first variance is sent as NaN. An unknown second variance is sent as 0: both autopilots then use the
     minimum in their parameters, and ArduPilot does not accept NaN there.

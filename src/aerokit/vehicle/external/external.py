@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 __all__ = ["External"]
 
-# ArduPilot stores the origin in centimetres; PX4 reports degrees of 32 bits.
+# Metres by which a reported origin may differ, because ArduPilot and PX4 round it.
 ORIGIN_TOLERANCE_M = 1.0
 POLL_INTERVAL_S = 0.5
 
@@ -44,8 +44,8 @@ class External:
     """Supplies the vehicle with measurements: ``async with vehicle.external.odometry() as stream: stream.send(…)``.
 
     ``rate_hz`` (above 0, at most 400) is the maximum rate at which measurements are sent. A measurement older than
-    ``valid_for_s`` is dropped. Time stamps are those of the event loop's clock. While a stream is open, aerokit answers
-    the vehicle's TIMESYNC requests with this clock.
+    ``valid_for_s`` is dropped. Time stamps are on the event loop's clock. While a stream is open, aerokit answers the
+    vehicle's TIMESYNC requests with this clock.
     """
 
     def __init__(self, context: VehicleContext, probe: Probe) -> None:
@@ -76,7 +76,7 @@ class External:
     def obstacles(self, *, rate_hz: float = 10.0, valid_for_s: float = 0.5) -> MeasurementStream[ObstacleSectors]:
         """Supply distances around the vehicle (OBSTACLE_DISTANCE).
 
-        ArduPilot needs PRX1_TYPE 2; PX4 uses them if CP_DIST is above 0.
+        ArduPilot needs PRX1_TYPE 2, PX4 needs CP_DIST above 0.
         """
         return self._stream("obstacles", ObstacleSectors, self._encode.obstacles, rate_hz, valid_for_s)
 
@@ -137,9 +137,9 @@ class External:
     async def set_origin(self, origin: Position, *, timeout: float = 10.0) -> None:
         """Set the origin of the estimator's local frame, and wait until GPS_GLOBAL_ORIGIN reports it.
 
-        A vehicle without GPS needs the origin to compute global positions. SET_GPS_GLOBAL_ORIGIN is sent once, because
-        it has no acknowledgement. Returns at once if the vehicle has this origin already. The vehicle may have accepted
-        the origin of a cancelled call.
+        A vehicle without GPS needs the origin to compute global positions. SET_GPS_GLOBAL_ORIGIN has no acknowledgement
+        and is sent once. Returns at once if the vehicle has this origin already. If you cancel the call, the vehicle
+        may still have accepted the origin.
 
         Args:
             origin: latitude, longitude and altitude above mean sea level.

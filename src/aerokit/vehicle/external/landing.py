@@ -1,4 +1,4 @@
-"""Precision landing: streams target positions, changes to the landing mode, and reports how it went."""
+"""Precision landing: streams target positions, changes to the landing mode, and reports how the landing went."""
 
 from __future__ import annotations
 
@@ -31,7 +31,8 @@ TargetSource: TypeAlias = (
     Callable[[], "TargetMeasurement | Awaitable[TargetMeasurement | None] | None"]
     | AsyncIterable["TargetMeasurement | None"]
 )
-"""A function, called at the rate of the stream, or an asynchronous iterable; None means that no target is visible."""
+"""A function that is called at the rate of the stream, or an asynchronous iterable. None: no target is visible.
+"""
 
 # A target counts as lost after this time without a measurement. ArduPilot's estimator keeps it for 2 s
 # (AC_PrecLand.cpp).
@@ -40,9 +41,9 @@ POLL_INTERVAL_S = 0.2
 
 
 class TargetLoss(Snapshot):
-    """One time during which the target was not visible.
+    """One period in which the target was not visible.
 
-    ``height_m`` is the vehicle's height above home at the start of this time; None if unknown.
+    ``height_m`` is the vehicle's height above home at the start of the period; None if unknown.
     """
 
     seconds: float
@@ -53,7 +54,7 @@ class LandingReport(Snapshot):
     """Report of a precision landing, made when the vehicle is on the ground and disarmed.
 
     ``last_target`` is the last measurement, and ``unseen_s`` its age at the end: a camera rarely sees the target from
-    close by. ``losses`` are the earlier times of more than a second without the target. ``climbed_m`` is how far the
+    close by. ``losses`` are the earlier periods of more than a second without the target. ``climbed_m`` is how far the
     vehicle climbed during the landing, in a retry of ArduPilot or a search of PX4. ``used_target`` is False if no
     measurement was sent during the descent; the vehicle then landed where its firmware chose. ``texts`` are the
     vehicle's status texts since the order.

@@ -28,7 +28,7 @@ __all__ = ["EstimatorUse", "MeasurementStream", "MeasurementT"]
 MeasurementT = TypeVar("MeasurementT")
 EstimatorUse: TypeAlias = Literal["used", "not used", "unknown"]
 
-# Bit of EKF_STATUS_REPORT and ESTIMATOR_STATUS: the estimator only holds a constant position.
+# Flag of EKF_STATUS_REPORT and ESTIMATOR_STATUS: the estimator has no position and assumes that it is constant.
 CONSTANT_POSITION = 1 << 7
 ESTIMATOR_MAX_AGE_S = 2.5
 
@@ -36,8 +36,8 @@ ESTIMATOR_MAX_AGE_S = 2.5
 class TimesyncAnswers:
     """Answers the vehicle's TIMESYNC requests with the clock of the event loop while a stream is open.
 
-    PX4 needs the answers to convert the time stamps of measurements to its own clock (Timesync.cpp, sync_stamp). Before
-    its offset has converged, PX4 uses the time of arrival, as ArduPilot always does.
+    PX4 needs the answers to convert the time stamps of measurements to its own clock (Timesync.cpp, sync_stamp). Until
+    PX4 knows the offset between the clocks, it uses the time of arrival. ArduPilot always does that.
     """
 
     def __init__(self, session: VehicleSession) -> None:
@@ -46,14 +46,14 @@ class TimesyncAnswers:
         self._detach: Detach | None = None
 
     def open(self) -> None:
-        """Start to answer. Each call must be paired with a call of `close`."""
+        """Start to answer requests. Each call must be paired with a call of `close`."""
         self._users += 1
         if self._users == 1:
             bus = self._session.connection.bus
             self._detach = bus.attach(Timesync, self._on_timesync, system_id=self._session.system_id)
 
     def close(self) -> None:
-        """Stop to answer when the last stream has closed."""
+        """Stop answering requests if this was the last open stream."""
         self._users -= 1
         if self._users == 0 and self._detach is not None:
             self._detach()
@@ -73,15 +73,15 @@ class MeasurementStream(Generic[MeasurementT]):
 
     A measurement is never repeated: if your program supplies no new one, nothing is sent, and the vehicle acts as if
     its sensor had failed. Of several measurements within one period, only the newest is sent. A measurement is dropped
-    if it is older than ``valid_for_s`` when its turn comes, for example after the event loop was blocked. While the
-    vehicle is silent, all measurements are dropped. ``sent`` and ``dropped`` count them. The stream ends only with the
-    block.
+    if it is older than ``valid_for_s`` when it is due to be sent, for example after the event loop was blocked. While
+    the vehicle is silent, all measurements are dropped. ``sent`` and ``dropped`` count measurements. The stream ends
+    only with the block.
 
     Entering raises:
         NotSupported: this firmware does not read such measurements. Nothing was sent.
         OperationRejected: a parameter makes the vehicle ignore such measurements; the error text names it. No
             measurement was sent.
-        ParameterTimeout: the vehicle did not report the parameters that decide about this.
+        ParameterTimeout: the vehicle did not report a parameter that aerokit must check first.
     """
 
     def __init__(
@@ -140,7 +140,7 @@ class MeasurementStream(Generic[MeasurementT]):
         if estimator.age > ESTIMATOR_MAX_AGE_S or not self._sent:
             return "unknown"
         has_position = health.has_relative_position or health.has_absolute_position
-        # PX4 also sets the flag while the vehicle is at rest.
+        # PX4 also sets this flag while the vehicle stands still on the ground.
         is_resting = self._session.telemetry.landed_state.latest == MavLandedState.ON_GROUND
         is_constant = health.flags & CONSTANT_POSITION and not (
             is_resting and self._session.autopilot.external.constant_position_at_rest
@@ -168,7 +168,7 @@ class MeasurementStream(Generic[MeasurementT]):
             message.encode()
         connection = self._session.connection
         if not connection.is_open:
-            connection.send(messages[0])  # Raises the error that ended the connection.
+            connection.send(messages[0])  # If the connection has ended, this raises the error that ended it.
         now = connection.now()
         given: float | None = getattr(measurement, "measured_at", None)
         if self._waiting is not None:
@@ -214,7 +214,7 @@ class MeasurementStream(Generic[MeasurementT]):
         self._answers.close()
 
     async def _check_support(self) -> dict[str, float]:
-        """Raise an error unless the vehicle uses these measurements; return the parameters that decide about it."""
+        """Raise an error unless the vehicle uses these measurements; return the parameters that select them."""
         firmware, rule = self._session.autopilot.firmware, self._session.autopilot.external.kinds.get(self._kind)
         what = self._kind.replace("_", " ")
         if rule is None:

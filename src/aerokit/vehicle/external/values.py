@@ -113,8 +113,8 @@ class GpsMeasurement(Snapshot):
 class ObstacleSectors(Snapshot):
     """Distances in metres to obstacles around the vehicle, in at most 72 sectors (OBSTACLE_DISTANCE).
 
-    The first sector is centred on ``first_deg`` clockwise from the nose, each next one ``step_deg`` further. None means
-    that the distance is unknown; infinity means that there is no obstacle within ``max_m``.
+    The first sector is centred on ``first_deg`` clockwise from the nose, each following sector ``step_deg`` further
+    clockwise. None means that the distance is unknown; infinity means that there is no obstacle within ``max_m``.
     """
 
     distances_m: tuple[float | None, ...]
@@ -149,7 +149,7 @@ class RangeMeasurement(Snapshot):
 class TargetMeasurement(Snapshot):
     """Position of a landing target relative to the vehicle in metres forward, right and down.
 
-    The axes are those of the body, which tilts with the vehicle. With ``is_level`` they are level, as for a stabilised
+    The axes are body axes, which tilt with the vehicle. With ``is_level`` the axes stay level, as for a stabilised
     camera.
     """
 
@@ -164,7 +164,7 @@ class TargetMeasurement(Snapshot):
     def from_angles(
         cls, forward_deg: float, right_deg: float, height_m: float, *, is_level: bool = False
     ) -> TargetMeasurement:
-        """Return the target ``height_m`` below a camera that sees it at these angles from straight down."""
+        """Return a target that is ``height_m`` below a camera and appears at these angles from straight down."""
         forward, right = (math.tan(math.radians(angle)) * height_m for angle in (forward_deg, right_deg))
         return cls(forward, right, height_m, is_level)
 

@@ -24,11 +24,12 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-# The vehicle may close a file at any time; a transfer opens it at most this often.
+# Maximum number of times that a transfer opens its file, because the vehicle may close a file at any time.
 MAX_OPEN_ATTEMPTS = 3
-# Error codes for opening a file while another one is open.
+# Error codes with which vehicles refuse to open a file while another file is open.
 SESSION_IN_USE = (MavFtpErr.FAIL, MavFtpErr.INVALIDSESSION, MavFtpErr.NOSESSIONSAVAILABLE)
-# The vehicle closes a file this long after the last request of any client: ArduPilot 3 s, PX4 10 s.
+# Seconds after the last request of any client in which the vehicle closes its open file: ArduPilot 3 s, PX4 10 s. The
+# keys are the errors with which ArduPilot and PX4 report the open file.
 SESSION_TIMEOUT_S: dict[int, float] = {MavFtpErr.INVALIDSESSION: 3.2, MavFtpErr.NOSESSIONSAVAILABLE: 10.5}
 CLOSE_TIMEOUT_S = 3.0
 
@@ -41,7 +42,7 @@ class RemoteFile(NamedTuple):
 
 
 class FileChannel:
-    """Sends MAVFTP requests one at a time. Files that were read or abandoned are closed in the background."""
+    """Sends MAVFTP requests to one vehicle, one at a time. Files are closed in the background."""
 
     def __init__(self, transfers: Transfers) -> None:
         connection = transfers.connection
@@ -67,7 +68,7 @@ class FileChannel:
     ) -> AsyncIterator[None]:
         """Wait for the previous operations, and for sessions that are still being closed.
 
-        After ``timeout`` seconds raises FileTimeout, with the ranges returned by ``missing()``.
+        Raises FileTimeout after ``timeout`` seconds; the error has the ranges that ``missing()`` returns.
         """
         try:
             with anyio.fail_after(timeout):
@@ -130,7 +131,7 @@ class FileChannel:
                 raise
             else:
                 if opcode == MavFtpOpcode.OPENFILERO:
-                    self._close_soon(file.session, path)  # The data is complete, so do not wait.
+                    self._close_soon(file.session, path)  # The caller need not wait until the file is closed.
                 else:
                     await self._close(file.session, path, idle_timeout_s)
                 return result
@@ -145,7 +146,7 @@ class FileChannel:
                 reply = await self.transfers.run(request)
             except FileError as error:
                 if may_be_ours and request.attempts > 1 and error.code in SESSION_IN_USE:
-                    # The first request opened it, but the reply was lost.
+                    # The first request may have opened this file: its reply was lost.
                     may_be_ours = False
                     for session in self._possible_sessions(request):
                         await self._close(session, path, idle_timeout_s)
@@ -177,7 +178,7 @@ class FileChannel:
         )
 
     def _possible_sessions(self, request: FtpRequest) -> tuple[int, ...]:
-        """Ids that the session may have if the reply to opening it was lost."""
+        """Ids that the session of a file may have if the reply to opening the file was lost."""
         return (request.session,) if self.transfers.autopilot.accepts_ftp_session_ids else (request.session, 0)
 
     async def _close(self, session: int, path: str, idle_timeout_s: float) -> None:
@@ -214,7 +215,7 @@ class _Closing:
 
     async def confirm(self, transfers: Transfers) -> None:
         try:
-            with suppress(AerokitError):  # The vehicle closes it after its own time-out.
+            with suppress(AerokitError):  # If closing fails, the vehicle closes the session after its own time-out.
                 await transfers.run(self.request)
         finally:
             self.ended.set()
@@ -231,7 +232,7 @@ class LogChannel:
     async def list(
         self, idle_timeout_s: float, only: int | None, *, max_unanswered: int | None
     ) -> tuple[LogEntry, ...]:
-        """Request all entries, or one, within an operation."""
+        """Request all entries of the log list, or the entry of one log, within an operation."""
         transfers = self._transfers
         exchange = LogList(
             transfers.system_id,
@@ -275,7 +276,7 @@ class LogChannel:
         timeout: float | None,
         missing: Callable[[], tuple[tuple[int, int], ...]] = tuple,
     ) -> AsyncIterator[None]:
-        """Wait for the previous operation; stop the vehicle from sending if this one does not complete."""
+        """Wait for the previous operation. If this operation does not complete, stop the vehicle from sending."""
         try:
             with anyio.fail_after(timeout):
                 async with self._lock:

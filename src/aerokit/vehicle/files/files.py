@@ -64,7 +64,9 @@ class Files:
         self._channel = FileChannel(transfers)
 
     async def is_supported(self) -> bool:
-        """Return True if the vehicle reports MAVFTP; False if it does not, or does not answer within three seconds."""
+        """Return True if the vehicle reports support for MAVFTP, False if not or without an answer within three
+        seconds.
+        """
         capabilities = await self._transfers.capabilities()
         return capabilities is not None and bool(capabilities & CAPABILITY_FTP)
 
@@ -98,8 +100,8 @@ class Files:
         """Copy a file to this computer. It is written to ``<to>.part`` and renamed when it is complete.
 
         With ``resume``, the download continues the ``<to>.part`` of an interrupted one, unless the vehicle's file is
-        shorter. The result is verified by CRC-32 if the vehicle can compute it; if it differs, the whole file is read
-        again. Files whose names begin with ``@`` are always read completely.
+        shorter. If the vehicle can compute the CRC-32, it is compared with that of the result; if they differ, the
+        whole file is read again. Files whose names begin with ``@`` are always read completely.
 
         Raises:
             RemoteProtocolError: as for :meth:`read`.
@@ -165,8 +167,8 @@ class Files:
     ) -> None:
         """Write a file. An existing file is replaced; its old content is lost as soon as the write begins.
 
-        ``verify`` compares the CRC-32 afterwards, if the vehicle can compute it. It cannot for files whose names
-        begin with ``@``: the vehicle evaluates them when they are closed, and does not report the result.
+        ``verify`` compares the CRC-32 afterwards, if the vehicle can compute it. Files whose names begin with ``@`` are
+        not verified: the vehicle evaluates them when they are closed, and does not report the result.
 
         Raises:
             VerificationFailed: the vehicle acknowledged everything, but the file has other content.
@@ -197,7 +199,7 @@ class Files:
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> None:
-        """Copy a local file to ``path`` on the vehicle, as :meth:`write` does.
+        """Copy a local file to ``path`` on the vehicle. ``verify`` is as for :meth:`write`.
 
         Raises:
             VerificationFailed, RemoteProtocolError: as for :meth:`write`.
@@ -263,7 +265,7 @@ class Files:
             return await self._channel.request(opcode, path, idle_timeout_s=idle_timeout_s, offset=offset, data=data)
 
     async def _list_from(self, path: str, offset: int, idle_timeout_s: float) -> FtpMessage | None:
-        """Return one message of a listing; None after its end."""
+        """Return the entries in one message of a listing; None after the end of the listing."""
         try:
             return await self._channel.request(
                 MavFtpOpcode.LISTDIRECTORY, path, idle_timeout_s=idle_timeout_s, offset=offset

@@ -1,4 +1,4 @@
-"""``LogStream``: the flight log that PX4 sends while it writes it."""
+"""``LogStream``: receives the flight log that PX4 sends while it is being written."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ DROPOUT = b"\x02\x00O"
 class UlogAssembler:
     """Assembles the messages of a log stream into a valid ULog file, with marks where messages are missing.
 
-    After a gap in the sequence numbers, the rest of the current ULog message is discarded, up to the start of the next.
+    After a gap in the sequence numbers, all data up to the start of the next ULog message is discarded.
     """
 
     def __init__(self) -> None:
@@ -84,8 +84,8 @@ class UlogAssembler:
 class LogStream(ReadOnly):
     """PX4's flight log, received while PX4 writes it (LOGGING_DATA): an async iterator over bytes.
 
-    If you append all bytes to a file, it is a valid ULog file at any time. Lost messages are marked in it as dropouts;
-    ``lost`` counts them. The iterator ends with the connection. PX4 sends one such log at a time.
+    If you append all bytes to a file, the file is a valid ULog file at any time. Lost messages are marked in the log as
+    dropouts; ``lost`` counts them. The iterator ends with the connection. PX4 streams its log to one station at a time.
 
     Entering raises:
         NotSupported: the vehicle runs ArduPilot. Nothing was sent.
@@ -115,7 +115,7 @@ class LogStream(ReadOnly):
             await START.send(self._context)
         except BaseException as error:
             self._close()
-            if not isinstance(error, CommandRejected):  # The stream of another station must not be stopped.
+            if not isinstance(error, CommandRejected):  # After a refusal, the running stream may be another station's.
                 session.transfers.command_in_background(MavCmd.LOGGING_STOP)
             raise
         return self
@@ -125,14 +125,16 @@ class LogStream(ReadOnly):
         self._detach()
 
     def _acknowledge(self, message: LoggingDataAcked) -> None:
-        """Acknowledge at once: PX4 repeats a message every 50 ms, and gives up after 50 attempts."""
+        """Acknowledge a message at once. PX4 repeats an unacknowledged message every 50 ms, and stops after 50
+        attempts.
+        """
         session = self._context.session
         session.send(LoggingAck(session.system_id, session.component_id, message.sequence))
 
     async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         is_stopped = False
         try:
-            if error is None:  # PX4 answers when its last message is acknowledged (logger.cpp)
+            if error is None:  # PX4 answers the command only when its last log message is acknowledged (logger.cpp).
                 await STOP.send(self._context)
                 is_stopped = True
         finally:

@@ -34,12 +34,13 @@ if TYPE_CHECKING:
 __all__ = ["LogEntry", "LogMethod", "Logs"]
 
 LogMethod = Literal["auto", "ftp", "log"]
-# PX4 without logs does not answer: after this many requests, MAVFTP is used to check whether it has any.
+# PX4 does not answer if it has no logs. After this many unanswered requests, MAVFTP shows whether it has any.
 MAX_UNANSWERED_REQUESTS = 4
 MAX_LOG_ID = 0xFFFF
 ERASE_RETRY_INTERVAL_S = 1.0
 ERASE_PATIENCE_S = 60.0
-# While a log is written, its time is the vehicle's clock; afterwards it is the time of the file.
+# The time of a log that is being written is the vehicle's clock; the time of a finished log is that of its file. Two
+# times of the same log may therefore differ by this much.
 MAX_CLOCK_DIFFERENCE = timedelta(days=1)
 ARDUPILOT_NAME = re.compile(r"(\d{8})\.BIN", re.IGNORECASE)
 PX4_LIST = "logdata.txt"
@@ -59,7 +60,7 @@ class LogEntry(Snapshot):
 
 
 class GrowthReporter:
-    """Forwards progress, and logs a message if the log was larger than its entry says."""
+    """Forwards the progress of a download, and logs a message if the log is larger than its entry says."""
 
     def __init__(self, entry: LogEntry, on_progress: OnProgress | None) -> None:
         self._entry, self._on_progress = entry, on_progress
@@ -87,15 +88,15 @@ class Logs:
     All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
     total; None for no limit). You can cancel any call; the vehicle then stops sending.
 
-    ArduPilot answers LOG_* messages only while disarmed, and reading a log by them ends its current log. By MAVFTP,
-    logs can also be read in flight. A log that is still being written is read up to its current end. If that exceeds
-    the size in the entry, logger "aerokit" reports it (INFO).
+    ArduPilot answers LOG_* messages only while disarmed, and ends its current log when a log is read by these messages.
+    By MAVFTP, logs can also be read in flight. A log that is still being written is read up to its current end. If it
+    is larger than its entry says, logger "aerokit" reports that (INFO).
     """
 
     def __init__(self, transfers: Transfers, files: Files, context: VehicleContext) -> None:
         self._transfers, self._files, self._context = transfers, files, context
         self._channel = LogChannel(transfers)
-        # The newest log in the last list may have been growing.
+        # The newest log in the last list, which may have been growing at that time.
         self._newest: LogEntry | None = None
 
     async def list(
@@ -130,17 +131,17 @@ class Logs:
         Args:
             log: an entry of :meth:`list`, or its id.
             to: path of the local file.
-            resume: continue an interrupted download of this log to this file; by LOG_* only if the vehicle reports the
-                time of the log.
-            method: ``"ftp"``, ``"log"`` (the LOG_* messages), or ``"auto"``: the faster one for this autopilot, and the
-                other one if that fails. MAVFTP requires that the file of the log can be identified.
+            resume: continue an interrupted download of this log to this file. By LOG_* this works only if the vehicle
+                reports the time of the log.
+            method: ``"ftp"``, ``"log"`` (the LOG_* messages), or ``"auto"``: the faster of the two for this autopilot,
+                then the slower if the faster fails. MAVFTP requires that the file of the log can be identified.
             idle_timeout_s: fail after this many seconds without progress.
             timeout: seconds in total.
             on_progress: called with the bytes so far and in total.
 
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
-            FileError: there is no such log, or it was requested by MAVFTP and cannot be identified.
+            FileError: there is no such log, or ``method`` is ``"ftp"`` and the file of the log cannot be identified.
             FileTimeout: the log did not arrive completely; ``missing`` has the missing ranges.
             OSError: the local file cannot be written.
         """
@@ -154,7 +155,7 @@ class Logs:
             growth.log_growth()
             return
         part = PartFile(to, _part_suffix(entry))
-        # Without a time, a log of another flight may have the same suffix.
+        # The time is part of the file name's suffix. Without it, a log of another flight may have the same suffix.
         is_known = entry.time_utc is not None
         start = part.size if resume and is_known and part.size <= entry.size else 0
         with part.writing(start) as disk:
@@ -176,8 +177,8 @@ class Logs:
 
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
-            FileError: there is no such log, or it was requested by MAVFTP and cannot be identified.
-            FileTimeout: it did not arrive; ``missing`` has the missing ranges.
+            FileError: there is no such log, or ``method`` is ``"ftp"`` and the file of the log cannot be identified.
+            FileTimeout: the log did not arrive completely; ``missing`` has the missing ranges.
         """
         _check(log)
         path, entry = await self._locate(log, method, idle_timeout_s, timeout)
@@ -257,7 +258,9 @@ class Logs:
     async def _entry(
         self, log: LogEntry | int, idle_timeout_s: float, timeout: float | None, *, may_be_silent: bool
     ) -> LogEntry:
-        """Return the current entry. Unknown ids are not requested: ArduPilot then lists nonexistent logs for ever."""
+        """Return the current entry of a log. An unknown id is not requested: ArduPilot would list nonexistent logs
+        endlessly.
+        """
         log_id, only = (log, None) if isinstance(log, int) else (log.id, log.id)
         async with self._channel.operation(f"log {log_id}", timeout):
             entries = await self._entries(idle_timeout_s, only, MAX_UNANSWERED_REQUESTS if may_be_silent else None)
@@ -312,13 +315,13 @@ def _no_such_log(log_id: int, text: str) -> FileError:
 
 
 def _part_suffix(entry: LogEntry) -> str:
-    # Identifies the log in the name of its part file.
+    # The time identifies the log in the name of its ``.part`` file.
     written_at = 0 if entry.time_utc is None else int(entry.time_utc.timestamp())
     return f".log{entry.id}-{written_at}"
 
 
 class ListedLog(NamedTuple):
-    """A line of the list that PX4 writes when its logs are requested; the line number is the log id."""
+    """One line of the list file that PX4 writes when its logs are requested. The line number is the log id."""
 
     id: int
     time_utc: int
@@ -358,7 +361,7 @@ async def log_path(
 async def listed_logs(
     files: Files, directories: tuple[str, ...], idle_timeout_s: float
 ) -> tuple[ListedLog, ...] | None:
-    """Return the logs in PX4's list, which it writes on request; None if there are logs but no list."""
+    """Return the logs in the list file that PX4 writes on request; None if there are logs but no list file."""
     for directory in directories:
         try:
             entries = await files.list(directory, idle_timeout_s=idle_timeout_s)
@@ -370,7 +373,7 @@ async def listed_logs(
 
 
 async def _list_in(files: Files, directory: str, idle_timeout_s: float) -> tuple[ListedLog, ...]:
-    """Read the list next to the directory of the logs; an empty tuple if there is none."""
+    """Read the list file next to the directory of the logs; return an empty tuple if there is none."""
     root = directory.rpartition("/")[0]
     try:
         text = await files.read(f"{root}/{PX4_LIST}", idle_timeout_s=idle_timeout_s)

@@ -36,17 +36,17 @@ CacheChoice = bool | str | os.PathLike[str]
 # Seconds and attempts without an answer after which MAVFTP counts as unsupported, even if the vehicle advertises it.
 FTP_PROBE_TIMEOUT_S, FTP_PROBE_ATTEMPTS = 2.0, 3
 ANSWER_DELAY_S = 0.1
-# SET_MESSAGE_INTERVAL: the default rate of the autopilot.
+# Value of SET_MESSAGE_INTERVAL that restores the autopilot's default rate.
 DEFAULT_INTERVAL = 0
 # Late or repeated answers to a write may arrive for this long.
 ECHO_WINDOW_S = 3.0
-# ArduPilot answers this many reads at once; more wait for its next turn.
+# ArduPilot answers this many reads at once. Further reads wait until it handles parameters again.
 MAX_READS_UNBOOSTED = 5
-# A missing parameter is recognised only after several requests, so the rate is raised after this time.
+# The rate is raised if reading takes longer than this: a parameter counts as missing only after several requests.
 BOOST_DELAY_S = 0.5
-# Fewer changes than this are set one by one, which is as fast, and which the vehicle confirms.
+# Fewer changes than this are set one by one. That is as fast as a file, and the vehicle confirms each value.
 MIN_PACK_SIZE = 10
-# More values than this are read back by a download.
+# If more values than this must be read back, the whole list is downloaded instead.
 MAX_READ_BACK = 100
 
 
@@ -123,7 +123,7 @@ class ParameterAccess:
 
     @contextmanager
     def _ftp_probe(self) -> Iterator[None]:
-        """Raise FileTimeout early if MAVFTP is not answered, because some relays drop it, and not the list."""
+        """Raise FileTimeout early if MAVFTP is not answered: some relays drop MAVFTP but forward the parameter list."""
         connection, round_trip = self._transfers.connection, self._transfers.round_trip
         timeout_s = max(FTP_PROBE_TIMEOUT_S, FTP_PROBE_ATTEMPTS * round_trip.timeout_s())
         answers: list[object] = []
@@ -148,9 +148,9 @@ class ParameterAccess:
     async def _download_pack(self, idle_timeout_s: float, on_progress: OnProgress | None) -> None:
         """Read the packed file; retry if its content is inconsistent.
 
-        ArduPilot generates it while it is read: when a parameter comes to differ from its default meanwhile, all
-        following data moves by some bytes, and blocks read at different times do not fit. Without defaults, nothing
-        moves.
+        ArduPilot generates the file while it is read. If a parameter changes from its default value meanwhile, all data
+        after it moves by some bytes, and blocks that were read at different times do not fit together. A file without
+        defaults does not have this problem.
         """
         from aerokit.parameters.pack import PACK_PATH, PACK_PATH_WITH_DEFAULTS, unpack_parameters
 
@@ -194,7 +194,7 @@ class ParameterAccess:
     async def read(
         self, names: Iterable[str], idle_timeout_s: float, *, probe: bool = False
     ) -> dict[str, ParameterAnswer]:
-        """Read parameters; with ``probe``, ones that the vehicle may not have."""
+        """Read parameters; ``probe`` is True for names that the vehicle may not have."""
         names = tuple(names)
         if not names:
             return {}
@@ -293,7 +293,7 @@ class ParameterAccess:
             return answers
 
     def _recently_written(self) -> set[str]:
-        """Names whose values may still be echoed: the next write of one of them is read back."""
+        """Names for which a late answer to a write may arrive. Their next write is therefore read back."""
         now = self._transfers.connection.now()
         self._written_at = {name: at for name, at in self._written_at.items() if now - at < ECHO_WINDOW_S}
         return set(self._written_at)
@@ -305,7 +305,7 @@ class ParameterAccess:
         idle_timeout_s: float,
         on_progress: OnProgress | None,
     ) -> dict[str, ParameterAnswer]:
-        """Like :meth:`write`, but in one file if possible; values that were not applied are then set one by one."""
+        """Write parameters in one file if possible; set the values that the vehicle did not apply one by one."""
         wanted = tuple(wanted)
         if method == "set" or (method == "auto" and (len(wanted) < MIN_PACK_SIZE or not await self.has_pack())):
             return await self.write(wanted, idle_timeout_s, on_progress)
@@ -340,7 +340,7 @@ class ParameterAccess:
         return {name: table[name] for name in _names(wanted) if name in table}
 
     def _was_applied(self, wanted: Parameter, answer: ParameterAnswer | None) -> bool:
-        """Return True if the vehicle has the value; a value that was read as a float lacks its last bits."""
+        """Return True if the vehicle has the value. The last bits are ignored in values that were read as floats."""
         if not isinstance(answer, Parameter):
             return False
         if self.store.bytewise:
@@ -349,14 +349,14 @@ class ParameterAccess:
 
 
 class _CachedList:
-    """The cached list of a vehicle, used if the vehicle's parameter hash has not changed."""
+    """Cached parameter list of a vehicle. It is used if the vehicle's parameter hash has not changed."""
 
     def __init__(self, access: ParameterAccess, cache: ParameterCache, idle_timeout_s: float) -> None:
         self._access, self._cache, self._idle_timeout_s = access, cache, idle_timeout_s
         self._hash: int | None = None
 
     async def load_if_current(self, refresh: bool) -> bool:
-        """Load the list into the store if it is current, and return True then."""
+        """Load the cached list into the store if its hash is the vehicle's; return True if it was loaded."""
         key, store, since = await self._key(), self._access.store, self._access.store.updates
         self._hash = await self._read_hash()
         table = None if refresh or self._hash is None else self._cache.load(key, self._hash)

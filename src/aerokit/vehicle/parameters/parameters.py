@@ -46,8 +46,8 @@ class Parameters(ReadOnly):
     :class:`aerokit.events.ParameterChanged`. A reboot clears the table.
 
     ArduPilot 4.7 renamed parameters and changed their units (``WPNAV_SPEED`` in cm/s became ``WP_SPD`` in m/s). Every
-    method accepts the old and the new name with either firmware, and converts the value; an old name that the vehicle
-    no longer has causes an :class:`aerokit.errors.ParameterRenamedWarning` with the new one.
+    method accepts the old and the new name with either firmware, and converts the value. An old name that the vehicle
+    no longer has causes an :class:`aerokit.errors.ParameterRenamedWarning`, which contains the new name.
 
     ArduPilot handles parameters a few times a second. aerokit raises this rate by SET_MESSAGE_INTERVAL of PARAM_VALUE
     while it reads more than five parameters, or if there is no answer within half a second, and restores the rate at
@@ -117,9 +117,9 @@ class Parameters(ReadOnly):
             method: ``"ftp"`` reads one small file that also has the defaults (``@PARAM/param.pck``), ``"list"``
                 requests one message for each parameter, ``"auto"`` uses the file if there is one.
             refresh: download again, even if the parameters are known or cached.
-            cache: keep the list on disk, and use it while the vehicle's parameter hash is unchanged: the second connect
-                takes one request. True means the user's cache directory; or pass a path. Only PX4 has a hash. It does
-                not cover parameters that PX4 changes by itself, so these may be outdated. Off by default.
+            cache: keep the list on disk, and use it while the vehicle's parameter hash is unchanged, so that the next
+                program needs one request. True means the user's cache directory; or pass a path. Only PX4 has a hash.
+                The hash does not cover parameters that PX4 changes by itself, so these may be outdated. Off by default.
             idle_timeout_s: fail after this many seconds without progress.
             timeout: seconds in total.
             on_progress: called with the number of parameters, or bytes of the file, so far and in total.
@@ -137,7 +137,7 @@ class Parameters(ReadOnly):
     async def get(
         self, name: str, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None
     ) -> int | float:
-        """Request one value from the vehicle; for arguments and errors see :meth:`read`."""
+        """Request one parameter from the vehicle; for arguments and errors see :meth:`read`."""
         return (await self.read(name, idle_timeout_s=idle_timeout_s, timeout=timeout)).value
 
     async def read(
@@ -165,8 +165,8 @@ class Parameters(ReadOnly):
         Use it to find out which of several names a firmware has; for renamed ArduPilot parameters use :meth:`get`.
 
         Returns:
-            For each name the parameter, or the error that :meth:`get` would have raised. Its ``code`` is None if the
-                vehicle did not report an error, but answered only requests for others.
+            For each name the parameter, or the error that :meth:`get` would have raised. The error's ``code`` is None
+            if the vehicle reported no error for this name, but answered requests for other names.
 
         Raises:
             InvalidArgument: a name is empty, or longer than 16 characters. Nothing was sent.
@@ -180,7 +180,7 @@ class Parameters(ReadOnly):
         """Set one parameter; return the result as confirmed by the vehicle.
 
         Raises:
-            InvalidArgument: an invalid name, NaN, or a value that the parameter's type cannot represent.
+            InvalidArgument: the name is invalid, or the value is NaN or does not fit the parameter's type.
             ParameterRejected: the vehicle has no such parameter, or keeps the previous value; see ``code``.
             ParameterTimeout: not confirmed, but it may have been set.
         """
@@ -198,9 +198,9 @@ class Parameters(ReadOnly):
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> dict[str, ParameterWrite]:
-        """Set several parameters concurrently; return a result for each of them: check its ``error``.
+        """Set several parameters concurrently; return a result for each of them. Check the ``error`` of each result.
 
-        Parameters that appear only when another one is set (ArduPilot's ``…_ENABLE``) are set after it.
+        A parameter that appears only after another one was set (ArduPilot's ``…_ENABLE``) is set after the other one.
 
         Raises:
             InvalidArgument: a name or value is invalid. Nothing was set.
@@ -221,9 +221,9 @@ class Parameters(ReadOnly):
 
         ``method="ftp"`` writes one file (``@PARAM/param.pck``) and reads the values back, ``"set"`` sets them one by
         one, ``"auto"`` uses the file if the vehicle supports it and there are many changes. Results are as for
-        :meth:`set_many`; parameters that the vehicle does not have end as ``"failed"`` with ParameterRejected, and the
-        others are set. If two names mean the same parameter, the value under the vehicle's current name is used, and
-        the other name gets no result.
+        :meth:`set_many`; a parameter that the vehicle does not have gets the outcome ``"failed"`` and a
+        ParameterRejected, and all other parameters are set. If two names mean the same parameter, the value under the
+        vehicle's current name is used, and the other name gets no result.
 
         Raises:
             InvalidArgument, FileFormatError: a name, a value or the file is invalid. Nothing was set.
@@ -246,9 +246,10 @@ class Parameters(ReadOnly):
         """Set values for the duration of an ``async with`` block and restore the previous ones at its end.
 
         They are also restored if the block raises or is cancelled, which takes up to ``idle_timeout_s`` seconds. If a
-        value cannot be set, the others are restored and its error is raised. Blocks may be nested and may overlap,
-        for the same parameter as well: it is restored to the value from before the first of them when the last one
-        ends. A value that another station has changed meanwhile stays, and a warning of logger "aerokit" names it.
+        value cannot be set, the others are restored and its error is raised. Blocks may be nested and may overlap, also
+        with the same parameter: when the last of these blocks ends, the parameter gets its value from before the first
+        block. A value that another station has changed meanwhile stays, and a warning of logger "aerokit" names the
+        parameter.
 
         Raises:
             RollbackFailed: values could not be restored; ``not_restored`` has them.
@@ -256,7 +257,7 @@ class Parameters(ReadOnly):
         return TemporaryParameters(self._registry, self._access, self._writing, values, idle_timeout_s)
 
     def transaction(self, *, idle_timeout_s: float = IDLE_TIMEOUT_S) -> Transaction:
-        """Write several parameters, all or none: ``async with vehicle.parameters.transaction() as t: await
+        """Write all of several parameters, or none: ``async with vehicle.parameters.transaction() as t: await
         t.set(…)``.
 
         Each write is verified. If the block raises or is cancelled, or a write fails, the previous values are
@@ -272,10 +273,10 @@ class Parameters(ReadOnly):
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> tuple[ParameterDifference, ...]:
-        """Compare the vehicle (``before``) with a table, a dict or a file (``after``), downloading it if needed.
+        """Compare the vehicle's parameters (``before``) with a table, a dict or a file (``after``).
 
-        Only names in ``parameters`` are compared; ``before`` is None for those that the vehicle does not have. Names
-        and units are the vehicle's.
+        The vehicle's parameters are downloaded if they are not known. Only names in ``parameters`` are compared;
+        ``before`` is None for a name that the vehicle does not have. Names and units in the result are the vehicle's.
         """
         from aerokit.parameters import diff
 
@@ -295,7 +296,7 @@ class Parameters(ReadOnly):
         """Return the parameters that differ from their default, according to MAVFTP or the metadata.
 
         Raises:
-            NotSupported: the defaults are unknown, because neither of the two is available.
+            NotSupported: the defaults are unknown, because neither MAVFTP nor metadata with defaults is available.
         """
         table = await self.download(idle_timeout_s=idle_timeout_s, timeout=timeout, on_progress=on_progress)
         if not any(parameter.default is not None for parameter in table.values()):

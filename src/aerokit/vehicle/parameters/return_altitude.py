@@ -1,4 +1,4 @@
-"""The altitude of a return, under its name and unit on each firmware."""
+"""Reads and writes the altitude of a return to launch, whose parameter and unit depend on the firmware."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.session.session import VehicleSession
 
 MAX_RETURN_ALTITUDE_M = 3000
-"""Upper limit of ArduCopter's RTL_ALT. The others have none."""
+"""Upper limit of ArduCopter's RTL_ALT. The parameters of other firmware have no limit."""
 
 
 async def read_return_altitude(parameters: Parameters, session: VehicleSession) -> float:
@@ -29,7 +29,7 @@ async def write_return_altitude(parameters: Parameters, session: VehicleSession,
 
 
 async def _find(action: str, parameters: Parameters, session: VehicleSession) -> tuple[str, float, float]:
-    """Return name, value and scale of the first parameter for the altitude that the vehicle has."""
+    """Return name, value and scale of the altitude parameter that the vehicle has."""
     autopilot = session.autopilot
     names = autopilot.return_altitude_parameters(is_vtol=session.telemetry.is_vtol)
     if not names:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from aerokit.connection.bus import Detach
     from aerokit.vehicle.session.transfers import Transfers
 
-# Messages with the previous value may still arrive for this long.
+# Seconds in which messages with the previous value may still arrive after a write.
 IN_FLIGHT_S = 1.0
 
 
@@ -63,14 +63,15 @@ class ParameterStore:
         return name in self._known
 
     def mark_replaced(self, name: str, value: float) -> None:
-        """Ignore this value for a moment, because it was just replaced.
+        """Ignore messages with this previous value for ``IN_FLIGHT_S``, because a write has just replaced it.
 
-        ArduPilot answers PARAM_SET at once, but PARAM_REQUEST_READ up to 0.1 s after it read the value.
+        ArduPilot answers PARAM_SET at once, but sends the answer to PARAM_REQUEST_READ up to 0.1 s after it read the
+        value. An answer with the previous value may therefore arrive after the confirmation of the write.
         """
         self._replaced[name] = value, self._transfers.connection.now() + IN_FLIGHT_S
 
     def clear_replaced(self, name: str) -> None:
-        """Accept any value again, because the parameter is being written."""
+        """Accept messages with any value of this parameter again, because the parameter is being written."""
         self._replaced.pop(name, None)
 
     def replaced_value(self, name: str) -> int | float | None:
@@ -165,7 +166,7 @@ class ParameterCache:
         self.directory: Path = default_directory() if directory is None else Path(directory)
 
     def load(self, vehicle: str, hash_: int) -> ParameterTable | None:
-        """Return the cached list of a vehicle if it has this hash."""
+        """Return the cached list of a vehicle if the list has this hash; otherwise None."""
         try:
             content = json.loads(self._path(vehicle).read_text(encoding="utf-8"))
             if (content["format"], content["vehicle"], content["hash"]) != (CACHE_FORMAT, vehicle, hash_):
@@ -192,7 +193,7 @@ class ParameterCache:
 
 
 def vehicle_key(autopilot: str, system_id: int, version: AutopilotVersion | None) -> str:
-    """Return the file name for a vehicle: hardware id, or system id if unknown, and firmware."""
+    """Return the file name for a vehicle: its hardware id (or its system id if that is unknown) and its firmware."""
     unit = f"uid-{version.uid:016x}" if version is not None and version.uid else f"system-{system_id}"
     firmware = "unknown" if version is None else f"{version.firmware}-{version.git_hash}"
     key = f"{autopilot}-{unit}-{firmware}"

@@ -1,4 +1,4 @@
-"""Writes that are restored: at the end of a block (``temporarily``), or if it fails (``transaction``)."""
+"""Parameter writes that are undone at the end of a block (``temporarily``) or if it fails (``transaction``)."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ __all__ = ["TemporaryParameters", "Transaction"]
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
-# Limits the end of a block to this many times ``idle_timeout_s``, however slow the link is.
+# Leaving a block takes at most this many times ``idle_timeout_s``, however slow the link is.
 MAX_RESTORE_TIMEOUTS = 3
 
 
 class RestoreRegistry:
-    """Open blocks that will restore each parameter, in the order of their first write."""
+    """Maps each parameter to the open blocks that will restore it, in the order in which they first wrote it."""
 
     def __init__(self) -> None:
         self._blocks: dict[str, list[_Block]] = {}
@@ -40,7 +40,7 @@ class RestoreRegistry:
         self._blocks.setdefault(name, []).append(block)
 
     def remove(self, name: str, block: _Block) -> _Block | None:
-        """Remove a block; return the block that wrote the parameter next after it, if any."""
+        """Remove a block; return the block that wrote the parameter next after the removed one, if any."""
         blocks = self._blocks[name]
         position = blocks.index(block)
         del blocks[position]
@@ -74,12 +74,14 @@ class _Block:
             if not isinstance(answer, Parameter):
                 raise answer
             if name not in self._before:
-                # A value that was read may lack its last bits.
+                # The store is preferred, because a value that was read as a float may lack its last bits.
                 self._before[name] = self._access.store.get(name) or answer
                 self._registry.add(name, self)
 
     def _release_own(self) -> list[Parameter]:
-        """Return the parameters that this block must restore. An overlapping block restores those that it shares."""
+        """Return the parameters that this block must restore. Parameters that an overlapping block also wrote are left
+        to it.
+        """
         own = []
         for name, before in self._before.items():
             later = self._registry.remove(name, self)
@@ -114,7 +116,9 @@ class _Block:
             raise RollbackFailed(f"could not restore{reason}: {names}", not_restored=left) from cause
 
     async def _changed_by_others(self, wanted: list[Parameter]) -> dict[str, object]:
-        """Return parameters that cannot be read, or that another station has changed since. Log these changes."""
+        """Return the parameters that cannot be read, or that another station has changed since the write; log these
+        changes.
+        """
         written = self._access.written
         own = [param.name for param in wanted if param.name in written]
         changed: dict[str, object] = {}
@@ -160,15 +164,16 @@ class TemporaryParameters(_Block):
 
 @checks_arguments
 class Transaction(_Block):
-    """Several writes, all or none.
+    """Several parameter writes, of which either all take effect or none.
 
-    Every write is verified; one that fails or is clamped raises. If the block raises, all written parameters are
-    restored as far as possible: those that could not be restored are in :class:`aerokit.errors.RollbackFailed`, and
-    are not tried again when the link returns. Otherwise the exception of the block propagates.
+    Every write is verified; a write that fails or is clamped raises. If the block raises, aerokit restores all written
+    parameters and the exception of the block propagates. If some could not be restored,
+    :class:`aerokit.errors.RollbackFailed` names them; they are not tried again when the link returns.
 
-    A value that another station has changed meanwhile stays, and a warning of logger "aerokit" names it. Other tasks
-    of your program may write meanwhile: a transaction restores the values from before its own first write. Blocks with
-    the same parameter may be nested and may overlap; an outer block that fails also undoes an inner one that succeeded.
+    A value that another station has changed meanwhile stays, and a warning of logger "aerokit" names the parameter.
+    Other tasks of your program may write at the same time: a transaction restores the values from before its own first
+    write. Blocks with the same parameter may be nested and may overlap; an outer block that fails also undoes an inner
+    block that succeeded.
     """
 
     def __init__(
@@ -201,7 +206,9 @@ class Transaction(_Block):
         return tuple(change.name for change in self.changes if self._name_needs_reboot(change.name))
 
     async def set(self, name: str, value: float) -> ParameterWrite:
-        """Set one parameter; errors as for :meth:`Parameters.set`, and VerificationFailed if it is clamped."""
+        """Set one parameter; errors as for :meth:`Parameters.set`, and VerificationFailed if the vehicle clamps the
+        value.
+        """
         return (await self.set_many({name: value}))[name]
 
     async def set_many(self, values: Mapping[str, float]) -> dict[str, ParameterWrite]:

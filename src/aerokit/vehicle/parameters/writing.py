@@ -29,7 +29,7 @@ ParameterFailure = ParameterRejected | ParameterTimeout
 
 
 class ResolvedParameter(Snapshot):
-    """A parameter of the vehicle, and the name ``requested`` by the program. ``is_fresh`` if it was just read."""
+    """A parameter of the vehicle, and the name that the program ``requested``. ``is_fresh``: it was just read."""
 
     requested: str
     parameter: Parameter
@@ -53,7 +53,7 @@ class ResolvedParameter(Snapshot):
 
 
 def resolve_known(name: str, known: Mapping[str, Parameter]) -> ResolvedParameter | None:
-    """Look up a parameter under any of its names among known ones."""
+    """Return the known parameter that has this name, or an old or new form of it; None if there is none."""
     if name in known:
         return ResolvedParameter(name, known[name], False)
     from aerokit.parameters.renames import resolve_rename
@@ -107,7 +107,7 @@ class NameResolver:
         return name.upper() if self._access.has_upper_case_names else name
 
     def _unknown_names(self, names: Iterable[str]) -> dict[str, None]:
-        """Return all possible names of the parameters that are known under none of their names."""
+        """Return the old and new names of all requested parameters whose values are not known yet."""
         from aerokit.parameters.renames import other_names, resolve_rename
 
         store = self._access.store
@@ -131,7 +131,7 @@ class NameResolver:
         return self._with_hint(own or ParameterRejected(f"the vehicle has no parameter {name}", name=name))
 
     def _with_hint(self, answer: ParameterFailure) -> ParameterFailure:
-        """Add similar or replacing names."""
+        """Add a hint to the error: similar names, or the name that replaced this one."""
         if not isinstance(answer, ParameterRejected):
             return answer
         from aerokit.parameters.renames import replacement_of
@@ -142,7 +142,7 @@ class NameResolver:
 
 
 def warn_of_rename(renamed: Renamed) -> None:
-    """Issue the warning for the line of the program that called aerokit."""
+    """Issue the warning, attributed to the line of the program that called aerokit."""
     from aerokit.parameters.renames import ParameterRenamedWarning
 
     depth, frame = 2, sys._getframe(1)
@@ -195,7 +195,7 @@ def outcome_of(wanted: Parameter, before: Parameter | None, answer: ParameterAns
         text = f"{wanted.name} = {wanted.value:g} was refused: the vehicle keeps {answer.value:g}"
         return ParameterRejected(text, name=wanted.name)
     if same_value(float(answer.value), float(wanted.value)):
-        return "rounded"  # The value is an integer that a float cannot represent exactly.
+        return "rounded"  # The requested value is an integer that a float cannot represent exactly.
     distance = abs(answer.value - wanted.value)
     near = (
         distance < MAX_INTEGER_ROUNDING
@@ -205,7 +205,7 @@ def outcome_of(wanted: Parameter, before: Parameter | None, answer: ParameterAns
     return "rounded" if near else "clamped"
 
 
-# Number of times that parameters are looked up that appear only after others were set.
+# Maximum number of rounds of writes. Parameters that appear after a round are looked up and set in the next one.
 MAX_ROUNDS = 3
 
 NoteOf = Callable[[str, float], str]
@@ -240,7 +240,9 @@ class ParameterWriter:
         idle_timeout_s: float,
         on_progress: OnProgress | None = None,
     ) -> dict[str, ParameterWrite]:
-        """Return one result for each value, in order. With ``upload``, send only differences, as a file if possible."""
+        """Write the values; return a result for each, in order. With ``upload``, send only differences, as a file if
+        possible.
+        """
         results: dict[str, ParameterWrite] = {}
         left = check_values(values)
         for attempt in range(MAX_ROUNDS):
@@ -275,7 +277,7 @@ class ParameterWriter:
         *,
         is_first: bool,
     ) -> tuple[list[_PlannedWrite], dict[str, AerokitError]]:
-        """Return the planned writes and the errors. Before anything is set, an invalid value is raised instead."""
+        """Return the planned writes and the errors. In the first round, an invalid value raises its error."""
         plans: dict[str, _PlannedWrite] = {}
         errors: dict[str, AerokitError] = {}
         for name, resolved in found.items():
@@ -324,7 +326,7 @@ def check_values(values: Mapping[str, float]) -> dict[str, int | float]:
 
 
 def _number(name: str, value: float) -> int | float:
-    # The range is checked when the type is known.
+    # The range of an integer is checked later, when the parameter's type is known.
     if isinstance(value, int) and not isinstance(value, bool):
         return value
     return checked_value(name, value, ParameterType.REAL64)

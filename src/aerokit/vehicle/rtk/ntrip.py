@@ -43,7 +43,7 @@ logger: logging.Logger = logging.getLogger("aerokit")
 DEFAULT_PORT = 2101
 MIN_RETRY_S, MAX_RETRY_S = 1.0, 30.0
 MAX_SILENCE_S = 30.0
-"""Seconds without data after which the client reconnects. Base stations send every second or two."""
+"""Seconds without data after which the client reconnects. Base stations send data every one or two seconds."""
 POSITION_INTERVAL_S = 10.0
 POSITION_POLL_INTERVAL_S = 1.0
 POSITION_MAX_AGE_S = 10.0
@@ -65,11 +65,13 @@ class Caster:
 
     @classmethod
     def parse(cls, url: str) -> Caster:
-        """Parse ``ntrip://user:password@host:port/MOUNT``. Error texts do not contain the URL, but its format."""
+        """Parse ``ntrip://user:password@host:port/MOUNT``. Error texts show the expected format, but never the URL
+        itself.
+        """
         try:
             parts = urlsplit(url)
             host, port = parts.hostname, parts.port
-        except ValueError:  # Its text may contain the password.
+        except ValueError:  # The text of this error may contain the password.
             parts, host, port = urlsplit(""), None, None
         mount = unquote(parts.path[1:])
         is_printable = mount.isascii() and mount.isprintable() and "/" not in mount and " " not in mount
@@ -146,8 +148,8 @@ class NtripClient:
     bytes, which GPS_RTCM_DATA cannot carry, are dropped. Leaving the block closes the connection.
 
     Entering raises:
-        OperationRejected: the caster refused the user or the password, or has no such mount point (the text lists its
-            mount points).
+        OperationRejected: the caster refused the user or the password, or has no such mount point. The error text lists
+            the caster's mount points.
         LinkOpenError: the caster could not be reached.
         OperationTimeout: the caster did not answer in time.
         BusyError: the client was entered before; call ``ntrip()`` again.
@@ -232,8 +234,8 @@ class NtripClient:
                     pause_s = min(2 * pause_s, MAX_RETRY_S)
                     try:
                         response = await self._open(self._caster.mount)
-                    # Retry after a refusal too: casters limit the connections of a user, and may still count the old
-                    # one.
+                    # A refusal is retried too, because casters limit the connections of a user and may still count the
+                    # lost connection.
                     except (OperationRejected, OperationTimeout, LinkOpenError) as error:
                         self._report(str(error))
                         continue
@@ -328,7 +330,7 @@ class NtripClient:
             self._close()
 
     async def _table(self, response: _Response) -> dict[str, bool]:
-        """Read a source table: return its mount points, and whether each needs the position (field ``nmea``)."""
+        """Read a source table: map each mount point to True if it needs the position (field ``nmea``)."""
         text = b""
         with suppress(OSError, ValueError, EOFError, asyncio.TimeoutError):
             async for data in response.body():
@@ -370,7 +372,7 @@ def gga_sentence(session: VehicleSession) -> bytes | None:
 
 
 def _angle(degrees: float, digits: int) -> str:
-    """Return degrees and minutes without a separator: 4723.86456."""
+    """Format an angle as degrees and minutes without a separator between them: 4723.86456."""
     units = round(abs(degrees) * 60 * 100_000)
     whole, rest = divmod(units, 60 * 100_000)
     return f"{whole:0{digits}d}{rest // 100_000:02d}.{rest % 100_000:05d}"

@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 __all__ = ["Corrections", "Rtk"]
 
 BANDWIDTH_WINDOW_S = 10.0
-# If several vehicles use the same corrections, all of them pass each message here within this time. A base station
-# repeats an equal message (1005, its position) after at least a second.
+# Seconds in which an equal message counts as the same one, passed on by another vehicle. A base station repeats an
+# equal message (1005, its position) after a second at the earliest.
 REPEAT_WINDOW_S = 0.9
 MAX_RECENT = 64
 
 
 class _SentMessages:
-    """RTCM messages that were sent on one connection, by all its vehicles."""
+    """RTCM messages that all vehicles of one connection have sent recently."""
 
     def __init__(self) -> None:
         self.sequence = 0
@@ -91,15 +91,15 @@ class Rtk:
 
     @property
     def corrections(self) -> StateCell[Corrections]:
-        """Number, bytes and bandwidth of the corrections. The age of this cell is the age of the last message."""
+        """Number, bytes and bandwidth of the corrections sent. The age of this cell is the age of the last message."""
         return self._corrections
 
     def send(self, rtcm: bytes) -> None:
         """Send RTCM 3 messages to the vehicle; never blocks.
 
         aerokit splits each message into GPS_RTCM_DATA. GPS_RTCM_DATA has no target and reaches all vehicles of the
-        connection. If several vehicles send the same message within 0.9 s, it is therefore transmitted once. There is
-        no acknowledgement: ``vehicle.gps`` shows whether the receiver uses the corrections.
+        connection. If you pass the same message to several vehicles within 0.9 s, aerokit therefore transmits it once.
+        There is no acknowledgement: ``vehicle.gps`` shows whether the receiver uses the corrections.
 
         Args:
             rtcm: one or more complete messages of at most 720 bytes each.

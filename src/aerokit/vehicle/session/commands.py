@@ -1,4 +1,4 @@
-"""Sends any MAV_CMD to one vehicle and awaits its result. Equal commands are sent one at a time."""
+"""Sends any MAV_CMD to one vehicle and awaits the result. Commands with the same MAV_CMD are sent one at a time."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from aerokit.protocols.command import OrderStatus
 
 UNKNOWN = (MavResult.UNSUPPORTED, MavResult.COMMAND_LONG_ONLY, MavResult.COMMAND_UNSUPPORTED_MAV_FRAME)
-"""MAV_RESULTs that mean that the firmware does not support a command, or not as this message."""
-# Nothing is repeated until this many measured round trips have passed, because the answer may still arrive.
+"""MAV_RESULTs that mean that the firmware does not support the command, or does not support it in this message type."""
+# A command is not repeated before this many measured round trips, because its answer may still arrive.
 ROUND_TRIPS = 2
 MAX_ATTEMPT_TIMEOUT_S = 5.0
 PENDING_ACK_TIMEOUT_S = 2.0
@@ -34,9 +34,9 @@ _Key = tuple[int, int]
 class CommandSender:
     """The command protocol with one vehicle (https://mavlink.io/en/services/command.html).
 
-    COMMAND_ACK has no request id, so equal commands to one component are serialized; different commands never wait for
-    each other. If an order ends, its running command is aborted, and its waiting command is not sent. Late acks of
-    cancelled or unconfirmed commands are not taken for the ack of the next command.
+    COMMAND_ACK has no request id. Commands with the same MAV_CMD to one component are therefore serialized; other
+    commands never wait for each other. When an order ends, aerokit aborts its running command and does not send its
+    waiting command. A late ack of a cancelled or unconfirmed command is not taken for the ack of the next command.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class CommandSender:
         )
 
     def close(self) -> None:
-        """Stop receiving acks; calls that wait for one, and later calls, raise ConnectionClosed."""
+        """Stop receiving acks. Calls that wait for an ack, and later calls, raise ConnectionClosed."""
         for detach in self._detach:
             detach()
         self._is_closed = True
@@ -120,9 +120,7 @@ class CommandSender:
         order_status: OrderStatus | None = None,
         **options: Any,
     ) -> CommandAck:
-        """Send a command with a position above mean sea level: as COMMAND_INT, or COMMAND_LONG if that is not
-        supported.
-        """
+        """Send a command with a position above mean sea level, as COMMAND_LONG if COMMAND_INT is not supported."""
         try:
             return await self.send_int(
                 command, *params, frame=MavFrame.GLOBAL_INT, x=x, y=y, z=z, order_status=order_status, **options
@@ -149,11 +147,11 @@ class CommandSender:
         )
 
     def last_result(self, command: int, component_id: int | None = None) -> int | None:
-        """Return the last MAV_RESULT of this command, also if its call was cancelled."""
+        """Return the last MAV_RESULT received for this command, even if the call that sent it was cancelled."""
         return self._results.get((self._component_id if component_id is None else component_id, command))
 
     def is_unknown(self, command: int, component_id: int | None = None) -> bool:
-        """Return True if the vehicle answered that it does not support the command, or not as this message."""
+        """Return True if the vehicle's last answer to this command was one of `UNKNOWN`."""
         return self.last_result(command, component_id) in UNKNOWN
 
     def accepted_at(self, command: int) -> float:
@@ -183,7 +181,7 @@ class CommandSender:
         key = (
             message.target_component or self._component_id,
             message.command,
-        )  # The autopilot answers commands to all components.
+        )  # For a command to all components, the autopilot's answer counts.
         self._make_way(key)
         end = "" if order_status is None else order_status.end
         async with self._locks[key]:
@@ -221,14 +219,14 @@ class CommandSender:
                 self._expect_answers(key, exchange.pending_answers, earlier[exchange.answers :])
 
     def _make_way(self, key: _Key) -> None:
-        """Abort a running command whose order has ended, so that a newer command need not wait."""
+        """Abort the running command with this key if its order has ended, so that a newer command need not wait."""
         order_status = self._standings.get(key)
         if order_status is not None and order_status.end:
             text = f"no COMMAND_ACK for {command_name(key[1])} yet; not sent again: {order_status.end}"
             self._runs[key].abort(CommandTimeout(text))
 
     def _answers_within_s(self) -> float:
-        """Return the minimum time to wait for an ack, limited because a stalled link makes the measured round trip too
+        """Return the minimum time to wait for an ack. It is limited, because a stalled link makes round trips look too
         long.
         """
         return min(ROUND_TRIPS * (self._round_trip_s() or 0.0), MAX_ATTEMPT_TIMEOUT_S)

@@ -1,4 +1,4 @@
-"""Message rates: requests the messages that subscribers need, checks that they arrive, and requests them again."""
+"""Message rates: requests the messages that subscribers need, and requests a message again if it does not arrive."""
 
 from __future__ import annotations
 
@@ -32,24 +32,24 @@ if TYPE_CHECKING:
 
 WATCH_PERIOD_S = 1.0
 
-# A rate is evaluated over this many watch periods.
+# A received rate is averaged over this many watch periods of a second.
 WATCH_WINDOW = 5
 
 SLOW_FACTOR = 0.5
 
 RETRY_INTERVAL_S = 5.0
-"""Seconds until a missing stream is requested again; doubled each time up to the maximum."""
+"""Seconds until a missing stream is requested again. Doubles with each request, up to ``MAX_RETRY_INTERVAL_S``."""
 
 MAX_RETRY_INTERVAL_S = 60.0
 
 AUTOPILOT_DEFAULT = 0.0
 
 SUBSCRIPTION_HZ = 4.0
-"""Rate in Hz for subscriptions that name no rate, to a streamed message without a default rate."""
+"""Rate in Hz for a subscription without a rate, to a streamed message that has no default rate."""
 
 
 def subscription_rate_hz(message_type: type[Message]) -> float | None:
-    """Return the rate for a subscription that names none; None for messages that are sent on demand."""
+    """Return the rate for a subscription without a rate; None for messages that are sent on demand."""
     name = message_type.__name__
     return DEFAULT_RATES_HZ.get(name, SUBSCRIPTION_HZ if name in STREAMED_MESSAGES else None)
 
@@ -126,14 +126,15 @@ class MessageRates:
     def request(self, message_type: type[Message], hz: float, *, is_optional: bool = False) -> Detach:
         """Request ``message_type`` at ``hz`` (above 0, at most 1000) or faster until the returned function is called.
 
-        For an optional message (e.g. of a sensor that may be missing) no StreamUnavailable event is published.
+        If an optional message (e.g. of a sensor that may be missing) does not arrive, StreamUnavailable is not
+        published.
         """
         check_rate(message_type, hz)
         stream = self._streams.get(message_type.ID)
         if stream is None:
             stream = self._streams[message_type.ID] = self._new_stream(message_type)
         stream.is_optional = stream.is_optional and is_optional
-        if stream.refused:  # A refusal may depend on the rate.
+        if stream.refused:  # The vehicle may accept another rate than the refused one.
             stream.refused, stream.requested_hz = False, None
         token = object()
         stream.requests[token] = hz
@@ -154,14 +155,14 @@ class MessageRates:
         self._dirty.set()
 
     async def run(self) -> None:
-        """Send the requests until cancelled; :meth:`watch` must run concurrently."""
+        """Send requests for message rates until cancelled; :meth:`watch` must run concurrently."""
         while True:
             await self._dirty.wait()
             self._dirty.clear()
             await self._request_all_due()
 
     async def watch(self) -> None:
-        """Evaluate the received rates once a second, until cancelled."""
+        """Check once a second at which rates messages arrive, until cancelled."""
         while True:
             await anyio.sleep(WATCH_PERIOD_S)
             for stream in self._streams.values():
@@ -184,7 +185,9 @@ class MessageRates:
         return stream
 
     async def _request_all_due(self) -> None:
-        """Request the due streams one at a time, the most urgent first; an unanswered stream is tried again last."""
+        """Request the due streams one at a time, the most urgent first. A stream whose request was not answered comes
+        last.
+        """
         while not self._legacy and (stream := self._most_urgent()) is not None:
             await self._request_by_command(stream)
         if self._legacy:
@@ -231,7 +234,9 @@ class MessageRates:
         self._publish_unavailable(stream, result_name(error.result))
 
     def _request_by_group(self) -> None:
-        """Request groups of messages. REQUEST_DATA_STREAM has no ack, so the watch repeats it when nothing arrives."""
+        """Request groups of messages by REQUEST_DATA_STREAM. It has no ack, so :meth:`watch` repeats it if nothing
+        arrives.
+        """
         wanted: dict[int, float] = {}
         for stream in self._streams.values():
             if not stream.is_due:
@@ -244,7 +249,7 @@ class MessageRates:
                 wanted[group] = self._fastest_of(group)
             stream.mark_requested(self._connection.now(), stream.needed_hz)
         for group, hz in wanted.items():
-            if hz > 0:  # Another ground station may have started a group that no subscriber here needs.
+            if hz > 0:  # Other groups may be in use by another ground station.
                 rate = math.ceil(hz)
                 self._connection.send(RequestDataStream(self._system_id, self._component_id, group, rate, 1))
 
@@ -336,9 +341,7 @@ class ComponentSubscriber:
         *,
         entire_system: bool = False,
     ) -> Subscription[ItemT]:
-        """Return a stream of messages of this component, or of the ``entire_system``, and of events; requests the
-        rates.
-        """
+        """Return a stream of events, and of messages of this component or the ``entire_system``; request the rates."""
         self._connection.check_types(types)
         messages: list[type[Message]] = [type_ for type_ in types if issubclass(type_, Message)]
         if rate_hz is not None:
@@ -398,7 +401,7 @@ class ComponentSubscriber:
         return cell
 
     def _only(self, sink: Callable[..., object]) -> Sink:
-        """Pass messages of this component, events about it, and events about no particular component."""
+        """Return a sink that drops messages of other components and events about other components."""
 
         def filtered(item: Any) -> None:
             frame = getattr(item, "received_frame", None)
@@ -410,7 +413,7 @@ class ComponentSubscriber:
 
 
 class WatchedStream:
-    """Feed of a cell that requests its message only while the program waits for the cell or follows it.
+    """Feed of a cell: requests the cell's message only while the program waits for the cell or follows it.
 
     ``request`` returns None if the message need not be requested now.
     """
@@ -422,7 +425,7 @@ class WatchedStream:
         self._release: Detach | None = None
 
     def catch_up(self) -> None:
-        """Do nothing: another feed decodes the message."""
+        """Do nothing, because another feed of the cell decodes the message."""
 
     def watchers_changed(self) -> None:
         if not self._cell._is_watched and self._release is not None:

@@ -60,7 +60,9 @@ EAGER_REQUESTS, EAGER_S = 4, 0.3
 
 
 async def learn_constants(connection: Connection, commands: CommandSender, telemetry: Telemetry) -> None:
-    """Request version, home, origin and modes until they are known, again after a reboot, until the link closes."""
+    """Request version, home, origin and modes until they are known, and again after each reboot. Runs until the link
+    closes.
+    """
     has_requested_modes = False
     await _learn_version(commands, telemetry)
     while connection.is_open:
@@ -77,7 +79,7 @@ async def learn_constants(connection: Connection, commands: CommandSender, telem
 
 
 async def _learn_version(commands: CommandSender, telemetry: Telemetry) -> None:
-    """Request the version in short intervals, because the first transfer waits for the capabilities."""
+    """Request the version at short intervals, because the first transfer waits for the capabilities in this message."""
     version = telemetry.version
     for _ in range(EAGER_REQUESTS):
         if version.is_known:
@@ -201,7 +203,7 @@ class VehicleSession:
             cell.close(self._ended_by)
 
     def add_timeout_hint(self, *cells: StateCell[Any]) -> None:
-        """Add rejected signatures to the time-out texts of these cells, because they are a likely reason."""
+        """Mention rejected signatures in the time-out texts of these cells, because signatures are a likely cause."""
         for cell in cells:
             cell._explain_timeout = self._describe_signatures
 
@@ -230,14 +232,14 @@ class VehicleSession:
     def check_disarmed(self, action: str, *, is_current: bool = True) -> None:
         """Raise OperationRejected unless the vehicle is known to be disarmed.
 
-        If ``is_current`` is False, the last HEARTBEAT is too old to know that.
+        ``is_current`` is False if the last HEARTBEAT is too old to show the present state.
         """
         if not self.telemetry.is_confirmed_disarmed or not is_current:
             state = "armed" if self.telemetry.is_armed else "not known to be disarmed"
             raise OperationRejected(f"{action}: the vehicle is {state}; nothing was sent")
 
     async def wait_for_heartbeat(self, since: float | None = None) -> None:
-        """Wait for a HEARTBEAT that was received after ``since`` (None: the next one)."""
+        """Wait for a HEARTBEAT that is received after ``since``; None means from now on."""
         armed, after = self.telemetry.armed, self.connection.now() if since is None else since
         await armed.wait_until(lambda _: armed.updated_at > after, description="the next HEARTBEAT")
 
@@ -267,7 +269,7 @@ class VehicleSession:
         await anyio.sleep(STATUS_TEXT_DELAY_S)
 
     def with_reasons(self, error: CommandRejected, since: float, reasons: tuple[str, ...] = ()) -> CommandRejected:
-        """Return the refusal with the vehicle's status texts since then and these reasons, without duplicates.
+        """Return the error with ``reasons`` and the vehicle's status texts since this time added, without duplicates.
 
         Informational texts ("ArduPilot Ready") are left out.
         """
@@ -284,7 +286,7 @@ class VehicleSession:
         )
 
     def deduplicate_reasons(self, *texts: str) -> tuple[str, ...]:
-        """Remove duplicates: ArduPilot sends the same text as "PreArm: …" and as "Arm: …"."""
+        """Remove duplicate texts: ArduPilot sends the same text once as "PreArm: …" and once as "Arm: …"."""
         reasons: dict[str, str] = {}
         for text in texts:
             reasons.setdefault(self.autopilot.arming_reason(text) or text, text)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.session.session import VehicleSession
 
 
-# The retry interval is that of HEARTBEAT, whose signature shows whether the key was accepted.
+# HEARTBEAT is sent at this interval, and its signature shows whether the vehicle has accepted the key.
 RETRY_INTERVAL_S = 1.0
 
 

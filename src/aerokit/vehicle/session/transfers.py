@@ -29,13 +29,13 @@ IN_BACKGROUND_S = 5.0
 
 
 class Messaging(Protocol):
-    """The interface of a session, with the autopilot or another component, that transfers depend on."""
+    """The part of a session that transfers use, for the autopilot or another component."""
 
     on_reboot: list[Callable[[], None]]
 
     @property
     def transfers(self) -> Transfers:
-        """Runs the exchanges of this session."""
+        """The object that runs the exchanges of this session."""
         ...
 
     def at_close(self, *functions: Detach) -> None:
@@ -88,7 +88,7 @@ class Transfers:
             except OperationTimeout as error:
                 self._explain(error)
                 raise
-            if isinstance(result, dict):  # One answer for each name.
+            if isinstance(result, dict):  # The result of a request by name is a mapping with one answer for each name.
                 for answer in result.values():
                     if isinstance(answer, OperationTimeout):
                         self._explain(answer)
@@ -104,7 +104,7 @@ class Transfers:
 
     @contextmanager
     def limit(self, timeout: float | None) -> Iterator[None]:
-        """Limit the duration of a block in seconds; raises :class:`OperationTimeout`. None: no limit."""
+        """Limit the duration of a block: raise :class:`OperationTimeout` after this many seconds. None: no limit."""
         try:
             with anyio.fail_after(timeout):
                 yield

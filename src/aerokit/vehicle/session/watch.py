@@ -31,12 +31,12 @@ if TYPE_CHECKING:
     from aerokit.events import LinkState
     from aerokit.mavlink.frame import Frame
 
-# A decrease of the time since boot above this limit is a reboot. Reordered messages cause a smaller decrease, and so
-# does a reboot soon after another one.
+# If the time since boot decreases by more than this, the vehicle has rebooted. Reordered messages cause a smaller
+# decrease. So does a reboot soon after another one, which is therefore not detected.
 REBOOT_STEP_MS = 3000
 # The decreased time must persist for this long and in at least two messages, because one message may be late.
 REBOOT_CONFIRM_S = 0.2
-# The limit after an accepted reboot command. A boot takes longer than this, and messages are delayed by less than this.
+# The same limit after an accepted reboot command. A boot takes longer than this; messages are delayed by less.
 MIN_REBOOT_STEP_MS = 2000
 CLOCK_SPAN_S = 5.0
 REPORT_PERIOD_S = 1.0
@@ -95,8 +95,8 @@ class VehicleWatch:
     def silent_for_s(self) -> float:
         """Seconds since a heartbeat was processed.
 
-        A pause of this program does not count as silence: after a blocked event loop, :attr:`last_heartbeat_at` may be
-        older.
+        If the event loop of this program was blocked, the pause does not count as silence. :attr:`last_heartbeat_at`
+        may therefore be older.
         """
         return self._connection.now() - self._heartbeat_read_at
 
@@ -125,7 +125,7 @@ class VehicleWatch:
 
     @contextmanager
     def expecting_reboot(self) -> Iterator[None]:
-        """Detect a reboot within the block even if the vehicle had booted very recently."""
+        """Detect a reboot within the block even if the previous boot was very recent."""
         self._expects_reboot = True
         try:
             yield
@@ -135,8 +135,8 @@ class VehicleWatch:
     def on_time_answer(self, requested_at: float, milliseconds: int) -> None:
         """Process the time since boot from an answer to our TIMESYNC request.
 
-        If the request was sent after the previous answer had arrived, only a reboot explains an earlier time. It needs
-        no confirmation, even in a fast simulation.
+        If the request was sent after the previous answer had arrived, a lower time can only come from a reboot. A
+        second message need not confirm it, even in a fast simulation.
         """
         before_at, before = self._last_answer
         if requested_at <= before_at:
@@ -202,7 +202,7 @@ class VehicleWatch:
             self._has_rebooted(clock, milliseconds)
 
     def _is_confirmed(self, clock: str, milliseconds: int) -> bool:
-        """Return True if the decreased time has persisted, with no message of the previous time in between."""
+        """Return True if the time has continued from its decreased value for ``REBOOT_CONFIRM_S``."""
         now = self._connection.now()
         first, since = self._candidates.setdefault(clock, (milliseconds, now))
         if milliseconds < first:
@@ -253,7 +253,7 @@ class LinkWatch:
     async def run(self, on_tick: Callable[[], None]) -> None:
         """Report once a second until cancelled or the connection ends; calls ``on_tick`` each time."""
         self.request_time()
-        self._next_request_at = self._connection.now()  # Ask once more with the first report.
+        self._next_request_at = self._connection.now()  # The first report sends another request.
         while self._connection.is_open:
             await anyio.sleep(REPORT_PERIOD_S)
             if self._connection.is_open:
@@ -263,16 +263,17 @@ class LinkWatch:
                 on_tick()
 
     def request_time(self) -> None:
-        """Request the vehicle's time now, in addition to every two seconds."""
+        """Request the vehicle's time now, in addition to the requests that are sent every two seconds."""
         now = self._connection.now()
         self._next_request_at = now + TIMESYNC_PERIOD_S
         self._open_requests.append(int(now * 1e9))
         self._connection.send(Timesync(0, self._open_requests[-1]), to=self._system_id)
 
     def _on_timesync(self, message: Timesync) -> None:
-        """Process the answer to our request; requests of the vehicle and answers to others are ignored.
+        """Process the autopilot's answer to our request. All other TIMESYNC messages are ignored.
 
-        Answers of its other components, such as a companion computer, are ignored as well; they may arrive first.
+        Another component of the vehicle, such as a companion computer, may answer before the autopilot; its answer is
+        ignored.
         """
         frame = message.received_frame
         if frame is None or frame.component_id != self._component_id:
@@ -280,7 +281,7 @@ class LinkWatch:
         if message.tc1 != 0 and message.ts1 in self._open_requests:
             self._open_requests.remove(message.ts1)
             now = self._connection.now()
-            if now - frame.received_at < CHECK_INTERVAL_S:  # An older answer was delayed by this program itself.
+            if now - frame.received_at < CHECK_INTERVAL_S:  # Otherwise this program delayed the answer.
                 self._round_trip_s = now - message.ts1 / 1e9
             self._on_answer(message.ts1 / 1e9, message.tc1 // 1_000_000)
 
