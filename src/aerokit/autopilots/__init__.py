@@ -1,4 +1,4 @@
-"""Differences between autopilots and vehicle types: mode tables and special behaviour.
+"""Differences between autopilots and vehicle types: mode tables and behaviour.
 
 ``autopilot_for(heartbeat)`` returns the :class:`Autopilot` that describes a vehicle. It does no IO and has no state.
 """
@@ -60,7 +60,7 @@ __all__ = [
 
 
 def autopilot_for(heartbeat: Heartbeat) -> Autopilot:
-    """Return the description for the autopilot and vehicle type of a HEARTBEAT; a generic one if they are unknown."""
+    """Return the description for the autopilot and vehicle type of a HEARTBEAT; a generic one for unknown types."""
     if heartbeat.autopilot == MavAutopilot.ARDUPILOTMEGA:
         return ardupilot_for(heartbeat.type)
     if heartbeat.autopilot == MavAutopilot.PX4:

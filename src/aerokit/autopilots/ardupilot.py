@@ -167,7 +167,7 @@ COPTERS = (
 
 
 class ArduPilot(Autopilot):
-    """Base class of ArduPilot's vehicles, and the description of one with an unknown type."""
+    """Base class of ArduPilot's vehicles. Describes an ArduPilot vehicle of unknown type."""
 
     name = "ArduPilot"
     gimbals: GimbalRules = GimbalRules(has_secondary=False, roi_per_gimbal=False, roi_needs_control=False)
@@ -194,7 +194,7 @@ class ArduPilot(Autopilot):
     first_log_id = 1
     prefers_log_messages = True
     stream_groups = ARDUPILOT_GROUPS
-    # ATTITUDE_QUATERNION is sent on request, and so not listed.
+    # ATTITUDE_QUATERNION is not listed, because it is sent on request.
     unsupported_messages: frozenset[str] = frozenset(
         (
             *("ESTIMATOR_STATUS", "WIND_COV", "ALTITUDE", "CURRENT_MODE"),
@@ -231,13 +231,13 @@ class ArduCopter(ArduPilot):
     """ArduCopter: multicopters and helicopters."""
 
     firmware = "ArduCopter"
-    mission_needs_take_off = True  # ModeAuto::init, "Auto: Missing Takeoff Cmd"
+    mission_needs_take_off = True  # ModeAuto::init refuses the mission with "Auto: Missing Takeoff Cmd".
     unsupported_commands: frozenset[int] = NOT_ON_COPTER
     modes: ModeTable = COPTER
     purposes: ClassVar[Mapping[str, str]] = {
-        "hold": "BRAKE",  # LOITER follows the throttle stick, which is down or absent while a program flies
+        "hold": "BRAKE",  # LOITER follows the throttle stick, which is down or absent while a program flies.
         "land": "LAND",
-        "precision_land": "LAND",  # with PLND_ENABLED
+        "precision_land": "LAND",  # LAND uses the target if PLND_ENABLED is 1.
         "return": "RTL",
         "setpoint": "GUIDED",
         "sticks": "LOITER",
@@ -310,9 +310,9 @@ class ArduPlane(ArduPilot):
     )
     reposition: Reposition | None = Reposition(relative_altitude=True, yaw=False, speed=False)
     speed_types: frozenset[int] = frozenset((SpeedType.AIRSPEED, SpeedType.GROUNDSPEED))
-    arrival_radius_m: float = 90.0  # it circles at WP_LOITER_RAD, 60 m by default
+    arrival_radius_m: float = 90.0  # A plane circles with WP_LOITER_RAD, 60 m by default.
     circles_by: Literal["orbit", "reposition", "setpoints"] | None = "reposition"
-    arming_mode: ClassVar[str | None] = "FBWA"  # manual throttle; a plane armed in TAKEOFF starts to move
+    arming_mode: ClassVar[str | None] = "FBWA"  # A plane armed in TAKEOFF starts to move.
     unarmable_modes: frozenset[str] = frozenset(("AUTOLAND", "INITIALISING", "QLAND", "QRTL", "RTL"))
 
     def _purpose_name(self, purpose: Purpose, is_vtol: bool) -> str | None:
@@ -332,7 +332,7 @@ class ArduPlane(ArduPilot):
 
     def return_altitude_parameters(self, *, is_vtol: bool) -> tuple[tuple[str, float], ...]:
         if self._can_hover(is_vtol):
-            return (("Q_RTL_ALT", 1.0),)  # This vehicle returns in QRTL.
+            return (("Q_RTL_ALT", 1.0),)  # A vehicle with this parameter returns in QRTL.
         return (("RTL_ALTITUDE", 1.0), ("ALT_HOLD_RTL", 100.0))
 
     def _can_hover(self, is_vtol: bool) -> bool:
@@ -366,7 +366,7 @@ class ArduRover(ArduPilot):
 
     def _purpose_name(self, purpose: Purpose, is_vtol: bool) -> str | None:
         if purpose == "hold" and self.vehicle_type == MavType.SURFACE_BOAT:
-            return "LOITER"  # in HOLD the motors are off, and a boat drifts
+            return "LOITER"  # In HOLD the motors are off, and a boat would drift.
         return super()._purpose_name(purpose, is_vtol)
 
 
@@ -385,7 +385,7 @@ class ArduSub(ArduPilot):
     }
     sticks: StickRules | None = StickRules(release="channels")
     setpoints: SetpointRules = SetpointRules(acceleration=False, position_restarts_path=True)
-    mode_when_landed: ClassVar[str | None] = "ALT_HOLD"  # at the surface
+    mode_when_landed: ClassVar[str | None] = "ALT_HOLD"  # The mode in which the vehicle stays at the surface.
     reposition: Reposition | None = Reposition(relative_altitude=True, yaw=False, speed=False)
     condition_yaw = True
 

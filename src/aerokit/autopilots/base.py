@@ -1,4 +1,4 @@
-"""``Autopilot``: interface to everything that differs between autopilots."""
+"""``Autopilot``: describes everything that differs between autopilots."""
 
 from __future__ import annotations
 
@@ -72,9 +72,9 @@ VTOLS = (
 class TakeOff(Snapshot):
     """Take-off procedure of a vehicle.
 
-    First change to ``mode`` (None: keep the current mode), then arm, then send ``command`` with ``params`` (None: the
-    vehicle takes off when armed in ``mode``). Afterwards the vehicle changes to ``mode_after`` by itself (None: it
-    stays in ``mode``).
+    First change to ``mode`` (None: keep the current mode), then arm, then send ``command`` with ``params``. If
+    ``command`` is None, the vehicle takes off when armed in ``mode``. After the take-off, the vehicle changes to
+    ``mode_after`` by itself (None: it stays in ``mode``).
     """
 
     mode: Mode | None
@@ -88,8 +88,9 @@ class SetpointRules(Snapshot):
 
     - ``stream_before_mode``: the stream must be running before the mode is requested.
     - ``body_yaw_is_relative``: in MAV_FRAME_BODY_NED, yaw is relative to the current heading instead of north.
-    - ``position_restarts_path``: each position set-point, even a repeated one, restarts the path from a standstill.
-    - ``trajectory``: positions with velocity and acceleration.
+    - ``position_restarts_path``: each position set-point, even a repeated set-point, restarts the path from a
+      standstill.
+    - ``trajectory``: set-points of positions with velocity and acceleration are supported.
     """
 
     local_position: bool = True
@@ -105,7 +106,7 @@ class SetpointRules(Snapshot):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the supported kinds."""
+        """Names of the supported kinds of set-points."""
         kinds = "local_position global_position velocity acceleration attitude attitude_rate trajectory"
         return tuple(kind.replace("_", " ") for kind in kinds.split() if getattr(self, kind))
 
@@ -114,8 +115,8 @@ class StickRules(Snapshot):
     """Interpretation of MANUAL_CONTROL.
 
     - ``signed_throttle``: the throttle ranges from −1000 to 1000; otherwise from 0 to 1000.
-    - ``release``: message that releases the sticks to the transmitter: MANUAL_CONTROL with "axes" without a value,
-      RC_CHANNELS_OVERRIDE with "channels" of 0, or "none".
+    - ``release``: how the sticks are released to the transmitter. ``"axes"``: by MANUAL_CONTROL with axes that have no
+      value; ``"channels"``: by RC_CHANNELS_OVERRIDE with channels of 0; ``"none"``: there is no such message.
     """
 
     signed_throttle: bool = False
@@ -125,12 +126,14 @@ class StickRules(Snapshot):
 class GimbalRules(Snapshot):
     """Support of the gimbal protocol v2 by the autopilot's gimbal manager. The defaults follow the standard.
 
-    - ``has_secondary``: there is secondary control.
-    - ``supports_retract``: it executes GIMBAL_MANAGER_FLAGS_RETRACT.
-    - ``supports_pitchyaw``: rates are sent by GIMBAL_MANAGER_SET_PITCHYAW; otherwise by GIMBAL_MANAGER_SET_ATTITUDE.
-    - ``supports_roi_sysid``: it supports MAV_CMD_DO_SET_ROI_SYSID.
-    - ``roi_per_gimbal``: a region of interest applies to the named gimbal; otherwise always to the first one.
-    - ``roi_needs_control``: it denies a region of interest to systems without control.
+    - ``has_secondary``: the manager has secondary control.
+    - ``supports_retract``: the manager executes GIMBAL_MANAGER_FLAGS_RETRACT.
+    - ``supports_pitchyaw``: the manager accepts rates by GIMBAL_MANAGER_SET_PITCHYAW; otherwise by
+      GIMBAL_MANAGER_SET_ATTITUDE.
+    - ``supports_roi_sysid``: the manager supports MAV_CMD_DO_SET_ROI_SYSID.
+    - ``roi_per_gimbal``: a region of interest applies to the gimbal named in the command; otherwise always to the first
+      gimbal.
+    - ``roi_needs_control``: the manager denies a region of interest to systems that are not in control.
     """
 
     has_secondary: bool = True
@@ -144,7 +147,7 @@ class GimbalRules(Snapshot):
 class Reposition(Snapshot):
     """Interpretation of MAV_CMD_DO_REPOSITION (192).
 
-    - ``relative_altitude``: frames relative to home are supported; otherwise the altitude must be AMSL.
+    - ``relative_altitude``: frames relative to home are supported; otherwise the altitude must be above mean sea level.
     - ``yaw``: param4 is a heading in radians.
     - ``speed``: param1 sets the ground speed.
     """
@@ -167,7 +170,7 @@ class ModeOrder(Snapshot):
 
 
 def mode_numbers(params: Sequence[float]) -> list[int]:
-    """Convert command parameters to mode numbers. Invalid ones become 0."""
+    """Convert command parameters to mode numbers. Invalid parameters become 0."""
     return [int(param) if 0 <= param < 2**32 else 0 for param in params]
 
 
@@ -187,25 +190,25 @@ class Autopilot:
     """Maps purposes to names of modes."""
     setpoints: SetpointRules = SetpointRules(*[False] * 5)
     external: ExternalRules = ExternalRules()
-    """Measurements of other sensors that the autopilot accepts by MAVLink."""
+    """External measurements that the autopilot accepts by MAVLink."""
     sticks: StickRules | None = None
-    """None if MANUAL_CONTROL is not known to work."""
+    """Interpretation of MANUAL_CONTROL; None if MANUAL_CONTROL is not known to work."""
     actuators_until: tuple[int, int] | None = None
     """First version (major, minor) that no longer has SET_ACTUATOR_CONTROL_TARGET; None if no version has it."""
     reposition: Reposition | None = None
-    """Behaviour of MAV_CMD_DO_REPOSITION; None if it is not known to work."""
+    """Interpretation of MAV_CMD_DO_REPOSITION; None if the command is not known to work."""
     home_is_item_0 = False
     """True if item 0 of a mission is home."""
     acks_per_command: ClassVar[Mapping[int, int]] = {}
-    """Maps a MAV_CMD to the number of COMMAND_ACKs for each transmission, unless it is 1."""
+    """Maps a MAV_CMD to the number of COMMAND_ACKs for each transmission. Commands with one ack are not listed."""
     signing_key_restriction = ""
-    """Clause for error texts: the links on which SETUP_SIGNING is accepted; empty if there is no restriction."""
+    """Clause for error texts about the links on which SETUP_SIGNING is accepted; empty if there is no restriction."""
     runs_prearm_checks = False
     """True if MAV_CMD_RUN_PREARM_CHECKS (401) repeats the failing checks as status texts."""
     calibrates_compasses_by_command = False
     """True if MAV_CMD_DO_START_MAG_CAL (42424) calibrates compasses; otherwise PREFLIGHT_CALIBRATION does."""
     speed_types: frozenset[int] = frozenset((SpeedType.GROUNDSPEED,))
-    """SPEED_TYPEs of MAV_CMD_DO_CHANGE_SPEED (178) that the autopilot applies to the speed of that name."""
+    """SPEED_TYPEs of MAV_CMD_DO_CHANGE_SPEED (178) that the autopilot applies to the speed with this name."""
     circles_by: Literal["orbit", "reposition", "setpoints"] | None = None
     """Way to circle a place: MAV_CMD_DO_ORBIT (34), DO_REPOSITION (192) with a radius, or set-points; None if there is
     none.
@@ -221,7 +224,7 @@ class Autopilot:
     lands_after_return = False
     """True if the return mode ends with a landing."""
     arrival_radius_m: float = 2.0
-    """Default distance in metres within which the vehicle counts as arrived. A fixed wing's includes the circle."""
+    """Default distance in metres within which the vehicle counts as arrived; for a fixed wing, its circle included."""
     mission_storage = "any"
     """Conversions that the autopilot applies to stored mission items: an :class:`aerokit.missions.ItemStorage`."""
     mission_upload_window = 1
@@ -233,23 +236,25 @@ class Autopilot:
     reports_mission_checksum = False
     """True if MISSION_CURRENT has checksums of the stored plans."""
     overwrites_plans_in_place: frozenset[int] = frozenset((0, 1, 2))
-    """MAV_MISSION_TYPEs whose old items are overwritten during an upload; others are kept until it is complete."""
+    """MAV_MISSION_TYPEs whose old items are overwritten during an upload. For other types, old items stay until the
+    upload is complete.
+    """
     mission_completes_at_home = False
-    """True if a mission that ends with a return is complete at home, False if it is when the return begins."""
+    """True if a mission that ends with a return is complete at home, False if it is complete when the return begins."""
     mission_starts_by_command = False
-    """True if MAV_CMD_MISSION_START (300) starts the mission even on the ground; it does not arm."""
+    """True if MAV_CMD_MISSION_START (300) starts the mission even on the ground. The command does not arm."""
     sets_current_by_command = False
     """True if MAV_CMD_DO_SET_MISSION_CURRENT (224) is supported."""
     repeats_item_reached = False
     """True if MISSION_ITEM_REACHED is sent repeatedly for one item."""
     accepts_ftp_session_ids = False
-    """True if the client chooses the number of a MAVFTP session, False if the vehicle does."""
+    """True if the client chooses the number of a MAVFTP session, False if the vehicle chooses it."""
     has_upper_case_parameters = False
     """True if parameters are always reported in upper case."""
     log_suffix = ".log"
     """Suffix of flight log files: ``.bin`` (dataflash) or ``.ulg``."""
     log_directories: ClassVar[tuple[str, ...]] = ()
-    """Directories with flight logs, for MAVFTP; the first one that exists is used."""
+    """Directories with flight logs, for MAVFTP. The first directory that exists is used."""
     first_log_id = 0
     """Id of the oldest log in LOG_ENTRY."""
     prefers_log_messages = False
@@ -270,7 +275,7 @@ class Autopilot:
     unarmable_modes: frozenset[str] = frozenset()
     """Modes in which the autopilot refuses to arm, or disarms at once."""
     armable_by_option: Mapping[str, str] = {}
-    """Maps modes that allow arming only if a parameter says so to that parameter."""
+    """Maps each mode in which only a parameter allows arming to this parameter."""
     modes_without_position: frozenset[str] = frozenset()
     """Modes in which the autopilot arms without an estimate of the position."""
     prearm_depends_on_mode = False
@@ -282,7 +287,7 @@ class Autopilot:
     video_addresses_camera = False
     """True if the stream id of VIDEO_START_CAPTURE selects a camera."""
     arming_mode: ClassVar[str | None] = None
-    """Mode in which to arm if the current mode does not allow arming. The vehicle stays at rest in it."""
+    """Mode in which to arm if the current mode does not allow arming. In this mode, the vehicle stays at rest."""
 
     def __init__(self, vehicle_type: int) -> None:
         self.vehicle_type = vehicle_type
@@ -294,7 +299,9 @@ class Autopilot:
     # --------------------------------------------------------------------------------- modes
 
     def mode_of(self, heartbeat: messages.Heartbeat, extra: Mapping[int, str] = NO_MODES) -> Mode:
-        """Return the mode of a HEARTBEAT. ``extra`` has names that the vehicle reported by AVAILABLE_MODES."""
+        """Return the mode of a HEARTBEAT. ``extra`` has the names of modes that the vehicle reported by
+        AVAILABLE_MODES.
+        """
         return self.mode(heartbeat.custom_mode, heartbeat.base_mode, extra)
 
     def mode(self, custom_mode: int, base_mode: int, extra: Mapping[int, str] = NO_MODES) -> Mode:
@@ -312,7 +319,7 @@ class Autopilot:
         return self.modes.find(mode, extra)
 
     def mode_for(self, purpose: Purpose, *, is_vtol: bool = False) -> Mode | None:
-        """Return the mode for a purpose, or None if the vehicle has none.
+        """Return the mode for a purpose, or None if the vehicle has no such mode.
 
         ``is_vtol``: the vehicle reports the type of a plane, but can hover.
         """
@@ -326,7 +333,7 @@ class Autopilot:
     def modes_of_command(
         self, command: int, params: Sequence[float], extra: Mapping[int, str] = NO_MODES
     ) -> tuple[Mode, ...]:
-        """Return the modes that a command may lead to; empty if none, or unknown."""
+        """Return the modes that a command may lead to; empty if there are none or they are unknown."""
         if command == MavCmd.DO_SET_MODE:
             return self._modes_of_order(params, extra)
         purposes = PURPOSES_OF_COMMANDS.get(command, ())
@@ -358,9 +365,10 @@ class Autopilot:
         return None
 
     def return_altitude_parameters(self, *, is_vtol: bool) -> tuple[tuple[str, float], ...]:
-        """Return the names, newest first, of the parameter for the altitude of a return, each with its units per metre.
+        """Return the parameter for the altitude of a return: its possible names, newest first, each with its units per
+        metre.
 
-        Empty if there is no such parameter.
+        The result is empty if there is no such parameter.
         """
         return ()
 
@@ -390,7 +398,7 @@ class Autopilot:
     def missing_estimates(self, flags: int) -> tuple[str, ...]:
         """Return the missing estimates that prevent arming in a mode that needs a position; empty if there are none.
 
-        ``flags`` are those of EKF_STATUS_REPORT or ESTIMATOR_STATUS.
+        ``flags`` are the flags in EKF_STATUS_REPORT or ESTIMATOR_STATUS.
         """
         return self._missing_estimates(flags, required=ATTITUDE_AND_HEIGHT, horizontal=POS_HORIZ_ABS)
 
@@ -431,9 +439,11 @@ class Autopilot:
 
     _bytewise_by_default = False
     parameter_interval_s: float | None = None
-    """Minimum interval between PARAM_VALUEs in seconds, for MAV_CMD_SET_MESSAGE_INTERVAL; None if it has no effect."""
+    """Minimum interval between PARAM_VALUEs in seconds, for MAV_CMD_SET_MESSAGE_INTERVAL; None if the command has no
+    effect.
+    """
     has_parameter_hash = False
-    """True if the parameter ``_HASH_CHECK`` is a checksum of all others."""
+    """True if the parameter ``_HASH_CHECK`` is a checksum of all other parameters."""
 
     def _git_hash(self, custom_version: bytes) -> str:
         return custom_version.hex().rstrip("0")
@@ -445,14 +455,16 @@ class Autopilot:
         return message.NAME not in self.unsupported_messages
 
     calibration_protocol: str = ""
-    """Reports of calibrations: ``"acknowledgements"`` (ArduPilot), status ``"texts"`` (PX4), or ``""`` if unknown."""
+    """Form in which calibrations are reported: ``"acknowledgements"`` (ArduPilot), status ``"texts"`` (PX4), ``""`` if
+    unknown.
+    """
 
     unsupported_commands: frozenset[int] = frozenset()
     """MAV_CMDs that the firmware does not handle. Actions that need one raise NotSupported before anything is sent."""
     reports_gripper_by_text: bool = False
-    """True if a status text reports the end of a gripper's movement, False if the acknowledgement does."""
+    """True if a status text reports the end of a gripper's movement, False if the acknowledgement reports it."""
     highres_imu_field_ut: float = 100.0
-    """Microtesla per unit of the magnetic field in HIGHRES_IMU; the unit is gauss, except on ArduPilot."""
+    """Microtesla per unit of the magnetic field in HIGHRES_IMU. The unit is gauss, except on ArduPilot."""
     has_shell: bool = False
     """True if SERIAL_CONTROL reaches a system shell."""
     winch_actions: frozenset[int] = frozenset(range(10))

@@ -39,15 +39,15 @@ class ExternalRule(Snapshot):
 
 
 class ExternalRules(Snapshot):
-    """Supported kinds of measurements, and their messages where those differ.
+    """Kinds of measurements that an autopilot supports, and differences in the messages that it reads.
 
-    - ``ned_frame``: MAV_FRAME for a pose north, east, down in ODOMETRY
+    - ``ned_frame``: the MAV_FRAME in ODOMETRY for a pose in north, east, down
     - ``has_mocap``: the estimator reads ATT_POS_MOCAP; otherwise VISION_POSITION_ESTIMATE is sent
-    - ``has_vision_speed``: it reads VISION_SPEED_ESTIMATE; otherwise ODOMETRY without a pose is sent
-    - ``flow_in_radians``: it reads OPTICAL_FLOW_RAD instead of OPTICAL_FLOW
-    - ``target_is_local``: it needs the landing target in the local frame instead of relative to the vehicle
-    - ``constant_position_at_rest``: the flag CONST_POS_MODE is also set for a vehicle at rest that has a position
-    - ``origin_is_final``: it refuses another origin of the local frame once it has one
+    - ``has_vision_speed``: the autopilot reads VISION_SPEED_ESTIMATE; otherwise ODOMETRY without a pose is sent
+    - ``flow_in_radians``: the autopilot reads OPTICAL_FLOW_RAD instead of OPTICAL_FLOW
+    - ``target_is_local``: the landing target must be in the local frame instead of relative to the vehicle
+    - ``constant_position_at_rest``: the flag CONST_POS_MODE is also set while a vehicle with a position is at rest
+    - ``origin_is_final``: once the local frame has an origin, the autopilot refuses another one
     """
 
     kinds: Mapping[ExternalKind, ExternalRule] = {}
@@ -61,7 +61,7 @@ class ExternalRules(Snapshot):
 
 
 def _external_navigation(what: str) -> ExternalRule:
-    """Return the rule of AP_VisualOdom: its type, and source 6 (ExternalNav) in each set of EK3_SRC."""
+    """Return the rule for AP_VisualOdom: VISO_TYPE, and source 6 (ExternalNav) in each set of EK3_SRC parameters."""
     sources = [(f"EK3_SRC1_{what}", (6.0,)), *((f"EK3_SRC{n}_{what}", (0.0, 6.0)) for n in (2, 3))]
     return ExternalRule(((("VISO_TYPE",), (1.0, 2.0, 3.0)),), tuple(sources))
 
@@ -81,7 +81,7 @@ ARDUPILOT_EXTERNAL = ExternalRules(
         "landing_target": ExternalRule(((("PLND_ENABLED",), (1.0,)), (("PLND_TYPE",), (1.0,)))),
         "optical_flow": ExternalRule(((("FLOW_TYPE",), (5.0,)),)),
     },
-    ned_frame=MavFrame.LOCAL_FRD,  # the only frame of GCS_Common.cpp, handle_odometry; the estimator reads it as NED
+    ned_frame=MavFrame.LOCAL_FRD,  # The only frame that GCS_Common.cpp, handle_odometry accepts. Read as NED.
     origin_is_final=True,  # GCS_Common.cpp, set_ekf_origin
 )
 
@@ -107,9 +107,9 @@ PX4_EXTERNAL = ExternalRules(
         "landing_target": ExternalRule(),
         "optical_flow": ExternalRule(((("EKF2_OF_CTRL",), (1.0,)),)),
     },
-    has_mocap=False,  # EKF2.hpp subscribes to vehicle_visual_odometry only
+    has_mocap=False,  # EKF2.hpp subscribes only to vehicle_visual_odometry.
     has_vision_speed=False,
     flow_in_radians=True,
-    constant_position_at_rest=True,  # measured in flight; ArduPilot sets the flag only without aiding
+    constant_position_at_rest=True,  # Measured in flight. ArduPilot sets the flag only if no sensor supplies positions.
     target_is_local=True,  # mavlink_receiver.cpp, handle_message_landing_target
 )

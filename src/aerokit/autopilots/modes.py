@@ -42,7 +42,7 @@ class Mode(Snapshot):
 
 
 class ModeTable:
-    """Names and numbers of the modes of one vehicle type. Lookups ignore case, spaces and underscores."""
+    """Table of names and numbers of the modes of one vehicle type. Lookups ignore case, spaces and underscores."""
 
     def __init__(self, names: Mapping[int, str], aliases: Mapping[str, str] | None = None) -> None:
         self._names = dict(names)
@@ -61,7 +61,9 @@ class ModeTable:
         return self._names
 
     def name_of(self, custom_mode: int, extra: Mapping[int, str] = NO_MODES) -> str:
-        """Return the name of a number. ``extra`` has the modes that the vehicle reported by AVAILABLE_MODES."""
+        """Return the name of the mode with this number. ``extra`` has the modes that the vehicle reported by
+        AVAILABLE_MODES.
+        """
         return self._names.get(custom_mode) or extra.get(custom_mode) or f"{_UNKNOWN} {custom_mode}"
 
     def find(self, mode: str | int | Mode, extra: Mapping[int, str] = NO_MODES) -> Mode:

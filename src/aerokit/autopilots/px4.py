@@ -42,7 +42,7 @@ def _auto(sub: int) -> int:
     return px4_custom_mode(MAIN_AUTO, sub)
 
 
-# From px4_custom_mode.h. Names are those of pymavlink; those of QGroundControl are aliases.
+# From px4_custom_mode.h. Names are those of pymavlink; names that QGroundControl uses are aliases.
 MODES = ModeTable(
     {
         px4_custom_mode(1): "MANUAL",
@@ -94,12 +94,12 @@ class Px4(Autopilot):
     signing_key_restriction = "PX4 accepts a signing key only on its USB port, and before 1.17 on no port"
     modes = MODES
     modes_are_numbered = False
-    # The MAVLink module acknowledges with ACCEPTED at once; the commander acknowledges later with the result.
+    # PX4's MAVLink module acknowledges at once with ACCEPTED. The commander acknowledges later with the result.
     acks_per_command: ClassVar[Mapping[int, int]] = {MavCmd.DO_SET_MODE: 2}
     setpoints: SetpointRules = SetpointRules(stream_before_mode=True, attitude_rate=True, trajectory=True)
     sticks: StickRules | None = StickRules(release="none")
     external: ExternalRules = PX4_EXTERNAL
-    actuators_until: tuple[int, int] | None = (1, 14)  # removed on 2023-03-06: MavlinkReceiver.cpp, commit 27658354
+    actuators_until: tuple[int, int] | None = (1, 14)  # removed on 2023-03-06 by commit 27658354 (MavlinkReceiver.cpp)
     reposition: Reposition | None = Reposition(relative_altitude=False, yaw=True, speed=True)
     gimbals: GimbalRules = GimbalRules(*[False] * 6)
     log_suffix = ".ulg"
@@ -112,14 +112,14 @@ class Px4(Autopilot):
     prearm_depends_on_mode = True
     # Commander.cpp repeats the failing checks as texts (measured with 1.17 in simulation).
     runs_prearm_checks = True
-    # The modes of mode_requirements.cpp. The receiver's health bit refers to these modes in every mode (modeCheck.cpp).
+    # From mode_requirements.cpp. In any mode, the receiver's health bit is about these modes (modeCheck.cpp).
     modes_with_rc: frozenset[str] | None = frozenset(
         ("MANUAL", "ALTCTL", "POSCTL", "POSITION_SLOW", "ALTITUDE_CRUISE", "ACRO", "STABILIZED", "RATTITUDE", "SIMPLE")
     )
     calibration_protocol = "texts"
     camera_by_trigger_only = True
     arming_mode: ClassVar[str | None] = "LOITER"
-    # OFFBOARD needs set-points.
+    # OFFBOARD needs a stream of set-points.
     unarmable_modes: frozenset[str] = frozenset(("LAND", "OFFBOARD", "PRECLAND", "RTL", "TERMINATION"))
     purposes: ClassVar[Mapping[str, str]] = {
         "hold": "LOITER",
@@ -163,7 +163,7 @@ class Px4(Autopilot):
             self.arrival_radius_m: float = 120.0  # a plane circles with NAV_LOITER_RAD, 80 m by default
 
     def mode(self, custom_mode: int, base_mode: int, extra: Mapping[int, str] = NO_MODES) -> Mode:
-        """Return the mode of these numbers. An external mode's own name takes precedence over EXTERNAL1 etc."""
+        """Return the mode of these numbers. The own name of an external mode takes precedence over EXTERNAL1 etc."""
         if custom_mode in _EXTERNAL and custom_mode in extra:
             return Mode(extra[custom_mode], custom_mode, base_mode)
         return super().mode(custom_mode, base_mode, extra)
@@ -187,7 +187,10 @@ class Px4(Autopilot):
         return (self.mode((main & 0xFF) << 16 | (sub & 0xFF) << 24, CUSTOM_MODE_ENABLED, extra),)
 
     def learn_mode_name(self, custom_mode: int, name: str) -> str | None:
-        """Return the names of external modes. Slots without a registered mode are called "(Mode not available)"."""
+        """Return the name if it belongs to an external mode.
+
+        An external mode slot without a registered mode is called "(Mode not available)".
+        """
         if name.startswith("("):
             return None
         if custom_mode in _EXTERNAL:
@@ -213,11 +216,11 @@ class Px4(Autopilot):
         return () if self._cannot_fly else (("RTL_RETURN_ALT", 1.0),)
 
     def take_off_needs_home(self) -> bool:
-        """True, because the altitude of NAV_TAKEOFF is above mean sea level."""
+        """True: PX4's NAV_TAKEOFF needs an altitude above mean sea level."""
         return not self._cannot_fly
 
     def failing_sensors(self, present: int, enabled: int, health: int) -> tuple[str, ...]:
-        # A required but missing sensor is enabled without being present.
+        # A sensor that is required but missing is reported as enabled but not present.
         missing = bit_names(enabled & ~present & ~health & ~PREARM_CHECK, SENSORS)
         return (
             *super().failing_sensors(present, enabled, health),
@@ -225,7 +228,7 @@ class Px4(Autopilot):
         )
 
     def prearm_checks_pass(self, present: int, enabled: int, health: int) -> bool:
-        # PX4 sets the bit only in ``health``, if the vehicle can be armed in its current mode.
+        # If the vehicle can be armed in its current mode, PX4 sets this bit, but only in ``health``.
         return bool(health & PREARM_CHECK)
 
     def missing_estimates(self, flags: int) -> tuple[str, ...]:

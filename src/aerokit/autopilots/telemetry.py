@@ -15,7 +15,7 @@ PREARM_CHECK = _S.MAV_SYS_STATUS_PREARM_CHECK.value
 
 POS_HORIZ_ABS = _E.POS_HORIZ_ABS.value
 
-# Required, besides the position itself, to arm in a mode that needs a position.
+# Besides the position itself, these are required to arm in a mode that needs a position.
 ATTITUDE_AND_HEIGHT = _E.ATTITUDE.value | _E.POS_VERT_ABS.value
 
 # MAV_SYS_STATUS_SENSOR (https://mavlink.io/en/messages/common.html#MAV_SYS_STATUS_SENSOR)
@@ -133,10 +133,10 @@ _ALSO_STREAMED = (
     *("PositionTargetLocalNed", "RawRpm", "ScaledImu", "UtmGlobalPosition", "WaterDepth", "WheelDistance"),
 )
 
-# Class names of messages that any autopilot sends as a stream. Others are sent when needed.
+# Class names of messages that any autopilot sends as a stream. Other messages are sent when needed.
 STREAMED_MESSAGES = frozenset((*(name for names in _GROUPS.values() for name in names), *_ALSO_STREAMED))
 
-# First number of each FIRMWARE_VERSION_TYPE.
+# First number of each FIRMWARE_VERSION_TYPE, and the suffix of its versions.
 _VERSION_TYPES = ((255, ""), (192, "-rc"), (128, "-beta"), (64, "-alpha"), (0, "-dev"))
 
 

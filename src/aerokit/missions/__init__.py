@@ -1,4 +1,4 @@
-"""Missions, fences and rally points: build, check and compare them, read and write their files.
+"""Missions, fences and rally points: building, checking and comparing them, and reading and writing their files.
 
 ```python
 from aerokit.missions import Mission, return_to_launch, take_off, waypoint

@@ -27,7 +27,7 @@ def change_speed(
     kind: Literal["air", "ground", "climb", "descent"] = "ground",
     throttle_percent: float | None = None,
 ) -> MissionItem:
-    """Change the speed: 0 to 1,000 m/s, or -2 for the vehicle's default (-1 on PX4).
+    """Change the speed to 0 to 1,000 m/s, or to the vehicle's default: -2, on PX4 -1.
 
     ``kind`` selects the speed; ``"climb"`` and ``"descent"`` are for copters. ``throttle_percent`` (0 to 100) is for
     planes without airspeed sensor; None leaves it unchanged.
@@ -110,7 +110,7 @@ def condition_yaw(
 
 
 def set_servo(servo: int, pwm_us: int) -> MissionItem:
-    """Set a servo output (1 to 32) to 500 to 2,500 microseconds; 0 stops the pulses (ArduPilot; PX4 refuses it).
+    """Set a servo output (1 to 32) to 500 to 2,500 microseconds; 0 stops the pulses. PX4 refuses this item.
 
     https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_SERVO
     """
@@ -119,7 +119,7 @@ def set_servo(servo: int, pwm_us: int) -> MissionItem:
 
 
 def set_relay(relay: int, on: bool) -> MissionItem:
-    """Switch a relay, 0 to 15 (ArduPilot; PX4 refuses it).
+    """Switch a relay, 0 to 15. PX4 refuses this item.
 
     https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_RELAY
     """
@@ -129,8 +129,8 @@ def set_relay(relay: int, on: bool) -> MissionItem:
 def jump(to_item: int, *, repeat: int = -1) -> MissionItem:
     """Jump to another item of the mission, ``repeat`` times (0 to 32,767; -1: without limit).
 
-    Items are counted from 0 without home, as in :class:`Mission`, for any autopilot: ``jump(0)`` goes to the first.
-    https://mavlink.io/en/messages/common.html#MAV_CMD_DO_JUMP
+    For any autopilot, items are counted from 0 without home, as in :class:`Mission`: ``jump(0)`` goes to the first
+    item. https://mavlink.io/en/messages/common.html#MAV_CMD_DO_JUMP
     """
     target = whole_number("to_item", to_item, 0, 65_534)
     return action_item(MavCmd.DO_JUMP, target, whole_number("repeat", repeat, -1, 32_767))
@@ -145,7 +145,7 @@ def jump_tag(tag: int) -> MissionItem:
 
 
 def jump_to_tag(tag: int, *, repeat: int = -1) -> MissionItem:
-    """Jump to the first :func:`jump_tag` with that number (ArduPilot), ``repeat`` times; -1: without limit.
+    """Jump to the first :func:`jump_tag` with this number (ArduPilot), ``repeat`` times; -1: without limit.
 
     https://mavlink.io/en/messages/common.html#MAV_CMD_DO_JUMP_TAG
     """
@@ -166,7 +166,7 @@ def vtol_transition(to: Literal["multicopter", "fixed_wing"]) -> MissionItem:
 
 
 def land_start() -> MissionItem:
-    """Mark the start of the landing sequence, used by returns and failsafes.
+    """Mark the start of the landing sequence, which returns and failsafes use.
 
     https://mavlink.io/en/messages/common.html#MAV_CMD_DO_LAND_START
     """
@@ -182,7 +182,7 @@ def enable_fence(enable: bool = True) -> MissionItem:
 
 
 def set_camera_trigger_distance(distance_m: float, *, trigger_now: bool = False) -> MissionItem:
-    """Take a photo every ``distance_m`` metres from here on; 0 stops. With ``trigger_now``, also take one at once.
+    """Take a photo every ``distance_m`` metres from here on; 0 stops. With ``trigger_now``, also take a photo at once.
 
     https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_CAM_TRIGG_DIST
     """
@@ -200,7 +200,7 @@ def take_photo(*, camera: int = 0) -> MissionItem:
 
 
 def take_photos(count: int = 0, *, interval_s: float = 0.0, camera: int = 0) -> MissionItem:
-    """Take ``count`` photos (0: until :func:`stop_photos`, at most 65,535), one every ``interval_s`` seconds.
+    """Take ``count`` photos, at most 65,535, one every ``interval_s`` seconds; 0: until :func:`stop_photos`.
 
     https://mavlink.io/en/messages/common.html#MAV_CMD_IMAGE_START_CAPTURE
     """
@@ -292,7 +292,7 @@ def region_of_interest_none() -> MissionItem:
 
 
 def point_gimbal(*, pitch_deg: float = 0.0, roll_deg: float = 0.0, yaw_deg: float = 0.0) -> MissionItem:
-    """Point the gimbal: -180 to 180 degrees each. Negative pitch is down; yaw is relative to the nose.
+    """Point the gimbal at angles of -180 to 180 degrees. Negative pitch is down; yaw is relative to the nose.
 
     https://mavlink.io/en/messages/common.html#MAV_CMD_DO_MOUNT_CONTROL
     """

@@ -36,8 +36,8 @@ def check_items(items: Sequence[MissionItem], mission_type: int = 0, *, home_is_
     Args:
         items: the items, without home.
         mission_type: the MAV_MISSION_TYPE.
-        home_is_item_0: True for ArduPilot missions, which have room for one item fewer; False for other autopilots, for
-            which 0°, 0° does not mean "the current position"; None if unknown.
+        home_is_item_0: True for missions of ArduPilot, where home takes the place of one item. False for other
+            autopilots, for which 0°, 0° does not mean "the current position". None if unknown.
 
     Raises:
         InvalidArgument: an item cannot be sent; the text names item, field, value and the allowed values.
@@ -61,7 +61,7 @@ def check_count(count: int, *, home_is_item_0: bool = False) -> None:
 
 
 def check_item(item: MissionItem, where: str = "item", mission_type: int = 0) -> None:
-    """Raise :class:`InvalidArgument`, whose text begins with ``where``, if MISSION_ITEM_INT cannot carry the item."""
+    """Raise :class:`InvalidArgument` if MISSION_ITEM_INT cannot carry the item. Its text begins with ``where``."""
     if not isinstance(item, MissionItem):
         raise InvalidArgument(f"{where} = {item!r} is not a MissionItem")
     _check_integer(where, "command", item.command, 0xFFFF)

@@ -1,13 +1,13 @@
-"""Comparison of items that tolerates the changes that the protocol and the vehicle's storage make.
+"""Comparison of items that tolerates the changes made by the protocol and by the vehicle's storage.
 
-The tables follow the conversions in the firmware (ArduPilot 4.7 AP_Mission, PX4 1.17 mavlink_mission), verified on
-vehicles. A string has one letter for each of the seven numbers of an item. A number without a letter, or with ``-``, is
-not stored, and is read back as 0. The other letters are:
+The tables describe how the firmware converts the numbers of an item (ArduPilot 4.7 AP_Mission, PX4 1.17
+mavlink_mission), and were verified on vehicles. A string has one letter for each of the seven numbers of an item. A
+number without a letter, or with ``-``, is not stored, and is read back as 0. The other letters are:
 
 - ``f`` unchanged; ``h`` 16-bit float; ``2`` always 2; ``?`` 1 if above 0, else 0; ``g`` 1 or -1, the sign;
 - ``u`` ``b`` unsigned integer of 16 or 8 bits; ``s`` ``i`` signed integer of 16 or 8 bits; ``U`` 16 bits that wrap;
-- ``c`` integer up to 255, larger ones clipped; ``n`` the same, but fractions below 1 in steps of 1/256;
-- ``r`` whole metres with sign; ``R`` the same in 8 bits, above 255 m in tens of metres; ``k`` whole centimetres;
+- ``c`` integer, clipped to 255; ``n`` like ``c``, but a fraction below 1 is stored in steps of 1/256;
+- ``r`` whole metres with sign; ``R`` like ``r`` in 8 bits, above 255 m in tens of metres; ``k`` whole centimetres;
 - ``y`` heading, normalised to 0 to 360.
 """
 
@@ -37,20 +37,20 @@ FIELDS = ("param1", "param2", "param3", "param4", "x", "y", "z")
 
 
 class ItemStorage(Enum):
-    """Storage whose loss of precision a comparison tolerates."""
+    """Form in which items are stored. A comparison tolerates the loss of precision that it causes."""
 
     WIRE = "wire"
     """Only MISSION_ITEM_INT: 32-bit floats, equivalent frames."""
     ARDUPILOT = "ardupilot"
-    """Also ArduPilot's storage of 15 bytes for each item."""
+    """MISSION_ITEM_INT, and ArduPilot's storage of 15 bytes for each item."""
     PX4 = "px4"
-    """Also PX4's item structure."""
+    """MISSION_ITEM_INT, and PX4's item structure."""
     ANY = "any"
-    """Any of these."""
+    """Any of the other three."""
 
 
 _ARDUPILOT: dict[int, tuple[str, ...]] = {
-    MavCmd.NAV_WAYPOINT: ("u", "-cc"),  # Copter, Rover and Sub; Plane
+    MavCmd.NAV_WAYPOINT: ("u", "-cc"),  # the first string is for Copter, Rover and Sub, the second for Plane
     MavCmd.NAV_LOITER_UNLIM: ("--r",),
     MavCmd.NAV_LOITER_TURNS: ("n-R?",),
     MavCmd.NAV_LOITER_TIME: ("u-g?",),
@@ -108,7 +108,7 @@ _ARDUPILOT: dict[int, tuple[str, ...]] = {
     MavCmd.DO_VTOL_TRANSITION: ("b",),
     MavCmd.NAV_FENCE_POLYGON_VERTEX_INCLUSION: ("u",),
     MavCmd.NAV_FENCE_POLYGON_VERTEX_EXCLUSION: ("u",),
-    MavCmd.NAV_FENCE_CIRCLE_INCLUSION: ("f", "u"),  # the radius was an integer before 4.5
+    MavCmd.NAV_FENCE_CIRCLE_INCLUSION: ("f", "u"),  # before 4.5, the radius was stored as an integer
     MavCmd.NAV_FENCE_CIRCLE_EXCLUSION: ("f", "u"),
     MavCmd.DO_WINCH: ("bbff",),
     MavCmd.NAV_SCRIPT_TIME: ("bbhhss",),
@@ -154,7 +154,7 @@ def _px4_letters(item: MissionItem) -> str:
 
 
 def _convert(letter: str, value: float) -> Iterator[float]:
-    """Yield the converted value; nothing if the conversion overflows, which is undefined in C."""
+    """Yield the converted value. Yield nothing if the conversion overflows, because the result is undefined in C."""
     if letter in ("", "-"):
         yield 0.0
     elif letter == "2":
@@ -213,7 +213,7 @@ _HEADING_IS_PARAM4 = frozenset(
 def plan_differences(
     wanted: Sequence[MissionItem], found: Sequence[MissionItem], storage: ItemStorage = ItemStorage.ANY
 ) -> tuple[str, ...]:
-    """Describe each difference: ``"item 3 (NAV_WAYPOINT): z is 20.0 instead of 30.0"``. Empty if there is none."""
+    """Describe each difference: ``"item 3 (NAV_WAYPOINT): z is 20.0 instead of 30.0"``. Empty for equal plans."""
     texts = [f"there are {len(found)} items instead of {len(wanted)}"] if len(wanted) != len(found) else []
     for index, (item, other) in enumerate(zip(wanted, found)):  # noqa: B905 - lengths may differ, see above
         texts += [f"item {index} ({item.name}): {text}" for text in item_differences(item, other, storage)]
@@ -223,9 +223,9 @@ def plan_differences(
 def changed_items(
     wanted: Sequence[MissionItem], found: Sequence[MissionItem], storage: ItemStorage = ItemStorage.WIRE
 ) -> tuple[int, ...]:
-    """Return the indices of the wanted items that ``found`` does not have at the same index.
+    """Return the indices at which ``found`` does not have the wanted item.
 
-    These must be sent in a partial update. By default only changes made by the protocol itself are tolerated.
+    These items must be sent in a partial update. By default, only changes made by the protocol itself are tolerated.
     """
     common = min(len(wanted), len(found))
     changed = [i for i in range(common) if item_differences(wanted[i], found[i], storage)]
@@ -241,7 +241,7 @@ def item_differences(
 ) -> tuple[str, ...]:
     """Describe each field that differs: ``"z is 20.0 instead of 30.0"``.
 
-    ``single_precision``: places were sent as 32-bit floats (MISSION_ITEM), whose resolution is up to 1.7 m.
+    ``single_precision``: places were sent as 32-bit floats (MISSION_ITEM), whose rounding error is up to 1.7 m.
     """
     if wanted.command != found.command:
         return (f"the command is {found.name} instead of {wanted.name}",)
@@ -269,7 +269,7 @@ def _different_fields(
 
 
 def _drops_autocontinue(found: MissionItem, storage: ItemStorage) -> bool:
-    # ArduPilot reports True for items of missions, False for those of fences and rally points.
+    # ArduPilot reports True for items of missions, False for items of fences and rally points.
     if found.command in FENCE_COMMANDS | RALLY_COMMANDS:
         return True
     return storage in (ItemStorage.ARDUPILOT, ItemStorage.ANY) and found.autocontinue
@@ -308,7 +308,7 @@ def _same_place(
 
 
 def _float_step(value: float) -> float:
-    # The distance between neighbouring 32-bit floats.
+    # This is the distance between neighbouring 32-bit floats.
     return math.ldexp(1.0, math.frexp(value)[1] - 24)
 
 
@@ -325,7 +325,7 @@ def _same_altitude(wanted: MissionItem, found: MissionItem, storage: ItemStorage
 
 
 def _close(left: float, right: float) -> bool:
-    # Equal as 32-bit floats, with some margin for arithmetic on them.
+    # Otherwise compare as 32-bit floats, with some margin for arithmetic on them.
     if left == right or (left != left and right != right):
         return True
     return abs(left - right) <= max(1e-6 * max(abs(left), abs(right)), 1e-9)

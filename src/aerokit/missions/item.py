@@ -1,4 +1,4 @@
-"""``MissionItem``: one item of a mission, a fence or rally points, as in MISSION_ITEM_INT.
+"""``MissionItem``: one item of a mission, a fence or rally points, with the fields of MISSION_ITEM_INT.
 
 https://mavlink.io/en/services/mission.html and https://mavlink.io/en/messages/common.html#mav_commands
 """
@@ -14,7 +14,7 @@ from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavFrame
 from aerokit.position import Home, Position, travel_target
 
-DEFAULT_XY = 0x7FFFFFFF  # in x or y: "not given", as NaN is in the other parameters
+DEFAULT_XY = 0x7FFFFFFF  # this value of x or y means "not given", like NaN in the other parameters
 
 FENCE_COMMANDS = frozenset(
     {
@@ -28,7 +28,7 @@ FENCE_COMMANDS = frozenset(
 
 RALLY_COMMANDS = frozenset({MavCmd.NAV_RALLY_POINT})
 
-# Commands whose altitude needs a frame that defines its reference.
+# Commands with an altitude, whose frame must define the reference of the altitude.
 DESTINATIONS = frozenset(
     {
         MavCmd.NAV_WAYPOINT,
@@ -70,7 +70,7 @@ PLACES = frozenset(
     }
 )
 
-# Parameters 1 to 4 of common commands for which the standard defines no NaN.
+# Maps common commands to those of parameters 1 to 4 that must not be NaN according to the standard.
 NUMBERS: dict[int, tuple[int, ...]] = {
     MavCmd.NAV_WAYPOINT: (1, 2, 3),
     MavCmd.NAV_LOITER_UNLIM: (3,),
@@ -146,19 +146,20 @@ _STANDARD_COMMANDS = frozenset(int(command) for command in MavCmd)
 
 
 def canonical_frame(frame: int) -> int:
-    """Return the frame without the deprecated "_INT" suffix, which has no meaning in MISSION_ITEM_INT."""
+    """Return the equivalent frame without the deprecated suffix "_INT", which has no meaning in MISSION_ITEM_INT."""
     return _FRAME_ALIASES.get(frame, frame)
 
 
 def has_place(command: int) -> bool:
-    """Return True if x and y of this command are coordinates; also for all commands of other dialects."""
+    """Return True if x and y of this command are coordinates, or if the command is from another dialect."""
     return command in PLACES or command not in _STANDARD_COMMANDS
 
 
 def xy_scale(command: int, frame: int) -> int:
     """Return the scale of x and y in MISSION_ITEM_INT: 10,000,000 for degrees, 10,000 for local metres, else 1.
 
-    ArduPilot decides by command, PX4 by frame. Where they would differ, PX4 refuses the item.
+    ArduPilot determines the scale by the command, PX4 by the frame. If the two scales would differ, PX4 refuses the
+    item.
     """
     if not has_place(command):
         return 1
@@ -168,7 +169,7 @@ def xy_scale(command: int, frame: int) -> int:
 
 
 def command_name(command: int) -> str:
-    """Return the name in the standard without the MAV_CMD prefix, or ``command`` with the number."""
+    """Return the name of a command without the prefix MAV_CMD, or ``"command"`` and the number if it is unknown."""
     return MavCmd(command).name if command in _STANDARD_COMMANDS else f"command {command}"
 
 
@@ -177,11 +178,12 @@ class MissionItem(Snapshot):
 
     ``command`` is a MAV_CMD, ``frame`` a MAV_FRAME. ``param1`` to ``param4`` belong to the command; NaN means "not
     given" where the standard allows it. ``x`` and ``y`` are integers as in MISSION_ITEM_INT: latitude and longitude in
-    1e-7 degrees in a global frame, 1e-4 m in a local one; for commands without a place they are parameters 5 and 6,
-    unscaled (fractions can only be sent as MISSION_ITEM). ``z`` is in metres, relative to what the frame says.
+    1e-7 degrees in a global frame, or 1e-4 m in a local frame. For commands without a place they are the unscaled
+    parameters 5 and 6; fractions of these can only be sent as MISSION_ITEM. ``z`` is in metres; the frame defines its
+    reference.
 
-    Values are not checked on construction, because vehicles and files may contain anything; ``check`` of the whole plan
-    checks them. Items are equal if all fields are, and NaN equals NaN.
+    Values are not checked on construction, because vehicles and files may contain anything; the method ``check`` of the
+    plan checks them. Items are equal if all their fields are equal; NaN equals NaN.
     https://mavlink.io/en/messages/common.html#MISSION_ITEM_INT
     """
 
@@ -205,8 +207,8 @@ class MissionItem(Snapshot):
     def position(self) -> Position | None:
         """Position of the item, with the altitude above home or above mean sea level, depending on the frame.
 
-        None for commands without a place, for local frames, and for 0°, 0°, which means "the current position". The
-        position has no altitude if the frame is relative to terrain; use ``z``.
+        None for commands without a place, for local frames, and for 0°, 0°, which means "the current position". If the
+        frame is relative to terrain, the position has no altitude; use ``z``.
         """
         if xy_scale(self.command, self.frame) != 10_000_000 or (self.x, self.y) in (
             (0, 0),
@@ -249,10 +251,10 @@ def place_item(
     *parameters: float,
     is_needed: bool = False,
 ) -> MissionItem:
-    """Create an item at a place. ``altitudes`` are relative to home, to mean sea level and to terrain; one is given.
+    """Create an item at a place. One of ``altitudes`` (relative to home, to mean sea level and to terrain) is given.
 
-    A Position supplies latitude, longitude, and the altitude if no altitude is given; Home supplies no altitude. If no
-    place is given, and ``is_needed`` is False, the item has 0°, 0°, which means the current position to ArduPilot.
+    A Position supplies latitude and longitude, and also the altitude if none is given. Home supplies no altitude. If no
+    place is given and ``is_needed`` is False, the item has 0°, 0°, which ArduPilot takes for the current position.
     """
     if isinstance(latitude_deg, (Position, Home)):
         if longitude_deg is not None:
@@ -283,7 +285,7 @@ def _altitudes_of(position: Position) -> Altitudes:
 def altitude_and_frame(
     relative_m: float | None, amsl_m: float | None, terrain_m: float | None
 ) -> tuple[float, MavFrame]:
-    """Return the one altitude that is given, and its frame."""
+    """Return the altitude that is given, which must be exactly one, and its frame."""
     given = {
         name: (value, frame)
         for name, value, frame in (
@@ -304,12 +306,12 @@ def altitude_and_frame(
 
 
 def action_item(command: int, *parameters: float, z: float = 0.0) -> MissionItem:
-    """Create an item without a place, in the frame MISSION, which PX4 requires for these."""
+    """Create an item without a place, in the frame MISSION, which PX4 requires for such items."""
     return MissionItem(command, MavFrame.MISSION, *_four(parameters), z=z)
 
 
 def in_range(name: str, value: object, low: float, high: float, *, or_: tuple[float, ...] = ()) -> float:
-    """Return the value as a float, or raise :class:`InvalidArgument` unless it is from low to high, or in ``or_``."""
+    """Return the value as a float; raise :class:`InvalidArgument` unless it is from low to high or in ``or_``."""
     if isinstance(value, (int, float)) and not isinstance(value, bool) and (low <= value <= high or value in or_):
         return float(value)
     others = "".join(f", or {other:g}" for other in or_)
@@ -317,7 +319,7 @@ def in_range(name: str, value: object, low: float, high: float, *, or_: tuple[fl
 
 
 def whole_number(name: str, value: object, low: int, high: int) -> float:
-    """Return the value as a float, or raise :class:`InvalidArgument` unless it is a whole number from low to high."""
+    """Return the value as a float; raise :class:`InvalidArgument` unless it is a whole number from low to high."""
     if isinstance(value, int) and not isinstance(value, bool) and low <= value <= high:
         return float(value)
     raise InvalidArgument(f"{name} = {value!r} is not allowed: a whole number from {low} to {high}")

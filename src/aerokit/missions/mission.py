@@ -32,10 +32,10 @@ class _ItemSequence(Snapshot):
     items: Sequence[MissionItem] = ()
 
     def differences(self, found: Self, storage: ItemStorage = ItemStorage.ANY) -> tuple[str, ...]:
-        """Describe how ``found``, read from a vehicle, differs from this plan, with one text for each difference.
+        """Describe how ``found``, read from a vehicle, differs from this plan; return one text for each difference.
 
-        Ignores home, and the changes that the protocol and the autopilot's ``storage`` make. Empty if there is no
-        difference.
+        Home is ignored, and so are changes made by the protocol and the autopilot's ``storage``. The result is empty if
+        there is no difference.
         """
         return plan_differences(self.items, found.items, storage)
 
@@ -47,8 +47,8 @@ class _ItemSequence(Snapshot):
         """Check that all items can be sent.
 
         NaN is accepted where the standard defines it as "not given": headings and reserved parameters. If you know the
-        autopilot, pass ``home_is_item_0`` to check more. True is for missions of ArduPilot, which has room for one item
-        fewer; False is for other autopilots, for which 0°, 0° does not mean "the current position".
+        autopilot, pass ``home_is_item_0`` to check more: True for missions of ArduPilot, where home takes the place of
+        one item; False for other autopilots, for which 0°, 0° does not mean "the current position".
 
         Raises:
             InvalidArgument: an item cannot be sent; the text names item, field, value and the allowed values.
@@ -78,9 +78,9 @@ class _ItemSequence(Snapshot):
 class Mission(_ItemSequence):
     """A mission: ``Mission([take_off(20), waypoint(47.3, 8.5, altitude_relative_m=20), land()])``.
 
-    ``items`` are counted from 0 and never include home, for any autopilot. Jumps, progress and errors use the same
-    indices. ``home`` is the planned home position, for files; a vehicle uses its own. A mission can be indexed, sliced
-    and iterated like a tuple of its items; ``items`` is converted to a tuple.
+    For any autopilot, ``items`` are counted from 0 and never include home. Jumps, progress and errors use the same
+    indices. ``home`` is the planned home position and only used in files, because a vehicle uses its own home. A
+    mission can be indexed, sliced and iterated like a tuple of its items; ``items`` is converted to a tuple.
     """
 
     MISSION_TYPE: ClassVar[int] = 0
@@ -88,7 +88,7 @@ class Mission(_ItemSequence):
     home: Position | None = None
 
     def to_items(self, *, home_is_item_0: bool = False) -> tuple[MissionItem, ...]:
-        """Return the items as the vehicle counts them: for ArduPilot with home first, and jump targets adjusted."""
+        """Return the items as the vehicle counts them. For ArduPilot, home is added and jump targets are adjusted."""
         return with_home(self.items, self.home) if home_is_item_0 else tuple(self.items)
 
     @classmethod
@@ -135,7 +135,8 @@ class FenceCircle(Snapshot):
 
 
 class Fence(Snapshot):
-    """A geofence: ``Fence(polygons=[FencePolygon([...])], circles=[FenceCircle(home, 300.0)])``; empty for no fence.
+    """A geofence: ``Fence(polygons=[FencePolygon([...])], circles=[FenceCircle(home, 300.0)])``. ``Fence()`` is no
+    fence.
 
     ``return_point`` is the destination after a breach (Plane, and PX4 if configured). Both sequences are converted to
     tuples.
@@ -219,7 +220,7 @@ def _return_item(place: Position) -> MissionItem:
 
 
 def _read_polygon(items: Sequence[MissionItem], first: int) -> FencePolygon:
-    # Every vertex has the number of vertices of its polygon, on PX4 and ArduPilot.
+    # On PX4 and ArduPilot, every vertex contains the number of vertices of its polygon.
     item = items[first]
     count = int(item.param1) if 3 <= item.param1 <= 0xFFFF else 0
     vertices = items[first : first + count]
@@ -282,8 +283,8 @@ class Plan(Snapshot):
     ``mission.home`` is the planned home position. ``firmware_type`` (MAV_AUTOPILOT) and ``vehicle_type`` (MAV_TYPE)
     describe the vehicle that the plan was made for; ``cruise_speed_m_s`` (planes) and ``hover_speed_m_s`` (copters) are
     assumptions of the planner. ``source`` is the text of the file from which the plan was read. When the plan is
-    written, only differences from this text are changed, so that surveys and unknown fields are kept. Comparisons of
-    plans ignore ``source``.
+    written, only the parts of this text that differ from the plan are changed, so that surveys and unknown fields are
+    kept. Comparisons of plans ignore ``source``.
     """
 
     mission: Mission = Mission()

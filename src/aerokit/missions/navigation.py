@@ -1,11 +1,11 @@
 """Builders for items with a place: waypoints, take-off and landing, loitering, rally points.
 
-A place is a :class:`~aerokit.Position`, or a latitude and a longitude in degrees (WGS 84). It needs exactly one
+A place is a :class:`~aerokit.Position`, or a latitude and a longitude in degrees (WGS 84). A place needs exactly one
 altitude in metres: ``altitude_relative_m`` above home, ``altitude_amsl_m`` above mean sea level, or
-``altitude_terrain_m`` above the terrain (ArduPilot with terrain data; PX4 refuses it). If no altitude is given, that of
-the Position is used (above home, if it has both). For landings, the altitude is that of the ground. ``take_off``,
-``vtol_take_off`` and ``loiter_to_altitude`` also accept only an altitude above home: ``take_off(10)``. ``yaw_deg`` is a
-heading in degrees from north; None leaves it to the vehicle. Invalid arguments raise
+``altitude_terrain_m`` above the terrain (ArduPilot with terrain data; PX4 refuses it). If no altitude is given, the
+altitude of the Position is used; if it has two, the altitude above home. For landings, the altitude is that of the
+ground. ``take_off``, ``vtol_take_off`` and ``loiter_to_altitude`` also accept only an altitude above home:
+``take_off(10)``. ``yaw_deg`` is a heading in degrees from north; None leaves it to the vehicle. Invalid arguments raise
 :class:`~aerokit.errors.InvalidArgument`, which names the argument and the allowed values.
 https://mavlink.io/en/messages/common.html#mav_commands
 """
@@ -63,11 +63,13 @@ def waypoint(
     pass_by_m: float = 0.0,
     yaw_deg: float | None = None,
 ) -> MissionItem:
-    """Fly to a place and hold there for ``hold_s`` seconds (0 to 65,535; whole seconds on ArduPilot, not on Plane).
+    """Fly to a place and hold there for ``hold_s`` seconds (0 to 65,535; ArduPilot: whole seconds; Plane: not
+    supported).
 
-    ``acceptance_radius_m`` is the distance at which the place counts as reached (0: the vehicle's setting); ArduCopter
-    ignores it. ``pass_by_m`` is the distance at which a plane may pass the place, negative on the other side. ArduPlane
-    stores both in whole metres up to 255. https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_WAYPOINT
+    ``acceptance_radius_m`` is the distance at which the place counts as reached (0: the vehicle's parameter);
+    ArduCopter ignores it. ``pass_by_m`` is the distance at which a plane may pass the place, negative for the other
+    side. ArduPlane stores both distances in whole metres up to 255.
+    https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_WAYPOINT
     """
     return place_item(
         MavCmd.NAV_WAYPOINT,
@@ -165,7 +167,7 @@ def take_off(
     pitch_deg: float = 0.0,
     yaw_deg: float | None = None,
 ) -> MissionItem:
-    """Take off to an altitude, at the current position if no place is given (ArduPilot; PX4 needs the place).
+    """Take off to an altitude. If no place is given, take off at the current position (ArduPilot; PX4 needs the place).
 
     ``pitch_deg`` is the minimum pitch of a plane, 0 to 90 degrees.
     https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_TAKEOFF
@@ -216,7 +218,7 @@ def vtol_take_off(
     altitude_terrain_m: float | None = None,
     yaw_deg: float | None = None,
 ) -> MissionItem:
-    """Take off vertically. PX4 then transitions to forward flight towards the place, which it needs.
+    """Take off vertically. PX4 needs a place, and then transitions to forward flight towards it.
 
     https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_VTOL_TAKEOFF
     """
@@ -267,9 +269,9 @@ def land(
 ) -> MissionItem:
     """Land at a place, or at the current position if none is given (ArduPilot; PX4 needs the place).
 
-    The altitude is that of the ground there, by default that of home; the altitude of a Position is ignored.
-    ``abort_altitude_m`` (0 to 65,535 m) is the altitude to which a plane climbs if it aborts the landing; 0 means its
-    setting. ``precision`` requests a precision landing from PX4: 0 no, 1 opportunistic, 2 required.
+    The altitude is that of the ground at the place, by default that of home; the altitude of a Position is ignored.
+    ``abort_altitude_m`` (0 to 65,535 m) is the altitude to which a plane climbs if it aborts the landing; 0 means the
+    altitude in its parameters. ``precision`` requests a precision landing from PX4: 0 no, 1 opportunistic, 2 required.
     https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_LAND
     """
     return place_item(
@@ -315,7 +317,7 @@ def vtol_land(
 ) -> MissionItem:
     """Land vertically at a place, or at the current position if none is given (ArduPilot; PX4 needs the place).
 
-    The altitude is that of the ground there, by default that of home; the altitude of a Position is ignored.
+    The altitude is that of the ground at the place, by default that of home; the altitude of a Position is ignored.
     https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_VTOL_LAND
     """
     return place_item(
@@ -362,7 +364,7 @@ def loiter_unlimited(
     radius_m: float = 0.0,
     yaw_deg: float | None = None,
 ) -> MissionItem:
-    """Stay at a place indefinitely. Planes circle with ``radius_m`` (0: their setting, negative: counter-clockwise).
+    """Stay at a place indefinitely. Planes circle with ``radius_m`` (0: their parameter, negative: counter-clockwise).
 
     https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_LOITER_UNLIM
     """
@@ -415,8 +417,8 @@ def loiter_time(
 ) -> MissionItem:
     """Stay at a place for 0 to 65,535 seconds. ArduPilot stores whole seconds, and only the sign of the radius.
 
-    ``leave_tangentially`` lets a plane leave from the circle instead of its centre.
-    https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_LOITER_TIME
+    ``leave_tangentially`` makes a plane fly to the next item on the line from its circle, not on the line from the
+    centre. https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_LOITER_TIME
     """
     return place_item(
         MavCmd.NAV_LOITER_TIME,
@@ -465,9 +467,9 @@ def loiter_turns(
     radius_m: float = 0.0,
     leave_tangentially: bool = False,
 ) -> MissionItem:
-    """Circle around a place 0 to 255 times with a radius of up to 2,550 m (ArduPilot; PX4 refuses it).
+    """Circle around a place 0 to 255 times with a radius of up to 2,550 m. PX4 refuses this item.
 
-    ArduPilot stores whole turns, or fractions below one turn; a radius above 255 m is stored in tens of metres. A
+    ArduPilot stores whole turns, or a fraction below one turn. It stores a radius above 255 m in tens of metres. A
     negative radius means counter-clockwise. https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_LOITER_TURNS
     """
     return place_item(

@@ -38,10 +38,11 @@ def read_plan_file(path: str | os.PathLike[str]) -> Plan:
     """Read a plan from a file.
 
     Surveys, corridor scans and landing patterns are converted to simple items. Other complex items are refused, because
-    the file has only their settings. Parameter ranges are not checked here; ``check`` does.
+    the file has only their settings and not their items. Ranges of parameters are not checked here, but by ``check``.
 
     Raises:
-        FileFormatError: the text names the file, the position in it and what was expected there.
+        FileFormatError: the file is invalid; the error text names the file, the position in it and what was expected
+            there.
         OSError: the file cannot be read.
     """
     return parse_plan(read_text(path), Path(path).name)
@@ -55,7 +56,7 @@ def write_plan_file(path: str | os.PathLike[str], plan: Plan) -> None:
 def parse_plan(text: str, name: str = "plan") -> Plan:
     """Parse the text of a file. Errors begin with ``name``."""
     document = load_json(text, name)
-    for key, allowed in (("fileType", "Plan"), ("version", 1)):  # First: another kind of file lacks most fields.
+    for key, allowed in (("fileType", "Plan"), ("version", 1)):  # first, because other files lack most fields
         if (found := document.child(key)) is not None:
             found.one_of(allowed)
     _check_required(document)
@@ -111,7 +112,7 @@ def _document(plan: Plan) -> dict[str, Any]:
 
 
 def _check_required(document: JsonValue) -> None:
-    """Raise one error for all required fields that are missing. The functions that read them check the types."""
+    """Raise one error for all required fields that are missing. The types of fields are checked when they are read."""
     missing = [(path, absent) for path, absent in _missing_fields(document.value) if absent]
     if not missing:
         return
@@ -187,7 +188,7 @@ def _read_fence(value: JsonValue) -> Fence:
 
 
 def _is_empty_and_old(value: JsonValue, *keys: str) -> bool:
-    # Version 1 had other contents. QGroundControl itself has written it for empty fences and rally points.
+    # Version 1 had other contents, but QGroundControl has written it for empty fences and empty rally points, too.
     is_empty = not any(value.members().get(key) for key in keys)
     value["version"].one_of(*((1, 2) if is_empty else (2,)))
     return bool(value["version"].value == 1)

@@ -1,10 +1,10 @@
-"""Items of a ``.plan`` file: simple items, and complex ones (surveys, landings) that consist of several.
+"""Items of a ``.plan`` file: simple items, and complex items (surveys, landings) that consist of several simple items.
 
 https://docs.qgroundcontrol.com/master/en/qgc-dev-guide/file_formats/plan.html
 
-Altitudes: ``frame`` and the last of ``params`` are flown. ``AltitudeMode``, ``Altitude`` and ``AMSLAltAboveTerrain``
-are for display, and only count if the last of ``params`` is null. Jump targets are the ``doJumpId`` of an item, which
-QGroundControl counts from 1.
+The altitude that is flown is the last of ``params``, relative to ``frame``. ``AltitudeMode``, ``Altitude`` and
+``AMSLAltAboveTerrain`` are for display, and are used only if the last of ``params`` is null. Jump targets are the
+``doJumpId`` of an item, which QGroundControl counts from 1.
 
 A landing pattern in the file has settings instead of items. This module generates the items that QGroundControl sends:
 DO_LAND_START, then commands that reset speed, photos and video, the approach, and the landing.
@@ -30,7 +30,7 @@ LANDING_PATTERNS = {"fwLandingPattern": MavCmd.NAV_LAND, "vtolLandingPattern": M
 
 
 def landing_items(pattern: JsonValue) -> tuple[MissionItem, ...]:
-    """Generate the items of a ComplexItem of a type in :data:`LANDING_PATTERNS`."""
+    """Generate the items of a ComplexItem whose type is in :data:`LANDING_PATTERNS`."""
     command = LANDING_PATTERNS[pattern["complexItemType"].value]
     relative = pattern["altitudesAreRelative"].boolean()
     frame = MavFrame.GLOBAL_RELATIVE_ALT if relative else MavFrame.GLOBAL
@@ -58,7 +58,7 @@ def _reset_items(pattern: JsonValue) -> list[MissionItem]:
 
 
 def _approach(pattern: JsonValue, frame: MavFrame, place: JsonValue) -> MissionItem:
-    # Descend in a circle and leave it tangentially, or fly to a waypoint. Older files have circles only.
+    # The approach is a descent in a circle, which is left tangentially, or a waypoint. Older files have circles only.
     if not _flag(pattern, "useLoiterToAlt", default=True):
         return MissionItem(MavCmd.NAV_WAYPOINT, frame, 0.0, 0.0, 0.0, math.nan, *_place(place))
     radius = pattern["loiterRadius"].number(0)
@@ -106,9 +106,9 @@ def read_entries(entries: Sequence[JsonValue]) -> list[tuple[MissionItem, ...]]:
 def merged_entries(
     entries: Sequence[Any], groups: Sequence[tuple[MissionItem, ...]], items: Sequence[MissionItem]
 ) -> list[Any]:
-    """Return entries for ``items``. Old entries at the beginning and the end that still match are kept.
+    """Return entries for ``items``. Old entries at the beginning and the end are kept if their items are unchanged.
 
-    ``groups`` are the items of each old entry.
+    ``groups`` has the items of each old entry.
     """
     head, used = 0, 0
     while head < len(groups) and _matches(groups[head], items[used : used + len(groups[head])]):
@@ -147,7 +147,7 @@ def json_number(value: float) -> int | float | None:
 
 
 def _simple_values(entry: JsonValue) -> list[JsonValue] | None:
-    """Return the simple items in an entry, or None for a landing pattern, whose items are generated."""
+    """Return the simple items in an entry, or None for a landing pattern, whose items must be generated."""
     kind = entry["type"]
     kind.one_of("SimpleItem", "ComplexItem")
     if kind.value == "SimpleItem":
@@ -212,7 +212,7 @@ def _planned_altitude(value: JsonValue, frame: int) -> tuple[int, float]:
 
 
 def _matches(group: Sequence[MissionItem], items: Sequence[MissionItem]) -> bool:
-    """Return True if they are equal, ignoring the target of a jump, which is always rewritten."""
+    """Return True if the items are equal. Jump targets are ignored, because they are always rewritten."""
     if len(group) == len(items) == 1 and group[0].command == items[0].command == MavCmd.DO_JUMP:
         return group[0].replace(param1=0.0) == items[0].replace(param1=0.0)
     return tuple(group) == tuple(items)
@@ -257,7 +257,7 @@ class JsonValue:
 
     def error(self, expected: str) -> FileFormatError:
         """Create an error for a value that is not as expected."""
-        # Encoded incrementally, so that a large value is not formatted only to be truncated.
+        # The value is encoded incrementally, because a large value need not be formatted completely to be truncated.
         found = "".join(islice(json.JSONEncoder().iterencode(self.value), 41))
         found = found if len(found) <= 40 else f"{found[:37]}..."
         return FileFormatError(f"{self.name}: {self.path or 'the document'} = {found}: expected {expected}")
@@ -282,7 +282,7 @@ class JsonValue:
         return self.value
 
     def elements(self, *sizes: int) -> list[JsonValue]:
-        """Return the elements of an array, which must have one of these sizes, if any are given."""
+        """Return the elements of an array. If ``sizes`` are given, the array must have one of them."""
         if not isinstance(self.value, list):
             raise self.error("an array")
         if sizes and len(self.value) not in sizes:
@@ -294,7 +294,7 @@ class JsonValue:
             yield JsonValue(value, self.name, f"{self.path}[{index}]")
 
     def number(self, low: float = -math.inf, high: float = math.inf, *, null: bool = False) -> float:
-        """Return a finite number in the range; with ``null``, NaN for null."""
+        """Return a finite number in the range. With ``null``, null is allowed and becomes NaN."""
         if self.value is None and null:
             return math.nan
         value = self._as_float()
@@ -322,7 +322,7 @@ class JsonValue:
             raise self.error(" or ".join(json.dumps(choice) for choice in choices))
 
     def _as_float(self) -> float:
-        # Return infinity, which every caller rejects, for a value that is not a number.
+        # A value that is not a number becomes infinity, which every caller rejects.
         if not isinstance(self.value, (int, float)) or isinstance(self.value, bool):
             return math.inf
         try:

@@ -2,7 +2,7 @@
 
 See https://mavlink.io/en/file_formats/#mission_plain_text_file. Each line is an item, separated by tabs: index, current
 flag, frame, command, parameters 1 to 4, latitude (or x, or parameter 5), longitude, altitude, autocontinue. In version
-110 item 0 is home, and jumps count it; version 120 has no home.
+110, item 0 is home, and jump targets count it. Version 120 has no home.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def read_waypoint_file(path: str | os.PathLike[str]) -> Mission:
     ``mission.home``. Places in MAVProxy's files are rounded to 1e-6 degrees.
 
     Raises:
-        FileFormatError: the text names the file, the line and what was expected there.
+        FileFormatError: the file is invalid; the error text names the file, the line and what was expected there.
         OSError: the file cannot be read.
     """
     return parse_waypoints(read_text(path), Path(path).name)
@@ -72,7 +72,7 @@ def parse_waypoints(text: str, name: str = "waypoints") -> Mission:
 
 
 def format_waypoints(mission: Mission, *, version: int = 110) -> str:
-    """Format a mission as the text of a file, in Mission Planner's precision or more where a number needs it.
+    """Format a mission as the text of a file, with Mission Planner's precision, or more where a number needs more.
 
     Raises:
         InvalidArgument: a number is infinite, or the version is neither 110 nor 120.
@@ -105,7 +105,7 @@ class _Row:
         return self.command in (0, MavCmd.NAV_WAYPOINT) and canonical_frame(self.frame) == MavFrame.GLOBAL
 
     def home(self) -> tuple[Position | None]:
-        # Wrapped in a tuple, because None means that home is at 0°, 0°, which is unknown.
+        # The result is a tuple, so that ``(None,)`` can stand for a line with an unknown home (0°, 0°).
         latitude, longitude = self._number("latitude", 90), self._number("longitude", 180)
         return (Position(latitude, longitude, self._number("altitude")) if latitude or longitude else None,)
 
@@ -166,6 +166,6 @@ def _item_row(item: MissionItem, index: int) -> str:
 
 
 def _text(value: float, digits: int) -> str:
-    """Format with ``digits`` decimal places, or as many as are needed to read the same number back."""
+    """Format a number with ``digits`` decimal places, or with more if they are needed to read the same number back."""
     text = f"{value:.{digits}f}"
     return text if float(text) == value or math.isnan(value) else repr(float(value))

@@ -1,4 +1,4 @@
-"""Conversion of items to messages and packed plans, and between the item indices of programs and vehicles."""
+"""Converts items to messages and packed plans, and item indices of programs to item indices of vehicles; and back."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def in_degrees(item: MissionItem) -> tuple[float, float]:
 
 
 def from_degrees(value: float, command: int, frame: int) -> int | float:
-    """Convert one coordinate back; the inverse of :func:`in_degrees`.
+    """Convert one coordinate from degrees or metres to ``x`` or ``y``; the inverse of :func:`in_degrees`.
 
     Positions are rounded to integers; other values keep their fraction.
     """
@@ -123,7 +123,7 @@ def from_degrees(value: float, command: int, frame: int) -> int | float:
 
 
 def with_home(items: Sequence[MissionItem], home: Position | None = None) -> tuple[MissionItem, ...]:
-    """Add home as item 0, as ArduPilot counts items, and adjust jump targets. Unknown home is 0°, 0°.
+    """Add home as item 0, as ArduPilot counts items, and adjust jump targets. An unknown home is 0°, 0°.
 
     ArduPilot ignores this item and uses its own home.
     """
@@ -131,7 +131,7 @@ def with_home(items: Sequence[MissionItem], home: Position | None = None) -> tup
 
 
 def without_home(items: Sequence[MissionItem]) -> tuple[tuple[MissionItem, ...], Position | None]:
-    """Remove item 0 and return the remaining items, and home, which is None if item 0 has no valid place."""
+    """Remove item 0. Return the remaining items and home, which is None if item 0 has no valid place."""
     home = items[0].position if items else None
     return shift_jumps(items[1:], -1), home
 
@@ -145,15 +145,15 @@ def home_item(home: Position | None) -> MissionItem:
 
 
 def shift_jumps(items: Iterable[MissionItem], by: int) -> tuple[MissionItem, ...]:
-    """Add ``by`` to the targets of DO_JUMP, the only parameter that counts items."""
+    """Add ``by`` to the targets of DO_JUMP, which are the only parameters that refer to items by number."""
     return tuple(item.replace(param1=item.param1 + by) if item.command == MavCmd.DO_JUMP else item for item in items)
 
 
 def convert_from_ardupilot(items: Iterable[MissionItem], here: tuple[float, float] | None) -> Iterator[MissionItem]:
-    """Convert the items of a mission made for ArduPilot for another autopilot.
+    """Convert the items of a mission that was made for ArduPilot, so that another autopilot accepts them.
 
-    ArduPilot accepts commands without a place in any frame, PX4 only in MAV_FRAME_MISSION. The place 0°, 0°, which
-    means the current position to ArduPilot, is replaced by the destination of the previous item; for the first item by
+    ArduPilot accepts commands without a place in any frame, PX4 only in MAV_FRAME_MISSION. ArduPilot takes the place
+    0°, 0° for the current position. It is replaced by the destination of the previous item, in the first item by
     ``here`` (latitude and longitude in degrees, None if unknown).
     """
     place = None if here is None else (round(here[0] * 1e7), round(here[1] * 1e7))
@@ -175,7 +175,7 @@ def convert_from_ardupilot(items: Iterable[MissionItem], here: tuple[float, floa
 # MISSION_ITEM_INT, not truncated. Missions have home as item 0.
 MAGIC = 0x763D
 HEADER = struct.Struct("<5H")
-NO_CLEAR = 1  # option: keep existing items, and replace only those in the file
+NO_CLEAR = 1  # option: keep existing items, and replace only items that are in the file
 PACKED_PATHS = {0: "@MISSION/mission.dat", 1: "@MISSION/fence.dat", 2: "@MISSION/rally.dat"}
 
 _ITEM_LENGTH = messages.MissionItemInt.LENGTH
@@ -206,9 +206,9 @@ def pack_items(
     """Encode items (with the vehicle's numbering) as a packed plan.
 
     A whole plan has ``first`` 0 and no options. ArduPilot accepts :data:`NO_CLEAR` only for missions: items from index
-    ``first`` on are replaced or appended, others are kept. Jump targets must then be below the number of items in the
-    file (4.7). ArduPilot processes a file when it is closed, and clears the old mission first. If it refuses an item,
-    the items before it are the new mission.
+    ``first`` on are replaced or appended, all others are kept. Jump targets must then be below the number of items in
+    the file (4.7). ArduPilot processes a file when it is closed, and first clears the old mission. If it refuses an
+    item, the new mission consists of the items before the refused one.
     """
     if len(items) + first > MAX_ITEMS:
         raise InvalidArgument(f"{len(items) + first} items are too many: at most {MAX_ITEMS} are possible")

@@ -28,9 +28,9 @@ class Range(Snapshot):
 
 
 class Param(Snapshot):
-    """Number of a command's parameter, 1 to 7: ``speed_m_s: Annotated[float, Param(3)]``.
+    """Number of a command's parameter, 1 to 7, for one argument: ``speed_m_s: Annotated[float, Param(3)]``.
 
-    By default the arguments of a handler are the parameters in order.
+    By default, the arguments of a handler are the command's parameters in order.
     """
 
     number: int

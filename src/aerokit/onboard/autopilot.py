@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from aerokit.onboard.services import ComponentServices
 
 FORCES = (21196, 2989)
-"""Values of param 2 that force arming or disarming: the standard's, and the one that ArduPilot uses for arming."""
+"""Values of param 2 that force arming or disarming: the value of the standard, and ArduPilot's value for arming."""
 _REBOOT, _SHUTDOWN = 1, 2
 
 
@@ -59,7 +59,7 @@ class AutopilotDriver:
         raise NotImplementedError
 
     async def terminate(self) -> None:
-        """End the flight at once, whatever happens to the vehicle."""
+        """End the flight at once, even if the vehicle falls."""
         raise NotImplementedError
 
 

@@ -36,7 +36,7 @@ class Photo(Snapshot):
     """A picture that a camera has taken.
 
     ``url`` is the address of the file for other programs: ``mftp:///DCIM/1.jpg`` for a file of `serve_files`, or an
-    HTTP address. The angles are those of the camera in degrees, yaw from north; None if unknown.
+    HTTP address. The angles are the camera's in degrees, with the yaw from north; None if unknown.
     """
 
     url: str = ""
@@ -60,8 +60,8 @@ class CameraDriver:
     """Base class for your program's camera; pass an instance to :meth:`OnboardComponent.add_camera`.
 
     Override the coroutines for the functions that the camera has; aerokit derives the reported capabilities from them.
-    An exception of a method becomes the result of the command, and a status text. A method is not called again before
-    its previous call for the same command has returned.
+    An exception of a method becomes the result of the command, and a status text. A method is not called again for the
+    same command before its previous call has returned.
 
     Args:
         vendor: at most 32 bytes.
@@ -107,7 +107,7 @@ class CameraDriver:
         """Focus to report; assign it when it changes."""
 
     async def take_photo(self, index: int) -> Photo:
-        """Take a picture and return it; ``index`` is its number, from 0."""
+        """Take a picture and return it. ``index`` is the number of the picture, from 0."""
         raise NotImplementedError
 
     async def start_video(self) -> None:
@@ -156,7 +156,7 @@ class CameraDriver:
         """Start or stop a video stream; numbers begin at 1."""
 
     def storage(self) -> Storage | None:
-        """Return the state of the camera's memory; None if it has none."""
+        """Return the state of the camera's memory; None if the camera has no memory."""
         return None
 
     async def format_storage(self) -> None:
@@ -307,7 +307,9 @@ class CameraAdapter(CameraDevice):
     async def _move(
         self, kind: int, value: float, now: float, to: Callable[[float], Any], at: Callable[[float], Any]
     ) -> bool:
-        """Move zoom or focus, because CAMERA_ZOOM_TYPE and SET_FOCUS_TYPE have the same numbers."""
+        """Move the zoom or the focus. One method serves both, because CAMERA_ZOOM_TYPE and SET_FOCUS_TYPE have the same
+        numbers.
+        """
         if kind == CameraZoomType.STEP and math.isfinite(now):
             kind, value = CameraZoomType.RANGE, max(0.0, min(100.0, now + value * _STEP_PERCENT))
         low, move = (0.0, to) if kind == CameraZoomType.RANGE else (-1.0, at)

@@ -140,7 +140,7 @@ class ComponentCommands:
         self.handlers[command] = partial(self._execute, function, arguments_of(function))
 
     def add_guarded(self, handlers: Mapping[int, CommandHandler]) -> None:
-        """Register handlers of a protocol server that call the program's code, whose exceptions become results."""
+        """Register handlers of a protocol server that call the program's code, and turn its exceptions into results."""
 
         def guard(handler: CommandHandler) -> CommandHandler:
             def guarded(command: ReceivedCommand) -> int | CommandProgress | None:
@@ -160,7 +160,7 @@ class ComponentCommands:
         return await found if inspect.isawaitable(found) else found
 
     def begin(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Like `call`, but return either the result of a plain function or an awaitable."""
+        """Begin to call a function as `call` does; return the result of a plain function, otherwise an awaitable."""
         if inspect.iscoroutinefunction(function) or not self.uses_threads:
             return function(*arguments)
         return self._call_in_thread(function, *arguments)
@@ -199,13 +199,13 @@ class ComponentCommands:
         running = self._running.start(command, cancel)
         if running is None:
             return
-        started = running  # Tells type checkers that it is not None in the closure.
+        started = running  # This name tells type checkers that the value is not None in the closure.
         loop = asyncio.get_running_loop() if self.uses_threads else None
 
         def report(percent: int) -> None:
             if loop is None:
                 self._running.report(started, percent)
-            else:  # Called from a thread.
+            else:  # This function was called from a thread.
                 loop.call_soon_threadsafe(self._running.report, started, percent)
 
         request = CommandRequest(command, report)

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 HEARTBEAT_INTERVAL_S = 1.0
 MAX_UNSENT_BYTES = 8192
-"""MAVFTP bursts pause while more bytes than this wait in the link."""
+"""MAVFTP bursts pause while more bytes than this wait to be sent on the link."""
 MAX_METADATA_BYTES = 1 << 20
 MAVLINK_VERSION = 3
 
@@ -47,7 +47,7 @@ class OnboardComponent:
     """Your program as one MAVLink component, returned by :func:`aerokit.component`.
 
     The component sends its own heartbeat, executes commands, and serves parameters, files, missions and messages. It
-    answers requests for anything else as MAVLink requires: UNSUPPORTED, DENIED, DOES_NOT_EXIST.
+    answers all other requests as MAVLink requires: with UNSUPPORTED, DENIED or DOES_NOT_EXIST.
     """
 
     def __init__(
@@ -164,9 +164,9 @@ class OnboardComponent:
         """Decorator: execute a MAV_CMD by a function or coroutine function.
 
         The function's first argument is the :class:`~aerokit.onboard.CommandRequest`. The other arguments are the
-        command's parameters in order, or as :class:`~aerokit.onboard.Param` says. Annotate each with float, int, bool
-        or an enum, add ``| None`` if the parameter may be missing, and limit it by ``Annotated[float, Range(0, 50)]``.
-        A command with other values is DENIED without a call of the function.
+        command's parameters in order, unless :class:`~aerokit.onboard.Param` numbers them. Annotate each argument with
+        float, int, bool or an enum. Add ``| None`` if the parameter may be missing, and limit its range by
+        ``Annotated[float, Range(0, 50)]``. A command whose values do not fit is DENIED, and the function is not called.
 
         The function returns None for ACCEPTED, a MAV_RESULT, or a :class:`~aerokit.onboard.CommandResult`. An exception
         becomes the result and a status text: InvalidArgument and ValueError DENIED, BusyError TEMPORARILY_REJECTED,
@@ -191,10 +191,10 @@ class OnboardComponent:
     def message(
         self, message_type: type[Message], *, hz: float = 0.0
     ) -> Callable[[Callable[[], Message | None]], Callable[[], Message | None]]:
-        """Decorator: send the message that a function returns, on request and at intervals that other programs set.
+        """Decorator: send the message that a function returns on request, and at intervals that other programs set.
 
         The function returns None while it has no values. ``hz`` (0 to 200) is the rate at which the message is sent to
-        all from the start; 0 sends it only on request.
+        all programs from the start; 0 sends it only on request.
 
         Raises:
             InvalidArgument: ``hz`` is out of range, or the message already has a function.
@@ -207,7 +207,7 @@ class OnboardComponent:
         return register
 
     def send(self, message: Message) -> None:
-        """Send a message as this component, to its target or to all.
+        """Send a message as this component, to the target in the message, or to all programs if it has no target.
 
         Raises:
             InvalidArgument: a field is out of range; nothing was sent.
@@ -217,7 +217,7 @@ class OnboardComponent:
         self._host.send(message)
 
     def send_text(self, text: str, *, severity: int = MavSeverity.INFO.value) -> None:
-        """Send a status text in ASCII to all (STATUSTEXT); a text of more than 254 characters is cut.
+        """Send a status text in ASCII to all programs (STATUSTEXT). A text of more than 254 characters is cut.
 
         Raises:
             InvalidArgument: ``severity`` is not a MAV_SEVERITY, 0 to 7.
@@ -226,7 +226,7 @@ class OnboardComponent:
         self._host.send_text(severity, text)
 
     def send_event(self, event_id: int, arguments: bytes = b"", *, severity: int = MavSeverity.INFO.value) -> None:
-        """Send an event to all (EVENT). A receiver that missed it can request it again.
+        """Send an event to all programs (EVENT). A receiver that missed the event can request it again.
 
         Args:
             event_id: id in the component's event metadata, ``component_id << 24`` plus a number.
@@ -241,7 +241,7 @@ class OnboardComponent:
     # ------------------------------------------------------------------------- files and missions
 
     def serve_files(self, directory: str | Path, *, writable: bool = False) -> None:
-        """Serve the files of one directory by MAVFTP; clients cannot leave it, not even by symbolic links.
+        """Serve the files of one directory by MAVFTP. Clients cannot leave the directory, not even by symbolic links.
 
         Files are read and written on the event loop, in blocks of 239 bytes, so the directory should be on a local
         disk.
@@ -282,7 +282,9 @@ class OnboardComponent:
 
     @property
     def missions(self) -> ComponentMissions:
-        """Missions, fences and rally points that other programs upload and download. The first access serves them."""
+        """Missions, fences and rally points that other programs upload and download. They are served after the first
+        access.
+        """
         if self._missions is None:
             self._missions = ComponentMissions(self._host, self._tasks, self._commands)
             self._streams.builders[m.MissionCurrent.ID] = self._missions._build_current
@@ -292,7 +294,7 @@ class OnboardComponent:
     # ---------------------------------------------------------------------------- ready-made parts
 
     def add_autopilot(self, driver: AutopilotDriver) -> None:
-        """Serve a ground station's commands to a vehicle: arm, mode, take-off, landing, return, reboot.
+        """Serve the commands that ground stations send to a vehicle: arm, mode, take-off, landing, return, reboot.
 
         Open the component with component id 1, a vehicle's ``type``, and ``autopilot=MavAutopilot.GENERIC``. HEARTBEAT
         reports armed after ``arm``, and the new mode after ``set_mode``. Send telemetry by :meth:`message`.
@@ -372,7 +374,7 @@ class OnboardComponent:
 
         Args:
             authorize: function or coroutine function, called with the vehicle's system id. It returns the number of
-                seconds for which arming is allowed, at most 255. An exception denies arming, and its text is sent as
+                seconds for which arming is allowed, at most 255. An exception denies arming; its text is sent as a
                 status text. To give a reason, return a :class:`~aerokit.onboard.CommandResult` with a
                 MAV_ARM_AUTH_DENIED_REASON as ``detail``.
 

@@ -24,7 +24,7 @@ _TEMPERATURE_UNKNOWN = 0x7FFF
 
 
 class WinchReport(Snapshot):
-    """State of a winch for WINCH_STATUS; unknown values are None. ``flags`` are MAV_WINCH_STATUS_FLAG bits."""
+    """State of a winch, sent as WINCH_STATUS; unknown values are None. ``flags`` are MAV_WINCH_STATUS_FLAG bits."""
 
     length_m: float | None = None
     speed_m_s: float | None = None
@@ -147,7 +147,7 @@ def add_arm_authorizer(services: ComponentServices, authorize: Authorize) -> Non
 
     async def arm_authorization(request: CommandRequest, system_id: int) -> CommandResult:
         try:
-            # PX4 sends system id 0 for itself (ArmAuthorization.cpp).
+            # PX4 sends 0 instead of its system id (ArmAuthorization.cpp).
             seconds = await services.commands.call(authorize, system_id or request.sender[0])
         except Exception as error:
             services.host.send_text(MavSeverity.WARNING, f"arming denied: {error_text(error)}")

@@ -72,7 +72,7 @@ def answer_pings(host: ComponentHost) -> None:
     """Answer PING requests and TIMESYNC requests."""
 
     def on_ping(ping: m.Ping, channel: Channel) -> None:
-        if ping.target_system == 0 and ping.target_component == 0:  # With a target, it is an answer.
+        if ping.target_system == 0 and ping.target_component == 0:  # A PING with a target is an answer.
             host.send(m.Ping(ping.time_usec, ping.seq, *channel), channel)
 
     def on_timesync(message: m.Timesync, channel: Channel) -> None:

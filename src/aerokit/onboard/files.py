@@ -64,11 +64,11 @@ class _DiskFile(FileHandle):
 
 
 class DirectoryFiles:
-    """Serves the regular files below one directory, and files in memory.
+    """Serves the regular files below one directory, and files that are kept in memory.
 
     Symbolic links are neither followed nor listed, and ``..`` is refused, so that clients cannot reach anything outside
-    the directory. Devices and pipes cannot be opened. ``memory`` has the component's own files; they hide files with
-    the same path, and clients cannot change them.
+    the directory. Devices and pipes cannot be opened. ``memory`` has the component's own files. They hide files in the
+    directory that have the same path, and clients cannot change them.
     """
 
     def __init__(self, root: Path | None, memory: FileTree, *, is_writable: bool) -> None:
@@ -181,7 +181,7 @@ class DirectoryFiles:
         for part in parts:
             if part == ".." or "\0" in part or "\\" in part or (os.name == "nt" and ":" in part):
                 raise FileFault(EINVAL)
-            if "\ufffd" in part:  # the name was not UTF-8
+            if "\ufffd" in part:  # The name was not valid UTF-8.
                 raise FileFault(ENOENT)
             target = target / part
             if target.is_symlink():

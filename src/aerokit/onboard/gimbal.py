@@ -38,7 +38,7 @@ class GimbalDriver:
     """Base class for your program's gimbal; pass an instance to :meth:`OnboardComponent.add_gimbal`.
 
     Override :meth:`point` and :meth:`attitude`. Only the component in control (DO_GIMBAL_MANAGER_CONFIGURE) can point
-    the gimbal; others are DENIED.
+    the gimbal; commands of all others are DENIED.
 
     Args:
         vendor: at most 32 bytes.
@@ -46,7 +46,7 @@ class GimbalDriver:
         roll_deg: minimum and maximum roll angle.
         pitch_deg: minimum and maximum pitch angle.
         yaw_deg: minimum and maximum yaw angle.
-        max_rate_deg_s: maximum rate, which full deflection in manual control commands.
+        max_rate_deg_s: maximum rate. Manual control with full deflection commands this rate.
         attitude_hz: rate of GIMBAL_DEVICE_ATTITUDE_STATUS, 0 to 100.
     """
 
@@ -87,7 +87,9 @@ class GimbalDriver:
         return 0.0
 
     def look_at(self, position: Position | None) -> None:
-        """Start to point at a position, or ahead for None. If it is not overridden, such commands are UNSUPPORTED."""
+        """Start to point at a position, or ahead for None. If not overridden, commands to point at a position are
+        UNSUPPORTED.
+        """
         raise NotImplementedError
 
 

@@ -28,7 +28,7 @@ _COMMANDS = (m.CommandLong.ID, m.CommandInt.ID)
 
 
 class ComponentHost:
-    """Delivers messages that are addressed to one component of a connection, and sends its messages.
+    """Delivers messages that are addressed to one component of a connection, and sends the component's messages.
 
     A channel is the (system id, component id) of a sender. ``accepts`` has the system ids whose messages are processed;
     None means all. ``knows_command`` decides whether this component executes a command that is addressed to all
@@ -91,7 +91,7 @@ class ComponentHost:
             self.connection.send_as(self._encoder, message, to=to)
 
     def send_text(self, severity: int, text: str) -> None:
-        """Send a STATUSTEXT to all; a text of more than 50 characters is sent in chunks."""
+        """Send a STATUSTEXT to all programs. A text of more than 50 characters is sent in chunks."""
         data = "".join(char if char.isprintable() else " " for char in text)
         data = data.encode("ascii", "replace").decode()[:MAX_TEXT_SIZE]
         if len(data) <= TEXT_SIZE:
@@ -104,7 +104,9 @@ class ComponentHost:
             self.send(m.Statustext(severity, "", self._text_id, len(data) // TEXT_SIZE))
 
     def report_error(self, what: str, error: Exception) -> None:
-        """Send an exception of the program's code as status text, and log it unless it is one of aerokit's."""
+        """Send an exception of the program's code as a status text. Log the exception unless it is one of aerokit's
+        errors.
+        """
         text = f"{what}: {error_text(error)}"
         if not isinstance(error, AerokitError):
             logger.error("component %d/%d: %s", self.system_id, self.component_id, text, exc_info=error)

@@ -48,7 +48,7 @@ class Identity(Snapshot):
 
     @property
     def version_number(self) -> int:
-        """The version as in AUTOPILOT_VERSION: one byte for each number."""
+        """The version in the form of AUTOPILOT_VERSION, which has one byte for each number."""
         parts = [*self.version.split("."), "0", "0", "0"][:4]
         if not all(part.isdecimal() and int(part) <= 255 for part in parts):
             raise InvalidArgument(f"version = {self.version!r} is not allowed: numbers up to 255, such as '1.4.2'")
@@ -103,7 +103,7 @@ class IdentityMessages:
         )
 
     def update_files(self) -> int:
-        """Write the metadata files, and return the checksum of the general metadata file."""
+        """Write the metadata files; return the checksum of the general metadata file."""
         entries = []
         for kind, (path, content) in self.metadata.items():
             data = content()
@@ -120,6 +120,6 @@ class IdentityMessages:
         return [m.ComponentMetadata(self._host.time_boot_ms, checksum, f"mftp://{GENERAL_PATH}")]
 
     def offer(self, kind: CompMetadataType, path: str, content: Callable[[], bytes]) -> None:
-        """Serve a metadata file; ``content()`` is called for each request."""
+        """Serve a metadata file. ``content()`` returns its content and is called for each request."""
         self.metadata[kind] = (path, content)
         self.update_files()

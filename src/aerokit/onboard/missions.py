@@ -54,14 +54,16 @@ class ComponentMissions:
     ) -> Callable[[str, tuple[MissionItem, ...]], Any]:
         """Decorator: ``function(kind, items)`` accepts or refuses each upload, before it is stored and acknowledged.
 
-        To refuse a list, the function raises InvalidArgument (result INVALID, and a status text) or returns a
-        MAV_MISSION_RESULT. It may be a coroutine function. An empty list is a request to clear the list.
+        To refuse a list, the function returns a MAV_MISSION_RESULT, or raises InvalidArgument, which becomes the result
+        INVALID and a status text. It may be a coroutine function. An empty list is a request to clear the list.
         """
         self._on_upload = function
         return function
 
     def on_set_current(self, function: Callable[[int], object]) -> Callable[[int], object]:
-        """Decorator: ``function(index)`` continues the mission at an item; without it, such requests are refused."""
+        """Decorator: ``function(index)`` continues the mission at an item. Without such a function, requests to do so
+        are refused.
+        """
         self._on_current = function
         return function
 

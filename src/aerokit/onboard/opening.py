@@ -57,9 +57,9 @@ async def component(
 
     Args:
         address: a connection string, a link or a list of them, as for :func:`aerokit.open_connection`.
-        connection: an open connection instead of an address. Use it for several components on one link, or for a
-            component and a ground station. The arguments after ``accepts`` are not allowed then.
-        system_id: system id of the component, 1 to 255; use that of the vehicle that carries it.
+        connection: an open connection instead of an address. Use this for several components on one link, or for a
+            component and a ground station. The arguments after ``accepts`` are then not allowed.
+        system_id: system id of the component, 1 to 255. Use the system id of the vehicle that carries the component.
         component_id: component id (MAV_COMPONENT), 1 to 255.
         type: MAV_TYPE of the heartbeat: ONBOARD_CONTROLLER, CAMERA, GIMBAL, WINCH, GRIPPER …
         autopilot: MAV_AUTOPILOT of the heartbeat; INVALID for everything that is not a flight controller.
@@ -67,8 +67,8 @@ async def component(
         parameters_file: JSON file that stores the parameters; it is replaced atomically after each change. None:
             parameters are not stored.
         bytewise: True to encode integers in PARAM_VALUE bytewise, as PX4 does; False to cast them to float, as
-            ArduPilot does. The component's capabilities announce the encoding. Clients that decide by the ``autopilot``
-            field expect bytewise.
+            ArduPilot does. The component's capabilities announce the encoding. Clients that decide by the field
+            ``autopilot`` of HEARTBEAT expect bytewise encoding.
         accepts: system ids whose messages are processed; None: all. Without signing, senders can claim any id.
         baud: bits per second of a serial link whose address has none.
         dialect: the messages that are decoded.

@@ -47,7 +47,7 @@ class ComponentParameters(Mapping[str, ParameterValue]):
     """Parameters of a component, a mapping of names to values. Other programs read and set them by MAVLink.
 
     PARAM serves numbers, PARAM_EXT numbers and texts. A value that is out of range, of another type, or refused by
-    ``on_set`` is not stored, and PARAM_ERROR or PARAM_EXT_ACK reports the reason to the sender.
+    ``on_set`` is not stored. PARAM_ERROR or PARAM_EXT_ACK then reports the reason to the sender.
     """
 
     def __init__(self, host: ComponentHost, path: Path | None, *, bytewise: bool) -> None:
@@ -87,9 +87,9 @@ class ComponentParameters(Mapping[str, ParameterValue]):
             description: description for the metadata.
             values: maps each allowed number to its name; other numbers are refused.
             read_only: True if only this program can change it.
-            reboot_required: for the metadata: True if a change takes effect after a reboot.
-            on_set: called on the event loop with a value that another program sets, before it is stored. It raises
-                InvalidArgument to refuse the value.
+            reboot_required: True if a change takes effect only after a reboot; reported in the metadata.
+            on_set: called on the event loop with a value that another program sets, before the value is stored. To
+                refuse the value, this function raises InvalidArgument.
 
         Raises:
             InvalidArgument: the name is invalid or in use, the default is not allowed, or the component already has
@@ -126,11 +126,11 @@ class ComponentParameters(Mapping[str, ParameterValue]):
         self._rows[name] = row
         if fits_param_value(row.type):
             self._small_names.append(name)
-        if self._extended is None:  # Not earlier, because a camera may serve its own settings by PARAM_EXT.
+        if self._extended is None:  # not earlier: a camera may need PARAM_EXT
             self._extended = TypedExtendedServer(self._host, _Store(self))
 
     def _give_way(self) -> None:
-        """Leave PARAM_EXT to the settings of a camera definition."""
+        """Stop serving PARAM_EXT, because the settings of a camera definition use it."""
         if self._rows:
             raise InvalidArgument("a component has either parameters or the settings of a camera definition")
         self._is_excluded = True
@@ -196,7 +196,7 @@ class ComponentParameters(Mapping[str, ParameterValue]):
         return json.dumps({**self._stored, **values}, indent=1) + "\n"
 
     async def _save(self, path: Path) -> None:
-        """Write the file until it has the last change, in a thread, because a memory card may need seconds."""
+        """Write the file until it has the last change. Uses a thread, because a memory card may need seconds."""
         try:
             while self._is_dirty:
                 self._is_dirty = False
@@ -265,7 +265,7 @@ class _Store:
 
 
 def _as_stored(limit: float | None, default: ParameterValue) -> float | None:
-    """Round a limit to 32 bits as values are rounded, so that the limit itself is allowed."""
+    """Round a limit to 32 bits in the same way as values, so that the limit itself is an allowed value."""
     return to_float32(limit) if limit is not None and isinstance(default, float) else limit
 
 

@@ -22,7 +22,7 @@ _NOT_MEASURED = 0xFFFF
 
 @checks_arguments
 class ComponentSources:
-    """Sends measurements as this component. Each call sends one message to all; call it as often as you measure."""
+    """Sends measurements as this component. Each call sends one message to all; make a call for each measurement."""
 
     def __init__(self, host: ComponentHost) -> None:
         self._host = host
@@ -44,8 +44,8 @@ class ComponentSources:
         """Send the distances to obstacles around the vehicle, clockwise as seen from above (OBSTACLE_DISTANCE).
 
         Args:
-            distances_m: at most 72 distances in metres; None if there was no measurement, infinity if nothing is in
-                range.
+            distances_m: at most 72 distances in metres. None means that there was no measurement, infinity that nothing
+                is in range.
             increment_deg: angle between two distances, above 0.
             first_deg: direction of the first distance from the nose.
             min_m: minimum range of the sensor, 0 to 655 m.
@@ -141,7 +141,7 @@ class ComponentSources:
 
         Args:
             right_deg: angle from straight down to the right, -90 to 90.
-            down_deg: angle from straight down towards the tail, -90 to 90; downwards in the camera's image.
+            down_deg: angle from straight down towards the tail, -90 to 90. It is downwards in the camera's image.
             distance_m: distance to the beacon in metres, 0 or more.
             target_number: number of the beacon, 0 to 255.
 

@@ -50,9 +50,10 @@ MAX_DEFINITION_SIZE, MAX_ELEMENTS = 1 << 20, 20_000
 
 
 class SettingRange(Snapshot):
-    """A restriction of an option: while it is selected and ``condition`` holds, ``setting`` accepts only ``options``.
+    """A restriction that an option imposes: while it is selected and ``condition`` holds, ``setting`` accepts only
+    ``options``.
 
-    ``condition`` has tests such as ``CAM_EXPMODE=1``, joined by AND and OR. An empty one always holds.
+    ``condition`` has tests such as ``CAM_EXPMODE=1``, joined by AND and OR. An empty condition always holds.
     """
 
     setting: str
@@ -61,7 +62,7 @@ class SettingRange(Snapshot):
 
 
 class SettingOption(Snapshot):
-    """A value that a setting can have. While it is selected, the settings in ``excludes`` have no effect."""
+    """A value that a setting can have. While this option is selected, the settings in ``excludes`` have no effect."""
 
     name: str
     value: SettingValue
@@ -70,9 +71,9 @@ class SettingOption(Snapshot):
 
 
 class SettingDefinition(Snapshot):
-    """Definition of one setting; None or empty for what the file does not define.
+    """Definition of one setting. Fields that the file does not define are None or empty.
 
-    ``type`` is the type name in the file (``"bool"``, ``"uint32"``, ``"float"`` …), ``wire_type`` the
+    ``type`` is the type name in the file (``"bool"``, ``"uint32"``, ``"float"`` …), and ``wire_type`` is the
     MAV_PARAM_EXT_TYPE. ``updates`` are settings that the camera may change together with this one. If ``is_control`` is
     False, a program should not display a control for it. ``step`` is enforced for whole numbers only.
     """
@@ -92,7 +93,7 @@ class SettingDefinition(Snapshot):
     write_only: bool = False
 
     def convert(self, value: SettingValue) -> SettingValue:
-        """Convert a value received from the camera: to ``bool`` if the setting has that type."""
+        """Convert a value received from the camera to a ``bool`` if the setting has this type."""
         return bool(value) if self.type == "bool" and not isinstance(value, (str, bytes)) else value
 
     def option_of(self, value: SettingValue) -> SettingOption | None:
@@ -133,7 +134,7 @@ class CameraDefinition(Snapshot):
     # ---------------------------------------------------------------------------------- dependencies
 
     def dependencies(self, name: str) -> tuple[str, ...]:
-        """Return the settings whose values restrict or exclude this one."""
+        """Return the settings whose values restrict or exclude this setting."""
         found: dict[str, None] = {}
         for setting in self.settings.values():
             for option in setting.options:
@@ -147,7 +148,7 @@ class CameraDefinition(Snapshot):
         return tuple(other for other in found if other != name)
 
     def excluded_by(self, name: str, values: Values) -> tuple[str, ...]:
-        """Return the selections that exclude a setting now, as texts such as ``CAM_EXPMODE = Auto``."""
+        """Return the selected options that exclude a setting now, as texts such as ``CAM_EXPMODE = Auto``."""
         return tuple(
             f"{other.name} = {option.name}"
             for other, option in self._selected(values)
@@ -159,7 +160,7 @@ class CameraDefinition(Snapshot):
         return self._options(name, values)[0]
 
     def _options(self, name: str, values: Values) -> tuple[tuple[SettingOption, ...], list[str]]:
-        """Return the options, and the selections that restrict them."""
+        """Return the options of a setting, and the selected options of other settings that restrict them."""
         own = self.settings.get(name)
         options = () if own is None else own.options
         reasons: list[str] = []
@@ -185,7 +186,7 @@ class CameraDefinition(Snapshot):
     # ----------------------------------------------------------------------------------------- checks
 
     def checked(self, name: str, value: object, values: Values) -> SettingValue:
-        """Check a value, or the name of an option, given the other settings, and return the value to send.
+        """Check a value, or the name of an option, against the values of other settings, and return the value to send.
 
         Raises:
             InvalidArgument: the setting is read-only, excluded now, or does not accept the value.
@@ -292,7 +293,10 @@ def _check_range(own: SettingDefinition, value: object) -> SettingValue:
 
 
 def _tests(condition: str) -> list[tuple[str, str, str, str]]:
-    """Parse into (setting, operator, value, AND or OR with the tests before); ValueError for a malformed condition."""
+    """Parse a condition into tests: (setting, operator, value, AND or OR with the tests before).
+
+    Raises ValueError if the condition is malformed.
+    """
     tests = []
     joiner, words = "AND", list[str]()
     for word in (*condition.split(), "AND") if condition else ():
@@ -310,7 +314,7 @@ def _tests(condition: str) -> list[tuple[str, str, str, str]]:
 
 
 def _evaluate(condition: str, values: Values) -> bool:
-    """Evaluate from left to right. A test of an unknown setting is False."""
+    """Evaluate a condition from left to right. A test of an unknown setting is False."""
     result = True
     for name, operator, value, joiner in _tests(condition):
         is_true = name in values and _compare(values[name], operator, value)
@@ -431,7 +435,7 @@ def _number(text: str | None) -> int | float | None:
     try:
         number = None if text is None else parse_number(text.strip())
         return None if number is None or not math.isfinite(number) else number
-    except (ValueError, OverflowError):  # also for more digits than a float can hold
+    except (ValueError, OverflowError):  # OverflowError: the number is too large for a float.
         return None
 
 

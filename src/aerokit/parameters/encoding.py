@@ -1,9 +1,9 @@
 """Encoding of parameter values in the 32-bit float of PARAM_VALUE and PARAM_SET.
 
-ArduPilot casts: 5 becomes 5.0, so an INT32 beyond 2**24 loses its last bits. PX4 copies the bytes of the integer
-(MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE). The bytes of some integers, such as -5,000,000, are signalling NaNs,
-in which a Python float changes one bit. :func:`parameter_of`, :func:`set_message` and :func:`value_message` preserve
-it.
+ArduPilot casts integers to float: 5 becomes 5.0, and an INT32 beyond 2**24 loses its last bits. PX4 copies the bytes of
+the integer (MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE). The bytes of some integers, such as -5,000,000, form
+signalling NaNs, in which a Python float changes one bit. :func:`parameter_of`, :func:`set_message` and
+:func:`value_message` preserve this bit.
 
 https://mavlink.io/en/services/parameter.html#parameter-encoding
 """
@@ -20,7 +20,7 @@ from aerokit.mavlink.frame import HEADER_LENGTH
 from aerokit.mavlink.messages import ParamSet, ParamValue
 from aerokit.parameters.parameter import Parameter, ParameterType, to_float32
 
-# The ``param_index`` of a PARAM_VALUE outside the list, which ArduPilot and PX4 send after PARAM_SET.
+# The ``param_index`` of a PARAM_VALUE that is not part of a list. ArduPilot and PX4 send it after PARAM_SET.
 UNKNOWN_INDEX = 0xFFFF
 
 _FLOAT = Struct("<f")
@@ -38,7 +38,7 @@ _M = TypeVar("_M", ParamSet, ParamValue)
 
 
 def to_bits(value: float, type: ParameterType, bytewise: bool) -> bytes:  # noqa: A002
-    """Encode a value, which :func:`checked_value` has accepted, as the four bytes of ``param_value``."""
+    """Encode a value as the four bytes of ``param_value``. :func:`checked_value` must have accepted the value."""
     if not bytewise or type is ParameterType.REAL32:
         return _FLOAT.pack(value)
     if type not in _FORMATS:
@@ -47,9 +47,9 @@ def to_bits(value: float, type: ParameterType, bytewise: bool) -> bytes:  # noqa
 
 
 def from_bits(bits: bytes, type: ParameterType, bytewise: bool) -> int | float:  # noqa: A002
-    """Decode the four bytes of ``param_value``; an int for integer types.
+    """Decode the four bytes of ``param_value``; return an int for integer types.
 
-    Never raises: if a vehicle sends a fraction or NaN for an integer type, that float is returned.
+    Never raises: if a vehicle sends a fraction or NaN for an integer type, the result is this float.
     """
     if bytewise and type in _FORMATS:
         return int(_FORMATS[type].unpack_from(bits)[0])
@@ -57,19 +57,19 @@ def from_bits(bits: bytes, type: ParameterType, bytewise: bool) -> int | float: 
 
 
 def to_wire(value: float, type: ParameterType, bytewise: bool) -> float:  # noqa: A002
-    """Encode a value as ``param_value``. Signalling NaNs change, see above."""
+    """Encode a value as ``param_value``. Signalling NaNs change, see the description of this module."""
     return float(_FLOAT.unpack(to_bits(value, type, bytewise))[0])
 
 
 def from_wire(param_value: float, type: ParameterType, bytewise: bool) -> int | float:  # noqa: A002
-    """Decode a ``param_value``. Signalling NaNs have changed, see above."""
+    """Decode a ``param_value``. Signalling NaNs have changed, see the description of this module."""
     if bytewise and type in _FORMATS:
         return from_bits(_FLOAT.pack(param_value), type, bytewise)
     return _cast(param_value, type)
 
 
 def value_of(message: ParamSet | ParamValue, bytewise: bool) -> int | float:
-    """Return the value in a message, exact to the bit if it was received."""
+    """Return the value in a message. The value of a received message is exact to the bit."""
     type_ = ParameterType.from_wire(message.param_type)
     if message.param_value == message.param_value or not bytewise:
         return from_wire(message.param_value, type_, bytewise)
@@ -77,7 +77,7 @@ def value_of(message: ParamSet | ParamValue, bytewise: bool) -> int | float:
 
 
 def parameter_of(message: ParamValue, bytewise: bool) -> Parameter:
-    """Convert a PARAM_VALUE. It has no default, and no index outside the list."""
+    """Convert a PARAM_VALUE to a parameter without a default. If it is not part of a list, the index is None."""
     index = None if message.param_index == UNKNOWN_INDEX else message.param_index
     type_ = ParameterType.from_wire(message.param_type)
     return Parameter(message.param_id, value_of(message, bytewise), type_, None, index)
@@ -153,8 +153,9 @@ _DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 
 def number_text(value: float) -> str:
-    """Format with the fewest digits: ``0.1`` for the 32-bit float nearest to 0.1, ``3`` for 3.0; all digits of an
-    int.
+    """Format a number with the fewest digits: ``0.1`` for the 32-bit float nearest to 0.1, ``3`` for 3.0.
+
+    An int is formatted with all its digits.
 
     Raises:
         OverflowError: the number exceeds a 32-bit float.
@@ -170,7 +171,7 @@ def number_text(value: float) -> str:
 
 
 def parse_number(text: str) -> int | float:
-    """Parse an int or a float. ValueError for anything else, including NaN and infinities."""
+    """Parse an int or a float. Raises ValueError for anything else, including NaN and infinities."""
     if _INTEGER.fullmatch(text):
         return int(text)
     if _HEXADECIMAL.fullmatch(text):
@@ -178,6 +179,6 @@ def parse_number(text: str) -> int | float:
     if not _DECIMAL.fullmatch(text):
         raise ValueError(text)
     number = float(text)
-    if math.isinf(number):  # for example of the text "1e999"
+    if math.isinf(number):  # The text is for example "1e999".
         raise ValueError(text)
     return number

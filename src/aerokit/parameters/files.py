@@ -1,9 +1,9 @@
 """Parameter files of Mission Planner, MAVProxy and QGroundControl.
 
-Mission Planner has lines with ``NAME,VALUE``, MAVProxy with ``NAME    VALUE``, both with ``#`` comments and without
+Mission Planner writes lines with ``NAME,VALUE``, MAVProxy with ``NAME VALUE``. Both formats have ``#`` comments and no
 types. QGroundControl has five columns separated by tabs: system, component, name, value, MAV_PARAM_TYPE
-(https://docs.qgroundcontrol.com/master/en/qgc-dev-guide/file_formats/parameters.html). A file with any damaged line is
-refused, because half a set of parameters is worse than none.
+(https://docs.qgroundcontrol.com/master/en/qgc-dev-guide/file_formats/parameters.html). A file with a damaged line is
+refused as a whole, because half a set of parameters is worse than none.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ _COLUMNS = "system id, component id, name, value and type with tabs between them
 class ParameterFile(Mapping[str, "int | float"]):
     """Content of a parameter file: maps names to values.
 
-    A value is an int if it is written like one. ``types`` are those in the file (QGroundControl only), ``comments`` the
-    lines that begin with ``#``, and ``component_id`` the component that has these parameters.
+    A value is an int if it is written as a whole number. ``types`` are the types in the file (QGroundControl only),
+    ``comments`` the lines that begin with ``#``, and ``component_id`` is the component that has these parameters.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class ParameterFile(Mapping[str, "int | float"]):
 
 
 def read_parameter_file(path: str | os.PathLike[str], *, component_id: int | None = None) -> ParameterFile:
-    """Read a file in any of the three formats; the first parameter determines which.
+    """Read a file in any of the three formats. The line of the first parameter determines the format.
 
     If a QGroundControl file has several components, ``component_id`` selects one, by default the autopilot (1).
 
@@ -107,7 +107,7 @@ def write_parameter_file(
     system_id: int = 1,
     component_id: int = _AUTOPILOT,
 ) -> None:
-    """Write parameters to a file, sorted by name, with the digits that a 32-bit float needs. Atomic.
+    """Write parameters to a file atomically, sorted by name, with the digits that a 32-bit float needs.
 
     ``system_id`` and ``component_id`` are only used in QGroundControl's format.
 
@@ -222,7 +222,7 @@ def _hint(fields: list[str]) -> str:
 
 
 def _rows(values: ParameterValues) -> Iterator[tuple[str, str, ParameterType]]:
-    """Yield name, formatted value and type, all checked."""
+    """Yield name, formatted value and type of each parameter, after checking them."""
     types = values.types if isinstance(values, ParameterFile) else {}
     numbers = plain_values(values)
     for name, number in numbers.items():

@@ -2,8 +2,8 @@
 
 Vehicles send little metadata. :func:`load_metadata` reads the files of both autopilots:
 
-- ArduPilot: ``apm.pdef.xml`` or ``apm.pdef.json`` from ``https://autotest.ardupilot.org/Parameters/ArduCopter/``
-  (``ArduPlane``, ``Rover``, ``ArduSub``, ``AntennaTracker``, ``Blimp``); of each release from
+- ArduPilot: ``apm.pdef.xml`` or ``apm.pdef.json`` from ``https://autotest.ardupilot.org/Parameters/ArduCopter/`` (or
+  ``ArduPlane``, ``Rover``, ``ArduSub``, ``AntennaTracker``, ``Blimp``). The files of each release are in
   https://github.com/ArduPilot/ParameterRepository (``Copter-4.6/apm.pdef.json`` …).
 - PX4: ``parameters.json.xz`` from the vehicle itself by MAVFTP (COMPONENT_METADATA names its general metadata, which
   names this file: ``mftp://etc/extras/parameters.json.xz``), or ``build/<target>/parameters.json``,
@@ -11,8 +11,8 @@ Vehicles send little metadata. :func:`load_metadata` reads the files of both aut
 
 https://mavlink.io/en/services/component_information.html
 
-The format is detected by the first character and the outermost names. Invalid numbers are ignored, because generators
-copy hand-written ranges such as "0 10" and "-1,1".
+The format is recognised by the first character and the outermost names. Invalid numbers are ignored, because the files
+contain hand-written ranges such as "0 10" and "-1,1".
 """
 
 from __future__ import annotations
@@ -41,10 +41,11 @@ _NO_BITS: Mapping[int, str] = MappingProxyType({})
 
 
 class ParameterMetadata(Snapshot):
-    """Metadata of one parameter; None or empty for what the file does not define.
+    """Metadata of one parameter. Fields that the file does not define are None or empty.
 
-    ``values`` names single values, ``bitmask`` bits (numbered from 0). ``minimum`` and ``maximum`` are recommendations;
-    vehicles also accept other values. A ``volatile`` parameter is changed by the vehicle itself.
+    ``values`` maps single values to names, ``bitmask`` maps bits (numbered from 0) to names. ``minimum`` and
+    ``maximum`` are recommendations; vehicles also accept other values. A ``volatile`` parameter is changed by the
+    vehicle itself.
     """
 
     name: str
@@ -65,7 +66,7 @@ class ParameterMetadata(Snapshot):
     volatile: bool = False
 
     def describe(self, value: float) -> str:
-        """Describe a value: by its name, the names of its bits, or as a number with unit."""
+        """Describe a value by its name, by the names of its bits, or as a number with its unit."""
         if value in self.values:
             return self.values[value]
         if self.bitmask and 0 <= value < math.inf and value == int(value):
@@ -93,7 +94,9 @@ class ParameterMetadata(Snapshot):
 
 
 class Metadata(Mapping[str, ParameterMetadata]):
-    """Maps names to :class:`ParameterMetadata`, for one vehicle type and version. The first of equal names counts."""
+    """Maps names to :class:`ParameterMetadata`, for one vehicle type and version. If a name occurs twice, the first
+    counts.
+    """
 
     __slots__ = ("_by_name",)
 
@@ -120,7 +123,7 @@ class Metadata(Mapping[str, ParameterMetadata]):
         return frozenset(parameter.name for parameter in self._by_name.values() if parameter.volatile)
 
     def reboot_required(self, names: Iterable[str]) -> tuple[str, ...]:
-        """Return those of the names whose changes take effect after a reboot."""
+        """Return the names of parameters whose changes take effect only after a reboot."""
         return tuple(name for name in names if name in self and self[name].reboot_required)
 
     def check(self, name: str, value: float) -> None:

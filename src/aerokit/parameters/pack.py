@@ -1,9 +1,9 @@
 """``param.pck``: all parameters in one compact file, read and written by MAVFTP.
 
-Vehicles serve it at ``@PARAM/param.pck``: ArduPilot since 4.1, PX4 since August 2026 (PR 28435). ``?withdefaults=1``
-requests defaults, ``?start=50&count=10`` a part. Use a single block size for the whole file, because padding depends
-on it: no value crosses a block boundary. Downloaded and uploaded files have different headers, see
-:func:`pack_parameters`.
+Vehicles serve it at ``@PARAM/param.pck``: ArduPilot since 4.1, PX4 since August 2026 (PR 28435). ``?withdefaults=1`` at
+the end of the path requests defaults, ``?start=50&count=10`` requests a part of the file. Use a single block size for
+the whole file: the file is padded so that no value crosses a block boundary. Downloaded and uploaded files have
+different headers, see :func:`pack_parameters`.
 
 https://mavlink.io/en/services/parameter_ftp.html
 """
@@ -74,11 +74,12 @@ class PackEntry(NamedTuple):
 def unpack_parameters(data: bytes, *, start: int = 0) -> ParameterTable:
     """Decode a downloaded file. ``start`` is the index of its first parameter, as requested in the path.
 
-    If defaults were requested, every returned parameter has one; the file omits defaults that equal the value.
+    If defaults were requested, every returned parameter has a default, although the file omits defaults that equal the
+    value.
 
     Raises:
-        RemoteProtocolError: the file is damaged, or has another number of parameters than its header. ArduPilot sends
-            such a file once after its list has changed; download it again.
+        RemoteProtocolError: the file is damaged, or its number of parameters differs from that in its header. ArduPilot
+            sends such a file once after its list has changed; download the file again.
     """
     magic, count, total = read_header(data)
     if magic not in (MAGIC, _MAGIC_WITH_DEFAULTS) or count > total:
@@ -90,8 +91,8 @@ def unpack_parameters(data: bytes, *, start: int = 0) -> ParameterTable:
 def pack_parameters(parameters: Mapping[str, Parameter] | Iterable[Parameter]) -> bytes:
     """Encode a file to write to ``@PARAM/param.pck``, in the given order.
 
-    The vehicle applies the parameters when the file is closed, and silently skips unknown and read-only ones, so read
-    back what you wrote.
+    The vehicle applies the parameters when the file is closed. It silently skips unknown and read-only parameters, so
+    read back the values that you have written.
 
     Raises:
         InvalidArgument: a name or value does not fit (INT32 is the widest type), or the file exceeds 65,535 bytes,
@@ -119,11 +120,11 @@ def pack_for_download(
     block_size: int = 239,
     whole_defaults: bool = True,
 ) -> bytes:
-    """Encode ``@PARAM/param.pck`` for these parameters. ``block_size``: data bytes per read. Values are not
-    validated.
+    """Encode ``@PARAM/param.pck`` for these parameters, without validating their values.
 
-    ``count`` 0 means all from ``start`` on. PX4 keeps a value and its default in the same block. ArduPilot
-    (``whole_defaults=False``) may separate them, but splits neither. InvalidArgument if ``start`` is beyond the list.
+    ``block_size`` is the number of data bytes per read. ``count`` 0 means all parameters from ``start`` on. PX4 keeps a
+    value and its default in the same block. ArduPilot (``whole_defaults=False``) may put them into different blocks,
+    but splits neither. InvalidArgument is raised if ``start`` is beyond the list.
     """
     rows = list(_rows(parameters))
     if not 0 <= start < len(rows):
@@ -153,7 +154,7 @@ def read_header(data: bytes) -> PackHeader:
 
 
 def read_entry(data: bytes, position: int, last: bytes) -> PackEntry | None:
-    """Decode the entry at ``position``; ``last`` is the previous name. None if the data ends inside the entry.
+    """Decode the entry at ``position``; ``last`` is the previous name. Returns None if the data ends inside the entry.
 
     Raises:
         RemoteProtocolError: there is no entry: the type or flags are undefined, or the name is too long.
@@ -229,7 +230,7 @@ def _entry(name: bytes, last: bytes, code: int, *values: float) -> bytes:
 
 
 def _common_length(name: bytes, last: bytes) -> int:
-    # A name must have at least one character that it does not share with the previous one.
+    # A name must have at least one character that it does not share with the previous name.
     common = 0
     for char, last_char in zip(name[:-1], last):  # noqa: B905 - the shorter one ends it
         if char != last_char:
@@ -247,10 +248,10 @@ _ALL_ONES = 0xFFFFFFFF
 def px4_hash(table: ParameterTable, volatile: Container[str] = ()) -> int:
     """Compute the ``_HASH_CHECK`` that PX4 would report for this table.
 
-    CRC-32 without inversions over the name and the four value bytes of each parameter, sorted by name. PX4 ignores
-    volatile parameters, which it changes itself; pass their names as ``volatile`` (:attr:`ParameterMetadata.volatile
-    <aerokit.parameters.ParameterMetadata>`). Without them the result differs, so a cache should store the vehicle's
-    own hash with the table.
+    The hash is a CRC-32 without inversions over the name and the four value bytes of each parameter, sorted by name.
+    PX4 ignores volatile parameters, which it changes itself. Pass their names as ``volatile``
+    (:attr:`ParameterMetadata.volatile <aerokit.parameters.ParameterMetadata>`), otherwise the result differs. Because
+    the names may be unknown, a cache should store the hash that the vehicle has reported.
     """
     counted = (table[name] for name in sorted(table) if name not in volatile)
     data = b"".join(p.name.encode() + to_bits(p.value, p.type, bytewise=True) for p in counted)

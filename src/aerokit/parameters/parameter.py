@@ -47,7 +47,7 @@ class ParameterType(IntEnum):
     def from_wire(cls, number: int) -> ParameterType:
         """Return the type with this MAV_PARAM_TYPE number.
 
-        REAL32 for unknown numbers, because every value is sent as a float.
+        The result is REAL32 for unknown numbers, because every value is sent as a float.
         """
         return cls(number) if 1 <= number <= 10 else cls.REAL32
 
@@ -79,8 +79,8 @@ class ParameterType(IntEnum):
 class Parameter(Snapshot):
     """One parameter of a vehicle, as last reported.
 
-    ``value`` is an ``int`` for integer types, else a ``float`` with 32-bit precision. ``default`` is None if unknown
-    (only MAVFTP reports it); ``index`` is the index in the vehicle's list, or None if not reported. Nothing is
+    ``value`` is an ``int`` for integer types, else a ``float`` with 32-bit precision. ``default`` is None if unknown;
+    only MAVFTP reports it. ``index`` is the index in the vehicle's list, or None if not reported. Values are not
     checked: a vehicle may report NaN.
     """
 
@@ -100,7 +100,7 @@ def check_name(name: str) -> str:
     """Check that a name can be sent, and return it.
 
     Raises:
-        InvalidArgument: it is not 1 to 16 printable ASCII characters without spaces.
+        InvalidArgument: the name is not 1 to 16 printable ASCII characters without spaces.
     """
     if not isinstance(name, str):
         raise InvalidArgument(f"parameter name = {short_repr(name)} is not a string")
@@ -114,7 +114,7 @@ def check_name(name: str) -> str:
 
 
 def checked_value(name: str, value: float, type: ParameterType) -> int | float:  # noqa: A002
-    """Convert a value as the vehicle stores it in that type: to an int, or to the nearest 32-bit float.
+    """Convert a value to the form in which a vehicle stores it in this type: an int, or the nearest 32-bit float.
 
     Raises:
         InvalidArgument: the type cannot hold the value: NaN, infinity, 300 as an INT8, 1.5 as an integer.
@@ -134,7 +134,10 @@ def checked_value(name: str, value: float, type: ParameterType) -> int | float: 
 
 
 def number_of(name: str, value: object) -> int | float:
-    """Convert to an int or a float. Numbers of other libraries, such as numpy, are accepted; else InvalidArgument."""
+    """Convert to an int or a float. Numbers of other libraries, such as numpy, are accepted.
+
+    Raises InvalidArgument for all other values.
+    """
     if isinstance(value, (int, float)):
         return value
     if isinstance(value, SupportsIndex):
@@ -145,7 +148,7 @@ def number_of(name: str, value: object) -> int | float:
 
 
 def to_float32(value: float) -> float:
-    """Round to the nearest 32-bit float. OverflowError if the value is too large."""
+    """Round to the nearest 32-bit float. Raises OverflowError if the value is too large."""
     return float(_FLOAT32.unpack(_FLOAT32.pack(value))[0])
 
 
@@ -164,9 +167,9 @@ def same_value(left: float, right: float) -> bool:
 # ------------------------------------------------------------------------------------- settings
 
 SettingValue = bool | int | float | str | bytes
-"""The value of a setting. ``bool`` only if a definition says so; ``str`` or ``bytes`` for the custom type."""
+"""The value of a setting: ``bool`` only if a definition says so, ``str`` or ``bytes`` for the custom type."""
 
-MAX_VALUE_SIZE = 128  # bytes in one message
+MAX_VALUE_SIZE = 128  # maximum bytes of a value, which one message can carry
 
 _STRUCTS = {
     MavParamExtType.UINT8: Struct("<B"),
@@ -196,7 +199,7 @@ class Setting(Snapshot):
 
 
 def setting_value(data: bytes, type: int) -> SettingValue:  # noqa: A002 - the name of the field in the standard
-    """Decode the bytes of a message. For unknown types, return the bytes without trailing zeros."""
+    """Decode the bytes of a value in a message. For unknown types, return the bytes without trailing zeros."""
     packed = _STRUCTS.get(type)  # type: ignore[call-overload]
     if packed is not None:
         number: int | float = packed.unpack(data[: packed.size].ljust(packed.size, b"\0"))[0]
@@ -222,7 +225,8 @@ def setting_bytes(value: SettingValue, type: int) -> bytes:  # noqa: A002
 
 
 def checked_setting(name: str, value: object, type: int) -> SettingValue:  # noqa: A002
-    """Convert a value as the component stores it: to an int, a 32-bit float, a string or bytes.
+    """Convert a value to the form in which a component stores it in this type: an int, a 32-bit float, a string or
+    bytes.
 
     Raises:
         InvalidArgument: the type cannot hold the value: 300 as a UINT8, 1.5 as an integer, a string for a number, a

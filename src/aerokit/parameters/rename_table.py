@@ -1,13 +1,13 @@
 """Table of parameters that ArduPilot renamed.
 
-For 4.7: from the metadata of 4.6 and 4.7 and the conversions in the firmware (AC_WPNav, AC_Loiter, AC_PosControl,
-AC_AttitudeControl, AC_Circle, AC_Avoid, AP_Arming, AP_RangeFinder, GCS, the vehicles' Parameters.cpp);
-https://ardupilot.org/copter/docs/common-param-name-changes.html. Like the firmware, PSC_ACCZ_FF, _PDMX and _D_FF are
-not scaled, although P, I and D are scaled by 0.1.
+The sources for version 4.7 are the metadata of 4.6 and 4.7, the conversions in the firmware (AC_WPNav, AC_Loiter,
+AC_PosControl, AC_AttitudeControl, AC_Circle, AC_Avoid, AP_Arming, AP_RangeFinder, GCS, the vehicles' Parameters.cpp),
+and https://ardupilot.org/copter/docs/common-param-name-changes.html. As in the firmware, PSC_ACCZ_FF, _PDMX and _D_FF
+are not scaled, although P, I and D are scaled by 0.1.
 
-For earlier versions: from the source code and the firmware's conversions (convert_old_parameters in the vehicles'
-Parameters.cpp, AP_Mount, AP_Camera, AP_GPS, AP_BattMonitor …). If a value changed by more than its unit (gains,
-choices), nothing is converted: see `REPLACED`.
+The sources for earlier versions are the source code and the firmware's conversions (convert_old_parameters in the
+vehicles' Parameters.cpp, AP_Mount, AP_Camera, AP_GPS, AP_BattMonitor …). If the meaning of a value changed and not only
+its unit (gains, choices), nothing is converted: see `REPLACED`.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _VERTICAL_ACCELERATION = "FF FLTT FLTE FLTD SMAX PDMX D_FF NTF NEF"
 
 
 def _position(prefix: str) -> tuple[tuple[int, str], ...]:
-    """Return the pairs of the position controller: from north-east-up in cm to north-east-down in m."""
+    """Return the pairs of the position controller, which changed from north-east-up in cm to north-east-down in m."""
     moved = (
         _same(f"{prefix}VELXY_", f"{prefix}NE_VEL_", _HORIZONTAL),
         _same(f"{prefix}VELZ_", f"{prefix}D_VEL_", _HORIZONTAL),
@@ -124,7 +124,9 @@ _OLDER_COPTER, _OLDER_PLANE, _ROVER = ("Copter",), ("Plane",), ("Rover",)
 
 
 def _moved(old: str, new: str, names: str) -> str:
-    """Make pairs from names: ``TYPE`` becomes ``RNGFND_TYPE>RNGFND1_TYPE``. Also accepts pairs ``A>B``."""
+    """Make pairs from names by adding prefixes: ``TYPE`` becomes ``RNGFND_TYPE>RNGFND1_TYPE``. Also accepts pairs
+    ``A>B``.
+    """
     halves = (name.partition(">") for name in names.split())
     return " ".join(f"{old}{before}>{new}{after or before}" for before, _, after in halves)
 

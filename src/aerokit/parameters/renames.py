@@ -1,7 +1,7 @@
 """Parameters that ArduPilot renamed since 2015, most of them in version 4.7: old names on new firmware and vice versa.
 
-The vehicle converts its own values on update; this module is for programs and files with the old names. Changes that
-are not one to one are not converted; :func:`replacement_of` describes them. The data is in
+A vehicle converts its own values on a firmware update. This module is for programs and files that have old names.
+Changes that are not one to one are not converted; :func:`replacement_of` describes them. The data is in
 :mod:`aerokit.parameters.rename_table`.
 """
 
@@ -17,7 +17,7 @@ from aerokit.parameters.encoding import number_text
 from aerokit.parameters.parameter import Parameter, ParameterType, to_float32
 from aerokit.parameters.rename_table import GROUPS, INVERTED, OLDER, ONE_WAY, OTHER_NEW_NAMES, REPLACED
 
-# Bits of ARMING_CHECK: 1 for all checks, bits 1 to 20 for single ones. ARMING_SKIPCHK = -1 skips every check.
+# The value 1 of ARMING_CHECK enables all checks, bits 1 to 20 enable single checks. ARMING_SKIPCHK = -1 skips all.
 _ALL_CHECKS = 1
 _CHECKS = 0x1FFFFE
 _EVERYTHING = -1
@@ -77,7 +77,7 @@ class Rename(Snapshot):
 
 
 class Renamed(Snapshot):
-    """A parameter that was requested under one name and that the vehicle has under another, ``name``."""
+    """A parameter that was requested under one name, and that the vehicle has under another name, ``name``."""
 
     requested: str
     name: str
@@ -129,9 +129,9 @@ class Renamed(Snapshot):
 
 
 def find_rename(name: str, other: str = "") -> Rename | None:
-    """Find a renamed parameter by any of its names; None for all others.
+    """Find a renamed parameter by any of its names; return None for parameters that were not renamed.
 
-    A few old names have different new names, depending on the vehicle type: ``other`` selects one of them.
+    The new names of a few old names depend on the vehicle type: ``other`` selects one of the new names.
     """
     return next((row for row in _by_name().get(name, ()) if not other or other in row.names), None)
 
@@ -167,8 +167,8 @@ def translate_values(
 ) -> tuple[dict[str, int | float], tuple[Renamed, ...]]:
     """Convert the values of a file or table to the names and units of a vehicle with the ``known`` names.
 
-    Names that the vehicle does not have under any name are kept. A value under the vehicle's own name takes precedence.
-    ``types`` are the vehicle's types, for rounding. The second result lists what was converted.
+    Names of parameters that the vehicle does not have are kept. A value under the vehicle's own name takes precedence.
+    ``types`` are the vehicle's types, for rounding. The second result lists the converted parameters.
     """
     translated: dict[str, int | float] = {}
     renamed: list[Renamed] = []
@@ -186,15 +186,16 @@ def translate_values(
 
 
 def _scaled(value: float, scale: Callable[[Decimal], Decimal]) -> float:
-    # In decimal, with the digits that a 32-bit float has.
+    # Computed in decimal, with the digits that a 32-bit float has.
     try:
         return float(scale(Decimal(number_text(value))))
-    except (ArithmeticError, ValueError):  # infinite, NaN, beyond 32 bits: vehicles accept none of these
+    except (ArithmeticError, ValueError):  # The value is infinite, NaN or beyond 32 bits, which no vehicle accepts.
         return value
 
 
 def _checks_to_skip(checks: int) -> int:
-    # All checks: skip none. No checks: skip everything, including future checks. Else skip the others.
+    # If all checks are enabled, none are skipped. If none are enabled, all are skipped, including future checks.
+    # Otherwise the checks that are not enabled are skipped.
     if checks & _ALL_CHECKS:
         return 0
     return ~checks & _CHECKS if checks & _CHECKS else _EVERYTHING
@@ -214,7 +215,7 @@ def _by_name() -> Mapping[str, tuple[Rename, ...]]:
     for since, vehicles, divisor, pairs in OLDER:
         for old, new in _pairs(pairs):
             row = rows.get(new) or Rename(old, new, divisor, vehicles=vehicles, since=since)
-            if old not in row.names:  # otherwise the new name was later renamed again, in the same unit
+            if old not in row.names:  # a later rename in the same unit may have this name too
                 row = row.replace(other_old=(*row.other_old, old))
             rows.update(dict.fromkeys(row.names, row))
     found: dict[str, tuple[Rename, ...]] = {name: (row,) for name, row in rows.items()}

@@ -83,7 +83,7 @@ class ParameterTable(Mapping[str, Parameter]):
     def updated_with(self, parameters: Iterable[Parameter]) -> ParameterTable:
         """Return a copy with these parameters: known ones are replaced, new ones appended.
 
-        A default or index that is None in the update is kept.
+        If a default or an index is None in the update, the known one is kept.
         """
         merged = dict(self._by_name)
         for new in parameters:
@@ -139,7 +139,7 @@ def diff(
     *,
     names: Iterable[str] | None = None,
 ) -> tuple[ParameterDifference, ...]:
-    """Compare parameters. Differences are in the order of ``before``, then those that only ``after`` has.
+    """Compare parameters. Differences are in the order of ``before``; parameters that only ``after`` has come last.
 
     Numbers that are equal as 32-bit floats, or differ by at most ``tolerance``, count as the same. ``names`` restricts
     the comparison: ``diff(file, table, names=file)`` ignores parameters that the file does not have.
@@ -167,5 +167,5 @@ def _text(value: float | None) -> str:
         return "missing"
     try:
         return number_text(value)
-    except (ArithmeticError, ValueError):  # NaN, infinite, beyond 32 bits
+    except (ArithmeticError, ValueError):  # A value is NaN, infinite or beyond 32 bits.
         return repr(value)

@@ -1,1 +1,1 @@
-"""MAVLink microservices without IO: messages and ``now`` in, messages and results out."""
+"""MAVLink microservices without I/O. They receive messages and the time, and return messages and results."""

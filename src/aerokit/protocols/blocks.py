@@ -8,27 +8,28 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from aerokit.protocols.exchange import RoundTrip
 
-# Number of later requests whose answers show that a request was lost, because answers arrive in order.
+# A request counts as lost when this many later requests were answered, because answers arrive in order.
 OVERTAKEN = 3
 
-# ArduPilot queues five requests, drops further ones, and processes them every 2 ms.
+# ArduPilot queues at most five requests, processes one every 2 ms, and drops further requests.
 BURST_SIZE = 4
 
-# Pause between requests beyond a burst.
+# Pause between requests that follow the first ``BURST_SIZE``.
 SPACING_S = 0.002
 
 # An answer that arrives within this fraction of the fastest round trip belongs to an earlier transmission.
 MIN_ROUND_TRIP_FRACTION = 0.5
 
-# Consecutive timeouts before requests back off, because radios lose single frames.
+# Number of consecutive timeouts after which requests back off. Fewer do not count, because radios lose single frames.
 TIMEOUTS_BEFORE_BACKOFF = 3
 
 
 class AdaptiveWindow:
     """Number of requests in flight: as many as the link carries without delaying their answers.
 
-    It grows while answers arrive as fast as the fastest ones, and shrinks when they take much longer, because they then
-    wait in a queue. Loss does not shrink it unless most requests are lost, because radios lose frames at any rate.
+    The window grows while answers arrive as fast as the fastest answers so far. It shrinks when answers take much
+    longer, because they then wait in a queue. Loss does not shrink the window unless most requests are lost, because
+    radios lose frames at any rate.
     """
 
     def __init__(self, *, start: int = 4, min_size: int = 2, max_size: int = 64) -> None:
@@ -47,7 +48,9 @@ class AdaptiveWindow:
         self._size = max(self._size, min(size, self._max_size / 2))
 
     def on_answer(self, seconds: float | None) -> None:
-        """Record an answer. ``seconds`` is the time since its request; None if several transmissions are possible."""
+        """Record an answer. ``seconds`` is the time since its request; None if it may answer one of several
+        transmissions.
+        """
         self._loss -= self._loss / 16
         if seconds is None:
             return
@@ -85,7 +88,7 @@ class BlockRequests:
         self.window: AdaptiveWindow = AdaptiveWindow()
         self._round_trip, self._burst_size, self._spacing_s = round_trip, burst_size, spacing_s
         self._waiting: dict[int, None] = {}
-        self._in_flight: dict[int, _Block] = {}  # in the order of sending
+        self._in_flight: dict[int, _Block] = {}  # in the order in which they were sent
         self._blocks: dict[int, _Block] = {}
         self._sent_count = 0
         self._timeouts = 0
@@ -104,7 +107,7 @@ class BlockRequests:
         return overdue_at
 
     def request(self, offset: int) -> None:
-        """Queue a request, unless one is waiting or in flight."""
+        """Queue a request for this block, unless such a request is waiting or in flight."""
         if offset not in self._in_flight:
             self._waiting[offset] = None
 
@@ -124,7 +127,7 @@ class BlockRequests:
         self._busy_until = until
 
     def on_answer(self, offset: int, now: float, *, sent_at: float | None = None) -> None:
-        """Record an answer. ``sent_at`` is the time of the sending that it answers, if known."""
+        """Record an answer. ``sent_at`` is the time of the transmission that it answers, if known."""
         block = self._blocks.get(offset)
         self.discard(offset)
         if block is None:
@@ -141,7 +144,7 @@ class BlockRequests:
             self._requeue_overtaken(block.number)
 
     def _answered_sending(self, block: _Block, now: float) -> float | None:
-        """Return the time of the transmission that was answered; None if several are possible."""
+        """Return the time of the transmission that was answered; None if it may be one of several."""
         if block.attempts == 1:
             return block.sent_at
         fastest_s = self._round_trip.fastest_s or 0.0
@@ -196,11 +199,11 @@ class BlockRequests:
 
 
 WriteBytes = Callable[[bytes], object]
-"""A function that takes the next bytes of a file."""
+"""A function that receives the next bytes of a file."""
 
 
 class Reassembly:
-    """Reassembles the blocks of one file, and passes them to ``write`` in order.
+    """Reassembles the blocks of one file, and passes them to ``write`` in the order of their offsets.
 
     The written data is therefore always the beginning of the file. Blocks start at ``start`` plus a multiple of
     ``block_size`` bytes; only the last one may be shorter.

@@ -33,8 +33,8 @@ MAX_ATTEMPTS = 4
 
 _ARM, _RELATIVE, _STEP = (0, 1.0), (3, 1.0), (0, 0.0)
 
-# Maps MAV_CMD to the effect of a repetition, and to the parameter (index, value) with which it has this effect (None:
-# always). docs/reliability.md has the same table.
+# Maps MAV_CMD to the effect that a repetition has. The second value is the parameter (index, value) for which the
+# repetition has this effect, or None if it always has. docs/reliability.md has the same table.
 UNREPEATABLE_COMMANDS: Mapping[int, tuple[str, tuple[int, float] | None]] = {
     MavCmd.COMPONENT_ARM_DISARM: ("arms a vehicle that a pilot has disarmed since", _ARM),
     MavCmd.CONDITION_YAW: ("turns by the same angle again", _RELATIVE),
@@ -70,7 +70,7 @@ UNREPEATABLE_COMMANDS: Mapping[int, tuple[str, tuple[int, float] | None]] = {
 
 
 def max_attempts(command: int, params: Sequence[float]) -> int:
-    """Return how often a command may be sent: once if a repetition would have a further effect."""
+    """Return how often a command may be sent: only once if a repetition would have a further effect."""
     if command not in UNREPEATABLE_COMMANDS:
         return MAX_ATTEMPTS
     _, condition = UNREPEATABLE_COMMANDS[command]
@@ -83,19 +83,20 @@ FLOAT32_MAX = 3.4028234663852886e38
 
 ATTEMPT_TIMEOUT_S = 1.0
 
-# Interval at which an order that waits for its next sending is checked for a new HEARTBEAT.
+# An order that waits to be sent again checks for a new HEARTBEAT at this interval.
 POLL_INTERVAL_S = 0.05
 
-# The earliest repetition, as a fraction of ``attempt_timeout``. Heartbeats come at 1 Hz, with some jitter.
+# Time before the earliest repetition, as a fraction of ``attempt_timeout``. It is below 1, because HEARTBEATs arrive at
+# 1 Hz with some jitter.
 MIN_RESEND_FRACTION = 0.75
 
 
 class OrderStatus(Protocol):
-    """State of a sent order. It decides whether the order is repeated."""
+    """State of an order that was sent, which decides whether the order is sent again."""
 
     @property
     def end(self) -> str:
-        """Reason why the order has ended, as a clause; empty while it may be sent again."""
+        """Reason why the order has ended, as a clause; empty while the order may be sent again."""
         ...
 
     @property
@@ -110,7 +111,8 @@ def command_long(
     """Build a COMMAND_LONG. ``params`` are param1 to param7; missing ones are 0, and NaN is allowed.
 
     Raises:
-        InvalidArgument: there are more than seven parameters, one is not a number or infinite, or the target is 0.
+        InvalidArgument: there are more than seven parameters, a parameter is infinite or not a number, or the target is
+            0.
     """
     _check_target(target_system, command)
     if len(params) > 7:
@@ -151,12 +153,13 @@ def command_int(
 class CommandExchange(Exchange[CommandAck]):
     """Sends one command until its result is known. The result is the COMMAND_ACK with ACCEPTED.
 
-    ``confirmation`` counts the repetitions. IN_PROGRESS extends the deadline by ``progress_timeout`` and is reported to
-    ``on_progress``: 0–100, or None if the vehicle does not report a percentage. Acknowledgements to other ground
+    ``confirmation`` counts the repetitions. An IN_PROGRESS extends the deadline by ``progress_timeout``, and calls
+    ``on_progress`` with 0–100, or None if the vehicle does not report a percentage. Acknowledgements to other ground
     stations, or from other components than the target, are ignored.
 
-    A request (no ``order_status``) is repeated every ``attempt_timeout`` seconds. An order is repeated only after a new
-    HEARTBEAT, and only until it takes effect or ends. It is therefore never sent to a silent vehicle.
+    A command without ``order_status`` is a request, and is repeated every ``attempt_timeout`` seconds. An order is
+    repeated only after a new HEARTBEAT, and only until it takes effect or ends. An order is therefore never sent again
+    to a silent vehicle.
 
     Args:
         message: the command.
@@ -164,10 +167,10 @@ class CommandExchange(Exchange[CommandAck]):
         own_component: our component id.
         attempts: maximum number of transmissions; None: four, or one for an order in `UNREPEATABLE_COMMANDS`.
         attempt_timeout: seconds for each attempt; None: one, or four for an order in `UNREPEATABLE_COMMANDS`.
-        progress_timeout: seconds without any answer, after IN_PROGRESS, until the command fails.
+        progress_timeout: seconds without any answer after an IN_PROGRESS, until the command fails.
         on_progress: called with each progress report.
-        earlier_answers: number of acknowledgements to ignore, because they belong to an earlier, abandoned command of
-            the same number. Once this command is repeated, because they did not arrive, every acknowledgement counts.
+        earlier_answers: number of acknowledgements to ignore, because they belong to an earlier, abandoned command with
+            the same MAV_CMD. Once this command was repeated, every acknowledgement counts.
         acks_per_sending: number of acknowledgements that the vehicle sends for each transmission; the first one counts.
         min_timeout_s: lower limit of ``attempt_timeout``, for slow links.
         order_status: the state of the order; None for a request.
@@ -247,18 +250,18 @@ class CommandExchange(Exchange[CommandAck]):
 
     @property
     def pending_answers(self) -> int:
-        """Number of acknowledgements that may still arrive, and that the next command of this number must ignore."""
-        # As in receive(), every acknowledgement counts as our own once the command was repeated.
+        """Number of acknowledgements that may still arrive. The next command with the same MAV_CMD must ignore them."""
+        # As in receive(), every acknowledgement belongs to this command once it was repeated.
         earlier = self._earlier_answers if self._sent == 1 else 0
         return max(0, self._sent * self._acks_per_sending - max(0, self._answers - earlier))
 
     @property
     def answers(self) -> int:
-        """Number of acknowledgements received, including those to earlier commands of this number."""
+        """Number of acknowledgements received, including those to earlier commands with the same MAV_CMD."""
         return self._answers
 
     def expire(self, now: float) -> None:
-        """Repeat the command, or fail after the last attempt or when progress reports have stopped."""
+        """Repeat the command. Fail after the last attempt, or when progress reports have stopped."""
         if self.deadline is None or now < self.deadline:
             return
         if self._in_progress:
@@ -271,7 +274,7 @@ class CommandExchange(Exchange[CommandAck]):
             self._fail(CommandTimeout(self._timeout_text(now)))
 
     def _expire_order(self, order_status: OrderStatus, now: float) -> None:
-        # Until the time is up, an order that has not ended is repeated after each new HEARTBEAT.
+        # Until this time, an order that has not ended is repeated after each new HEARTBEAT.
         until = self._started + self._attempts * self._attempt_timeout
         if order_status.end:
             self._fail(CommandTimeout(f"{self._timeout_text(now)}; not sent again: {order_status.end}"))
@@ -303,7 +306,7 @@ class CommandExchange(Exchange[CommandAck]):
         self.deadline = now + wait_s
 
     def _with_confirmation(self, confirmation: int) -> Message:
-        # COMMAND_INT has no field `confirmation`.
+        # Only COMMAND_LONG has the field `confirmation`.
         message = self._message
         if confirmation == 0 or not isinstance(message, CommandLong):
             return message
@@ -380,11 +383,11 @@ def _check_target(target_system: int, command: int) -> None:
 
 
 def _checked_params(command: int, params: tuple[float, ...], count: int) -> list[float]:
-    """Convert the parameters to floats, with zeros for missing ones."""
+    """Convert the parameters to floats, and add zeros for missing parameters."""
     numbers = [0.0] * count
     for index, value in enumerate(params):
         if isinstance(value, (int, float)) and -FLOAT32_MAX <= value <= FLOAT32_MAX:
-            numbers[index] = float(value)  # fast path
+            numbers[index] = float(value)  # Fast path for ordinary numbers.
         else:
             numbers[index] = _checked_number(command, f"param{index + 1}", value)
     return numbers

@@ -1,4 +1,4 @@
-"""Base classes of all protocol exchanges with a vehicle. Sans-IO: no sockets, tasks or clocks."""
+"""Base classes of all protocol exchanges with a vehicle. They use no sockets, tasks or clocks (sans-I/O)."""
 
 from __future__ import annotations
 
@@ -56,17 +56,18 @@ class Exchange(ABC, Generic[ResultT]):
 
     @abstractmethod
     def expire(self, now: float) -> None:
-        """Retry or fail, because the deadline has passed. Not called once ``done``."""
+        """Retry or fail, because the deadline has passed. Not called after ``done`` has become True."""
 
     def link_changed(self, now: float) -> None:
-        """Handle a switch to another link, and so to another port of the vehicle.
+        """Handle a switch to another link, which leads to another port of the vehicle.
 
-        Most exchanges only repeat unanswered requests. An exchange restarts if the vehicle keeps its state per port.
+        Most exchanges only repeat unanswered requests. If the vehicle keeps the state of an exchange for each port, the
+        exchange restarts.
         """
         return
 
     def abort(self, error: Exception) -> None:
-        """End with this error, unless already done."""
+        """End the exchange with this error, unless it is already done."""
         self._fail(error)
 
     def take_outbox(self) -> list[Message]:
@@ -93,11 +94,11 @@ class Exchange(ABC, Generic[ResultT]):
             self.deadline = None
 
 
-# The smoothing factors and the number of deviations of TCP (RFC 6298).
+# The smoothing factors of TCP for the round trip and its deviation (RFC 6298).
 GAIN, DEVIATION_GAIN = 1 / 8, 1 / 4
 DEVIATIONS = 4.0
 
-# Jitter of the vehicle's main loop and of the clock resolution, which even regular answers have.
+# Jitter that even regular answers have, from the vehicle's main loop and the resolution of the clock.
 JITTER_S = 0.03
 
 BACKOFF = 1.5
@@ -107,8 +108,8 @@ MAX_BACKOFFS = 30
 class RoundTrip:
     """Smoothed round-trip time to one vehicle, shared by its transfers.
 
-    Only answers to requests that were sent once are measured (Karn's algorithm): an answer after a retry may belong to
-    either sending.
+    Only answers to requests that were sent once are measured (Karn's algorithm), because an answer after a retry may
+    belong to either transmission.
     """
 
     def __init__(self, initial_s: float | None = None, *, min_s: float = 0.05, max_s: float = 2.0) -> None:
@@ -122,7 +123,7 @@ class RoundTrip:
             self.add_sample(initial_s)
 
     def add_sample(self, seconds: float) -> None:
-        """Record the time from a request, sent once, to its answer."""
+        """Record the time from a request that was sent once to its answer."""
         self.fastest_s = seconds if self.fastest_s is None else min(self.fastest_s, seconds)
         if self.smoothed_s is None:
             self.smoothed_s, self._deviation_s = seconds, seconds / 2
@@ -131,10 +132,10 @@ class RoundTrip:
         self.smoothed_s += GAIN * (seconds - self.smoothed_s)
 
     def timeout_s(self, attempt: int = 1) -> float:
-        """Seconds to wait for the answer to the ``attempt``-th sending, counted from 1, before the next retry.
+        """Seconds to wait for an answer after transmission number ``attempt`` (from 1), before the next retry.
 
-        The second attempt waits as long as the first, because radios lose single frames. Later ones back off, because
-        the link may be congested or down.
+        The second attempt waits as long as the first, because radios lose single frames. Later attempts back off,
+        because the link may be congested or down.
         """
         if self.smoothed_s is None:
             first = min(1.0, self._max_s)
@@ -169,18 +170,18 @@ class MessageStream:
 
     @property
     def due_at(self) -> float:
-        """Time at which the stream counts as ended, or as not started, if no further message arrives."""
+        """Time at which the stream counts as ended, or as not started, unless a message arrives earlier."""
         silence = self._round_trip.timeout_s(max(1, self.failures - 1))
         if self._received_at is not None and self._interval.smoothed_s is not None:
             silence += max(SILENT_MESSAGES * self._interval.smoothed_s, self._interval.timeout_s())
         return self._last_at + silence
 
     def on_request(self, now: float) -> None:
-        """Record that the request is sent."""
+        """Record that the request for the stream is sent now."""
         self._last_at, self._received_at = now, None
 
     def on_message(self, now: float, messages: int) -> None:
-        """Record a message that comes ``messages`` places after the previous one."""
+        """Record a message that is ``messages`` places after the previous message in the stream."""
         if self._received_at is not None and messages > 0:
             self._interval.add_sample((now - self._received_at) / messages)
         elif self._received_at is None and self.failures == 0:
@@ -217,7 +218,7 @@ _MAX_RANGES = 10
 
 
 def format_ranges(numbers: Iterable[int]) -> str:
-    """Format numbers as ranges: ``3, 7–12``. After ten ranges, only the number of further ranges follows."""
+    """Format numbers as ranges: ``3, 7–12``. After ten ranges, the text only says how many more there are."""
     found: list[tuple[int, int]] = []
     for number in sorted(numbers):
         if found and number == found[-1][1] + 1:
@@ -243,8 +244,8 @@ class TransferOptions(TypedDict, total=False):
 class Transfer(Exchange[ResultT]):
     """An exchange of many messages with one component.
 
-    It fails after ``idle_timeout_s`` seconds without progress. A long transfer over a bad radio succeeds while anything
-    new arrives.
+    The transfer fails after ``idle_timeout_s`` seconds without progress. It has no total limit: over a bad radio it may
+    take long, but continues while new data arrives.
     """
 
     # set by start()
@@ -292,13 +293,13 @@ class Transfer(Exchange[ResultT]):
 # No answer arrives in less than this fraction of the fastest round trip so far.
 MIN_ROUND_TRIP_FRACTION = 0.5
 
-# After more early answers than this, they are accepted, because the vehicle has become faster. Without this limit, a
+# After this many early answers, further ones are accepted, because the vehicle has become faster. Without this limit, a
 # vehicle that was slow at first would get requests until the idle timeout.
 MAX_EARLY_ANSWERS = 2
 
 
 class StaleAnswerFilter:
-    """Detects answers that arrive too early to belong to the last request: late or repeated answers to earlier ones."""
+    """Detects answers that arrive too early to belong to the last request, because they answer an earlier request."""
 
     def __init__(self, round_trip: RoundTrip) -> None:
         self._round_trip = round_trip
@@ -310,7 +311,7 @@ class StaleAnswerFilter:
         if elapsed_s >= MIN_ROUND_TRIP_FRACTION * (self._round_trip.fastest_s or 0.0):
             return False
         if attempts == 1:
-            self._round_trip.add_sample(elapsed_s)  # the vehicle may be this fast: accept the next such answer
+            self._round_trip.add_sample(elapsed_s)  # the vehicle may be this fast: accept the next answer
         early = self._early.setdefault(name, set())
         early.add(sent_at)
         return len(early) <= MAX_EARLY_ANSWERS

@@ -42,7 +42,7 @@ SettingAnswer = Setting | ParameterRejected | ParameterTimeout
 UNKNOWN_INDEX = 0xFFFF
 MAX_QUIET_S = 1.1
 READ_WINDOW = 10
-# Seconds to wait after PARAM_ACK_IN_PROGRESS before the component is asked for the value.
+# Seconds to wait after PARAM_ACK_IN_PROGRESS before the value is requested.
 PROGRESS_TIMEOUT_S = 5.0
 REFUSALS = {
     ParamAck.VALUE_UNSUPPORTED: "the component has no such setting, or does not accept this value",
@@ -60,8 +60,8 @@ def setting_of(message: ParamExtValue | ParamExtAck) -> Setting:
 class SettingList(ValueList[dict[str, Setting], Setting]):
     """Download of all settings: requests the list once, then missing indices as soon as a gap appears.
 
-    If the component reports another number of settings than before, values received before the change are requested
-    again. A component without settings does not answer, so its transfer times out.
+    If the number of settings that the component reports changes, values received before the change are requested again.
+    A component without settings does not answer, so the transfer times out.
 
     Raises from ``result()``:
         ParameterTimeout: no progress for ``idle_timeout_s`` seconds; ``missing`` has the missing indices.
@@ -78,7 +78,7 @@ class SettingList(ValueList[dict[str, Setting], Setting]):
         self._step(now)
 
     def receive(self, message: Message, now: float) -> None:
-        """Process a value. Other messages, and those of other components, are ignored."""
+        """Process a value. Other messages, and messages of other components, are ignored."""
         if self.done or not isinstance(message, ParamExtValue) or not self._is_from_target(message):
             return
         count, index = min(message.param_count, MAX_PARAMETERS), message.param_index
@@ -135,11 +135,12 @@ class SettingList(ValueList[dict[str, Setting], Setting]):
 
 
 class SettingReads(NamedReads[Setting]):
-    """Read some settings by name. The result has one answer for each, in the order given.
+    """Read some settings by name. The result has one answer for each name, in the order given.
 
-    Components do not answer requests for unknown names. Overdue names are therefore requested together with the setting
-    of index 0. While index 0 is answered repeatedly and a name is not, the result for the name is a ParameterRejected.
-    After ``idle_timeout_s`` seconds without progress, the missing answers become ParameterTimeout errors.
+    Components do not answer requests for unknown names. An overdue name is therefore requested together with the
+    setting of index 0. If the requests for index 0 are answered several times, but those for the name are not, the
+    result for the name is a ParameterRejected. After ``idle_timeout_s`` seconds without progress, the missing answers
+    become ParameterTimeout errors.
     """
 
     expects: tuple[type[Message], ...] = (ParamExtValue,)
@@ -185,13 +186,14 @@ class SettingWrite(Transfer[Setting]):
     """Set one setting. The result is the setting as the component reports it afterwards.
 
     A PARAM_EXT_ACK with the requested value, or a refusal, completes the write. IN_PROGRESS extends the wait. If no
-    answer arrives, the value is read. PARAM_EXT_SET is sent again only if the component still reports the value
-    ``before``. If it reports any other value twice, this is the result: the component rounded or clamped the value, or
-    another station set it. Retries are therefore bounded, and a later change by another station is not undone.
+    answer arrives, the value is read. PARAM_EXT_SET is sent again only if the component still reports ``before``, the
+    value from before the write. Any other value that it reports twice is the result: the component rounded or clamped
+    the value, or another station set it. Retries are therefore bounded, and a later change by another station is not
+    undone.
 
     Raises from ``result()``:
         ParameterRejected: the component refused (``code`` is the PARAM_ACK), or keeps the previous value.
-        ParameterTimeout: no answer for ``idle_timeout_s`` seconds. The setting may have been changed nevertheless.
+        ParameterTimeout: no answer for ``idle_timeout_s`` seconds. The setting may still have been changed.
     """
 
     expects: tuple[type[Message], ...] = (ParamExtAck, ParamExtValue)
@@ -221,7 +223,7 @@ class SettingWrite(Transfer[Setting]):
         self._write(now)
 
     def receive(self, message: Message, now: float) -> None:
-        """Process an answer. Messages about other settings, and those of other components, are ignored."""
+        """Process an answer. Messages about other settings, and messages of other components, are ignored."""
         if self.done or not self._is_from_target(message):
             return
         if not isinstance(message, (ParamExtAck, ParamExtValue)) or message.param_id != self._name:
@@ -256,7 +258,7 @@ class SettingWrite(Transfer[Setting]):
             self._is_writing = True
             self.deadline = now + min(PROGRESS_TIMEOUT_S, self._idle_timeout_s)
         elif result == ParamAck.ACCEPTED:
-            self._read(now)  # the component has another value: it changed the value, or another station did
+            self._read(now)  # the component has another value: it adjusted the value, or another station has set it
         else:
             reason = REFUSALS.get(result, f"PARAM_ACK {result}")  # type: ignore[call-overload]
             self._fail(ParameterRejected(f"{self._name} was refused: {reason}", name=self._name, code=result))

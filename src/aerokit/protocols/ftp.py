@@ -1,7 +1,7 @@
 """MAVFTP messages, errors and single requests (https://mavlink.io/en/services/ftp.html).
 
-A retried request keeps its sequence number. A server keeps its last reply, and repeats it for the same number, so that
-no operation is executed twice. A new request gets a new number.
+A retried request keeps its sequence number. A server stores its last reply, and repeats it if it receives the same
+number again, so that no operation is executed twice. A new request gets a new number.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ DATA_SIZE = 239
 """Maximum number of data bytes in one message."""
 
 PATH_SIZE = DATA_SIZE - 1
-"""Maximum number of bytes of a path. ArduPilot and PX4 overwrite the last byte of a longer one with NUL."""
+"""Maximum number of bytes of a path. ArduPilot and PX4 overwrite the last byte of a longer path with NUL."""
 
 HEADER = struct.Struct("<HBBBBBxI")
 
@@ -56,7 +56,7 @@ CODES: dict[int, str] = {
     MavFtpErr.FILENOTFOUND: "no such file or directory",
 }
 
-# Error numbers of Linux, NuttX and newlib, which agree in the small ones.
+# Error numbers on which Linux, NuttX and newlib agree.
 ERRNOS = {
     1: ("EPERM", "operation not permitted"),
     2: ("ENOENT", "no such file or directory"),
@@ -121,7 +121,9 @@ class FtpMessage(Snapshot):
 
     @classmethod
     def decode(cls, payload: bytes, *, cut: bool = True) -> Self:
-        """Decode a payload, valid or not. ``data`` is cut to ``size``, or with ``cut=False`` to 239 bytes."""
+        """Decode a payload without validating it. ``data`` is cut to ``size`` bytes, or with ``cut=False`` to 239
+        bytes.
+        """
         payload = payload.ljust(PAYLOAD_SIZE, b"\0")
         sequence, session, opcode, size, request_opcode, burst_complete, offset = HEADER.unpack_from(payload)
         data = payload[HEADER.size : HEADER.size + size if cut else PAYLOAD_SIZE]
@@ -146,7 +148,7 @@ class FtpMessage(Snapshot):
 
     @property
     def error_code(self) -> int:
-        """The MAV_FTP_ERR of a NAK; FAIL if it gives none."""
+        """The MAV_FTP_ERR of a NAK; FAIL if the NAK contains none."""
         return self.data[0] if self.data else MavFtpErr.FAIL
 
     @property
@@ -199,13 +201,13 @@ SLOW_ANSWER_S = 0.25
 
 MAX_RENUMBERED = 3
 
-# Attempts before retries back off, because radios lose single frames.
+# Number of attempts after which retries back off. Fewer do not count, because radios lose single frames.
 ATTEMPTS_BEFORE_BACKOFF = 3
 
 NEED_SESSION = (MavFtpOpcode.READFILE, MavFtpOpcode.WRITEFILE, MavFtpOpcode.BURSTREADFILE)
 
-# Errors for NEED_SESSION requests while no file is open: INVALIDSESSION from PX4, FILENOTFOUND from ArduPilot.
-# A PX4 that has once answered FILEEXISTS repeats it for any refusal until another operation fails with an errno.
+# Answers to NEED_SESSION requests while no file is open: INVALIDSESSION from PX4, FILENOTFOUND from ArduPilot. After
+# PX4 has answered FILEEXISTS once, it gives this answer for any refusal, until an operation fails with an errno.
 NO_SESSION = (MavFtpErr.INVALIDSESSION, MavFtpErr.FILENOTFOUND, MavFtpErr.FILEEXISTS)
 
 
@@ -237,13 +239,13 @@ class FtpClient:
         self._session = first_sequence
 
     def next_sequence(self, replies: int = 1) -> int:
-        """Return the sequence number of a new request, and reserve the next ``replies`` numbers for its replies."""
+        """Return the sequence number of a new request. The next ``replies`` numbers are reserved for its replies."""
         sequence = self._sequence % SEQUENCES
         self._sequence = sequence + replies
         return sequence
 
     def next_session(self) -> int:
-        """Return a new session number, 1–255. ArduPilot uses it; PX4 answers with its own, which is always 0."""
+        """Return a new session number, 1–255. ArduPilot uses this number; PX4 answers with its own number, always 0."""
         self._session = self._session % SESSIONS + 1
         return self._session
 
@@ -269,7 +271,7 @@ class FtpExchange(Transfer[ResultT]):
         self._client, self._path = client, path
 
     def receive(self, message: Message, now: float) -> None:
-        """Process a message. All but replies of this server to this client are ignored."""
+        """Process a message. Only replies of this server to this client count; all others are ignored."""
         if self.done or not isinstance(message, FileTransferProtocol):
             return
         if self._is_from_target(message) and self._client.is_for_us(message):
@@ -377,7 +379,7 @@ class FtpRequest(FtpExchange[FtpMessage]):
             self._end(reply)
 
     def _renumber(self, now: float) -> None:
-        # The server repeated its previous reply, because the request before had the same sequence number.
+        # The server repeated its reply to an earlier request, because that had the same sequence number as this one.
         if self._renumbered < MAX_RENUMBERED:
             self._renumbered += 1
             self._request = self._request.replace(sequence=self._client.next_sequence())
@@ -400,7 +402,7 @@ class FtpRequest(FtpExchange[FtpMessage]):
     def _was_done_before(self, reply: FtpMessage) -> bool:
         opcode, code = self._request.opcode, reply.error_code
         if opcode == MavFtpOpcode.TERMINATESESSION:
-            return True  # the session does not exist any more
+            return True  # The session no longer exists, so it is closed.
         if self.attempts == 1:
             return False
         # An earlier transmission may have removed the file, and only the answer was lost.

@@ -2,13 +2,15 @@
 
 Behaviour of servers (ArduPilot 4.7, PX4 1.17) that determines this design:
 
-- A burst request is answered by blocks without further requests. ArduPilot sends 500 of them and processes nothing else
+- The answer to a burst request is a sequence of blocks. ArduPilot sends 500 blocks, and processes nothing else
   meanwhile; it queues five requests and drops further ones. PX4 answers reads during a burst, and a new burst request
-  replaces the current one. So missing blocks are requested at once: four at a time during a burst, more afterwards.
+  replaces the current burst. Missing blocks are therefore requested as soon as they are noticed: four at a time during
+  a burst, more afterwards.
 - Requests are always for whole blocks at multiples of the block size: ``@PARAM/param.pck`` is packed for one block
   size.
 - The size that ArduPilot reports for files whose names begin with ``@`` is an estimate. Only the EOF error is reliable.
-- The EOF error of a burst is a NAK. If the last block was full, ArduPilot's NAK has the offset of that block.
+- A burst ends with a NAK that has the EOF error. If the last block was full, ArduPilot's NAK has the offset of this
+  block.
 """
 
 from __future__ import annotations
@@ -28,11 +30,11 @@ if TYPE_CHECKING:
 
 __all__ = ["FtpDownload", "FtpUpload", "is_virtual"]
 
-# Errors with which servers refuse bursts altogether.
+# Errors of servers that do not support bursts.
 NO_BURST = (MavFtpErr.FAIL, MavFtpErr.UNKNOWNCOMMAND)
 WINDOW_DURING_BURST = 4
-# With more missing blocks than this, they are requested before the next burst, because the blocks after them are held
-# in memory.
+# If more blocks than this are missing, they are requested before the next burst, because all blocks after the first
+# missing one are held in memory.
 MAX_GAPS = 512
 BURST_BLOCKS = 500
 BUSY_BLOCKS = 3
@@ -42,9 +44,10 @@ SHORT_FILE = 20 * DATA_SIZE
 MAX_REPEATED_BURSTS = 3
 # Maximum number of bursts whose blocks may still arrive.
 MAX_BURSTS = 32
-# Beyond this distance, the sequence number of a block is ambiguous.
+# The sequence number of a block that is farther away than this is ambiguous.
 MAX_BLOCK_DISTANCE = SEQUENCES // 2 * DATA_SIZE
-# If this many blocks in a row are missing, the burst has not started, or has ended: radios hardly ever lose so many.
+# If this many blocks in a row are missing, the burst has not started (first number) or has ended (second number):
+# radios hardly ever lose so many.
 FIRST_BLOCKS, SILENT_BLOCKS = 4, 10
 
 
@@ -54,7 +57,7 @@ def is_virtual(path: str) -> bool:
 
 
 class _SentRequest(NamedTuple):
-    # Each sending has its own sequence number, so that every answer measures the round trip.
+    # Each transmission has its own sequence number, so that every answer measures the round trip.
     offset: int
     at: float
 
@@ -85,7 +88,7 @@ class _Burst(NamedTuple):
 
 
 class FtpDownload(FtpExchange[int]):
-    """Download of an open file from ``into.position`` on. The result is its size.
+    """Download of an open file from ``into.position`` on. The result is the size of the file.
 
     ``into`` keeps the blocks received, even if the download fails.
 
@@ -109,19 +112,19 @@ class FtpDownload(FtpExchange[int]):
         self._size = None if is_virtual(path) or size == 0 else size
         self._scanned = into.position
         self._requests = BlockRequests(self.round_trip)
-        self._reads: dict[int, _SentRequest] = {}  # by sequence number
+        self._reads: dict[int, _SentRequest] = {}  # requests by sequence number
         self._bursts: list[_Burst] = []
         self._is_bursting = False
         self._failed_bursts = 0
         self._repeated_bursts = 0  # bursts requested since the last new block
-        self._blocks_sent: dict[int, int] = {}  # highest block number of each burst, by its sequence number
+        self._blocks_sent: dict[int, int] = {}  # sequence number of each burst → its highest block number
         self._supports_bursts = True
         self._burst_at = 0.0
         self._last_block: tuple[_Burst | None, float, int] = (None, 0.0, -1)
         self._interval = RoundTrip(min_s=0.001)
 
     def start(self, now: float) -> None:
-        """Request the first burst, and the blocks that are missing already."""
+        """Request the first burst, and the blocks that are already known to be missing."""
         self._start_clock(now)
         self._proceed(now)
 
@@ -172,7 +175,8 @@ class FtpDownload(FtpExchange[int]):
         if number > self._blocks_sent.get(burst.sequence, -1) and self._repeated_bursts <= MAX_REPEATED_BURSTS:
             self._blocks_sent[burst.sequence], self._progress_at = number, now
         last, previous_at, previous = self._last_block
-        # A later burst may have to wait for the end of the one before it, so only the first one measures.
+        # Only the first burst measures the round trip, because a later burst may have to wait for the end of an earlier
+        # one.
         if last is None and number == 0 and len(self._bursts) == 1:
             self.round_trip.add_sample(now - burst.sent_at)
         elif last is burst and number > previous:
@@ -216,7 +220,7 @@ class FtpDownload(FtpExchange[int]):
         return not self._is_past_size(offset) and offset - self._into.tail < MAX_BLOCK_DISTANCE
 
     def _is_past_size(self, offset: int) -> bool:
-        # PX4 answers FILEEXISTS instead of EOF once it has answered FILEEXISTS to another request.
+        # After PX4 has answered another request with FILEEXISTS, it also sends FILEEXISTS instead of EOF.
         return self._size is not None and offset >= self._size
 
     def _add(self, offset: int, data: bytes, now: float) -> None:
@@ -277,7 +281,7 @@ class FtpDownload(FtpExchange[int]):
         self._send(FtpMessage(sequence, MavFtpOpcode.READFILE, self._session, DATA_SIZE, offset=offset))
 
     def _burst(self, now: float) -> None:
-        """Request everything after the last block."""
+        """Request a burst of everything after the last block received."""
         offset = self._into.tail
         blocks = BURST_BLOCKS if self._size is None else max(BURST_BLOCKS, (self._size - offset) // DATA_SIZE)
         # The sequence numbers of the replies are reserved. Otherwise a server might mistake a later request for this
@@ -290,10 +294,10 @@ class FtpDownload(FtpExchange[int]):
 
     @property
     def _burst_due_at(self) -> float:
-        """Time at which the burst counts as ended, or as not started, if no further block arrives."""
+        """Time at which the burst counts as ended, or as not started, unless a block arrives earlier."""
         silence = self.round_trip.timeout_s(1 + self._failed_bursts)
         if self._interval.smoothed_s is None:
-            if self._size is not None and self._size > SHORT_FILE:  # repeating a long burst is expensive
+            if self._size is not None and self._size > SHORT_FILE:  # Repeating the burst of a long file is expensive.
                 silence = max(silence, FIRST_BLOCK_TIMEOUT_S)
         else:
             blocks = SILENT_BLOCKS if self._last_block[0] is self._bursts[-1] else FIRST_BLOCKS
@@ -349,7 +353,7 @@ class FtpUpload(FtpExchange[None]):
         self._requests = BlockRequests(self.round_trip)
         self._unwritten = dict.fromkeys(range(0, len(data), DATA_SIZE))
         self._written = 0
-        self._writes: dict[int, _SentRequest] = {}  # by sequence number
+        self._writes: dict[int, _SentRequest] = {}  # requests by sequence number
 
     def start(self, now: float) -> None:
         self._start_clock(now)

@@ -2,13 +2,14 @@
 
 Behaviour of vehicles (ArduPilot 4.7, PX4 1.17) that determines this design:
 
-- ArduPilot serves one request at a time and ignores others meanwhile, but answers requests for single blocks at once.
-  PX4 serves the latest request and drops the previous one; over UDP it sends 256 kB at once, regardless of losses.
-  So a long range is requested alone. Once it has ended, its gaps are requested: long ones as ranges, single blocks many
-  at a time with a short delay between them. Ranges become shorter if most of their blocks are lost.
+- ArduPilot serves one request at a time and ignores others meanwhile. Only requests for single blocks are answered at
+  once. PX4 serves the latest request and drops the previous request; over UDP it sends 256 kB at once, regardless of
+  losses. Therefore only one long range is requested at a time. Once it has ended, its gaps are requested: long gaps as
+  ranges, single blocks many at a time with a short delay between them. Ranges become shorter if most of their blocks
+  are lost.
 - ArduPilot does not answer while armed, and sends nothing if it has received no heartbeat for three seconds.
-- ArduPilot numbers logs from 1, PX4 from 0. PX4 lists all logs from the first one requested, and does not answer if it
-  has none. After a boot it sends no data before it has listed its logs.
+- ArduPilot numbers logs from 1, PX4 from 0. PX4 lists all logs from the first requested log on, and does not answer if
+  it has no logs. After a boot, PX4 sends no data before it has listed its logs.
 """
 
 from __future__ import annotations
@@ -40,14 +41,14 @@ FIRST_RANGE, MIN_RANGE, MAX_RANGE = 512, 64, 40_000
 # Gaps of at least this many blocks are requested as ranges.
 LONG_GAP = 8
 
-# A range lasts at least this many round trips, so that the pauses after it are negligible.
+# A range lasts at least this many round trips, so that the pause after it is negligible.
 MIN_RANGE_ROUND_TRIPS = 60
 
 MAX_EARLY_ENDS = 3
 
 
 class LogDownload(Transfer[int]):
-    """Download of one log from ``into.position`` on. The result is its size.
+    """Download of one log from ``into.position`` on. The result is the size of the log.
 
     ``into`` keeps the blocks received, even if the download fails.
 
@@ -123,7 +124,7 @@ class LogDownload(Transfer[int]):
             self._latest = offset
             self._received += 1
             self._is_streaming = offset + LOG_BLOCK < self._range_end
-        # PX4 sends a whole block even at the listed end, if the log has grown since.
+        # If the log has grown since it was listed, PX4 sends a whole block even at the listed end.
         length = min(message.count, self._size - offset)
         if into.add(offset, bytes(message.data[:length])):
             self._report_progress(now, into.done, self._size)
@@ -151,7 +152,7 @@ class LogDownload(Transfer[int]):
         self._set_deadline()
 
     def _request_gaps(self, now: float) -> None:
-        """After a range, request long gaps one by one, then all other missing blocks."""
+        """After a range has ended, request its long gaps one by one, then all other missing blocks."""
         if not self._has_checked_gaps:
             gap = self._first_long_gap()
             if gap is not None:
@@ -174,7 +175,7 @@ class LogDownload(Transfer[int]):
         return (start, end) if end - start >= LONG_GAP * LOG_BLOCK else None
 
     def _stream_range(self, start: int, end: int, now: float) -> None:
-        """Request a range, or its first part."""
+        """Request a range, or the first part of a range that is too long."""
         self._adapt_range()
         self._range_end = min(start + self._range * LOG_BLOCK, end, self._size)
         self._requested = -(-(self._range_end - start) // LOG_BLOCK)
@@ -206,7 +207,7 @@ class LogDownload(Transfer[int]):
 
 
 class LogStop(Transfer[None]):
-    """LOG_REQUEST_END, repeated until the vehicle stops sending, because it is not acknowledged.
+    """Sends LOG_REQUEST_END until the vehicle stops sending, because LOG_REQUEST_END is not acknowledged.
 
     Args:
         is_sent: True if the request was already sent outside this exchange.
@@ -257,7 +258,7 @@ LAST_ID = 0xFFFF
 
 
 class LogList(Transfer[tuple[LogEntry, ...]]):
-    """The entries of the logs from ``start`` to ``end`` (None: the last one).
+    """Requests the entries of the logs from ``start`` to ``end`` (None: to the last log).
 
     Args:
         first_id: the id of this autopilot's oldest log.
@@ -306,7 +307,7 @@ class LogList(Transfer[tuple[LogEntry, ...]]):
         if not self._missing:
             self._finish(tuple(self._entries[number] for number in sorted(self._entries)))
             self._outbox.append(LogRequestEnd(self.target_system, self.target_component))
-        elif message.id > next(reversed(self._missing)):  # entries arrive in order, so this was the last one
+        elif message.id > next(reversed(self._missing)):  # entries arrive in order, so this was the last entry
             self._request_missing(now)
         self._set_deadline()
 

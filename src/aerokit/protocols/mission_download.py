@@ -41,7 +41,8 @@ MIN_ROUND_TRIP_FRACTION = 0.8
 class DownloadResult(Snapshot):
     """Result of a download: the items, their total number on the vehicle, and the plan's ``opaque_id``.
 
-    ``count`` exceeds the number of items if only some were requested. ``opaque_id`` is 0 if the vehicle sends none.
+    ``count`` is larger than the number of items if only some items were requested. ``opaque_id`` is 0 if the vehicle
+    sends none.
     """
 
     items: tuple[Item, ...]
@@ -50,10 +51,10 @@ class DownloadResult(Snapshot):
 
 
 class MissionDownload(MissionExchange[DownloadResult]):
-    """MISSION_REQUEST_LIST, then a request for every item, then our MISSION_ACK.
+    """Downloads a plan: sends MISSION_REQUEST_LIST, then a request for every item, then MISSION_ACK.
 
-    ``window`` is the number of requests in flight. It must be 1 for PX4, which aborts with ERROR when a request is for
-    neither the next item nor the previous one. ArduPilot answers any request, so only missing items are requested
+    ``window`` is the number of requests in flight. It must be 1 for PX4, which aborts with ERROR unless a request is
+    for the next item or the previous one. ArduPilot answers requests in any order, so only missing items are requested
     again. ``only`` restricts the download to these items.
     """
 
@@ -147,7 +148,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
             self.round_trip.add_sample(now - self._requested_at[item.seq])
         del self._requested_at[item.seq]
         self._items[item.seq] = from_wire(item)
-        # An item that was received before also counts as progress, because the vehicle answers.
+        # An item that was received before also counts as progress, because it shows that the vehicle answers.
         self._report_progress(now, len(self._items), len(self._indices))
         self._proceed(now)
 
@@ -155,7 +156,8 @@ class MissionDownload(MissionExchange[DownloadResult]):
         if result == MavMissionResult.DENIED:
             self._wait_while_busy(result, now)
         elif result == MavMissionResult.ERROR:
-            # An ERROR that arrives earlier answers a previous message, for example a repeated item of an upload.
+            # An ERROR that arrives earlier than this answers a previous message, for example a repeated item of an
+            # upload.
             if now - self._list_at >= MIN_ROUND_TRIP_FRACTION * (self.round_trip.smoothed_s or 0.0):
                 self._restart_after_error(now)
         elif result not in (
@@ -166,7 +168,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
             self._reject(result)
 
     def _wait_while_busy(self, result: int, now: float) -> None:
-        # ArduPilot refuses downloads during an upload. It drops an upload without messages after 8 s.
+        # ArduPilot refuses downloads during an upload, and drops an upload after 8 s without messages.
         if self._busy_until is None:
             self._busy_until = now + BUSY_TIMEOUT_S
         if now + BUSY_RETRY_INTERVAL_S > self._busy_until:
@@ -178,7 +180,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
         self.deadline = now + BUSY_RETRY_INTERVAL_S
 
     def _restart_after_error(self, now: float) -> None:
-        # PX4 has dropped the transfer. The items received are kept, but must be requested in sequence again.
+        # PX4 has dropped the transfer. Received items are kept, but all items must be requested in sequence again.
         if self._restarts >= MAX_RESTARTS:
             self._reject(MavMissionResult.ERROR)
             return

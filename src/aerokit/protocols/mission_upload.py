@@ -38,9 +38,9 @@ IN_FLIGHT_ROUND_TRIPS = 0.8
 class UploadResult(Snapshot):
     """Result of an upload that was not refused.
 
-    ``is_confirmed`` is True if the vehicle has confirmed it. Otherwise everything was sent, but the answers are
-    ambiguous, so read the plan back; ``item`` is then the first unconfirmed item. ``opaque_id`` identifies it on the
-    vehicle, 0 if the vehicle sends none.
+    ``is_confirmed`` is True if the vehicle has confirmed the plan. Otherwise all items were sent, but the answers are
+    ambiguous, and the plan must be read back; ``item`` is then the first unconfirmed item. ``opaque_id`` identifies the
+    plan on the vehicle; 0 if the vehicle sends none.
     """
 
     is_confirmed: bool
@@ -49,15 +49,18 @@ class UploadResult(Snapshot):
 
 
 class MissionUpload(MissionExchange[UploadResult]):
-    """MISSION_COUNT, or MISSION_WRITE_PARTIAL_LIST from ``first`` on, then the items that the vehicle requests.
+    """Uploads a plan: sends MISSION_COUNT, then the items that the vehicle requests.
 
-    With a ``window`` above 1, items are sent before they are requested, so that one round trip carries several:
-    ArduPilot and PX4 accept the next item even if their request for it was lost, and request what they miss. A request
-    confirms all items before it. ArduPilot answers an item out of sequence with INVALID_SEQUENCE and continues to
-    wait; PX4 ignores it and repeats its request every 0.25 s.
+    If ``first`` is given, the upload begins with MISSION_WRITE_PARTIAL_LIST instead, and replaces the items from
+    ``first`` on.
 
-    An unanswered item is repeated. If the vehicle has it, because its next request was lost, ArduPilot answers
-    INVALID_SEQUENCE, and the following item is sent.
+    With a ``window`` above 1, items are sent before they are requested, so that one round trip carries several items.
+    ArduPilot and PX4 accept the next item even if their request for it was lost, and request items that they miss. A
+    request confirms all items before the requested one. ArduPilot answers an item out of sequence with INVALID_SEQUENCE
+    and continues to wait; PX4 ignores such an item and repeats its request every 0.25 s.
+
+    An unanswered item is repeated. If the item had arrived, and only the request for the next item was lost, ArduPilot
+    answers the repetition with INVALID_SEQUENCE. The next item is then sent.
     """
 
     expects: tuple[type[Message], ...] = (MissionRequestInt, MissionRequest, MissionAck)
@@ -105,7 +108,7 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     @property
     def may_have_changed_items(self) -> bool:
-        """True if the vehicle may have overwritten items in place. A vehicle that truncates the list first has not."""
+        """True if the vehicle may have overwritten old items. False before it has requested any."""
         return self.was_started and not (self._is_partial and self._sent == self._first + 1)
 
     @property
@@ -142,7 +145,7 @@ class MissionUpload(MissionExchange[UploadResult]):
             self._announce(now)
         elif self._sent < self._end:
             self._send_window(now, ahead=int(self._window > 1))
-        elif self._attempt % 2 == 0:  # a vehicle that has everything confirms it again on the last item
+        elif self._attempt % 2 == 0:  # a vehicle that has all items confirms again on the last item
             self._send(self._end - 1, now)
         else:
             self._send_window(now)
@@ -157,7 +160,7 @@ class MissionUpload(MissionExchange[UploadResult]):
     # ------------------------------------------------------------------------------- requests
 
     def _on_request(self, seq: int, now: float) -> None:
-        # A request beyond the next item is left over from another transfer.
+        # A request for an item beyond the next one is left over from another transfer.
         if seq > self._sent:
             return
         if not self._is_accepted:
@@ -168,7 +171,7 @@ class MissionUpload(MissionExchange[UploadResult]):
         if seq > self._confirmed:
             self._advance(seq, now)
         elif seq < self._confirmed:
-            self._send(seq, now, again=True)  # an old request, or the vehicle has restarted the transfer
+            self._send(seq, now, again=True)  # This is an old request, or the vehicle has restarted the transfer.
         elif seq in self._requested:
             self._send_window(now)  # the item was lost, and the vehicle ignored the items after it
         self._requested.add(seq)
@@ -185,7 +188,7 @@ class MissionUpload(MissionExchange[UploadResult]):
         self._report_progress(now, seq - self._first, len(self._items))
 
     def _measure(self, seconds: float) -> None:
-        # A vehicle repeats its requests, so a late one may be a repetition.
+        # A late request does not measure the round trip, because vehicles repeat their requests.
         if self.round_trip.smoothed_s is None or seconds <= self.round_trip.timeout_s():
             self.round_trip.add_sample(seconds)
 
@@ -214,7 +217,8 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     def _on_error(self, now: float) -> None:
         # PX4 sends ERROR when it is busy, when an item arrives after the end, when MISSION_COUNT arrives twice, and for
-        # real errors. ArduPilot sends it for an item after the end. So repeat an item before believing it.
+        # real errors. ArduPilot sends ERROR for an item after the end. An item is therefore repeated before an ERROR
+        # counts.
         if not self._is_accepted:
             self._wait_while_busy(now)
         elif self._error_at is None:
@@ -271,7 +275,7 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     def _announce(self, now: float) -> None:
         target = (self.target_system, self.target_component)
-        if self._busy_until is not None:  # its last download to us may lack our acknowledgement
+        if self._busy_until is not None:  # The vehicle may still wait for our acknowledgement of an earlier download.
             self._outbox += self.cancellation()
         if self._is_partial:
             partial = MissionWritePartialList(*target, self._first, self._end - 1, self.mission_type)
@@ -281,7 +285,7 @@ class MissionUpload(MissionExchange[UploadResult]):
         self._wait(now)
 
     def _send_window(self, now: float, *, ahead: int = 0) -> None:
-        """Repeat everything in flight and send ``ahead`` more items, because requests may have been lost."""
+        """Repeat all unconfirmed items and send ``ahead`` more items, because requests may have been lost."""
         if self._sent == self._end and self._sent - self._confirmed > 1:
             # PX4 takes any repeated item for the last item of the mission.
             self._was_tail_repeated = True
@@ -308,7 +312,7 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     def _is_in_flight(self, seq: int, now: float) -> bool:
         sent_at, round_trip_s = self._sent_at.get(seq), self.round_trip.smoothed_s
-        # Without a limit, every item sent in vain would trigger a whole window of others.
+        # Without a limit, the answer to every superfluous item would cause a whole window of items to be sent.
         if round_trip_s is None:
             round_trip_s = self.round_trip.timeout_s()
         return sent_at is not None and now - sent_at < IN_FLIGHT_ROUND_TRIPS * round_trip_s

@@ -1,7 +1,7 @@
-"""Base class of mission, fence and rally transfers, and the exchanges that need no items.
+"""Base class of mission, fence and rally transfers, and the exchanges that transfer no items.
 
-See https://mavlink.io/en/services/mission.html. The three kinds differ only in ``mission_type``. Items are those on the
-wire, including item 0 if it is home.
+See https://mavlink.io/en/services/mission.html. The three kinds of plans differ only in ``mission_type``. Items are
+numbered as in the messages, which includes item 0 if it is home.
 """
 
 from __future__ import annotations
@@ -36,14 +36,15 @@ __all__ = [
 
 ResultT = TypeVar("ResultT")
 
-# Maximum time for which a vehicle is busy with a transfer that its ground station has dropped: ArduPilot 8 s, PX4 5 s.
+# Maximum seconds for which a vehicle is busy with a transfer that its ground station has dropped: ArduPilot 8, PX4 5.
 BUSY_TIMEOUT_S = 9.0
 
 BUSY_RETRY_INTERVAL_S = 1.0
 
 FEW_ATTEMPTS, SAME_ATTEMPTS = 5, 7
 
-# After this much silence the vehicle may have dropped the transfer: PX4 does after 5 s, ArduPilot after 8 s.
+# After this many seconds without messages, the vehicle may have dropped the transfer: PX4 does after 5 s, ArduPilot
+# after 8 s.
 TRANSFER_EXPIRY_S = 4.5
 
 NAMES: dict[int, str] = {
@@ -75,7 +76,7 @@ RESULTS: dict[int, str] = {
 class MissionExchange(Transfer[ResultT]):
     """A transfer with one component. Ignores messages to other systems and of other mission types.
 
-    Errors contain the program's indices: those on the wire minus ``offset``.
+    Errors contain the program's indices, which are the indices in the messages minus ``offset``.
     """
 
     def __init__(
@@ -119,8 +120,8 @@ class MissionExchange(Transfer[ResultT]):
         self.deadline: float | None = now + (self._timeout_s(self._attempt) if seconds is None else seconds)
 
     def _timeout_s(self, attempt: int) -> float:
-        # Small messages do not congest a link, so the timeout grows during the first few attempts and after many, but
-        # not between.
+        # The timeout grows during the first few attempts and after many attempts. In between it does not, because small
+        # messages do not congest a link.
         return self.round_trip.timeout_s(min(attempt, max(FEW_ATTEMPTS, attempt - SAME_ATTEMPTS)))
 
     def _reject(self, result: int, *, seq: int | None = None) -> None:
@@ -143,7 +144,7 @@ class MissionClear(MissionExchange[None]):
         self._send(now)
 
     def receive(self, message: Message, now: float) -> None:
-        """Process the MISSION_ACK. Results that only an expired upload can have are ignored."""
+        """Process the MISSION_ACK. A result that only an expired upload can have is ignored."""
         if not isinstance(message, MissionAck) or not self._is_ours(message):
             return
         if message.type == MavMissionResult.ACCEPTED:
@@ -174,16 +175,18 @@ class MissionClear(MissionExchange[None]):
 
 POLL_INTERVAL_S = 0.1
 
-# MISSION_CURRENT is streamed at this interval, and sent when it changes.
+# MISSION_CURRENT is streamed at this interval, and also sent when the current item changes.
 MISSION_CURRENT_INTERVAL_S = 1.0
 
 
 class SetCurrentItem(Transfer[None]):
     """Sends MISSION_SET_CURRENT until MISSION_CURRENT confirms it, because there is no acknowledgement.
 
-    ``reported`` is the item last reported by the vehicle. It also counts as confirmation if the vehicle moves from
-    ``reported`` past the requested item.
-    With an ``order_status``, retries wait for a HEARTBEAT since the last sending, and stop when the order has ended.
+    ``reported`` is the item last reported by the vehicle. If the vehicle moves from ``reported`` past the requested
+    item, this also counts as confirmation.
+
+    With an ``order_status``, a retry waits for a HEARTBEAT since the last transmission, and retries stop when the order
+    has ended.
     """
 
     expects: tuple[type[Message], ...] = (MissionCurrent,)
@@ -236,7 +239,7 @@ class SetCurrentItem(Transfer[None]):
             self._send(now)
 
     def _has_passed(self, seq: int) -> bool:
-        """Return True if the vehicle has passed our item, rather than continued from the reported one."""
+        """Return True if the vehicle has passed our item, and has not just continued from the reported item."""
         last = self._reported
         return last is not None and (last <= self._seq < seq or self._seq < seq < last)
 
@@ -257,9 +260,9 @@ _INVERT = 0xFFFFFFFF
 def mission_checksum(items: Iterable[MissionItem]) -> int:
     """Compute the checksum with which PX4 identifies a plan.
 
-    CRC-32 with initial value 0 and without final inversion, over frame, command, autocontinue and the seven numbers of
-    each item. PX4 (since 1.15) reports it as ``opaque_id`` in MISSION_ACK and MISSION_COUNT, and as ``mission_id``,
-    ``fence_id`` and ``rally_points_id`` in MISSION_CURRENT
+    The checksum is a CRC-32 with initial value 0 and without final inversion, over frame, command, autocontinue and the
+    seven numbers of each item. PX4 (since 1.15) reports it as ``opaque_id`` in MISSION_ACK and MISSION_COUNT, and as
+    ``mission_id``, ``fence_id`` and ``rally_points_id`` in MISSION_CURRENT
     (https://mavlink.io/en/messages/common.html#MISSION_CURRENT).
     """
     checksum = _INVERT

@@ -23,20 +23,20 @@ if TYPE_CHECKING:
 ValueT = TypeVar("ValueT")
 ResultT = TypeVar("ResultT")
 
-# A list stream has stopped when nothing arrives for this many of its longest pauses.
+# The stream of a list has stopped when nothing arrives for this multiple of its longest pause so far.
 PAUSES = 4
-# A list may take this long to start; requesting it again would restart it.
+# Seconds in which a list may start. It is not requested again earlier, because that would restart it.
 MIN_START_TIMEOUT_S = 0.3
-# Maximum number of times that values received under another count are requested again.
+# Maximum number of times that values are requested again because the number of parameters has changed since.
 MAX_REFRESHES = 3
-# The index in requests by name.
+# The index that is sent in requests by name.
 BY_NAME = -1
-# The request for index 0, which every component with any parameters answers.
+# The request for index 0, which every component that has parameters answers.
 PROBE, PROBE_INDEX = "", 0
-# A name counts as unknown once the probability that all its answers were lost is below this.
+# A name counts as unknown once the probability that only the answers were lost is below this.
 MAX_LOSS_PROBABILITY = 1e-4
-# This many answers with the same unexpected value settle a write. More are needed for the previous value, because it
-# may also be in a message sent before the write arrived.
+# Number of answers with the same unexpected value after which a write counts as done with this value. The second number
+# applies to the previous value, which may also be in messages that were sent before the write arrived.
 ANSWERS_TO_SETTLE, ANSWERS_TO_SETTLE_UNCHANGED = 2, 8
 
 
@@ -50,9 +50,9 @@ class ValueList(Transfer[ResultT], Generic[ResultT, ValueT]):
     def __init__(self, target_system: int, target_component: int, **options: Unpack[TransferOptions]) -> None:
         super().__init__(target_system, target_component, **options)
         self._window: RequestWindow[int] = RequestWindow(self.round_trip, size=self.window_size)
-        self._received: dict[int, tuple[ValueT, int]] = {}  # by index, with the count in the same message
+        self._received: dict[int, tuple[ValueT, int]] = {}  # index → value, and the count in the same message
         self._count: int | None = None
-        self._next = 0  # the next index of the stream
+        self._next = 0  # the index that the stream should send next
         self._is_streaming = False
         self._quiet_at: float | None = None
         self._last_at = self._pause_s = 0.0
@@ -82,7 +82,7 @@ class ValueList(Transfer[ResultT], Generic[ResultT, ValueT]):
 
     @abstractmethod
     def _conclude(self) -> None:
-        """Finish if complete, else queue requests for what is missing."""
+        """Finish if the list is complete; otherwise queue requests for the missing indices."""
 
     def _send_list_request(self, now: float) -> None:
         self._attempts += 1
@@ -107,7 +107,7 @@ class ValueList(Transfer[ResultT], Generic[ResultT, ValueT]):
         self.deadline: float | None = min(at for at in times if at is not None)
 
     def _drop_stale(self, count: int) -> tuple[int, ...]:
-        """Drop values that were received under another count, a few times at most. Return their indices."""
+        """Drop values that were received with another count, and return their indices. Does so only a few times."""
         stale = tuple(index for index in range(count) if self._received[index][1] != count)
         if not stale or self._refreshes >= MAX_REFRESHES:
             return ()
@@ -158,7 +158,7 @@ class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTi
         self._step(now)
 
     def receive(self, message: Message, now: float) -> None:
-        """Process an answer. Other messages, and those of other components, are ignored."""
+        """Process an answer. Other messages, and messages of other components, are ignored."""
         if not self.done and self._is_from_target(message):
             self._on_message(message, now)
             self._step(now)
@@ -209,7 +209,7 @@ class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTi
 
 
 class NamedReads(NamedRequests[ValueT]):
-    """Read some values by name. A name without an answer becomes a ParameterRejected while the `PROBE` is answered."""
+    """Read some values by name. If the `PROBE` is answered, but a name is not, its result is a ParameterRejected."""
 
     unknown_text: ClassVar[str]  # for example "the vehicle has no parameter"
     _is_probe_wanted = False
@@ -233,7 +233,7 @@ class NamedReads(NamedRequests[ValueT]):
         self._is_probe_wanted = False
 
     def _count_probe(self) -> None:
-        self._probes_answered = min(self._probes_answered + 1, self._probes_sent)  # duplicates do not count
+        self._probes_answered = min(self._probes_answered + 1, self._probes_sent)  # duplicate answers do not count
 
     def _reject_unknown(self, names: Iterable[str], now: float) -> None:
         for name in names:
@@ -242,14 +242,14 @@ class NamedReads(NamedRequests[ValueT]):
                 self._settle(name, ParameterRejected(text, name=name), now)
 
     def _loss_probability(self, attempts: int) -> float:
-        """Estimate the probability of losing all answers to that many requests (rule of succession)."""
+        """Estimate the probability that the answers to ``attempts`` requests were all lost (rule of succession)."""
         lost = self._probes_sent - self._probes_answered
         chances = ((lost + 1 + i) / (self._probes_sent + 2 + i) for i in range(attempts))
         return math.prod(chances) if self._probes_answered else 1.0
 
 
 class UnexpectedAnswers(Generic[ValueT]):
-    """Consecutive answers to one write with the same value, other than the one requested."""
+    """Consecutive answers to one write that have the same value, which is not the requested value."""
 
     def __init__(self, is_same: Callable[[ValueT, ValueT], bool]) -> None:
         self._is_same = is_same
@@ -262,11 +262,11 @@ class UnexpectedAnswers(Generic[ValueT]):
         return bool(self._answers) and self._is_same(self._answers[-1], answer)
 
     def add(self, answer: ValueT) -> None:
-        """Add an answer. If it differs from the previous ones, they are dropped."""
+        """Add an answer. If its value differs from that of the previous answers, those are dropped."""
         if not self.ends_with(answer):
             self._answers.clear()
         self._answers.append(answer)
 
     def are_conclusive(self, *, is_unchanged: bool) -> bool:
-        """Return True if the last answer is final. ``is_unchanged``: it has the value from before the write."""
+        """Return True if the last answer is final. ``is_unchanged``: its value is the one from before the write."""
         return len(self._answers) >= (ANSWERS_TO_SETTLE_UNCHANGED if is_unchanged else ANSWERS_TO_SETTLE)

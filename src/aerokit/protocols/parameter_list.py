@@ -22,11 +22,11 @@ __all__ = ["ParameterList", "merge_update"]
 
 
 def merge_update(known: Parameter, reported: Parameter, bytewise: bool) -> Parameter:
-    """Merge a PARAM_VALUE outside a list into a known parameter.
+    """Merge a PARAM_VALUE that is not part of a list into a known parameter.
 
-    If values are sent as numbers, not bytewise, such a message has less information than a list or a file: ArduPilot
-    reports an integer as a float in its answer to PARAM_SET if the value is the default, and an INT32 beyond 2**24
-    loses its last bits.
+    If values are not sent bytewise, such a message has less information than a list or a file. In its answer to
+    PARAM_SET, ArduPilot reports an integer as a float if the value is the default. An INT32 beyond 2**24 loses its last
+    bits.
     """
     value, type_ = reported.value, reported.type
     if not bytewise and known.type.is_integer:
@@ -38,25 +38,27 @@ def merge_update(known: Parameter, reported: Parameter, bytewise: bool) -> Param
     return Parameter(known.name, value, type_, known.default, index)
 
 
-# ArduPilot sends parts of the list ten times a second, or only once a second (MAV1_PARAMS).
+# Maximum seconds between two parts of a list. ArduPilot sends parts ten times a second, or once a second (MAV1_PARAMS).
 MAX_TICK_S = 1.1
 
-# When this few values are left, a gap is requested without waiting for the next tick, because it costs little.
+# When this few values are left, a gap is requested without waiting for the next part of the list, because that costs
+# little.
 NEAR_END = 20
 
-# After this many values the stream has started, and the list is not requested again.
+# After this many values, the stream counts as started, and the list is not requested again.
 STARTED = 2
 
-# PARAM_ERROR messages after which an index counts as nonexistent.
+# Number of PARAM_ERROR messages after which an index counts as nonexistent.
 MAX_REFUSALS = 2
 
 
 class ParameterList(ValueList[ParameterTable, Parameter]):
     """Download of all parameters: requests the list once, then missing indices as soon as a gap appears.
 
-    The vehicle reports the number of parameters. The number may change during the transfer (ArduPilot reveals a group
-    when it is enabled, PX4 counts a parameter once it is used), which shifts indices. If a name then has two indices or
-    none, values received before the change are requested again. Values with index 65535 are not part of the list.
+    The vehicle reports the number of parameters. If this number changes during the transfer, indices shift: ArduPilot
+    reveals a group of parameters when the group is enabled, PX4 counts a parameter once it is used. If a name then has
+    two indices or none, values received before the change are requested again. Values with index 65535 are not part of
+    the list.
 
     Raises from ``result()``:
         ParameterTimeout: no progress for ``idle_timeout_s`` seconds; ``missing`` has the missing indices.
@@ -80,7 +82,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
     # ---------------------------------------------------------------------------- as an exchange
 
     def start(self, now: float) -> None:
-        """Request the list, and one value by index to measure the round trip."""
+        """Request the list, and also one value by index to measure the round trip."""
         self._start_clock(now)
         self._send_list_request(now)
         if self.round_trip.smoothed_s is None:
@@ -88,7 +90,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
         self._step(now)
 
     def receive(self, message: Message, now: float) -> None:
-        """Process a value or an error. Other messages, and those of other components, are ignored."""
+        """Process a value or an error. Other messages, and messages of other components, are ignored."""
         if self.done or not self._is_from_target(message):
             return
         if isinstance(message, ParamValue):
@@ -121,7 +123,8 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
         self._store(index, parameter, message.param_count, now)
 
     def _on_uncounted_value(self, message: ParamValue, now: float) -> None:
-        # A parameter was set by another client, or this is the hash: the list is about to start.
+        # This is not part of the list: another client has set the parameter, or it is the hash, after which the list
+        # starts.
         self._note_count(message.param_count, False)
         if message.param_id == HASH_NAME:
             self._last_at = now
@@ -131,7 +134,8 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
             self._names[reported.name] = merge_update(self._names[reported.name], reported, self._bytewise)
 
     def _on_refusal(self, message: ParamError) -> None:
-        # The list has become shorter. Only the index is reliable: PX4 does not fill in the name.
+        # The list has become shorter. Only the index of this message is reliable, because PX4 does not fill in the
+        # name.
         index = message.param_index
         if message.error != MavParamError.DOES_NOT_EXIST or index not in self._window or index in self._received:
             return
@@ -142,7 +146,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
             self._count = min(self._count, index)
 
     def _note_count(self, count: int, is_streamed: bool) -> None:
-        # ArduPilot's stream keeps the count from its start, so only a different count in the stream is a change.
+        # ArduPilot's stream always has the count from its start, so its count is compared only with that of the stream.
         if count == (self._streamed_count if is_streamed else self._count):
             return
         if is_streamed:
@@ -150,7 +154,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
         self._count, self._needs_check = count, True
 
     def _on_streamed_value(self, index: int, now: float) -> None:
-        """Request gaps, and measure the pauses of the stream."""
+        """Request missing indices before this one, and measure the pauses of the stream."""
         for missing in range(self._next, min(index, self._count or 0)):
             self._window.request(missing)
         if self._streamed:
@@ -183,7 +187,10 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
         self._is_streaming, self._quiet_at, self._needs_check = False, None, True
 
     def _quiet_s(self) -> float:
-        """Seconds without any message after which the stream has stopped. Answers to requests delay the stream."""
+        """Seconds without any message after which the stream has stopped.
+
+        Answers to requests also count as messages, because they delay the stream.
+        """
         seconds = max(self.round_trip.timeout_s(), PAUSES * self._pause_s)
         if self._streamed < STARTED:  # the only value may be the answer to the request by index
             return max(seconds, MIN_START_TIMEOUT_S)
@@ -219,7 +226,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
             self._finish(ParameterTable(self._in_order(parameters, names)))
 
     def _in_order(self, parameters: list[Parameter], names: set[str]) -> list[Parameter]:
-        """Sort by index, each name once with its latest value. Names that have lost their index come last."""
+        """Sort parameters by index, each name once with its latest value. Names without an index come last."""
         ordered = dict.fromkeys(parameter.name for parameter in parameters)
         if self._refreshes == 0:
             ordered.update(dict.fromkeys(name for name in self._names if name not in names))

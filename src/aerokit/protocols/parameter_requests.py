@@ -98,15 +98,15 @@ READ_WINDOW = 20
 
 
 class ParameterReads(ParameterRequests, NamedReads[Parameter]):
-    """Read some parameters by name. The result has one answer for each.
+    """Read some parameters by name. The result has one answer for each name.
 
-    ArduPilot, and PX4 before 1.17, do not answer requests for unknown names. With ``probe=True``, overdue names are
-    requested together with the parameter of index 0. While index 0 is answered repeatedly and a name is not, the result
-    for the name is a ParameterRejected without a code.
+    ArduPilot, and PX4 before 1.17, do not answer requests for unknown names. With ``probe=True``, an overdue name is
+    requested together with the parameter of index 0. If the requests for index 0 are answered several times, but those
+    for the name are not, the result for the name is a ParameterRejected without a code.
 
-    ``alternatives`` maps names to other names of the same parameter. The vehicle has at most one of them, so an answer
-    for one name rejects the others. ``possibly_stale`` maps names to old values that a delayed message may still have.
-    Such a value is accepted only when it is received a second time.
+    ``alternatives`` maps names to other names of the same parameter. The vehicle has at most one of these names, so an
+    answer for one name makes the result of all others a ParameterRejected. ``possibly_stale`` maps names to old values
+    that a delayed message may still have. Such a value is accepted only when it is received a second time.
     """
 
     unknown_text = "the vehicle has no parameter"
@@ -171,7 +171,7 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
                 self._settle(other, ParameterRejected(text, name=other), now)
 
     def _on_error(self, message: ParamError, now: float) -> None:
-        # PX4 also answers DOES_NOT_EXIST if it has no room to send the value, so one retry follows.
+        # PX4 also answers DOES_NOT_EXIST if it has no room to send the value, so the request is repeated once.
         name = message.param_id
         is_first = name in self._names and name in self._window and name not in self._refused
         if is_first and message.error == MavParamError.DOES_NOT_EXIST:
@@ -182,20 +182,20 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
             super()._on_error(message, now)
 
 
-# ArduPilot saves through a queue of 30, which must not overflow while it is armed.
+# Maximum number of writes in flight. ArduPilot saves through a queue of 30, which must not overflow while armed.
 WRITE_WINDOW = 10
 
 
 class ParameterWrites(ParameterRequests):
-    """Set some parameters. The result has the value of each afterwards, as the vehicle reports it.
+    """Set some parameters. The result has the value that each parameter has afterwards, as the vehicle reports it.
 
-    An answer with the requested value and type completes a write. If none arrives, the value is read. PARAM_SET is sent
-    again only if the vehicle still reports the last known value (``before``). If it reports any other value twice, this
+    An answer with the requested value and type completes a write. If no answer arrives, the value is read. PARAM_SET is
+    sent again only if the vehicle still reports ``before``, the last known value. Any other value that it reports twice
     is the result: the vehicle rounded or clamped the value, or another station set it. Retries are therefore bounded,
     and a later change by another station is not undone.
 
-    ``recent`` has names that were written a moment ago. Answers to that write may still arrive, so the first matching
-    answer is verified by another read.
+    ``recent`` has names that were already written a moment ago. Answers to that earlier write may still arrive, so the
+    first matching answer is verified by another read.
     """
 
     def __init__(
@@ -238,7 +238,7 @@ class ParameterWrites(ParameterRequests):
     def _on_value(self, message: ParamValue, now: float) -> None:
         name = message.param_id
         if not self._window.attempts(name):
-            return  # not requested yet
+            return  # This name was not requested yet.
         wanted = self._wanted[name]
         reported = self._with_integer_type(parameter_of(message, self._bytewise), wanted.type)
         unexpected = self._unexpected.setdefault(name, UnexpectedAnswers(_is_same))

@@ -1,4 +1,4 @@
-"""Window of independent requests: decides which to send, when, and which to repeat."""
+"""Window of independent requests: decides which requests to send or repeat, and when."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ DEFAULT_SIZE = 20
 MAX_GROWTH = 5
 # An answer that takes longer than QUEUED_FACTOR times the fastest one plus QUEUED_MARGIN_S has waited in a queue.
 QUEUED_FACTOR, QUEUED_MARGIN_S = 1.5, 0.02
-# When only this many requests are left, those at their third attempt or later are sent twice. Otherwise a transfer over
-# a bad radio would wait long for a few requests.
+# When only this many requests are left, a request is sent twice from its third attempt on. Otherwise a transfer over a
+# bad radio would wait long for a few requests.
 FEW_LEFT, DUPLICATE_FROM_ATTEMPT = 5, 3
-# The last few requests are repeated after at most this time, or two round trips, because it costs little.
+# Each of the last few requests is repeated after at most this time or two round trips, because that costs little.
 FEW_LEFT_TIMEOUT_S = 0.5
-# Maximum wait for an answer: a queue that delays answers may be empty after this time.
+# Maximum seconds to wait for an answer. A queue that delayed answers may be empty after this time.
 MAX_TIMEOUT_S = 2.0
-# Number of later requests whose answers show that a request was lost, because answers arrive in order.
+# A request counts as lost when this many later requests were answered, because answers arrive in order.
 OVERTAKEN = 3
 
 
@@ -39,7 +39,7 @@ class _Request:
 
 
 class RequestWindow(Generic[KeyT]):
-    """Requests by key, with ``size`` of them in flight, and more while that does not delay answers.
+    """Requests by key. ``size`` requests are in flight, or more while that does not delay their answers.
 
     A request is repeated when its answer is overdue (:class:`RoundTrip`), or when later requests were answered first.
     """
@@ -51,7 +51,7 @@ class RequestWindow(Generic[KeyT]):
         self._answered_at = self._silent_until = -math.inf
         self._silences = 0
         self._waiting: dict[KeyT, None] = {}
-        self._in_flight: dict[KeyT, _Request] = {}  # in the order of sending
+        self._in_flight: dict[KeyT, _Request] = {}  # in the order in which they were sent
         self._requests: dict[KeyT, _Request] = {}
         self._ambiguous: dict[KeyT, float] = {}
         self._sent_count = 0
@@ -77,7 +77,7 @@ class RequestWindow(Generic[KeyT]):
         return [key for key, request in self._in_flight.items() if request.due_at <= now]
 
     def request(self, key: KeyT) -> None:
-        """Queue a request, unless it is waiting or in flight."""
+        """Queue a request, unless it is already waiting or in flight."""
         if key not in self:
             self._waiting[key] = None
 
@@ -93,7 +93,9 @@ class RequestWindow(Generic[KeyT]):
         self._requests.pop(key, None)
 
     def on_answer(self, key: KeyT, now: float, *, overtaken: int = OVERTAKEN) -> list[KeyT]:
-        """Record an answer, and return the requests considered lost: sent at least ``overtaken`` places before it."""
+        """Record an answer. Return the requests that were sent at least ``overtaken`` places earlier, which count as
+        lost.
+        """
         request = self._requests.pop(key, None)
         self._waiting.pop(key, None)
         self._in_flight.pop(key, None)
@@ -114,7 +116,7 @@ class RequestWindow(Generic[KeyT]):
         return lost
 
     def take_due(self, now: float) -> list[KeyT]:
-        """Return the keys to send now, some of them twice, and count them as sent."""
+        """Return the keys to request now, some of them twice, and count these requests as sent."""
         overdue = self.overdue(now)
         if any(self._in_flight[key].sent_at >= self._answered_at for key in overdue):
             self._on_silence(now)
@@ -133,7 +135,7 @@ class RequestWindow(Generic[KeyT]):
         return due
 
     def _on_silence(self, now: float) -> None:
-        # Nothing arrives, so the link may be down: send fewer requests at a time, and less often.
+        # The link may be down because nothing arrives, so fewer requests are sent at a time, and less often.
         self._limit = self._size
         if now >= self._silent_until:
             self._silences += 1
@@ -147,7 +149,7 @@ class RequestWindow(Generic[KeyT]):
         return min(seconds, MAX_TIMEOUT_S)
 
     def _measure(self, seconds: float) -> None:
-        # Widen the window while answers stay fast; slower answers show that a queue is building up.
+        # The window widens while answers stay fast. Slower answers show that a queue builds up.
         self._round_trip.add_sample(seconds)
         self._fastest_s = min(self._fastest_s, seconds)
         if seconds <= QUEUED_FACTOR * self._fastest_s + QUEUED_MARGIN_S:
@@ -172,7 +174,7 @@ class RequestWindow(Generic[KeyT]):
             self._waiting = {**dict.fromkeys(keys), **self._waiting}
 
     def _on_second_answer(self, key: KeyT) -> None:
-        # The first answer belonged to the first transmission, which was considered lost too early.
+        # The first answer was to the first transmission, which was considered lost too early.
         seconds = self._ambiguous.pop(key, None)
         if seconds is not None:
             self._round_trip.add_sample(seconds)

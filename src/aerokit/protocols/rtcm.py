@@ -16,7 +16,7 @@ __all__ = ["MAX_MESSAGE_SIZE", "RtcmReader", "crc24q", "fragments", "message_num
 PREAMBLE, HEADER_SIZE, CRC_SIZE = 0xD3, 3, 3
 FRAGMENT_SIZE, MAX_FRAGMENTS = 180, 4
 MAX_MESSAGE_SIZE = FRAGMENT_SIZE * MAX_FRAGMENTS
-"""Maximum bytes of an RTCM message that GPS_RTCM_DATA can carry. RTCM 3 itself allows 1029."""
+"""Maximum bytes of an RTCM message that GPS_RTCM_DATA can carry. RTCM 3 itself allows 1029 bytes."""
 
 
 def _crc_table() -> tuple[int, ...]:
@@ -54,10 +54,10 @@ def _frame_size(data: bytes, begin: int) -> int | None:
 
 
 def rtcm_messages(data: bytes) -> list[bytes]:
-    """Split bytes into the RTCM 3 messages of which they consist.
+    """Split bytes that consist of complete RTCM 3 messages into these messages.
 
     Raises:
-        InvalidArgument: ``data`` is empty, a message is incomplete, damaged, or longer than 720 bytes.
+        InvalidArgument: ``data`` is empty, or a message is incomplete, damaged, or longer than 720 bytes.
     """
     found: list[bytes] = []
     begin = 0
@@ -117,8 +117,8 @@ def fragments(message: bytes, sequence: int) -> list[GpsRtcmData]:
     """Return one RTCM message of 1 to 720 bytes as GPS_RTCM_DATA messages.
 
     Flags: bit 0 is set for a fragment, bits 1 and 2 are the fragment number, bits 3 to 7 the sequence number. A
-    receiver considers a message complete after four fragments, or after one that is not full. An empty fragment
-    therefore follows a full last one.
+        receiver considers a message complete after four fragments, or after a fragment that is not full. If the last of
+        fewer fragments is full, an empty fragment therefore follows.
     """
     from aerokit.mavlink.messages import GpsRtcmData
 

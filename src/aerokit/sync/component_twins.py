@@ -59,7 +59,7 @@ class ComponentParameters(TwinOf["AsyncComponentParameters"]):
     """Parameters of a component, a mapping of names to values. Other programs read and set them by MAVLink.
 
     PARAM serves numbers, PARAM_EXT numbers and texts. A value that is out of range, of another type, or refused by
-    ``on_set`` is not stored, and PARAM_ERROR or PARAM_EXT_ACK reports the reason to the sender.
+    ``on_set`` is not stored. PARAM_ERROR or PARAM_EXT_ACK then reports the reason to the sender.
     """
 
     def add(
@@ -88,9 +88,9 @@ class ComponentParameters(TwinOf["AsyncComponentParameters"]):
             description: description for the metadata.
             values: maps each allowed number to its name; other numbers are refused.
             read_only: True if only this program can change it.
-            reboot_required: for the metadata: True if a change takes effect after a reboot.
-            on_set: called on the event loop with a value that another program sets, before it is stored. It raises
-                InvalidArgument to refuse the value.
+            reboot_required: True if a change takes effect only after a reboot; reported in the metadata.
+            on_set: called on the event loop with a value that another program sets, before the value is stored. To
+                refuse the value, this function raises InvalidArgument.
 
         Raises:
             InvalidArgument: the name is invalid or in use, the default is not allowed, or the component already has
@@ -164,13 +164,15 @@ class ComponentMissions(TwinOf["AsyncComponentMissions"]):
     ) -> Callable[[str, tuple[MissionItem, ...]], Any]:
         """Decorator: ``function(kind, items)`` accepts or refuses each upload, before it is stored and acknowledged.
 
-        To refuse a list, the function raises InvalidArgument (result INVALID, and a status text) or returns a
-        MAV_MISSION_RESULT. It may be a coroutine function. An empty list is a request to clear the list.
+        To refuse a list, the function returns a MAV_MISSION_RESULT, or raises InvalidArgument, which becomes the result
+        INVALID and a status text. It may be a coroutine function. An empty list is a request to clear the list.
         """
         return self._loop.call(self.aio.on_upload, function)
 
     def on_set_current(self, function: Callable[[int], object]) -> Callable[[int], object]:
-        """Decorator: ``function(index)`` continues the mission at an item; without it, such requests are refused."""
+        """Decorator: ``function(index)`` continues the mission at an item. Without such a function, requests to do so
+        are refused.
+        """
         return self._loop.call(self.aio.on_set_current, function)
 
     @property
@@ -192,7 +194,7 @@ class ComponentMissions(TwinOf["AsyncComponentMissions"]):
 
 
 class ComponentSources(TwinOf["AsyncComponentSources"]):
-    """Sends measurements as this component. Each call sends one message to all; call it as often as you measure."""
+    """Sends measurements as this component. Each call sends one message to all; make a call for each measurement."""
 
     def send_obstacles(
         self,
@@ -207,8 +209,8 @@ class ComponentSources(TwinOf["AsyncComponentSources"]):
         """Send the distances to obstacles around the vehicle, clockwise as seen from above (OBSTACLE_DISTANCE).
 
         Args:
-            distances_m: at most 72 distances in metres; None if there was no measurement, infinity if nothing is in
-                range.
+            distances_m: at most 72 distances in metres. None means that there was no measurement, infinity that nothing
+                is in range.
             increment_deg: angle between two distances, above 0.
             first_deg: direction of the first distance from the nose.
             min_m: minimum range of the sensor, 0 to 655 m.
@@ -284,7 +286,7 @@ class ComponentSources(TwinOf["AsyncComponentSources"]):
 
         Args:
             right_deg: angle from straight down to the right, -90 to 90.
-            down_deg: angle from straight down towards the tail, -90 to 90; downwards in the camera's image.
+            down_deg: angle from straight down towards the tail, -90 to 90. It is downwards in the camera's image.
             distance_m: distance to the beacon in metres, 0 or more.
             target_number: number of the beacon, 0 to 255.
 
@@ -311,7 +313,7 @@ class OnboardComponent(ComponentTwin):
     """Your program as one MAVLink component, returned by :func:`aerokit.component`.
 
     The component sends its own heartbeat, executes commands, and serves parameters, files, missions and messages. It
-    answers requests for anything else as MAVLink requires: UNSUPPORTED, DENIED, DOES_NOT_EXIST.
+    answers all other requests as MAVLink requires: with UNSUPPORTED, DENIED or DOES_NOT_EXIST.
     """
 
     @cached_property
@@ -353,7 +355,7 @@ class OnboardComponent(ComponentTwin):
         self._loop.call(self.aio.set_state, state, base_mode=base_mode, custom_mode=custom_mode)
 
     def send(self, message: Message) -> None:
-        """Send a message as this component, to its target or to all.
+        """Send a message as this component, to the target in the message, or to all programs if it has no target.
 
         Raises:
             InvalidArgument: a field is out of range; nothing was sent.
@@ -362,7 +364,7 @@ class OnboardComponent(ComponentTwin):
         self._loop.call(self.aio.send, message)
 
     def send_text(self, text: str, *, severity: int = MavSeverity.INFO.value) -> None:
-        """Send a status text in ASCII to all (STATUSTEXT); a text of more than 254 characters is cut.
+        """Send a status text in ASCII to all programs (STATUSTEXT). A text of more than 254 characters is cut.
 
         Raises:
             InvalidArgument: ``severity`` is not a MAV_SEVERITY, 0 to 7.
@@ -370,7 +372,7 @@ class OnboardComponent(ComponentTwin):
         self._loop.call(self.aio.send_text, text, severity=severity)
 
     def send_event(self, event_id: int, arguments: bytes = b"", *, severity: int = MavSeverity.INFO.value) -> None:
-        """Send an event to all (EVENT). A receiver that missed it can request it again.
+        """Send an event to all programs (EVENT). A receiver that missed the event can request it again.
 
         Args:
             event_id: id in the component's event metadata, ``component_id << 24`` plus a number.
@@ -383,7 +385,7 @@ class OnboardComponent(ComponentTwin):
         self._loop.call(self.aio.send_event, event_id, arguments, severity=severity)
 
     def serve_files(self, directory: str | Path, *, writable: bool = False) -> None:
-        """Serve the files of one directory by MAVFTP; clients cannot leave it, not even by symbolic links.
+        """Serve the files of one directory by MAVFTP. Clients cannot leave the directory, not even by symbolic links.
 
         Files are read and written on the event loop, in blocks of 239 bytes, so the directory should be on a local
         disk.
@@ -414,11 +416,13 @@ class OnboardComponent(ComponentTwin):
 
     @cached_property
     def missions(self) -> ComponentMissions:
-        """Missions, fences and rally points that other programs upload and download. The first access serves them."""
+        """Missions, fences and rally points that other programs upload and download. They are served after the first
+        access.
+        """
         return ComponentMissions(self._loop, self._loop.call(lambda: self.aio.missions))
 
     def add_autopilot(self, driver: AutopilotDriver) -> None:
-        """Serve a ground station's commands to a vehicle: arm, mode, take-off, landing, return, reboot.
+        """Serve the commands that ground stations send to a vehicle: arm, mode, take-off, landing, return, reboot.
 
         Open the component with component id 1, a vehicle's ``type``, and ``autopilot=MavAutopilot.GENERIC``. HEARTBEAT
         reports armed after ``arm``, and the new mode after ``set_mode``. Send telemetry by :meth:`message`.
@@ -480,7 +484,7 @@ class OnboardComponent(ComponentTwin):
 
         Args:
             authorize: function or coroutine function, called with the vehicle's system id. It returns the number of
-                seconds for which arming is allowed, at most 255. An exception denies arming, and its text is sent as
+                seconds for which arming is allowed, at most 255. An exception denies arming; its text is sent as a
                 status text. To give a reason, return a :class:`~aerokit.onboard.CommandResult` with a
                 MAV_ARM_AUTH_DENIED_REASON as ``detail``.
 
@@ -532,9 +536,9 @@ def component(
 
     Args:
         address: a connection string, a link or a list of them, as for :func:`aerokit.open_connection`.
-        connection: an open connection instead of an address. Use it for several components on one link, or for a
-            component and a ground station. The arguments after ``accepts`` are not allowed then.
-        system_id: system id of the component, 1 to 255; use that of the vehicle that carries it.
+        connection: an open connection instead of an address. Use this for several components on one link, or for a
+            component and a ground station. The arguments after ``accepts`` are then not allowed.
+        system_id: system id of the component, 1 to 255. Use the system id of the vehicle that carries the component.
         component_id: component id (MAV_COMPONENT), 1 to 255.
         type: MAV_TYPE of the heartbeat: ONBOARD_CONTROLLER, CAMERA, GIMBAL, WINCH, GRIPPER …
         autopilot: MAV_AUTOPILOT of the heartbeat; INVALID for everything that is not a flight controller.
@@ -542,8 +546,8 @@ def component(
         parameters_file: JSON file that stores the parameters; it is replaced atomically after each change. None:
             parameters are not stored.
         bytewise: True to encode integers in PARAM_VALUE bytewise, as PX4 does; False to cast them to float, as
-            ArduPilot does. The component's capabilities announce the encoding. Clients that decide by the ``autopilot``
-            field expect bytewise.
+            ArduPilot does. The component's capabilities announce the encoding. Clients that decide by the field
+            ``autopilot`` of HEARTBEAT expect bytewise encoding.
         accepts: system ids whose messages are processed; None: all. Without signing, senders can claim any id.
         baud: bits per second of a serial link whose address has none.
         dialect: the messages that are decoded.

@@ -492,7 +492,7 @@ class Guided(TwinOf["AsyncGuided"]):
 
     All streams have the same arguments. ``rate_hz`` (2 to 400) is the transmission rate of the latest set-point. The
     stream stops if it gets no new set-point for ``valid_for_s`` seconds, or if the event loop is late by ``max_lag_s``
-    seconds. NotSupported is raised for a kind of set-point that this type of vehicle does not support. Rates and
+    seconds. A stream raises NotSupported for a kind of set-point that this type of vehicle does not support. Rates and
     seconds are in real time: a simulation at ten times the speed needs ten times the rate.
     """
 
@@ -714,9 +714,9 @@ class StickStream(BlockTwin["AsyncStickStream"]):
 
     If the program is killed, ArduPilot returns to the transmitter after RC_OVERRIDE_TIME (3 s), and PX4 treats the
     sticks as lost after COM_RC_LOSS_T (0.5 s). PX4 has no message that releases the sticks, so it treats every end of a
-    stream as a loss. Without another source of manual control, it then acts as NAV_RCL_ACT says (return by default),
-    even in its hold mode unless bit 1 of COM_RCL_EXCEPT is set. ArduCopter without a transmitter acts as FS_THR_ENABLE
-    says.
+    stream as a loss of the sticks. Without another source of manual control, PX4 then executes NAV_RCL_ACT (return by
+    default). It does so even in its hold mode, unless bit 1 of COM_RCL_EXCEPT is set. ArduCopter without a transmitter
+    executes FS_THR_ENABLE.
 
     Entering raises:
         InvalidArgument: a position is out of range. Nothing was sent.
@@ -946,8 +946,8 @@ class GimbalControl(BlockTwin["AsyncGimbalControl"]):
     Entering takes control from any other station and returns when the manager confirms it. Leaving releases it, without
     waiting if the block exits by an error or cancellation. When another station takes control, aerokit publishes
     ``GimbalControlLost``, and orders to the gimbal, including running ones, raise :class:`GimbalTaken`. Leaving the
-    block then raises it too, unless your program has already seen the loss, and releases nothing. Another station that
-    uses your own system and component id cannot be detected.
+    block then releases nothing; it raises GimbalTaken too, unless your program has already seen the loss. Another
+    station that uses your own system and component id cannot be detected.
 
     Entering raises:
         NotSupported: the vehicle has no gimbal manager, or its manager has no secondary control.
@@ -969,7 +969,7 @@ class GimbalControl(BlockTwin["AsyncGimbalControl"]):
 
     @property
     def is_taken(self) -> bool:
-        """True if another station has taken control, or released yours."""
+        """True if another station has taken control, or has released your control."""
         return self.aio.is_taken
 
     def until_lost(self) -> tuple[int, int]:
@@ -984,21 +984,20 @@ class GimbalControl(BlockTwin["AsyncGimbalControl"]):
     def raise_if_taken(self) -> None:
         """Raise GimbalTaken if control was lost.
 
-        Raises:
-            GimbalTaken: another station is in control, or none.
+        Raises: GimbalTaken: another station is in control, or none.
         """
         self._loop.call(self.aio.raise_if_taken)
 
 
 class GimbalRates(BlockTwin["AsyncGimbalRates"]):
-    """Turns a gimbal at the latest rates while its ``async with`` block feeds them.
+    """Turns a gimbal at the latest rates that the program supplies in the ``async with`` block.
 
-    Entering orders the first rates by MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW; then they are sent at ``rate_hz``
-    (GIMBAL_MANAGER_SET_PITCHYAW, or GIMBAL_MANAGER_SET_ATTITUDE to PX4). Leaving, in any way, orders a rate of zero:
-    the gimbal keeps its direction. The stream stops by itself, with a rate of zero, if no new rates are set for
-    ``valid_for_s``, the event loop is blocked for ``max_lag_s``, or the vehicle is silent. It stops without sending a
-    rate of zero if another order is given to the gimbal, or control is lost. ``set`` and leaving the block then raise
-    :class:`SetpointStreamStopped` or :class:`GimbalTaken`.
+    Entering orders the first rates by MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW. From then on the latest rates are sent at
+    ``rate_hz`` (GIMBAL_MANAGER_SET_PITCHYAW, or GIMBAL_MANAGER_SET_ATTITUDE to PX4). Leaving the block in any way
+    orders a rate of zero, so that the gimbal keeps its direction. The stream stops by itself, with a rate of zero, if
+    no new rates are set for ``valid_for_s``, the event loop is blocked for ``max_lag_s``, or the vehicle is silent. It
+    stops without sending a rate of zero if another order is given to the gimbal, or control is lost. ``set`` and
+    leaving the block then raise :class:`SetpointStreamStopped` or :class:`GimbalTaken`.
 
     Entering raises:
         InvalidArgument: a rate is out of range. Nothing was sent.
@@ -1028,16 +1027,17 @@ class GimbalRates(BlockTwin["AsyncGimbalRates"]):
         self._loop.call(self.aio.set, pitch_deg_s, yaw_deg_s)
 
     def turn(self, pitch_deg_s: float, yaw_deg_s: float, duration_s: float) -> None:
-        """Feed one pair of rates for ``duration_s`` seconds. Rates are as for :meth:`set`. Raises as :meth:`set`."""
+        """Supply one pair of rates for ``duration_s`` seconds. Arguments and errors are as for :meth:`set`."""
         self._loop.run(self.aio.turn, pitch_deg_s, yaw_deg_s, duration_s)
 
 
 class Gimbal(TwinOf["AsyncGimbal"]):
     """One gimbal, by the gimbal protocol v2 (https://mavlink.io/en/services/gimbal_v2.html), or an older mount.
 
-    ``vehicle.gimbal`` is the first one, ``vehicle.gimbals`` has all. An order returns when the gimbal reports the
-    ordered direction, and ends when another order is given. The gimbal keeps the direction while the vehicle moves. If
-    the manager requires control, an order outside a block of :meth:`control` claims it until :meth:`release`.
+    ``vehicle.gimbal`` is the first gimbal, ``vehicle.gimbals`` has all gimbals. An order returns when the gimbal
+    reports the ordered direction, and ends when another order is given. The gimbal keeps the direction while the
+    vehicle moves. If the manager requires control, an order outside a block of :meth:`control` claims it until
+    :meth:`release`.
     """
 
     @cached_property
@@ -1054,7 +1054,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
 
     @property
     def device_id(self) -> int:
-        """Gimbal device id: 1 to 6 if attached to its manager, or the component id; 0 until one is discovered."""
+        """Gimbal device id: 1 to 6 if attached to its manager, or the component id; 0 until a gimbal is discovered."""
         return self._loop.call(lambda: self.aio.device_id)
 
     def look_at(
@@ -1067,8 +1067,8 @@ class Gimbal(TwinOf["AsyncGimbal"]):
     ) -> None:
         """Keep the gimbal pointed at a position; returns when it points there.
 
-        Sends MAV_CMD_DO_SET_ROI_LOCATION. A target without an altitude is at the vehicle's own altitude. A copter whose
-        gimbal does not pan turns its nose.
+        Sends MAV_CMD_DO_SET_ROI_LOCATION. A target without an altitude is at the vehicle's own altitude. If the gimbal
+        of a copter cannot turn to the side, the copter turns its nose.
 
         Args:
             target: the position.
@@ -1095,7 +1095,8 @@ class Gimbal(TwinOf["AsyncGimbal"]):
     ) -> None:
         """Keep the gimbal pointed at another vehicle (MAV_CMD_DO_SET_ROI_SYSID); returns when it points there.
 
-        The gimbal's manager and this connection both need the position of the other vehicle (GLOBAL_POSITION_INT).
+        Both the gimbal's manager and this connection must receive the position of the other vehicle
+        (GLOBAL_POSITION_INT).
 
         Args:
             system_id: its MAVLink system id, 1 to 255.
@@ -1137,16 +1138,16 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         Args:
             pitch_deg: from the horizon, −360 to 360: 0 is level, −90 straight down.
             yaw_deg: −360 to 360, clockwise from north (``frame="earth"``) or from the nose (``"vehicle"``).
-            roll_deg: from the horizon, −360 to 360. A roll other than 0 needs the mount command, whose yaw turns with
-                the vehicle: a yaw from north is right only at the time of the order.
-            frame: reference of the yaw, which the gimbal keeps afterwards.
+            roll_deg: from the horizon, −360 to 360. A roll other than 0 is sent by the older mount command. The gimbal
+                then turns with the vehicle, so a yaw from north is right only at the time of the order.
+            frame: reference of the yaw. The gimbal keeps the yaw relative to this reference afterwards.
             wait: False: return when the manager has accepted the order.
             tolerance_deg: accepted deviation in each axis, above 0 to 45.
             timeout: seconds to wait.
 
-        Sends MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW. If it is denied, aerokit claims control until :meth:`release`. A
-        vehicle without a gimbal manager gets MAV_CMD_DO_MOUNT_CONTROL, and one that does not support that either gets
-        MOUNT_CONTROL, which is not acknowledged.
+        Sends MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW. If the manager denies it, aerokit claims control until
+        :meth:`release`. A vehicle without a gimbal manager gets MAV_CMD_DO_MOUNT_CONTROL. If the vehicle does not
+        support that command either, it gets MOUNT_CONTROL, which is not acknowledged.
 
         Raises:
             InvalidArgument: an angle is out of range, or beyond the limits of the gimbal if :meth:`information` was
@@ -1234,12 +1235,12 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         valid_for_s: float = 1.0,
         max_lag_s: float = 0.5,
     ) -> GimbalRates:
-        """Turn the gimbal at rates during an ``async with`` block that feeds them; see :class:`GimbalRates`.
+        """Turn the gimbal at rates that the ``async with`` block supplies; see :class:`GimbalRates`.
 
         Args:
             pitch_deg_s: the first rate in degrees per second, −720 to 720; positive is up.
             yaw_deg_s: the first rate in degrees per second, −720 to 720; positive is to the right.
-            frame: ``"earth"`` if the yaw is held relative to north, ``"vehicle"`` if it turns with the vehicle.
+            frame: ``"earth"``: the yaw stays relative to north; ``"vehicle"``: it turns with the vehicle.
             rate_hz: how often the latest rates are sent, 2 to 100.
             valid_for_s: stop if no new rates are set for this time.
             max_lag_s: stop if the event loop is blocked for this time.
@@ -1311,7 +1312,7 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
         return self.aio.end
 
     def command(self, command: int, *params: float, component_id: int | None = None) -> None:
-        """Send a COMMAND_LONG of this order; returns at the acknowledgement, or when the order's effect is reported.
+        """Send a COMMAND_LONG of this order. Returns at the acknowledgement, or when the order's effect is reported.
 
         The command is not sent again after a newer order about the same subject, or after another party changed the
         mode.
@@ -1319,8 +1320,7 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
         Args:
             command: the MAV_CMD.
             params: param1 to param7; missing ones are 0.
-            component_id: the target component instead of the autopilot; 0: all components, and the autopilot's ack
-                counts.
+            component_id: the target component, by default the autopilot. 0: all components; the autopilot's ack counts.
 
         Raises:
             InvalidArgument: a parameter is not a number or does not fit, or the block was left. Nothing was sent.
@@ -1342,14 +1342,14 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
     ) -> None:
         """Send a COMMAND_INT: param1 to param4, ``x`` and ``y`` in 1e-7 degrees, ``z`` in metres in ``frame``.
 
-        All else as for :meth:`command`.
+        Otherwise works like :meth:`command`.
         """
         self._loop.run(self.aio.command_int, command, *params, frame=frame, x=x, y=y, z=z, component_id=component_id)
 
     def set_mode(self, mode: Mode, *, timeout: float = 5.0, component_id: int | None = None) -> None:
         """Order a mode and wait until HEARTBEAT reports the order's effect.
 
-        Sends MAV_CMD_DO_SET_MODE, or SET_MODE to a vehicle that does not support it. If the vehicle answers
+        Sends MAV_CMD_DO_SET_MODE, or SET_MODE to a vehicle that does not support the command. If the vehicle answers
         TEMPORARILY_REJECTED, as PX4 does while it checks a mission, the command is sent again after a HEARTBEAT that
         confirms that the order is still valid.
 
@@ -1367,10 +1367,10 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
         self._loop.run(self.aio.set_mode, mode, timeout=timeout, component_id=component_id)
 
     def wait_confirmed(self, timeout: float) -> None:
-        """Wait until HEARTBEAT reports the order's effect, which may be at once.
+        """Wait until HEARTBEAT reports the order's effect. Returns at once if it is already reported.
 
         Raises:
-            CommandRejected: the vehicle first accepted and then refused, as PX4 may do.
+            CommandRejected: the vehicle first accepted and then refused the command, as PX4 may do.
             OperationTimeout: the effect was not reported within ``timeout`` seconds.
         """
         self._loop.run(self.aio.wait_confirmed, timeout)
@@ -1709,8 +1709,8 @@ class Logs(TwinOf["AsyncLogs"]):
 class Actuators(TwinOf["AsyncActuators"]):
     """Outputs of the vehicle other than its flight controls: ``vehicle.actuators``.
 
-    ArduPilot has servos, relays, landing gear and a parachute; PX4 has actuators. The vehicle may have executed the
-    order of a cancelled call.
+    ArduPilot has servos, relays, landing gear and a parachute; PX4 has actuators. If you cancel a call, the vehicle may
+    still have executed the order.
     """
 
     def set_servo(self, number: int, pulse_us: int) -> None:
@@ -1737,7 +1737,7 @@ class Actuators(TwinOf["AsyncActuators"]):
 
         ArduPilot only. Returns when ArduPilot has acknowledged and begins, because no message reports the end.
         ArduPilot repeats one output at a time: the next order of this kind replaces the previous one. The command is
-        never sent twice, because each copy starts again.
+        never sent twice, because a second one would start the cycles again.
 
         Args:
             number: output, 1 to 32, as for :meth:`set_servo`.
@@ -1753,8 +1753,8 @@ class Actuators(TwinOf["AsyncActuators"]):
     def set_relay(self, number: int, on: bool) -> None:
         """Switch a relay, and return when RELAY_STATUS reports it (MAV_CMD_DO_SET_RELAY).
 
-        ArduPilot only; it refuses a relay without a pin. With firmware before 4.5, which has no RELAY_STATUS, the call
-        returns at the acknowledgement. Raises as :meth:`set_servo`.
+        ArduPilot only. ArduPilot refuses a relay that has no pin. With firmware before 4.5, which has no RELAY_STATUS,
+        the call returns at the acknowledgement. Raises as :meth:`set_servo`.
 
         Args:
             number: relay from 0 (RELAY1_PIN) to 15.
@@ -1763,7 +1763,7 @@ class Actuators(TwinOf["AsyncActuators"]):
         self._loop.run(self.aio.set_relay, number, on)
 
     def repeat_relay(self, number: int, *, count: int, period_s: float) -> None:
-        """Toggle a relay and toggle it back, ``count`` times (MAV_CMD_DO_REPEAT_RELAY).
+        """Toggle a relay and back again, ``count`` times (MAV_CMD_DO_REPEAT_RELAY).
 
         ArduPilot only. Returns when ArduPilot has acknowledged and begins. The command is never sent twice. Raises as
         :meth:`repeat_servo`.
@@ -1783,8 +1783,8 @@ class Actuators(TwinOf["AsyncActuators"]):
         """Set up to six actuators: the first value is for "Peripheral via Actuator Set 1" (MAV_CMD_DO_SET_ACTUATOR).
 
         PX4 only; for ArduPilot use ``set_servo``. Returns when PX4 has acknowledged, because no message reports the
-        values. PX4 acknowledges even if no output has this function (PWM_MAIN_FUNCn 301 to 306). Raises as
-        :meth:`repeat_servo`.
+        values. PX4 acknowledges even if no output has the function of the actuator (PWM_MAIN_FUNCn 301 to 306). Raises
+        as :meth:`repeat_servo`.
 
         Args:
             values: one to six values, −1 to 1; None leaves an actuator as it is.
@@ -1795,7 +1795,7 @@ class Actuators(TwinOf["AsyncActuators"]):
         """Retract the landing gear (MAV_CMD_AIRFRAME_CONFIGURATION); returns at the acknowledgement.
 
         ArduCopter and ArduPlane only. No message reports the position of the gear. Both accept the order even if there
-        is no landing gear (LGR_ENABLE), and even while the vehicle stands on it.
+        is no landing gear (LGR_ENABLE), and even while the vehicle stands on its gear.
 
         Raises:
             NotSupported: the firmware (PX4, Rover or Sub) does not have the command. Nothing was sent.
@@ -1829,7 +1829,7 @@ class Actuators(TwinOf["AsyncActuators"]):
         """Spin one motor of a disarmed vehicle, and return when it has stopped; remove the propellers first.
 
         ArduPilot: MAV_CMD_DO_MOTOR_TEST. PX4: MAV_CMD_ACTUATOR_TEST, if COM_MOT_TEST_EN is 1. The command is sent once,
-        because a copy would spin the motor again.
+            because a second one would spin the motor again.
 
         The motor stops after ``duration_s``. If the call is cancelled or fails while the motor may turn, aerokit orders
         the motor to stop at once. ArduCopter reports armed during the test, and the call returns when it reports
@@ -1840,15 +1840,15 @@ class Actuators(TwinOf["AsyncActuators"]):
                 function (Motor 1).
             throttle_percent: 0 to 100.
             duration_s: seconds, above 0, at most 3.
-            intent: must be ``"spin motor"``, so that no other call can be mistaken for it.
+            intent: must be ``"spin motor"``, so that a motor test is never started by mistake.
 
         Raises:
-            InvalidArgument: a value is out of range, or the intent is another one. Nothing was sent.
+            InvalidArgument: a value is out of range, or the intent is another text. Nothing was sent.
             OperationRejected: the vehicle is armed, or not known to be disarmed (nothing was sent); or your program
                 started another motor test.
             CommandRejected: the vehicle refused (not landed, safety switch, COM_MOT_TEST_EN).
             CommandTimeout: there was no acknowledgement; the motor may have turned.
-            OperationTimeout: the vehicle still reports armed four seconds after the end.
+            OperationTimeout: the vehicle still reports armed four seconds after the end of the test.
         """
         self._loop.run(
             self.aio.test_motor,
@@ -1865,10 +1865,10 @@ class Actuators(TwinOf["AsyncActuators"]):
         by a status text if the vehicle is on the ground or below CHUTE_ALT_MIN, or if the parachute is disabled.
 
         Args:
-            intent: must be ``"release parachute"``, so that no other call can be mistaken for it.
+            intent: must be ``"release parachute"``, so that the parachute is never released by mistake.
 
         Raises:
-            InvalidArgument: the intent is another one. Nothing was sent.
+            InvalidArgument: the intent is another text. Nothing was sent.
             NotSupported: the firmware (PX4, Rover or Sub) does not have the command. Nothing was sent.
             OperationRejected: the vehicle refused after the acknowledgement; ``reasons`` has its status texts.
             CommandRejected: the vehicle refused.
@@ -1896,7 +1896,7 @@ class Gripper(TwinOf["AsyncGripper"]):
 
     PX4 acknowledges when the gripper has moved (PD_GRIPPER_EN). ArduPilot (GRIP_ENABLE) acknowledges at once and
     reports the end by a status text. For an electro-permanent gripper it reports only the start, and the call returns
-    three seconds later. Orders are sent once. The gripper may have moved after a cancelled call.
+    three seconds later. Orders are sent once. If you cancel a call, the gripper may still have moved.
     """
 
     def grab(self) -> None:
@@ -1906,7 +1906,7 @@ class Gripper(TwinOf["AsyncGripper"]):
             CommandRejected: the vehicle has no gripper, or refused.
             CommandTimeout: there was no acknowledgement.
             OperationRejected: your program gave a newer order for this gripper.
-            OperationTimeout: the vehicle did not report the end within ten seconds.
+            OperationTimeout: the vehicle did not report the end of the movement within ten seconds.
         """
         self._loop.run(self.aio.grab)
 
@@ -1919,9 +1919,10 @@ class Winch(TwinOf["AsyncWinch"]):
     """One winch: ``vehicle.winch()`` (MAV_CMD_DO_WINCH).
 
     ArduCopter supports :meth:`relax`, :meth:`pay_out` and :meth:`set_rate`. The other orders are for winches that are
-    MAVLink components: ``vehicle.winch(component_id=169)``. PX4 drives no winch itself and forwards the command to such
-    a component. An order that could pay out line twice is sent once. A newer order for the winch ends the call that
-    waits for the previous one. A cancelled call does not stop the winch: call ``set_rate(0)``.
+    MAVLink components: ``vehicle.winch(component_id=169)``. PX4 itself drives no winch, but forwards the command to
+    such a component. An order is sent only once if a second transmission could pay out more line. A newer order for the
+    winch ends the call that waits for the previous order. A cancelled call does not stop the winch: call
+    ``set_rate(0)``.
     """
 
     @cached_property
@@ -1930,7 +1931,7 @@ class Winch(TwinOf["AsyncWinch"]):
         return StateCell(self._loop, self.aio.status)
 
     def relax(self) -> None:
-        """Let the line run freely. Returns at the acknowledgement, because ArduCopter reports nothing else.
+        """Let the line run freely. Returns at the acknowledgement, because ArduCopter does not report the effect.
 
         Raises:
             NotSupported: the autopilot has no such order. Nothing was sent.
@@ -1942,8 +1943,8 @@ class Winch(TwinOf["AsyncWinch"]):
     def pay_out(self, length_m: float, *, rate_m_s: float = 0.5, timeout: float = ACTION_TIMEOUT_S) -> None:
         """Pay out a length of line, and return when WINCH_STATUS reports it within 0.1 m.
 
-        Returns at the acknowledgement if the winch sends no WINCH_STATUS. The command is sent once, because a copy
-        would pay out more line.
+        Returns at the acknowledgement if the winch sends no WINCH_STATUS. The command is sent once, because a second
+        one would pay out more line.
 
         Args:
             length_m: metres, −1000 to 1000; negative values wind the line up.
@@ -2001,7 +2002,7 @@ class Winch(TwinOf["AsyncWinch"]):
             CommandTimeout: there was no acknowledgement; the winch may run.
             OperationRejected: a newer order for this winch was given.
             HeartbeatTimeout: the vehicle was silent for ten seconds.
-            OperationTimeout: the end was not reported in time.
+            OperationTimeout: WINCH_STATUS did not report the end in time.
         """
         self._loop.run(self.aio.retract, timeout=timeout)
 
@@ -2021,9 +2022,9 @@ class Winch(TwinOf["AsyncWinch"]):
 class Shell(BlockTwin["AsyncShell"]):
     """PX4's system shell, open for the duration of an ``async with`` block: ``vehicle.shell()`` (SERIAL_CONTROL).
 
-    PX4 has one shell for each of its ports, and all stations on that port share it. aerokit sends each line once. It
-    does not know what a shell command does, so the rules for orders do not apply to it. SERIAL_CONTROL has neither
-    sequence numbers nor acknowledgements, so parts of the text may be lost.
+    PX4 has one shell for each of its ports, and all stations on a port share the shell. aerokit sends each line once.
+    aerokit does not know what a shell command does, so its rules for orders do not apply to shell commands.
+    SERIAL_CONTROL has neither sequence numbers nor acknowledgements, so parts of the text may be lost.
 
     Entering raises:
         NotSupported: the vehicle runs ArduPilot, which has no shell. Nothing was sent.
@@ -2043,7 +2044,7 @@ class Shell(BlockTwin["AsyncShell"]):
         self._loop.call(self.aio.write, line)
 
     def read(self, *, timeout: float | None = None) -> str:
-        """Return the next piece of output, up to 70 bytes, with echoes and prompts.
+        """Return the next piece of output, up to 70 bytes, including echoes and prompts.
 
         Args:
             timeout: seconds; None waits without a limit.
@@ -2468,8 +2469,8 @@ class CalibrationControl(TwinOf["AsyncCalibrationControl"]):
 class MissionControl(TwinOf["AsyncMissionControl"]):
     """The mission of a vehicle: ``await vehicle.mission.upload(mission)``, ``start()``, ``wait_finished()``.
 
-    Item numbers count from 0, and home is not an item, for all autopilots. Starting, pausing and resuming are orders:
-    each supersedes earlier orders to move, and ends with a later one.
+    For all autopilots, item numbers count from 0 and home is not an item. Starting, pausing and resuming are orders:
+    each supersedes earlier orders to move, and is superseded by later ones.
     """
 
     def upload(
@@ -2484,34 +2485,34 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> None:
-        """Replace the plan on the vehicle by this one; an empty one clears it.
+        """Replace the plan on the vehicle by ``plan``. An empty plan clears the vehicle's plan.
 
         Args:
             plan: checked before anything is sent.
             method: ``"ftp"`` (ArduPilot's ``@MISSION/…`` files), ``"items"`` (the mission protocol), or ``"auto"``.
-            only_changes: compare with the vehicle's plan, if it is known from an earlier transfer and the vehicle
-                confirms it. Send nothing if both are equal, and only the items that differ if the vehicle supports
-                that.
+            only_changes: compare ``plan`` with the vehicle's plan, if that is known from an earlier transfer and the
+                vehicle confirms that it is unchanged. Send nothing if both are equal. Send only the items that differ
+                if the vehicle supports that.
             verify: read the plan back and compare it, or compare PX4's checksum if that is faster. Files are always
                 read back.
-            max_distance_m: refuse a plan with a position farther than this from the vehicle, if its position is
-                known.
+            max_distance_m: refuse a plan with a position farther than this from the vehicle, if the vehicle's position
+                is known.
             idle_timeout_s: fail after this many seconds without progress.
             timeout: seconds in total.
             on_progress: called with the progress in items, or in bytes of a file.
 
-        See https://mavlink.io/en/services/mission.html. PX4 keeps the old items until it has all of the new ones.
-        ArduPilot overwrites missions and rally points item by item, and a fence at the end. After a failure it may have
-        both old and new items; the error then states that.
+        See https://mavlink.io/en/services/mission.html. PX4 keeps the old items until it has received all new ones.
+        ArduPilot overwrites missions and rally points item by item, and a fence at the end. After a failure, ArduPilot
+        may therefore have both old and new items; the error text then says so.
 
         Raises:
             InvalidArgument: the plan is invalid, or has a position that is too far away. Nothing was sent.
             MissionRejected: the vehicle refused; see ``item``, ``result`` and ``reasons``.
-            MissionTimeout: the vehicle stopped answering; ``missing`` has the items that it did not confirm.
+            MissionTimeout: the vehicle stopped answering; ``missing`` has the items that the vehicle did not confirm.
             VerificationFailed: the vehicle confirmed the plan, but has different items.
             NotSupported: ``"ftp"`` was requested, but the vehicle does not support it.
             FileError, FileTimeout: with ``"ftp"``: the vehicle refused an operation on a file, or did not answer.
-            OperationTimeout: not done within ``timeout``.
+            OperationTimeout: the transfer was not done within ``timeout``.
         """
         self._loop.run(
             self.aio.upload,
@@ -2541,7 +2542,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
             MissionTimeout: items did not arrive; ``missing`` has their numbers.
             RemoteProtocolError: the received items are not a valid plan.
             NotSupported, FileError, FileTimeout: as for :meth:`upload`, with ``"ftp"``.
-            OperationTimeout: not done within ``timeout``.
+            OperationTimeout: the transfer was not done within ``timeout``.
         """
         return self._loop.run(
             self.aio.download,
@@ -2559,7 +2560,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
             MissionRejected: the vehicle refused.
             MissionTimeout: the vehicle stopped answering.
             VerificationFailed: the vehicle confirmed the command, but still has items.
-            OperationTimeout: not done within ``timeout``.
+            OperationTimeout: the transfer was not done within ``timeout``.
         """
         self._loop.run(self.aio.clear, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
@@ -2580,20 +2581,21 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
 
     @property
     def reached(self) -> int | None:
-        """The last item that was reached (MISSION_ITEM_REACHED); None before the first."""
+        """The last item that was reached (MISSION_ITEM_REACHED); None before the first item was reached."""
         return self.aio.reached
 
     def set_current(self, item: int, *, timeout: float = 5.0) -> None:
         """Set the next item. A vehicle that is flying its mission proceeds to it immediately.
 
-        Sends MAV_CMD_DO_SET_MISSION_CURRENT, or MISSION_SET_CURRENT to PX4, which supports only that. An item without a
+        Sends MAV_CMD_DO_SET_MISSION_CURRENT. PX4 does not support it, and gets MISSION_SET_CURRENT. An item without a
         position (a DO command) is executed; ``current`` then shows the next item.
 
         Raises:
             InvalidArgument: there is no such item. Nothing was sent.
             CommandRejected: the vehicle refused.
-            OperationRejected: a pilot took over, or a newer order was given, before it was confirmed.
-            OperationTimeout: MISSION_CURRENT did not confirm it.
+            OperationRejected: a pilot took over, or a newer order was given, before the item was confirmed.
+
+            OperationTimeout: MISSION_CURRENT did not confirm the item.
         """
         self._loop.run(self.aio.set_current, item, timeout=timeout)
 
@@ -2603,7 +2605,8 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         The vehicle must be armed: **it takes off** if the mission begins with a take-off. A copter on the ground needs
         a take-off as the first item. If you cancel the call, aerokit orders the vehicle to hold.
 
-        Sends MISSION_START to ArduPilot, which then takes off from the ground. Other autopilots get a mode change.
+        Sends MISSION_START to ArduPilot, because a mode change alone does not make it take off. Other autopilots get a
+        mode change.
 
         Raises:
             InvalidArgument: there is no such item. Nothing was sent.
@@ -2617,19 +2620,20 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
     def pause(self) -> None:
         """Hold and remember the current item; returns when HEARTBEAT reports the hold mode.
 
-        Raises OperationRejected if the vehicle is not flying its mission, else as :meth:`Vehicle.hold`.
+        Raises OperationRejected if the vehicle is not flying its mission. Other errors are as for :meth:`Vehicle.hold`.
         """
         self._loop.run(self.aio.pause)
 
     def resume(self, *, timeout: float = 10.0) -> None:
-        """Continue the mission from the current item, even after a pilot or another order has interrupted it.
+        """Continue the mission from the current item, even if a pilot or another order has interrupted the mission.
 
-        ArduPilot starts again from the first item if its parameter MIS_RESTART is 1. Raises as :meth:`start`.
+        If its parameter MIS_RESTART is 1, ArduPilot starts again from the first item. Raises as :meth:`start`.
         """
         self._loop.run(self.aio.resume, timeout=timeout)
 
     def wait_finished(self, *, timeout: float | None = None, max_silence_s: float | None = MAX_SILENCE_S) -> None:
-        """Wait until the mission has been flown to its end; if it ends with a landing, until the vehicle has landed.
+        """Wait until the mission has been flown to its end. If it ends with a landing, wait until the vehicle has
+        landed.
 
         A :meth:`pause` by another task does not end the wait. Cancelling this call does not stop the vehicle, and no
         command is sent when it fails.
@@ -2641,9 +2645,9 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         Raises:
             OperationRejected: the vehicle no longer flies the mission: a pilot, a failsafe or another order changed the
                 mode, it disarmed on the way, or it fell. ``reasons`` has the vehicle's status texts.
-            OperationTimeout: the mission was not finished in time; or the armed vehicle has not moved for 12 s after a
-                descent at more than 3 m/s that ended on the ground; or it has not moved for 60 s at a take-off or at a
-                waypoint without a hold (only if the items are known from an upload or a download).
+            OperationTimeout: the mission was not finished in time; or the armed vehicle has not moved for 12 s after it
+                descended to the ground at more than 3 m/s; or it has not moved for 60 s at a take-off or at a waypoint
+                without a hold. The last case is detected only if the items are known from an upload or a download.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
         """
         self._loop.run(self.aio.wait_finished, timeout=timeout, max_silence_s=max_silence_s)
@@ -2652,7 +2656,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
     def explains_mode(self) -> bool:
         """True if the vehicle holds, returns or lands because its mission has ended.
 
-        The mission must be the last order, and must be complete or at its last item.
+        The mission must be the last order to the vehicle, and must be complete or at its last item.
         """
         return self.aio.explains_mode
 
@@ -2660,8 +2664,8 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
 class FenceControl(TwinOf["AsyncFenceControl"]):
     """The fence of a vehicle: ``await vehicle.fence.upload(Fence(polygons=[...]))``.
 
-    For ArduPilot, uploading does not enable the fence: use :meth:`enable`, or the parameter FENCE_ENABLE. PX4 always
-    enforces its fence; GF_ACTION defines its reaction.
+    ArduPilot does not enable an uploaded fence: use :meth:`enable`, or the parameter FENCE_ENABLE. PX4 always enforces
+    its fence; its parameter GF_ACTION defines the reaction.
     """
 
     def upload(
@@ -2676,34 +2680,34 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> None:
-        """Replace the plan on the vehicle by this one; an empty one clears it.
+        """Replace the plan on the vehicle by ``plan``. An empty plan clears the vehicle's plan.
 
         Args:
             plan: checked before anything is sent.
             method: ``"ftp"`` (ArduPilot's ``@MISSION/…`` files), ``"items"`` (the mission protocol), or ``"auto"``.
-            only_changes: compare with the vehicle's plan, if it is known from an earlier transfer and the vehicle
-                confirms it. Send nothing if both are equal, and only the items that differ if the vehicle supports
-                that.
+            only_changes: compare ``plan`` with the vehicle's plan, if that is known from an earlier transfer and the
+                vehicle confirms that it is unchanged. Send nothing if both are equal. Send only the items that differ
+                if the vehicle supports that.
             verify: read the plan back and compare it, or compare PX4's checksum if that is faster. Files are always
                 read back.
-            max_distance_m: refuse a plan with a position farther than this from the vehicle, if its position is
-                known.
+            max_distance_m: refuse a plan with a position farther than this from the vehicle, if the vehicle's position
+                is known.
             idle_timeout_s: fail after this many seconds without progress.
             timeout: seconds in total.
             on_progress: called with the progress in items, or in bytes of a file.
 
-        See https://mavlink.io/en/services/mission.html. PX4 keeps the old items until it has all of the new ones.
-        ArduPilot overwrites missions and rally points item by item, and a fence at the end. After a failure it may have
-        both old and new items; the error then states that.
+        See https://mavlink.io/en/services/mission.html. PX4 keeps the old items until it has received all new ones.
+        ArduPilot overwrites missions and rally points item by item, and a fence at the end. After a failure, ArduPilot
+        may therefore have both old and new items; the error text then says so.
 
         Raises:
             InvalidArgument: the plan is invalid, or has a position that is too far away. Nothing was sent.
             MissionRejected: the vehicle refused; see ``item``, ``result`` and ``reasons``.
-            MissionTimeout: the vehicle stopped answering; ``missing`` has the items that it did not confirm.
+            MissionTimeout: the vehicle stopped answering; ``missing`` has the items that the vehicle did not confirm.
             VerificationFailed: the vehicle confirmed the plan, but has different items.
             NotSupported: ``"ftp"`` was requested, but the vehicle does not support it.
             FileError, FileTimeout: with ``"ftp"``: the vehicle refused an operation on a file, or did not answer.
-            OperationTimeout: not done within ``timeout``.
+            OperationTimeout: the transfer was not done within ``timeout``.
         """
         self._loop.run(
             self.aio.upload,
@@ -2733,7 +2737,7 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
             MissionTimeout: items did not arrive; ``missing`` has their numbers.
             RemoteProtocolError: the received items are not a valid plan.
             NotSupported, FileError, FileTimeout: as for :meth:`upload`, with ``"ftp"``.
-            OperationTimeout: not done within ``timeout``.
+            OperationTimeout: the transfer was not done within ``timeout``.
         """
         return self._loop.run(
             self.aio.download,
@@ -2751,7 +2755,7 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
             MissionRejected: the vehicle refused.
             MissionTimeout: the vehicle stopped answering.
             VerificationFailed: the vehicle confirmed the command, but still has items.
-            OperationTimeout: not done within ``timeout``.
+            OperationTimeout: the transfer was not done within ``timeout``.
         """
         self._loop.run(self.aio.clear, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
@@ -2785,34 +2789,34 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> None:
-        """Replace the plan on the vehicle by this one; an empty one clears it.
+        """Replace the plan on the vehicle by ``plan``. An empty plan clears the vehicle's plan.
 
         Args:
             plan: checked before anything is sent.
             method: ``"ftp"`` (ArduPilot's ``@MISSION/…`` files), ``"items"`` (the mission protocol), or ``"auto"``.
-            only_changes: compare with the vehicle's plan, if it is known from an earlier transfer and the vehicle
-                confirms it. Send nothing if both are equal, and only the items that differ if the vehicle supports
-                that.
+            only_changes: compare ``plan`` with the vehicle's plan, if that is known from an earlier transfer and the
+                vehicle confirms that it is unchanged. Send nothing if both are equal. Send only the items that differ
+                if the vehicle supports that.
             verify: read the plan back and compare it, or compare PX4's checksum if that is faster. Files are always
                 read back.
-            max_distance_m: refuse a plan with a position farther than this from the vehicle, if its position is
-                known.
+            max_distance_m: refuse a plan with a position farther than this from the vehicle, if the vehicle's position
+                is known.
             idle_timeout_s: fail after this many seconds without progress.
             timeout: seconds in total.
             on_progress: called with the progress in items, or in bytes of a file.
 
-        See https://mavlink.io/en/services/mission.html. PX4 keeps the old items until it has all of the new ones.
-        ArduPilot overwrites missions and rally points item by item, and a fence at the end. After a failure it may have
-        both old and new items; the error then states that.
+        See https://mavlink.io/en/services/mission.html. PX4 keeps the old items until it has received all new ones.
+        ArduPilot overwrites missions and rally points item by item, and a fence at the end. After a failure, ArduPilot
+        may therefore have both old and new items; the error text then says so.
 
         Raises:
             InvalidArgument: the plan is invalid, or has a position that is too far away. Nothing was sent.
             MissionRejected: the vehicle refused; see ``item``, ``result`` and ``reasons``.
-            MissionTimeout: the vehicle stopped answering; ``missing`` has the items that it did not confirm.
+            MissionTimeout: the vehicle stopped answering; ``missing`` has the items that the vehicle did not confirm.
             VerificationFailed: the vehicle confirmed the plan, but has different items.
             NotSupported: ``"ftp"`` was requested, but the vehicle does not support it.
             FileError, FileTimeout: with ``"ftp"``: the vehicle refused an operation on a file, or did not answer.
-            OperationTimeout: not done within ``timeout``.
+            OperationTimeout: the transfer was not done within ``timeout``.
         """
         self._loop.run(
             self.aio.upload,
@@ -2842,7 +2846,7 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
             MissionTimeout: items did not arrive; ``missing`` has their numbers.
             RemoteProtocolError: the received items are not a valid plan.
             NotSupported, FileError, FileTimeout: as for :meth:`upload`, with ``"ftp"``.
-            OperationTimeout: not done within ``timeout``.
+            OperationTimeout: the transfer was not done within ``timeout``.
         """
         return self._loop.run(
             self.aio.download,
@@ -2860,7 +2864,7 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
             MissionRejected: the vehicle refused.
             MissionTimeout: the vehicle stopped answering.
             VerificationFailed: the vehicle confirmed the command, but still has items.
-            OperationTimeout: not done within ``timeout``.
+            OperationTimeout: the transfer was not done within ``timeout``.
         """
         self._loop.run(self.aio.clear, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
@@ -2958,8 +2962,8 @@ class CameraBlock(BlockTwin["AsyncCameraBlock"]):
 class PhotoInterval(PhotoIntervalTwin):
     """A series of photos for the duration of an ``async with`` block; an async iterator over its captures, in order.
 
-    Returned by :meth:`Camera.photo_interval`. Missed captures are requested again; ``missed`` counts those that the
-    camera did not send (ArduPilot and PX4 keep only the last one of their own cameras).
+    Returned by :meth:`Camera.photo_interval`. Missed captures are requested; ``missed`` counts those that the camera
+    did not send. ArduPilot and PX4 keep only the last capture of the cameras attached to them.
     """
 
     @property
@@ -2972,9 +2976,9 @@ class Camera(TwinOf["AsyncCamera"]):
     """One camera: photos, video, lens, tracking, storage, streams (https://mavlink.io/en/services/camera.html).
 
     ``vehicle.camera`` is the first camera, ``vehicle.camera_at(number)`` any other. A camera has its own component id
-    (100 to 105), or is attached to the autopilot (1 to 6) by ArduPilot's drivers or PX4's trigger. A call that the
-    camera's reported capabilities exclude is refused before anything is sent. Cells are polled only while your program
-    uses them.
+    (100 to 105), or is attached to the autopilot (1 to 6) by ArduPilot's drivers or PX4's trigger. If the capabilities
+    that the camera has reported exclude a call, aerokit refuses the call before anything is sent. Cells are polled only
+    while your program uses them.
     """
 
     @cached_property
@@ -3002,7 +3006,8 @@ class Camera(TwinOf["AsyncCamera"]):
     def set_mode(self, mode: ModeName, *, timeout: float = 5.0) -> None:
         """Change the mode (MAV_CMD_SET_CAMERA_MODE); returns when the camera reports the new mode.
 
-        If the camera does not report its mode (CAMERA_SETTINGS), returns when it has accepted.
+        If the camera does not report its mode (CAMERA_SETTINGS), the call returns when the camera has accepted the
+        command.
 
         Args:
             mode: ``"photo"``, ``"video"`` or ``"survey"``.
@@ -3031,12 +3036,12 @@ class Camera(TwinOf["AsyncCamera"]):
         timeout: float = FORMAT_TIMEOUT_S,
         on_progress: Callable[[int | None], None] | None = None,
     ) -> None:
-        """Format a storage medium (MAV_CMD_STORAGE_FORMAT): all data on it is lost. Also clears the log of captures.
+        """Format a storage medium (MAV_CMD_STORAGE_FORMAT), which erases all data on it and clears the log of captures.
 
         Args:
             number: number of the medium, 1 to 255.
             timeout: seconds to wait for the answer, and after each progress report.
-            on_progress: called with 0–100, or None.
+            on_progress: called with the progress, 0–100 or None if unknown.
 
         Raises:
             InvalidArgument: ``number`` is out of range. Nothing was sent.
@@ -3108,9 +3113,11 @@ class Camera(TwinOf["AsyncCamera"]):
         self._loop.run(self.aio.stop_tracking)
 
     def zoom_step(self, steps: int) -> None:
-        """Zoom in by a number of the camera's own steps, out if negative (MAV_CMD_SET_CAMERA_ZOOM).
+        """Zoom in by a number of steps, or out if the number is negative (MAV_CMD_SET_CAMERA_ZOOM).
 
-        Not retried if unanswered, because the step could be made twice.
+        The camera defines the size of a step.
+
+        An unanswered command is not retried, because the step could be made twice.
 
         Args:
             steps: −100 to 100.
@@ -3133,12 +3140,13 @@ class Camera(TwinOf["AsyncCamera"]):
         self._loop.run(self.aio.zoom_to_focal_length, millimetres)
 
     def zooming(self, speed: float = 1.0) -> CameraBlock:
-        """Zoom for the duration of an ``async with`` block; the end of the block stops it, also under cancellation.
+        """Zoom for the duration of an ``async with`` block. The end of the block stops the zoom, also under
+        cancellation.
 
         Entering raises what :meth:`zoom_step` does.
 
         Args:
-            speed: −1 (out) to 1 (in); many cameras support only these two.
+            speed: −1 (out) to 1 (in); many cameras support only these two values.
 
         Raises:
             InvalidArgument: ``speed`` is out of range. Nothing was sent.
@@ -3146,9 +3154,11 @@ class Camera(TwinOf["AsyncCamera"]):
         return CameraBlock(self._loop, self._loop.call(self.aio.zooming, speed))
 
     def focus_step(self, steps: int) -> None:
-        """Focus farther by a number of the camera's own steps, nearer if negative (MAV_CMD_SET_CAMERA_FOCUS).
+        """Focus farther by a number of steps, or nearer if the number is negative (MAV_CMD_SET_CAMERA_FOCUS).
 
-        Not retried if unanswered, because the step could be made twice. Raises as :meth:`zoom_step`.
+        The camera defines the size of a step.
+
+        An unanswered command is not retried, because the step could be made twice. Raises as :meth:`zoom_step`.
 
         Args:
             steps: −100 to 100.
@@ -3164,19 +3174,21 @@ class Camera(TwinOf["AsyncCamera"]):
         self._loop.run(self.aio.focus_at, metres)
 
     def auto_focus(self, kind: AutoFocus = "auto") -> None:
-        """Start the camera's auto focus: ``"auto"`` by its own rules, ``"single"`` once, ``"continuous"`` from now on.
+        """Start the auto focus: ``"single"`` focuses once, ``"continuous"`` from now on, ``"auto"`` as the camera
+        chooses.
 
         Raises as :meth:`reset_settings`, and NotSupported if the camera cannot be focused.
         """
         self._loop.run(self.aio.auto_focus, kind)
 
     def focusing(self, speed: float = 1.0) -> CameraBlock:
-        """Move the focus for the duration of an ``async with`` block; its end stops it, also under cancellation.
+        """Move the focus for the duration of an ``async with`` block. The end of the block stops it, also under
+        cancellation.
 
         Entering raises what :meth:`focus_step` does.
 
         Args:
-            speed: −1 (nearer) to 1 (farther); many cameras support only these two.
+            speed: −1 (nearer) to 1 (farther); many cameras support only these two values.
 
         Raises:
             InvalidArgument: ``speed`` is out of range. Nothing was sent.
@@ -3203,7 +3215,8 @@ class Camera(TwinOf["AsyncCamera"]):
     def start_video(self, *, status_hz: float = 1.0, timeout: float = 5.0) -> None:
         """Start recording (MAV_CMD_VIDEO_START_CAPTURE); returns when the camera reports that it records.
 
-        If the camera does not report its status (e.g. one attached to an autopilot), returns when it has accepted.
+        If the camera does not report its status, as for example a camera attached to the autopilot, the call returns
+        when the camera has accepted the command.
 
         Args:
             status_hz: rate at which the camera sends its status while recording, 0 to 10.
@@ -3230,7 +3243,8 @@ class Camera(TwinOf["AsyncCamera"]):
         self._loop.run(self.aio.stop_video, timeout=timeout)
 
     def video(self, *, status_hz: float = 1.0) -> CameraBlock:
-        """Record for the duration of an ``async with`` block; its end stops recording, also under cancellation.
+        """Record for the duration of an ``async with`` block. The end of the block stops recording, also under
+        cancellation.
 
         Entering raises what :meth:`start_video` does.
 
@@ -3240,11 +3254,12 @@ class Camera(TwinOf["AsyncCamera"]):
         return CameraBlock(self._loop, self._loop.call(self.aio.video, status_hz=status_hz))
 
     def load_streams(self) -> tuple[CameraStream, ...]:
-        """Request the video streams (VIDEO_STREAM_INFORMATION), one by one if the camera does not send all at once.
+        """Request information about all video streams (VIDEO_STREAM_INFORMATION), one by one if the camera requires
+        that.
 
         Raises:
             NotSupported: the camera has no video streams. Nothing was sent.
-            OperationTimeout: not all of them arrived, or no camera was found.
+            OperationTimeout: the information about some streams did not arrive, or no camera was found.
         """
         return self._loop.run(self.aio.load_streams)
 
@@ -3305,21 +3320,21 @@ class Camera(TwinOf["AsyncCamera"]):
         return self.aio.number
 
     def wait_found(self, *, timeout: float = 10.0) -> CameraInformation:
-        """Wait until the camera is found and has identified itself; other calls wait for that by themselves.
+        """Wait until the camera is found and has identified itself. Other calls include this wait.
 
         Raises:
             CommandRejected: the camera refused to identify itself.
-            OperationTimeout: no camera was found, or it did not identify itself: PX4's trigger never does.
+            OperationTimeout: no camera was found, or the camera did not identify itself. PX4's trigger never does.
         """
         return self._loop.run(self.aio.wait_found, timeout=timeout)
 
     def take_photo(self, *, timeout: float = 10.0) -> Capture:
         """Take one photo; returns when the camera has reported it.
 
-        Sends MAV_CMD_IMAGE_START_CAPTURE (https://mavlink.io/en/services/camera.html), or MAV_CMD_DO_DIGICAM_CONTROL
-        to PX4's trigger and to cameras that do not support the former. The order is sent again only if the camera
-        reports afterwards that it has taken no picture and is taking none. A lost CAMERA_IMAGE_CAPTURED is requested.
-        If you cancel the call, the camera may still take the picture.
+        Sends MAV_CMD_IMAGE_START_CAPTURE (https://mavlink.io/en/services/camera.html). PX4's trigger, and cameras that
+        do not support this command, get MAV_CMD_DO_DIGICAM_CONTROL. The order is sent again only if the camera reports
+        afterwards that it has taken no picture and is taking none. A lost CAMERA_IMAGE_CAPTURED is requested again. If
+        you cancel the call, the camera may still take the picture.
 
         Args:
             timeout: seconds to wait for the report.
@@ -3350,20 +3365,22 @@ class Camera(TwinOf["AsyncCamera"]):
         return PhotoInterval(self._loop, self._loop.call(self.aio.photo_interval, seconds, count))
 
     def captures(self) -> list[Capture]:
-        """Return the captures received so far, ordered by index: at most the newest 20,000."""
+        """Return the newest captures received so far, at most 20,000, ordered by index."""
         return self._loop.call(self.aio.captures)
 
     def load_captures(self, *, timeout: float = 600.0) -> list[Capture]:
-        """Return all captures in the camera's log, including earlier ones, after requesting the missing ones.
+        """Request missing captures, and return all captures in the camera's log.
 
-        The newest 20,000 at most. For a camera attached to the autopilot, only the newest capture is available. Stops
-        after three successive captures that the camera does not send.
+        These include captures from before this program started. At most the newest 20,000 are returned. A camera
+        attached to the autopilot has only the newest capture. Requests stop after three successive captures that the
+        camera does not send.
 
         Args:
-            timeout: seconds to wait for all of them; :meth:`captures` has those that arrived in time.
+            timeout: seconds to wait for all captures; :meth:`captures` returns those that arrived in time.
 
         Raises:
-            OperationTimeout: the camera did not report its count or identify itself, or it took too long.
+            OperationTimeout: the camera did not report its number of captures or identify itself, or not all captures
+                arrived in time.
         """
         return self._loop.run(self.aio.load_captures, timeout=timeout)
 
@@ -3734,12 +3751,12 @@ class Vehicle(VehicleTwin):
 
     @cached_property
     def velocity(self) -> StateCell[Velocity]:
-        """Velocity over ground in m/s, north, east, down (GLOBAL_POSITION_INT)."""
+        """Velocity over ground in m/s: north, east, down (GLOBAL_POSITION_INT)."""
         return StateCell(self._loop, self.aio.velocity)
 
     @cached_property
     def local_position(self) -> StateCell[LocalPosition]:
-        """Position in metres and velocity in m/s, north, east, down from the local origin (LOCAL_POSITION_NED)."""
+        """Position in metres from the local origin, and velocity in m/s: north, east, down (LOCAL_POSITION_NED)."""
         return StateCell(self._loop, self.aio.local_position)
 
     @cached_property
@@ -3764,7 +3781,7 @@ class Vehicle(VehicleTwin):
 
     @cached_property
     def gps(self) -> StateCell[tuple[GpsReceiver, ...]]:
-        """All satellite receivers, the first one first (GPS_RAW_INT, GPS2_RAW)."""
+        """All satellite receivers, in the order of their numbers (GPS_RAW_INT, GPS2_RAW)."""
         return StateCell(self._loop, self.aio.gps)
 
     @cached_property
@@ -3774,7 +3791,7 @@ class Vehicle(VehicleTwin):
 
     @cached_property
     def power(self) -> StateCell[Power]:
-        """Supply of the board and of its servos in volts (POWER_STATUS)."""
+        """Supply voltages of the board and of its servos (POWER_STATUS)."""
         return StateCell(self._loop, self.aio.power)
 
     @cached_property
@@ -3799,12 +3816,12 @@ class Vehicle(VehicleTwin):
 
     @cached_property
     def rc_channels(self) -> StateCell[RcChannels]:
-        """Remote control, pulse widths in µs (RC_CHANNELS)."""
+        """Pulse widths of the remote control channels in µs (RC_CHANNELS)."""
         return StateCell(self._loop, self.aio.rc_channels)
 
     @cached_property
     def servo_outputs(self) -> StateCell[ServoOutputs]:
-        """Outputs to motors and servos, pulse widths in µs (SERVO_OUTPUT_RAW)."""
+        """Pulse widths of the outputs to motors and servos in µs (SERVO_OUTPUT_RAW)."""
         return StateCell(self._loop, self.aio.servo_outputs)
 
     @cached_property
@@ -3849,7 +3866,7 @@ class Vehicle(VehicleTwin):
 
     @cached_property
     def status_text(self) -> StateCell[StatusText]:
-        """The last status text (STATUSTEXT, chunks joined)."""
+        """The last status text (STATUSTEXT); the chunks of a long text are joined."""
         return StateCell(self._loop, self.aio.status_text)
 
     @cached_property
@@ -4004,8 +4021,8 @@ class Vehicle(VehicleTwin):
         Args:
             unit: the part that fails (FAILURE_UNIT).
             kind: how it fails (FAILURE_TYPE).
-            instance: number of the part from 1 to 16; 0 for all.
-            intent: must be ``"inject failure"``, so that no other call can be mistaken for it.
+            instance: number of the part from 1 to 16; 0 means all parts of this kind.
+            intent: must be ``"inject failure"``, so that a failure is never injected by mistake.
 
         Raises:
             InvalidArgument: an argument is not allowed. Nothing was sent.
@@ -4033,22 +4050,22 @@ class Vehicle(VehicleTwin):
         Args:
             command: the number, or a member of ``enums.MavCmd``.
             params: param1 to param7; missing ones are 0, or NaN where the command allows it.
-            component_id: the target component instead of the autopilot; 0: all components, and the autopilot's ack
-                counts.
+            component_id: the target component, by default the autopilot. 0: all components; the autopilot's ack counts.
             retries: maximum number of retransmissions without an ack, from 0; ``confirmation`` increments each time. A
-                command that changes something is sent again only right after a HEARTBEAT, and only if the mode has not
-                changed, no failsafe is active and there is no newer order (docs/reliability.md). None: 3 for a request
-                that changes nothing but streams, 0 for all other commands, because a lost ack would cause a second
-                execution.
-            attempt_timeout: seconds to wait for an ack after each transmission, above 0. aerokit waits for at least two
-                measured round trips. None: 1, or 4 if the command is sent only once.
+                command that changes more than streams is sent again only right after a HEARTBEAT, and only if the mode
+                has not changed, no failsafe is active and there is no newer order (docs/reliability.md). None: 3 for a
+                request for data, 0 for all other commands, because a retry after a lost ack would execute the command
+                twice.
+            attempt_timeout: seconds to wait for an ack after each transmission, above 0, extended to two measured round
+                trips if necessary. None: 1, or 4 if the command is sent only once.
             progress_timeout: seconds to wait for the next ack after each IN_PROGRESS; calibrations can take long.
-            on_progress: called with 0–100, or None, for each IN_PROGRESS.
+            on_progress: called for each IN_PROGRESS with the progress, 0–100 or None if unknown.
 
         Raises:
             InvalidArgument: a parameter is not a number or does not fit. Nothing was sent.
-            CommandRejected: any other result; ``reasons`` has the status texts received meanwhile.
-            CommandTimeout: no ack; the text has attempts, seconds, the age of the last heartbeat and the packet loss.
+            CommandRejected: the result is not ACCEPTED; ``reasons`` has the status texts received meanwhile.
+            CommandTimeout: there was no ack. The error text has the attempts, the seconds, the age of the last
+                heartbeat and the packet loss.
         """
         return self._loop.run(
             self.aio.command,
@@ -4079,8 +4096,8 @@ class Vehicle(VehicleTwin):
         """Send any MAV_CMD as COMMAND_INT: param1 to param4, ``x``, ``y``, ``z`` in ``frame`` (MAV_FRAME).
 
         ``x`` and ``y`` are latitude and longitude in 1e-7 degrees, or 1e-4 m in local frames; ``z`` is in metres. With
-        ``or_long``, firmware that does not support the command as COMMAND_INT gets a COMMAND_LONG with degrees; this
-        requires frame 0. Other arguments and errors are those of :meth:`command`.
+        ``or_long``, firmware that does not support the command as COMMAND_INT gets a COMMAND_LONG with degrees;
+        ``frame`` must then be 0. Other arguments and errors are those of :meth:`command`.
         """
         return self._loop.run(
             self.aio.command_int,
@@ -4101,7 +4118,7 @@ class Vehicle(VehicleTwin):
     def send(self, message: Message) -> None:
         """Send one message unchanged, once; never blocks. The caller sets its ``target_system``.
 
-        A steering command or SET_MODE is an order, and ends the action in progress, as with :meth:`command`. A
+        A steering command or a SET_MODE counts as an order and ends the action in progress, like :meth:`command`. A
         set-point supersedes :meth:`posted` orders about motion. A message to another system has neither effect.
 
         Raises:
@@ -4123,20 +4140,20 @@ class Vehicle(VehicleTwin):
         """Open an order without waiting for its effect, so that mode, arming and take-off can be sent in one go.
 
         Within the block, the order's commands are sent again right after a HEARTBEAT, until they are acknowledged or
-        their effect is reported. Retries end with a newer order about the same subject; with a mode that neither this
-        order nor another order of the last ten seconds explains; and, for orders about motion, with disarming. An
-        abandoned posted order does not make the vehicle hold, and late arming is not monitored; use the actions for
+        their effect is reported. A newer order about the same subject ends the retries. So does a mode that neither
+        this order nor another order of the last ten seconds explains, and disarming if the order is about motion. If a
+        posted order is abandoned, aerokit neither makes the vehicle hold nor monitors late arming; use the actions for
         that.
 
         Args:
-            subjects: ``"mode"``, ``"motion"`` or ``"arm"``. A newer order about the first subject ends this order; this
-                order ends earlier ones about any of its subjects. An order about mode or motion also ends the action in
-                progress.
+            subjects: ``"mode"``, ``"motion"`` or ``"arm"``. A newer order about the first subject ends this order. This
+                order ends earlier orders about any of its subjects. An order about mode or motion also ends the action
+                in progress.
             modes: the modes that the order leads to.
             armed: True if the order arms the vehicle, False if it disarms it; required for ``"arm"``.
 
         Raises:
-            InvalidArgument: no subject, or ``"arm"`` without ``armed``. Nothing was sent.
+            InvalidArgument: there is no subject, or ``"arm"`` was given without ``armed``. Nothing was sent.
         """
         return self._twin_block(PostedOrder, self.aio.posted(*subjects, modes=modes, armed=armed))
 
@@ -4149,10 +4166,10 @@ class Vehicle(VehicleTwin):
     ) -> Subscription[ItemT]:
         """Return a stream of messages or events of this vehicle, for use in a ``with`` block.
 
-        ``capacity=1`` keeps only the latest message; ``missed`` counts the dropped ones. For the duration of the block,
-        aerokit requests these messages from the autopilot at ``rate_hz`` (above 0, at most 1000), or faster if another
-        subscriber needs it. None requests the default rate of streamed messages; messages sent on demand (HEARTBEAT,
-        STATUSTEXT, acks) are not requested. For a camera or another component use
+        ``capacity=1`` keeps only the latest message; ``missed`` counts the dropped messages. For the duration of the
+        block, aerokit requests these messages from the autopilot at ``rate_hz`` (above 0, at most 1000), or faster if
+        another subscriber needs it. None requests the default rate of streamed messages; messages sent on demand
+        (HEARTBEAT, STATUSTEXT, acks) are not requested. For a camera or another component use
         ``vehicle.component(100).subscribe(...)``.
 
         Raises:
@@ -4170,10 +4187,10 @@ class Vehicle(VehicleTwin):
     def streams(self, rate_hz: float) -> AbstractContextManager[None]:
         """Request all streams of the vehicle at ``rate_hz`` for the duration of the ``with`` block.
 
-        For recordings, ground stations, and firmware without rates of single messages. ArduPilot receives
-        REQUEST_DATA_STREAM (whole Hz, at least 1), again after a reboot or a silence and while nothing arrives; it
-        continues to stream after the block. Other autopilots stream by themselves; missing common states are requested
-        as by :meth:`rate`.
+        For recordings, ground stations, and firmware that cannot set the rate of a single message. ArduPilot receives
+        REQUEST_DATA_STREAM (whole Hz, at least 1). aerokit repeats it after a reboot or a silence, and while no message
+        arrives. ArduPilot continues to stream after the block. Other autopilots stream by themselves; aerokit requests
+        common states that are missing, like :meth:`rate`.
 
         Raises:
             InvalidArgument: the rate is not above 0 and at most 1000. Nothing was sent.
@@ -4183,9 +4200,9 @@ class Vehicle(VehicleTwin):
     def message(self, message_type: type[MessageT], *, rate_hz: float | None = None) -> StateCell[MessageT]:
         """Return the cell with the latest message of a type: ``vehicle.message(messages.RawImu).value.xacc``.
 
-        The first call requests it at ``rate_hz`` (None: the default rate of a streamed message) for the lifetime of
-        the vehicle object; later calls return the same cell and may change the rate. Only messages of the autopilot
-        count; use ``vehicle.component(100).message(...)`` for a camera or another component.
+        The first call requests the message at ``rate_hz`` (None: the default rate of a streamed message) for the
+        lifetime of the vehicle object. Later calls return the same cell and may change the rate. Only messages of the
+        autopilot count; use ``vehicle.component(100).message(...)`` for a camera or another component.
 
         Raises:
             InvalidArgument: the rate is out of range, or the dialect does not contain the message.
@@ -4258,8 +4275,8 @@ class Vehicle(VehicleTwin):
             NotSupported: the firmware is ArduPilot, whose mode AUTOTUNE a pilot controls. Nothing was sent.
             OperationRejected: the mode changed, or another party disarmed the vehicle.
             CommandRejected: PX4 was built without the autotune module, or the tuning failed.
-            CommandTimeout: an answer is missing, or the program has paused; PX4 may go on tuning.
-            OperationTimeout: the tuning was not done in time; PX4 may go on tuning.
+            CommandTimeout: an answer is missing, or the program was paused for too long; PX4 may continue to tune.
+            OperationTimeout: the tuning was not done in time; PX4 may continue to tune.
         """
         self._loop.run(self.aio.autotune, timeout=timeout, on_progress=on_progress)
 
@@ -4277,7 +4294,8 @@ class Vehicle(VehicleTwin):
 
         Raises:
             InvalidArgument: the intent is another text. Nothing was sent.
-            CommandRejected: the vehicle refused; ``reasons`` has its status texts. PX4 refuses while it is disarmed.
+            CommandRejected: the vehicle refused; ``reasons`` has its status texts. PX4 refuses the command while
+                disarmed.
             CommandTimeout: there was no acknowledgement; the flight may have been terminated nevertheless.
             HeartbeatTimeout: the vehicle was silent for ten seconds after its acknowledgement.
             OperationTimeout: the vehicle accepted the command, but HEARTBEAT does not report the termination.
@@ -4287,9 +4305,9 @@ class Vehicle(VehicleTwin):
     def shutdown(self, *, intent: ShutdownIntent, timeout: float = 15.0) -> None:
         """Switch the autopilot off, and wait until its HEARTBEATs end (MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN).
 
-        Only a person at the vehicle can switch it on again. HEARTBEATs count as ended after 3.5 s without one, or when
-        the link goes down after the acknowledgement. The command is sent once. A cancelled call may have switched the
-        autopilot off.
+        Only a person at the vehicle can switch it on again. HEARTBEATs count as ended after 3.5 s without a HEARTBEAT,
+        or when the link goes down after the acknowledgement. The command is sent once. A cancelled call may have
+        switched the autopilot off.
 
         Args:
             intent: must be ``"shut down"``.
@@ -4308,7 +4326,7 @@ class Vehicle(VehicleTwin):
     def set_mode(self, mode: str | int, *, timeout: float = 6.0) -> None:
         """Change the flight mode and wait until HEARTBEAT reports it.
 
-        Sends MAV_CMD_DO_SET_MODE, or SET_MODE to a vehicle that does not support it
+        Sends MAV_CMD_DO_SET_MODE, or SET_MODE to a vehicle that does not support the command
         (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_MODE).
 
         Args:
@@ -4325,12 +4343,12 @@ class Vehicle(VehicleTwin):
         self._loop.run(self.aio.set_mode, mode, timeout=timeout)
 
     def hold(self) -> None:
-        """Stop and stay (a fixed wing circles); returns when HEARTBEAT reports the autopilot's mode for that.
+        """Stop and stay (a fixed wing circles); returns when HEARTBEAT reports the autopilot's hold mode.
 
         The mode is BRAKE on Copter, LOITER on Plane and boats, HOLD on Rover, POSHOLD on Sub and LOITER on PX4.
 
         Raises:
-            NotSupported: this vehicle has no mode for it. Nothing was sent.
+            NotSupported: this vehicle has no hold mode. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             OperationRejected: a pilot or a failsafe has chosen another mode meanwhile.
             OperationTimeout: the vehicle did not acknowledge, or accepted the mode but stayed in another one.
@@ -4346,8 +4364,8 @@ class Vehicle(VehicleTwin):
     def is_flown_by_program(self) -> bool:
         """True while the vehicle is armed and executes orders of this program.
 
-        This program armed it, or has given a steering order since another party armed it, and no pilot, failsafe or
-        other program took over since. False for a vehicle that this program only observes.
+        This program armed the vehicle, or has given a steering order since another party armed it. No pilot, failsafe
+        or other program took over since. False for a vehicle that this program only observes.
         """
         return self.aio.is_flown_by_program
 
@@ -4355,10 +4373,10 @@ class Vehicle(VehicleTwin):
     def taken_over(self) -> str:
         """The takeover that ended the program's last action, as a clause; empty if there was none.
 
-        ``"the mode changed to LOITER"`` may be the work of a pilot, a failsafe or another program, because HEARTBEAT
-        does not distinguish them. ``"a failsafe became active (MAV_STATE_CRITICAL)"`` may be reported seconds before
-        the mode changes. Disarming alone, as after a landing, is not a takeover. The program's next action resets this
-        text.
+        A change of the mode (``"the mode changed to LOITER"``) may come from a pilot, a failsafe or another program:
+        HEARTBEAT does not distinguish them. A failsafe (``"a failsafe became active (MAV_STATE_CRITICAL)"``) may be
+        reported seconds before the mode changes. Disarming alone, as after a landing, is not a takeover. The program's
+        next action clears this text.
         """
         return self.aio.taken_over
 
@@ -4369,17 +4387,17 @@ class Vehicle(VehicleTwin):
     def why_not_armable(self) -> list[str]:
         """Return the reasons why arming would be refused now; an empty list means that none is known.
 
-        Asks the vehicle to run its checks (MAV_CMD_RUN_PREARM_CHECKS) where it supports that, and collects its status
-        texts; reads SYS_STATUS and the estimator's flags (ArduPilot EKF_STATUS_REPORT, PX4 ESTIMATOR_STATUS). Takes
-        about a second and does not arm the vehicle.
+        Asks the vehicle to run its checks (MAV_CMD_RUN_PREARM_CHECKS) if it supports that, and collects its status
+        texts. Also reads SYS_STATUS and the estimator's flags (ArduPilot EKF_STATUS_REPORT, PX4 ESTIMATOR_STATUS).
+        Takes about a second and does not arm the vehicle.
         """
         return self._loop.run(self.aio.why_not_armable)
 
     def wait_ready(self, *, timeout: float = 90.0) -> None:
         """Wait until position and home are known, the estimator is healthy and the pre-arm checks pass.
 
-        The mode is not considered, because :meth:`arm` leaves a mode in which the vehicle cannot arm;
-        :meth:`why_not_armable` reports it.
+        The present mode does not matter, because :meth:`arm` leaves a mode in which the vehicle cannot arm.
+        :meth:`why_not_armable` reports such a mode.
 
         Raises:
             OperationTimeout: not ready within ``timeout`` seconds; the text lists what is missing, and recent status
@@ -4399,19 +4417,19 @@ class Vehicle(VehicleTwin):
         """Arm the motors and wait until HEARTBEAT reports armed: **propellers may start to turn**.
 
         If the present mode does not allow arming (RTL or LAND after a flight, OFFBOARD), the mode is changed first.
-        The command is sent once: a HEARTBEAT that reports disarmed may mean that a pilot has disarmed the vehicle.
-        After a cancellation, or an error other than a refusal, the command may still be executed. aerokit therefore
-        monitors the vehicle for 15 seconds, as long as the connection is open. It disarms the vehicle if this command
-        arms it: the vehicle accepts the command, or reports armed in the next HEARTBEAT without a takeover. An arming
-        that cannot be attributed to this command is left alone. Logger "aerokit" warns about the outcome.
+        The command is sent only once, because a pilot may have disarmed the vehicle since. After a cancellation, or an
+        error other than a refusal, the command may still be executed. aerokit therefore monitors the vehicle for 15
+        seconds, as long as the connection is open. If this command arms the vehicle after all, aerokit disarms it.
+        Arming is attributed to this command if the vehicle accepts it, or reports armed in the next HEARTBEAT without a
+        takeover. A vehicle that was armed otherwise stays armed. Logger "aerokit" warns about the outcome.
 
         Args:
-            mode: the mode to arm in. None: the present mode, or one that ``take_off`` starts in if the present mode
-                does not allow arming.
+            mode: the mode to arm in. None: the present mode; if it does not allow arming, the mode in which
+                ``take_off`` starts.
             force: skip the vehicle's own arming checks. Dangerous.
-            reason: why your program arms, at most 50 bytes. Logger "aerokit" reports it at INFO. A STATUSTEXT also
-                sends it to the vehicle right before the command, and ArduPilot writes it into its flight log. PX4 logs
-                only texts that have the vehicle's own system id.
+            reason: why your program arms, at most 50 bytes. Logger "aerokit" reports the reason at INFO. It is also
+                sent to the vehicle as a STATUSTEXT right before the command, and ArduPilot writes this text into its
+                flight log. PX4 logs only texts that have the vehicle's own system id.
             timeout: seconds for HEARTBEAT to report armed after the command was accepted.
             max_silence_s: raise when no heartbeat was received for this long; None: wait until ``timeout``.
 
@@ -4420,8 +4438,8 @@ class Vehicle(VehicleTwin):
                 sent.
             CommandRejected: the vehicle refused; ``reasons`` has its pre-arm texts, failing sensors and missing
                 estimates. A vehicle that can run its checks on request runs them again for this.
-            CommandTimeout: there was no acknowledgement, and the vehicle did not arm; the text says whether it may
-                still arm.
+            CommandTimeout: there was no acknowledgement, and the vehicle did not arm. The error text says whether it
+                may still arm.
             OperationRejected: the vehicle is armed already in a mode other than ``mode`` (nothing was sent), or another
                 party disarmed it or changed its mode meanwhile.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
@@ -4475,13 +4493,15 @@ class Vehicle(VehicleTwin):
         self._loop.run(self.aio.reboot, force=force, timeout=timeout)
 
     def look_at(self, target: Position | Home) -> None:
-        """Point nose or gimbal at a place until :meth:`stop_looking`; a place without altitude is at the vehicle's own.
+        """Point the nose or the gimbal at a place until :meth:`stop_looking`.
+
+        A place without an altitude is taken to be at the vehicle's altitude.
 
         Sends MAV_CMD_DO_SET_ROI_LOCATION (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_ROI_LOCATION), or
         MAV_CMD_DO_SET_ROI to old firmware.
 
         Raises:
-            ValueUnknownError: home is needed here and not known.
+            ValueUnknownError: home is needed to convert the altitude, but unknown.
             CommandRejected: the vehicle refused.
             CommandTimeout: there was no acknowledgement.
             OperationRejected: the mode changed, or a newer order was given, before the acknowledgement.
@@ -4511,7 +4531,8 @@ class Vehicle(VehicleTwin):
         timeout: float | None = None,
         max_silence_s: float | None = MAX_SILENCE_S,
     ) -> None:
-        """Fly circles around a place; returns when the vehicle's reported positions have circled it ``turns`` times.
+        """Fly circles around a place; returns when the vehicle's reported positions have gone around it ``turns``
+        times.
 
         Afterwards a multicopter holds, and a fixed wing goes on circling. After a cancellation or a time-out, aerokit
         orders the vehicle to hold.
@@ -4522,16 +4543,16 @@ class Vehicle(VehicleTwin):
 
         Args:
             center: the middle of the circle, at the altitude of the circle. For home, or a position without altitude,
-                the vehicle keeps its own altitude.
+                the vehicle keeps its present altitude.
             radius_m: above 0, at most 10,000. PX4's multicopters refuse more than MC_ORBIT_RAD_MAX.
             speed_m_s: ground speed, above 0, at most 50. A fixed wing ignores it.
             turns: number of turns, above 0, at most 1000. None: circle until the call is cancelled or another order is
                 given.
             clockwise: direction, as seen from above.
-            facing: direction of the nose: towards the center, ahead, as it was at the beginning, or free for the
-                autopilot to choose. A fixed wing ignores it.
+            facing: direction of the nose: towards the center, ahead, unchanged from the beginning, or chosen by the
+                autopilot. A fixed wing ignores it.
             max_distance_m: a center farther away than this many metres is refused.
-            timeout: seconds; None: no limit while heartbeats arrive, the mode stays and the vehicle moves.
+            timeout: seconds. None: no limit, as long as heartbeats arrive, the mode stays and the vehicle moves.
             max_silence_s: raise when no heartbeat was received for this long; None: no limit.
 
         Raises:
@@ -4568,14 +4589,14 @@ class Vehicle(VehicleTwin):
     ) -> None:
         """Fly a figure eight; returns when the vehicle's reported positions have passed both lobes ``rounds`` times.
 
-        A PX4 fixed wing flies the figure itself (MAV_CMD_DO_FIGURE_EIGHT), as two circles and straight lines between
-        them, and goes on until another order. For ArduCopter and PX4's multicopters, aerokit streams the set-points of
-        a lemniscate, and they hold at its center at the end. Errors, cancellation and time-out are as for
+        A PX4 fixed wing flies the figure itself (MAV_CMD_DO_FIGURE_EIGHT), as two circles joined by straight lines, and
+        continues until another order. For ArduCopter and PX4's multicopters, aerokit streams the set-points of a
+        lemniscate; at the end the vehicle holds at the center. Errors, cancellation and time-out are as for
         :meth:`orbit`.
 
         Args:
-            center: the point where the lines cross, at the altitude of the figure. Without altitude, the vehicle keeps
-                its own.
+            center: the point where the lines cross, at the altitude of the figure. If it has no altitude, the vehicle
+                keeps its present altitude.
             major_radius_m: half the length of the figure, above 0, at most 10,000.
             minor_radius_m: half the width of the figure, above 0, at most half of ``major_radius_m``.
             axis_deg: direction from the center to the first lobe, 0–360 clockwise from north.
@@ -4583,7 +4604,7 @@ class Vehicle(VehicleTwin):
             rounds: number of figures, a multiple of 0.5, above 0, at most 1000. None: fly until the call is cancelled.
             clockwise: direction in the first lobe, as seen from above.
             max_distance_m: a center farther away than this many metres is refused.
-            timeout: seconds; None: no limit while heartbeats arrive, the mode stays and the vehicle moves.
+            timeout: seconds. None: no limit, as long as heartbeats arrive, the mode stays and the vehicle moves.
             max_silence_s: raise when no heartbeat was received for this long; None: no limit.
         """
         self._loop.run(
@@ -4629,7 +4650,8 @@ class Vehicle(VehicleTwin):
             turns: return after this many turns, above 0, at most 1000; only with ``radius_m``.
             duration_s: return this many seconds after the arrival.
             max_distance_m: a place farther away than this many metres is refused.
-            timeout: seconds in total; None: no limit while heartbeats arrive, the mode stays and the vehicle moves.
+            timeout: seconds in total. None: no limit, as long as heartbeats arrive, the mode stays and the vehicle
+                moves.
             max_silence_s: raise when no heartbeat was received for this long; None: no limit.
 
         Raises:
@@ -4676,16 +4698,17 @@ class Vehicle(VehicleTwin):
             distance_m: distance along the ground to keep, 0 to 1000.
             bearing_deg: direction from the target to the vehicle, 0–360 clockwise from north. None: the direction at
                 the beginning.
-            from_course: measure ``bearing_deg`` from the target's direction of movement instead: 180 is behind it.
-            height_m: height above the target, −1000 to 1000. None: the vehicle keeps its own altitude.
+            from_course: measure ``bearing_deg`` from the target's direction of movement instead; 180 is behind the
+                target.
+            height_m: height above the target, −1000 to 1000. None: the vehicle keeps its present altitude.
             face_target: turn the nose to the target.
             valid_for_s: seconds without a new position of the target after which the vehicle holds.
             max_distance_m: distance to the target in metres above which the vehicle holds.
 
         Raises:
             InvalidArgument: an argument is out of range, or the target is the vehicle itself.
-            NotSupported: this type of vehicle has no position set-points, or it is a fixed wing, or a VTOL in forward
-                flight.
+            NotSupported: this type of vehicle has no position set-points, or the vehicle is a fixed wing or a VTOL in
+                forward flight.
         """
         return FollowStream(
             self._loop,
@@ -4705,8 +4728,8 @@ class Vehicle(VehicleTwin):
     def transition_to(self, state: FlightState, *, timeout: float = 60.0) -> None:
         """Change a VTOL between hover and forward flight (MAV_CMD_DO_VTOL_TRANSITION).
 
-        Returns when EXTENDED_SYS_STATE reports the state, which may be at once. ArduPilot accepts the command only in
-        AUTO. A cancelled call does not stop the transition.
+        Returns when EXTENDED_SYS_STATE reports the state: at once if the vehicle is already in it. ArduPilot accepts
+        the command only in AUTO. A cancelled call does not stop the transition.
 
         Args:
             state: ``"fixed_wing"`` or ``"multicopter"``.
@@ -4762,24 +4785,22 @@ class Vehicle(VehicleTwin):
 
         After a cancellation, a time-out or a silence, aerokit orders the vehicle to hold where it is, unless another
         order was given meanwhile or another party changed the mode. After a silence, aerokit waits for the next
-        heartbeat, and orders the hold if the vehicle is still on its way. Sends MAV_CMD_DO_REPOSITION
+        heartbeat, and orders a hold if the vehicle is still on its way. Sends MAV_CMD_DO_REPOSITION
         (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_REPOSITION), or SET_POSITION_TARGET_GLOBAL_INT to a
-        vehicle that does not support it.
-
-        Args:
-            target: latitude and longitude, and an altitude above home or above mean sea level. Without an altitude, and
-                for ``vehicle.home.value``, the vehicle keeps its present altitude.
-            speed_m_s: ground speed from now on, above 0; None keeps the present one.
+        vehicle that does not support it. Args:
+            target: latitude and longitude, and an altitude above home or above mean sea level. The vehicle keeps its
+                present altitude if the target has none, or is ``vehicle.home.value``.
+            speed_m_s: ground speed from now on, above 0; None keeps the present speed.
             heading_deg: heading on arrival, 0–360 clockwise from north; None leaves it to the autopilot.
             tolerance_m: arrival radius in metres; None: the default of the type of vehicle.
             max_distance_m: a place farther away than this many metres is refused.
-            timeout: seconds; None: no limit while heartbeats arrive, the mode stays and the vehicle moves.
+            timeout: seconds. None: no limit, as long as heartbeats arrive, the mode stays and the vehicle moves.
             max_silence_s: raise when no heartbeat was received for this long; None: no limit.
 
         Raises:
             InvalidArgument: the target is not on earth or too far away, or another argument is out of range. Nothing
                 was sent.
-            ValueUnknownError: the vehicle's position or home is needed, and is not known.
+            ValueUnknownError: the vehicle's position or home is needed but unknown.
             CommandRejected: the vehicle refused (outside its fence, no position, …).
             OperationRejected: the mode changed (a pilot, a failsafe) or the vehicle disarmed on the way.
             CommandTimeout: there was no acknowledgement.
@@ -4800,11 +4821,11 @@ class Vehicle(VehicleTwin):
     def set_speed(self, speed_m_s: float) -> None:
         """Change the ground speed in m/s, above 0 (MAV_CMD_DO_CHANGE_SPEED).
 
-        ArduPilot applies it only while the vehicle is on its way in GUIDED or AUTO; ``go_to(speed_m_s=...)`` waits for
-        that.
+        ArduPilot applies the speed only while the vehicle is on its way in GUIDED or AUTO. ``go_to(speed_m_s=...)``
+        sets the speed at that time.
 
         Raises:
-            InvalidArgument: out of range. Nothing was sent.
+            InvalidArgument: an argument is out of range. Nothing was sent.
             CommandRejected: the vehicle refused.
         """
         self._loop.run(self.aio.set_speed, speed_m_s)
@@ -4825,16 +4846,16 @@ class Vehicle(VehicleTwin):
         vehicle stops and turns by MAV_CMD_DO_REPOSITION.
 
         Args:
-            heading_deg: −360 to 360, clockwise from north; with ``relative`` an angle to turn by, negative to the
+            heading_deg: −360 to 360, clockwise from north. With ``relative``, an angle to turn by, negative to the
                 left.
             relative: True to turn by an angle from the present heading.
             rate_deg_s: turn rate in degrees per second; 0 leaves it to the autopilot. PX4 ignores it.
             tolerance_deg: accepted deviation in degrees.
-            timeout: seconds until it has the heading.
+            timeout: seconds until the vehicle has the heading.
             max_silence_s: raise when no heartbeat was received for this long; None: wait until ``timeout``.
 
         Raises:
-            InvalidArgument: out of range. Nothing was sent.
+            InvalidArgument: an argument is out of range. Nothing was sent.
             CommandRejected: the vehicle refused.
             OperationRejected: the mode changed or the vehicle disarmed meanwhile.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
@@ -4854,8 +4875,8 @@ class Vehicle(VehicleTwin):
         """Move the home position, to a place or to the vehicle's present position, and wait until HOME_POSITION
         reports it.
 
-        Sends MAV_CMD_DO_SET_HOME (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_HOME), as COMMAND_LONG
-        with a resolution of about a metre to old firmware, which does not support it as COMMAND_INT.
+        Sends MAV_CMD_DO_SET_HOME (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_HOME) as COMMAND_INT. Old
+        firmware that does not support this gets a COMMAND_LONG, which has a resolution of about a metre.
 
         Args:
             place: latitude, longitude and an altitude above mean sea level; None: the present position.
@@ -4885,8 +4906,8 @@ class Vehicle(VehicleTwin):
     ) -> None:
         """Take off and climb to ``altitude_m`` above home; returns at that altitude.
 
-        The vehicle must be armed. Its mode is changed if the autopilot needs that. After a cancellation or a time-out,
-        aerokit orders the vehicle to hold where it is.
+        The vehicle must be armed. If the autopilot requires another mode for a take-off, aerokit changes the mode.
+        After a cancellation or a time-out, aerokit orders the vehicle to hold where it is.
 
         Args:
             altitude_m: metres above home, above 0, at most 10,000.
@@ -4896,19 +4917,21 @@ class Vehicle(VehicleTwin):
         Raises:
             InvalidArgument: the altitude is out of range. Nothing was sent.
             NotSupported: this type of vehicle cannot take off.
-            OperationRejected: the vehicle is not armed, is flying already, or changed its mode or disarmed meanwhile.
+            OperationRejected: the vehicle is not armed or is already flying; or its mode changed or it disarmed
+                meanwhile.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the vehicle did not reach the altitude in time, or does not move.
-            ValueUnknownError: home is not known, and PX4 needs its altitude.
+            ValueUnknownError: the altitude of home is unknown, which PX4 needs.
         """
         self._loop.run(self.aio.take_off, altitude_m, timeout=timeout, max_silence_s=max_silence_s)
 
     def land(self, *, timeout: float | None = 300.0, max_silence_s: float | None = MAX_SILENCE_S) -> None:
-        """Land at the present position; returns on the ground, where the motors may still be turning.
+        """Land at the present position; returns when the vehicle is on the ground.
 
-        Watch ``vehicle.armed`` for the motors. After a cancellation the vehicle continues to land.
+        The motors may still be turning then; ``vehicle.armed`` reports when they have stopped. After a cancellation the
+        vehicle continues to land.
 
         Args:
             timeout: seconds until it is on the ground; None: no limit.
@@ -4925,7 +4948,7 @@ class Vehicle(VehicleTwin):
         self._loop.run(self.aio.land, timeout=timeout, max_silence_s=max_silence_s)
 
     def return_to_launch(self, *, timeout: float | None = 600.0, max_silence_s: float | None = MAX_SILENCE_S) -> None:
-        """Return to launch; returns on the ground, or above it if the autopilot does not land by itself.
+        """Return to launch; the call ends on the ground, or above it if the autopilot does not land by itself.
 
         Raises the same errors as :meth:`land`.
         """

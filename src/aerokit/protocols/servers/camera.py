@@ -13,7 +13,7 @@ from aerokit.protocols.servers.camera_device import CameraDevice
 from aerokit.protocols.servers.commands import ReceivedCommand, whole
 from aerokit.protocols.servers.intervals import Builder
 
-# Handlers are coroutines, because a device may need time; those of a simulated device never suspend.
+# Handlers are coroutines, because a device may need time. The handlers of a simulated device never suspend.
 AsyncHandler = Callable[[ReceivedCommand], Coroutine[Any, Any, int]]
 
 _TO_THE_END = -1

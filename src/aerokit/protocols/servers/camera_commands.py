@@ -69,7 +69,9 @@ class _Pictures:
         self._last_number = 0
 
     async def start(self, command: ReceivedCommand) -> int:
-        """Take images if param 1 is 0 or 1 (this camera). A repeated sequence number (param 4) takes no image."""
+        """Take images if param 1 is 0 or 1 (this camera). A command with a repeated sequence number (param 4) takes
+        none.
+        """
         camera, captures = self._camera, self._camera.captures
         interval = command.param2 if math.isfinite(command.param2) else 0.0
         count, number = whole(command.param3), whole(command.param4)
@@ -121,7 +123,7 @@ class _Videos:
         self._camera = camera
 
     async def start(self, command: ReceivedCommand) -> int:
-        """Start to record; param 2 is the rate of CAMERA_CAPTURE_STATUS during the recording in Hz."""
+        """Start to record; param 2 is the rate in Hz of CAMERA_CAPTURE_STATUS during the recording."""
         camera, captures = self._camera, self._camera.captures
         if not camera.can(CameraCapFlags.CAPTURE_VIDEO):
             return MavResult.UNSUPPORTED
@@ -143,7 +145,7 @@ class _Videos:
         return MavResult.ACCEPTED
 
     async def stream(self, command: ReceivedCommand, *, runs: bool) -> int:
-        """Start or stop the stream of param 1; 0 selects all."""
+        """Start or stop the stream with the number in param 1; 0 selects all streams."""
         camera, number = self._camera, whole(command.param1)
         available = range(1, len(camera.streams) + 1)
         if not available or number not in (0, *available):
@@ -158,7 +160,7 @@ class _Videos:
 
 
 class _Settings:
-    """Commands for mode, zoom and focus; each of them sends CAMERA_SETTINGS."""
+    """Commands for mode, zoom and focus. Each command sends CAMERA_SETTINGS."""
 
     def __init__(self, camera: CameraDevice) -> None:
         self._camera = camera

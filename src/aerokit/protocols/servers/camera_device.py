@@ -21,7 +21,7 @@ _IDLE, _CAPTURING, _WAITING, _WAITING_AND_CAPTURING = 0, 1, 2, 3
 _UNLIMITED = -1
 
 MIN_STATUS_INTERVAL_S = 0.02
-"""Minimum time between two CAMERA_CAPTURE_STATUS; a client that requests a higher rate gets this one."""
+"""Minimum seconds between two CAMERA_CAPTURE_STATUS, even if a client requests a higher rate."""
 
 # Creates CAMERA_IMAGE_CAPTURED from the keywords image_index, capture_result and file_url.
 Shot = Callable[..., CameraImageCaptured]
@@ -33,7 +33,8 @@ UNKNOWN_ATTITUDE = (math.nan, math.nan, math.nan, math.nan)
 class CameraDevice:
     """Base class of a camera: its state, and the methods that the protocol server calls.
 
-    A subclass implements the methods. A method raises an exception to refuse, which becomes the result of the command.
+    A subclass implements the methods. To refuse a command, a method raises an exception, which becomes the command's
+    result.
     """
 
     vendor: str = "aerokit"
@@ -95,7 +96,7 @@ class CameraDevice:
         return 0
 
     def expose(self, done: Callable[[Shot | None], None]) -> None:
-        """Take an image, then call ``done`` with it, or with None after a failure."""
+        """Take an image, then call ``done`` with the image, or with None after a failure."""
         raise NotImplementedError
 
     def failed_shot(self) -> Shot:
@@ -111,7 +112,7 @@ class CameraDevice:
         return ""
 
     def storage(self, number: int) -> list[m.StorageInformation]:
-        """Return STORAGE_INFORMATION for one storage, or for all if ``number`` is 0."""
+        """Return STORAGE_INFORMATION for one storage, or for all storages if ``number`` is 0."""
         return []
 
     def tracked_place(self) -> list[m.CameraTrackingGeoStatus]:
@@ -125,7 +126,7 @@ class CameraDevice:
         """End the recording."""
 
     async def set_mode(self, mode: int) -> None:
-        """Set the CAMERA_MODE, which the protocol has checked."""
+        """Set the CAMERA_MODE. The protocol server has already checked the value."""
 
     async def set_zoom(self, kind: int, value: float) -> bool:
         """Apply SET_CAMERA_ZOOM; return False if type or value is not supported."""
@@ -136,7 +137,7 @@ class CameraDevice:
         return False
 
     async def set_source(self, source: int) -> bool:
-        """Show another sensor (CAMERA_SOURCE); return False if there is none."""
+        """Show another sensor (CAMERA_SOURCE); return False if there is no such sensor."""
         return source == CameraSource.DEFAULT
 
     async def switch_stream(self, numbers: set[int], *, on: bool) -> None:
@@ -153,7 +154,9 @@ class CameraDevice:
 
 
 class Captures:
-    """Series of images, videos, and the image log. An image begins when the device has finished the previous one."""
+    """Series of images, videos, and the image log. The next image begins when the device has finished the previous
+    image.
+    """
 
     def __init__(self, camera: CameraDevice) -> None:
         self._camera = camera
@@ -168,7 +171,7 @@ class Captures:
         self._recording_since = math.nan
 
     def switch_off(self) -> None:
-        """Abort everything, as a power failure does; the images are kept."""
+        """Abort everything, as by a power failure. The images are kept."""
         self._remaining, self._is_open, self._is_late, self._recording_since = 0, False, False, math.nan
         self._series += 1
 
@@ -185,7 +188,7 @@ class Captures:
         self.take_series(0.0, 1)
 
     def take_series(self, interval_s: float, count: int) -> None:
-        """Take ``count`` images, one every ``interval_s`` seconds, the first at once; 0 means until `stop`."""
+        """Take ``count`` images (0: until `stop`), the first at once, then one every ``interval_s`` seconds."""
         self.interval_s = interval_s if count != 1 else 0.0
         self._remaining = count or _UNLIMITED
         self._series += 1
@@ -236,14 +239,14 @@ class Captures:
             self._open(series)
 
     def record(self, status_interval_s: float) -> None:
-        """Register the start of a video, and send CAMERA_CAPTURE_STATUS at this interval; 0 means never."""
+        """Register the start of a video, and send CAMERA_CAPTURE_STATUS at this interval (0: never)."""
         self._recording_since = self._camera.host.now
         self._camera.host.send(self.status())
         if 0.0 < status_interval_s < math.inf:
             self._send_status_every(self._recording_since, max(MIN_STATUS_INTERVAL_S, status_interval_s))
 
     def stop_recording(self) -> float:
-        """Register the end of the video and return its length in seconds; 0 if none was being recorded."""
+        """Register the end of the video and return its length in seconds; 0 if no video was being recorded."""
         if not self.is_recording:
             return 0.0
         seconds = self._camera.host.now - self._recording_since

@@ -51,7 +51,7 @@ class ReceivedCommand:
 
     @property
     def altitude_frame(self) -> int:
-        """MAV_FRAME of ``z``; that of a COMMAND_LONG is relative to home."""
+        """MAV_FRAME of ``z``. In a COMMAND_LONG, ``z`` is relative to home."""
         return MavFrame.GLOBAL_RELATIVE_ALT if self.frame is None else self.frame
 
 
@@ -73,8 +73,8 @@ CommandHandler = Callable[[ReceivedCommand], "int | CommandProgress | None"]
 class CommandDispatcher:
     """Dispatches commands to handlers and sends COMMAND_ACK to the sender.
 
-    Messages that a handler sends precede the acknowledgement. A command without a handler is UNSUPPORTED. ``refusal``
-    is called before the handler; it returns a MAV_RESULT to refuse the command, or None.
+    Messages that a handler sends precede the acknowledgement. A command without a handler is answered with UNSUPPORTED.
+    ``refusal`` is called before the handler, and returns a MAV_RESULT to refuse the command, or None.
     """
 
     def __init__(
@@ -143,7 +143,7 @@ class CommandDispatcher:
 
 
 MAX_RUNNING_COMMANDS = 16
-"""Maximum number of commands that a component executes at once; further ones are TEMPORARILY_REJECTED."""
+"""Maximum number of commands that a component executes at once. Further commands are TEMPORARILY_REJECTED."""
 PROGRESS_DELAY_S = 0.1
 """Seconds before the first IN_PROGRESS, so that a quick command is acknowledged once."""
 PROGRESS_INTERVAL_S = 0.5
@@ -173,11 +173,12 @@ class RunningCommand:
 
 
 class RunningCommands:
-    """Commands that take time: IN_PROGRESS while they run, COMMAND_CANCEL, and at most one of each MAV_CMD.
+    """Commands that take time. Sends IN_PROGRESS while they run, handles COMMAND_CANCEL, and runs one command of each
+    MAV_CMD.
 
     A repeated transmission (COMMAND_LONG with a confirmation) never executes a command twice: it is answered by
     IN_PROGRESS, or by the result if the command ended at most five seconds ago. Another command with the same MAV_CMD
-    is TEMPORARILY_REJECTED while the first one runs, as is every command above ``MAX_RUNNING_COMMANDS``.
+    is TEMPORARILY_REJECTED while the first command runs. So is every command above ``MAX_RUNNING_COMMANDS``.
     """
 
     def __init__(self, host: ServerHost, server: CommandDispatcher) -> None:

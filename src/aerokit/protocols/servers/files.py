@@ -67,7 +67,7 @@ class FileSystem(Protocol):
 
 
 class UploadedFile(FileHandle):
-    """A file that a client writes in blocks, in any order; it takes effect when it is closed."""
+    """A file that a client writes in blocks, in any order. The file takes effect when it is closed."""
 
     def __init__(self) -> None:
         self.content: bytearray = bytearray()
@@ -81,7 +81,7 @@ class UploadedFile(FileHandle):
         self.content[offset : offset + len(data)] = data
 
     def announced_size(self, data: bytes) -> int:
-        """Return the file size that the first block announces; 0 if it announces none."""
+        """Return the file size that the first block announces; 0 if it announces no size."""
         return 0
 
 
@@ -149,7 +149,7 @@ class _File:
 
     @property
     def size(self) -> int:
-        """Size in bytes; does not create the content if the size was given."""
+        """Size in bytes. The content is not created for this if the size was given."""
         return self._size if self._make is not None and self._size is not None else len(self.content)
 
 

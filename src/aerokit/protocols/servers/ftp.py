@@ -27,7 +27,7 @@ class FtpRequestServer(Generic[FilesT]):
 
     @property
     def is_enabled(self) -> bool:
-        """False to answer nothing, like a component without MAVFTP."""
+        """True normally; False to answer no request, like a component without MAVFTP."""
         return True
 
     @property
@@ -87,12 +87,12 @@ class FtpPeer:
 
 
 class SessionFtpServer(FtpRequestServer[FilesT]):
-    """MAVFTP server with several sessions for each client, and immediate answers.
+    """MAVFTP server that answers immediately, with several sessions for each client.
 
     A session is closed when its client has sent nothing for ``session_timeout_s``. A burst sends ``burst`` blocks every
     ``burst_interval_s`` seconds, and none while ``is_congested()``. A burst ends after 35 kB, and the client must
-    request the next one, so that a single request with a forged sender cannot cause a whole file to be sent. A reply
-    without file content is sent again if the request is repeated.
+    request the next burst, so that a single request with a forged sender cannot cause a whole file to be sent. If a
+    request is repeated, a reply without file content is sent again.
     """
 
     burst: int = _BURST_BLOCKS
@@ -122,7 +122,7 @@ class SessionFtpServer(FtpRequestServer[FilesT]):
         return sum(len(peer.sessions) for peer in self._peers.values())
 
     def restart(self) -> None:
-        """Drop all sessions without closing their files, as a power failure does."""
+        """Drop all sessions without closing their files, as by a power failure."""
         self._peers.clear()
 
     def close(self) -> None:
@@ -139,13 +139,15 @@ class SessionFtpServer(FtpRequestServer[FilesT]):
     def _is_repeated(self, request: FtpPacket, last: FtpPacket) -> bool:
         """Return True if the last reply answers this request.
 
-        The sequence number is not enough, because MAVProxy starts each operation with number 0.
+        Equal sequence numbers are not sufficient, because MAVProxy starts each operation with number 0.
         """
         same = request.client == last.client and request.opcode == last.request_opcode
         return same and request.sequence + 1 == last.sequence
 
     def _new_number(self, peer: FtpPeer, request: FtpPacket) -> int:
-        """Return the number for a new session: the one that the client requests, as MAVProxy does, or a free one."""
+        """Return the number for a new session: the number that the client requests (as MAVProxy does), or a free
+        number.
+        """
         if request.session and request.session not in peer.sessions:
             return request.session
         return next(number for number in range(self.max_sessions) if number not in peer.sessions)
@@ -375,7 +377,7 @@ class SessionFtpServer(FtpRequestServer[FilesT]):
             return
         with suppress(FileFault):
             file.close()
-        if peer.checksum is request:  # otherwise a newer request has replaced it
+        if peer.checksum is request:  # otherwise a newer request has replaced this one
             peer.checksum, peer.used_at = None, self._host.now
             self._reply(peer, answer)
 

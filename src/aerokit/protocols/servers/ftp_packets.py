@@ -12,7 +12,7 @@ from aerokit.protocols.servers.host import sender_of
 
 
 class FtpPacket(FtpMessage):
-    """Payload of a FILE_TRANSFER_PROTOCOL message, and its client.
+    """Payload of a FILE_TRANSFER_PROTOCOL message, and the client that the message is from or for.
 
     In a request, ``data`` always has 239 bytes.
     """

@@ -98,7 +98,7 @@ class GimbalMount:
         raise NotImplementedError
 
     def look_at(self, place: Place | None) -> None:
-        """Point at a position; None points ahead again."""
+        """Point at a position, or ahead again if it is None."""
         raise NotImplementedError
 
     def follow(self, system_id: int) -> None:
@@ -196,7 +196,7 @@ class GimbalRequests:
         return whole(device_id) in (0, self._gimbal.device_id)
 
     def configure(self, command: ReceivedCommand) -> int:
-        """Set primary (params 1, 2) and secondary control (3, 4): an id, -1 unchanged, -2 the sender, -3 release."""
+        """Set primary (params 1, 2) and secondary control (3, 4). -1 means unchanged, -2 the sender, -3 release."""
         gimbal, sender = self._gimbal, command.sender
         numbers = [command.param1, command.param2, command.param3, command.param4]
         if not self._is_mine(command.z) or not all(_RELEASE <= number <= 255 for number in numbers):
@@ -271,7 +271,7 @@ class GimbalRequests:
             self._apply_attitude(message)
 
     def on_device_attitude(self, message: m.GimbalDeviceSetAttitude, _: Channel) -> None:
-        """Apply the set-point of another manager, such as an autopilot, unless a third component is in control."""
+        """Apply the set-point of another manager, such as an autopilot, unless a different component is in control."""
         if self._gimbal.primary in ((0, 0), sender_of(message)):
             self._apply_attitude(message)
 
@@ -294,7 +294,7 @@ class GimbalRequests:
 
 
 def _owner(before: Owner, wanted: tuple[int, int], sender: Owner) -> Owner:
-    """Return the component that is in control after a pair of params of the command; (0, 0) if none."""
+    """Return the component in control after a pair of params of the command is applied; (0, 0) if none."""
     if _SENDER in wanted:
         return sender
     if _RELEASE in wanted:

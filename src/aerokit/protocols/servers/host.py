@@ -7,13 +7,13 @@ from typing import Any, Protocol
 
 from aerokit.mavlink.message import Message
 
-# The origin of a message, to which its answer is sent. Only the host knows the type.
+# The origin of a message, to which the answer is sent. Only the host knows its type.
 Channel = Any
 Handler = Callable[[Any, Channel], None]
 
 
 class ServerHost(Protocol):
-    """Interface to the component: delivers messages, sends messages, and schedules calls.
+    """Interface to the component, which delivers messages, sends messages, and schedules calls.
 
     A handler gets each message that is addressed to the component, and the channel on which it arrived. A message is
     sent to one channel, or to all if the channel is None.

@@ -61,7 +61,7 @@ class MessageStreams:
         return True
 
     def _send_stream(self, key: tuple[Channel, int], stream: _Stream) -> None:
-        if self._streams.get(key) is not stream:  # Another stream has replaced it.
+        if self._streams.get(key) is not stream:  # Another stream has replaced this one.
             return
         channel, message_id = key
         try:
@@ -84,7 +84,7 @@ class MessageStreams:
         return self.answer_with(whole(command.param1), command)
 
     def _set_interval(self, command: ReceivedCommand) -> int:
-        """Set or stop a stream. 0 (default rate) stops it as -1 does, because streams have no default rate."""
+        """Set or stop a stream. Both 0 (default rate) and -1 stop it, because streams have no default rate."""
         message_id = whole(command.param1)
         if message_id not in self.builders:
             return MavResult.DENIED

@@ -83,7 +83,7 @@ class MissionServer:
     ) -> None:
         self.lists: dict[int, tuple[MissionItem, ...]] = dict.fromkeys(_TYPES, ())
         """Maps MAV_MISSION_TYPE to items; call `replace` to change them."""
-        self._opaque_ids: dict[int, int] = {}  # Cached, because MISSION_CURRENT reports them at its stream rate.
+        self._opaque_ids: dict[int, int] = {}  # Cached, because MISSION_CURRENT, which is streamed, contains them.
         self.current: int = 0
         """Index of the current item of the mission."""
         self._host = host
@@ -130,7 +130,7 @@ class MissionServer:
             self.current = 0
 
     def set_current(self, seq: int) -> bool:
-        """Let the component continue at an item, and announce the item; return False if the component refuses."""
+        """Make the component continue its mission at an item, and announce the item; return False if it refuses."""
         if not 0 <= seq < len(self.lists[MavMissionType.MISSION]) or not self._on_set_current(seq):
             return False
         self.current = seq
@@ -256,7 +256,7 @@ class MissionServer:
             self._clear([kind], client, kind, channel)
 
     def _clear(self, kinds: list[int], client: tuple[int, int], answered: int, channel: Channel) -> None:
-        """Clear these lists one after the other, each if ``judge`` accepts it."""
+        """Clear these lists one after the other, each only if ``judge`` accepts that."""
         if not kinds:
             self._acknowledge(client, answered, _R.ACCEPTED, channel)
             return

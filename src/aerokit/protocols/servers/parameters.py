@@ -50,7 +50,7 @@ class ParameterLists:
         self._lists.clear()
 
     def start_list(self, channel: Channel) -> None:
-        """Send all parameters on a channel; restarts a running list."""
+        """Send all parameters on a channel. If the list is already being sent there, it restarts."""
         self._list_number += 1
         self._lists[channel] = number = self._list_number
         if self.starts_at_once:
@@ -121,7 +121,7 @@ class TypedStore(NamedList, Protocol):
     def type(self, name: str) -> MavParamExtType: ...
 
     def problem(self, name: str, value: SettingValue, type: int) -> tuple[int, int] | None:  # noqa: A002
-        """Return MAV_PARAM_ERROR and PARAM_ACK for a value that must not be stored; None for any other."""
+        """Return MAV_PARAM_ERROR and PARAM_ACK for a value that must not be stored; None if it may be stored."""
         ...
 
     def store(self, name: str, value: SettingValue) -> None:
@@ -130,7 +130,7 @@ class TypedStore(NamedList, Protocol):
 
 
 class TypedParameterServer(ParameterProtocolServer):
-    """PARAM server for typed parameters, which encodes values bytewise or casts them to float.
+    """PARAM server for typed parameters. It encodes values bytewise or casts them to float.
 
     A refused PARAM_SET is answered with PARAM_ERROR, and with PARAM_VALUE (the unchanged value) for clients that do not
     know PARAM_ERROR. Texts and 64-bit numbers do not fit into PARAM_VALUE, and are left out.
@@ -153,7 +153,7 @@ class TypedParameterServer(ParameterProtocolServer):
         return value_message(Parameter(name, value, type_, index=place), len(self.names), bytewise=self.bytewise)
 
     def publish(self, name: str) -> None:
-        """Send a value that has changed to all."""
+        """Send a changed value to all other programs."""
         if fits_param_value(self._store.type(name)):
             self.send(name, self.names.index(name), None)
 
@@ -175,7 +175,7 @@ class TypedParameterServer(ParameterProtocolServer):
             self.send_error(sender_of(request), name, -1, MavParamError.DOES_NOT_EXIST, channel)
             return
         value = value_of(request, bytewise=self.bytewise)
-        # The type is ignored for a cast value, because ArduPilot's clients send all values as REAL32.
+        # The type is ignored if values are cast to float, because ArduPilot's clients send all values as REAL32.
         problem = store.problem(name, value, request.param_type if self.bytewise else store.type(name))
         if problem is not None:
             self.send_error(sender_of(request), name, names.index(name), problem[0], channel)

@@ -37,9 +37,9 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
     """One camera: photos, video, lens, tracking, storage, streams (https://mavlink.io/en/services/camera.html).
 
     ``vehicle.camera`` is the first camera, ``vehicle.camera_at(number)`` any other. A camera has its own component id
-    (100 to 105), or is attached to the autopilot (1 to 6) by ArduPilot's drivers or PX4's trigger. A call that the
-    camera's reported capabilities exclude is refused before anything is sent. Cells are polled only while your program
-    uses them.
+    (100 to 105), or is attached to the autopilot (1 to 6) by ArduPilot's drivers or PX4's trigger. If the capabilities
+    that the camera has reported exclude a call, aerokit refuses the call before anything is sent. Cells are polled only
+    while your program uses them.
     """
 
     def __init__(self, link: CameraLink) -> None:
@@ -57,11 +57,11 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
         return self._link.number
 
     async def wait_found(self, *, timeout: float = 10.0) -> CameraInformation:
-        """Wait until the camera is found and has identified itself; other calls wait for that by themselves.
+        """Wait until the camera is found and has identified itself. Other calls include this wait.
 
         Raises:
             CommandRejected: the camera refused to identify itself.
-            OperationTimeout: no camera was found, or it did not identify itself: PX4's trigger never does.
+            OperationTimeout: no camera was found, or the camera did not identify itself. PX4's trigger never does.
         """
         found: CameraInformation | None = None
         with anyio.move_on_after(timeout):
@@ -73,10 +73,10 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
     async def take_photo(self, *, timeout: float = 10.0) -> Capture:
         """Take one photo; returns when the camera has reported it.
 
-        Sends MAV_CMD_IMAGE_START_CAPTURE (https://mavlink.io/en/services/camera.html), or MAV_CMD_DO_DIGICAM_CONTROL
-        to PX4's trigger and to cameras that do not support the former. The order is sent again only if the camera
-        reports afterwards that it has taken no picture and is taking none. A lost CAMERA_IMAGE_CAPTURED is requested.
-        If you cancel the call, the camera may still take the picture.
+        Sends MAV_CMD_IMAGE_START_CAPTURE (https://mavlink.io/en/services/camera.html). PX4's trigger, and cameras that
+        do not support this command, get MAV_CMD_DO_DIGICAM_CONTROL. The order is sent again only if the camera reports
+        afterwards that it has taken no picture and is taking none. A lost CAMERA_IMAGE_CAPTURED is requested again. If
+        you cancel the call, the camera may still take the picture.
 
         Args:
             timeout: seconds to wait for the report.
@@ -110,20 +110,22 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
         return PhotoInterval(self._shutter, seconds, count)
 
     def captures(self) -> list[Capture]:
-        """Return the captures received so far, ordered by index: at most the newest 20,000."""
+        """Return the newest captures received so far, at most 20,000, ordered by index."""
         return self._log.captures()
 
     async def load_captures(self, *, timeout: float = 600.0) -> list[Capture]:
-        """Return all captures in the camera's log, including earlier ones, after requesting the missing ones.
+        """Request missing captures, and return all captures in the camera's log.
 
-        The newest 20,000 at most. For a camera attached to the autopilot, only the newest capture is available. Stops
-        after three successive captures that the camera does not send.
+        These include captures from before this program started. At most the newest 20,000 are returned. A camera
+        attached to the autopilot has only the newest capture. Requests stop after three successive captures that the
+        camera does not send.
 
         Args:
-            timeout: seconds to wait for all of them; :meth:`captures` has those that arrived in time.
+            timeout: seconds to wait for all captures; :meth:`captures` returns those that arrived in time.
 
         Raises:
-            OperationTimeout: the camera did not report its count or identify itself, or it took too long.
+            OperationTimeout: the camera did not report its number of captures or identify itself, or not all captures
+                arrived in time.
         """
         count: int | None = None
         with anyio.move_on_after(timeout):
@@ -180,11 +182,11 @@ class Cameras:
         self.cell: StateCell[tuple[int, ...]] = session.connection.new_cell(
             "cameras", "HEARTBEAT or CAMERA_INFORMATION of a camera"
         )
-        # Captures of cameras attached to the autopilot, kept until the first camera is known.
+        # Captures of cameras attached to the autopilot, kept until it is known which camera is the first.
         self._early: list[tuple[int, Any]] = []
         self._first_link = CameraLink(context, components.component, None, on_bound=self._on_first_bound)
         self._first = Camera(self._first_link)
-        # True once `first` has returned `_first`, which it then always returns.
+        # True once `first` has returned `_first`: from then on it always returns the same object.
         self._is_first_in_use = False
         session.keep(self.cell)
         bus = session.connection.bus
@@ -203,7 +205,9 @@ class Cameras:
 
     @property
     def first(self) -> Camera:
-        """The camera found first, preferring low component ids; those attached to the autopilot come last."""
+        """The camera that was found first. Low component ids take precedence; cameras attached to the autopilot come
+        last.
+        """
         if not self._is_first_in_use and self._first_link.number in self._made:
             return self._made[self._first_link.number]
         self._is_first_in_use = True
@@ -233,11 +237,11 @@ class Cameras:
         self._record(message, message.camera_device_id or message.lens_id + 1)
 
     def _on_first_bound(self, number: int) -> None:
-        # Only one of two objects for the same camera publishes its events.
+        # If two objects stand for the same camera, only one of them publishes its events.
         self._first_link.is_muted = number in self._made
 
     def _on_capture(self, message: Any, device: int) -> None:
-        """Create the camera if needed, so that its capture log gets this capture, too."""
+        """Create the camera object if needed, so that its capture log also gets this first capture."""
         number = self._record(message, device)
         if number in (0, self._first_link.number, *self._made):
             return
@@ -250,14 +254,14 @@ class Cameras:
             self.at(number)._log.record(message)
 
     def _process_early(self) -> None:
-        # No camera with its own component id was discovered, so the autopilot's is the first.
+        # No camera with its own component id was discovered, so the first camera is one attached to the autopilot.
         early, self._early = self._early, []
         self._first_link.bind(early[0][0])
         for number, message in early:
             self.at(number)._log.record(message)
 
     def _record(self, message: Any, device: int) -> int:
-        """Add the sender to the cell and return its number, or 0. Only the autopilot's ``device`` is used."""
+        """Add the sender to the cell of cameras; return its number or 0. Only the autopilot's ``device`` counts."""
         frame = message.received_frame
         if frame is None:
             return 0

@@ -1,4 +1,4 @@
-"""``Capture``: one picture, decoded from one of three messages; CSV export and geotagging.
+"""``Capture``: the data of one picture, decoded from one of three messages. Also CSV export and geotagging.
 
 Pillow (``pip install aerokit-mavlink[pictures]``) writes the EXIF; the image data of the JPEG stays unchanged.
 """
@@ -36,7 +36,7 @@ Quaternion = tuple[float, float, float, float]
 # Time stamps below this (the year 1990) are not UTC: they count from the boot of the vehicle.
 SECONDS_IN_1990 = 631_152_000
 
-# End of the year 9999, the last one that datetime can represent.
+# End of the year 9999, the last year that datetime can represent.
 MAX_UTC_S = 253_402_300_799
 
 # CAMERA_FEEDBACK counts pictures in 16 bits.
@@ -49,10 +49,12 @@ MAX_PITCH_SINE = 0.99999
 class Capture(Snapshot):
     """One picture. Values that the camera did not report are None, or an empty text.
 
-    - ``camera``: 1 to 6 for a camera attached to the autopilot, otherwise its component id; ``index`` counts from 0
+    - ``camera``: 1 to 6 for a camera attached to the autopilot, otherwise its component id; ``index`` counts the
+    camera's pictures from 0
     - ``success``: False if the camera failed to take the picture; None if not reported (CAMERA_TRIGGER)
     - ``received_at``: when the message arrived, on the loop's clock; ``taken_at``: seconds since 1970
-    - ``place`` and attitude of the camera: ``quaternion`` (w, x, y, z), angles from the horizon and from north
+    - ``place``: position of the camera; ``quaternion`` (w, x, y, z) and angles from the horizon and from north: its
+    attitude
     - ``file_url``: ``mftp:///…`` on the camera itself, or ``http://…``
     """
 
@@ -106,7 +108,7 @@ def from_feedback(message: CameraFeedback, camera: int, received_at: float) -> C
 
 
 def from_trigger(message: CameraTrigger, camera: int, received_at: float, telemetry: Telemetry) -> Capture:
-    """Decode PX4's CAMERA_TRIGGER, which has no position: use position and attitude of the vehicle."""
+    """Decode PX4's CAMERA_TRIGGER. It has no position, so position and attitude of the vehicle are used."""
     position, attitude = telemetry.position.latest, telemetry.attitude.latest
     angles: tuple[float | None, float | None, float | None] = (None, None, None)
     if attitude is not None:
@@ -148,7 +150,7 @@ def _quaternion_of(roll: float | None, pitch: float | None, yaw: float | None) -
 
 
 def _euler(quaternion: Quaternion) -> tuple[float, float, float]:
-    """Convert to roll, pitch and yaw in degrees. Straight up or down, roll is 0 and yaw has all of the rotation."""
+    """Convert to roll, pitch and yaw in degrees. For a camera that points straight up or down, roll is 0."""
     length = math.sqrt(sum(value * value for value in quaternion))
     w, x, y, z = (value / length for value in quaternion)
     sine = max(-1.0, min(1.0, 2 * (w * y - z * x)))
@@ -165,7 +167,7 @@ def _euler(quaternion: Quaternion) -> tuple[float, float, float]:
 
 
 def _round(degrees: float) -> float:
-    # 32-bit floats have no more digits; adding 0.0 turns -0.0 into 0.0.
+    # Degrees from 32-bit floats have no more exact digits; adding 0.0 turns -0.0 into 0.0.
     return round(degrees, 3) + 0.0
 
 
@@ -183,7 +185,7 @@ DATE_TIME_ORIGINAL, OFFSET_TIME_ORIGINAL, CAMERA_ELEVATION_ANGLE = 0x9003, 0x901
 
 @checked
 def captures_csv(captures: Iterable[Capture]) -> str:
-    """Format captures as CSV: a header line, then a line for each capture; unknown values are empty.
+    """Format captures as CSV: a header line, then a line for each capture. Unknown values are empty fields.
 
     ``file`` is the last part of the URL, ``taken_at`` is UTC in ISO 8601, angles are in degrees from horizon and north.
     """

@@ -29,17 +29,17 @@ if TYPE_CHECKING:
 
 MAX_CAPTURES = 20_000
 FETCH_ATTEMPTS, REQUEST_TIMEOUT_S = 12, 1.0
-# PX4 may send CAMERA_IMAGE_CAPTURED, which has the position, up to this long after CAMERA_TRIGGER.
+# Maximum seconds after CAMERA_TRIGGER in which PX4 may send CAMERA_IMAGE_CAPTURED, which has the position.
 TRIGGER_GRACE_S = 0.3
 # Messages of two types with the same index within this time report the same picture.
 DUPLICATE_WINDOW_S = 10.0
-# A status that is older than the newest by less than this arrived out of order; an older one means a restart.
+# If a status is older than the newest by less than this, it arrived out of order; by more, the camera has restarted.
 REORDER_WINDOW_MS = 5000
-# Maximum difference between an index and the reported count. Above it, the camera does not count as the standard says.
+# Maximum difference between an index and the reported count. If it is larger, the count does not follow the standard.
 MAX_COUNT_LEAD = 100
 # A larger jump of the index counts as corrupt until a second picture confirms it.
 MAX_INDEX_GAP = 1000
-# An index that is lower by more than half the range has wrapped around, because CAMERA_FEEDBACK counts in 16 bits.
+# If an index is lower than the previous one by more than this, the 16-bit counter of CAMERA_FEEDBACK has wrapped.
 HALF_RANGE = FEEDBACK_INDEX_RANGE // 2
 
 
@@ -73,9 +73,9 @@ class _Entry:
 
 
 class CaptureLog:
-    """Captures by index. Of the two messages that PX4 sends for a picture, the one with the position wins.
+    """Captures by index. Of the two messages that PX4 sends for a picture, the message with the position is kept.
 
-    The log resets itself when the camera counts from 0 again, after a restart or formatting.
+    When the camera counts from 0 again, after a restart or formatting, the log resets itself.
     """
 
     def __init__(self, link: CameraLink) -> None:
@@ -120,7 +120,9 @@ class CaptureLog:
         return None if found is None else found.capture
 
     async def _request(self, index: int) -> bool:
-        """Request the capture once; return True if the camera answers that it does not have it, or only newer ones."""
+        """Request the capture once; return True if the camera answers that it has no such capture, or only newer
+        captures.
+        """
         request = self._link.requests.request
         try:
             if not self._link.is_autopilot_attached:
@@ -204,7 +206,7 @@ class CaptureLog:
             previous = None
         is_new = previous is None or previous.capture.success is False
         if previous is not None and not is_new and previous.kind in (entry.kind, m.CameraImageCaptured):
-            return  # a repetition, or CAMERA_TRIGGER after the message with the position
+            return  # a repeated message, or CAMERA_TRIGGER after the message with the position
         self._store(entry)
         self._update_highest(entry)
         if isinstance(message, m.CameraImageCaptured):

@@ -51,9 +51,11 @@ class LensMixin(CameraMixin):
     """Zoom and focus: by steps, to a value, or at a speed for the duration of a block."""
 
     async def zoom_step(self, steps: int) -> None:
-        """Zoom in by a number of the camera's own steps, out if negative (MAV_CMD_SET_CAMERA_ZOOM).
+        """Zoom in by a number of steps, or out if the number is negative (MAV_CMD_SET_CAMERA_ZOOM).
 
-        Not retried if unanswered, because the step could be made twice.
+        The camera defines the size of a step.
+
+        An unanswered command is not retried, because the step could be made twice.
 
         Args:
             steps: −100 to 100.
@@ -79,12 +81,13 @@ class LensMixin(CameraMixin):
         await self._set("zoom_to_focal_length", HAS_ZOOM, ZOOM, CameraZoomType.FOCAL_LENGTH, millimetres)
 
     def zooming(self, speed: float = 1.0) -> CameraBlock:
-        """Zoom for the duration of an ``async with`` block; the end of the block stops it, also under cancellation.
+        """Zoom for the duration of an ``async with`` block. The end of the block stops the zoom, also under
+        cancellation.
 
         Entering raises what :meth:`zoom_step` does.
 
         Args:
-            speed: −1 (out) to 1 (in); many cameras support only these two.
+            speed: −1 (out) to 1 (in); many cameras support only these two values.
 
         Raises:
             InvalidArgument: ``speed`` is out of range. Nothing was sent.
@@ -93,9 +96,11 @@ class LensMixin(CameraMixin):
         return self._continuous("zooming", HAS_ZOOM, ZOOM, CameraZoomType.CONTINUOUS, speed)
 
     async def focus_step(self, steps: int) -> None:
-        """Focus farther by a number of the camera's own steps, nearer if negative (MAV_CMD_SET_CAMERA_FOCUS).
+        """Focus farther by a number of steps, or nearer if the number is negative (MAV_CMD_SET_CAMERA_FOCUS).
 
-        Not retried if unanswered, because the step could be made twice. Raises as :meth:`zoom_step`.
+        The camera defines the size of a step.
+
+        An unanswered command is not retried, because the step could be made twice. Raises as :meth:`zoom_step`.
 
         Args:
             steps: −100 to 100.
@@ -114,19 +119,21 @@ class LensMixin(CameraMixin):
         await self._set("focus_at", HAS_FOCUS, FOCUS, SetFocusType.METERS, metres)
 
     async def auto_focus(self, kind: AutoFocus = "auto") -> None:
-        """Start the camera's auto focus: ``"auto"`` by its own rules, ``"single"`` once, ``"continuous"`` from now on.
+        """Start the auto focus: ``"single"`` focuses once, ``"continuous"`` from now on, ``"auto"`` as the camera
+        chooses.
 
         Raises as :meth:`reset_settings`, and NotSupported if the camera cannot be focused.
         """
         await self._set("auto_focus", HAS_FOCUS, FOCUS, AUTO_FOCUS_TYPES[kind], 0)
 
     def focusing(self, speed: float = 1.0) -> CameraBlock:
-        """Move the focus for the duration of an ``async with`` block; its end stops it, also under cancellation.
+        """Move the focus for the duration of an ``async with`` block. The end of the block stops it, also under
+        cancellation.
 
         Entering raises what :meth:`focus_step` does.
 
         Args:
-            speed: −1 (nearer) to 1 (farther); many cameras support only these two.
+            speed: −1 (nearer) to 1 (farther); many cameras support only these two values.
 
         Raises:
             InvalidArgument: ``speed`` is out of range. Nothing was sent.
@@ -289,7 +296,8 @@ class StorageMixin(CameraMixin):
     async def set_mode(self, mode: ModeName, *, timeout: float = 5.0) -> None:
         """Change the mode (MAV_CMD_SET_CAMERA_MODE); returns when the camera reports the new mode.
 
-        If the camera does not report its mode (CAMERA_SETTINGS), returns when it has accepted.
+        If the camera does not report its mode (CAMERA_SETTINGS), the call returns when the camera has accepted the
+        command.
 
         Args:
             mode: ``"photo"``, ``"video"`` or ``"survey"``.
@@ -335,12 +343,12 @@ class StorageMixin(CameraMixin):
         timeout: float = FORMAT_TIMEOUT_S,
         on_progress: Callable[[int | None], None] | None = None,
     ) -> None:
-        """Format a storage medium (MAV_CMD_STORAGE_FORMAT): all data on it is lost. Also clears the log of captures.
+        """Format a storage medium (MAV_CMD_STORAGE_FORMAT), which erases all data on it and clears the log of captures.
 
         Args:
             number: number of the medium, 1 to 255.
             timeout: seconds to wait for the answer, and after each progress report.
-            on_progress: called with 0–100, or None.
+            on_progress: called with the progress, 0–100 or None if unknown.
 
         Raises:
             InvalidArgument: ``number`` is out of range. Nothing was sent.

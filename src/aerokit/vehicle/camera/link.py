@@ -1,4 +1,4 @@
-"""``CameraLink``: the connection to one camera, whether it has its own component id or is attached to the autopilot."""
+"""``CameraLink``: the connection to one camera, which has its own component id or is attached to the autopilot."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ if TYPE_CHECKING:
 # A camera with a component id sends a HEARTBEAT within this time.
 DISCOVERY_TIMEOUT_S = 2.5
 
-# After a longer gap between heartbeats, another camera may use the id.
+# After more seconds than this without a heartbeat, another camera may use the component id.
 MAX_SILENCE_S = 5.0
 
 
 class CameraLink(CameraOrders):
     """One camera, addressed by component id, and by device id if it is attached to the autopilot.
 
-    Without a ``number`` it binds to the first camera that is found.
+    Without a ``number``, the link binds to the first camera that is found.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class CameraLink(CameraOrders):
         self._is_polling = False
         # Messages that the camera refused to send.
         self.unavailable: set[type[Message]] = set()
-        # Called when the camera's log of captures was cleared.
+        # Callbacks for when the camera's log of captures was cleared.
         self.on_cleared: list[Callable[[], None]] = []
         self._identifying = anyio.Lock()
         self._is_bound = anyio.Event()
@@ -118,7 +118,7 @@ class CameraLink(CameraOrders):
         return f"camera {self.number}{f' ({model})' if model else ''}"
 
     def bind(self, number: int) -> None:
-        """Bind to a camera; has no effect if bound already."""
+        """Bind to the camera with this number. Does nothing if the link is already bound."""
         if self.number is not None:
             return
         self.number = number
@@ -137,7 +137,9 @@ class CameraLink(CameraOrders):
             self._session.background.start(self.requests.run, "aerokit camera")
 
     async def identify(self) -> CameraInformation | None:
-        """Find the camera and request its information once; None if one attached to the autopilot does not send it."""
+        """Find the camera and request its information once. None: a camera attached to the autopilot sends no
+        information.
+        """
         if not self.information.is_known or self._was_silent:
             async with self._identifying:
                 if self.number is None:
@@ -164,7 +166,7 @@ class CameraLink(CameraOrders):
             raise self.timeout_error("did not identify itself")
 
     async def require_capability(self, action: str, *capabilities: str) -> None:
-        """Raise NotSupported if the camera reports its capabilities, and none of these is among them."""
+        """Raise NotSupported if the camera reports its capabilities, but none of these."""
         information = await self.identify()
         if self.is_trigger and "capture_image" not in capabilities:
             raise NotSupported(
@@ -181,7 +183,7 @@ class CameraLink(CameraOrders):
         where: Callable[[MessageT], bool] | None = None,
         timeout: float = 3.0,
     ) -> MessageT | None:
-        """Request one message; None if it does not arrive, or the camera does not support it."""
+        """Request one message; return None if it does not arrive or the camera does not support it."""
 
         def is_meant(message: MessageT) -> bool:
             return self._is_for_this_camera(message) and (where is None or where(message))
@@ -232,7 +234,7 @@ class CameraLink(CameraOrders):
             self._session.at_close(bus.attach(message_type, filtered, system_id=self._session.system_id))
 
     def _is_for_this_camera(self, message: Any) -> bool:
-        # Firmware that does not set this field sends 0, which means its first camera.
+        # Firmware that does not set this field sends 0, which stands for its first camera.
         if not self.is_autopilot_attached:
             return True
         device = getattr(message, "camera_device_id", 0) or getattr(message, "camera_id", 0)
@@ -283,7 +285,9 @@ class ActiveOperation:
         link.on_finish.append(self._finish)
 
     def commit(self, error: BaseException | None = None) -> bool:
-        """Record the result of the start; return True if it failed but the operation may run, and must be stopped."""
+        """Record the result of the start; return True if the start failed but the operation may run, so that it must be
+        stopped.
+        """
         if error is not None and (not self.order.may_move or isinstance(error, CommandRejected)):
             self.order.withdraw()
             self.discard()

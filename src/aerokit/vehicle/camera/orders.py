@@ -29,8 +29,8 @@ MessageT = TypeVar("MessageT", bound=Message)
 # Camera device ids of cameras that are attached to the autopilot and have no component id of their own.
 AUTOPILOT_CAMERA_IDS = range(1, 7)
 
-# Maximum transmissions of an order that must not be executed twice. It is sent again only if the camera reports that
-# the previous transmission had no effect.
+# Maximum number of transmissions of an order that must not be executed twice. Such an order is sent again only if the
+# camera reports that the previous transmission had no effect.
 MAX_ORDER_ATTEMPTS = 8
 
 
@@ -86,7 +86,7 @@ class CameraOrders:
 
     @property
     def on_finish(self) -> list[Callable[[], None]]:
-        """Called when the block of the vehicle ends; may send, must not wait."""
+        """Called when the block of the vehicle ends. A callback may send messages, but must not wait."""
         return self._context.on_finish
 
     def topic(self, subject: str) -> Topic:
@@ -140,9 +140,10 @@ class CameraOrders:
         send: Callable[[], Awaitable[None]],
         is_confirmed: Callable[[], Awaitable[bool | None]],
     ) -> None:
-        """Send an order that must not be executed twice; retry only if the camera reports that it had no effect.
+        """Send an order that must not be executed twice; retry only if the camera reports that the order had no effect.
 
-        ``is_confirmed`` asks the camera, and returns None if it does not answer. A newer order ends the retries.
+        ``is_confirmed`` asks the camera whether the order had an effect, and returns None without an answer. A newer
+        order ends the retries.
         """
         for attempt in range(1, MAX_ORDER_ATTEMPTS + 1):
             try:
@@ -167,7 +168,7 @@ class CameraOrders:
     async def end_operation(self, order: Order, command: int, *params: float, is_awaited: bool) -> None:
         """Send the command that ends a block at once, and retry it in the background until it is acknowledged.
 
-        Does nothing if a newer order was given. With ``is_awaited``, raises what :meth:`command` does.
+        Does nothing if a newer order was given. With ``is_awaited``, raises as :meth:`command`.
         """
         if not order.is_newest or self._session.is_closed:
             return
@@ -219,7 +220,8 @@ NUMBERED_MESSAGES = (
 # Results that are final until the next reboot; others are temporary.
 UNSUPPORTED = (MavResult.UNSUPPORTED, MavResult.DENIED)
 
-# ArduPilot answers FAILED if it does not support a message, other firmware if it cannot send it now: poll rarely.
+# ArduPilot answers FAILED if it does not support a message, other firmware if it cannot send the message now. Such a
+# message is therefore polled, but rarely.
 MAYBE_UNSUPPORTED = (*UNSUPPORTED, MavResult.FAILED)
 DOUBTFUL_POLL_INTERVAL_S = 60.0
 
@@ -238,7 +240,7 @@ class _PolledCell:
 
     @property
     def pending(self) -> bool:
-        # The cell reads this property on every access.
+        # The cell reads this property on every access, so the program is using the cell now.
         self.read_at = self._now()
         return False
 
@@ -271,7 +273,9 @@ class MessageRequests:
         where: Callable[[MessageT], bool] = lambda _: True,
         timeout: float = 3.0,
     ) -> MessageT | None:
-        """Request one message; None if it does not arrive in time, CommandRejected if it is not supported."""
+        """Request one message; return None if it does not arrive in time. CommandRejected: the camera does not support
+        it.
+        """
         refusal: CommandRejected | None = None
         if message_type not in self._legacy_types:
             try:

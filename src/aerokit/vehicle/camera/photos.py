@@ -24,13 +24,15 @@ if TYPE_CHECKING:
 START, STOP = MavCmd.IMAGE_START_CAPTURE, MavCmd.IMAGE_STOP_CAPTURE
 CONTROL, TRIGGER = MavCmd.DO_DIGICAM_CONTROL, MavCmd.DO_TRIGGER_CONTROL
 TRIGGER_INTERVAL = MavCmd.DO_SET_CAM_TRIGG_INTERVAL
-# Seconds without a capture after which a series is checked, and seconds to wait for the status.
+# Seconds without a capture after which the status of a series is requested, and seconds to wait for the status.
 CHECK_INTERVAL_S, STATUS_TIMEOUT_S = 1.0, 2.0
-# Number of status requests before an order: to a camera that has answered before, and to any other camera.
+# Number of status requests before an order: the first for a camera that has answered such a request before, the second
+# for all other cameras.
 STATUS_ATTEMPTS, FIRST_STATUS_ATTEMPTS = 8, 3
 # Maximum number of checks without a result, after which a silent series has failed.
 MAX_SILENT_CHECKS = 6
-# The camera may have taken twice as many pictures since the newest capture as its interval allows, plus this many.
+# An index counts as plausible if the camera has taken at most twice as many pictures since the newest capture as its
+# interval allows, plus this many.
 MAX_EXTRA_CAPTURES = 10
 # After this many unanswered requests in a row, the remaining gap is skipped.
 MAX_UNANSWERED = 3
@@ -75,7 +77,7 @@ class Shutter:
                 sent, error = 1, await self.order_photo(before)
                 while True:
                     while capture := new_captures.take():
-                        # The index of a failed picture may be used again.
+                        # The camera may use the index of a failed picture again.
                         is_old = before is not None and capture.index < before.image_count
                         if not is_old or capture.index not in known:
                             return self._done(capture)
@@ -86,16 +88,16 @@ class Shutter:
                     if now is None:
                         continue
                     if before is None:
-                        # The order was accepted, so the newest picture is the ordered one.
+                        # The order was accepted, so the newest picture is the one that was ordered.
                         newest = now.image_count - 1
                         is_missed = error is None and not now.is_capturing and newest >= 0 and newest not in known
                         missed = await self.log.fetch(newest) if is_missed else None
                     elif now.image_count > before.image_count:
                         missed = await self.log.fetch(before.image_count)
                     elif self.link.latest_order("series") is not series:
-                        continue  # A series was started or stopped since, so the count proves nothing.
+                        continue  # A series was started or stopped, so the count of pictures proves nothing.
                     elif error is not None and sent < MAX_ORDER_ATTEMPTS and not now.is_capturing:
-                        # The camera reports, after the order, that nothing was taken: the order was lost.
+                        # The camera reported after the order that it had taken no picture, so the order was lost.
                         sent, error = sent + 1, await self.order_photo(before, again=True)
                         continue
                     else:
@@ -112,9 +114,9 @@ class Shutter:
         return capture
 
     async def order_photo(self, before: CameraStatus | None, *, again: bool = False) -> CommandTimeout | None:
-        """Order a picture, once; return the time-out if it was not acknowledged.
+        """Send the order for a picture once; return the time-out if the order was not acknowledged.
 
-        A repeated order has the same sequence number, so that a camera does not execute it twice.
+        With ``again`` the order has the same sequence number as before, so that a camera does not execute it twice.
         """
         if not again:
             count = 0 if before is None else before.image_count
@@ -163,8 +165,8 @@ class Shutter:
 class PhotoInterval:
     """A series of photos for the duration of an ``async with`` block; an async iterator over its captures, in order.
 
-    Returned by :meth:`Camera.photo_interval`. Missed captures are requested again; ``missed`` counts those that the
-    camera did not send (ArduPilot and PX4 keep only the last one of their own cameras).
+    Returned by :meth:`Camera.photo_interval`. Missed captures are requested; ``missed`` counts those that the camera
+    did not send. ArduPilot and PX4 keep only the last capture of the cameras attached to them.
     """
 
     def __init__(self, shutter: Shutter, seconds: float, count: int) -> None:
@@ -174,9 +176,9 @@ class PhotoInterval:
         self._next: int | None = None
         self._began_at = self._log.reset_at
         self._possible_first: Capture | None = None
-        # True if no status was available: the index of the first capture is taken as the start.
+        # True if no status was available, so that the index of the first capture counts as the start.
         self._is_start_guessed = False
-        # Highest plausible index so far, and when it was received.
+        # Time at which the highest plausible index so far was received.
         self._newest_at = 0.0
         self._newest = 0
         self._unanswered = 0
@@ -288,7 +290,7 @@ class PhotoInterval:
         return 2.0 * (self._link.now() - self._newest_at) / self._seconds + MAX_EXTRA_CAPTURES
 
     def _is_plausible(self, index: int) -> bool:
-        """Return True if the series can have this index by now; one far ahead is corrupt."""
+        """Return True if the series can have reached this index by now. An index far ahead is corrupt."""
         return index <= self._newest + self._max_new_captures()
 
     def _contradicts_guess(self, index: int) -> bool:

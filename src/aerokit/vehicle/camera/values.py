@@ -69,14 +69,14 @@ class CameraInformation(Snapshot):
     gimbal_device_id: int | None
 
     def can(self, *capabilities: str) -> bool:
-        """Return True if it has one of these capabilities, or reports none at all."""
+        """Return True if the camera has one of these capabilities, or reports no capabilities at all."""
         return not self.capabilities or not self.capabilities.isdisjoint(capabilities)
 
 
 class CameraStatus(Snapshot):
     """Activity of a camera (CAMERA_CAPTURE_STATUS).
 
-    ``is_capturing``: the camera is taking a picture; ``is_in_series``: it takes one every ``interval_s`` seconds.
+    ``is_capturing``: the camera is taking a picture. ``is_in_series``: it takes a picture every ``interval_s`` seconds.
     ``recording_s`` is the duration of the video so far, None if unknown. ``image_count`` counts pictures until the
     camera's log is cleared. ``available_mib`` is the free storage, None if unknown.
     """
@@ -93,8 +93,8 @@ class CameraStatus(Snapshot):
 class CameraStorage(Snapshot):
     """One storage medium of a camera (STORAGE_INFORMATION).
 
-    ``status`` is ``"ready"``, ``"empty"`` (no medium), ``"unformatted"`` or ``"not_supported"``; sizes in MiB are None
-    unless it is ready, speeds in MiB/s are None if unknown. ``kind`` is ``"sd"``, ``"microsd"`` …
+    ``status`` is ``"ready"``, ``"empty"`` (no medium), ``"unformatted"`` or ``"not_supported"``. Sizes are in MiB, None
+    unless the medium is ready; speeds in MiB/s, None if unknown. ``kind`` is ``"sd"``, ``"microsd"`` …
     """
 
     number: int
@@ -112,9 +112,10 @@ class CameraStorage(Snapshot):
 class CameraStream(Snapshot):
     """One video stream of a camera (VIDEO_STREAM_INFORMATION, VIDEO_STREAM_STATUS).
 
-    ``number`` counts from 1. ``uri`` is its address, or for RTP over UDP the port to listen on. ``kind`` is
-    ``"rtsp"``, ``"rtpudp"``, ``"tcp_mpeg"``, ``"mpeg_ts"`` or ``"whep"``, ``encoding`` ``"h264"``, ``"h265"`` or
-    ``"unknown"``. ``bitrate`` in bits per second, ``rotation_deg`` clockwise, ``horizontal_fov_deg`` None if unknown.
+    ``number`` counts from 1. ``uri`` is the stream's address, or for RTP over UDP the port to listen on. ``kind`` is
+    ``"rtsp"``, ``"rtpudp"``, ``"tcp_mpeg"``, ``"mpeg_ts"`` or ``"whep"``; ``encoding`` is ``"h264"``, ``"h265"`` or
+    ``"unknown"``. ``bitrate`` is in bits per second, ``rotation_deg`` is clockwise, and ``horizontal_fov_deg`` is None
+    if unknown.
     """
 
     number: int
@@ -137,8 +138,8 @@ class CameraStream(Snapshot):
 class TrackingStatus(Snapshot):
     """Tracking in the image (CAMERA_TRACKING_IMAGE_STATUS); coordinates are 0 to 1 from the left and the top.
 
-    ``mode`` is ``"none"``, ``"point"`` or ``"rectangle"``; ``point`` is (x, y) and ``radius`` a part of the image
-    width, ``rectangle`` (left, top, right, bottom). ``has_failed``: the tracked object was lost.
+    ``mode`` is ``"none"``, ``"point"`` or ``"rectangle"``. ``point`` is (x, y), ``radius`` is a fraction of the image
+    width, and ``rectangle`` is (left, top, right, bottom). ``has_failed`` is True if the tracked object was lost.
     """
 
     is_active: bool
@@ -153,7 +154,7 @@ class TrackingStatus(Snapshot):
 class TrackedPlace(Snapshot):
     """Position on earth of the object that a camera tracks (CAMERA_TRACKING_GEO_STATUS); unknown values are None.
 
-    Velocities to north, east and down; ``distance_m`` from the camera; ``heading_deg`` 0 to 360 from north.
+    Velocities are north, east and down, ``distance_m`` is from the camera, and ``heading_deg`` is 0 to 360 from north.
     """
 
     is_active: bool
@@ -177,7 +178,7 @@ class ThermalRange(Snapshot):
     min_at: tuple[float, float] | None
 
 
-# Positions this close to 0, 0 mean that the vehicle did not know where it was.
+# A position this close to 0, 0 means that the vehicle did not know its position.
 MIN_COORDINATE_DEG = 0.01
 
 # Values of CAMERA_CAPTURE_STATUS.image_status.
@@ -194,7 +195,7 @@ def finite_or_none(value: T) -> T | None:
 def place_of(
     latitude_e7: int, longitude_e7: int, altitude_amsl_m: float, altitude_relative_m: float | None
 ) -> Position | None:
-    """Decode a position; None if it is invalid, or so close to 0, 0 that the sender did not know it."""
+    """Decode a position; return None if it is invalid or so close to 0, 0 that the sender did not know it."""
     latitude, longitude = latitude_e7 * 1e-7, longitude_e7 * 1e-7
     is_somewhere = abs(latitude) > MIN_COORDINATE_DEG or abs(longitude) > MIN_COORDINATE_DEG
     if not is_somewhere or abs(latitude) > 90.0 or abs(longitude) > 180.0:
@@ -273,7 +274,7 @@ def stream_of(message: m.VideoStreamInformation) -> CameraStream:
 
 
 def stream_state(message: m.VideoStreamInformation | m.VideoStreamStatus) -> dict[str, Any]:
-    """Return the fields of a CameraStream that change."""
+    """Return the fields of a CameraStream that may change while the stream runs."""
     return {
         "width_px": message.resolution_h,
         "height_px": message.resolution_v,

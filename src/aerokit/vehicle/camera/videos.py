@@ -63,7 +63,8 @@ class VideoMixin(CameraMixin):
     async def start_video(self, *, status_hz: float = 1.0, timeout: float = 5.0) -> None:
         """Start recording (MAV_CMD_VIDEO_START_CAPTURE); returns when the camera reports that it records.
 
-        If the camera does not report its status (e.g. one attached to an autopilot), returns when it has accepted.
+        If the camera does not report its status, as for example a camera attached to the autopilot, the call returns
+        when the camera has accepted the command.
 
         Args:
             status_hz: rate at which the camera sends its status while recording, 0 to 10.
@@ -104,7 +105,8 @@ class VideoMixin(CameraMixin):
             await self._wait_recording(False, timeout)
 
     def video(self, *, status_hz: float = 1.0) -> CameraBlock:
-        """Record for the duration of an ``async with`` block; its end stops recording, also under cancellation.
+        """Record for the duration of an ``async with`` block. The end of the block stops recording, also under
+        cancellation.
 
         Entering raises what :meth:`start_video` does.
 
@@ -124,7 +126,7 @@ class VideoMixin(CameraMixin):
         return (STOP, self._link.video_stream, self._link.device)
 
     async def _is_recording(self) -> bool | None:
-        if self._link.is_autopilot_attached:  # ArduPilot always reports that it does not record.
+        if self._link.is_autopilot_attached:  # ArduPilot always reports that it is not recording.
             return None
         message = await self._link.request(m.CameraCaptureStatus, timeout=1.0)
         return None if message is None else message.video_status == 1
@@ -139,11 +141,12 @@ class VideoMixin(CameraMixin):
         raise self._link.timeout_error(f"accepted the order, but {outcome} after {timeout:g} s")
 
     async def load_streams(self) -> tuple[CameraStream, ...]:
-        """Request the video streams (VIDEO_STREAM_INFORMATION), one by one if the camera does not send all at once.
+        """Request information about all video streams (VIDEO_STREAM_INFORMATION), one by one if the camera requires
+        that.
 
         Raises:
             NotSupported: the camera has no video streams. Nothing was sent.
-            OperationTimeout: not all of them arrived, or no camera was found.
+            OperationTimeout: the information about some streams did not arrive, or no camera was found.
         """
         await self._link.require_capability("load_streams", "has_video_stream")
         first = await self._link.request(m.VideoStreamInformation, 0)

@@ -21,28 +21,29 @@ if TYPE_CHECKING:
 MODE_GRACE_S = 3.0
 """Seconds by which HEARTBEAT (1 Hz) may lag behind an accepted command that changes the mode."""
 ARM_HEARTBEAT_DELAY_S = 1.5
-"""Seconds after an accepted arm command in which a HEARTBEAT (1 Hz) may still report the previous state."""
+"""Seconds after an accepted arm command in which HEARTBEAT (1 Hz) may still report the previous state."""
 MODE_MAX_AGE_S = 2.5
-"""Maximum age in seconds of a HEARTBEAT that counts as the vehicle's present state, so that two may be lost. The
+"""Maximum age in seconds of a HEARTBEAT that counts as the vehicle's present state. Two HEARTBEATs may be lost. The
 ground-station failsafes of ArduPilot and PX4 act later (FS_GCS_TIMEOUT 5 s, COM_DL_LOSS_T 10 s).
 """
 OWN_MODES_MAX_AGE_S = 10.0
 """Seconds in which a mode that the program ordered may still appear without counting as a takeover."""
 
 STEERING, ACTION = "steering", "action"
-"""Topics: STEERING of all steering orders, ACTION of steering orders that actions and raw commands give."""
+"""Topics. STEERING belongs to all steering orders, ACTION only to those given by actions and raw commands."""
 
 
 def was_armed_by_order(disarmed_at: float, accepted_at: float) -> bool:
-    """Return True if the vehicle was armed by the order that it accepted at ``accepted_at``.
+    """Return True if the order that the vehicle accepted at ``accepted_at`` has armed it.
 
-    If the vehicle reported disarmed after that, another party armed it.
+    If the vehicle reported disarmed after it accepted the order, another party has armed it since.
     """
     return disarmed_at <= accepted_at + ARM_HEARTBEAT_DELAY_S
 
 
 class CommandArbiter:
-    """Keeps the orders of one vehicle, determines the newest for each topic, and updates them with each HEARTBEAT.
+    """Keeps the orders to one vehicle, determines the newest order for each topic, and updates orders with each
+    HEARTBEAT.
 
     Every order of the program is registered here: flight actions, set-points, devices, fleets and classic scripts.
     """
@@ -99,7 +100,7 @@ class CommandArbiter:
         self._register(Order(self._now(), next(self._numbers), self._is_newest), topics)
 
     def of_device(self, topic: Topic, *, may_be_withdrawn: bool = False) -> Order:
-        """Create an order about a device. It supersedes earlier ones, which become valid again if it is withdrawn."""
+        """Create an order about a device. It supersedes earlier orders; if it is withdrawn, they become valid again."""
         order = Order(self._now(), next(self._numbers), self._is_newest, ended_by=(topic,))
         order.before = self.latest(topic) if may_be_withdrawn else None
         self._register(order, (topic,))
@@ -110,8 +111,8 @@ class CommandArbiter:
     def order(self, *modes: Mode, subjects: Iterable[Subject] = ("mode", "motion"), ends_flight: bool = False) -> Order:
         """Create a steering order that may lead to these modes.
 
-        It supersedes the previous steering order, and posted orders about these subjects. A failsafe does not end an
-        order with ``ends_flight``.
+        The new order supersedes the previous steering order, and posted orders about these subjects. With
+        ``ends_flight``, a failsafe does not end the order.
         """
         self._notify_steering()
         self._modes_ordered.extend((self._now(), mode.custom_mode) for mode in modes)
@@ -128,7 +129,9 @@ class CommandArbiter:
         return order
 
     def raw_order(self, subjects: Iterable[Subject] = ("mode", "motion"), *, modes: Collection[Mode] = ()) -> Order:
-        """Register a raw command of the program; without ``modes``, any mode that follows may be its effect."""
+        """Register a raw command of the program. Without ``modes``, any mode reported afterwards may be the command's
+        effect.
+        """
         if not modes:
             self._any_mode_until = self._now() + MODE_GRACE_S
         return self.order(*modes, subjects=subjects)
@@ -152,7 +155,8 @@ class CommandArbiter:
 
     @contextmanager
     def auxiliary_order(self, of: Order | None = None, *, ends_flight: bool = False) -> Iterator[Order]:
-        """Create an order that does not steer (speed, home, arming …), or a further one ``of`` an order to a device.
+        """Create an order that does not steer (speed, home, arming …), or a further order that belongs to the device
+        order ``of``.
 
         Raises:
             OperationRejected: a newer order to the device was given.
@@ -222,7 +226,7 @@ class CommandArbiter:
             armed=armed,
             is_done=is_done,
         )
-        if order.armed is None:  # A posted order to arm has ended the earlier ones already.
+        if order.armed is None:  # A posted order to arm has already ended earlier orders to arm.
             self._note_arming(armed)
         self._sent.append(sent)
         try:
@@ -232,12 +236,12 @@ class CommandArbiter:
             self._sent.remove(sent)
 
     def note_own_arming(self, armed: bool) -> None:
-        """Record an arm or disarm command that was sent without waiting for its acknowledgement."""
+        """Record that an arm or disarm command was sent without waiting for the acknowledgement."""
         self._note_arming(armed)
         self._note_accepted(armed)
 
     def _note_accepted(self, armed: bool | None) -> None:
-        """Record the time of an accepted arm command; HEARTBEAT may report its effect later."""
+        """Record the time at which an arm command was accepted, because HEARTBEAT reports the effect later."""
         if armed:
             self._arming_accepted_at = self._now()
 
@@ -255,8 +259,8 @@ class CommandArbiter:
     def is_flown_by_program(self) -> bool:
         """True while the vehicle is armed and executes orders of this program.
 
-        The program armed the vehicle, or has given a steering order since another party armed it; and there was no
-        takeover since.
+        The program armed the vehicle, or has given a steering order since another party armed it. Since then there was
+        no takeover.
         """
         order = self.current
         if order is not None and order.was_refused:
@@ -265,12 +269,12 @@ class CommandArbiter:
 
     @property
     def current(self) -> Order | None:
-        """The program's order since the vehicle was armed: the newest steering order, or the one that armed it."""
+        """The program's present order to the armed vehicle: the newest steering order, or the order that armed it."""
         newest = self.newest
         return newest if newest is not None and newest.given_at >= self._armed_at else self._armed_by_program
 
     def clear_failsafe(self) -> None:
-        """Ignore a failsafe that is over, or was active before the program's new order."""
+        """Ignore a failsafe that has ended, or that was already active when the program gave its new order."""
         for order in (self.newest, self._armed_by_program):
             if order is not None:
                 order.clear_failsafe()
@@ -279,8 +283,8 @@ class CommandArbiter:
     def may_be_executing(self) -> bool:
         """True while the vehicle may still execute an order of the program.
 
-        The program armed the vehicle, which was not disarmed since; or the program steers it, and there was no
-        takeover.
+        Either the program armed the vehicle, and it was not disarmed since. Or the program steers the vehicle, and
+        there was no takeover.
         """
         order, about = self.newest, self._ordered_since_disarmed
         # The effect of an order without modes, such as a raw command, is unknown.
@@ -294,10 +298,10 @@ class CommandArbiter:
 
     @contextmanager
     def changing_mode(self) -> Iterator[None]:
-        """Distrust the reported mode until the vehicle's answer is known; a cancellation or time-out leaves it
-        unknown.
+        """Distrust the reported mode until the vehicle has answered a command that changes the mode.
 
-        A refusal restores the previous doubt, because an earlier order may still take effect.
+        After a cancellation or a time-out, the mode stays in doubt. After a refusal, it is in doubt only if it was
+        before, by an earlier order that may still take effect.
         """
         was_in_doubt, self.mode_is_in_doubt = self.mode_is_in_doubt, True
         try:
@@ -334,7 +338,7 @@ class CommandArbiter:
     def _new(
         self, modes: Collection[Mode], ended_by: Sequence[Topic], expected: Collection[int], **rules: Any
     ) -> Order:
-        """Create an order that processes all reports from now on."""
+        """Create an order that processes all reports of the vehicle from now on."""
         return Order(
             self._now(),
             next(self._numbers),
@@ -349,14 +353,14 @@ class CommandArbiter:
         )
 
     def _end_flights(self, modes: Collection[Mode]) -> bool:
-        """Return True if these are modes to land or to return in."""
+        """Return True if all these modes are for landing or returning."""
         autopilot, is_vtol = self._telemetry.autopilot, self._telemetry.is_vtol
         ends = {autopilot.mode_for("land", is_vtol=is_vtol), autopilot.mode_for("return", is_vtol=is_vtol)}
         numbers = {mode.custom_mode for mode in ends if mode is not None}
         return bool(modes) and {mode.custom_mode for mode in modes} <= numbers
 
     def _posted_modes(self) -> tuple[Mode, ...]:
-        """Modes that posted orders may still lead to, including superseded orders."""
+        """Modes that posted orders, including superseded ones, may still lead to."""
         return tuple(mode for order in self._posted if not order.is_confirmed for mode in order.modes)
 
     def _steers(self) -> bool:

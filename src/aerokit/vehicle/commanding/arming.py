@@ -31,14 +31,14 @@ if TYPE_CHECKING:
 
 FORCE_REBOOT = 20190226
 PREARM_REPORT_INTERVAL_S = 35.0
-"""Seconds in which ArduPilot repeats its pre-arm failures (every 30 s)."""
+"""Seconds in which ArduPilot surely repeats its pre-arm failures, which it does every 30 s."""
 POLL_INTERVAL_S = 0.1
 """Poll interval in seconds while waiting for a reboot."""
 # MAV_STATE_BOOT and MAV_STATE_CALIBRATING.
 BOOTING = (1, 2)
 REBOOT_ANSWER_S = 3.0
 MODE_READY_TIMEOUT_S = 3.0
-"""Seconds that a vehicle may need to become armable after a mode change."""
+"""Seconds to wait after a mode change until the vehicle can arm in the new mode."""
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
@@ -54,17 +54,17 @@ class ArmingActions(VehicleBase):
     async def why_not_armable(self) -> list[str]:
         """Return the reasons why arming would be refused now; an empty list means that none is known.
 
-        Asks the vehicle to run its checks (MAV_CMD_RUN_PREARM_CHECKS) where it supports that, and collects its status
-        texts; reads SYS_STATUS and the estimator's flags (ArduPilot EKF_STATUS_REPORT, PX4 ESTIMATOR_STATUS). Takes
-        about a second and does not arm the vehicle.
+        Asks the vehicle to run its checks (MAV_CMD_RUN_PREARM_CHECKS) if it supports that, and collects its status
+        texts. Also reads SYS_STATUS and the estimator's flags (ArduPilot EKF_STATUS_REPORT, PX4 ESTIMATOR_STATUS).
+        Takes about a second and does not arm the vehicle.
         """
         return await self._health.why_not_armable()
 
     async def wait_ready(self, *, timeout: float = 90.0) -> None:
         """Wait until position and home are known, the estimator is healthy and the pre-arm checks pass.
 
-        The mode is not considered, because :meth:`arm` leaves a mode in which the vehicle cannot arm;
-        :meth:`why_not_armable` reports it.
+        The present mode does not matter, because :meth:`arm` leaves a mode in which the vehicle cannot arm.
+        :meth:`why_not_armable` reports such a mode.
 
         Raises:
             OperationTimeout: not ready within ``timeout`` seconds; the text lists what is missing, and recent status
@@ -101,19 +101,19 @@ class ArmingActions(VehicleBase):
         """Arm the motors and wait until HEARTBEAT reports armed: **propellers may start to turn**.
 
         If the present mode does not allow arming (RTL or LAND after a flight, OFFBOARD), the mode is changed first.
-        The command is sent once: a HEARTBEAT that reports disarmed may mean that a pilot has disarmed the vehicle.
-        After a cancellation, or an error other than a refusal, the command may still be executed. aerokit therefore
-        monitors the vehicle for 15 seconds, as long as the connection is open. It disarms the vehicle if this command
-        arms it: the vehicle accepts the command, or reports armed in the next HEARTBEAT without a takeover. An arming
-        that cannot be attributed to this command is left alone. Logger "aerokit" warns about the outcome.
+        The command is sent only once, because a pilot may have disarmed the vehicle since. After a cancellation, or an
+        error other than a refusal, the command may still be executed. aerokit therefore monitors the vehicle for 15
+        seconds, as long as the connection is open. If this command arms the vehicle after all, aerokit disarms it.
+        Arming is attributed to this command if the vehicle accepts it, or reports armed in the next HEARTBEAT without a
+        takeover. A vehicle that was armed otherwise stays armed. Logger "aerokit" warns about the outcome.
 
         Args:
-            mode: the mode to arm in. None: the present mode, or one that ``take_off`` starts in if the present mode
-                does not allow arming.
+            mode: the mode to arm in. None: the present mode; if it does not allow arming, the mode in which
+                ``take_off`` starts.
             force: skip the vehicle's own arming checks. Dangerous.
-            reason: why your program arms, at most 50 bytes. Logger "aerokit" reports it at INFO. A STATUSTEXT also
-                sends it to the vehicle right before the command, and ArduPilot writes it into its flight log. PX4 logs
-                only texts that have the vehicle's own system id.
+            reason: why your program arms, at most 50 bytes. Logger "aerokit" reports the reason at INFO. It is also
+                sent to the vehicle as a STATUSTEXT right before the command, and ArduPilot writes this text into its
+                flight log. PX4 logs only texts that have the vehicle's own system id.
             timeout: seconds for HEARTBEAT to report armed after the command was accepted.
             max_silence_s: raise when no heartbeat was received for this long; None: wait until ``timeout``.
 
@@ -122,8 +122,8 @@ class ArmingActions(VehicleBase):
                 sent.
             CommandRejected: the vehicle refused; ``reasons`` has its pre-arm texts, failing sensors and missing
                 estimates. A vehicle that can run its checks on request runs them again for this.
-            CommandTimeout: there was no acknowledgement, and the vehicle did not arm; the text says whether it may
-                still arm.
+            CommandTimeout: there was no acknowledgement, and the vehicle did not arm. The error text says whether it
+                may still arm.
             OperationRejected: the vehicle is armed already in a mode other than ``mode`` (nothing was sent), or another
                 party disarmed it or changed its mode meanwhile.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
@@ -209,7 +209,7 @@ class ArmingActions(VehicleBase):
     # ------------------------------------------------------------------------ where it arms
 
     def _mode_to_arm_in(self, mode: str | int | None) -> Mode | None:
-        """Return the mode to change to before arming; None if the present one allows it."""
+        """Return the mode to change to before arming; None if the present mode allows arming."""
         if mode is not None:
             wanted = self.autopilot.find_mode(mode, self.telemetry.mode_names)
             if wanted.name in self.autopilot.unarmable_modes:
@@ -241,9 +241,7 @@ class ArmingActions(VehicleBase):
             raise HeartbeatTimeout(f"arm(): {self._session.describe_link()}; the arm command was not sent")
 
     async def _wait_until_armable(self) -> None:
-        """Wait until SYS_STATUS reports whether the vehicle can arm in its new mode; PX4 sends it a few times a
-        second.
-        """
+        """Wait until SYS_STATUS, a few times a second, reports whether the vehicle can arm in its new mode."""
         sensors = self.telemetry.sensors
         with self._session.streaming("sensors"), anyio.move_on_after(MODE_READY_TIMEOUT_S):
             since = self.connection.now()
@@ -270,7 +268,7 @@ class ArmingActions(VehicleBase):
         if not force:
             self._session.check_disarmed("reboot")
         reboots = self._session.watch.reboots
-        self._session.link_watch.request_time()  # Request the time before the reboot, to compare with.
+        self._session.link_watch.request_time()  # A reboot is recognised by the time since boot before it.
         unanswered: CommandTimeout | None = None
         with self._session.watch.expecting_reboot():
             try:
@@ -285,7 +283,7 @@ class ArmingActions(VehicleBase):
         raise OperationTimeout(f"reboot: no restart within {timeout:g} s; {self._session.describe_link()}")
 
     async def _order_reboot(self, force: bool) -> None:
-        """Send the command once: if only the acknowledgement was lost, a second one would reboot the vehicle again."""
+        """Send the command once: if only its acknowledgement was lost, a second one would cause another reboot."""
         params = (1, *(0.0,) * 4, FORCE_REBOOT if force else 0)
         options: dict[str, Any] = {"attempts": 1, "attempt_timeout": REBOOT_ANSWER_S}
         await self._sender.auxiliary_command(MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, *params, **options)

@@ -29,10 +29,10 @@ logger: logging.Logger = logging.getLogger("aerokit")
 
 
 class BackgroundTask:
-    """One background task of the vehicle. A new task replaces the previous one; leaving the vehicle's block waits
-    briefly for it.
+    """Runs one background task for a vehicle. A new task replaces the previous one.
 
-    ``name`` is the task's name; ``what_it_leaves`` completes the warning if the block is left before the task is done.
+    Leaving the vehicle's block waits briefly for the task. ``name`` is the task's name; ``what_it_leaves`` completes
+    the warning if the block is left before the task is done.
     """
 
     def __init__(self, session: VehicleSession, name: str, what_it_leaves: str) -> None:
@@ -60,14 +60,14 @@ class BackgroundTask:
         self._session.background.start(run, self._name)
 
     def drop(self) -> None:
-        """Cancel the task; code that it has shielded finishes."""
+        """Cancel the task. Code of the task that is shielded from cancellation still finishes."""
         if self._scope is not None:
             self._scope.cancel()
             self._scope = None
 
     @contextmanager
     def spared(self) -> Iterator[None]:
-        """Ignore ``drop`` within the block, for orders that the task itself gives."""
+        """Ignore ``drop`` within the block, because orders that the task itself gives would cancel it."""
         scope, self._scope = self._scope, None
         try:
             yield
@@ -75,7 +75,7 @@ class BackgroundTask:
             self._scope = scope
 
     async def finish(self, within_s: float) -> None:
-        """Wait this long for the task when the vehicle's block is left; log a warning if it is not done."""
+        """Wait at most ``within_s`` for the task when the vehicle's block is left; log a warning if it is not done."""
         if self._scope is None or self._is_over is None or not self._session.connection.is_open:
             return
         if within_s:
@@ -92,20 +92,21 @@ class BackgroundTask:
 # Seconds that leaving the block waits for the acknowledgement of a hold.
 HOLD_CLOSE_TIMEOUT_S = 1.5
 
-# Number of attempts to hold a vehicle that was silent, counted from when it is received again.
+# Maximum number of attempts to hold a vehicle that was silent. Attempts count from the end of the silence.
 MAX_HOLD_ATTEMPTS = 3
 
-# Seconds to wait for the acknowledgement of a hold that was sent without waiting, and number of attempts.
+# For a hold that was sent without waiting: seconds until it is sent again if not acknowledged, and maximum number of
+# times that it is sent again.
 HOLD_ACK_TIMEOUT_S, MAX_HOLD_RESENDS = 0.5, 10
 
-# NaN means the present position, and leaves room for braking.
+# NaN means the present position. With it, the vehicle can brake instead of flying back to a point that it has passed.
 STOP_HERE = (MavCmd.DO_REPOSITION, -1, MavDoRepositionFlags.CHANGE_MODE, 0, *(math.nan,) * 4)
 
 
 class FlightCleanup:
-    """Makes the vehicle hold, when the program orders it or after an order was abandoned.
+    """Makes the vehicle hold when the program orders a hold, or after an order was abandoned.
 
-    ``stop_stream`` stops the active set-point stream, with a reason.
+    ``stop_stream(reason)`` stops the active set-point stream.
     """
 
     def __init__(self, session: VehicleSession, arbiter: CommandArbiter, sender: OrderSender) -> None:
@@ -122,7 +123,9 @@ class FlightCleanup:
         await self.stop_in(mode, self._arbiter.order(mode))
 
     async def stop_in(self, mode: Mode, order: Order) -> None:
-        """Order the vehicle to hold even if it is in the hold mode: PX4 in LOITER may be flying to a place."""
+        """Order the vehicle to hold even if it already is in the hold mode, because PX4 in LOITER may be flying to a
+        place.
+        """
         if self._holds_by_reposition:
             await self._sender.send_long(order, *STOP_HERE)
             await self._sender.ensure_mode(mode, order)
@@ -146,12 +149,13 @@ class FlightCleanup:
     # ---------------------------------------------------------------------- abandoned orders
 
     def hold_in_background(self, order: Order) -> bool:
-        """Hold after an order was abandoned, without waiting: for the ends of blocks and cancelled calls.
+        """Hold after an order was abandoned, without waiting. For use at the ends of blocks and in cancelled calls.
 
-        One command is sent at once if the last HEARTBEAT is recent, otherwise after the next HEARTBEAT, unless a
-        failsafe or a pilot has taken over by then. A background task waits for the confirmation while the connection is
-        open. Nothing is sent if the order has ended, if the vehicle is disarmed, or if another party flies the vehicle
-        and no command of the order was sent. Returns True if the command was sent, or may be sent later.
+        If the last HEARTBEAT is recent, one command is sent at once. Otherwise it is sent after the next HEARTBEAT,
+        unless a failsafe or a pilot has taken over by then. A background task waits for the confirmation while the
+        connection is open. Nothing is sent if the order has ended, if the vehicle is disarmed, or if another party
+        flies the vehicle and no command of the order was sent. Returns True if the command was sent, or may be sent
+        later.
         """
         if not order.may_move:
             return False
@@ -187,7 +191,7 @@ class FlightCleanup:
                     return
                 await self._session.wait_for_heartbeat()
                 if not order.end and not self._session.telemetry.is_confirmed_disarmed:
-                    with self._task.spared():  # This task gives the newer order itself.
+                    with self._task.spared():  # This task itself gives the newer order, which must not cancel the task.
                         order = self._arbiter.order(*order.modes, mode)
                     await self.stop_in(mode, order)
                 return
@@ -205,12 +209,14 @@ class FlightCleanup:
         return self._task.is_open
 
     async def finish(self) -> None:
-        """Wait briefly for the acknowledgement of a hold, and repeat it, when the vehicle's block is left."""
+        """Wait briefly for the acknowledgement of a hold when the vehicle's block is left. The hold is repeated
+        meanwhile.
+        """
         await self._task.finish(HOLD_CLOSE_TIMEOUT_S if self._arbiter.is_known else 0)
 
     @contextmanager
     def flying(self, order: Order) -> Iterator[None]:
-        """Hold the vehicle if its block is left while a call waits for this order."""
+        """Hold the vehicle if the vehicle's block is left while a call in this block waits for the order."""
         self._flight = order
         try:
             yield
@@ -225,7 +231,7 @@ class FlightCleanup:
 
     @contextmanager
     def preparing(self, mode: Mode) -> Iterator[Order]:
-        """Give the order for this mode before the preparation of a stream, which may wait.
+        """Give the order to change to this mode, then prepare a stream in the block. The preparation may wait.
 
         Raises:
             BusyError: another stream is open.
@@ -244,7 +250,7 @@ class FlightCleanup:
             raise
 
     def end_flights(self) -> None:
-        """End the flights of other tasks and hold the vehicle, when its block is left."""
+        """End the flights of other tasks and hold the vehicle, when the vehicle's block is left."""
         if self.stop_stream is not None:
             self.stop_stream("the block of its vehicle was left")
         if self._flight is not None:
@@ -256,12 +262,12 @@ class FlightCleanup:
 
 
 ARM_WATCH_S = 15.0
-"""Seconds for which aerokit monitors the vehicle after an abandoned arm order, to disarm it if that order arms it."""
+"""Seconds for which aerokit monitors the vehicle after an abandoned arm order, and disarms it if the order arms it."""
 
 ACK_S = 3.0
-"""Seconds after a HEARTBEAT that reports armed in which the COMMAND_ACK of the order may arrive."""
+"""Seconds after a HEARTBEAT that reports armed in which the COMMAND_ACK of the arm order may still arrive."""
 
-# Seconds that leaving the block waits for the outcome.
+# Seconds that leaving the vehicle's block waits for the outcome of an abandoned arm order.
 ARM_CLOSE_TIMEOUT_S = 1.5
 
 
@@ -313,7 +319,7 @@ class ArmCleanup:
 
     async def _disarm_again(self, order: Order, count: int, disarmed_at: float) -> None:
         """Disarm the vehicle, unless another party armed it."""
-        if self._arbiter.arming_orders != count:  # The program has sent a newer arm or disarm command itself.
+        if self._arbiter.arming_orders != count:  # The program itself has sent a newer arm or disarm command.
             return
         if not await self._has_armed(order, disarmed_at):
             logger.warning(
@@ -330,10 +336,10 @@ class ArmCleanup:
                 logger.error("an abandoned arm command has armed the vehicle, and it could not be disarmed: %s", error)
 
     async def _has_armed(self, order: Order, disarmed_at: float) -> bool:
-        """Return True if this order armed the vehicle, and not a pilot.
+        """Return True if this order, and not a pilot, has armed the vehicle.
 
-        True if the vehicle accepted the order and has not reported disarmed since. Without an acknowledgement, true if
-        the next HEARTBEAT reports armed and there was no takeover.
+        That is so if the vehicle accepted the order and has not reported disarmed since. Without an acknowledgement, it
+        is so if the next HEARTBEAT reports armed and there was no takeover.
         """
         reported_after_s = self._session.telemetry.armed.updated_at - order.given_at
         if not order.end and reported_after_s <= ARM_HEARTBEAT_DELAY_S:
@@ -347,7 +353,7 @@ class ArmCleanup:
         return was_armed_by_order(disarmed_at, accepted_at)
 
     def stop(self) -> None:
-        """Stop monitoring, because another order about arming was given."""
+        """Stop monitoring, because a newer order about arming was given."""
         self._task.drop()
 
     async def finish(self) -> None:

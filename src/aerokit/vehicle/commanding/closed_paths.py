@@ -1,4 +1,4 @@
-"""Closed paths in a plane, set-points along them, and counters of rounds by reported positions. No I/O."""
+"""Closed paths in a plane: set-points along them, and counting of rounds from reported positions. No I/O."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 ACCELERATION_M_S2 = 1.0
-"""Acceleration along the path, at its start and at its end."""
+"""Acceleration along the path at its start, and deceleration at its end."""
 MIN_SPEED_M_S = 0.1
-"""Minimum speed while slowing down, so that the set-point arrives."""
+"""Minimum speed while slowing down, so that the set-point reaches the end."""
 
 MIN_TOLERANCE_M, TOLERANCE_SHARE = 5.0, 0.3
 """Tolerance to count a vehicle as on its circle: this fraction of the radius, and at least this many metres."""
@@ -23,7 +23,10 @@ Vector = tuple[float, float]
 
 
 class ClosedPath:
-    """A closed curve around a centre. ``at(phase)`` returns a place and its first two derivatives; a round is 2π."""
+    """A closed curve around a centre, with a phase that increases by 2π each round.
+
+    ``at(phase)`` returns a place and its first two derivatives.
+    """
 
     first_phase: float = 0.0
 

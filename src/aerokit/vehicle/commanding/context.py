@@ -39,7 +39,7 @@ class VehicleContext:
         session.on_reboot.append(self.arbiter.on_reboot)
 
     async def finish(self) -> bool:
-        """Hold the vehicle if a flight was abandoned, when its block is left; return True if there was one."""
+        """When the vehicle's block is left: hold the vehicle and return True if a flight was abandoned."""
         for callback in tuple(self.on_finish):
             callback()
         self.flight_cleanup.end_flights()
@@ -67,9 +67,7 @@ class VehicleContext:
 
 
 class VehicleBase(States):
-    """Base of the classes that :class:`aerokit.Vehicle` is composed of. They share the context and do not call each
-    other.
-    """
+    """Base class of the parts of :class:`aerokit.Vehicle`. The parts share the context and do not call each other."""
 
     def __init__(self, context: VehicleContext) -> None:
         self._context, session = context, context.session

@@ -42,7 +42,7 @@ CLIMB_DETECTED_M = 0.5
 
 MODE_TIMEOUT_S = 6.0
 
-# Home is at the surface. A submarine that leaves the mode below this depth has not surfaced.
+# A submarine that leaves the surfacing mode below this depth has not surfaced. Home is at the surface.
 MAX_SURFACE_DEPTH_M = 1.5
 
 
@@ -59,8 +59,8 @@ class FlightActions(VehicleBase):
     ) -> None:
         """Take off and climb to ``altitude_m`` above home; returns at that altitude.
 
-        The vehicle must be armed. Its mode is changed if the autopilot needs that. After a cancellation or a time-out,
-        aerokit orders the vehicle to hold where it is.
+        The vehicle must be armed. If the autopilot requires another mode for a take-off, aerokit changes the mode.
+        After a cancellation or a time-out, aerokit orders the vehicle to hold where it is.
 
         Args:
             altitude_m: metres above home, above 0, at most 10,000.
@@ -70,12 +70,13 @@ class FlightActions(VehicleBase):
         Raises:
             InvalidArgument: the altitude is out of range. Nothing was sent.
             NotSupported: this type of vehicle cannot take off.
-            OperationRejected: the vehicle is not armed, is flying already, or changed its mode or disarmed meanwhile.
+            OperationRejected: the vehicle is not armed or is already flying; or its mode changed or it disarmed
+                meanwhile.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the vehicle did not reach the altitude in time, or does not move.
-            ValueUnknownError: home is not known, and PX4 needs its altitude.
+            ValueUnknownError: the altitude of home is unknown, which PX4 needs.
         """
         check_range("altitude_m", altitude_m, 0, 10_000, above=True)
         plan = self._take_off_plan(altitude_m)
@@ -83,7 +84,7 @@ class FlightActions(VehicleBase):
             raise OperationRejected("take_off: the vehicle is not armed: call arm() first; nothing was sent")
         landed = self.telemetry.landed_state
         flies = landed.latest in (MavLandedState.IN_AIR, MavLandedState.LANDING)
-        if flies and landed.age <= POSITION_MAX_AGE_S:  # A mode change alone would abort a landing.
+        if flies and landed.age <= POSITION_MAX_AGE_S:  # A mode change would abort a landing.
             raise OperationRejected(
                 f"take_off: the vehicle is already {IN_THE_AIR[landed.latest]}: use go_to() to climb; nothing was sent"
             )
@@ -105,7 +106,7 @@ class FlightActions(VehicleBase):
             raise self._with_state(error) from error
 
     def _with_state(self, error: CommandRejected) -> CommandRejected:
-        """Add the flight state to a refused take-off, because the vehicle does not report it as the reason."""
+        """Add the landed state to the error of a refused take-off, because the vehicle does not give this reason."""
         state, altitude = (
             IN_THE_AIR.get(self.telemetry.landed_state.latest),
             self._position.altitude_relative(),
@@ -137,7 +138,9 @@ class FlightActions(VehicleBase):
                 await self._sender.send_long(order, plan.command, *plan.params, modes=order.modes, is_done=is_rising)
 
     def _rises_from_here(self) -> Callable[[], bool]:
-        """Return a predicate for a climb in new messages; earlier messages may describe the previous flight."""
+        """Return a function that returns True once new messages report a climb. Earlier ones may be of the previous
+        flight.
+        """
         here, landed = self.telemetry.position.latest, self.telemetry.landed_state
         begins_at = math.nan if here is None else self._position.altitude_relative()
         state_before = landed.latest
@@ -154,7 +157,7 @@ class FlightActions(VehicleBase):
     async def _await_altitude(
         self, altitude_m: float, timeout: float, max_silence_s: float | None, order: Order
     ) -> None:
-        """Wait for the altitude, as long as the vehicle is in the take-off's mode or in the mode after it."""
+        """Wait for the altitude. Fail if the vehicle leaves the mode of the take-off and the mode that follows it."""
         enough_m = altitude_m - max(0.5, 0.05 * altitude_m)
         started = self.connection.now()
 
@@ -175,9 +178,10 @@ class FlightActions(VehicleBase):
             )
 
     async def land(self, *, timeout: float | None = 300.0, max_silence_s: float | None = MAX_SILENCE_S) -> None:
-        """Land at the present position; returns on the ground, where the motors may still be turning.
+        """Land at the present position; returns when the vehicle is on the ground.
 
-        Watch ``vehicle.armed`` for the motors. After a cancellation the vehicle continues to land.
+        The motors may still be turning then; ``vehicle.armed`` reports when they have stopped. After a cancellation the
+        vehicle continues to land.
 
         Args:
             timeout: seconds until it is on the ground; None: no limit.
@@ -205,7 +209,7 @@ class FlightActions(VehicleBase):
     async def return_to_launch(
         self, *, timeout: float | None = 600.0, max_silence_s: float | None = MAX_SILENCE_S
     ) -> None:
-        """Return to launch; returns on the ground, or above it if the autopilot does not land by itself.
+        """Return to launch; the call ends on the ground, or above it if the autopilot does not land by itself.
 
         Raises the same errors as :meth:`land`.
         """
@@ -218,7 +222,9 @@ class FlightActions(VehicleBase):
             await self._await_home(order, timeout, max_silence_s)
 
     async def _await_ground(self, what: str, order: Order, timeout: float | None, max_silence_s: float | None) -> None:
-        """Wait until messages received after the order report the ground; older messages may be wrong by now."""
+        """Wait until the vehicle is reported on the ground by messages received after the order. Older ones may be
+        outdated.
+        """
         armed, landed, mode = self.telemetry.armed, self.telemetry.landed_state, self.telemetry.mode
         accepted_at = self.connection.now()
 
@@ -283,7 +289,7 @@ class ModeActions(VehicleBase):
     async def set_mode(self, mode: str | int, *, timeout: float = 6.0) -> None:
         """Change the flight mode and wait until HEARTBEAT reports it.
 
-        Sends MAV_CMD_DO_SET_MODE, or SET_MODE to a vehicle that does not support it
+        Sends MAV_CMD_DO_SET_MODE, or SET_MODE to a vehicle that does not support the command
         (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_MODE).
 
         Args:
@@ -301,12 +307,12 @@ class ModeActions(VehicleBase):
         await self._sender.change_mode(wanted, self._arbiter.order(wanted), timeout)
 
     async def hold(self) -> None:
-        """Stop and stay (a fixed wing circles); returns when HEARTBEAT reports the autopilot's mode for that.
+        """Stop and stay (a fixed wing circles); returns when HEARTBEAT reports the autopilot's hold mode.
 
         The mode is BRAKE on Copter, LOITER on Plane and boats, HOLD on Rover, POSHOLD on Sub and LOITER on PX4.
 
         Raises:
-            NotSupported: this vehicle has no mode for it. Nothing was sent.
+            NotSupported: this vehicle has no hold mode. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             OperationRejected: a pilot or a failsafe has chosen another mode meanwhile.
             OperationTimeout: the vehicle did not acknowledge, or accepted the mode but stayed in another one.
@@ -322,8 +328,8 @@ class ModeActions(VehicleBase):
     def is_flown_by_program(self) -> bool:
         """True while the vehicle is armed and executes orders of this program.
 
-        This program armed it, or has given a steering order since another party armed it, and no pilot, failsafe or
-        other program took over since. False for a vehicle that this program only observes.
+        This program armed the vehicle, or has given a steering order since another party armed it. No pilot, failsafe
+        or other program took over since. False for a vehicle that this program only observes.
         """
         return self.telemetry.is_armed and self._arbiter.is_flown_by_program
 
@@ -331,15 +337,15 @@ class ModeActions(VehicleBase):
     def taken_over(self) -> str:
         """The takeover that ended the program's last action, as a clause; empty if there was none.
 
-        ``"the mode changed to LOITER"`` may be the work of a pilot, a failsafe or another program, because HEARTBEAT
-        does not distinguish them. ``"a failsafe became active (MAV_STATE_CRITICAL)"`` may be reported seconds before
-        the mode changes. Disarming alone, as after a landing, is not a takeover. The program's next action resets this
-        text.
+        A change of the mode (``"the mode changed to LOITER"``) may come from a pilot, a failsafe or another program:
+        HEARTBEAT does not distinguish them. A failsafe (``"a failsafe became active (MAV_STATE_CRITICAL)"``) may be
+        reported seconds before the mode changes. Disarming alone, as after a landing, is not a takeover. The program's
+        next action clears this text.
         """
         order = self._arbiter.current or self._arbiter.newest
         if order is None or not order.has_lost_mode:
             return "" if order is None else order.failsafe
         may_have_landed = self.telemetry.landed_state.latest != MavLandedState.IN_AIR
         if may_have_landed and self.telemetry.armed.updated_at < order.mode_lost_at:
-            return ""  # PX4 leaves LAND when it disarms: CURRENT_MODE reports that before HEARTBEAT does.
+            return ""  # PX4 leaves LAND on disarming, and CURRENT_MODE may arrive before HEARTBEAT.
         return order.takeover_reason

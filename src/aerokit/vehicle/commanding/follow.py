@@ -72,7 +72,7 @@ class TargetState(Snapshot):
 
 
 class FollowedTarget:
-    """Latest position and velocity of the target, reported by a vehicle or computed from two positions."""
+    """Latest position and velocity of the target. The velocity is reported, or computed from two positions."""
 
     def __init__(self, target: FollowTarget, now: Callable[[], float]) -> None:
         self._target, self._now = target, now
@@ -98,8 +98,8 @@ class FollowedTarget:
     def add(self, position: object) -> None:
         """Process a position that the program supplied. An unchanged position counts as a new report.
 
-        The velocity is computed from two different positions, because a program may be asked more often than its target
-        moves. It becomes zero when the next different position is overdue, and after a jump.
+        The velocity is computed from two different positions, because the program may report the same position several
+        times. The velocity becomes zero after a jump, and when the next different position is overdue.
 
         Raises:
             InvalidArgument: the object is not a `Position`.
@@ -202,7 +202,7 @@ class FollowStream(SteeringStream[TargetState]):
             with self._context.flight_cleanup.preparing(mode) as self._prepared_order:
                 self._value = await self._first_state()
                 self._choose_place(self._value.position)
-                self._take(self._value)  # Raises for an invalid place, before the mode changes.
+                self._take(self._value)  # Raises for an invalid place before the mode changes.
             return await super().__aenter__()
         except BaseException:
             self._stop_reading()
@@ -243,7 +243,7 @@ class FollowStream(SteeringStream[TargetState]):
         return state
 
     def _choose_place(self, target: Position) -> None:
-        """Choose the values that were not given: the present bearing from the target, and the present altitude."""
+        """Use the present bearing from the target and the present altitude where the caller gave none."""
         here = self._session.telemetry.position.fresh(POSITION_MAX_AGE_S)
         self._bearing_deg = target.bearing_to(here) if self._place.bearing_deg is None else self._place.bearing_deg
         self._course_deg = here.bearing_to(target)
@@ -265,7 +265,7 @@ class FollowStream(SteeringStream[TargetState]):
             if state is not None:
                 self._take(state)
                 self._set_at = state.at
-        # The function raises CancelledError if it returns the result of a cancelled task.
+        # The program's function raises CancelledError if it reads the result of a cancelled task.
         except (Exception, asyncio.CancelledError) as error:
             self._end_reason = f"the position of the target raised {error!r}"
         super()._tick(due)

@@ -1,4 +1,4 @@
-"""Distinguishes a landing from a fall, after which the vehicle is on the ground, too."""
+"""Distinguishes a landing from a fall. After both, the vehicle is on the ground."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ if TYPE_CHECKING:
     from aerokit.vehicle.session.session import VehicleSession
 
 FALL_EVIDENT_S = 0.5
-"""Free fall for this time exceeds ``FALL_SINK_M_S``, also with the resistance of the air."""
+"""Seconds after which a falling vehicle sinks faster than ``FALL_SINK_M_S``, even with air resistance."""
 
 IMPACT_M_S = 6.0
-"""Sink rate that no landing has right before the ground: autopilots descend at 5 m/s at most, and slow down."""
+"""Sink rate in m/s that no landing has right before touchdown. Autopilots descend at 5 m/s at most, and slow down."""
 
 STILL_M_S = 0.5
 
@@ -45,7 +45,7 @@ class ImpactDetector:
             self._impact_m_s = self._max_sink_m_s
 
     def text(self) -> str:
-        """Return the impact as a clause; empty if there was none, or the vehicle has moved up or down since."""
+        """Return the impact as a clause; empty if there was no impact, or the vehicle has moved up or down since."""
         return "" if self._impact_m_s is None else f"the vehicle hit the ground at {self._impact_m_s:.1f} m/s"
 
 
@@ -63,7 +63,7 @@ class GroundCheck:
     def confirms(self, is_reported: bool) -> bool:
         """Return True if the vehicle is reported on the ground, does not sink half a second later, and did not fall.
 
-        If no velocity is received, the report is accepted as it is.
+        If no velocity is received, the report alone counts.
         """
         now, velocity = self._session.connection.now(), self._session.telemetry.velocity
         self._impact.update()
@@ -78,7 +78,7 @@ class GroundCheck:
         return is_settled and not self._impact.text()
 
     def trouble(self, before: Callable[[], str | None]) -> str | None:
-        """Return a clause if a vehicle that is reported on the ground falls or fell; until then, ``before()``."""
+        """Return a clause if a vehicle that is reported on the ground falls or fell; otherwise ``before()``."""
         if self._reported_at is None:
             return before()
         telemetry = self._session.telemetry

@@ -1,8 +1,8 @@
 """Guided set-points, streamed at a fixed rate while a program supplies them.
 
 An autopilot stops by itself when set-points stop arriving (ArduCopter after 3 s, PX4 after 0.5 s). A library that
-resends the last set-point without limit defeats that. In aerokit, the stream ends and the vehicle is ordered to hold
-when the code that supplies set-points ends, raises, is cancelled, stops supplying them or blocks the event loop, and
+resends the last set-point without limit defeats that protection. aerokit ends the stream and orders the vehicle to hold
+when the code that supplies set-points ends, raises, is cancelled, supplies no new ones, or blocks the event loop, and
 when the vehicle falls silent.
 """
 
@@ -40,8 +40,8 @@ __all__ = ["Guided", "SetpointStream"]
 
 SetpointT = TypeVar("SetpointT")
 
-# If a position set-point restarts the path, it is sent this many times at once (one may be lost), then at this
-# interval.
+# For autopilots that restart their path at each position set-point: a new set-point is sent this many times at the
+# stream's rate, because one may be lost, and then at this interval.
 INITIAL_REPEATS, REPEAT_INTERVAL_S = 3, 5.0
 
 
@@ -51,7 +51,7 @@ class Guided:
 
     All streams have the same arguments. ``rate_hz`` (2 to 400) is the transmission rate of the latest set-point. The
     stream stops if it gets no new set-point for ``valid_for_s`` seconds, or if the event loop is late by ``max_lag_s``
-    seconds. NotSupported is raised for a kind of set-point that this type of vehicle does not support. Rates and
+    seconds. A stream raises NotSupported for a kind of set-point that this type of vehicle does not support. Rates and
     seconds are in real time: a simulation at ten times the speed needs ten times the rate.
     """
 

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from aerokit.autopilots import Mode
     from aerokit.vehicle.session.session import VehicleSession
 
-# Seconds in which status texts are collected after the vehicle was asked to run its checks.
+# Seconds in which status texts are collected after the vehicle was requested to run its checks.
 TEXTS_S = 1.0
-# Older values do not describe the present state.
+# Values older than this do not describe the present state.
 HEALTH_MAX_AGE_S = 5.0
 RC_RECEIVER = SENSORS[MavSysStatusSensor.RC_RECEIVER]
 
@@ -65,14 +65,15 @@ class Health:
         return [*heartbeats, *old, *before]
 
     async def why_not_armable(self) -> list[str]:
-        """Return why arming would be refused now; the vehicle runs its checks where it supports that."""
+        """Return why arming would be refused now. The vehicle is requested to run its checks if it supports that."""
         if self._telemetry.is_armed:
             return []
         return list(await self.arming_reasons(self._session.connection.now()))
 
     async def arming_reasons(self, since: float) -> tuple[str, ...]:
-        """Return the reasons against arming: status texts received since ``since`` (pre-arm checks are run if there
-        are none), then failing sensors and flags.
+        """Return the reasons against arming: status texts received since ``since``, then failing sensors and flags.
+
+        If there are no such texts, the vehicle is requested to run its pre-arm checks.
         """
         with self._session.streaming("sensors", "estimator"):
             await self._session.wait_for_status_texts()
@@ -86,7 +87,7 @@ class Health:
         return self._session.deduplicate_reasons(*(reason for reasons in found for reason in reasons))
 
     def unarmable_mode(self) -> list[str]:
-        """Return a list with a text if the present mode does not allow arming, otherwise an empty list."""
+        """Return a list with one text if the present mode does not allow arming, otherwise an empty list."""
         mode = self._telemetry.mode.latest
         return [self.unarmable_text(mode)] if mode is not None and mode.name in self._left_modes() else []
 
@@ -119,11 +120,13 @@ class Health:
         await anyio.sleep(TEXTS_S)
 
     def arming_texts(self, since: float) -> list[str]:
-        """Return the status texts about arming since then."""
+        """Return the status texts about arming that were received since this time."""
         return [text for text in self._session.texts_since(since) if self._autopilot.arming_reason(text) is not None]
 
     def _failing(self) -> list[str]:
-        """Return failing sensors, failing pre-arm checks, missing estimates, and a missing GPS fix as their cause."""
+        """Return failing sensors, failing pre-arm checks, missing estimates, and a missing GPS fix if it is their
+        cause.
+        """
         failing, estimator = self._failing_sensors(), self._telemetry.estimator.latest
         if estimator is None or not estimator.missing:
             return failing
@@ -136,9 +139,10 @@ class Health:
     def _failing_sensors(self) -> list[str]:
         """Return failing sensors and failing pre-arm checks.
 
-        If the vehicle reports that it can be armed, failing sensors are left out, because they are not required (PX4
-        without an RC receiver). In a mode that does not allow arming, PX4 evaluates the requirements of that mode,
-        which say nothing about arming. PX4 reports a missing receiver as failing even in modes that do not require it.
+        If the vehicle reports that it can be armed, failing sensors are left out, because they are not required (for
+        example an RC receiver on PX4). In a mode that does not allow arming, PX4 evaluates the requirements of that
+        mode, which say nothing about arming. PX4 reports a missing RC receiver as failing even in modes that do not
+        require a receiver.
         """
         failing: list[str] = []
         sensors = self._telemetry.sensors.latest

@@ -50,7 +50,8 @@ class ManeuverActions(VehicleBase):
         timeout: float | None = None,
         max_silence_s: float | None = MAX_SILENCE_S,
     ) -> None:
-        """Fly circles around a place; returns when the vehicle's reported positions have circled it ``turns`` times.
+        """Fly circles around a place; returns when the vehicle's reported positions have gone around it ``turns``
+        times.
 
         Afterwards a multicopter holds, and a fixed wing goes on circling. After a cancellation or a time-out, aerokit
         orders the vehicle to hold.
@@ -61,16 +62,16 @@ class ManeuverActions(VehicleBase):
 
         Args:
             center: the middle of the circle, at the altitude of the circle. For home, or a position without altitude,
-                the vehicle keeps its own altitude.
+                the vehicle keeps its present altitude.
             radius_m: above 0, at most 10,000. PX4's multicopters refuse more than MC_ORBIT_RAD_MAX.
             speed_m_s: ground speed, above 0, at most 50. A fixed wing ignores it.
             turns: number of turns, above 0, at most 1000. None: circle until the call is cancelled or another order is
                 given.
             clockwise: direction, as seen from above.
-            facing: direction of the nose: towards the center, ahead, as it was at the beginning, or free for the
-                autopilot to choose. A fixed wing ignores it.
+            facing: direction of the nose: towards the center, ahead, unchanged from the beginning, or chosen by the
+                autopilot. A fixed wing ignores it.
             max_distance_m: a center farther away than this many metres is refused.
-            timeout: seconds; None: no limit while heartbeats arrive, the mode stays and the vehicle moves.
+            timeout: seconds. None: no limit, as long as heartbeats arrive, the mode stays and the vehicle moves.
             max_silence_s: raise when no heartbeat was received for this long; None: no limit.
 
         Raises:
@@ -112,14 +113,14 @@ class ManeuverActions(VehicleBase):
     ) -> None:
         """Fly a figure eight; returns when the vehicle's reported positions have passed both lobes ``rounds`` times.
 
-        A PX4 fixed wing flies the figure itself (MAV_CMD_DO_FIGURE_EIGHT), as two circles and straight lines between
-        them, and goes on until another order. For ArduCopter and PX4's multicopters, aerokit streams the set-points of
-        a lemniscate, and they hold at its center at the end. Errors, cancellation and time-out are as for
+        A PX4 fixed wing flies the figure itself (MAV_CMD_DO_FIGURE_EIGHT), as two circles joined by straight lines, and
+        continues until another order. For ArduCopter and PX4's multicopters, aerokit streams the set-points of a
+        lemniscate; at the end the vehicle holds at the center. Errors, cancellation and time-out are as for
         :meth:`orbit`.
 
         Args:
-            center: the point where the lines cross, at the altitude of the figure. Without altitude, the vehicle keeps
-                its own.
+            center: the point where the lines cross, at the altitude of the figure. If it has no altitude, the vehicle
+                keeps its present altitude.
             major_radius_m: half the length of the figure, above 0, at most 10,000.
             minor_radius_m: half the width of the figure, above 0, at most half of ``major_radius_m``.
             axis_deg: direction from the center to the first lobe, 0–360 clockwise from north.
@@ -127,7 +128,7 @@ class ManeuverActions(VehicleBase):
             rounds: number of figures, a multiple of 0.5, above 0, at most 1000. None: fly until the call is cancelled.
             clockwise: direction in the first lobe, as seen from above.
             max_distance_m: a center farther away than this many metres is refused.
-            timeout: seconds; None: no limit while heartbeats arrive, the mode stays and the vehicle moves.
+            timeout: seconds. None: no limit, as long as heartbeats arrive, the mode stays and the vehicle moves.
             max_silence_s: raise when no heartbeat was received for this long; None: no limit.
         """
         from aerokit.vehicle.commanding.closed_paths import Eight, LobeCounter
@@ -184,7 +185,8 @@ class ManeuverActions(VehicleBase):
             turns: return after this many turns, above 0, at most 1000; only with ``radius_m``.
             duration_s: return this many seconds after the arrival.
             max_distance_m: a place farther away than this many metres is refused.
-            timeout: seconds in total; None: no limit while heartbeats arrive, the mode stays and the vehicle moves.
+            timeout: seconds in total. None: no limit, as long as heartbeats arrive, the mode stays and the vehicle
+                moves.
             max_silence_s: raise when no heartbeat was received for this long; None: no limit.
 
         Raises:
@@ -245,16 +247,17 @@ class ManeuverActions(VehicleBase):
             distance_m: distance along the ground to keep, 0 to 1000.
             bearing_deg: direction from the target to the vehicle, 0–360 clockwise from north. None: the direction at
                 the beginning.
-            from_course: measure ``bearing_deg`` from the target's direction of movement instead: 180 is behind it.
-            height_m: height above the target, −1000 to 1000. None: the vehicle keeps its own altitude.
+            from_course: measure ``bearing_deg`` from the target's direction of movement instead; 180 is behind the
+                target.
+            height_m: height above the target, −1000 to 1000. None: the vehicle keeps its present altitude.
             face_target: turn the nose to the target.
             valid_for_s: seconds without a new position of the target after which the vehicle holds.
             max_distance_m: distance to the target in metres above which the vehicle holds.
 
         Raises:
             InvalidArgument: an argument is out of range, or the target is the vehicle itself.
-            NotSupported: this type of vehicle has no position set-points, or it is a fixed wing, or a VTOL in forward
-                flight.
+            NotSupported: this type of vehicle has no position set-points, or the vehicle is a fixed wing or a VTOL in
+                forward flight.
         """
         from aerokit.vehicle.commanding.follow import FollowPlace, FollowStream
 
@@ -266,7 +269,7 @@ class ManeuverActions(VehicleBase):
     def _circling(
         self, what: str, radius_m: float, speed_m_s: float, facing: Facing, *, clockwise: bool
     ) -> tuple[int, tuple[float, ...], Mode]:
-        """Return the command that circles a place, its first four parameters, and its mode."""
+        """Return the command that circles a place, its first four parameters, and the mode that it leads to."""
         if self.autopilot.circles_by == "orbit":
             radius = radius_m if clockwise else -radius_m
             params: tuple[float, ...] = (radius, speed_m_s, float(YAW_BEHAVIOURS[facing]), 0.0)
@@ -287,8 +290,8 @@ class ManeuverActions(VehicleBase):
     async def transition_to(self, state: FlightState, *, timeout: float = 60.0) -> None:
         """Change a VTOL between hover and forward flight (MAV_CMD_DO_VTOL_TRANSITION).
 
-        Returns when EXTENDED_SYS_STATE reports the state, which may be at once. ArduPilot accepts the command only in
-        AUTO. A cancelled call does not stop the transition.
+        Returns when EXTENDED_SYS_STATE reports the state: at once if the vehicle is already in it. ArduPilot accepts
+        the command only in AUTO. A cancelled call does not stop the transition.
 
         Args:
             state: ``"fixed_wing"`` or ``"multicopter"``.

@@ -101,7 +101,7 @@ async def _request_missing(session: VehicleSession, rate_hz: float, ends: ExitSt
 
 
 class _StreamMonitor:
-    """Tracks whether streamed messages arrive, and whether the streams must be requested again."""
+    """Tracks whether streamed messages arrive, and decides whether the streams must be requested again."""
 
     def __init__(self, session: VehicleSession, ends: ExitStack) -> None:
         self.has_received = False
@@ -124,7 +124,7 @@ class _StreamMonitor:
             self.must_request.set()
 
 
-# ``target_system`` of a message to all systems.
+# Value of ``target_system`` in a message to all systems.
 ALL_SYSTEMS = 0
 
 ItemT = TypeVar("ItemT", bound="Message | Event")
@@ -155,22 +155,22 @@ class MessagingActions(VehicleBase):
         Args:
             command: the number, or a member of ``enums.MavCmd``.
             params: param1 to param7; missing ones are 0, or NaN where the command allows it.
-            component_id: the target component instead of the autopilot; 0: all components, and the autopilot's ack
-                counts.
+            component_id: the target component, by default the autopilot. 0: all components; the autopilot's ack counts.
             retries: maximum number of retransmissions without an ack, from 0; ``confirmation`` increments each time. A
-                command that changes something is sent again only right after a HEARTBEAT, and only if the mode has not
-                changed, no failsafe is active and there is no newer order (docs/reliability.md). None: 3 for a request
-                that changes nothing but streams, 0 for all other commands, because a lost ack would cause a second
-                execution.
-            attempt_timeout: seconds to wait for an ack after each transmission, above 0. aerokit waits for at least two
-                measured round trips. None: 1, or 4 if the command is sent only once.
+                command that changes more than streams is sent again only right after a HEARTBEAT, and only if the mode
+                has not changed, no failsafe is active and there is no newer order (docs/reliability.md). None: 3 for a
+                request for data, 0 for all other commands, because a retry after a lost ack would execute the command
+                twice.
+            attempt_timeout: seconds to wait for an ack after each transmission, above 0, extended to two measured round
+                trips if necessary. None: 1, or 4 if the command is sent only once.
             progress_timeout: seconds to wait for the next ack after each IN_PROGRESS; calibrations can take long.
-            on_progress: called with 0–100, or None, for each IN_PROGRESS.
+            on_progress: called for each IN_PROGRESS with the progress, 0–100 or None if unknown.
 
         Raises:
             InvalidArgument: a parameter is not a number or does not fit. Nothing was sent.
-            CommandRejected: any other result; ``reasons`` has the status texts received meanwhile.
-            CommandTimeout: no ack; the text has attempts, seconds, the age of the last heartbeat and the packet loss.
+            CommandRejected: the result is not ACCEPTED; ``reasons`` has the status texts received meanwhile.
+            CommandTimeout: there was no ack. The error text has the attempts, the seconds, the age of the last
+                heartbeat and the packet loss.
         """
         return await self._sender.answered(
             self._session.commands.send_long,
@@ -201,8 +201,8 @@ class MessagingActions(VehicleBase):
         """Send any MAV_CMD as COMMAND_INT: param1 to param4, ``x``, ``y``, ``z`` in ``frame`` (MAV_FRAME).
 
         ``x`` and ``y`` are latitude and longitude in 1e-7 degrees, or 1e-4 m in local frames; ``z`` is in metres. With
-        ``or_long``, firmware that does not support the command as COMMAND_INT gets a COMMAND_LONG with degrees; this
-        requires frame 0. Other arguments and errors are those of :meth:`command`.
+        ``or_long``, firmware that does not support the command as COMMAND_INT gets a COMMAND_LONG with degrees;
+        ``frame`` must then be 0. Other arguments and errors are those of :meth:`command`.
         """
         if or_long and frame != MavFrame.GLOBAL:
             raise InvalidArgument(f"frame = {frame} is not allowed with or_long: MAV_FRAME_GLOBAL (0)")
@@ -225,7 +225,7 @@ class MessagingActions(VehicleBase):
     def send(self, message: Message) -> None:
         """Send one message unchanged, once; never blocks. The caller sets its ``target_system``.
 
-        A steering command or SET_MODE is an order, and ends the action in progress, as with :meth:`command`. A
+        A steering command or a SET_MODE counts as an order and ends the action in progress, like :meth:`command`. A
         set-point supersedes :meth:`posted` orders about motion. A message to another system has neither effect.
 
         Raises:
@@ -260,20 +260,20 @@ class MessagingActions(VehicleBase):
         """Open an order without waiting for its effect, so that mode, arming and take-off can be sent in one go.
 
         Within the block, the order's commands are sent again right after a HEARTBEAT, until they are acknowledged or
-        their effect is reported. Retries end with a newer order about the same subject; with a mode that neither this
-        order nor another order of the last ten seconds explains; and, for orders about motion, with disarming. An
-        abandoned posted order does not make the vehicle hold, and late arming is not monitored; use the actions for
+        their effect is reported. A newer order about the same subject ends the retries. So does a mode that neither
+        this order nor another order of the last ten seconds explains, and disarming if the order is about motion. If a
+        posted order is abandoned, aerokit neither makes the vehicle hold nor monitors late arming; use the actions for
         that.
 
         Args:
-            subjects: ``"mode"``, ``"motion"`` or ``"arm"``. A newer order about the first subject ends this order; this
-                order ends earlier ones about any of its subjects. An order about mode or motion also ends the action in
-                progress.
+            subjects: ``"mode"``, ``"motion"`` or ``"arm"``. A newer order about the first subject ends this order. This
+                order ends earlier orders about any of its subjects. An order about mode or motion also ends the action
+                in progress.
             modes: the modes that the order leads to.
             armed: True if the order arms the vehicle, False if it disarms it; required for ``"arm"``.
 
         Raises:
-            InvalidArgument: no subject, or ``"arm"`` without ``armed``. Nothing was sent.
+            InvalidArgument: there is no subject, or ``"arm"`` was given without ``armed``. Nothing was sent.
         """
         if not subjects:
             raise InvalidArgument("posted: subjects are missing: pass 'mode', 'motion' or 'arm'")
@@ -296,10 +296,10 @@ class MessagingActions(VehicleBase):
     ) -> Subscription[ItemT]:
         """Return a stream of messages or events of this vehicle, for use in a ``with`` block.
 
-        ``capacity=1`` keeps only the latest message; ``missed`` counts the dropped ones. For the duration of the block,
-        aerokit requests these messages from the autopilot at ``rate_hz`` (above 0, at most 1000), or faster if another
-        subscriber needs it. None requests the default rate of streamed messages; messages sent on demand (HEARTBEAT,
-        STATUSTEXT, acks) are not requested. For a camera or another component use
+        ``capacity=1`` keeps only the latest message; ``missed`` counts the dropped messages. For the duration of the
+        block, aerokit requests these messages from the autopilot at ``rate_hz`` (above 0, at most 1000), or faster if
+        another subscriber needs it. None requests the default rate of streamed messages; messages sent on demand
+        (HEARTBEAT, STATUSTEXT, acks) are not requested. For a camera or another component use
         ``vehicle.component(100).subscribe(...)``.
 
         Raises:
@@ -320,10 +320,10 @@ class MessagingActions(VehicleBase):
     def streams(self, rate_hz: float) -> Iterator[None]:
         """Request all streams of the vehicle at ``rate_hz`` for the duration of the ``with`` block.
 
-        For recordings, ground stations, and firmware without rates of single messages. ArduPilot receives
-        REQUEST_DATA_STREAM (whole Hz, at least 1), again after a reboot or a silence and while nothing arrives; it
-        continues to stream after the block. Other autopilots stream by themselves; missing common states are requested
-        as by :meth:`rate`.
+        For recordings, ground stations, and firmware that cannot set the rate of a single message. ArduPilot receives
+        REQUEST_DATA_STREAM (whole Hz, at least 1). aerokit repeats it after a reboot or a silence, and while no message
+        arrives. ArduPilot continues to stream after the block. Other autopilots stream by themselves; aerokit requests
+        common states that are missing, like :meth:`rate`.
 
         Raises:
             InvalidArgument: the rate is not above 0 and at most 1000. Nothing was sent.
@@ -336,9 +336,9 @@ class MessagingActions(VehicleBase):
     def message(self, message_type: type[MessageT], *, rate_hz: float | None = None) -> StateCell[MessageT]:
         """Return the cell with the latest message of a type: ``vehicle.message(messages.RawImu).value.xacc``.
 
-        The first call requests it at ``rate_hz`` (None: the default rate of a streamed message) for the lifetime of
-        the vehicle object; later calls return the same cell and may change the rate. Only messages of the autopilot
-        count; use ``vehicle.component(100).message(...)`` for a camera or another component.
+        The first call requests the message at ``rate_hz`` (None: the default rate of a streamed message) for the
+        lifetime of the vehicle object. Later calls return the same cell and may change the rate. Only messages of the
+        autopilot count; use ``vehicle.component(100).message(...)`` for a camera or another component.
 
         Raises:
             InvalidArgument: the rate is out of range, or the dialect does not contain the message.

@@ -1,4 +1,5 @@
-"""Orders of this program to one vehicle: their validity, and whether their commands may be sent again.
+"""Orders of this program to one vehicle: tracks whether they are still valid, and whether their commands may be
+repeated.
 
 docs/reliability.md has the table of all orders. Only commands listed there are sent again.
 """
@@ -27,7 +28,7 @@ ROI: Topic = "region of interest"
 """Topic of orders that point the autopilot's gimbal, or the nose, at a place."""
 
 SUPERSEDED = "another order was given"
-"""End reason of an order that a newer one replaced."""
+"""Reason for the end of an order that a newer order replaced."""
 
 _MODE: tuple[Subject, ...] = ("mode", "motion")
 _MOTION: tuple[Subject, ...] = ("motion",)
@@ -60,8 +61,8 @@ CHANGED_BY_MESSAGE: Mapping[str, tuple[Subject, ...]] = {
     "MISSION_SET_CURRENT": _MOTION,
 }
 FAILSAFE_STATES = (MavState.CRITICAL, MavState.EMERGENCY, MavState.FLIGHT_TERMINATION)
-"""HEARTBEAT.system_status values while a failsafe is active. PX4 reports them seconds before the failsafe changes the
-mode (COM_FAIL_ACT_T), and an order that arrives in that time cancels the failsafe.
+"""Values of HEARTBEAT.system_status while a failsafe is active. PX4 reports them seconds before the failsafe changes
+the mode (COM_FAIL_ACT_T). An order that arrives in between cancels the failsafe.
 """
 # Values of MISSION_ITEM.current for an item that the vehicle flies to at once.
 GUIDED_ITEM = (2, 3)
@@ -80,11 +81,11 @@ REQUEST_COMMANDS = frozenset(
         MavCmd.REQUEST_FLIGHT_INFORMATION,
     )
 )
-"""MAV_CMDs that only request data. They change nothing but streams, so they may be repeated until acknowledged."""
+"""MAV_CMDs that only request data. They change only streams, so they may be repeated until acknowledged."""
 
 
 def subjects_of(message: Message) -> tuple[Subject, ...]:
-    """Return the subjects that this message changes when the program sends it itself."""
+    """Return the subjects that this message changes if the program sends it directly."""
     fields: Any = message
     if message.NAME in ("COMMAND_LONG", "COMMAND_INT"):
         return CHANGED_BY_COMMAND.get(fields.command, ())
@@ -94,7 +95,7 @@ def subjects_of(message: Message) -> tuple[Subject, ...]:
 
 
 def is_worse(state: int, before: int | None) -> bool:
-    """Return True if this MAV_STATE reports a failsafe, and the previous one reported none or a less severe one."""
+    """Return True if this MAV_STATE reports a failsafe, and the previous MAV_STATE none or a less severe failsafe."""
     is_first = before is None or before not in FAILSAFE_STATES
     return state in FAILSAFE_STATES and (is_first or state > (before or 0))
 
@@ -108,17 +109,17 @@ def failsafe_text(state: int) -> str:
 class Order:
     """One order of this program, from its creation until it is done, superseded or taken over.
 
-    A newer order about any topic in ``ended_by`` supersedes this one. The arbiter updates the order with each
-    HEARTBEAT; an unexpected mode, a failsafe, disarming or a reboot ends it. It does not become valid again, even if
-    the mode comes back.
+    A newer order about any topic in ``ended_by`` supersedes this order. The arbiter updates the order with each
+    HEARTBEAT: an unexpected mode, a failsafe, disarming or a reboot ends the order. An order that has ended does not
+    become valid again, even if its mode is reported again.
 
     Modes are classified as follows:
 
     - ``mode_before`` was active when the order was given.
     - ``modes`` are the order's own modes.
-    - ``expected`` modes may appear, in any sequence until ``settles_at``, because the program ordered them shortly
-      before. After a report of an own mode they are no longer accepted; with ``requires_mode_change``, that report must
-      differ from the previous mode.
+    - ``expected`` modes may appear in any sequence until ``settles_at``, because the program ordered them shortly
+    before. Once one of the order's own modes is reported, they are no longer accepted. With ``requires_mode_change``,
+    that own mode must differ from the previous mode.
     - Until ``any_until`` every mode is accepted, because the program sent a raw command with an unknown effect.
     - Any other mode is attributed to the pilot or a failsafe.
     """
@@ -199,19 +200,19 @@ class Order:
         return self.takeover_reason or ("" if self._ends_flight else self.failsafe)
 
     def is_own(self, mode: Mode) -> bool:
-        """Return True if the order itself may bring about this mode."""
+        """Return True if this mode may be the effect of the order itself."""
         return mode.custom_mode in self._own
 
     def expect(self, modes: Collection[Mode]) -> None:
-        """Accept these modes as well, because another order of the program brings them about."""
+        """Also accept these modes, because they may be the effect of another order of the program."""
         self._own |= {mode.custom_mode for mode in modes}
 
     def withdraw(self) -> None:
-        """Cancel the order after a refusal or a missing ack: the previous order about the device is valid again."""
+        """Cancel the order after a refusal or a missing ack; the device's previous order becomes valid again."""
         self.is_withdrawn = True
 
     def commit(self) -> None:
-        """Make the order final: it can no longer be withdrawn."""
+        """Make the order final, so that it can no longer be withdrawn."""
         self.before = None
 
     def close(self) -> None:
@@ -246,9 +247,9 @@ class Order:
         self._mode_now = number
 
     def on_system_status(self, state: int) -> None:
-        """Process MAV_STATE. A failsafe that was active before the order does not end it: the program knew about it.
+        """Process MAV_STATE. A failsafe that was already active when the program gave the order does not end the order.
 
-        No failsafe ends an order to land, to return or to disarm.
+        An order to land, to return or to disarm is not ended by any failsafe.
         """
         if is_worse(state, self._state_before):
             self.failsafe = self.failsafe or failsafe_text(state)
@@ -268,10 +269,10 @@ class Order:
 
 
 class SentCommand:
-    """One command of an order after its first transmission, which decides about retransmissions.
+    """One command of an order after its first transmission. Decides whether the command may be sent again.
 
     The command may be sent again while the vehicle has reported neither the command's effect nor an action of another
-    party. A change to one of ``modes``, or to ``armed``, is the effect; ``is_done`` reports any other effect.
+    party. The effect is a change to one of ``modes`` or to ``armed``; ``is_done`` reports any other effect.
     """
 
     def __init__(
@@ -310,7 +311,7 @@ class SentCommand:
         return self.order.end or (SUPERSEDED if self._is_overruled else "") or self.order.unexplained
 
     def on_newer_command(self, armed: bool | None) -> None:
-        """Process a newer command: arming supersedes disarming and vice versa."""
+        """Process a newer command of the program: arming supersedes disarming, and disarming supersedes arming."""
         if armed is not None and self.arms is not None and armed is not self.arms:
             self._is_overruled = True
 

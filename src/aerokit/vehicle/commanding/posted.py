@@ -1,4 +1,4 @@
-"""`PostedOrder`: an order whose effect need not be awaited, so that the next one can be given at once."""
+"""`PostedOrder`: an order whose effect need not be awaited, so that the next order can be given at once."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class PostedOrder:
         return "its effect was reported" if self._order.is_confirmed else self._order.end or self._order.unexplained
 
     async def command(self, command: int, *params: float, component_id: int | None = None) -> None:
-        """Send a COMMAND_LONG of this order; returns at the acknowledgement, or when the order's effect is reported.
+        """Send a COMMAND_LONG of this order. Returns at the acknowledgement, or when the order's effect is reported.
 
         The command is not sent again after a newer order about the same subject, or after another party changed the
         mode.
@@ -62,8 +62,7 @@ class PostedOrder:
         Args:
             command: the MAV_CMD.
             params: param1 to param7; missing ones are 0.
-            component_id: the target component instead of the autopilot; 0: all components, and the autopilot's ack
-                counts.
+            component_id: the target component, by default the autopilot. 0: all components; the autopilot's ack counts.
 
         Raises:
             InvalidArgument: a parameter is not a number or does not fit, or the block was left. Nothing was sent.
@@ -85,7 +84,7 @@ class PostedOrder:
     ) -> None:
         """Send a COMMAND_INT: param1 to param4, ``x`` and ``y`` in 1e-7 degrees, ``z`` in metres in ``frame``.
 
-        All else as for :meth:`command`.
+        Otherwise works like :meth:`command`.
         """
         place: dict[str, Any] = {"frame": frame, "x": x, "y": y, "z": z}
         await self._give(self._session.commands.send_int, command, *params, component_id=component_id, **place)
@@ -93,7 +92,7 @@ class PostedOrder:
     async def set_mode(self, mode: Mode, *, timeout: float = 5.0, component_id: int | None = None) -> None:
         """Order a mode and wait until HEARTBEAT reports the order's effect.
 
-        Sends MAV_CMD_DO_SET_MODE, or SET_MODE to a vehicle that does not support it. If the vehicle answers
+        Sends MAV_CMD_DO_SET_MODE, or SET_MODE to a vehicle that does not support the command. If the vehicle answers
         TEMPORARILY_REJECTED, as PX4 does while it checks a mission, the command is sent again after a HEARTBEAT that
         confirms that the order is still valid.
 
@@ -139,10 +138,10 @@ class PostedOrder:
         return False
 
     async def wait_confirmed(self, timeout: float) -> None:
-        """Wait until HEARTBEAT reports the order's effect, which may be at once.
+        """Wait until HEARTBEAT reports the order's effect. Returns at once if it is already reported.
 
         Raises:
-            CommandRejected: the vehicle first accepted and then refused, as PX4 may do.
+            CommandRejected: the vehicle first accepted and then refused the command, as PX4 may do.
             OperationTimeout: the effect was not reported within ``timeout`` seconds.
         """
         await self._sender.await_effect(
@@ -169,7 +168,7 @@ class PostedOrder:
         await self._sender.run_command(order, send, command, *params, modes=order.modes, armed=order.armed, **options)
 
     def _prepare(self, command: int) -> None:
-        """Prepare to send: collect later refusals of this command as well."""
+        """Prepare to send a command: from now on, collect refusals that follow an acceptance of it."""
         if self._is_over:
             raise InvalidArgument(f"the block of this order was left: {command_name(command)} was not sent")
         self._ends.close()

@@ -1,4 +1,4 @@
-"""Waits for operations in progress, and fails as soon as they can no longer succeed."""
+"""Waits for the end of operations, and fails as soon as an operation can no longer succeed."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.session.session import VehicleSession
 
 POLL_INTERVAL_S = 0.25
-"""Poll interval in seconds, because no message arrives during a silence."""
+"""Seconds between evaluations of the state when no message arrives, as during a silence of the vehicle."""
 
 MAX_SILENCE_S = 10.0
 
@@ -36,7 +36,7 @@ FALL_EVIDENT_S = 0.5
 """After falling for this time, a vehicle sinks faster than ``FALL_SINK_M_S``, even with air resistance."""
 
 FALL_STOP_S = 1.5
-"""A fast descent that ends within this time is a fall, if the vehicle then stands still on the ground."""
+"""Maximum seconds from a fast descent to a standstill on the ground that together count as a fall."""
 
 
 async def await_progress(
@@ -51,8 +51,9 @@ async def await_progress(
     held_for: float = 0.0,
     stillness: Callable[[], str | None] | None = None,
 ) -> None:
-    """Return when ``is_done()`` has been true for ``held_for`` seconds; evaluated whenever the vehicle's state
-    changes.
+    """Return when ``is_done()`` has been true for ``held_for`` seconds.
+
+    All functions are called whenever the vehicle's state changes.
 
     Raises:
         OperationRejected: ``trouble()`` returned a reason why the operation cannot succeed.
@@ -115,7 +116,8 @@ class ChangeSignal:
     async def next(self, at_most_s: float) -> None:
         """Wait for the next change, at most this many seconds."""
         self._changed.clear()
-        # No cancel scope: on Python 3.10 an expiring one swallows a cancellation of the same loop iteration.
+        # No cancel scope is used, because on Python 3.10 an expiring scope swallows a cancellation in the same
+        # iteration of the event loop.
         tick = asyncio.get_running_loop().call_later(at_most_s, self._changed.set)
         try:
             await self._changed.wait()
@@ -126,11 +128,11 @@ class ChangeSignal:
 class StallDetector:
     """Detects that a vehicle does not move although it has accepted an order to move.
 
-    It reports nothing without positions, nor before ``STALL_TIMEOUT_S`` seconds, because a vehicle may turn or spool
-    up.
+    The detector reports nothing without positions. It waits for ``STALL_TIMEOUT_S`` seconds, because a vehicle may
+    first turn or spool up.
     """
 
-    # Set together with _from.
+    # Time at which _from was set.
     _since: float
 
     def __init__(self, session: VehicleSession) -> None:
@@ -141,11 +143,13 @@ class StallDetector:
 
     @property
     def follows_fast_descent(self) -> bool:
-        """True if the vehicle stands still, and was sinking at ``FALL_SINK_M_S`` or faster right before."""
+        """True if the vehicle stands still, and sank at ``FALL_SINK_M_S`` or faster right before that."""
         return self._from is not None and self._since - self._fast_at <= FALL_STOP_S
 
     def __call__(self, timeout_s: float = STALL_TIMEOUT_S) -> str | None:
-        """Return a clause about how long the vehicle has not moved; None if it moves or its position is unknown."""
+        """Return a clause with the time for which the vehicle has not moved; None if it moves or its position is
+        unknown.
+        """
         now, cell = self._session.connection.now(), self._session.telemetry.position
         here = cell.latest
         if here is None or cell.age > POSITION_MAX_AGE_S:
@@ -166,7 +170,7 @@ class StallDetector:
             self._fast_at = self._since
 
     def _reason(self, here: Position) -> str:
-        """Return a fast descent before the standstill, as a clause; empty if there was none."""
+        """Return a clause about a fast descent before the standstill; empty if there was none."""
         height_m = here.altitude_relative_m
         if height_m is None or self._max_sink_m_s < FALL_SINK_M_S or self._top_m - height_m <= 1.0:
             return ""
@@ -178,15 +182,16 @@ def _metres(one: Position, other: Position) -> float:
 
 
 METRES_PER_DEGREE = 112_000
-"""Upper limit for one degree of latitude, or of longitude at the equator."""
+"""Upper limit in metres for one degree of latitude, or of longitude at the equator."""
 
 MAX_DISTANCE_M = 100_000.0
-"""A place farther away is treated as a mistake (swapped coordinates, a lost sign) unless the caller raises the limit.
+"""A place farther away than this is treated as a mistake (swapped coordinates, a lost sign), unless the caller raises
+the limit.
 """
 
 
 CIRCLE_MARGIN = 1.3
-"""Multiple of the ordered radius within which the vehicle counts as on its circle."""
+"""A vehicle that is within this multiple of the ordered radius counts as on its circle."""
 
 
 class VehiclePosition:
@@ -198,12 +203,14 @@ class VehiclePosition:
         session.telemetry.mode.observe(lambda *_: self.note_circle(0.0))
 
     def note_circle(self, radius_m: float) -> None:
-        """Record the radius that was ordered: ArduPlane keeps it for the next place, until it leaves GUIDED."""
+        """Record the ordered radius. ArduPlane keeps this radius for further places until it leaves GUIDED."""
         self._circle_m = radius_m
 
     @property
     def arrival_radius_m(self) -> float:
-        """Distance in metres at which the vehicle counts as arrived; includes the circle that it was ordered to fly."""
+        """Distance in metres at which the vehicle counts as arrived. It includes the circle that the vehicle was
+        ordered to fly.
+        """
         return max(self._autopilot.arrival_radius_m, CIRCLE_MARGIN * self._circle_m)
 
     def distance_to(self, target: Position) -> float:
@@ -220,9 +227,10 @@ class VehiclePosition:
     def check_reach(
         self, name: str, places: Iterable[Position | None], max_distance_m: float, *, are_items: bool = False
     ) -> None:
-        """Raise InvalidArgument for a place farther away than the limit; accept all while the position is unknown.
+        """Raise InvalidArgument for a place farther away than the limit; accept all places while the position is
+        unknown.
 
-        With ``are_items`` the places are those of the items of a plan, None for an item without one.
+        With ``are_items``, ``places`` has one entry for each item of a plan: None for an item without a place.
         """
         check_range("max_distance_m", max_distance_m, 0, math.inf, above=True)
         here = self._telemetry.position.latest
@@ -232,7 +240,7 @@ class VehiclePosition:
             if place is None:
                 continue
             degrees = abs(place.latitude_deg - here.latitude_deg) + abs(place.longitude_deg - here.longitude_deg)
-            if degrees * METRES_PER_DEGREE < max_distance_m:  # Missions have thousands of nearby places.
+            if degrees * METRES_PER_DEGREE < max_distance_m:  # Missions may have thousands of nearby places.
                 continue
             distance_m = self.distance_to(place)
             if distance_m > max_distance_m:
@@ -244,14 +252,16 @@ class VehiclePosition:
                 )
 
     def remaining_distance(self, target: Position) -> float:
-        """Return the remaining distance. Only horizontal for ground vehicles, whose altitude has no fixed origin."""
+        """Return the remaining distance. For ground vehicles it is horizontal, because their altitude has no fixed
+        origin.
+        """
         if self._autopilot.is_surface_vehicle:
             return self.distance_to(Position(target.latitude_deg, target.longitude_deg))
         return self.distance_to(target)
 
     @staticmethod
     def height_above(here: Position, target: Position) -> float:
-        """Return how much higher the first place is; 0 if that is not known."""
+        """Return how many metres ``here`` is above ``target``; 0 if that is unknown."""
         for mine, its in (
             (here.altitude_relative_m, target.altitude_relative_m),
             (here.altitude_amsl_m, target.altitude_amsl_m),
@@ -261,7 +271,7 @@ class VehiclePosition:
         return 0.0
 
     def is_known_since(self, started: float) -> bool:
-        """Return True if a position was received since then and is recent."""
+        """Return True if a recent position was received since this time."""
         position = self._telemetry.position
         return position.updated_at >= started and position.age <= POSITION_MAX_AGE_S
 
@@ -276,7 +286,7 @@ class VehiclePosition:
         return self._telemetry.home.value.altitude_amsl_m
 
     def global_target(self, target: Position) -> tuple[int, int, float, MavFrame]:
-        """Return latitude and longitude in 1e-7 degrees, altitude in metres, and the frame that the altitude is in.
+        """Return latitude and longitude in 1e-7 degrees, the altitude in metres, and the frame of the altitude.
 
         The frame is MAV_FRAME_GLOBAL_RELATIVE_ALT_INT or MAV_FRAME_GLOBAL_INT.
 

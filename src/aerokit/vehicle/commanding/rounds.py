@@ -1,4 +1,4 @@
-"""`RoundFlight`: flies around a place, by a firmware command or by set-points, and counts the rounds."""
+"""`RoundFlight`: flies around a place by a command to the firmware or by set-points, and counts the rounds."""
 
 from __future__ import annotations
 
@@ -27,9 +27,11 @@ if TYPE_CHECKING:
 
 SETPOINT_INTERVAL_S, SETPOINT_RATE_HZ, VALID_FOR_S = 0.1, 20.0, 1.0
 RADIUS_ERROR_M, CIRCLE_REPORT_S = 0.5, 2.0
-"""Deviation from which the radius counts as wrong, and seconds for which PX4 may still report the previous circle."""
+"""Deviation in metres from which a reported radius counts as wrong, and seconds in which PX4 may still report the
+previous circle.
+"""
 LAG_ROUNDS = 0.02
-"""Fraction of a round that the count may lack although the vehicle is at the end of its path."""
+"""Fraction of a round by which the count may lag although the vehicle is at the end of its path."""
 END_TIMEOUT_S = 15.0
 """Seconds to reach the end of a path after its last set-point."""
 FRAME_TIMEOUT_S = 5.0
@@ -37,7 +39,8 @@ FRAME_TIMEOUT_S = 5.0
 
 
 class RoundFlight:
-    """One flight around a place, or to it if there is no ``counter``. Without ``rounds`` it goes on until cancelled.
+    """One flight around a place, or to the place if there is no ``counter``. Without ``rounds``, it lasts until
+    cancelled.
 
     ``limits`` are max_distance_m, timeout and max_silence_s. The constructor raises if the vehicle cannot fly there.
     """
@@ -81,7 +84,7 @@ class RoundFlight:
     ) -> None:
         """Send the command, and wait until the rounds are flown and another ``stay_s`` seconds have passed.
 
-        At the end, the vehicle holds if ``is_held``, or goes on with a circle of radius ``circle_m``.
+        At the end, the vehicle is ordered to hold if ``is_held``; otherwise it continues on a circle of ``circle_m``.
         """
         context, cleanup = self._context, self._context.flight_cleanup
         hold = context.sender.mode_for(self._what, "hold")
@@ -110,7 +113,7 @@ class RoundFlight:
         stall, stays = StallDetector(session), self._context.sender.stays_in(order, mode)
 
         def on_status(status: OrbitExecutionStatus) -> None:
-            """Recognise a wrong radius: PX4 accepts a radius above its limit, but flies another one."""
+            """Recognise a wrong radius: PX4 accepts a radius above its limit, but then flies another radius."""
             flown_m = abs(status.radius)
             is_wrong = circle_m and abs(flown_m - circle_m) > RADIUS_ERROR_M
             self._wrong_circle = (
@@ -184,7 +187,9 @@ class RoundFlight:
             raise OperationTimeout(f"{self._what}: not done within {self._timeout:g} s; {self._describe()}")
 
     async def _path_flight(self, path: ClosedPath, speed_m_s: float, facing: str) -> PathFlight:
-        """Convert the center to the local frame, by the vehicle's present position in both frames."""
+        """Return the flight along the path; the vehicle's position in both frames converts the center to the local
+        frame.
+        """
         local, since = self._telemetry.local_position, self._session.connection.now()
         place = await local.wait_until(lambda _: local.updated_at >= since, timeout=FRAME_TIMEOUT_S)
         here = self._telemetry.position.fresh(POSITION_MAX_AGE_S)

@@ -74,12 +74,12 @@ class OrderSender:
         await self.run_command(order, self._session.commands.send_long, command, *params, **options)
 
     def raise_if_ended(self, order: Order) -> None:
-        """Raise OperationRejected if the order has ended, so that the rest of it is not sent."""
+        """Raise OperationRejected if the order has ended, so that its remaining commands are not sent."""
         if order.end:
             raise OperationRejected(f"{order.end}; the rest of the order was not sent")
 
     def _unanswered(self, error: CommandTimeout, order: Order) -> Exception:
-        """Return the takeover as the error if there was one, otherwise the time-out."""
+        """Return the error for a command without an answer: the takeover if there was one, otherwise the time-out."""
         if order.takeover_reason or (order.failsafe and order.end):
             return OperationRejected(str(error), reasons=self._session.texts_since(order.given_at))
         return error
@@ -163,11 +163,11 @@ class OrderSender:
     ) -> None:
         """Wait until HEARTBEAT reports the effect of an accepted command.
 
-        PX4 acknowledges twice: the first ack is always ACCEPTED, the second one may be a refusal, collected in
-        ``refusals``.
+        PX4 acknowledges some commands twice: the first ack is always ACCEPTED, the second ack may be a refusal, which
+        ``refusals`` collects.
 
         Raises:
-            CommandRejected: the vehicle first accepted and then refused.
+            CommandRejected: the vehicle first accepted and then refused the command.
             OperationRejected: ``trouble()`` returned a reason.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the effect was not reported within ``timeout`` seconds.
@@ -199,15 +199,18 @@ class OrderSender:
             await self.change_mode(mode, order)
 
     def mode_for(self, action: str, purpose: Purpose) -> Mode:
-        """Return the autopilot's mode for this purpose; raise NotSupported, naming the action, if it has none."""
+        """Return the autopilot's mode for this purpose; raise NotSupported, naming ``action``, if there is no such
+        mode.
+        """
         mode = self._session.autopilot.mode_for(purpose, is_vtol=self._session.telemetry.is_vtol)
         if mode is None:
             raise NotSupported(f"{action}: {self._session.autopilot.firmware} has no mode for it")
         return mode
 
     def stays_in(self, order: Order, *modes: Mode) -> Callable[[], str | None]:
-        """Return a function that reports why the order cannot succeed: it was superseded, or the vehicle is disarmed or
-        in another mode.
+        """Return a function that reports why the order cannot succeed, as a clause.
+
+        The reasons are: the order was superseded, or the vehicle is disarmed or in another mode.
         """
         grace_until, settles_at = self._session.connection.now() + MODE_GRACE_S, self._arbiter.mode_settles_at
         arrived = False
@@ -234,7 +237,7 @@ class OrderSender:
 
         def trouble() -> str | None:
             is_open = order.has_lost_mode and armed.updated_at < order.mode_lost_at
-            return None if is_open else stays()  # The next HEARTBEAT may report that it has landed and disarmed.
+            return None if is_open else stays()  # The next HEARTBEAT may report a landing and disarming.
 
         return trouble
 
@@ -253,7 +256,7 @@ class OrderSender:
         retries: int | None,
         **options: Any,
     ) -> CommandAck:
-        """Send a raw command of the program by ``send``, a method of the command sender."""
+        """Send a raw command of the program by ``send``, which is a method of `CommandSender`."""
         started = self._session.connection.now()
         if retries is None:
             retries = MAX_ATTEMPTS - 1 if command in REQUEST_COMMANDS else 0
@@ -278,7 +281,7 @@ class OrderSender:
 
     @contextmanager
     def _own_order(self, command: int, modes: Collection[Mode]) -> Iterator[Order]:
-        """Register a raw command as an order, which supersedes actions if it steers."""
+        """Register a raw command as an order. A command that steers supersedes actions."""
         if CHANGED_BY_COMMAND.get(command, ARM_ALONE) != ARM_ALONE:
             yield self._arbiter.raw_order(CHANGED_BY_COMMAND[command], modes=modes)
         else:

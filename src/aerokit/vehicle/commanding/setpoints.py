@@ -46,11 +46,11 @@ VECTORS = {
     IGNORE_VELOCITY: ("north_m_s", "east_m_s", "down_m_s"),
     IGNORE_ACCELERATION: ("north_m_s2", "east_m_s2", "down_m_s2"),
 }
-"""Maps the bits that ignore a vector in SET_POSITION_TARGET_LOCAL_NED to its fields."""
+"""Maps type-mask bits of SET_POSITION_TARGET_LOCAL_NED to the fields that they make the vehicle ignore."""
 ZERO = (0.0, 0.0, 0.0)
 IGNORE_BODY_RATES, IGNORE_ATTITUDE = 0x07, 0x80
 ACTUATORS_PER_GROUP, MAX_BODY_RATE_DEG_S = 8, 3600.0
-# Below this speed, or within this many arrival radii, a vehicle that follows its set-point may stand still.
+# A vehicle may stand still if its set-point is slower than this, or nearer than this many arrival radii.
 SLOW_M_S, MAX_RESTING_RADII = 0.3, 2.0
 
 
@@ -135,9 +135,9 @@ class ActuatorSetpoint(Snapshot):
 
 
 class TrajectorySetpoint(Snapshot):
-    """Position in metres from the estimator's origin, with the velocity (m/s) and the acceleration (m/s²) there.
+    """Position in metres from the estimator's origin, with velocity (m/s) and acceleration (m/s²) at this position.
 
-    Velocity and acceleration are feed-forward: with them the vehicle follows a moving position without lag.
+    Velocity and acceleration are feed-forward terms: with them, the vehicle follows a moving position without lag.
     """
 
     north_m: float
@@ -165,7 +165,7 @@ def wants_motion(setpoint: object, context: VehicleContext) -> bool:
     far_m = MAX_RESTING_RADII * context.session.autopilot.arrival_radius_m
     if isinstance(setpoint, PositionSetpoint):
         return far_m < context.vehicle_position.distance_to(setpoint.position) < math.inf
-    # Reading the position decodes it; other set-points, at up to 400 Hz, do not need that.
+    # The position is read only here, because reading decodes it and set-points are sent at up to 400 Hz.
     if isinstance(setpoint, LocalPositionSetpoint) and (here := context.session.telemetry.local_position.latest):
         north_m, east_m = setpoint.north_m - here.north_m, setpoint.east_m - here.east_m
         return math.hypot(north_m, east_m, setpoint.down_m - here.down_m) > far_m
@@ -195,8 +195,9 @@ class SetpointEncoder:
     def body_velocity(self, s: BodyVelocitySetpoint) -> Message:
         """Return SET_POSITION_TARGET_LOCAL_NED with a velocity in MAV_FRAME_BODY_NED.
 
-        For ArduPilot, a set-point with a heading is converted to MAV_FRAME_LOCAL_NED by the present heading: in
-        MAV_FRAME_BODY_NED, ArduPilot adds each yaw to the previous target, and a correction by telemetry oscillates.
+        For ArduPilot, a set-point with a heading is converted to MAV_FRAME_LOCAL_NED by the present heading. In
+        MAV_FRAME_BODY_NED, ArduPilot adds each yaw to the previous target, and correcting for that by telemetry
+        oscillates.
         """
         forward, right, frame = s.forward_m_s, s.right_m_s, MavFrame.BODY_NED
         if s.yaw_deg is not None and self._session.autopilot.setpoints.body_yaw_is_relative:

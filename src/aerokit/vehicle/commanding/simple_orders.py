@@ -2,8 +2,8 @@
 
 A row has the command, its parameters with units and ranges, and the message that reports its effect.
 `aerokit.autopilots` lists the commands that a firmware does not support (``unsupported_commands``), and
-`aerokit.protocols.command` those that may be repeated. The method that gives the order documents its arguments, as in
-``devices/actuators.py``.
+`aerokit.protocols.command` the commands that must not be repeated. The method that gives the order documents its
+arguments, as in ``devices/actuators.py``.
 """
 
 from __future__ import annotations
@@ -29,15 +29,16 @@ if TYPE_CHECKING:
 MessageT = TypeVar("MessageT", bound="Message")
 
 EFFECT_TIMEOUT_S = 5.0
-"""Seconds after the acknowledgement until a message must report the effect."""
+"""Seconds after the acknowledgement within which a message must report the effect."""
 EFFECT_POLL_S = 0.4
 """Seconds between requests for the message that reports the effect."""
 
 
 class Argument(Snapshot):
-    """One parameter of a command that the caller chooses.
+    """One parameter of a command whose value the caller chooses.
 
-    ``name`` is the argument of the public method, with its unit. With ``above``, ``minimum`` itself is invalid.
+    ``name`` is the name of the public method's argument, including its unit. With ``above``, ``minimum`` itself is
+    invalid.
     """
 
     name: str
@@ -52,7 +53,7 @@ class Argument(Snapshot):
 
 
 class Effect(Snapshot):
-    """The message that reports the effect of an order, by its class name, and a predicate.
+    """Effect of an order: the class name of the message that reports it, and a predicate for the message.
 
     ``is_reported`` is called with each message and the values of the arguments.
     """
@@ -101,10 +102,10 @@ class SimpleOrder(Snapshot):
         Args:
             context: the vehicle.
             values: one for each `Argument`, in order; they are also passed to `Effect.is_reported`.
-            of: an earlier order to the device, if this is a further command of it.
+            of: an earlier order to the device, if this command belongs to that order.
             topic: key of the device that the command is for. A newer order with the same topic ends this call.
             component_id: the target component; None: the autopilot.
-            timeout: seconds after the acknowledgement until a message must report the effect.
+            timeout: seconds after the acknowledgement within which a message must report the effect.
 
         Raises:
             InvalidArgument: a value is out of range. Nothing was sent.
@@ -172,7 +173,7 @@ class SimpleOrder(Snapshot):
         target: int,
         timeout: float,
     ) -> None:
-        """Request the message until it reports the effect; return if the vehicle does not have this message."""
+        """Request the message until it reports the effect; return early if the vehicle does not have this message."""
         session, message_type = context.session, getattr(m, effect.message)
         reports: list[Message] = []
         is_reported = False
@@ -213,7 +214,7 @@ def _superseded(order: Order | None) -> str | None:
 
 async def _has_message(context: VehicleContext, message_id: int, component_id: int) -> bool:
     """Request a message; return False if the vehicle refuses, which means that it does not have the message."""
-    with suppress(CommandTimeout):  # The vehicle may have the message nevertheless.
+    with suppress(CommandTimeout):  # Without an answer, the vehicle may still have the message.
         try:
             await context.session.commands.send_long(
                 MavCmd.REQUEST_MESSAGE, message_id, component_id=component_id, attempts=2, attempt_timeout=1.0

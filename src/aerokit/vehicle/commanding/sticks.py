@@ -1,4 +1,4 @@
-"""`StickStream`: sends stick positions from your program, as a pilot's transmitter does.
+"""`StickStream`: sends stick positions from your program in place of a pilot's transmitter.
 
 The stream sends MANUAL_CONTROL (https://mavlink.io/en/services/manual_control.html). ArduPilot treats this message as
 an override of the transmitter's channels, PX4 as a second source of manual control.
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["StickInput", "StickStream"]
 
-# Value of an axis that has none: ArduPilot releases the axis's channel (GCS_Common.cpp, manual_override).
+# Value of an axis without a position: ArduPilot releases the channel of this axis (GCS_Common.cpp, manual_override).
 NO_VALUE = 0x7FFF
 # Values of RC_CHANNELS_OVERRIDE: release a channel (1 to 8), release a channel (9 to 18), leave it unchanged.
 RELEASED, RELEASED_UPPER, UNCHANGED = 0, 0xFFFE, 0xFFFF
@@ -63,9 +63,9 @@ class StickStream(SteeringStream[StickInput]):
 
     If the program is killed, ArduPilot returns to the transmitter after RC_OVERRIDE_TIME (3 s), and PX4 treats the
     sticks as lost after COM_RC_LOSS_T (0.5 s). PX4 has no message that releases the sticks, so it treats every end of a
-    stream as a loss. Without another source of manual control, it then acts as NAV_RCL_ACT says (return by default),
-    even in its hold mode unless bit 1 of COM_RCL_EXCEPT is set. ArduCopter without a transmitter acts as FS_THR_ENABLE
-    says.
+    stream as a loss of the sticks. Without another source of manual control, PX4 then executes NAV_RCL_ACT (return by
+    default). It does so even in its hold mode, unless bit 1 of COM_RCL_EXCEPT is set. ArduCopter without a transmitter
+    executes FS_THR_ENABLE.
 
     Entering raises:
         InvalidArgument: a position is out of range. Nothing was sent.
@@ -112,7 +112,7 @@ class StickStream(SteeringStream[StickInput]):
 
     @property
     def _is_stream_before_mode(self) -> bool:
-        return True  # Otherwise the mode would start with the transmitter's throttle.
+        return True  # Without the initial positions, the mode would start with the transmitter's throttle.
 
     def _wanted_mode(self) -> Mode:
         if self._rules is None:

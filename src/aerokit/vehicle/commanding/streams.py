@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.commanding.order import Order
 
     Probe = Callable[..., Awaitable[Mapping[str, object]]]
-    """``Parameters.probe``, which this package must not import."""
+    """Type of ``Parameters.probe``, because this package must not import `Parameters`."""
 
 __all__ = ["MAX_RATE_HZ", "SteeringStream", "TakeoverCheck", "ValueStream", "known_values"]
 
@@ -56,7 +56,7 @@ class ValueStream(Generic[ValueT]):
     Subclasses implement entering and leaving the block, and what happens when the stream stops by itself.
     """
 
-    _NAME, _VALUE = "stream", "value"  # nouns for error texts
+    _NAME, _VALUE = "stream", "value"  # Nouns for the stream and its value in error texts.
 
     def __init__(
         self,
@@ -105,7 +105,7 @@ class ValueStream(Generic[ValueT]):
     # ---------------------------------------------------------------------------- the stream
 
     def _take(self, value: ValueT) -> None:
-        """Encode the value completely, so that an invalid one is refused here."""
+        """Encode the value completely, so that an invalid value is refused here and not when it is sent."""
         message = self._encode(value)
         message.encode()
         self._value, self._message, self._set_at = value, message, self._now()
@@ -136,7 +136,7 @@ class ValueStream(Generic[ValueT]):
         self._session.connection.send(self._message)
 
     def _takeover(self) -> str | None:
-        """Return the reason if a pilot, a failsafe or another program took over, else None."""
+        """Return a clause if a pilot, a failsafe or another program took over, else None."""
         return None
 
     def _why_stop(self, lag: float) -> str | None:
@@ -145,13 +145,13 @@ class ValueStream(Generic[ValueT]):
             return f"the event loop was blocked for {lag:.1f} s"
         if age > self._valid_for_s:
             return f"no new {self._VALUE} was supplied for {age:.1f} s (valid_for_s = {self._valid_for_s:g})"
-        # If the connection has ended, the next transmission raises its error.
+        # If the connection has ended, the next transmission raises the error of the connection.
         if self._session.watch.is_silent and self._session.connection.is_open:
             return f"the vehicle has been silent for {self._session.heartbeat_age:.1f} s"
         return None
 
     def _stop(self, reason: str, *, hold: bool = True) -> None:
-        """Stop the stream from inside; order the vehicle to hold unless there was a takeover."""
+        """Stop the stream by itself; order the vehicle to hold unless there was a takeover."""
         self._end()
         is_confirmed = hold and self._hold()
         self._release()
@@ -160,11 +160,11 @@ class ValueStream(Generic[ValueT]):
         )
 
     def _hold(self) -> bool:
-        """Order the vehicle to hold, without waiting; return True if it was sent."""
+        """Order the vehicle to hold, without waiting; return True if the order was sent."""
         return False
 
     def _release(self) -> None:
-        """End the effect of the last value, if the vehicle would keep it."""
+        """End the effect of the last value, if the vehicle would otherwise keep executing it."""
 
     def _end(self) -> None:
         """Stop sending."""
@@ -183,7 +183,7 @@ class ValueStream(Generic[ValueT]):
 
 @checks_arguments
 class SteeringStream(ValueStream[ValueT]):
-    """Flies the vehicle in the mode for its values while its ``async with`` block supplies them.
+    """Flies the vehicle by values that the ``async with`` block supplies, in the flight mode for such values.
 
     Entering the block changes to the mode. Leaving it in any way orders the vehicle to hold. If the stream stops by
     itself, supplying a value and leaving the block raise :class:`SetpointStreamStopped`. If it stopped because a pilot
@@ -191,7 +191,7 @@ class SteeringStream(ValueStream[ValueT]):
     """
 
     _prepared_order: Order | None = None
-    """The order, if it was given before the block is entered; see `FlightCleanup.preparing`."""
+    """The steering order, if it was already given before the block is entered; see `FlightCleanup.preparing`."""
     _order: Order | None = None
     _mode: Mode | None = None
 
@@ -201,7 +201,7 @@ class SteeringStream(ValueStream[ValueT]):
         return self._session.autopilot.setpoints.stream_before_mode
 
     def _wanted_mode(self) -> Mode:
-        """Return the mode that the values are for; raise NotSupported if there is none."""
+        """Return the mode in which the vehicle executes the values; raise NotSupported if there is no such mode."""
         raise NotImplementedError
 
     async def _check_support(self) -> None:
@@ -251,7 +251,7 @@ class SteeringStream(ValueStream[ValueT]):
         self._stopped = SetpointStreamStopped(f"the block of this {self._NAME} was left")
         if exc is not None:
             self._hold()
-        # There may have been a takeover that was not received yet.
+        # There may have been a takeover whose report was not received yet.
         elif not self._context.arbiter.is_known:
             self._stop(f"the vehicle has been silent for {self._session.heartbeat_age:.1f} s")
             raise self._stopped
@@ -265,7 +265,9 @@ class SteeringStream(ValueStream[ValueT]):
                 raise
 
     async def _enter(self, mode: Mode, order: Order) -> None:
-        """Change the mode. ArduPilot takes values once it is in the mode; PX4 enters the mode once it receives them."""
+        """Change the mode. ArduPilot accepts values once it is in the mode; PX4 enters the mode once it receives
+        values.
+        """
         if self._is_stream_before_mode:
             self._begin_sending()
             await self._feed(self._value, LEAD_TIME_S)
@@ -299,8 +301,9 @@ class SteeringStream(ValueStream[ValueT]):
 
 
 class TakeoverCheck:
-    """Refuses to order a mode if, since its creation, another party has changed the mode or the program has given
-    another order.
+    """Refuses a mode change that a newer event has overtaken.
+
+    Such events, since the creation of this object, are a mode change by another party and another order of the program.
     """
 
     def __init__(self, context: VehicleContext, wanted: Mode) -> None:
@@ -312,7 +315,9 @@ class TakeoverCheck:
         self._take_off, self._hold = (session.autopilot.mode_for(p, is_vtol=is_vtol) for p in ("take_off", "hold"))
 
     def raise_if_changed(self, what: str) -> None:
-        """Raise OperationRejected if an order was given, or the mode has changed except by the end of a take-off."""
+        """Raise OperationRejected if an order was given or the mode was changed; the end of a take-off may change the
+        mode.
+        """
         if self._arbiter.latest(STEERING) is not self._order:
             raise OperationRejected(f"{what}: {SUPERSEDED} before anything was ordered")
         before, mode = self._before, self._telemetry.mode.latest
@@ -322,7 +327,7 @@ class TakeoverCheck:
 
 
 async def known_values(probe: Probe, *names: str) -> dict[str, float]:
-    """Return the values of the parameters that the vehicle has; raise ParameterTimeout if it does not answer."""
+    """Return the values of those parameters that the vehicle has; raise ParameterTimeout if it does not answer."""
     answers = await probe(*names)
     for answer in answers.values():
         if isinstance(answer, ParameterTimeout):

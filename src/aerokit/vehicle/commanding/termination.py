@@ -38,7 +38,8 @@ class TerminationActions(VehicleBase):
 
         Raises:
             InvalidArgument: the intent is another text. Nothing was sent.
-            CommandRejected: the vehicle refused; ``reasons`` has its status texts. PX4 refuses while it is disarmed.
+            CommandRejected: the vehicle refused; ``reasons`` has its status texts. PX4 refuses the command while
+                disarmed.
             CommandTimeout: there was no acknowledgement; the flight may have been terminated nevertheless.
             HeartbeatTimeout: the vehicle was silent for ten seconds after its acknowledgement.
             OperationTimeout: the vehicle accepted the command, but HEARTBEAT does not report the termination.
@@ -69,9 +70,9 @@ class TerminationActions(VehicleBase):
     async def shutdown(self, *, intent: ShutdownIntent, timeout: float = 15.0) -> None:
         """Switch the autopilot off, and wait until its HEARTBEATs end (MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN).
 
-        Only a person at the vehicle can switch it on again. HEARTBEATs count as ended after 3.5 s without one, or when
-        the link goes down after the acknowledgement. The command is sent once. A cancelled call may have switched the
-        autopilot off.
+        Only a person at the vehicle can switch it on again. HEARTBEATs count as ended after 3.5 s without a HEARTBEAT,
+        or when the link goes down after the acknowledgement. The command is sent once. A cancelled call may have
+        switched the autopilot off.
 
         Args:
             intent: must be ``"shut down"``.

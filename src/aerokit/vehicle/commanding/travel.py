@@ -54,24 +54,22 @@ class TravelActions(VehicleBase):
 
         After a cancellation, a time-out or a silence, aerokit orders the vehicle to hold where it is, unless another
         order was given meanwhile or another party changed the mode. After a silence, aerokit waits for the next
-        heartbeat, and orders the hold if the vehicle is still on its way. Sends MAV_CMD_DO_REPOSITION
+        heartbeat, and orders a hold if the vehicle is still on its way. Sends MAV_CMD_DO_REPOSITION
         (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_REPOSITION), or SET_POSITION_TARGET_GLOBAL_INT to a
-        vehicle that does not support it.
-
-        Args:
-            target: latitude and longitude, and an altitude above home or above mean sea level. Without an altitude, and
-                for ``vehicle.home.value``, the vehicle keeps its present altitude.
-            speed_m_s: ground speed from now on, above 0; None keeps the present one.
+        vehicle that does not support it. Args:
+            target: latitude and longitude, and an altitude above home or above mean sea level. The vehicle keeps its
+                present altitude if the target has none, or is ``vehicle.home.value``.
+            speed_m_s: ground speed from now on, above 0; None keeps the present speed.
             heading_deg: heading on arrival, 0–360 clockwise from north; None leaves it to the autopilot.
             tolerance_m: arrival radius in metres; None: the default of the type of vehicle.
             max_distance_m: a place farther away than this many metres is refused.
-            timeout: seconds; None: no limit while heartbeats arrive, the mode stays and the vehicle moves.
+            timeout: seconds. None: no limit, as long as heartbeats arrive, the mode stays and the vehicle moves.
             max_silence_s: raise when no heartbeat was received for this long; None: no limit.
 
         Raises:
             InvalidArgument: the target is not on earth or too far away, or another argument is out of range. Nothing
                 was sent.
-            ValueUnknownError: the vehicle's position or home is needed, and is not known.
+            ValueUnknownError: the vehicle's position or home is needed but unknown.
             CommandRejected: the vehicle refused (outside its fence, no position, …).
             OperationRejected: the mode changed (a pilot, a failsafe) or the vehicle disarmed on the way.
             CommandTimeout: there was no acknowledgement.
@@ -93,7 +91,7 @@ class TravelActions(VehicleBase):
             resend = await self._send_there(order, place, yaw, speed_m_s)
             under_way = True
             if speed_m_s is not None and not self._speeds_by_reposition:
-                # ArduPilot applies it only once the vehicle is on its way.
+                # ArduPilot applies the speed only once the vehicle is on its way.
                 await self._sender.send_long(order, MavCmd.DO_CHANGE_SPEED, 1, speed_m_s, -1)
             if heading_deg is not None and math.isnan(yaw):
                 await self._sender.send_long(order, MavCmd.CONDITION_YAW, heading_deg % 360)
@@ -111,7 +109,7 @@ class TravelActions(VehicleBase):
     async def _send_there(
         self, order: Order, place: dict[str, Any], yaw: float, speed_m_s: float | None
     ) -> SetPositionTargetGlobalInt | None:
-        """Send the order; return the message to repeat on the way, if it has no acknowledgement."""
+        """Send the order; return the message to repeat on the way, or None if the order was acknowledged."""
         speed = speed_m_s if speed_m_s is not None and self._speeds_by_reposition else -1
         params = (speed, MavDoRepositionFlags.CHANGE_MODE, 0, yaw)
         modes = (self._sender.mode_for("go_to", self.autopilot.reposition_purpose),)
@@ -140,7 +138,7 @@ class TravelActions(VehicleBase):
         mode: Mode,
         resend: SetPositionTargetGlobalInt | None,
     ) -> None:
-        """Wait for the arrival, and meanwhile repeat the order if its message has no acknowledgement."""
+        """Wait for the arrival. Meanwhile repeat ``resend``: the message of the order, if it is not acknowledged."""
         started = sent_at = self.connection.now()
 
         def is_there() -> bool:
@@ -168,11 +166,11 @@ class TravelActions(VehicleBase):
     async def set_speed(self, speed_m_s: float) -> None:
         """Change the ground speed in m/s, above 0 (MAV_CMD_DO_CHANGE_SPEED).
 
-        ArduPilot applies it only while the vehicle is on its way in GUIDED or AUTO; ``go_to(speed_m_s=...)`` waits for
-        that.
+        ArduPilot applies the speed only while the vehicle is on its way in GUIDED or AUTO. ``go_to(speed_m_s=...)``
+        sets the speed at that time.
 
         Raises:
-            InvalidArgument: out of range. Nothing was sent.
+            InvalidArgument: an argument is out of range. Nothing was sent.
             CommandRejected: the vehicle refused.
         """
         check_range("speed_m_s", speed_m_s, 0, 1000, above=True)
@@ -194,16 +192,16 @@ class TravelActions(VehicleBase):
         vehicle stops and turns by MAV_CMD_DO_REPOSITION.
 
         Args:
-            heading_deg: −360 to 360, clockwise from north; with ``relative`` an angle to turn by, negative to the
+            heading_deg: −360 to 360, clockwise from north. With ``relative``, an angle to turn by, negative to the
                 left.
             relative: True to turn by an angle from the present heading.
             rate_deg_s: turn rate in degrees per second; 0 leaves it to the autopilot. PX4 ignores it.
             tolerance_deg: accepted deviation in degrees.
-            timeout: seconds until it has the heading.
+            timeout: seconds until the vehicle has the heading.
             max_silence_s: raise when no heartbeat was received for this long; None: wait until ``timeout``.
 
         Raises:
-            InvalidArgument: out of range. Nothing was sent.
+            InvalidArgument: an argument is out of range. Nothing was sent.
             CommandRejected: the vehicle refused.
             OperationRejected: the mode changed or the vehicle disarmed meanwhile.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
@@ -257,8 +255,8 @@ class TravelActions(VehicleBase):
         """Move the home position, to a place or to the vehicle's present position, and wait until HOME_POSITION
         reports it.
 
-        Sends MAV_CMD_DO_SET_HOME (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_HOME), as COMMAND_LONG
-        with a resolution of about a metre to old firmware, which does not support it as COMMAND_INT.
+        Sends MAV_CMD_DO_SET_HOME (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_HOME) as COMMAND_INT. Old
+        firmware that does not support this gets a COMMAND_LONG, which has a resolution of about a metre.
 
         Args:
             place: latitude, longitude and an altitude above mean sea level; None: the present position.
@@ -330,13 +328,15 @@ class LookActions(VehicleBase):
     """Pointing the nose or the gimbal at a place. A new order replaces the previous one."""
 
     async def look_at(self, target: Position | Home) -> None:
-        """Point nose or gimbal at a place until :meth:`stop_looking`; a place without altitude is at the vehicle's own.
+        """Point the nose or the gimbal at a place until :meth:`stop_looking`.
+
+        A place without an altitude is taken to be at the vehicle's altitude.
 
         Sends MAV_CMD_DO_SET_ROI_LOCATION (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_ROI_LOCATION), or
         MAV_CMD_DO_SET_ROI to old firmware.
 
         Raises:
-            ValueUnknownError: home is needed here and not known.
+            ValueUnknownError: home is needed to convert the altitude, but unknown.
             CommandRejected: the vehicle refused.
             CommandTimeout: there was no acknowledgement.
             OperationRejected: the mode changed, or a newer order was given, before the acknowledgement.
@@ -349,7 +349,7 @@ class LookActions(VehicleBase):
         await self._give(MavCmd.DO_SET_ROI, 0, 0, 0, 0, place["x"] * 1e-7, place["y"] * 1e-7, above_home)
 
     async def _set_roi_location(self, place: dict[str, Any]) -> bool:
-        """Return False for firmware that does not support the command, or no COMMAND_INT."""
+        """Send MAV_CMD_DO_SET_ROI_LOCATION; return False if the firmware does not support it as COMMAND_INT."""
         with self._newest() as order:
             try:
                 await self._sender.run_command(order, self._session.commands.send_int, LOCATION, **place)

@@ -18,9 +18,13 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 POLL_INTERVAL_S, ANSWER_TIMEOUT_S = 1.0, 1.0
-"""PX4 reports the result for two seconds after the end. Polling later would start another tuning."""
+"""Seconds between polls, and seconds to wait for an answer. PX4 reports the result for two seconds after the end; a
+later poll would start another tuning.
+"""
 MAX_ANSWER_AGE_S = 1.5
-"""Maximum age of an answer. If the program or its event loop paused for longer, the tuning may have ended."""
+"""Maximum seconds since the last answer. After a longer pause of the program or its event loop, the tuning may have
+ended.
+"""
 TUNED_PERCENT = 95
 """Progress in percent at which PX4 has finished, and waits for disarming to save its new gains."""
 
@@ -44,8 +48,8 @@ class TuningActions(VehicleBase):
             NotSupported: the firmware is ArduPilot, whose mode AUTOTUNE a pilot controls. Nothing was sent.
             OperationRejected: the mode changed, or another party disarmed the vehicle.
             CommandRejected: PX4 was built without the autotune module, or the tuning failed.
-            CommandTimeout: an answer is missing, or the program has paused; PX4 may go on tuning.
-            OperationTimeout: the tuning was not done in time; PX4 may go on tuning.
+            CommandTimeout: an answer is missing, or the program was paused for too long; PX4 may continue to tune.
+            OperationTimeout: the tuning was not done in time; PX4 may continue to tune.
         """
         if not self.autopilot.tunes_by_command:
             raise NotSupported(

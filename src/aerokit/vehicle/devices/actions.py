@@ -30,7 +30,7 @@ FailureKind = Literal["ok", "off", "stuck", "garbage", "wrong", "slow", "delayed
 Severity = Literal["emergency", "alert", "critical", "error", "warning", "notice", "info", "debug"]
 # fmt: on
 FailureIntent = Literal["inject failure"]
-# FAILURE_UNIT_SENSOR_GYRO is "gyro".
+# The part after the prefix is the name: FAILURE_UNIT_SENSOR_GYRO becomes "gyro".
 UNITS: dict[str, FailureUnit] = {unit.name.partition("_")[2].lower(): unit for unit in FailureUnit}
 INJECT_FAILURE = SimpleOrder(
     "inject_failure",
@@ -38,14 +38,14 @@ INJECT_FAILURE = SimpleOrder(
     (Argument("unit", 0, 255), Argument("kind", 0, 255), Argument("instance", 0, 16)),
 )
 TUNE = re.compile(r"[A-Ga-gLlMmNnOoPpSsTt0-9#+.<>\- ]+")
-"""Characters of QBASIC 1.1's PLAY statement, which ArduPilot and PX4 play."""
+"""Characters of QBASIC 1.1's PLAY statement, whose notes ArduPilot and PX4 can play."""
 TUNE_PART, MAX_TUNE = 30, 230
 MAX_TEXT_BYTES = 1000
 
 
 @checks_arguments
 class DeviceActions(VehicleBase):
-    """Devices and signals of a vehicle besides its flight."""
+    """Devices and signals of a vehicle that do not control its flight."""
 
     @cached_property
     def actuators(self) -> Actuators:
@@ -147,8 +147,8 @@ class DeviceActions(VehicleBase):
         Args:
             unit: the part that fails (FAILURE_UNIT).
             kind: how it fails (FAILURE_TYPE).
-            instance: number of the part from 1 to 16; 0 for all.
-            intent: must be ``"inject failure"``, so that no other call can be mistaken for it.
+            instance: number of the part from 1 to 16; 0 means all parts of this kind.
+            intent: must be ``"inject failure"``, so that a failure is never injected by mistake.
 
         Raises:
             InvalidArgument: an argument is not allowed. Nothing was sent.
@@ -161,10 +161,10 @@ class DeviceActions(VehicleBase):
 
 
 def _chunks(text: str) -> list[str]:
-    """Split a text into chunks of at most 50 bytes, between characters; an empty chunk follows a full last one.
+    """Split a text into chunks of at most 50 bytes, between characters.
 
-    A receiver treats a chunk of less than 50 bytes as the last one. A chunk that cannot hold the next character is
-    therefore padded with spaces.
+    A receiver treats a chunk of less than 50 bytes as the last chunk. A chunk that cannot hold the next character is
+    therefore padded with spaces, and an empty chunk follows if the last chunk is full.
     """
     chunks = [""]
     for character in text:

@@ -65,8 +65,8 @@ PERCENT = MotorTestThrottleType.THROTTLE_PERCENT
 class Actuators(ReadOnly):
     """Outputs of the vehicle other than its flight controls: ``vehicle.actuators``.
 
-    ArduPilot has servos, relays, landing gear and a parachute; PX4 has actuators. The vehicle may have executed the
-    order of a cancelled call.
+    ArduPilot has servos, relays, landing gear and a parachute; PX4 has actuators. If you cancel a call, the vehicle may
+    still have executed the order.
     """
 
     def __init__(self, context: VehicleContext) -> None:
@@ -96,7 +96,7 @@ class Actuators(ReadOnly):
 
         ArduPilot only. Returns when ArduPilot has acknowledged and begins, because no message reports the end.
         ArduPilot repeats one output at a time: the next order of this kind replaces the previous one. The command is
-        never sent twice, because each copy starts again.
+        never sent twice, because a second one would start the cycles again.
 
         Args:
             number: output, 1 to 32, as for :meth:`set_servo`.
@@ -112,8 +112,8 @@ class Actuators(ReadOnly):
     async def set_relay(self, number: int, on: bool) -> None:
         """Switch a relay, and return when RELAY_STATUS reports it (MAV_CMD_DO_SET_RELAY).
 
-        ArduPilot only; it refuses a relay without a pin. With firmware before 4.5, which has no RELAY_STATUS, the call
-        returns at the acknowledgement. Raises as :meth:`set_servo`.
+        ArduPilot only. ArduPilot refuses a relay that has no pin. With firmware before 4.5, which has no RELAY_STATUS,
+        the call returns at the acknowledgement. Raises as :meth:`set_servo`.
 
         Args:
             number: relay from 0 (RELAY1_PIN) to 15.
@@ -122,7 +122,7 @@ class Actuators(ReadOnly):
         await SET_RELAY.send(self._context, number, on, topic=("relay", number))
 
     async def repeat_relay(self, number: int, *, count: int, period_s: float) -> None:
-        """Toggle a relay and toggle it back, ``count`` times (MAV_CMD_DO_REPEAT_RELAY).
+        """Toggle a relay and back again, ``count`` times (MAV_CMD_DO_REPEAT_RELAY).
 
         ArduPilot only. Returns when ArduPilot has acknowledged and begins. The command is never sent twice. Raises as
         :meth:`repeat_servo`.
@@ -143,8 +143,8 @@ class Actuators(ReadOnly):
         """Set up to six actuators: the first value is for "Peripheral via Actuator Set 1" (MAV_CMD_DO_SET_ACTUATOR).
 
         PX4 only; for ArduPilot use ``set_servo``. Returns when PX4 has acknowledged, because no message reports the
-        values. PX4 acknowledges even if no output has this function (PWM_MAIN_FUNCn 301 to 306). Raises as
-        :meth:`repeat_servo`.
+        values. PX4 acknowledges even if no output has the function of the actuator (PWM_MAIN_FUNCn 301 to 306). Raises
+        as :meth:`repeat_servo`.
 
         Args:
             values: one to six values, −1 to 1; None leaves an actuator as it is.
@@ -164,7 +164,7 @@ class Actuators(ReadOnly):
         """Retract the landing gear (MAV_CMD_AIRFRAME_CONFIGURATION); returns at the acknowledgement.
 
         ArduCopter and ArduPlane only. No message reports the position of the gear. Both accept the order even if there
-        is no landing gear (LGR_ENABLE), and even while the vehicle stands on it.
+        is no landing gear (LGR_ENABLE), and even while the vehicle stands on its gear.
 
         Raises:
             NotSupported: the firmware (PX4, Rover or Sub) does not have the command. Nothing was sent.
@@ -174,7 +174,7 @@ class Actuators(ReadOnly):
         """
         LANDING_GEAR.check_supported(self._context)
         telemetry = self._context.session.telemetry
-        # An old report counts too: a vehicle on the ground stands on its gear until it reports a take-off.
+        # Old reports count too, because a vehicle on the ground stands on its gear until it reports a take-off.
         if telemetry.landed_state.latest == MavLandedState.ON_GROUND or telemetry.is_confirmed_disarmed:
             raise OperationRejected("raise_landing_gear: the vehicle is disarmed or on the ground; nothing was sent")
         await LANDING_GEAR.send(self._context, 1, topic="landing gear")
@@ -204,7 +204,7 @@ class Actuators(ReadOnly):
         """Spin one motor of a disarmed vehicle, and return when it has stopped; remove the propellers first.
 
         ArduPilot: MAV_CMD_DO_MOTOR_TEST. PX4: MAV_CMD_ACTUATOR_TEST, if COM_MOT_TEST_EN is 1. The command is sent once,
-        because a copy would spin the motor again.
+            because a second one would spin the motor again.
 
         The motor stops after ``duration_s``. If the call is cancelled or fails while the motor may turn, aerokit orders
         the motor to stop at once. ArduCopter reports armed during the test, and the call returns when it reports
@@ -215,15 +215,15 @@ class Actuators(ReadOnly):
                 function (Motor 1).
             throttle_percent: 0 to 100.
             duration_s: seconds, above 0, at most 3.
-            intent: must be ``"spin motor"``, so that no other call can be mistaken for it.
+            intent: must be ``"spin motor"``, so that a motor test is never started by mistake.
 
         Raises:
-            InvalidArgument: a value is out of range, or the intent is another one. Nothing was sent.
+            InvalidArgument: a value is out of range, or the intent is another text. Nothing was sent.
             OperationRejected: the vehicle is armed, or not known to be disarmed (nothing was sent); or your program
                 started another motor test.
             CommandRejected: the vehicle refused (not landed, safety switch, COM_MOT_TEST_EN).
             CommandTimeout: there was no acknowledgement; the motor may have turned.
-            OperationTimeout: the vehicle still reports armed four seconds after the end.
+            OperationTimeout: the vehicle still reports armed four seconds after the end of the test.
         """
         check_range("number", number, 1, 12)
         check_range("throttle_percent", throttle_percent, 0, 100)
@@ -257,7 +257,8 @@ class Actuators(ReadOnly):
         except CommandRejected:
             raise
         except BaseException:
-            # After the end of the test, the stop command would start another test, which arms the motors.
+            # After the end of the test, no stop command is sent, because it would start another test, which arms the
+            # motors.
             is_spinning = session.connection.now() < spins_until
             if is_spinning and order.is_newest and arbiter.is_known and session.connection.is_open:
                 session.commands.send_unconfirmed(command, *stop)
@@ -270,10 +271,10 @@ class Actuators(ReadOnly):
         by a status text if the vehicle is on the ground or below CHUTE_ALT_MIN, or if the parachute is disabled.
 
         Args:
-            intent: must be ``"release parachute"``, so that no other call can be mistaken for it.
+            intent: must be ``"release parachute"``, so that the parachute is never released by mistake.
 
         Raises:
-            InvalidArgument: the intent is another one. Nothing was sent.
+            InvalidArgument: the intent is another text. Nothing was sent.
             NotSupported: the firmware (PX4, Rover or Sub) does not have the command. Nothing was sent.
             OperationRejected: the vehicle refused after the acknowledgement; ``reasons`` has its status texts.
             CommandRejected: the vehicle refused.

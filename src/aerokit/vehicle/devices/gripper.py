@@ -17,7 +17,7 @@ __all__ = ["Gripper"]
 NUMBER = Argument("number", 1, 8)
 GRIP_TIMEOUT_S = 10.0
 EPM_WAIT_S = 3.0
-"""Seconds until an electro-permanent gripper has moved: it reports the begin, but not the end as a servo does."""
+"""Seconds until an electro-permanent gripper has moved. ArduPilot reports only the start of its movement."""
 BEGINS = {GripperActions.GRAB: "Gripper load grabbing", GripperActions.RELEASE: "Gripper load releasing"}
 ENDS = {GripperActions.GRAB: "Gripper load grabbed", GripperActions.RELEASE: "Gripper load released"}
 
@@ -28,7 +28,7 @@ class Gripper(ReadOnly):
 
     PX4 acknowledges when the gripper has moved (PD_GRIPPER_EN). ArduPilot (GRIP_ENABLE) acknowledges at once and
     reports the end by a status text. For an electro-permanent gripper it reports only the start, and the call returns
-    three seconds later. Orders are sent once. The gripper may have moved after a cancelled call.
+    three seconds later. Orders are sent once. If you cancel a call, the gripper may still have moved.
     """
 
     def __init__(self, context: VehicleContext, number: int) -> None:
@@ -41,7 +41,7 @@ class Gripper(ReadOnly):
             CommandRejected: the vehicle has no gripper, or refused.
             CommandTimeout: there was no acknowledgement.
             OperationRejected: your program gave a newer order for this gripper.
-            OperationTimeout: the vehicle did not report the end within ten seconds.
+            OperationTimeout: the vehicle did not report the end of the movement within ten seconds.
         """
         await self._move(GripperActions.GRAB)
 

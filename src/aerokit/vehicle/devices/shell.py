@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 __all__ = ["Shell"]
 
 PROMPTS = ("pxh> ", "nsh> ")
-"""PX4's prompts, in simulation and on NuttX. The shell shows one when a command has ended."""
+"""PX4's prompts, in simulation and on NuttX. The shell shows its prompt when a command has ended."""
 DATA_BYTES, MAX_LINE, MAX_WAITING, OPEN_TIMEOUT_S = 70, 1000, 4096, 5.0
 _RESPOND, _REPLY = SerialControlFlag.RESPOND, SerialControlFlag.REPLY
 
@@ -28,9 +28,9 @@ _RESPOND, _REPLY = SerialControlFlag.RESPOND, SerialControlFlag.REPLY
 class Shell(ReadOnly):
     """PX4's system shell, open for the duration of an ``async with`` block: ``vehicle.shell()`` (SERIAL_CONTROL).
 
-    PX4 has one shell for each of its ports, and all stations on that port share it. aerokit sends each line once. It
-    does not know what a shell command does, so the rules for orders do not apply to it. SERIAL_CONTROL has neither
-    sequence numbers nor acknowledgements, so parts of the text may be lost.
+    PX4 has one shell for each of its ports, and all stations on a port share the shell. aerokit sends each line once.
+    aerokit does not know what a shell command does, so its rules for orders do not apply to shell commands.
+    SERIAL_CONTROL has neither sequence numbers nor acknowledgements, so parts of the text may be lost.
 
     Entering raises:
         NotSupported: the vehicle runs ArduPilot, which has no shell. Nothing was sent.
@@ -95,7 +95,7 @@ class Shell(ReadOnly):
         session.send(SerialControl(SerialControlDev.DEV_SHELL, flags, 0, 0, len(data), padded, *target))
 
     async def read(self, *, timeout: float | None = None) -> str:
-        """Return the next piece of output, up to 70 bytes, with echoes and prompts.
+        """Return the next piece of output, up to 70 bytes, including echoes and prompts.
 
         Args:
             timeout: seconds; None waits without a limit.

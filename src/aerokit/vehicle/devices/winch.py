@@ -33,9 +33,10 @@ class Winch(ReadOnly):
     """One winch: ``vehicle.winch()`` (MAV_CMD_DO_WINCH).
 
     ArduCopter supports :meth:`relax`, :meth:`pay_out` and :meth:`set_rate`. The other orders are for winches that are
-    MAVLink components: ``vehicle.winch(component_id=169)``. PX4 drives no winch itself and forwards the command to such
-    a component. An order that could pay out line twice is sent once. A newer order for the winch ends the call that
-    waits for the previous one. A cancelled call does not stop the winch: call ``set_rate(0)``.
+    MAVLink components: ``vehicle.winch(component_id=169)``. PX4 itself drives no winch, but forwards the command to
+    such a component. An order is sent only once if a second transmission could pay out more line. A newer order for the
+    winch ends the call that waits for the previous order. A cancelled call does not stop the winch: call
+    ``set_rate(0)``.
     """
 
     def __init__(self, context: VehicleContext, number: int, component_id: int | None) -> None:
@@ -52,7 +53,7 @@ class Winch(ReadOnly):
         return cell
 
     async def relax(self) -> None:
-        """Let the line run freely. Returns at the acknowledgement, because ArduCopter reports nothing else.
+        """Let the line run freely. Returns at the acknowledgement, because ArduCopter does not report the effect.
 
         Raises:
             NotSupported: the autopilot has no such order. Nothing was sent.
@@ -64,8 +65,8 @@ class Winch(ReadOnly):
     async def pay_out(self, length_m: float, *, rate_m_s: float = 0.5, timeout: float = ACTION_TIMEOUT_S) -> None:
         """Pay out a length of line, and return when WINCH_STATUS reports it within 0.1 m.
 
-        Returns at the acknowledgement if the winch sends no WINCH_STATUS. The command is sent once, because a copy
-        would pay out more line.
+        Returns at the acknowledgement if the winch sends no WINCH_STATUS. The command is sent once, because a second
+        one would pay out more line.
 
         Args:
             length_m: metres, −1000 to 1000; negative values wind the line up.
@@ -86,7 +87,7 @@ class Winch(ReadOnly):
         self._check_supported(_A.RELATIVE_LENGTH_CONTROL)
         order = self._context.arbiter.of_device(
             self._topic
-        )  # The next line waits; a newer order given meanwhile ends this one.
+        )  # A newer order that is given while the next line waits ends this order.
         start = await receive_once(self._context, m.WinchStatus, self._component_id)
         goal_m = None if start is None else start.line_length + length_m
         await self._send(
@@ -141,7 +142,7 @@ class Winch(ReadOnly):
             CommandTimeout: there was no acknowledgement; the winch may run.
             OperationRejected: a newer order for this winch was given.
             HeartbeatTimeout: the vehicle was silent for ten seconds.
-            OperationTimeout: the end was not reported in time.
+            OperationTimeout: WINCH_STATUS did not report the end in time.
         """
         await self._send_until(_F.FULLY_RETRACTED, _A.RETRACT, timeout)
 

@@ -36,11 +36,11 @@ RELEASE_ATTEMPTS, ATTEMPT_TIMEOUT_S = 10, 0.5
 
 
 class ReleaseCommand:
-    """The last command of a block, which stops or releases a gimbal. It is sent at once and retried in the background.
+    """The last command of a block, which stops or releases a gimbal. Sent at once, and retried in the background.
 
     While the vehicle is silent, it is sent at the next HEARTBEAT. ``is_meant`` is checked before each attempt, so that
-    the command does not undo a newer order or the control of another station. If the manager has fallen silent, the
-    command is sent once more at the manager's next HEARTBEAT.
+    the command does not undo a newer order or the control of another station. If the gimbal manager has fallen silent,
+    the command is sent once more at its next HEARTBEAT.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class ReleaseCommand:
         self._target = orders.manager_id
 
     async def send_and_wait(self, what: str) -> None:
-        """Send it and wait for the acknowledgement; OperationTimeout if the vehicle is silent."""
+        """Send the command and wait for the acknowledgement; raise OperationTimeout if the vehicle is silent."""
         if not self._is_meant():
             return
         if not self._orders.context.arbiter.is_known:
@@ -64,7 +64,7 @@ class ReleaseCommand:
         await self._confirm()
 
     def send_soon(self) -> None:
-        """Send it without waiting, e.g. when a block exits by an error or cancellation."""
+        """Send the command without waiting, e.g. when a block exits by an error or cancellation."""
         if not self._session.connection.is_open or self._session.is_closed or not self._is_meant():
             return
         is_sent = self._orders.context.arbiter.is_known
@@ -125,7 +125,7 @@ class ReleaseCommand:
             detach()
 
 
-# Seconds in which the manager may confirm our control without a request, and seconds in total including a request.
+# Seconds to wait for the manager's confirmation of our control before it is requested, and seconds in total.
 STATUS_TIMEOUT_S, CONFIRM_TIMEOUT_S = 0.5, 3.0
 
 STATUS_HZ = 1.0
@@ -138,8 +138,8 @@ class GimbalControl:
     Entering takes control from any other station and returns when the manager confirms it. Leaving releases it, without
     waiting if the block exits by an error or cancellation. When another station takes control, aerokit publishes
     ``GimbalControlLost``, and orders to the gimbal, including running ones, raise :class:`GimbalTaken`. Leaving the
-    block then raises it too, unless your program has already seen the loss, and releases nothing. Another station that
-    uses your own system and component id cannot be detected.
+    block then releases nothing; it raises GimbalTaken too, unless your program has already seen the loss. Another
+    station that uses your own system and component id cannot be detected.
 
     Entering raises:
         NotSupported: the vehicle has no gimbal manager, or its manager has no secondary control.
@@ -171,7 +171,7 @@ class GimbalControl:
 
     @property
     def is_taken(self) -> bool:
-        """True if another station has taken control, or released yours."""
+        """True if another station has taken control, or has released your control."""
         return self._taken is not None
 
     async def until_lost(self) -> tuple[int, int]:
@@ -195,8 +195,7 @@ class GimbalControl:
     def raise_if_taken(self) -> None:
         """Raise GimbalTaken if control was lost.
 
-        Raises:
-            GimbalTaken: another station is in control, or none.
+        Raises: GimbalTaken: another station is in control, or none.
         """
         if self._taken is not None:
             self._was_raised = True
@@ -236,7 +235,7 @@ class GimbalControl:
             if error is None and not self._was_raised:
                 self.raise_if_taken()
             return
-        if self._is_ended:  # the block of the vehicle has ended before
+        if self._is_ended:  # the vehicle's block ended before this block
             return
         release = self._release_command()
         self._end()
@@ -256,7 +255,7 @@ class GimbalControl:
             raise
 
     async def _await_confirmation(self, since: float) -> None:
-        """Wait for a GIMBAL_MANAGER_STATUS after ``since`` that confirms our control."""
+        """Wait for a GIMBAL_MANAGER_STATUS, received after ``since``, that confirms our control."""
         orders, session = self._orders, self._session
         cell = orders.public_device.controllers
         if orders.manager_id == session.component_id:

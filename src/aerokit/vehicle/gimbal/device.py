@@ -46,9 +46,10 @@ class GimbalControllers(Snapshot):
 class GimbalInformation(Snapshot):
     """Capabilities and identity of a gimbal (GIMBAL_MANAGER_INFORMATION, GIMBAL_DEVICE_INFORMATION).
 
-    ``gimbal_device_id``: component id of the device, or 1 to 6 for one attached to its manager, whose component id is
-    ``manager_component_id``. ``roll_deg``, ``pitch_deg``, ``yaw_deg``: lowest and highest angle, None if unknown. The
-    texts are empty and ``uid`` is 0 if the device does not report them.
+    ``gimbal_device_id`` is the component id of the device, or 1 to 6 for a gimbal without its own component id, which
+    is attached to its manager. ``manager_component_id`` is the component id of the manager. ``roll_deg``, ``pitch_deg``
+    and ``yaw_deg`` are the lowest and highest angle, None if unknown. Texts are empty and ``uid`` is 0 if the device
+    does not report them.
     """
 
     gimbal_device_id: int
@@ -80,7 +81,7 @@ class GimbalInformation(Snapshot):
 
     @property
     def axes(self) -> tuple[str, ...]:
-        """The axes about which the gimbal rotates, of ``"roll"``, ``"pitch"``, ``"yaw"``."""
+        """The axes about which the gimbal rotates: some of ``"roll"``, ``"pitch"`` and ``"yaw"``."""
         bits = (("roll", Can.HAS_ROLL_AXIS), ("pitch", Can.HAS_PITCH_AXIS), ("yaw", Can.HAS_YAW_AXIS))
         return tuple(name for name, bit in bits if self.can(bit))
 
@@ -127,7 +128,7 @@ def _version(number: int) -> str:
 # Gimbals without their own component id are numbered from 1 to this.
 MAX_GIMBAL_NUMBER = 6
 
-# A status that is older by less than this arrived out of order; an older one means that the manager has rebooted.
+# If a status is older than the newest by less than this, it arrived out of order; by more, the manager has rebooted.
 REORDER_WINDOW_MS = 5_000
 
 ATTITUDE_MESSAGES = "GIMBAL_DEVICE_ATTITUDE_STATUS or MOUNT_ORIENTATION"
@@ -145,8 +146,8 @@ class ControlBlock(Protocol):
 class GimbalDevice:
     """One gimbal, addressed by the component that sends its attitude, and a number.
 
-    ``number`` is 1 to 6 for gimbals attached to that component, 0 for the component itself. ``component_id`` is 0 for
-    the placeholder that stands for the first gimbal before any is discovered.
+    ``number`` is 1 to 6 for gimbals attached to that component, and 0 if the component itself is the gimbal. Before any
+    gimbal is discovered, a placeholder with ``component_id`` 0 stands for the first gimbal.
     """
 
     def __init__(self, context: VehicleContext, component_id: int, number: int) -> None:
@@ -161,7 +162,7 @@ class GimbalDevice:
         self.device_information: GimbalDeviceInformation | None = None
         # Open control blocks: primary (True) and secondary (False).
         self.control_blocks: dict[bool, ControlBlock] = {}
-        # Once the program has requested the limits, orders beyond them are refused.
+        # True once the program has requested the limits: orders beyond them are then refused.
         self.checks_limits = False
         # Reboots of the vehicle so far.
         self.reboots: int = 0
@@ -170,12 +171,12 @@ class GimbalDevice:
         self.attitude: StateCell[GimbalAttitude] = context.session.connection.new_cell(
             f"{name}.attitude", ATTITUDE_MESSAGES
         )
-        if component_id in (0, context.session.component_id):  # other gimbals send their attitude without a request
+        if component_id in (0, context.session.component_id):  # Other gimbals send their attitude by themselves.
             self.attitude._feed_from(WatchedStream(self.attitude, partial(self._request_attitude, context.session)))
         self.controllers: StateCell[GimbalControllers] = context.session.connection.new_cell(
             f"{name}.controllers", "GIMBAL_MANAGER_STATUS"
         )
-        # False for a gimbal that the program has named, but from which nothing was received.
+        # False if the program has named this gimbal, but no message from it was received.
         self.is_discovered = False
         self.pending_orders: int = 0
         self._manager_rank = 0
@@ -220,7 +221,7 @@ class GimbalDevice:
         self.flags, self.failures = message.flags, message.failure_flags
 
     def update_status(self, message: GimbalManagerStatus) -> bool:
-        """Set the controllers; return False for a status that arrived out of order, which is ignored."""
+        """Set the controllers. Ignore a status that arrived out of order, and return False."""
         behind = self._status_ms - message.time_boot_ms
         if 0 < behind < REORDER_WINDOW_MS:
             return False
@@ -234,12 +235,12 @@ class GimbalDevice:
         self.controllers.set(GimbalControllers(primary, secondary), self._source(message))
 
     def update_manager(self, component_id: int, rank: int, *, is_gone: bool) -> None:
-        """Choose between managers: higher rank first, then the earlier one unless it is gone."""
+        """Choose between two managers: the one with the higher rank, or the earlier one unless it is gone."""
         if self.manager_id == component_id:
             self._manager_rank = max(self._manager_rank, rank)
         elif self.manager_id is None or rank > self._manager_rank or is_gone:
             self.manager_id, self._manager_rank = component_id, rank
-            self._status_ms = 0  # The new manager has another clock.
+            self._status_ms = 0  # The time stamps of the new manager are from another clock.
 
     def reset(self) -> None:
         self.reboots += 1
@@ -258,13 +259,15 @@ class GimbalDevice:
 
 
 class ControlClaim:
-    """Claim of a control block, from its entry on. A ``gimbal_id_param`` of 0 means all gimbals of the manager."""
+    """A control block's claim to a gimbal, from the entry of the block on. A ``gimbal_id_param`` of 0 means all gimbals
+    of the manager.
+    """
 
     def __init__(self, manager_id: int, parameter: int, *, is_primary: bool) -> None:
         self.manager_id: int = manager_id
         self.gimbal_id_param: int = parameter
         self.is_primary: bool = is_primary
-        # True if the release of an earlier block was skipped because of this claim, so that this block must release.
+        # True if an earlier block did not release control because of this claim. This block must release it then.
         self.owes_release = False
 
     def shares(self, other: ControlClaim) -> bool:
@@ -275,7 +278,9 @@ class ControlClaim:
         )
 
     def may_be_released(self, claims: Iterable[ControlClaim]) -> bool:
-        """Return True if no other claim shares this one; otherwise make those responsible for releasing it."""
+        """Return True if no other claim shares this control. Otherwise leave the release of control to the other
+        claims.
+        """
         others = [other for other in claims if other is not self and other.shares(self)]
         for other in others:
             other.owes_release = True

@@ -29,9 +29,9 @@ if TYPE_CHECKING:
 MAX_GIMBALS = 32
 GIMBAL_COMPONENT_IDS = frozenset((154, *range(171, 176)))
 UNKNOWN_ATTITUDE = GimbalAttitude(None, None, None, None)
-# A component is gone after this many seconds of silence during which the autopilot was not silent.
+# A component counts as gone if it is silent for this many seconds while the autopilot is not.
 MAX_SILENCE_S = 10.0
-# Precedence of managers. A device that manages itself ranks as RANK_INFORMATION, whatever it sends.
+# Precedence of managers. A device that manages itself always has RANK_INFORMATION.
 RANK_STATUS, RANK_INFORMATION, RANK_AUTOPILOT = 1, 2, 3
 
 
@@ -41,7 +41,7 @@ class GimbalRegistry:
     def __init__(self, context: VehicleContext) -> None:
         self._context, self._session = context, context.session
         self.devices: dict[tuple[int, int], GimbalDevice] = {}
-        # Stands for the first gimbal while none is discovered; its cells always mirror the first one.
+        # Stands for the first gimbal until one is discovered. Its cells always mirror those of the first gimbal.
         self.placeholder: GimbalDevice = GimbalDevice(context, 0, 0)
         self.placeholder.topic = ROI
         # Open control blocks of this program.
@@ -61,7 +61,7 @@ class GimbalRegistry:
 
     @property
     def first(self) -> GimbalDevice:
-        """The gimbal for programs that name none. Gimbals that are gone come after all others."""
+        """The gimbal for programs that name no gimbal. Gimbals that are gone come after all others."""
         return min(self.devices.values(), key=self.sort_key, default=self.placeholder)
 
     @property
@@ -70,7 +70,7 @@ class GimbalRegistry:
         return min(reporting, key=self.sort_key, default=None)
 
     def sort_key(self, device: GimbalDevice) -> tuple[bool, tuple[int, int]]:
-        """Sort key: gimbals that are gone come last, unless an order or control block uses them."""
+        """Sort key. Gimbals that are gone come last, unless an order or a control block uses them."""
         return (not device.is_in_use and self._has_gone(device), device.key)
 
     def silent_for_s(self, component_id: int) -> float:
@@ -78,7 +78,7 @@ class GimbalRegistry:
         return self._session.connection.now() - self._received_at.get(component_id, -math.inf)
 
     def _has_gone(self, device: GimbalDevice) -> bool:
-        # A device that sends nothing itself is represented by its manager.
+        # If a device sends nothing itself, the messages of its manager count.
         component_id = device.component_id
         if component_id not in self._received_at and device.manager_id is not None:
             component_id = device.manager_id
@@ -90,19 +90,19 @@ class GimbalRegistry:
         return received_at(self._session.component_id, -math.inf) - since > MAX_SILENCE_S
 
     def find(self, device_id: int) -> GimbalDevice | None:
-        """Return the gimbal of this id; one attached to the autopilot takes precedence over others."""
+        """Return the gimbal with this id. A gimbal attached to the autopilot takes precedence over others."""
         found = [device for device in self.devices.values() if device.device_id == device_id]
         autopilot_id = self._session.component_id
         return min(found, key=lambda device: (device.component_id != autopilot_id, device.key), default=None)
 
     def device(self, component_id: int, number: int) -> GimbalDevice | None:
-        """Return the gimbal of this key, created if needed; None if there are too many."""
+        """Return the gimbal with this component id and number, created if needed; None if there are too many."""
         key = (component_id, number)
         device = self.devices.get(key)
         if device is None and len(self.devices) < MAX_GIMBALS:
             device = self.devices[key] = GimbalDevice(self._context, *key)
             if component_id == self._session.component_id and number == 1:
-                device.topic = ROI  # The region of interest of the vehicle moves this gimbal.
+                device.topic = ROI  # the vehicle's region of interest moves this gimbal
         return device
 
     def _listen(self, message_type: type[Message], callback: Callable[[Any], None]) -> None:
@@ -120,7 +120,7 @@ class GimbalRegistry:
         self._received_at[frame.component_id] = self._session.connection.now()
 
     def _device_of(self, message: Message, device_id: int) -> GimbalDevice | None:
-        """Return the device of a message: the component itself (id 0), or one attached to it (1 to 6); else None."""
+        """Return the device of a message: the sender (id 0), or a gimbal attached to it (1 to 6); else None."""
         self._record_received(message)
         frame = message.received_frame
         component_id = self._session.component_id if frame is None else frame.component_id
@@ -128,7 +128,7 @@ class GimbalRegistry:
             return None
         has_own_id = component_id > MAX_GIMBAL_NUMBER and component_id != self._session.component_id
         is_itself = device_id > MAX_GIMBAL_NUMBER or (device_id == 0 and has_own_id)
-        number = 0 if is_itself else device_id or 1  # Older autopilots do not number their gimbal.
+        number = 0 if is_itself else device_id or 1  # Older autopilots send 0 for their gimbal.
         return self._discovered(self.device(component_id, number))
 
     def _discovered(self, device: GimbalDevice | None) -> GimbalDevice | None:
@@ -166,7 +166,7 @@ class GimbalRegistry:
     def _managed_device(
         self, message: GimbalManagerStatus | GimbalManagerInformation, device_id: int
     ) -> GimbalDevice | None:
-        """Return the gimbal that a manager message is about; None unless the sender is the selected manager."""
+        """Return the gimbal that a manager's message is about; None unless the sender is its chosen manager."""
         frame = message.received_frame
         if frame is None:
             return None
@@ -186,7 +186,7 @@ class GimbalRegistry:
         return device if device.manager_id == sender else None
 
     def _device_with_own_id(self, device_id: int, *, may_be_new: bool) -> GimbalDevice | None:
-        # A status alone may name a device that does not exist, information may not.
+        # A GIMBAL_MANAGER_STATUS may name a device that does not exist. GIMBAL_MANAGER_INFORMATION does not.
         key = (device_id, 0)
         if key in self.devices or (may_be_new and device_id in GIMBAL_COMPONENT_IDS):
             return self._discovered(self.device(*key))

@@ -81,8 +81,8 @@ class RoiMixin(GimbalMixin):
     ) -> None:
         """Keep the gimbal pointed at a position; returns when it points there.
 
-        Sends MAV_CMD_DO_SET_ROI_LOCATION. A target without an altitude is at the vehicle's own altitude. A copter whose
-        gimbal does not pan turns its nose.
+        Sends MAV_CMD_DO_SET_ROI_LOCATION. A target without an altitude is at the vehicle's own altitude. If the gimbal
+        of a copter cannot turn to the side, the copter turns its nose.
 
         Args:
             target: the position.
@@ -119,7 +119,8 @@ class RoiMixin(GimbalMixin):
     ) -> None:
         """Keep the gimbal pointed at another vehicle (MAV_CMD_DO_SET_ROI_SYSID); returns when it points there.
 
-        The gimbal's manager and this connection both need the position of the other vehicle (GLOBAL_POSITION_INT).
+        Both the gimbal's manager and this connection must receive the position of the other vehicle
+        (GLOBAL_POSITION_INT).
 
         Args:
             system_id: its MAVLink system id, 1 to 255.
@@ -167,7 +168,7 @@ class RoiMixin(GimbalMixin):
         await orders.send_roi(orders.begin_order(), MavCmd.DO_SET_ROI_NONE, orders.roi_parameter)
 
 
-# Seconds in which information must arrive after the manager accepted the request.
+# Seconds to wait for the information after the manager has accepted the request.
 INFORMATION_TIMEOUT_S = 2.0
 
 
@@ -175,9 +176,10 @@ INFORMATION_TIMEOUT_S = 2.0
 class Gimbal(ReadOnly, PointingMixin, RoiMixin):
     """One gimbal, by the gimbal protocol v2 (https://mavlink.io/en/services/gimbal_v2.html), or an older mount.
 
-    ``vehicle.gimbal`` is the first one, ``vehicle.gimbals`` has all. An order returns when the gimbal reports the
-    ordered direction, and ends when another order is given. The gimbal keeps the direction while the vehicle moves. If
-    the manager requires control, an order outside a block of :meth:`control` claims it until :meth:`release`.
+    ``vehicle.gimbal`` is the first gimbal, ``vehicle.gimbals`` has all gimbals. An order returns when the gimbal
+    reports the ordered direction, and ends when another order is given. The gimbal keeps the direction while the
+    vehicle moves. If the manager requires control, an order outside a block of :meth:`control` claims it until
+    :meth:`release`.
     """
 
     async def information(self) -> GimbalInformation:
@@ -237,12 +239,12 @@ class Gimbal(ReadOnly, PointingMixin, RoiMixin):
         valid_for_s: float = 1.0,
         max_lag_s: float = 0.5,
     ) -> GimbalRates:
-        """Turn the gimbal at rates during an ``async with`` block that feeds them; see :class:`GimbalRates`.
+        """Turn the gimbal at rates that the ``async with`` block supplies; see :class:`GimbalRates`.
 
         Args:
             pitch_deg_s: the first rate in degrees per second, −720 to 720; positive is up.
             yaw_deg_s: the first rate in degrees per second, −720 to 720; positive is to the right.
-            frame: ``"earth"`` if the yaw is held relative to north, ``"vehicle"`` if it turns with the vehicle.
+            frame: ``"earth"``: the yaw stays relative to north; ``"vehicle"``: it turns with the vehicle.
             rate_hz: how often the latest rates are sent, 2 to 100.
             valid_for_s: stop if no new rates are set for this time.
             max_lag_s: stop if the event loop is blocked for this time.

@@ -32,7 +32,7 @@ MOUNT = MavCmd.DO_MOUNT_CONTROL
 # Roll and pitch relative to the horizon, yaw relative to the nose of the vehicle.
 LEVEL = GimbalManagerFlags.ROLL_LOCK | GimbalManagerFlags.PITCH_LOCK
 
-# The same with yaw relative to north.
+# Roll and pitch relative to the horizon, yaw relative to north.
 LOCKED = LEVEL | GimbalManagerFlags.YAW_LOCK
 
 RELEASE, UNCHANGED = -3, -1
@@ -57,7 +57,7 @@ class GimbalOrders:
 
     @property
     def public_device(self) -> GimbalDevice:
-        """The device with the public cells. For the first gimbal it is always the same object."""
+        """The device whose cells are public. For the first gimbal this is always the same object."""
         return self.registry.placeholder if self._device is None else self._device
 
     @property
@@ -68,7 +68,7 @@ class GimbalOrders:
 
     @property
     def manager_id(self) -> int:
-        """Component id that orders are sent to; the autopilot's until a manager is known."""
+        """Component id that orders are sent to: the manager's, or the autopilot's until a manager is known."""
         manager_id = self.device.manager_id
         return self.session.component_id if manager_id is None else manager_id
 
@@ -112,7 +112,7 @@ class GimbalOrders:
         return self.context.arbiter.of_device(self.device.topic)
 
     async def send_claiming_control(self, command: int, send: Callable[[], Awaitable[None]]) -> None:
-        """Send a command; if it is denied for lack of control, claim control and send it again."""
+        """Send a command. If the manager denies it because we are not in control, claim control and send it again."""
         self.raise_if_taken()
         self.claim_if_denied(command)
         try:
@@ -124,7 +124,7 @@ class GimbalOrders:
             await send()
 
     async def send_pitch_yaw(self, order: Order, pitch: float, yaw: float, *rates: float, flags: int) -> bool:
-        """Send MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW, in degrees; return False if the manager does not support it."""
+        """Send MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW in degrees; return False if the manager does not support it."""
         if self.session.commands.is_unknown(PITCHYAW, self.manager_id):
             return False
         pitch_rate, yaw_rate = rates or (NAN, NAN)
@@ -158,7 +158,7 @@ class GimbalOrders:
             await send()
 
     async def send_mount_mode(self, order: Order, mode: int, pitch: float = 0, roll: float = 0, yaw: float = 0) -> bool:
-        """Send DO_MOUNT_CONTROL; return False for older firmware, which gets the mode by MOUNT_CONFIGURE instead."""
+        """Send DO_MOUNT_CONTROL. Older firmware gets the mode by MOUNT_CONFIGURE instead; return False then."""
         if not self.session.commands.is_unknown(MOUNT, self.manager_id):
             try:
                 await self.send(order, MOUNT, pitch, roll, yaw, 0, 0, 0, mode)
@@ -173,7 +173,7 @@ class GimbalOrders:
         return False
 
     async def send_mount_angles(self, order: Order, pitch: float, roll: float, yaw: float, *, from_nose: bool) -> None:
-        """Send mount angles. The mount's yaw is relative to the nose, so a yaw from north is right only now."""
+        """Send mount angles. The mount turns with the vehicle, so a yaw from north is right only at this moment."""
         heading = self.session.telemetry.attitude.latest
         nose = 0.0 if heading is None else heading.yaw_deg
         turned = yaw if from_nose else math.remainder(yaw - nose, 360.0)
@@ -197,7 +197,7 @@ class GimbalOrders:
         )
 
     async def wait_for(self, found: Callable[[], object], kind: type[Message], within_s: float) -> None:
-        """Wait up to ``within_s`` seconds until ``found()`` is not None; it is called at each ``kind`` message."""
+        """Wait at most ``within_s`` seconds until ``found()``, called at each message of type ``kind``, is not None."""
         done = asyncio.Event()
 
         def check(_: Message) -> None:
@@ -216,7 +216,7 @@ class GimbalOrders:
             detach()
 
     async def find_manager(self) -> int:
-        """Return the manager. If none is known, first ask the device whether it manages itself."""
+        """Return the manager. If none is known, first ask the device whether it is its own manager."""
         device = self.device
         if device.manager_id is None and device.component_id:
             with suppress(CommandRejected, CommandTimeout):
@@ -225,7 +225,7 @@ class GimbalOrders:
         return self.manager_id
 
     def control_params(self, *, is_primary: bool, release: bool = False) -> tuple[float, ...]:
-        """Parameters that claim or release control. Own ids are explicit: PX4 takes -2 ("sender") for itself."""
+        """Parameters that claim or release control. They have our ids, because PX4 takes -2 ("sender") for itself."""
         pair = (RELEASE, RELEASE) if release else self.own_ids
         unchanged = (UNCHANGED, UNCHANGED)
         return (
@@ -237,7 +237,7 @@ class GimbalOrders:
         )
 
     def claim_if_denied(self, command: int) -> bool:
-        """Claim control if the manager has denied this command for lack of it; return True if so."""
+        """Claim control if the manager denied this command because we are not in control; return True if claimed."""
         commands, manager_id = self.session.commands, self.manager_id
         if self.device.control_blocks or commands.last_result(command, manager_id) != MavResult.DENIED:
             return False
@@ -261,7 +261,7 @@ class GimbalOrders:
             await self.send(order, CONFIGURE, *params)
 
     def raise_if_taken(self) -> None:
-        """Raise GimbalTaken if an open control block has lost control, and no other block has it."""
+        """Raise GimbalTaken if an open control block has lost control and no other open block is in control."""
         blocks = self.device.control_blocks.values()
         if not any(block.is_held for block in blocks):
             for block in blocks:
@@ -295,7 +295,7 @@ class GimbalMixin:
 
     @property
     def device_id(self) -> int:
-        """Gimbal device id: 1 to 6 if attached to its manager, or the component id; 0 until one is discovered."""
+        """Gimbal device id: 1 to 6 if attached to its manager, or the component id; 0 until a gimbal is discovered."""
         return self._orders.device.device_id
 
     def _now(self) -> float:

@@ -26,15 +26,18 @@ if TYPE_CHECKING:
     from aerokit.vehicle.gimbal.device import GimbalDevice
     from aerokit.vehicle.gimbal.orders import GimbalOrders
 
-# A gimbal that turns by less than this angle in this time stands still; attitudes arrive about five times a second.
+# A gimbal that turns by less than this angle (degrees) in this time (seconds) stands still. Attitudes arrive about five
+# times a second.
 STILL_S, STILL_DEG = 0.4, 0.5
 
-# Pitch, roll, yaw from north, yaw from the nose; None: any.
+# Pitch, roll, yaw from north, yaw from the nose. None: any angle is right.
 Angles = tuple[float | None, float | None, float | None, float | None]
 
 
 class AngleTarget:
-    """Angles to reach within a tolerance. ``wanted`` returns them, or None while they are unknown."""
+    """Target of an order: angles to reach within a tolerance. ``wanted`` returns the angles, or None while they are
+    unknown.
+    """
 
     def __init__(self, wanted: Callable[[], Angles | None], tolerance_deg: float, unknown: str = "") -> None:
         self._wanted, self._tolerance_deg, self._unknown = wanted, tolerance_deg, unknown
@@ -54,7 +57,10 @@ class AngleTarget:
 
 
 class RestTarget:
-    """A position reported by a flag (retracted, neutral), or straight ahead, in which the gimbal must stand still."""
+    """Target of an order: the gimbal stands still in a position that a flag reports, or straight ahead.
+
+    The flag is RETRACT or NEUTRAL.
+    """
 
     def __init__(self, flag: int, *, or_ahead: bool) -> None:
         self._flag, self._or_ahead = flag, or_ahead
@@ -79,7 +85,9 @@ class RestTarget:
 
 @contextmanager
 def attitude_stream(orders: GimbalOrders) -> Iterator[None]:
-    """Stream the attitude from the autopilot; gimbals with their own component id send it by themselves."""
+    """Request the attitude from the autopilot during a block. Gimbals with their own component id send it by
+    themselves.
+    """
     if orders.device.component_id not in (0, orders.session.component_id):
         yield
         return
@@ -154,22 +162,22 @@ def _range(limits: tuple[float, float] | None) -> str:
     return "unknown" if limits is None else f"{limits[0]:g} to {limits[1]:g}"
 
 
-# Closer to straight up or down than this, yaw and roll are the same rotation.
+# Beyond this pitch up or down, yaw and roll are the same rotation.
 MAX_PITCH_FOR_YAW_DEG = 89.0
 
-# For targets nearer than this along the ground, the bearing is meaningless.
+# The bearing to a target that is nearer than this along the ground is meaningless.
 MIN_BEARING_DISTANCE_M = 1.0
 
 
 def ordered_angles(pitch: float, yaw: float, roll: float | None, *, from_nose: bool) -> Angles:
-    """Return the angles of an order; None for the yaw when pointing straight down or up, where any yaw is right."""
+    """Return the angles of an order. The yaw is None when pointing straight down or up: any yaw is right then."""
     is_upright = abs(pitch) > MAX_PITCH_FOR_YAW_DEG
     turned = None if is_upright else yaw
     return (pitch, roll, None if from_nose else turned, turned if from_nose else None)
 
 
 def direction_to(context: VehicleContext, target: Position) -> Angles | None:
-    """Direction from the vehicle to a position; None while its own position or the height difference is unknown."""
+    """Direction from the vehicle to a position; None while the vehicle's position or height is unknown."""
     cell = context.session.telemetry.position
     here = cell.latest
     if here is None or cell.age > POSITION_MAX_AGE_S:
@@ -216,16 +224,16 @@ class PointingMixin(GimbalMixin):
         Args:
             pitch_deg: from the horizon, −360 to 360: 0 is level, −90 straight down.
             yaw_deg: −360 to 360, clockwise from north (``frame="earth"``) or from the nose (``"vehicle"``).
-            roll_deg: from the horizon, −360 to 360. A roll other than 0 needs the mount command, whose yaw turns with
-                the vehicle: a yaw from north is right only at the time of the order.
-            frame: reference of the yaw, which the gimbal keeps afterwards.
+            roll_deg: from the horizon, −360 to 360. A roll other than 0 is sent by the older mount command. The gimbal
+                then turns with the vehicle, so a yaw from north is right only at the time of the order.
+            frame: reference of the yaw. The gimbal keeps the yaw relative to this reference afterwards.
             wait: False: return when the manager has accepted the order.
             tolerance_deg: accepted deviation in each axis, above 0 to 45.
             timeout: seconds to wait.
 
-        Sends MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW. If it is denied, aerokit claims control until :meth:`release`. A
-        vehicle without a gimbal manager gets MAV_CMD_DO_MOUNT_CONTROL, and one that does not support that either gets
-        MOUNT_CONTROL, which is not acknowledged.
+        Sends MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW. If the manager denies it, aerokit claims control until
+        :meth:`release`. A vehicle without a gimbal manager gets MAV_CMD_DO_MOUNT_CONTROL. If the vehicle does not
+        support that command either, it gets MOUNT_CONTROL, which is not acknowledged.
 
         Raises:
             InvalidArgument: an angle is out of range, or beyond the limits of the gimbal if :meth:`information` was
@@ -242,7 +250,7 @@ class PointingMixin(GimbalMixin):
 
         async def send() -> None:
             flags = LEVEL if from_nose else LOCKED
-            # The gimbal manager's command has no roll.
+            # The gimbal manager's command has no roll, so an order with roll uses the mount command.
             if roll_deg or not await orders.send_pitch_yaw(order, pitch_deg, yaw_deg, flags=flags):
                 await orders.send_mount_angles(order, pitch_deg, roll_deg, yaw_deg, from_nose=from_nose)
 

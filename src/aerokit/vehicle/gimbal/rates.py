@@ -1,4 +1,4 @@
-"""``GimbalRates``: turning a gimbal at rates while the program feeds them."""
+"""``GimbalRates``: turns a gimbal at rates while the program supplies them."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ if TYPE_CHECKING:
 
 __all__ = ["GimbalRates"]
 
-# Gimbals limit the rate themselves.
+# Limits of the arguments. Gimbals may limit the rates further.
 MAX_RATE_DEG_S, MAX_RATE_HZ = 720.0, 100
 
 
 @checks_arguments
 class GimbalRates(ValueStream[tuple[float, float]]):
-    """Turns a gimbal at the latest rates while its ``async with`` block feeds them.
+    """Turns a gimbal at the latest rates that the program supplies in the ``async with`` block.
 
-    Entering orders the first rates by MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW; then they are sent at ``rate_hz``
-    (GIMBAL_MANAGER_SET_PITCHYAW, or GIMBAL_MANAGER_SET_ATTITUDE to PX4). Leaving, in any way, orders a rate of zero:
-    the gimbal keeps its direction. The stream stops by itself, with a rate of zero, if no new rates are set for
-    ``valid_for_s``, the event loop is blocked for ``max_lag_s``, or the vehicle is silent. It stops without sending a
-    rate of zero if another order is given to the gimbal, or control is lost. ``set`` and leaving the block then raise
-    :class:`SetpointStreamStopped` or :class:`GimbalTaken`.
+    Entering orders the first rates by MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW. From then on the latest rates are sent at
+    ``rate_hz`` (GIMBAL_MANAGER_SET_PITCHYAW, or GIMBAL_MANAGER_SET_ATTITUDE to PX4). Leaving the block in any way
+    orders a rate of zero, so that the gimbal keeps its direction. The stream stops by itself, with a rate of zero, if
+    no new rates are set for ``valid_for_s``, the event loop is blocked for ``max_lag_s``, or the vehicle is silent. It
+    stops without sending a rate of zero if another order is given to the gimbal, or control is lost. ``set`` and
+    leaving the block then raise :class:`SetpointStreamStopped` or :class:`GimbalTaken`.
 
     Entering raises:
         InvalidArgument: a rate is out of range. Nothing was sent.
@@ -83,7 +83,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         self._set((pitch_deg_s, yaw_deg_s))
 
     async def turn(self, pitch_deg_s: float, yaw_deg_s: float, duration_s: float) -> None:
-        """Feed one pair of rates for ``duration_s`` seconds. Rates are as for :meth:`set`. Raises as :meth:`set`."""
+        """Supply one pair of rates for ``duration_s`` seconds. Arguments and errors are as for :meth:`set`."""
         _check(pitch_deg_s, yaw_deg_s)
         await self._feed((pitch_deg_s, yaw_deg_s), duration_s)
 
@@ -100,10 +100,10 @@ class GimbalRates(ValueStream[tuple[float, float]]):
             self._began_at = self._now()
             orders.context.on_finish.append(self._finish)
             self._begin_sending()
-        except (CommandRejected, NotSupported):  # The gimbal does not turn.
+        except (CommandRejected, NotSupported):  # The gimbal does not turn, because the manager refused.
             self._end()
             raise
-        except BaseException:  # Without an answer it may turn.
+        except BaseException:  # Without an answer, the gimbal may turn.
             self._stop("it was not entered")
             raise
         return self

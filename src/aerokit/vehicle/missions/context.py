@@ -31,20 +31,20 @@ if TYPE_CHECKING:
 # MISSION_CURRENT is sent at 1 Hz.
 PLAN_ID_MAX_AGE_S = 2.5
 
-# The same item reached again within this time is a repeated message.
+# If the same item is reported as reached again within this time, the message is a repetition.
 DUPLICATE_WINDOW_S = 0.3
 
 REPEAT_AFTER_S = 1.0
 
-# After a landing, a vehicle may report another item than the last one for this long before it disarms.
+# Between a landing and disarming, a vehicle may report another item than the last for this long.
 FINAL_ITEM_MAX_AGE_S = 3.0
 
-# A vehicle that starts its mission again may report for this long that it is complete.
+# A vehicle that starts its mission again may still report for this long that the mission is complete.
 STALE_STATE_S = 3.0
 
 
 class PlanCache:
-    """Last known content of one kind of plan on the vehicle, with the item numbers of the vehicle."""
+    """Last known content of one kind of plan on the vehicle. Items are numbered as the vehicle numbers them."""
 
     def __init__(self) -> None:
         self.items: tuple[MissionItem, ...] | None = None
@@ -62,8 +62,8 @@ class PlanCache:
 class PlanContext:
     """State shared by the mission, the fence and the rally points of one vehicle.
 
-    They share one lock, because autopilots have one state machine for the transfers of all three. ``files`` returns the
-    vehicle's files on demand.
+    The three plans share one lock, because autopilots have a single state machine for transfers of plans. ``files`` is
+    a function that returns the vehicle's files.
     """
 
     def __init__(self, vehicle_context: VehicleContext, files: Callable[[], Files]) -> None:
@@ -73,7 +73,7 @@ class PlanContext:
         self.transfers: Transfers = vehicle_context.session.transfers
         self.autopilot: Autopilot = vehicle_context.session.autopilot
         self.lock: asyncio.Lock = asyncio.Lock()
-        # By MAV_MISSION_TYPE.
+        # The index is the MAV_MISSION_TYPE.
         self.caches: tuple[PlanCache, PlanCache, PlanCache] = (PlanCache(), PlanCache(), PlanCache())
         self._current: Frame | None = None
         session = vehicle_context.session
@@ -100,7 +100,7 @@ class PlanContext:
         return self.tracker.is_in_mission_mode and not self.session.telemetry.is_confirmed_disarmed
 
     def plan_id(self, mission_type: int, since: float) -> int:
-        """Return the plan's id in a recent MISSION_CURRENT that arrived after ``since``; 0 if unknown."""
+        """Return the plan's id from a recent MISSION_CURRENT that arrived after ``since``; 0 if there is none."""
         frame = self._current
         if frame is None or frame.received_at <= since or self.now() - frame.received_at > PLAN_ID_MAX_AGE_S:
             return 0
@@ -131,9 +131,9 @@ class PlanContext:
 class MissionTracker:
     """Cells and events for mission progress. Item numbers do not count home.
 
-    If ArduCopter lands at the end, it disarms and returns to its first item, without reporting that the mission is
-    complete. PX4 reports completion until the next mission has started, reports an active mission even in its landing
-    mode, and sends each MISSION_ITEM_REACHED ten times.
+    If the mission of an ArduCopter ends with a landing, the vehicle disarms and reports its first item as current, but
+    never reports the mission as complete. PX4 reports completion until the next mission has started. It reports an
+    active mission even in its landing mode, and sends each MISSION_ITEM_REACHED ten times.
     """
 
     def __init__(self, session: VehicleSession) -> None:
@@ -165,13 +165,13 @@ class MissionTracker:
 
     @property
     def last(self) -> int | None:
-        """Number of the last item; None while the number of items is unknown."""
+        """Index of the last item; None while the number of items is unknown."""
         count = self.count.latest
         return count - 1 if count else None
 
     @property
     def is_at_last(self) -> bool:
-        """True while the current item is the last one, and shortly afterwards."""
+        """True while the current item is the last item, and shortly afterwards."""
         return self._session.connection.now() - self._at_last_at <= FINAL_ITEM_MAX_AGE_S
 
     def on_transfer_count(self, count: int) -> None:

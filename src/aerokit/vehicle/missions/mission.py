@@ -1,4 +1,4 @@
-"""``MissionControl``: the mission of a vehicle, and flying it."""
+"""``MissionControl``: transfers the mission of a vehicle, and makes the vehicle fly it."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ RETURN_TIMEOUT_S = 300.0
 class MissionEndDetector:
     """Detects the end of a mission.
 
-    A mission has ended when the vehicle reports that it is complete, or has landed and disarmed at its last item. If
-    the mission ends with a landing, or with a return that includes a landing, the vehicle must also be on the ground,
-    because PX4 reports completion when the return starts, and returns in another mode. A return without a landing ends
-    at home. A vehicle that reports no mission state must have reached the last item.
+    A mission has ended when the vehicle reports the mission as complete, or has landed and disarmed at its last item.
+    If the mission ends with a landing, or with a return that includes a landing, the vehicle must also be on the
+    ground: PX4 reports completion when the return starts, and returns in another mode. A return without a landing ends
+    at home. If a vehicle reports no mission state, it must have reached the last item.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class MissionEndDetector:
         if self._tracker.is_complete:
             at_home = self._ends_in_air and (self._session.autopilot.mission_completes_at_home or self._is_home)
             return not self._ends_by_landing or self._is_on_ground or at_home
-        # ArduPlane returns in another mode, which stops its mission.
+        # ArduPlane returns in another mode than its mission mode, which stops the mission.
         if self._ends_in_air and self._is_landing:
             return self._is_on_ground or self._is_home
         self._returns_since = None
@@ -87,7 +87,7 @@ class MissionEndDetector:
         return not reports_state and last is not None and self._tracker.reached == last
 
     def failure(self, order: Order | None, *, is_paused: bool) -> str | None:
-        """Return the reason why the mission can no longer end. ``order`` is the last one for the mission."""
+        """Return the reason why the mission can no longer end. ``order`` is the last order for the mission."""
         session, now = self._session, self._session.connection.now()
         if self._vehicle_context.arbiter.newest not in (self._order, order):
             return "another order was given"
@@ -100,7 +100,7 @@ class MissionEndDetector:
         ):
             self._left_at = None
             return None
-        if self._left_at is None:  # The end of the mission may be reported after the mode change that it causes.
+        if self._left_at is None:  # The end of the mission causes a mode change, and may be reported after it.
             self._left_at = now
         if now - self._left_at < END_GRACE_S or now < self._grace_until:
             return None
@@ -118,7 +118,7 @@ class MissionEndDetector:
 
     @property
     def _is_landing(self) -> bool:
-        """True if the vehicle has changed from the mission mode to that of its last item."""
+        """True if the vehicle has changed from the mission mode to the mode of its last item (land or return)."""
         mode = self._session.telemetry.mode.latest
         current, last = self._tracker.current.latest, self._tracker.last
         return self._ends_by_landing and current is not None and current == last and mode in self._landing_modes
@@ -147,15 +147,15 @@ class MissionEndDetector:
 class MissionControl(VehiclePlan["Mission"]):
     """The mission of a vehicle: ``await vehicle.mission.upload(mission)``, ``start()``, ``wait_finished()``.
 
-    Item numbers count from 0, and home is not an item, for all autopilots. Starting, pausing and resuming are orders:
-    each supersedes earlier orders to move, and ends with a later one.
+    For all autopilots, item numbers count from 0 and home is not an item. Starting, pausing and resuming are orders:
+    each supersedes earlier orders to move, and is superseded by later ones.
     """
 
     def __init__(self, context: PlanContext) -> None:
         super().__init__(context)
         self._vehicle_context, self._session = context.vehicle_context, context.session
         self._tracker = context.tracker
-        # The last order of this object.
+        # The last order that was given by a method of this object.
         self._order: Order | None = None
         self._is_paused = False
 
@@ -176,20 +176,21 @@ class MissionControl(VehiclePlan["Mission"]):
 
     @property
     def reached(self) -> int | None:
-        """The last item that was reached (MISSION_ITEM_REACHED); None before the first."""
+        """The last item that was reached (MISSION_ITEM_REACHED); None before the first item was reached."""
         return self._tracker.reached
 
     async def set_current(self, item: int, *, timeout: float = 5.0) -> None:
         """Set the next item. A vehicle that is flying its mission proceeds to it immediately.
 
-        Sends MAV_CMD_DO_SET_MISSION_CURRENT, or MISSION_SET_CURRENT to PX4, which supports only that. An item without a
+        Sends MAV_CMD_DO_SET_MISSION_CURRENT. PX4 does not support it, and gets MISSION_SET_CURRENT. An item without a
         position (a DO command) is executed; ``current`` then shows the next item.
 
         Raises:
             InvalidArgument: there is no such item. Nothing was sent.
             CommandRejected: the vehicle refused.
-            OperationRejected: a pilot took over, or a newer order was given, before it was confirmed.
-            OperationTimeout: MISSION_CURRENT did not confirm it.
+            OperationRejected: a pilot took over, or a newer order was given, before the item was confirmed.
+
+            OperationTimeout: MISSION_CURRENT did not confirm the item.
         """
         self._check_item(item)
         with self._vehicle_context.arbiter.auxiliary_order() as order:
@@ -201,7 +202,8 @@ class MissionControl(VehiclePlan["Mission"]):
         The vehicle must be armed: **it takes off** if the mission begins with a take-off. A copter on the ground needs
         a take-off as the first item. If you cancel the call, aerokit orders the vehicle to hold.
 
-        Sends MISSION_START to ArduPilot, which then takes off from the ground. Other autopilots get a mode change.
+        Sends MISSION_START to ArduPilot, because a mode change alone does not make it take off. Other autopilots get a
+        mode change.
 
         Raises:
             InvalidArgument: there is no such item. Nothing was sent.
@@ -231,7 +233,7 @@ class MissionControl(VehiclePlan["Mission"]):
     async def pause(self) -> None:
         """Hold and remember the current item; returns when HEARTBEAT reports the hold mode.
 
-        Raises OperationRejected if the vehicle is not flying its mission, else as :meth:`Vehicle.hold`.
+        Raises OperationRejected if the vehicle is not flying its mission. Other errors are as for :meth:`Vehicle.hold`.
         """
         vehicle_context, session = self._vehicle_context, self._session
         mode = vehicle_context.sender.mode_for("mission.pause", "hold")
@@ -245,9 +247,9 @@ class MissionControl(VehiclePlan["Mission"]):
         await vehicle_context.flight_cleanup.stop_in(mode, self._order)
 
     async def resume(self, *, timeout: float = 10.0) -> None:
-        """Continue the mission from the current item, even after a pilot or another order has interrupted it.
+        """Continue the mission from the current item, even if a pilot or another order has interrupted the mission.
 
-        ArduPilot starts again from the first item if its parameter MIS_RESTART is 1. Raises as :meth:`start`.
+        If its parameter MIS_RESTART is 1, ArduPilot starts again from the first item. Raises as :meth:`start`.
         """
         vehicle_context, session = self._vehicle_context, self._session
         mode = vehicle_context.sender.mode_for("mission.resume", "mission")
@@ -263,7 +265,8 @@ class MissionControl(VehiclePlan["Mission"]):
         self._is_paused = False
 
     async def wait_finished(self, *, timeout: float | None = None, max_silence_s: float | None = MAX_SILENCE_S) -> None:
-        """Wait until the mission has been flown to its end; if it ends with a landing, until the vehicle has landed.
+        """Wait until the mission has been flown to its end. If it ends with a landing, wait until the vehicle has
+        landed.
 
         A :meth:`pause` by another task does not end the wait. Cancelling this call does not stop the vehicle, and no
         command is sent when it fails.
@@ -275,9 +278,9 @@ class MissionControl(VehiclePlan["Mission"]):
         Raises:
             OperationRejected: the vehicle no longer flies the mission: a pilot, a failsafe or another order changed the
                 mode, it disarmed on the way, or it fell. ``reasons`` has the vehicle's status texts.
-            OperationTimeout: the mission was not finished in time; or the armed vehicle has not moved for 12 s after a
-                descent at more than 3 m/s that ended on the ground; or it has not moved for 60 s at a take-off or at a
-                waypoint without a hold (only if the items are known from an upload or a download).
+            OperationTimeout: the mission was not finished in time; or the armed vehicle has not moved for 12 s after it
+                descended to the ground at more than 3 m/s; or it has not moved for 60 s at a take-off or at a waypoint
+                without a hold. The last case is detected only if the items are known from an upload or a download.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
         """
         vehicle_context, session = self._vehicle_context, self._session
@@ -300,7 +303,7 @@ class MissionControl(VehiclePlan["Mission"]):
     def explains_mode(self) -> bool:
         """True if the vehicle holds, returns or lands because its mission has ended.
 
-        The mission must be the last order, and must be complete or at its last item.
+        The mission must be the last order to the vehicle, and must be complete or at its last item.
         """
         session = self._vehicle_context.session
         if self._order is None or self._vehicle_context.arbiter.newest is not self._order:

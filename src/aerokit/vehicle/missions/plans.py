@@ -48,34 +48,34 @@ class VehiclePlan(ReadOnly, Generic[PlanT]):
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> None:
-        """Replace the plan on the vehicle by this one; an empty one clears it.
+        """Replace the plan on the vehicle by ``plan``. An empty plan clears the vehicle's plan.
 
         Args:
             plan: checked before anything is sent.
             method: ``"ftp"`` (ArduPilot's ``@MISSION/…`` files), ``"items"`` (the mission protocol), or ``"auto"``.
-            only_changes: compare with the vehicle's plan, if it is known from an earlier transfer and the vehicle
-                confirms it. Send nothing if both are equal, and only the items that differ if the vehicle supports
-                that.
+            only_changes: compare ``plan`` with the vehicle's plan, if that is known from an earlier transfer and the
+                vehicle confirms that it is unchanged. Send nothing if both are equal. Send only the items that differ
+                if the vehicle supports that.
             verify: read the plan back and compare it, or compare PX4's checksum if that is faster. Files are always
                 read back.
-            max_distance_m: refuse a plan with a position farther than this from the vehicle, if its position is
-                known.
+            max_distance_m: refuse a plan with a position farther than this from the vehicle, if the vehicle's position
+                is known.
             idle_timeout_s: fail after this many seconds without progress.
             timeout: seconds in total.
             on_progress: called with the progress in items, or in bytes of a file.
 
-        See https://mavlink.io/en/services/mission.html. PX4 keeps the old items until it has all of the new ones.
-        ArduPilot overwrites missions and rally points item by item, and a fence at the end. After a failure it may have
-        both old and new items; the error then states that.
+        See https://mavlink.io/en/services/mission.html. PX4 keeps the old items until it has received all new ones.
+        ArduPilot overwrites missions and rally points item by item, and a fence at the end. After a failure, ArduPilot
+        may therefore have both old and new items; the error text then says so.
 
         Raises:
             InvalidArgument: the plan is invalid, or has a position that is too far away. Nothing was sent.
             MissionRejected: the vehicle refused; see ``item``, ``result`` and ``reasons``.
-            MissionTimeout: the vehicle stopped answering; ``missing`` has the items that it did not confirm.
+            MissionTimeout: the vehicle stopped answering; ``missing`` has the items that the vehicle did not confirm.
             VerificationFailed: the vehicle confirmed the plan, but has different items.
             NotSupported: ``"ftp"`` was requested, but the vehicle does not support it.
             FileError, FileTimeout: with ``"ftp"``: the vehicle refused an operation on a file, or did not answer.
-            OperationTimeout: not done within ``timeout``.
+            OperationTimeout: the transfer was not done within ``timeout``.
         """
         plan = self._checked(plan)
         places = [item.position for item in plan.to_items()]
@@ -101,7 +101,7 @@ class VehiclePlan(ReadOnly, Generic[PlanT]):
             MissionTimeout: items did not arrive; ``missing`` has their numbers.
             RemoteProtocolError: the received items are not a valid plan.
             NotSupported, FileError, FileTimeout: as for :meth:`upload`, with ``"ftp"``.
-            OperationTimeout: not done within ``timeout``.
+            OperationTimeout: the transfer was not done within ``timeout``.
         """
         async with self._transfer(idle_timeout_s, timeout, on_progress) as transfer:
             plan = await transfer.download(method)
@@ -116,7 +116,7 @@ class VehiclePlan(ReadOnly, Generic[PlanT]):
             MissionRejected: the vehicle refused.
             MissionTimeout: the vehicle stopped answering.
             VerificationFailed: the vehicle confirmed the command, but still has items.
-            OperationTimeout: not done within ``timeout``.
+            OperationTimeout: the transfer was not done within ``timeout``.
         """
         async with self._transfer(idle_timeout_s, timeout, None) as transfer:
             await transfer.clear()
@@ -127,7 +127,7 @@ class VehiclePlan(ReadOnly, Generic[PlanT]):
         raise NotImplementedError
 
     def _on_count(self, count: int) -> None:
-        """Called with the number of items after a transfer."""
+        """Called after each transfer with the number of items."""
 
     def _checked(self, plan: PlanT) -> PlanT:
         plan_type = self._plan_type()
@@ -152,8 +152,8 @@ class VehiclePlan(ReadOnly, Generic[PlanT]):
 class FenceControl(VehiclePlan["Fence"]):
     """The fence of a vehicle: ``await vehicle.fence.upload(Fence(polygons=[...]))``.
 
-    For ArduPilot, uploading does not enable the fence: use :meth:`enable`, or the parameter FENCE_ENABLE. PX4 always
-    enforces its fence; GF_ACTION defines its reaction.
+    ArduPilot does not enable an uploaded fence: use :meth:`enable`, or the parameter FENCE_ENABLE. PX4 always enforces
+    its fence; its parameter GF_ACTION defines the reaction.
     """
 
     async def enable(self, on: bool = True) -> None:

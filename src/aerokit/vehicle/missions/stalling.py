@@ -16,17 +16,19 @@ if TYPE_CHECKING:
     from aerokit.vehicle.session.session import VehicleSession
 
 MISSION_STALL_TIMEOUT_S = 60.0
-"""Longer than ``STALL_TIMEOUT_S``, because obstacle avoidance and strong wind may stop a vehicle between waypoints."""
+"""Seconds without movement that count as a stall in a mission. Longer than ``STALL_TIMEOUT_S``, because obstacle
+avoidance and strong wind may stop a vehicle between waypoints.
+"""
 
 GROUND_HEIGHT_M = 3.0
-"""Height above home below which a vehicle that stands still after a fast descent counts as fallen."""
+"""A vehicle that stands still below this height above home after a fast descent counts as fallen."""
 
 _TAKEOFFS = (MavCmd.NAV_TAKEOFF, MavCmd.NAV_VTOL_TAKEOFF)
 _WAYPOINTS = (MavCmd.NAV_WAYPOINT, MavCmd.NAV_SPLINE_WAYPOINT)
 
 
 class MissionStallDetector:
-    """Reports a fall, and a vehicle that does not move although its item requires it.
+    """Detects a fall, and a vehicle that does not move although its mission item requires movement.
 
     A fall is a standstill of 12 s right after a fast descent, on the ground or at an item without a hold. Without a
     fast descent, a standstill is reported after ``MISSION_STALL_TIMEOUT_S`` at an item without a hold, while the
@@ -45,12 +47,12 @@ class MissionStallDetector:
         self._session, self._tracker, self._mode = session, tracker, mode
         self._items, self._is_paused = items or (), is_paused
         self._stall = StallDetector(session)
-        # Item of the last call that should move the vehicle, and the time since when.
+        # The item that should have moved the vehicle at the last call, and the time since which it should.
         self._item: int | None = None
         self._moving_since = session.connection.now()
 
     def __call__(self) -> str | None:
-        """Return a clause about the standstill; None if the vehicle moves, may stand still, or is disarmed."""
+        """Return a clause about the standstill; None if the vehicle moves, may stand still here, or is disarmed."""
         progress, current = self._tracker.progress.latest, self._tracker.current.latest
         is_paused = self._is_paused() or (progress is not None and progress.state == MissionState.PAUSED)
         if is_paused or not self._session.telemetry.is_armed:

@@ -39,9 +39,9 @@ REFUSAL_TEXT_DELAY_S = 0.3
 
 
 class PlanChannel:
-    """Transfers plans of one MAV_MISSION_TYPE, with the item numbers of the vehicle.
+    """Transfers plans of one MAV_MISSION_TYPE. Items are numbered as the vehicle numbers them.
 
-    Errors have the item numbers of the program, the texts of the vehicle, and the state of the old items.
+    Errors use the item numbers of the program, and contain the vehicle's status texts and the state of the old items.
     """
 
     def __init__(
@@ -51,13 +51,13 @@ class PlanChannel:
         self._context = context
         self._options: dict[str, Any] = {"idle_timeout_s": idle_timeout_s, "on_progress": on_progress}
         self._path = PACKED_PATHS[mission_type]
-        # True if the vehicle may have some of our items.
+        # True if the vehicle may have received some of our items.
         self._has_changed = False
         # True if positions are sent as 32-bit floats, because the vehicle does not support MISSION_ITEM_INT.
         self.is_single_precision: bool = False
 
     async def send(self, items: Sequence[MissionItem]) -> UploadResult:
-        """Send all items. If a refusal does not identify the item, send them again one at a time."""
+        """Send all items. If a refusal does not identify the refused item, send the items again one at a time."""
         window = self._context.autopilot.mission_upload_window
         exchange = await self._upload(items, window=window)
         try:
@@ -68,7 +68,7 @@ class PlanChannel:
         return await self._run(await self._upload(items, window=1))
 
     async def send_part(self, items: Sequence[MissionItem], first: int) -> UploadResult | None:
-        """Replace the items from ``first`` on; None if the vehicle does not support partial uploads."""
+        """Replace the items from ``first`` on; return None if the vehicle does not support partial uploads."""
         exchange = await self._upload(items, window=1, first=first)
         try:
             end = await self._run(exchange)
@@ -98,12 +98,12 @@ class PlanChannel:
         return await self._has(MavProtocolCapability.FTP, by_default=False)
 
     async def write_file(self, items: Sequence[MissionItem]) -> None:
-        """Write the file. ArduPilot evaluates the file when it is closed, and does not report the result."""
+        """Write the plan's file. ArduPilot evaluates the file when it is closed, and does not report the result."""
         await self._context.files().write(self._path, pack_items(items, self.mission_type), **self._options)
         self._has_changed = True
 
     async def read_file(self) -> tuple[MissionItem, ...]:
-        """Read the file; raises RemoteProtocolError if it is not a file of this kind."""
+        """Read the plan's file; raise RemoteProtocolError if it does not contain a plan of this kind."""
         data = await self._context.files().read(self._path, **self._options)
         return self._normalized(unpack_items(data, self.mission_type))
 
@@ -216,7 +216,7 @@ PlanT = TypeVar("PlanT", bound=PlanProtocol)
 
 
 class PlanTransfer(Generic[PlanT]):
-    """One upload, download or clearing, with the item numbers of the vehicle: item 0 of an ArduPilot is home."""
+    """One upload, download or clearing. Items are numbered as the vehicle numbers them: ArduPilot's item 0 is home."""
 
     def __init__(
         self,
@@ -235,7 +235,7 @@ class PlanTransfer(Generic[PlanT]):
 
     async def upload(self, plan: PlanT, method: str, *, only_changes: bool, verify: bool) -> None:
         items = plan.to_items()
-        if self._offset:  # Send the vehicle's home, because older firmware might replace it by that of the plan.
+        if self._offset:  # Older firmware might otherwise take the plan's home.
             items = with_home(items, self._context.home)
         if len(items) == self._offset:
             await self.clear()
@@ -280,12 +280,12 @@ class PlanTransfer(Generic[PlanT]):
             if not has_ftp:
                 raise NotSupported(f"{self._name}: the vehicle has no file transfer; nothing was sent")
             return True
-        # ArduPilot clears the old mission first, and refuses that while it flies it.
+        # ArduPilot clears the old mission before it reads the file, and refuses to do so while it flies the mission.
         is_flying = is_upload and self._type == 0 and self._context.is_flying_mission
         return has_ftp and self._cache.has_file is not False and not is_flying
 
     def _on_file_error(self, error: Exception, method: str) -> None:
-        """Transfer no files from now on; raise the error if the caller chose files, or if they have worked before."""
+        """Transfer no files from now on. Raise the error if the caller chose files, or if files have worked before."""
         if method == "ftp" or (self._cache.has_file and not isinstance(error, FileError)):
             raise error
         self._cache.has_file = False
@@ -320,16 +320,18 @@ class PlanTransfer(Generic[PlanT]):
             except VerificationFailed:
                 if method == "ftp":
                     raise
-        # There is no such file, or an item was refused. The mission protocol then reports which item and why.
+        # There is no such file, or an item was refused. The mission protocol reports which item was refused and why.
         await self._send_items(items, method, verify=True)
 
     async def _send_changes(self, items: Sequence[MissionItem], method: str, *, verify: bool) -> bool:
-        """Send only differences; False if the vehicle's plan is unknown, or this is not faster."""
+        """Send only the differences; return False if the vehicle's plan is unknown, or sending differences is not
+        faster.
+        """
         autopilot = self._context.autopilot
         if autopilot.reports_mission_checksum:
             reported = self._context.plan_id(self._type, self._cache.updated_at)
             checksum = mission_checksum(items)
-            # The plan may have been replaced a moment ago, so wait for the next report, too.
+            # The plan may have been replaced a moment ago, so the next report must have the same checksum.
             if reported == checksum and await self._context.wait_for_plan_id(self._type, checksum):
                 return True
         if not autopilot.writes_partial_missions or not self._is_worthwhile(self._changes(items), len(items)):
@@ -360,7 +362,7 @@ class PlanTransfer(Generic[PlanT]):
         return True
 
     def _changes(self, items: Sequence[MissionItem]) -> list[int] | None:
-        """Return the numbers of the items that differ from the known plan; None if its number of items differs."""
+        """Return the numbers of the items that differ from the known plan; None if the numbers of items differ."""
         held = self._cache.items
         if held is None or len(held) != len(items):
             return None
@@ -373,7 +375,7 @@ class PlanTransfer(Generic[PlanT]):
         return len(changes) + PART_OVERHEAD_ITEMS * len(list(_stretches(changes))) < count or len(changes) == 0
 
     async def _has_checksum_of(self, items: Sequence[MissionItem]) -> bool:
-        """Wait for the checksum of these items, if that is faster than reading them back; True if it arrives."""
+        """Wait for the checksum of these items if that is faster than reading them back; return True if it arrives."""
         autopilot = self._context.autopilot
         round_trip_s = self._context.transfers.round_trip.smoothed_s or 0.0
         takes_s = len(items) / autopilot.mission_download_window * round_trip_s
@@ -409,7 +411,7 @@ class PlanTransfer(Generic[PlanT]):
 
 
 def _stretches(seqs: Collection[int]) -> Iterator[range]:
-    """Ranges of consecutive numbers: 3, 4, 7 → 3–4, 7."""
+    """Return the ranges of consecutive numbers: 3, 4, 7 become 3–4 and 7."""
     start = previous = None
     for seq in sorted(seqs):
         if previous is not None and start is not None and seq > previous + 1:

@@ -58,9 +58,9 @@ class SystemTime(Snapshot):
 class SensorHealth(Snapshot):
     """Sensor health from SYS_STATUS (https://mavlink.io/en/messages/common.html#SYS_STATUS).
 
-    ``present``, ``enabled`` and ``healthy`` are MAV_SYS_STATUS_SENSOR bits. ``failing`` has the names of enabled but
-    unhealthy sensors. ``prearm_checks_pass`` is None if the vehicle does not report it. ``load_percent`` is the load
-    of the processor.
+    ``present``, ``enabled`` and ``healthy`` are MAV_SYS_STATUS_SENSOR bits. ``failing`` has the names of the sensors
+    that are enabled but not healthy. ``prearm_checks_pass`` is None if the vehicle does not report it. ``load_percent``
+    is the load of the processor.
     """
 
     present: int
@@ -79,9 +79,9 @@ class SensorHealth(Snapshot):
 class EstimatorHealth(Snapshot):
     """State estimator health from EKF_STATUS_REPORT (ArduPilot) or ESTIMATOR_STATUS (PX4).
 
-    ``message`` is the name of the message, ``flags`` its flags, ``missing`` the estimates that flight by position
-    still needs. Ratios are innovations divided by their limits: below 1 is good. Accuracies are in metres, one
-    standard deviation.
+    ``message`` is the name of the message and ``flags`` its flags. ``missing`` names the estimates that are not good
+    yet but needed to fly by position. Ratios are innovations divided by their limits: below 1 is good. Accuracies are
+    one standard deviation, in metres.
     """
 
     message: str
@@ -123,7 +123,8 @@ class EstimatorHealth(Snapshot):
 
 
 class MissionProgress(Snapshot):
-    """The current mission item, counted from 0, and the number of items; None: not reported, or no mission.
+    """The current mission item, counted from 0, and the number of items; each is None if not reported or without a
+    mission.
 
     ``state`` is a MISSION_STATE (1 no mission, 2 not started, 3 active, 4 paused, 5 complete), 0 unknown.
     """
@@ -134,7 +135,7 @@ class MissionProgress(Snapshot):
 
 
 class StatusText(Snapshot):
-    """One status text; ``severity`` is a MAV_SEVERITY, 0 emergency to 7 debug. "…" marks a lost part."""
+    """One status text. ``severity`` is a MAV_SEVERITY, 0 emergency to 7 debug. "…" stands for a lost part."""
 
     severity: int
     text: str
@@ -152,12 +153,12 @@ class StatusText(Snapshot):
 
 
 def mode(message: messages.Heartbeat, context: Context) -> Mode:
-    """The flight mode."""
+    """Return the flight mode in HEARTBEAT."""
     return context.autopilot.mode_of(message, context.mode_names)
 
 
 def current_mode(message: messages.CurrentMode, context: Context) -> Mode | None:
-    """Return the flight mode of CURRENT_MODE, which is sent before the next HEARTBEAT but lacks ``base_mode``."""
+    """Return the flight mode in CURRENT_MODE. It arrives before the next HEARTBEAT, but lacks ``base_mode``."""
     if not message.custom_mode or context.before is None:
         return None
     return context.autopilot.mode(message.custom_mode, context.base_mode, context.mode_names)
@@ -169,17 +170,17 @@ def armed(message: messages.Heartbeat) -> bool:
 
 
 def system_status(message: messages.Heartbeat) -> int:
-    """MAV_STATE."""
+    """Return the MAV_STATE."""
     return member(MavState, message.system_status)
 
 
 def vtol_state(message: messages.ExtendedSysState) -> int:
-    """MAV_VTOL_STATE."""
+    """Return the MAV_VTOL_STATE."""
     return member(MavVtolState, message.vtol_state)
 
 
 def landed_state(message: messages.ExtendedSysState) -> int | None:
-    """MAV_LANDED_STATE."""
+    """Return the MAV_LANDED_STATE."""
     if message.landed_state == MavLandedState.UNDEFINED:
         return None
     return member(MavLandedState, message.landed_state)
@@ -197,7 +198,7 @@ def version(message: messages.AutopilotVersion, context: Context) -> AutopilotVe
 
 
 def capabilities(message: messages.AutopilotVersion) -> int:
-    """MAV_PROTOCOL_CAPABILITY."""
+    """Return the MAV_PROTOCOL_CAPABILITY bits."""
     return MavProtocolCapability(message.capabilities)
 
 
@@ -208,7 +209,7 @@ def system_time(message: messages.SystemTime) -> SystemTime:
 
 
 def sensor_health(message: messages.SysStatus, context: Context) -> SensorHealth:
-    """Return the sensor health as the autopilot defines the bits."""
+    """Return the sensor health; the autopilot's definition gives the bits their meaning."""
     bits = (
         message.onboard_control_sensors_present,
         message.onboard_control_sensors_enabled,
@@ -255,9 +256,7 @@ def estimator_health(message: messages.EstimatorStatus, context: Context) -> Est
 
 
 def mission_progress(message: messages.MissionCurrent) -> MissionProgress:
-    """Return the mission progress. Without a mission ``total`` is UINT16_MAX; 0 means that the vehicle does not
-    report it.
-    """
+    """Return the mission progress. In the message, ``total`` is UINT16_MAX without a mission, and 0 if not reported."""
     state = member(MissionState, message.mission_state)
     if message.total == U16:
         return MissionProgress(None, None, state)
@@ -265,5 +264,5 @@ def mission_progress(message: messages.MissionCurrent) -> MissionProgress:
 
 
 def mission_reached(message: messages.MissionItemReached) -> int:
-    """Return the index of the item."""
+    """Return the index of the mission item that was reached."""
     return message.seq

@@ -53,7 +53,8 @@ LOOKING_DOWN = 25
 
 GPS_FIX_TYPE_3D = 3
 
-# Largest value of one cell. A pack above 65.5 V is reported as several "cells", all but the last with this value.
+# Largest voltage value of one cell. BATTERY_STATUS reports a pack above 65.5 V as several "cells", of which all but the
+# last have this value.
 FULL_CELL = 0xFFFE
 
 INVALID_QUALITY = 1
@@ -76,7 +77,7 @@ class RangeFinder(Snapshot):
 
 
 class GpsReceiver(Snapshot):
-    """One satellite receiver: 0 is GPS_RAW_INT, 1 is GPS2_RAW.
+    """One satellite receiver. Number 0 is reported by GPS_RAW_INT, number 1 by GPS2_RAW.
 
     ``fix_type`` is a GPS_FIX_TYPE (0 no receiver, 1 no fix, 2 2D, 3 3D, 4 DGPS, 5 RTK float, 6 RTK fixed). The
     position is None before a fix. Accuracies are one standard deviation.
@@ -167,7 +168,7 @@ def distance_sensors(message: messages.DistanceSensor, context: Context) -> tupl
 
 
 def range_finder(message: messages.Rangefinder, context: Context) -> tuple[RangeFinder, ...]:
-    """Return the downward sensor of ArduPilot's older message."""
+    """Return the downward sensor reported by ArduPilot's older message RANGEFINDER."""
     return _with(context.before, RangeFinder(0, finite(message.distance), LOOKING_DOWN), _id_of)
 
 
@@ -203,7 +204,9 @@ def _gps_receiver(message: messages.GpsRawInt | messages.Gps2Raw, index: int) ->
 
 
 def batteries(message: messages.BatteryStatus, context: Context) -> tuple[Battery, ...]:
-    """Return the known batteries with the battery of this message replaced or added; cells 11 to 14 are 0 if absent."""
+    """Return the known batteries with the battery of this message replaced or added. In the message, 0 means that a
+    cell from 11 to 14 is absent.
+    """
     cells = [mv for mv in message.voltages if mv != U16]
     cells += [mv for mv in message.voltages_ext if mv not in (0, U16)]
     is_pack = len(cells) == 1 or FULL_CELL in cells
@@ -233,12 +236,12 @@ def main_battery(message: messages.SysStatus, context: Context) -> tuple[Battery
 
 
 def current(centiampere: int, autopilot: Autopilot) -> float | None:
-    """Return the current in amperes; None for the autopilot's value for unknown."""
+    """Return the current in amperes; None if the message has the autopilot's value for "unknown"."""
     return None if centiampere in autopilot.unknown_currents_ca else centiampere / 100
 
 
 def power(message: messages.PowerStatus) -> Power:
-    """Return the supply voltages; 0 means not measured."""
+    """Return the supply voltages; None for a 0 in the message, which means that the voltage is not measured."""
     return Power(scaled(message.Vcc, 0, 1000), scaled(message.Vservo, 0, 1000), member(MavPowerStatus, message.flags))
 
 
@@ -250,7 +253,7 @@ def rc_channels(message: messages.RcChannels) -> RcChannels:
 
 
 def servo_outputs(message: messages.ServoOutputRaw, context: Context) -> ServoOutputs:
-    """Return the known outputs with the sixteen of this port replaced (eight in MAVLink 1)."""
+    """Return the known outputs with the sixteen outputs of the message's port (eight in MAVLink 1) replaced."""
     frame = message.received_frame
     outputs: tuple[int, ...] = _SERVOS(message)[: 8 if frame is not None and frame.version == 1 else 16]
     before: tuple[int, ...] = () if context.before is None else context.before.outputs_us
@@ -285,7 +288,7 @@ YAW_IN_VEHICLE_FRAME = GimbalDeviceFlags.YAW_IN_VEHICLE_FRAME.value
 
 YAW_IN_EARTH_FRAME = GimbalDeviceFlags.YAW_IN_EARTH_FRAME.value
 
-# Sine of the pitch at which roll and yaw rotate about the same axis.
+# If the sine of the pitch exceeds this, the camera points straight up or down, and roll and yaw have the same axis.
 STRAIGHT = 0.99999
 
 
@@ -294,8 +297,8 @@ class GimbalAttitude(Snapshot):
 
     ``pitch_deg`` (0 level, −90 straight down) and ``roll_deg`` are from the horizon. ``yaw_deg`` is 0 to 360 clockwise
     from north, ``yaw_from_nose_deg`` −180 to 180 clockwise from the vehicle's nose. While the vehicle's heading is
-    unknown, ``yaw_deg`` may be relative to the nose. From MOUNT_STATUS (ArduPilot before 4.3) ``yaw_deg`` is the raw
-    number, which may have either reference.
+    unknown, ``yaw_deg`` may be relative to the nose. From MOUNT_STATUS (ArduPilot before 4.3) ``yaw_deg`` is
+    unconverted, and may be relative to north or to the nose.
     """
 
     pitch_deg: float | None
@@ -305,7 +308,7 @@ class GimbalAttitude(Snapshot):
 
 
 def from_status(message: MountStatus) -> GimbalAttitude:
-    """Return the attitude of MOUNT_STATUS, unconverted."""
+    """Return the attitude of MOUNT_STATUS, without converting its yaw."""
     return GimbalAttitude(message.pointing_a / 100.0, message.pointing_b / 100.0, message.pointing_c / 100.0)
 
 
@@ -326,8 +329,8 @@ def from_orientation(message: MountOrientation, heading: float | None) -> Gimbal
 def from_device(message: GimbalDeviceAttitudeStatus, heading: float | None) -> GimbalAttitude:
     """Return the attitude of GIMBAL_DEVICE_ATTITUDE_STATUS.
 
-    A yaw from the nose is converted to north by the difference in the message, or by the vehicle's ``heading`` in
-    degrees. While neither is known, ``yaw_deg`` stays relative to the nose.
+    A yaw from the nose is converted to a yaw from north by ``delta_yaw`` in the message, or by the vehicle's
+    ``heading`` in degrees. While both are unknown, ``yaw_deg`` stays relative to the nose.
     """
     pitch, roll, yaw = _euler(message.q)
     has_delta = message.flags & (YAW_IN_VEHICLE_FRAME | YAW_IN_EARTH_FRAME) and math.isfinite(message.delta_yaw)
@@ -349,7 +352,7 @@ def _is_from_nose(flags: int) -> bool:
 
 
 def _euler(q: tuple[float, ...]) -> tuple[float, float, float]:
-    """Return pitch, roll, yaw in degrees; for a camera that points straight up or down all rotation is yaw."""
+    """Return pitch, roll and yaw in degrees. If the camera points straight up or down, roll is 0."""
     length = math.sqrt(sum(component * component for component in q))
     if not length > 0:
         return math.nan, math.nan, math.nan

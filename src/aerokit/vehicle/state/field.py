@@ -1,8 +1,8 @@
-"""`StateField`: declares a state: the messages that report it, their decoders, and the ones to request.
+"""`StateField`: declares a state with the messages that report it, their decoders, and the rates to request.
 
-Values are immutable, in SI units and degrees, with the unit in the name. A number that the standard defines as
-unknown (UINT16_MAX, −1, NaN …) becomes None. Angles are in degrees, lengths in metres, speeds in metres per second;
-directions are clockwise from north; ``down`` is positive downwards.
+Values are immutable, in SI units and degrees, with the unit in the name. A number that MAVLink defines as "unknown"
+(UINT16_MAX, −1, NaN …) becomes None. Angles are in degrees, lengths in metres, speeds in metres per second; directions
+are clockwise from north; ``down`` is positive downwards.
 """
 
 from __future__ import annotations
@@ -37,15 +37,15 @@ class MessageSource(Generic[T]):
     """One message that reports a state.
 
     Args:
-        message: name of its class, so that not all messages are imported.
-        decode: function that returns the value, or None if the message has none. Without a function, `Telemetry`
-            handles the message.
-        needs_context: ``decode`` takes a :class:`Context` as well.
+        message: name of the message class. The class itself is imported only when it is needed.
+        decode: function that returns the value, or None if the message does not contain it. If this is None,
+            `Telemetry` handles the message.
+        needs_context: True if ``decode`` also takes a :class:`Context`.
         hz: the default rate to request, in Hz.
-        fallback: the message is used only while no better message has reported the state recently.
-        alternative: some autopilots send this message instead of the first one.
+        fallback: use the message only while no better message has reported the state recently.
+        alternative: some autopilots send this message instead of the first message of the state.
         instance_field: the field that distinguishes several instances, all of which are kept.
-        watched_hz: the rate to request while your program waits for the state or follows it, instead of ``hz``.
+        watched_hz: the rate to request instead of ``hz`` while your program waits for the state or follows it.
     """
 
     def __init__(
@@ -77,12 +77,12 @@ class _HasCells(Protocol):
 
 
 class StateField(Generic[T]):
-    """A state reported by messages: a declaration on the class, a cell on its instances.
+    """Descriptor of a state: the class attribute is the declaration, the instance attribute is the state's cell.
 
     Args:
-        sources: the messages that report it, the best first.
+        sources: the messages that report the state, the best first.
         waits_for: shown in error texts while the state is unknown; default: the requested messages.
-        eager: decode when the message arrives, not on the first access.
+        eager: decode each message when it arrives, not on the first access to the value.
     """
 
     name: str
@@ -105,7 +105,7 @@ class StateField(Generic[T]):
         if instance is None:
             return self
         cell: StateCell[T] = instance._cell_of(self.name)
-        instance.__dict__[self.name] = cell  # Later accesses find it in the instance.
+        instance.__dict__[self.name] = cell  # Later accesses find the cell in the instance and bypass this method.
         return cell
 
     def requested_from(self, autopilot: Autopilot) -> list[type[Message]]:
@@ -147,22 +147,22 @@ def member(enum: type[int], value: int) -> int:
 
 
 def finite(value: float) -> float | None:
-    """Return the number, None for NaN and infinity."""
+    """Return the number; None for NaN and infinity."""
     return value if math.isfinite(value) else None
 
 
 def unless(value: int, unknown: int) -> int | None:
-    """Return the number, None if it is the value for unknown."""
+    """Return the number; None if it equals ``unknown``."""
     return None if value == unknown else value
 
 
 def scaled(value: int, unknown: int, divisor: int) -> float | None:
-    """Return the number divided by ``divisor``, None if it is the value for unknown."""
+    """Return the number divided by ``divisor``; None if it equals ``unknown``."""
     return None if value == unknown else value / divisor
 
 
-# Maximum delay in seconds of decoding a frame whose value is not read. A later frame may lack a value that this frame
-# has: without a fix, the position is missing.
+# A frame whose values are not read is decoded after at most this many seconds. A later frame, which would replace it,
+# may lack a value that it contains: without a fix, for example, the position is missing.
 MAX_DECODE_DELAY_S = 5.0
 
 _HEADER_LENGTH = 9
@@ -171,9 +171,9 @@ _HEADER_LENGTH = 9
 class StreamedMessage:
     """One message type of a vehicle's autopilot. Keeps the latest frame and decodes it on access.
 
-    ``instance_at``: offset in the payload of the byte that distinguishes several instances, each of which is kept.
-    While one of ``cells`` has observers, each frame is decoded (``apply(frame, message)``) as it arrives. Frames
-    arrive in the loop's thread; any thread may read. ``lock`` protects the state.
+    ``instance_at`` is the offset in the payload of the byte that distinguishes several instances; the latest frame of
+    each instance is kept. While one of ``cells`` has observers, each frame is decoded (``apply(frame, message)``) when
+    it arrives. Frames arrive in the event loop's thread; any thread may read. ``lock`` protects the state.
     """
 
     __slots__ = (
@@ -203,7 +203,7 @@ class StreamedMessage:
         """Frames that are not decoded yet, by instance."""
 
     def take(self, frame: Frame, message: Message | None = None) -> None:
-        """Process a frame of the vehicle's system, and ``message`` if it is decoded; ignores other components."""
+        """Process a frame of the vehicle's system, and ``message`` if it is decoded. Ignore other components."""
         if frame.component_id != self._component_id:
             return
         if self._is_watched or frame.received_at >= self._look_at:

@@ -25,8 +25,8 @@ _F = AdsbFlags
 class Imu(Snapshot):
     """One inertial sensor, in body axes: x forward, y right, z down.
 
-    Accelerations in m/s², rates in degrees per second, magnetic field in microtesla (1 gauss is 100 µT). Pressures are
-    in Pa, the pressure altitude in metres; None if the message does not contain them.
+    Accelerations are in m/s², rates in degrees per second, the magnetic field in microtesla (1 gauss is 100 µT),
+    pressures in Pa and the pressure altitude in metres. A value that the message does not contain is None.
     """
 
     acceleration_m_s2: tuple[float, float, float]
@@ -39,7 +39,7 @@ class Imu(Snapshot):
 
 
 class RawImu(Snapshot):
-    """Raw readings of one inertial sensor, without a unit: x, y, z of the body axes."""
+    """Raw readings of one inertial sensor along the body axes x, y, z, without a unit."""
 
     acceleration: tuple[int, int, int]
     rate: tuple[int, int, int]
@@ -87,7 +87,7 @@ class Altitude(Snapshot):
 
 
 class ActuatorControls(Snapshot):
-    """Control outputs of one group, −1 to 1: roll, pitch, yaw, throttle and others, before mixing."""
+    """Control outputs of one group before mixing, −1 to 1: roll, pitch, yaw, throttle and others."""
 
     group: int
     controls: tuple[float, ...]
@@ -96,9 +96,10 @@ class ActuatorControls(Snapshot):
 class Aircraft(Snapshot):
     """Another aircraft that an ADS-B receiver on board has reported; unknown values are None.
 
-    ``altitude_m`` is above mean sea level, geometric if ``altitude_is_geometric``, otherwise by pressure.
-    ``course_deg`` is clockwise from north, ``climb_m_s`` up is positive. ``silent_for_s``: seconds between its last
-    transmission and the message. ``emitter`` is an ADSB_EMITTER_TYPE. ``squawk`` is read as four decimal digits.
+    ``altitude_m`` is above mean sea level: geometric if ``altitude_is_geometric``, otherwise derived from pressure.
+    ``course_deg`` is clockwise from north; ``climb_m_s`` is positive upwards. ``silent_for_s`` is the time between the
+    aircraft's last transmission and this message. ``emitter`` is an ADSB_EMITTER_TYPE. ``squawk`` is read as four
+    decimal digits.
     """
 
     icao: int
@@ -118,8 +119,8 @@ class Aircraft(Snapshot):
 class WinchStatus(Snapshot):
     """Line and motor of a winch; unknown values are None. ``flags`` are MAV_WINCH_STATUS_FLAG bits.
 
-    ``speed_m_s`` is positive while the line runs out. ArduCopter reports the ordered speed, and a length calculated
-    from it.
+    ``speed_m_s`` is positive while the line runs out. ArduCopter measures neither: it reports the ordered speed, and a
+    length calculated from this speed.
     """
 
     length_m: float | None
@@ -153,7 +154,7 @@ def highres_imu(message: messages.HighresImu, context: Context) -> Imu:
 
 
 def scaled_imu(message: messages.ScaledImu) -> Imu:
-    """Decode SCALED_IMU: thousandths of g, rad/s and gauss."""
+    """Decode SCALED_IMU, which has thousandths of g, of rad/s and of gauss."""
     return Imu(
         _scaled(MG_M_S2, message.xacc, message.yacc, message.zacc),
         _scaled(RAD_DEG / 1000, message.xgyro, message.ygyro, message.zgyro),
@@ -231,7 +232,7 @@ def actuator_controls(message: messages.ActuatorControlTarget) -> ActuatorContro
 
 
 def aircraft(message: messages.AdsbVehicle, context: Context) -> tuple[Aircraft, ...]:
-    """Return the aircraft reported so far, at most 64, with this one last."""
+    """Return the aircraft reported so far, at most 64, with the aircraft of this message last."""
 
     def if_valid(flag: AdsbFlags, value: float) -> float | None:
         return value if message.flags & flag else None

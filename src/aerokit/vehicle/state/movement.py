@@ -78,8 +78,8 @@ class Velocity(Snapshot):
 class Attitude(Snapshot):
     """Attitude in degrees and turn rates about the body axes in degrees per second.
 
-    ``roll_deg`` right side down, ``pitch_deg`` nose up, ``yaw_deg`` −180 to 180 clockwise from north; a rate is None
-    if not reported.
+    ``roll_deg`` is positive with the right side down, ``pitch_deg`` with the nose up. ``yaw_deg`` is −180 to 180,
+    clockwise from north. A rate is None if not reported.
     """
 
     roll_deg: float
@@ -98,7 +98,7 @@ class Attitude(Snapshot):
         z: float,
         rates_deg_s: tuple[float | None, float | None, float | None],
     ) -> Self:
-        """Return the attitude of a quaternion from earth (north, east, down) to body axes, w first."""
+        """Return the attitude of a quaternion (w first) from earth axes (north, east, down) to body axes."""
         roll, pitch, yaw = euler_from_quaternion(w, x, y, z)
         return cls(math.degrees(roll), math.degrees(pitch), math.degrees(yaw), *rates_deg_s)
 
@@ -109,7 +109,9 @@ class Attitude(Snapshot):
 
 
 class Wind(Snapshot):
-    """Wind speed in m/s; ``direction_deg`` (0 to 360) is where it comes from, ``down_m_s`` None if not reported."""
+    """Wind speed in m/s. ``direction_deg`` (0 to 360) is where the wind comes from; ``down_m_s`` is None if not
+    reported.
+    """
 
     speed_m_s: float
     direction_deg: float
@@ -117,9 +119,9 @@ class Wind(Snapshot):
 
 
 def place(latitude: int, longitude: int) -> tuple[float, float] | None:
-    """Return degrees from 1e-7 degrees; None without a fix, and for a place that is not on earth.
+    """Convert 1e-7 degrees to degrees; return None without a fix, and for a place that is not on earth.
 
-    Without a fix, autopilots report 0, 0 or a place near it: ArduPlane was observed to dead-reckon from there.
+    Without a fix, autopilots report 0, 0 or a place near 0, 0: ArduPlane was observed to dead-reckon from there.
     """
     if abs(latitude) < MIN_COORDINATE and abs(longitude) < MIN_COORDINATE:
         return None
@@ -131,7 +133,7 @@ def place(latitude: int, longitude: int) -> tuple[float, float] | None:
 def position(message: messages.GlobalPositionInt, context: Context) -> Position | None:
     """Return the position, None before the first fix.
 
-    Until home is set, ``relative_alt`` equals the altitude above mean sea level and is left out.
+    Until home is set, ``relative_alt`` is the altitude above mean sea level, so the result has no relative altitude.
     """
     where = place(message.lat, message.lon)
     if where is None:
@@ -158,7 +160,7 @@ def local_position(message: messages.LocalPositionNed) -> LocalPosition:
 
 
 def local_velocity(message: messages.LocalPositionNed) -> Velocity:
-    """Return the velocity only."""
+    """Return the velocity in the local frame, without the position."""
     return Velocity(message.vx, message.vy, message.vz)
 
 
@@ -225,12 +227,12 @@ def origin(message: messages.GpsGlobalOrigin) -> Position | None:
 
 
 def wind(message: messages.Wind) -> Wind:
-    """Return the wind of ArduPilot, which reports where it comes from."""
+    """Return the wind reported by ArduPilot, as the direction that it comes from."""
     return Wind(message.speed, geo.wrap_360(message.direction), finite(message.speed_z))
 
 
 def wind_of_covariance(message: messages.WindCov) -> Wind | None:
-    """Return the wind of PX4, which reports the vector in which the air moves."""
+    """Return the wind reported by PX4, which is the vector in which the air moves."""
     if not (math.isfinite(message.wind_x) and math.isfinite(message.wind_y)):
         return None
     comes_from = math.degrees(math.atan2(-message.wind_y, -message.wind_x))

@@ -1,8 +1,8 @@
 """All states of a vehicle, each declared once.
 
-To add one: write its value and decoder (``movement.py``, ``equipment.py``, ``condition.py``) and declare it here,
-with its documentation below. Its cell, the attribute of both vehicle classes, its requested rate and the table in
-docs/states.md follow from that.
+To add a state, write its value class and its decoder (``movement.py``, ``equipment.py``, ``condition.py``), declare the
+state here, and document it below the declaration. Its cell, the attribute of both vehicle classes, its requested rate
+and its row in docs/states.md follow from the declaration.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class States:
     system_status: StateField[int] = StateField(MessageSource("Heartbeat", condition.system_status), eager=True)
     """MAV_STATE: 3 standby, 4 active, 5 critical, 6 emergency (HEARTBEAT)."""
 
-    # After mode and system_status, so that its observers see the whole HEARTBEAT.
+    # Declared after mode and system_status, so that these are up to date when observers of ``armed`` are called.
     armed: StateField[bool] = StateField(MessageSource("Heartbeat", condition.armed), eager=True)
     """True if the motors are armed (HEARTBEAT)."""
 
@@ -104,12 +104,12 @@ class States:
         MessageSource("LocalPositionNed", movement.local_velocity, fallback=True),
         waits_for="GLOBAL_POSITION_INT with a fix",
     )
-    """Velocity over ground in m/s, north, east, down (GLOBAL_POSITION_INT)."""
+    """Velocity over ground in m/s: north, east, down (GLOBAL_POSITION_INT)."""
 
     local_position: StateField[LocalPosition] = StateField(
         MessageSource("LocalPositionNed", movement.local_position, hz=10.0)
     )
-    """Position in metres and velocity in m/s, north, east, down from the local origin (LOCAL_POSITION_NED)."""
+    """Position in metres from the local origin, and velocity in m/s: north, east, down (LOCAL_POSITION_NED)."""
 
     ground_speed_m_s: StateField[float] = StateField(MessageSource("VfrHud", movement.ground_speed_m_s, hz=5.0))
     """Ground speed in m/s (VFR_HUD)."""
@@ -129,7 +129,7 @@ class States:
         MessageSource("GpsRawInt", equipment.first_gps, needs_context=True, hz=2.0),
         MessageSource("Gps2Raw", equipment.second_gps, needs_context=True),
     )
-    """All satellite receivers, the first one first (GPS_RAW_INT, GPS2_RAW)."""
+    """All satellite receivers, in the order of their numbers (GPS_RAW_INT, GPS2_RAW)."""
 
     batteries: StateField[tuple[Battery, ...]] = StateField(
         MessageSource("BatteryStatus", equipment.batteries, needs_context=True, hz=1.0, instance_field="id"),
@@ -139,7 +139,7 @@ class States:
     """All batteries (BATTERY_STATUS, else SYS_STATUS)."""
 
     power: StateField[Power] = StateField(MessageSource("PowerStatus", equipment.power, hz=1.0))
-    """Supply of the board and of its servos in volts (POWER_STATUS)."""
+    """Supply voltages of the board and of its servos (POWER_STATUS)."""
 
     sensors: StateField[SensorHealth] = StateField(
         MessageSource("SysStatus", condition.sensor_health, needs_context=True, hz=2.0)
@@ -159,12 +159,12 @@ class States:
     """Origin of the estimator's local frame (GPS_GLOBAL_ORIGIN)."""
 
     rc_channels: StateField[RcChannels] = StateField(MessageSource("RcChannels", equipment.rc_channels, hz=2.0))
-    """Remote control, pulse widths in µs (RC_CHANNELS)."""
+    """Pulse widths of the remote control channels in µs (RC_CHANNELS)."""
 
     servo_outputs: StateField[ServoOutputs] = StateField(
         MessageSource("ServoOutputRaw", equipment.servo_outputs, needs_context=True, hz=2.0, instance_field="port")
     )
-    """Outputs to motors and servos, pulse widths in µs (SERVO_OUTPUT_RAW)."""
+    """Pulse widths of the outputs to motors and servos in µs (SERVO_OUTPUT_RAW)."""
 
     wind: StateField[Wind] = StateField(
         MessageSource("Wind", movement.wind, hz=1.0),
@@ -203,7 +203,7 @@ class States:
     """The last mission item reached (MISSION_ITEM_REACHED)."""
 
     status_text: StateField[StatusText] = StateField(MessageSource("Statustext", None), eager=True)
-    """The last status text (STATUSTEXT, chunks joined)."""
+    """The last status text (STATUSTEXT); the chunks of a long text are joined."""
 
     imu: StateField[Imu] = StateField(
         MessageSource("HighresImu", measurements.highres_imu, needs_context=True, watched_hz=10.0)
@@ -253,7 +253,7 @@ class States:
 STATES: Mapping[str, StateField[Any]] = {
     name: value for name, value in vars(States).items() if isinstance(value, StateField)
 }
-"""Declarations by name."""
+"""All declarations by name of the state."""
 
 
 def _by_message() -> dict[str, list[tuple[StateField[Any], MessageSource[Any]]]]:
@@ -265,10 +265,10 @@ def _by_message() -> dict[str, list[tuple[StateField[Any], MessageSource[Any]]]]
 
 
 SOURCES: Mapping[str, list[tuple[StateField[Any], MessageSource[Any]]]] = _by_message()
-"""The states that a message reports, and how, by name of the message class."""
+"""Maps the name of a message class to the states that the message reports, each with its `MessageSource`."""
 
 LAZY = tuple(name for name, rows in SOURCES.items() if not any(field.eager for field, _ in rows))
-"""Messages that are decoded on access to one of their states."""
+"""Message classes that are decoded only when one of their states is accessed."""
 
 DEFAULT_RATES_HZ: Mapping[str, float] = {
     name: max(source.hz for _, source in rows if source.hz is not None)

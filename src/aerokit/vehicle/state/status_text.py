@@ -1,4 +1,4 @@
-"""STATUSTEXT: joins chunks, removes padding, and keeps recent texts to explain failures."""
+"""Assembles status texts from STATUSTEXT messages, and keeps recent texts to explain failures."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ CHUNK_LENGTH = 50
 """Bytes of text in one STATUSTEXT."""
 CHUNK_TIMEOUT_S = 2.0
 MAX_RECENT_TEXTS = 64
-# Maximum chunks of one text; a longer text is invalid and passed on in parts.
+# Maximum number of chunks of one text. A longer text is invalid, and is passed on in parts.
 MAX_CHUNKS = 20
-# Maximum number of incomplete texts of all components.
+# Maximum number of incomplete texts, over all components.
 MAX_OPEN = 16
 ELLIPSIS = "…"
 
@@ -70,7 +70,7 @@ class StatusTextAssembler:
         text = self._open.get(key)
         if text is not None and message.chunk_seq < text.next_seq:
             if message.chunk_seq == text.next_seq - 1 and text.last_chunk == chunk:
-                return  # The same frame, received by another link.
+                return  # The same chunk was already received by another link.
             yield self._open.pop(key).cut(now)
             text = None
         if text is None:
@@ -87,7 +87,7 @@ class StatusTextAssembler:
 
 
 class _OpenText:
-    """The chunks received of one text, at least one."""
+    """An incomplete text: the chunks of it that were received, at least one."""
 
     last_chunk: bytes
     touched_at: float
@@ -116,7 +116,7 @@ def _sender(message: Statustext) -> _Sender:
 
 
 def _bytes_of(message: Statustext) -> bytes:
-    """Return the text as sent: a multi-byte character may be split between two chunks."""
+    """Return the undecoded text of a chunk, because a multi-byte character may be split between two chunks."""
     frame = message.received_frame
     data = message.text.encode() if frame is None else frame.payload[1 : 1 + CHUNK_LENGTH]
     return data.split(b"\0")[0]

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.vehicle.state.condition import StatusText
 
-# Seconds for which a fallback message is ignored after a better one.
+# Seconds for which a fallback message is ignored after a better message.
 FALLBACK_DELAY_S = 2.0
 MAX_MODE_NAMES = 256
 
@@ -33,9 +33,10 @@ Handler = Callable[[Any, Source], None]
 class Telemetry(States):
     """All state cells of one vehicle, updated by its messages.
 
-    Only messages of system ``system_id``, component ``component_id`` (the autopilot) are processed; messages built by
-    the program itself are accepted. ``handles`` has the handler for each message id, ``streams`` those that take
-    frames of streamed messages. ``clock`` returns seconds; without ``autopilot`` the first HEARTBEAT determines it.
+    Only messages of system ``system_id``, component ``component_id`` (the autopilot) are processed, and messages that
+    the program itself has built. ``handles`` maps message ids to handlers of messages, ``streams`` maps them to
+    handlers of undecoded frames. ``clock`` returns seconds. If ``autopilot`` is None, the first HEARTBEAT determines
+    it.
     """
 
     autopilot: Autopilot
@@ -53,7 +54,7 @@ class Telemetry(States):
         self.autopilot = autopilot or Autopilot(0)
         self._knows_autopilot = autopilot is not None
         self._clock = clock
-        self._lock = threading.RLock()  # Any thread may read a cell, which decodes the pending frame.
+        self._lock = threading.RLock()  # Any thread may read a cell, and reading decodes pending frames.
         self._arrived_at: float | None = None
         self._texts = StatusTextAssembler()
         self._mode_names: dict[int, str] = {}
@@ -78,7 +79,7 @@ class Telemetry(States):
 
     @property
     def streams(self) -> Mapping[int, StreamedMessage]:
-        """Handlers of frames, which are decoded on access to their cells, by message id."""
+        """Handlers of frames by message id. These frames are decoded when one of their cells is accessed."""
         return self._streams
 
     def accepts(self, frame: Frame) -> bool:
@@ -86,13 +87,13 @@ class Telemetry(States):
         return frame.system_id == self.system_id and frame.component_id == self.component_id
 
     def receive(self, message: Message) -> None:
-        """Process any message; messages without state are ignored."""
+        """Process any message. Messages that report no state are ignored."""
         handler = self._handlers.get(message.ID)
         if handler is not None:
             handler(message)
 
     def expire(self, now: float) -> None:
-        """Deliver status texts whose last chunk is missing. Call it about once a second."""
+        """Publish status texts whose last chunk did not arrive. Call this about once a second."""
         self._publish_texts(self._texts.expire(now), self._source("Statustext"))
 
     def forget(self) -> None:
@@ -116,7 +117,7 @@ class Telemetry(States):
 
     @property
     def mode_names(self) -> Mapping[int, str]:
-        """Names of modes from AVAILABLE_MODES that no table contains, by custom_mode."""
+        """Maps the custom_mode of each mode in AVAILABLE_MODES that no built-in table contains to its name."""
         return self._mode_names
 
     @property
@@ -185,7 +186,7 @@ class Telemetry(States):
         return take
 
     def _handle(self, handler: Handler, message: Message, source: Source, frame: Frame | None) -> None:
-        """Process a message. Its values are as old as the frame that contained it, regardless of when it is decoded."""
+        """Process a message. Its values get the time at which its frame arrived, regardless of when it is decoded."""
         before, self._arrived_at = self._arrived_at, None if frame is None else frame.received_at
         try:
             handler(message, source)
@@ -213,7 +214,7 @@ class Telemetry(States):
         return on_heartbeat if class_name == "Heartbeat" else handlers[0] if len(handlers) == 1 else handler
 
     def _handler_for(self, cell: StateCell[Any], by: MessageSource[Any]) -> Handler:
-        """Return the handler that updates one cell from one message; a value of None is ignored."""
+        """Return the handler that updates one cell from one type of message. Decoded values of None are ignored."""
         decode, context = by.decode, self._context
         assert decode is not None
 
@@ -251,7 +252,7 @@ class Telemetry(States):
         return StreamedMessage(self.component_id, cells, instance_at, apply, self._lock)
 
     def _has_better(self, cell: StateCell[Any], source: Source) -> bool:
-        """Return True if a better message has reported this value recently."""
+        """Return True if a better message than ``source`` has reported the cell's value recently."""
         return (
             cell.source is not None
             and cell.source.message != source.message
@@ -281,7 +282,8 @@ class Telemetry(States):
             self._mode_names[message.custom_mode] = name
 
     def _on_status_text(self, message: messages.Statustext, source: Source) -> None:
-        # Stamped when read, so that a text that explains a refusal is not older than the refused command.
+        # The time stamp is that of processing, so that a text that explains a refusal is not older than the refused
+        # command.
         self._publish_texts(self._texts.receive(message, self._clock()), source)
 
     def _publish_texts(self, texts: Iterable[StatusText], source: Source) -> None:
