@@ -136,7 +136,7 @@ _ALSO_STREAMED = (
 # Class names of messages that any autopilot sends as a stream. Other messages are sent when needed.
 STREAMED_MESSAGES = frozenset((*(name for names in _GROUPS.values() for name in names), *_ALSO_STREAMED))
 
-# First number of each FIRMWARE_VERSION_TYPE, and the suffix of its versions.
+# First number of each FIRMWARE_VERSION_TYPE, and the suffix for its version texts.
 _VERSION_TYPES = ((255, ""), (192, "-rc"), (128, "-beta"), (64, "-alpha"), (0, "-dev"))
 
 

@@ -260,7 +260,7 @@ class RallyPoints(_ItemSequence):
 
     @property
     def positions(self) -> tuple[Position, ...]:
-        """The positions of all items that have one."""
+        """The positions of all items that have a position."""
         return tuple(item.position for item in self.items if item.position is not None)
 
     def check(self, *, home_is_item_0: bool | None = None) -> None:

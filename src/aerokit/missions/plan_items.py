@@ -140,7 +140,7 @@ def simple_entry(item: MissionItem) -> dict[str, Any]:
 
 
 def json_number(value: float) -> int | float | None:
-    """Convert a number as QGroundControl does: null for NaN, whole numbers without a decimal point."""
+    """Convert a number to QGroundControl's form: null for NaN, whole numbers without a decimal point."""
     if math.isnan(value):
         return None
     return int(value) if math.isfinite(value) and value == int(value) and abs(value) < 2**53 else value
@@ -304,7 +304,7 @@ class JsonValue:
         return value
 
     def integer(self, low: int, high: int) -> int:
-        """Return a whole number in the range. 3.0 counts as one."""
+        """Return a whole number in the range. 3.0 counts as a whole number."""
         value = self.number()
         if not value.is_integer() or not low <= value <= high:
             raise self.error(f"a whole number from {low} to {high}")

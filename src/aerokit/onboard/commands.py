@@ -123,7 +123,7 @@ class ComponentCommands:
         self.uses_threads = False
         """True to call plain functions in threads, for blocking programs."""
         self.handlers: dict[int, CommandHandler] = {}
-        """Maps MAV_CMD to handler; protocol servers add theirs."""
+        """Maps MAV_CMD to handler. Protocol servers add their handlers."""
         self.server: CommandDispatcher = CommandDispatcher(host, self.handlers)
         self._running = RunningCommands(host, self.server)
         self._host, self._tasks = host, tasks

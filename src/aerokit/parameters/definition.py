@@ -74,8 +74,8 @@ class SettingDefinition(Snapshot):
     """Definition of one setting. Fields that the file does not define are None or empty.
 
     ``type`` is the type name in the file (``"bool"``, ``"uint32"``, ``"float"`` …), and ``wire_type`` is the
-    MAV_PARAM_EXT_TYPE. ``updates`` are settings that the camera may change together with this one. If ``is_control`` is
-    False, a program should not display a control for it. ``step`` is enforced for whole numbers only.
+    MAV_PARAM_EXT_TYPE. ``updates`` are settings that the camera may change together with this setting. If
+    ``is_control`` is False, a program should not display a control for it. ``step`` is enforced for whole numbers only.
     """
 
     name: str

@@ -33,7 +33,7 @@ class ParameterRenamedWarning(UserWarning):
 class Rename(Snapshot):
     """A renamed parameter.
 
-    ``divisor`` converts old values to new ones: 100 for centimetres that became metres. ``is_inverted`` is True for
+    ``divisor`` converts old values to new values: 100 for centimetres that became metres. ``is_inverted`` is True for
     ARMING_CHECK (checks to make, 1 for all) and ARMING_SKIPCHK (checks to skip). ``vehicles`` are the vehicle types
     that have the parameter. ``other_new`` are further names in new units, ``other_old`` further names in old units.
     ``since`` is the ArduPilot version that introduced the new name.

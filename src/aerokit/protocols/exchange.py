@@ -161,7 +161,7 @@ class MessageStream:
         self._received_at: float | None = None
         self._last_at = 0.0
         self.failures: int = 0
-        """Consecutive requests without any message; counted by the owner."""
+        """Number of consecutive requests that no message followed. The owner of this object counts them."""
 
     @property
     def interval_s(self) -> float | None:

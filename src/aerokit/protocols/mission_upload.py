@@ -88,9 +88,9 @@ class MissionUpload(MissionExchange[UploadResult]):
         self._end = self._first + len(items)
         self._window, self._accepts_int = window, takes_int
         self.is_refusal_ambiguous: bool = False
-        """True if a refusal may concern any of several items in flight; to find out, send one at a time."""
+        """True if a refusal may be about any of several items in flight. To find out, send items one at a time."""
         self.was_started: bool = False
-        """True once the vehicle has requested an item, and so may have overwritten some."""
+        """True once the vehicle has requested an item. From then on it may have overwritten items."""
         self._restarts = 0
         self._busy_until: float | None = None
         self._reset()

@@ -609,7 +609,7 @@ class Guided(TwinOf["AsyncGuided"]):
         """Stream body rates with thrust (SET_ATTITUDE_TARGET without an attitude).
 
         ArduCopter and PX4 execute them. The autopilot does not level the vehicle: it keeps turning until the next
-        set-point, or until aerokit orders a hold, after ``valid_for_s`` without a new one.
+        set-point, or until aerokit orders a hold because there was no new set-point for ``valid_for_s``.
         """
         return SetpointStream(
             self._loop,
@@ -750,11 +750,11 @@ class StickStream(BlockTwin["AsyncStickStream"]):
 class MeasurementStream(MeasurementTwin[MeasurementT]):
     """Sends each measurement passed to ``send`` once, at most ``rate_hz`` measurements a second.
 
-    A measurement is never repeated: if your program supplies no new one, nothing is sent, and the vehicle acts as if
-    its sensor had failed. Of several measurements within one period, only the newest is sent. A measurement is dropped
-    if it is older than ``valid_for_s`` when it is due to be sent, for example after the event loop was blocked. While
-    the vehicle is silent, all measurements are dropped. ``sent`` and ``dropped`` count measurements. The stream ends
-    only with the block.
+    A measurement is never repeated. If your program supplies no new measurement, nothing is sent, and the vehicle
+    behaves as if its sensor had failed. Of several measurements within one period, only the newest is sent. A
+    measurement is dropped if it is older than ``valid_for_s`` when it is due to be sent, for example after the event
+    loop was blocked. While the vehicle is silent, all measurements are dropped. ``sent`` and ``dropped`` count
+    measurements. The stream ends only with the block.
 
     Entering raises:
         NotSupported: this firmware does not read such measurements. Nothing was sent.
@@ -1271,7 +1271,9 @@ class Gimbals(GimbalsTwin["Gimbal"]):
 
     @cached_property
     def first(self) -> Gimbal:
-        """The first gimbal; one attached to the autopilot takes precedence over those with their own component id."""
+        """The first gimbal. A gimbal attached to the autopilot takes precedence over gimbals with their own component
+        id.
+        """
         return Gimbal(self._loop, self.aio.first)
 
     @property
@@ -1362,7 +1364,7 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
             InvalidArgument: the mode is not one of the modes of the order, or the block was left. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement.
-            OperationTimeout: the vehicle accepted the mode but stayed in another one.
+            OperationTimeout: the vehicle accepted the mode but stayed in another mode.
         """
         self._loop.run(self.aio.set_mode, mode, timeout=timeout, component_id=component_id)
 
@@ -1431,9 +1433,9 @@ class Files(TwinOf["AsyncFiles"]):
     ) -> None:
         """Copy a file to this computer. It is written to ``<to>.part`` and renamed when it is complete.
 
-        With ``resume``, the download continues the ``<to>.part`` of an interrupted one, unless the vehicle's file is
-        shorter. If the vehicle can compute the CRC-32, it is compared with that of the result; if they differ, the
-        whole file is read again. Files whose names begin with ``@`` are always read completely.
+        With ``resume``, the download continues the ``<to>.part`` of an interrupted download, unless the vehicle's file
+        is shorter than it. If the vehicle can compute the CRC-32, it is compared with that of the result; if they
+        differ, the whole file is read again. Files whose names begin with ``@`` are always read completely.
 
         Raises:
             RemoteProtocolError: as for :meth:`read`.
@@ -1724,7 +1726,7 @@ class Actuators(TwinOf["AsyncActuators"]):
 
         Raises:
             InvalidArgument: a value is out of range. Nothing was sent.
-            NotSupported: the firmware does not have the command. Nothing was sent.
+            NotSupported: the firmware does not support the command. Nothing was sent.
             CommandRejected: the vehicle refused, for example because the output has another function.
             CommandTimeout: there was no acknowledgement.
             OperationRejected: your program gave a newer order for this output.
@@ -1798,7 +1800,7 @@ class Actuators(TwinOf["AsyncActuators"]):
         is no landing gear (LGR_ENABLE), and even while the vehicle stands on its gear.
 
         Raises:
-            NotSupported: the firmware (PX4, Rover or Sub) does not have the command. Nothing was sent.
+            NotSupported: the firmware (PX4, Rover or Sub) does not support the command. Nothing was sent.
             OperationRejected: the vehicle is disarmed, or on the ground. Nothing was sent.
             CommandRejected: the vehicle refused.
             CommandTimeout: there was no acknowledgement.
@@ -1816,8 +1818,8 @@ class Actuators(TwinOf["AsyncActuators"]):
     def set_lights(self, on: bool, *, component_id: int = MavComponent.ILLUMINATOR) -> None:
         """Switch an illuminator, and return when ILLUMINATOR_STATUS reports it (MAV_CMD_ILLUMINATOR_ON_OFF).
 
-        Only for lights that are MAVLink components, because ArduPilot and PX4 do not have the command. Switch lights on
-        an output of ArduPilot by ``set_servo`` or ``set_relay``. Raises as :meth:`set_servo`.
+        Only for lights that are MAVLink components, because ArduPilot and PX4 do not support the command. Switch lights
+        on an output of ArduPilot by ``set_servo`` or ``set_relay``. Raises as :meth:`set_servo`.
 
         Args:
             on: the new state.
@@ -1869,7 +1871,7 @@ class Actuators(TwinOf["AsyncActuators"]):
 
         Raises:
             InvalidArgument: the intent is another text. Nothing was sent.
-            NotSupported: the firmware (PX4, Rover or Sub) does not have the command. Nothing was sent.
+            NotSupported: the firmware (PX4, Rover or Sub) does not support the command. Nothing was sent.
             OperationRejected: the vehicle refused after the acknowledgement; ``reasons`` has its status texts.
             CommandRejected: the vehicle refused.
             CommandTimeout: there was no acknowledgement.
@@ -2305,13 +2307,13 @@ class Parameters(TwinOf["AsyncParameters"]):
         *,
         idle_timeout_s: float = IDLE_TIMEOUT_S,
     ) -> TemporaryParameters:
-        """Set values for the duration of an ``async with`` block and restore the previous ones at its end.
+        """Set values for the duration of an ``async with`` block, and restore the previous values at its end.
 
-        They are also restored if the block raises or is cancelled, which takes up to ``idle_timeout_s`` seconds. If a
-        value cannot be set, the others are restored and its error is raised. Blocks may be nested and may overlap, also
-        with the same parameter: when the last of these blocks ends, the parameter gets its value from before the first
-        block. A value that another station has changed meanwhile stays, and a warning of logger "aerokit" names the
-        parameter.
+        They are also restored if the block raises or is cancelled, which takes up to ``idle_timeout_s`` seconds. If one
+        value cannot be set, all other values are restored and the error is raised. Blocks may be nested and may
+        overlap, also with the same parameter: when the last of these blocks ends, the parameter gets its value from
+        before the first block. A value that another station has changed meanwhile stays, and a warning of logger
+        "aerokit" names the parameter.
 
         Raises:
             RollbackFailed: values could not be restored; ``not_restored`` has them.
@@ -2983,19 +2985,19 @@ class Camera(TwinOf["AsyncCamera"]):
 
     @cached_property
     def mode(self) -> StateCell[str]:
-        """``"photo"``, ``"video"`` or ``"survey"`` (CAMERA_SETTINGS). Polled every 5 s while your
-        program uses this cell, like the next two.
+        """``"photo"``, ``"video"`` or ``"survey"`` (CAMERA_SETTINGS). Polled every 5 s while your program uses this
+        cell.
         """
         return StateCell(self._loop, self.aio.mode)
 
     @cached_property
     def zoom_percent(self) -> StateCell[float | None]:
-        """0 (widest) to 100; None if the camera does not know it."""
+        """Zoom from 0 (widest) to 100; None if the camera does not know it. Polled like ``mode``."""
         return StateCell(self._loop, self.aio.zoom_percent)
 
     @cached_property
     def focus_percent(self) -> StateCell[float | None]:
-        """0 (nearest) to 100; None if the camera does not know it."""
+        """Focus from 0 (nearest) to 100; None if the camera does not know it. Polled like ``mode``."""
         return StateCell(self._loop, self.aio.focus_percent)
 
     @cached_property
@@ -3068,7 +3070,9 @@ class Camera(TwinOf["AsyncCamera"]):
 
     @cached_property
     def tracked_place(self) -> StateCell[TrackedPlace]:
-        """Position of the tracked object on earth, if the camera reports it; requested in the same way."""
+        """Position of the tracked object on earth, if the camera reports it; requested at the same rate as
+        ``tracking``.
+        """
         return StateCell(self._loop, self.aio.tracked_place)
 
     def track_point(self, x: float, y: float, *, radius: float = 0.0, status_hz: float = 5.0) -> None:
@@ -3143,7 +3147,7 @@ class Camera(TwinOf["AsyncCamera"]):
         """Zoom for the duration of an ``async with`` block. The end of the block stops the zoom, also under
         cancellation.
 
-        Entering raises what :meth:`zoom_step` does.
+        Entering raises as :meth:`zoom_step`.
 
         Args:
             speed: −1 (out) to 1 (in); many cameras support only these two values.
@@ -3185,7 +3189,7 @@ class Camera(TwinOf["AsyncCamera"]):
         """Move the focus for the duration of an ``async with`` block. The end of the block stops it, also under
         cancellation.
 
-        Entering raises what :meth:`focus_step` does.
+        Entering raises as :meth:`focus_step`.
 
         Args:
             speed: −1 (nearer) to 1 (farther); many cameras support only these two values.
@@ -3246,7 +3250,7 @@ class Camera(TwinOf["AsyncCamera"]):
         """Record for the duration of an ``async with`` block. The end of the block stops recording, also under
         cancellation.
 
-        Entering raises what :meth:`start_video` does.
+        Entering raises as :meth:`start_video`.
 
         Raises:
             InvalidArgument: ``status_hz`` is not 0 to 10. Nothing was sent.
@@ -3283,7 +3287,7 @@ class Camera(TwinOf["AsyncCamera"]):
         self._loop.run(self.aio.stop_streaming, stream)
 
     def select_stream(self, stream: int) -> None:
-        """Start one stream and stop the others; errors as for :meth:`start_streaming`.
+        """Start one stream and stop all other streams; errors as for :meth:`start_streaming`.
 
         Args:
             stream: number of the stream, 1 to 255.
@@ -3311,7 +3315,7 @@ class Camera(TwinOf["AsyncCamera"]):
 
     @cached_property
     def information(self) -> StateCell[CameraInformation]:
-        """Vendor, model, capabilities (CAMERA_INFORMATION); the first call requests it."""
+        """Vendor, model, capabilities (CAMERA_INFORMATION). The first call to the camera requests the message."""
         return StateCell(self._loop, self.aio.information)
 
     @property
@@ -3352,11 +3356,11 @@ class Camera(TwinOf["AsyncCamera"]):
         """Take a photo every ``seconds`` for the duration of an ``async with`` block.
 
         ``async with camera.photo_interval(2, count=10) as captures: async for capture in captures: …`` gives the
-        captures in order; lost ones are requested again. MAV_CMD_IMAGE_STOP_CAPTURE is sent at the end of the block,
-        also under cancellation. PX4's trigger is started and stopped by MAV_CMD_DO_TRIGGER_CONTROL.
+        captures in order; lost captures are requested again. MAV_CMD_IMAGE_STOP_CAPTURE is sent at the end of the
+        block, also under cancellation. PX4's trigger is started and stopped by MAV_CMD_DO_TRIGGER_CONTROL.
 
         Args:
-            seconds: time between two pictures, above 0 to 3600.
+            seconds: time between two pictures, above 0, at most 3600.
             count: number of pictures, after which the iterator ends: 1 to 32767, or 0 for no limit.
 
         Raises:
@@ -3931,7 +3935,7 @@ class Vehicle(VehicleTwin):
 
     @property
     def component_id(self) -> int:
-        """Component id of its autopilot, usually 1."""
+        """Component id of the vehicle's autopilot, usually 1."""
         return self.aio.component_id
 
     @property
@@ -3941,7 +3945,7 @@ class Vehicle(VehicleTwin):
 
     @property
     def autopilot(self) -> Autopilot:
-        """Behaviour that differs between ArduPilot, PX4 and others."""
+        """Description of the autopilot's behaviour, which differs between ArduPilot, PX4 and other firmware."""
         return self.aio.autopilot
 
     @cached_property
@@ -4296,7 +4300,7 @@ class Vehicle(VehicleTwin):
             InvalidArgument: the intent is another text. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts. PX4 refuses the command while
                 disarmed.
-            CommandTimeout: there was no acknowledgement; the flight may have been terminated nevertheless.
+            CommandTimeout: there was no acknowledgement; the flight may still have been terminated.
             HeartbeatTimeout: the vehicle was silent for ten seconds after its acknowledgement.
             OperationTimeout: the vehicle accepted the command, but HEARTBEAT does not report the termination.
         """
@@ -4318,7 +4322,7 @@ class Vehicle(VehicleTwin):
             NotSupported: this firmware cannot be switched off (ArduPilot). Nothing was sent.
             OperationRejected: the vehicle is armed, or not known to be disarmed. Nothing was sent.
             CommandRejected: the vehicle refused, as PX4 does on boards that cannot switch their power off.
-            CommandTimeout: there was no acknowledgement; the autopilot may have switched off nevertheless.
+            CommandTimeout: there was no acknowledgement; the autopilot may still have switched off.
             OperationTimeout: the autopilot accepted the command, but still sends HEARTBEATs.
         """
         self._loop.run(self.aio.shutdown, intent=intent, timeout=timeout)
@@ -4338,7 +4342,7 @@ class Vehicle(VehicleTwin):
             InvalidArgument: this vehicle has no such mode; the text lists its modes. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             OperationRejected: a pilot or a failsafe has chosen another mode meanwhile.
-            OperationTimeout: the vehicle did not acknowledge, or accepted the mode but stayed in another one.
+            OperationTimeout: the vehicle did not acknowledge, or accepted the mode but stayed in another mode.
         """
         self._loop.run(self.aio.set_mode, mode, timeout=timeout)
 
@@ -4351,7 +4355,7 @@ class Vehicle(VehicleTwin):
             NotSupported: this vehicle has no hold mode. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             OperationRejected: a pilot or a failsafe has chosen another mode meanwhile.
-            OperationTimeout: the vehicle did not acknowledge, or accepted the mode but stayed in another one.
+            OperationTimeout: the vehicle did not acknowledge, or accepted the mode but stayed in another mode.
         """
         self._loop.run(self.aio.hold)
 
@@ -4464,7 +4468,7 @@ class Vehicle(VehicleTwin):
         """Stop the motors and wait until HEARTBEAT reports disarmed.
 
         Args:
-            force: disarm in flight as well: **the vehicle falls**.
+            force: also disarm in flight: **the vehicle falls**.
             timeout: seconds for HEARTBEAT to report disarmed after the command was accepted.
             max_silence_s: raise when no heartbeat was received for this long; None: wait until ``timeout``.
 
@@ -4480,7 +4484,7 @@ class Vehicle(VehicleTwin):
         """Reboot the autopilot and wait until its time since boot has restarted.
 
         Args:
-            force: reboot while armed as well: **a flying vehicle falls**.
+            force: also reboot while armed: **a flying vehicle falls**.
             timeout: seconds until the vehicle has restarted.
 
         Raises:

@@ -73,7 +73,9 @@ def _information(camera: CameraDevice) -> m.CameraInformation:
 
 
 def _images(camera: CameraDevice, command: ReceivedCommand | None) -> Iterable[Message]:
-    """Return the images with the indexes from param 2 (-1: all) to param 3 (0: only one, -1: all)."""
+    """Return the images with indexes from param 2 (-1: all images) to param 3 (0: only the first of them, -1: to the
+    last).
+    """
     images = camera.captures.images
     if command is None:
         return images[-1:]

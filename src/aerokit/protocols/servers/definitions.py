@@ -29,7 +29,9 @@ class DefinedParameterServer(ExtendedParameterServer):
         self.values: dict[str, SettingValue] = {}
         """Current values; assign them at any time."""
         self.slow: dict[str, float] = {}
-        """Maps the name of a slow setting to the seconds that a change takes; the answer is IN_PROGRESS until then."""
+        """Maps the name of a slow setting to the seconds that a change takes. During this time, the answer is
+        IN_PROGRESS.
+        """
         self._pending: set[str] = set()
         super().__init__(host, self)
         self.reset()
@@ -54,7 +56,7 @@ class DefinedParameterServer(ExtendedParameterServer):
         return value
 
     def restart(self) -> None:
-        """Drop pending changes, as a reboot does."""
+        """Drop pending changes, as by a reboot."""
         super().restart()
         self._pending.clear()
 

@@ -82,7 +82,7 @@ class MissionServer:
         capacity: int = MAX_ITEMS,
     ) -> None:
         self.lists: dict[int, tuple[MissionItem, ...]] = dict.fromkeys(_TYPES, ())
-        """Maps MAV_MISSION_TYPE to items; call `replace` to change them."""
+        """Maps MAV_MISSION_TYPE to items. Call `replace` to change the items."""
         self._opaque_ids: dict[int, int] = {}  # Cached, because MISSION_CURRENT, which is streamed, contains them.
         self.current: int = 0
         """Index of the current item of the mission."""

@@ -46,7 +46,7 @@ class ParameterLists:
         return len(self._lists)
 
     def restart(self) -> None:
-        """Drop all lists, as a reboot does."""
+        """Stop sending all lists, as by a reboot."""
         self._lists.clear()
 
     def start_list(self, channel: Channel) -> None:

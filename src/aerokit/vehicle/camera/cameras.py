@@ -49,7 +49,7 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
         self.capture: StateCell[Capture] = self._log.cell
         """The latest capture."""
         self.information: StateCell[CameraInformation] = link.information
-        """Vendor, model, capabilities (CAMERA_INFORMATION); the first call requests it."""
+        """Vendor, model, capabilities (CAMERA_INFORMATION). The first call to the camera requests the message."""
 
     @property
     def number(self) -> int | None:
@@ -95,11 +95,11 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
         """Take a photo every ``seconds`` for the duration of an ``async with`` block.
 
         ``async with camera.photo_interval(2, count=10) as captures: async for capture in captures: …`` gives the
-        captures in order; lost ones are requested again. MAV_CMD_IMAGE_STOP_CAPTURE is sent at the end of the block,
-        also under cancellation. PX4's trigger is started and stopped by MAV_CMD_DO_TRIGGER_CONTROL.
+        captures in order; lost captures are requested again. MAV_CMD_IMAGE_STOP_CAPTURE is sent at the end of the
+        block, also under cancellation. PX4's trigger is started and stopped by MAV_CMD_DO_TRIGGER_CONTROL.
 
         Args:
-            seconds: time between two pictures, above 0 to 3600.
+            seconds: time between two pictures, above 0, at most 3600.
             count: number of pictures, after which the iterator ends: 1 to 32767, or 0 for no limit.
 
         Raises:

@@ -253,7 +253,7 @@ def geotagged(jpeg: bytes, capture: Capture) -> bytes:
 def geotag_file(path: str | os.PathLike[str], capture: Capture, *, to: str | os.PathLike[str] | None = None) -> None:
     """Write the position of a capture into a JPEG file, or a copy of it.
 
-    Raises what :func:`geotagged` does, and OSError.
+    Raises as :func:`geotagged`, and OSError if a file cannot be read or written.
 
     Args:
         path: the picture.

@@ -1,4 +1,4 @@
-"""``CaptureLog``: stores the captures that one camera has reported, and requests lost ones."""
+"""``CaptureLog``: stores the captures that one camera has reported, and requests lost captures."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ HALF_RANGE = FEEDBACK_INDEX_RANGE // 2
 
 
 class _Entry:
-    """One capture with the type and the time stamps of its message."""
+    """One capture, with the type and the time stamps of the message that reported it."""
 
     __slots__ = ("boot_us", "capture", "kind", "utc_us")
 

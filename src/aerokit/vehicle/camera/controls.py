@@ -84,7 +84,7 @@ class LensMixin(CameraMixin):
         """Zoom for the duration of an ``async with`` block. The end of the block stops the zoom, also under
         cancellation.
 
-        Entering raises what :meth:`zoom_step` does.
+        Entering raises as :meth:`zoom_step`.
 
         Args:
             speed: −1 (out) to 1 (in); many cameras support only these two values.
@@ -130,7 +130,7 @@ class LensMixin(CameraMixin):
         """Move the focus for the duration of an ``async with`` block. The end of the block stops it, also under
         cancellation.
 
-        Entering raises what :meth:`focus_step` does.
+        Entering raises as :meth:`focus_step`.
 
         Args:
             speed: −1 (nearer) to 1 (farther); many cameras support only these two values.
@@ -173,7 +173,9 @@ class TrackingMixin(CameraMixin):
         self.tracked_place: StateCell[TrackedPlace] = link.new_cell(
             "camera.tracked_place", "CAMERA_TRACKING_GEO_STATUS"
         )
-        """Position of the tracked object on earth, if the camera reports it; requested in the same way."""
+        """Position of the tracked object on earth, if the camera reports it; requested at the same rate as
+        ``tracking``.
+        """
         self._releases: list[Detach] = []
         link.listen(
             m.CameraTrackingImageStatus,
@@ -275,16 +277,17 @@ class StorageMixin(CameraMixin):
     def __init__(self, link: CameraLink) -> None:
         super().__init__(link)
         self.mode: StateCell[str] = link.polled_cell("camera.mode", m.CameraSettings, SETTINGS_POLL_INTERVAL_S)
-        """``"photo"``, ``"video"`` or ``"survey"`` (CAMERA_SETTINGS). Polled every 5 s while your
-        program uses this cell, like the next two."""
+        """``"photo"``, ``"video"`` or ``"survey"`` (CAMERA_SETTINGS). Polled every 5 s while your program uses this
+        cell.
+        """
         self.zoom_percent: StateCell[float | None] = link.polled_cell(
             "camera.zoom_percent", m.CameraSettings, SETTINGS_POLL_INTERVAL_S
         )
-        """0 (widest) to 100; None if the camera does not know it."""
+        """Zoom from 0 (widest) to 100; None if the camera does not know it. Polled like ``mode``."""
         self.focus_percent: StateCell[float | None] = link.polled_cell(
             "camera.focus_percent", m.CameraSettings, SETTINGS_POLL_INTERVAL_S
         )
-        """0 (nearest) to 100; None if the camera does not know it."""
+        """Focus from 0 (nearest) to 100; None if the camera does not know it. Polled like ``mode``."""
         self.storage: StateCell[tuple[CameraStorage, ...]] = link.polled_cell(
             "camera.storage", m.StorageInformation, STORAGE_POLL_INTERVAL_S
         )

@@ -217,7 +217,7 @@ NUMBERED_MESSAGES = (
     m.VideoStreamStatus,
 )
 
-# Results that are final until the next reboot; others are temporary.
+# Results that are final until the next reboot. Other results are temporary.
 UNSUPPORTED = (MavResult.UNSUPPORTED, MavResult.DENIED)
 
 # ArduPilot answers FAILED if it does not support a message, other firmware if it cannot send the message now. Such a

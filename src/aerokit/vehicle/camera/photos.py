@@ -286,7 +286,7 @@ class PhotoInterval:
                     self._newest, self._newest_at = capture.index, self._link.now()
 
     def _max_new_captures(self) -> float:
-        """Upper limit of pictures taken since the newest one."""
+        """Upper limit of the number of pictures taken since the newest capture."""
         return 2.0 * (self._link.now() - self._newest_at) / self._seconds + MAX_EXTRA_CAPTURES
 
     def _is_plausible(self, index: int) -> bool:
@@ -294,7 +294,7 @@ class PhotoInterval:
         return index <= self._newest + self._max_new_captures()
 
     def _contradicts_guess(self, index: int) -> bool:
-        """Return True if an index far below the first one shows that the first one was corrupt."""
+        """Return True if this index is so far below the first index that the first index must have been corrupt."""
         return self._is_start_guessed and self._next is not None and index < self._next - self._max_new_captures()
 
     async def _fetch_missing(self) -> None:

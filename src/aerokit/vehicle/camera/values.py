@@ -169,7 +169,10 @@ class TrackedPlace(Snapshot):
 
 
 class ThermalRange(Snapshot):
-    """Coldest and hottest point of a thermal image (CAMERA_THERMAL_RANGE): °C, coordinates 0 to 1."""
+    """Coldest and hottest point of a thermal image (CAMERA_THERMAL_RANGE).
+
+    Temperatures are in °C, coordinates are fractions of the image from 0 to 1.
+    """
 
     stream: int
     max_celsius: float

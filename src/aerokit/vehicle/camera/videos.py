@@ -108,7 +108,7 @@ class VideoMixin(CameraMixin):
         """Record for the duration of an ``async with`` block. The end of the block stops recording, also under
         cancellation.
 
-        Entering raises what :meth:`start_video` does.
+        Entering raises as :meth:`start_video`.
 
         Raises:
             InvalidArgument: ``status_hz`` is not 0 to 10. Nothing was sent.
@@ -185,7 +185,7 @@ class VideoMixin(CameraMixin):
         await self._send_stream_command("stop_streaming", MavCmd.VIDEO_STOP_STREAMING, stream)
 
     async def select_stream(self, stream: int) -> None:
-        """Start one stream and stop the others; errors as for :meth:`start_streaming`.
+        """Start one stream and stop all other streams; errors as for :meth:`start_streaming`.
 
         Args:
             stream: number of the stream, 1 to 255.

@@ -57,11 +57,11 @@ class CommandArbiter:
         self.arming_orders = 0
         """Number of arm and disarm commands sent."""
         self.mode_is_in_doubt: bool = False
-        """True while the result of a command that changes the mode is unknown: the reported mode may be about to
-        change.
+        """True while the result of a command that changes the mode is unknown, so that the reported mode may change
+        soon.
         """
         self.mode_settles_at: float = -math.inf
-        """Until this time HEARTBEAT may report the mode of an abandoned order."""
+        """Time until which HEARTBEAT may report the mode of an abandoned order."""
         self._any_mode_until = self._arming_accepted_at = self._disarmed_at = -math.inf
         self._armed_at = -math.inf
         self._armed_by_program: Order | None = None

@@ -163,7 +163,7 @@ class ArmingActions(VehicleBase):
         """Stop the motors and wait until HEARTBEAT reports disarmed.
 
         Args:
-            force: disarm in flight as well: **the vehicle falls**.
+            force: also disarm in flight: **the vehicle falls**.
             timeout: seconds for HEARTBEAT to report disarmed after the command was accepted.
             max_silence_s: raise when no heartbeat was received for this long; None: wait until ``timeout``.
 
@@ -255,7 +255,7 @@ class ArmingActions(VehicleBase):
         """Reboot the autopilot and wait until its time since boot has restarted.
 
         Args:
-            force: reboot while armed as well: **a flying vehicle falls**.
+            force: also reboot while armed: **a flying vehicle falls**.
             timeout: seconds until the vehicle has restarted.
 
         Raises:

@@ -76,13 +76,13 @@ class VehicleBase(States):
         self.system_id: int = session.system_id
         """MAVLink system id, 1–255."""
         self.component_id: int = session.component_id
-        """Component id of its autopilot, usually 1."""
+        """Component id of the vehicle's autopilot, usually 1."""
         self.vehicle_type: int = session.vehicle_type
         """MAV_TYPE of the first heartbeat (https://mavlink.io/en/messages/minimal.html#MAV_TYPE)."""
         self.autopilot: Autopilot = session.autopilot
-        """Behaviour that differs between ArduPilot, PX4 and others."""
+        """Description of the autopilot's behaviour, which differs between ArduPilot, PX4 and other firmware."""
         self.telemetry: Telemetry = session.telemetry
-        """The state cells; most are properties of the vehicle as well."""
+        """The state cells. Most of them are also properties of the vehicle."""
         self.link_quality: StateCell[LinkReport] = session.link_quality
         """Packet loss, delay and data rates of the last second."""
         self._session, self._arbiter, self._sender = session, context.arbiter, context.sender

@@ -138,8 +138,9 @@ class FlightActions(VehicleBase):
                 await self._sender.send_long(order, plan.command, *plan.params, modes=order.modes, is_done=is_rising)
 
     def _rises_from_here(self) -> Callable[[], bool]:
-        """Return a function that returns True once new messages report a climb. Earlier ones may be of the previous
-        flight.
+        """Return a function that returns True once new messages report a climb.
+
+        Earlier messages may describe the previous flight.
         """
         here, landed = self.telemetry.position.latest, self.telemetry.landed_state
         begins_at = math.nan if here is None else self._position.altitude_relative()
@@ -222,8 +223,9 @@ class FlightActions(VehicleBase):
             await self._await_home(order, timeout, max_silence_s)
 
     async def _await_ground(self, what: str, order: Order, timeout: float | None, max_silence_s: float | None) -> None:
-        """Wait until the vehicle is reported on the ground by messages received after the order. Older ones may be
-        outdated.
+        """Wait until messages received after the order report the vehicle on the ground.
+
+        Older messages may be outdated.
         """
         armed, landed, mode = self.telemetry.armed, self.telemetry.landed_state, self.telemetry.mode
         accepted_at = self.connection.now()
@@ -301,7 +303,7 @@ class ModeActions(VehicleBase):
             InvalidArgument: this vehicle has no such mode; the text lists its modes. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             OperationRejected: a pilot or a failsafe has chosen another mode meanwhile.
-            OperationTimeout: the vehicle did not acknowledge, or accepted the mode but stayed in another one.
+            OperationTimeout: the vehicle did not acknowledge, or accepted the mode but stayed in another mode.
         """
         wanted = self.autopilot.find_mode(mode, self.telemetry.mode_names)
         await self._sender.change_mode(wanted, self._arbiter.order(wanted), timeout)
@@ -315,7 +317,7 @@ class ModeActions(VehicleBase):
             NotSupported: this vehicle has no hold mode. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             OperationRejected: a pilot or a failsafe has chosen another mode meanwhile.
-            OperationTimeout: the vehicle did not acknowledge, or accepted the mode but stayed in another one.
+            OperationTimeout: the vehicle did not acknowledge, or accepted the mode but stayed in another mode.
         """
         await self._flight_cleanup.hold()
 

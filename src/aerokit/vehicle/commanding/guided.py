@@ -2,7 +2,7 @@
 
 An autopilot stops by itself when set-points stop arriving (ArduCopter after 3 s, PX4 after 0.5 s). A library that
 resends the last set-point without limit defeats that protection. aerokit ends the stream and orders the vehicle to hold
-when the code that supplies set-points ends, raises, is cancelled, supplies no new ones, or blocks the event loop, and
+when the code that supplies set-points ends, raises, is cancelled, stops supplying them, or blocks the event loop, and
 when the vehicle falls silent.
 """
 
@@ -136,7 +136,7 @@ class Guided:
         """Stream body rates with thrust (SET_ATTITUDE_TARGET without an attitude).
 
         ArduCopter and PX4 execute them. The autopilot does not level the vehicle: it keeps turning until the next
-        set-point, or until aerokit orders a hold, after ``valid_for_s`` without a new one.
+        set-point, or until aerokit orders a hold because there was no new set-point for ``valid_for_s``.
         """
         return self._stream("attitude rate", self._encode.attitude_rate, initial, rate_hz, valid_for_s, max_lag_s)
 

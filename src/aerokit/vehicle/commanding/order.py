@@ -151,15 +151,15 @@ class Order:
         self.armed = armed
         """True if the order arms the vehicle, False if it disarms it, None if it does neither."""
         self.may_move = False
-        """True once the vehicle may move because of this order or an earlier one, so that it must hold if the order is
+        """True once the vehicle may move because of this order or an earlier order. It must then hold if the order is
         abandoned.
         """
         self.was_refused: bool = False
         """True if the vehicle refused the order, and therefore continues its previous task."""
         self.was_flown_before: bool = False
-        """True if the vehicle was executing an order of this program before this one."""
+        """True if the vehicle was executing another order of this program before this order."""
         self.before: Order | None = None
-        """The previous order about the same device, which becomes valid again if this one is withdrawn."""
+        """The previous order about the same device, which becomes valid again if this order is withdrawn."""
         self.is_withdrawn: bool = False
         self.takeover_reason: str = ""
         """The action of another party that ended the order, as a clause; empty if there was none."""
@@ -172,7 +172,9 @@ class Order:
         self.has_lost_mode: bool = False
         """True if the mode was changed to one that the order does not explain."""
         self.mode_lost_at: float = -math.inf
-        """Time of that change, which CURRENT_MODE reports before a HEARTBEAT does, which may also report disarming."""
+        """Time of this change of the mode. CURRENT_MODE may report it before HEARTBEAT, which may also report
+        disarming.
+        """
         self.is_confirmed: bool = False
         """True once a change to one of the order's modes, or to its armed state, was reported."""
         self._before = set() if mode_before is None else {mode_before.custom_mode} - set(expected)

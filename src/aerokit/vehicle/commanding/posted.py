@@ -105,7 +105,7 @@ class PostedOrder:
             InvalidArgument: the mode is not one of the modes of the order, or the block was left. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement.
-            OperationTimeout: the vehicle accepted the mode but stayed in another one.
+            OperationTimeout: the vehicle accepted the mode but stayed in another mode.
         """
         if mode not in self._order.modes:
             raise InvalidArgument(f"mode = {mode} is not allowed: it is not a mode of this order")

@@ -271,7 +271,7 @@ class VehiclePosition:
         return 0.0
 
     def is_known_since(self, started: float) -> bool:
-        """Return True if a recent position was received since this time."""
+        """Return True if the last position is recent and was received after ``started``."""
         position = self._telemetry.position
         return position.updated_at >= started and position.age <= POSITION_MAX_AGE_S
 

@@ -109,7 +109,7 @@ class SimpleOrder(Snapshot):
 
         Raises:
             InvalidArgument: a value is out of range. Nothing was sent.
-            NotSupported: the command is for the autopilot, which does not have it. Nothing was sent.
+            NotSupported: the command is for the autopilot, whose firmware does not support it. Nothing was sent.
             CommandRejected: the vehicle refused.
             CommandTimeout: there was no acknowledgement.
             OperationRejected: a newer order for the same device was given.

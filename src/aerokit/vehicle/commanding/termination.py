@@ -40,7 +40,7 @@ class TerminationActions(VehicleBase):
             InvalidArgument: the intent is another text. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts. PX4 refuses the command while
                 disarmed.
-            CommandTimeout: there was no acknowledgement; the flight may have been terminated nevertheless.
+            CommandTimeout: there was no acknowledgement; the flight may still have been terminated.
             HeartbeatTimeout: the vehicle was silent for ten seconds after its acknowledgement.
             OperationTimeout: the vehicle accepted the command, but HEARTBEAT does not report the termination.
         """
@@ -83,7 +83,7 @@ class TerminationActions(VehicleBase):
             NotSupported: this firmware cannot be switched off (ArduPilot). Nothing was sent.
             OperationRejected: the vehicle is armed, or not known to be disarmed. Nothing was sent.
             CommandRejected: the vehicle refused, as PX4 does on boards that cannot switch their power off.
-            CommandTimeout: there was no acknowledgement; the autopilot may have switched off nevertheless.
+            CommandTimeout: there was no acknowledgement; the autopilot may still have switched off.
             OperationTimeout: the autopilot accepted the command, but still sends HEARTBEATs.
         """
         if not self.autopilot.can_shut_down:

@@ -83,7 +83,7 @@ class Actuators(ReadOnly):
 
         Raises:
             InvalidArgument: a value is out of range. Nothing was sent.
-            NotSupported: the firmware does not have the command. Nothing was sent.
+            NotSupported: the firmware does not support the command. Nothing was sent.
             CommandRejected: the vehicle refused, for example because the output has another function.
             CommandTimeout: there was no acknowledgement.
             OperationRejected: your program gave a newer order for this output.
@@ -167,7 +167,7 @@ class Actuators(ReadOnly):
         is no landing gear (LGR_ENABLE), and even while the vehicle stands on its gear.
 
         Raises:
-            NotSupported: the firmware (PX4, Rover or Sub) does not have the command. Nothing was sent.
+            NotSupported: the firmware (PX4, Rover or Sub) does not support the command. Nothing was sent.
             OperationRejected: the vehicle is disarmed, or on the ground. Nothing was sent.
             CommandRejected: the vehicle refused.
             CommandTimeout: there was no acknowledgement.
@@ -190,8 +190,8 @@ class Actuators(ReadOnly):
     async def set_lights(self, on: bool, *, component_id: int = MavComponent.ILLUMINATOR) -> None:
         """Switch an illuminator, and return when ILLUMINATOR_STATUS reports it (MAV_CMD_ILLUMINATOR_ON_OFF).
 
-        Only for lights that are MAVLink components, because ArduPilot and PX4 do not have the command. Switch lights on
-        an output of ArduPilot by ``set_servo`` or ``set_relay``. Raises as :meth:`set_servo`.
+        Only for lights that are MAVLink components, because ArduPilot and PX4 do not support the command. Switch lights
+        on an output of ArduPilot by ``set_servo`` or ``set_relay``. Raises as :meth:`set_servo`.
 
         Args:
             on: the new state.
@@ -275,7 +275,7 @@ class Actuators(ReadOnly):
 
         Raises:
             InvalidArgument: the intent is another text. Nothing was sent.
-            NotSupported: the firmware (PX4, Rover or Sub) does not have the command. Nothing was sent.
+            NotSupported: the firmware (PX4, Rover or Sub) does not support the command. Nothing was sent.
             OperationRejected: the vehicle refused after the acknowledgement; ``reasons`` has its status texts.
             CommandRejected: the vehicle refused.
             CommandTimeout: there was no acknowledgement.

@@ -99,9 +99,9 @@ class Files:
     ) -> None:
         """Copy a file to this computer. It is written to ``<to>.part`` and renamed when it is complete.
 
-        With ``resume``, the download continues the ``<to>.part`` of an interrupted one, unless the vehicle's file is
-        shorter. If the vehicle can compute the CRC-32, it is compared with that of the result; if they differ, the
-        whole file is read again. Files whose names begin with ``@`` are always read completely.
+        With ``resume``, the download continues the ``<to>.part`` of an interrupted download, unless the vehicle's file
+        is shorter than it. If the vehicle can compute the CRC-32, it is compared with that of the result; if they
+        differ, the whole file is read again. Files whose names begin with ``@`` are always read completely.
 
         Raises:
             RemoteProtocolError: as for :meth:`read`.

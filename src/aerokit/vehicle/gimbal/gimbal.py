@@ -273,7 +273,9 @@ class Gimbals:
         self._registry = GimbalRegistry(context)
         self._gimbals: dict[tuple[int, int], Gimbal] = {}
         self.first: Gimbal = Gimbal(context, self._registry, None)
-        """The first gimbal; one attached to the autopilot takes precedence over those with their own component id."""
+        """The first gimbal. A gimbal attached to the autopilot takes precedence over gimbals with their own component
+        id.
+        """
 
     @property
     def ids(self) -> tuple[int, ...]:

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 ResultT = TypeVar("ResultT")
 
-# Texts that explain a refusal may arrive this long after it.
+# Seconds after a refusal in which the texts that explain it may arrive.
 REFUSAL_TEXT_DELAY_S = 0.3
 
 

@@ -243,13 +243,13 @@ class Parameters(ReadOnly):
     def temporarily(
         self, values: Mapping[str, float], *, idle_timeout_s: float = IDLE_TIMEOUT_S
     ) -> TemporaryParameters:
-        """Set values for the duration of an ``async with`` block and restore the previous ones at its end.
+        """Set values for the duration of an ``async with`` block, and restore the previous values at its end.
 
-        They are also restored if the block raises or is cancelled, which takes up to ``idle_timeout_s`` seconds. If a
-        value cannot be set, the others are restored and its error is raised. Blocks may be nested and may overlap, also
-        with the same parameter: when the last of these blocks ends, the parameter gets its value from before the first
-        block. A value that another station has changed meanwhile stays, and a warning of logger "aerokit" names the
-        parameter.
+        They are also restored if the block raises or is cancelled, which takes up to ``idle_timeout_s`` seconds. If one
+        value cannot be set, all other values are restored and the error is raised. Blocks may be nested and may
+        overlap, also with the same parameter: when the last of these blocks ends, the parameter gets its value from
+        before the first block. A value that another station has changed meanwhile stays, and a warning of logger
+        "aerokit" names the parameter.
 
         Raises:
             RollbackFailed: values could not be restored; ``not_restored`` has them.

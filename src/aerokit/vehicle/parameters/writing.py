@@ -164,7 +164,7 @@ class ParameterWrite(Snapshot):
 
     - ``"set"``: the vehicle confirmed the value and its type.
     - ``"unchanged"``: the vehicle had this value before.
-    - ``"rounded"``: the vehicle set a value near the ``requested`` one.
+    - ``"rounded"``: the vehicle set a value near the ``requested`` value.
     - ``"clamped"``: the vehicle set another value.
     - ``"failed"``: see ``error``; ``value`` is the last known value, or NaN.
 

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 __all__ = ["Corrections", "Rtk"]
 
 BANDWIDTH_WINDOW_S = 10.0
-# Seconds in which an equal message counts as the same one, passed on by another vehicle. A base station repeats an
-# equal message (1005, its position) after a second at the earliest.
+# If another vehicle passes an equal message on within this many seconds, it is the same message. A base station repeats
+# an equal message (1005, its position) after a second at the earliest.
 REPEAT_WINDOW_S = 0.9
 MAX_RECENT = 64
 
@@ -32,7 +32,7 @@ class _SentMessages:
     def __init__(self) -> None:
         self.sequence = 0
         self.recent: dict[bytes, tuple[float, set[int]]] = {}
-        """Maps each message to the time of its transmission and the ids of the senders that passed it here."""
+        """Maps each message to the time at which it was sent, and the ids of the objects that passed it on."""
 
 
 _SENT: WeakKeyDictionary[Connection, _SentMessages] = WeakKeyDictionary()

@@ -155,7 +155,7 @@ class CommandSender:
         return self.last_result(command, component_id) in UNKNOWN
 
     def accepted_at(self, command: int) -> float:
-        """Return the time of the autopilot's last ACCEPTED ack that was addressed to us; −inf without one."""
+        """Return the time of the autopilot's last ACCEPTED ack that was addressed to us; −inf if there was none."""
         return self._accepted_at.get((self._component_id, command), -math.inf)
 
     def forget_result(self, command: int, component_id: int | None = None) -> None:

@@ -61,13 +61,15 @@ class Transfers:
     ) -> None:
         self.connection = connection
         self.began_at: float = connection.now()
-        """Start time of the session. Sequence numbers derive from it, to differ from those of an earlier program."""
+        """Start time of the session. Sequence numbers derive from this time, so that they differ from an earlier
+        program's.
+        """
         self.system_id: int = system_id
         self.component_id: int = component_id
         self.autopilot = autopilot
         self.background = background
         self.round_trip: RoundTrip = RoundTrip()
-        """Round trip measured by previous transfers, initially by TIMESYNC."""
+        """Round trip, measured by previous transfers and initially by TIMESYNC."""
         self.is_closed: bool = False
         self._is_version_unavailable = False
         self._send_command, self._request_version = send_command, request_version

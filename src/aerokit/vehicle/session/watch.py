@@ -113,7 +113,8 @@ class VehicleWatch:
             detach()
 
     def boot_time_ms(self, now: float) -> float | None:
-        """Return the vehicle's time since boot at ``now``, extrapolated from its last message; None without one.
+        """Return the vehicle's time since boot at ``now``, extrapolated from the last message that had it; None if
+        unknown.
 
         Considers the speed of a simulation.
         """
