@@ -224,7 +224,7 @@ class Autopilot:
     lands_after_return = False
     """True if the return mode ends with a landing."""
     arrival_radius_m: float = 2.0
-    """Default distance in metres within which the vehicle counts as arrived; for a fixed wing, its circle included."""
+    """Default distance in metres within which the vehicle counts as arrived. A fixed wing's includes its circle."""
     mission_storage = "any"
     """Conversions that the autopilot applies to stored mission items: an :class:`aerokit.missions.ItemStorage`."""
     mission_upload_window = 1
@@ -267,7 +267,7 @@ class Autopilot:
     """Maps message ids to MAV_DATA_STREAM, for firmware without MAV_CMD_SET_MESSAGE_INTERVAL."""
     gimbals: GimbalRules = GimbalRules()
     is_surface_vehicle = False
-    """True for vehicles that drive, or swim on the surface, for which altitudes are meaningless."""
+    """True for vehicles that drive or float on the surface, so that altitudes are meaningless for them."""
     mission_needs_take_off = False
     """True if a mission is refused on the ground unless its first navigation command is a take-off."""
     mode_when_landed: ClassVar[str | None] = None
@@ -287,7 +287,7 @@ class Autopilot:
     video_addresses_camera = False
     """True if the stream id of VIDEO_START_CAPTURE selects a camera."""
     arming_mode: ClassVar[str | None] = None
-    """Mode in which to arm if the current mode does not allow arming. In this mode, the vehicle stays at rest."""
+    """Mode in which to arm if the current mode does not allow arming. A vehicle armed in it stays at rest."""
 
     def __init__(self, vehicle_type: int) -> None:
         self.vehicle_type = vehicle_type

@@ -163,13 +163,13 @@ class Px4(Autopilot):
             self.arrival_radius_m: float = 120.0  # a plane circles with NAV_LOITER_RAD, 80 m by default
 
     def mode(self, custom_mode: int, base_mode: int, extra: Mapping[int, str] = NO_MODES) -> Mode:
-        """Return the mode of these numbers. The own name of an external mode takes precedence over EXTERNAL1 etc."""
+        """Return the mode of these numbers. An external mode's registered name takes precedence over EXTERNAL1 etc."""
         if custom_mode in _EXTERNAL and custom_mode in extra:
             return Mode(extra[custom_mode], custom_mode, base_mode)
         return super().mode(custom_mode, base_mode, extra)
 
     def find_mode(self, mode: str | int | Mode, extra: Mapping[int, str] = NO_MODES) -> Mode:
-        """Find a mode by name or number. External modes are also found by their own names."""
+        """Find a mode by name or number. External modes are also found by their registered names."""
         found = super().find_mode(mode, extra)
         return Mode(extra.get(found.custom_mode, found.name), found.custom_mode)
 

@@ -218,7 +218,7 @@ def vtol_take_off(
     altitude_terrain_m: float | None = None,
     yaw_deg: float | None = None,
 ) -> MissionItem:
-    """Take off vertically. PX4 needs a place, and then transitions to forward flight towards it.
+    """Take off vertically. PX4 needs a place, and transitions to forward flight towards this place after the take-off.
 
     https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_VTOL_TAKEOFF
     """

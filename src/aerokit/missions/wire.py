@@ -103,7 +103,7 @@ def from_wire(message: messages.MissionItemInt | messages.MissionItem) -> Missio
 
 
 def in_degrees(item: MissionItem) -> tuple[float, float]:
-    """Return x and y as MISSION_ITEM and files have them: degrees or metres for places, NaN for "not given"."""
+    """Return x and y in the form of MISSION_ITEM and files: degrees or metres for places, NaN for "not given"."""
     scale = xy_scale(item.command, item.frame)
     x, y = (math.nan if value == DEFAULT_XY else value / scale for value in (item.x, item.y))
     return x, y
@@ -123,7 +123,7 @@ def from_degrees(value: float, command: int, frame: int) -> int | float:
 
 
 def with_home(items: Sequence[MissionItem], home: Position | None = None) -> tuple[MissionItem, ...]:
-    """Add home as item 0, as ArduPilot counts items, and adjust jump targets. An unknown home is 0°, 0°.
+    """Add home as item 0, because ArduPilot counts home, and adjust jump targets. An unknown home is 0°, 0°.
 
     ArduPilot ignores this item and uses its own home.
     """

@@ -191,7 +191,9 @@ class OnboardComponent:
     def message(
         self, message_type: type[Message], *, hz: float = 0.0
     ) -> Callable[[Callable[[], Message | None]], Callable[[], Message | None]]:
-        """Decorator: send the message that a function returns on request, and at intervals that other programs set.
+        """Decorator: send the message that the function returns.
+
+        The message is sent on request, and at intervals that other programs set.
 
         The function returns None while it has no values. ``hz`` (0 to 200) is the rate at which the message is sent to
         all programs from the start; 0 sends it only on request.

@@ -100,7 +100,7 @@ class ComponentHost:
         self._text_id = self._text_id % 0xFFFF + 1
         for number, start in enumerate(range(0, len(data), TEXT_SIZE)):
             self.send(m.Statustext(severity, data[start : start + TEXT_SIZE], self._text_id, number))
-        if len(data) % TEXT_SIZE == 0:  # An empty chunk follows a full last one.
+        if len(data) % TEXT_SIZE == 0:  # an empty chunk follows if the last chunk is full
             self.send(m.Statustext(severity, "", self._text_id, len(data) // TEXT_SIZE))
 
     def report_error(self, what: str, error: Exception) -> None:

@@ -38,7 +38,7 @@ class ComponentServices:
         self.memory: FileTree = FileTree()
 
     def add_message(self, message_type: type[Message], function: Callable[[], Message | None], hz: float) -> None:
-        """Send the message that a function returns on request, and at a rate of ``hz``.
+        """Send the message that ``function`` returns: on request, and at a rate of ``hz``.
 
         Raises:
             InvalidArgument: the rate is above 200 Hz, or the message already has a function.

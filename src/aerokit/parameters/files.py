@@ -1,6 +1,6 @@
 """Parameter files of Mission Planner, MAVProxy and QGroundControl.
 
-Mission Planner writes lines with ``NAME,VALUE``, MAVProxy with ``NAME VALUE``. Both formats have ``#`` comments and no
+Mission Planner's lines are ``NAME,VALUE``, those of MAVProxy ``NAME    VALUE``. Both formats have ``#`` comments and no
 types. QGroundControl has five columns separated by tabs: system, component, name, value, MAV_PARAM_TYPE
 (https://docs.qgroundcontrol.com/master/en/qgc-dev-guide/file_formats/parameters.html). A file with a damaged line is
 refused as a whole, because half a set of parameters is worse than none.

@@ -249,7 +249,7 @@ _OUTPUT = "SERVOn_FUNCTION and SERVOn_REVERSED of the outputs"
 
 _GAINS = "its gains are counted differently"
 
-# Names without a direct successor, and what replaces them.
+# Maps each name without a direct successor to a text about what replaces it.
 REPLACED: dict[str, str] = {
     **{f"RATE_{axis}_{gain}": f"ATC_RAT_{axis}_{gain}; {_GAINS}" for axis in ("RLL", "PIT", "YAW") for gain in "PID"},
     **{f"RATE_{axis}_IMAX": f"ATC_RAT_{axis}_IMAX; {_GAINS}" for axis in ("RLL", "PIT", "YAW")},

@@ -218,8 +218,8 @@ class FtpSessionLost(FileError):
 class FtpClient:
     """State shared by all exchanges of one client with one server: addresses, sequence and session numbers.
 
-    ``first_sequence`` should differ between programs, because a server that receives the sequence number of its last
-    request again repeats its last reply.
+    ``first_sequence`` should differ between programs, because a server repeats its last reply if a request has the same
+    sequence number as the request before it.
     """
 
     def __init__(

@@ -13,7 +13,7 @@ KeyT = TypeVar("KeyT", bound=Hashable)
 
 # ArduPilot queues 20 PARAM_REQUEST_READ and drops further ones.
 DEFAULT_SIZE = 20
-# The window grows to at most this many times its size.
+# The window grows to at most this many times its initial size.
 MAX_GROWTH = 5
 # An answer that takes longer than QUEUED_FACTOR times the fastest one plus QUEUED_MARGIN_S has waited in a queue.
 QUEUED_FACTOR, QUEUED_MARGIN_S = 1.5, 0.02

@@ -117,8 +117,8 @@ def fragments(message: bytes, sequence: int) -> list[GpsRtcmData]:
     """Return one RTCM message of 1 to 720 bytes as GPS_RTCM_DATA messages.
 
     Flags: bit 0 is set for a fragment, bits 1 and 2 are the fragment number, bits 3 to 7 the sequence number. A
-        receiver considers a message complete after four fragments, or after a fragment that is not full. If the last of
-        fewer fragments is full, an empty fragment therefore follows.
+        receiver considers a message complete after four fragments, or after a fragment that is not full. If a message
+        has fewer than four fragments and the last one is full, an empty fragment follows.
     """
     from aerokit.mavlink.messages import GpsRtcmData
 

@@ -790,7 +790,7 @@ class MeasurementStream(MeasurementTwin[MeasurementT]):
         return self.aio.estimator_use
 
     def send(self, measurement: MeasurementT) -> None:
-        """Send a measurement now, or at the end of the period if another one was already sent in this period.
+        """Send a measurement now, or at the end of the period if another measurement was already sent in it.
 
         Raises:
             InvalidArgument: a value is out of range; nothing was sent.
@@ -943,11 +943,11 @@ class External(TwinOf["AsyncExternal"]):
 class GimbalControl(BlockTwin["AsyncGimbalControl"]):
     """Control of a gimbal for the duration of its ``async with`` block (MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE).
 
-    Entering takes control from any other station and returns when the manager confirms it. Leaving releases it, without
-    waiting if the block exits by an error or cancellation. When another station takes control, aerokit publishes
-    ``GimbalControlLost``, and orders to the gimbal, including running ones, raise :class:`GimbalTaken`. Leaving the
-    block then releases nothing; it raises GimbalTaken too, unless your program has already seen the loss. Another
-    station that uses your own system and component id cannot be detected.
+    Entering takes control from any other station and returns when the manager confirms that you are in control. Leaving
+    releases control, without waiting if the block exits by an error or cancellation. When another station takes
+    control, aerokit publishes ``GimbalControlLost``, and orders to the gimbal, including running ones, raise
+    :class:`GimbalTaken`. Leaving the block then releases nothing; it raises GimbalTaken too, unless your program has
+    already seen the loss. Another station that uses your own system and component id cannot be detected.
 
     Entering raises:
         NotSupported: the vehicle has no gimbal manager, or its manager has no secondary control.
@@ -984,7 +984,8 @@ class GimbalControl(BlockTwin["AsyncGimbalControl"]):
     def raise_if_taken(self) -> None:
         """Raise GimbalTaken if control was lost.
 
-        Raises: GimbalTaken: another station is in control, or none.
+        Raises:
+            GimbalTaken: another station is in control, or none.
         """
         self._loop.call(self.aio.raise_if_taken)
 
@@ -996,12 +997,12 @@ class GimbalRates(BlockTwin["AsyncGimbalRates"]):
     ``rate_hz`` (GIMBAL_MANAGER_SET_PITCHYAW, or GIMBAL_MANAGER_SET_ATTITUDE to PX4). Leaving the block in any way
     orders a rate of zero, so that the gimbal keeps its direction. The stream stops by itself, with a rate of zero, if
     no new rates are set for ``valid_for_s``, the event loop is blocked for ``max_lag_s``, or the vehicle is silent. It
-    stops without sending a rate of zero if another order is given to the gimbal, or control is lost. ``set`` and
+    stops without sending a rate of zero if another order to the gimbal is given, or if control is lost. ``set`` and
     leaving the block then raise :class:`SetpointStreamStopped` or :class:`GimbalTaken`.
 
     Entering raises:
         InvalidArgument: a rate is out of range. Nothing was sent.
-        NotSupported: the vehicle has no gimbal manager; older mounts turn to angles only.
+        NotSupported: the vehicle has no gimbal manager, and older mounts support only angles.
         CommandRejected: the manager refused.
         CommandTimeout: there was no answer.
         GimbalTaken: your program had control and lost it.
@@ -1099,14 +1100,14 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         (GLOBAL_POSITION_INT).
 
         Args:
-            system_id: its MAVLink system id, 1 to 255.
+            system_id: MAVLink system id of the other vehicle, 1 to 255.
             wait: False: return when the manager has accepted the order.
             tolerance_deg: accepted deviation in each axis, above 0 to 45.
             timeout: seconds to wait.
 
         Raises:
             InvalidArgument: the system id or the tolerance is out of range. Nothing was sent.
-            NotSupported: the manager does not support it. Nothing was sent.
+            NotSupported: the manager does not support this command. Nothing was sent.
 
         Otherwise raises as :meth:`neutral`.
         """
@@ -1294,7 +1295,7 @@ class Gimbals(GimbalsTwin["Gimbal"]):
         return Gimbal(self._loop, self._loop.call(self.aio.get, device_id))
 
     def discover(self, *, timeout: float = 2.0) -> tuple[int, ...]:
-        """Ask all components which gimbals they manage (GIMBAL_MANAGER_INFORMATION); return :attr:`ids` afterwards.
+        """Ask all components which gimbals they manage (GIMBAL_MANAGER_INFORMATION), then return :attr:`ids`.
 
         Args:
             timeout: seconds to wait for answers; the call always takes this time.
@@ -1395,8 +1396,9 @@ class Files(TwinOf["AsyncFiles"]):
     """
 
     def is_supported(self) -> bool:
-        """Return True if the vehicle reports support for MAVFTP, False if not or without an answer within three
-        seconds.
+        """Return True if the vehicle reports support for MAVFTP.
+
+        Without an answer within three seconds, the result is False.
         """
         return self._loop.run(self.aio.is_supported)
 
@@ -1431,10 +1433,10 @@ class Files(TwinOf["AsyncFiles"]):
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> None:
-        """Copy a file to this computer. It is written to ``<to>.part`` and renamed when it is complete.
+        """Copy a file to this computer. The copy is written to ``<to>.part`` and renamed when it is complete.
 
         With ``resume``, the download continues the ``<to>.part`` of an interrupted download, unless the vehicle's file
-        is shorter than it. If the vehicle can compute the CRC-32, it is compared with that of the result; if they
+        is shorter than it. The result is verified by its CRC-32 if the vehicle can compute that of its file; if they
         differ, the whole file is read again. Files whose names begin with ``@`` are always read completely.
 
         Raises:
@@ -2035,7 +2037,7 @@ class Shell(BlockTwin["AsyncShell"]):
     """
 
     def write(self, line: str) -> None:
-        """Send one line without waiting for its output, which :meth:`read` returns.
+        """Send one line without waiting for output. :meth:`read` returns the output.
 
         Args:
             line: at most 1000 bytes, without a line break.
@@ -2107,7 +2109,7 @@ class Transaction(TransactionTwin):
         return self._loop.run(self.aio.set, name, value)
 
     def set_many(self, values: Mapping[str, float]) -> dict[str, ParameterWrite]:
-        """Set several parameters; raises the first error after all were tried."""
+        """Set several parameters. If some fail, the first error is raised after all were tried."""
         return self._loop.run(self.aio.set_many, values)
 
 
@@ -2438,7 +2440,9 @@ class CalibrationControl(TwinOf["AsyncCalibrationControl"]):
         return Calibration(self._loop, self._loop.call(self.aio.level))
 
     def barometer(self) -> Calibration:
-        """Calibrate the barometer: ArduPilot takes the present pressure as the ground's, PX4 uses the GPS altitude."""
+        """Calibrate the barometer: ArduPilot takes the present pressure for that of the ground, PX4 uses the GPS
+        altitude.
+        """
         return Calibration(self._loop, self._loop.call(self.aio.barometer))
 
     def airspeed(self) -> Calibration:
@@ -2649,7 +2653,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
                 mode, it disarmed on the way, or it fell. ``reasons`` has the vehicle's status texts.
             OperationTimeout: the mission was not finished in time; or the armed vehicle has not moved for 12 s after it
                 descended to the ground at more than 3 m/s; or it has not moved for 60 s at a take-off or at a waypoint
-                without a hold. The last case is detected only if the items are known from an upload or a download.
+                without a hold. The last case is only detected if the items are known from an upload or a download.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
         """
         self._loop.run(self.aio.wait_finished, timeout=timeout, max_silence_s=max_silence_s)
@@ -2985,8 +2989,8 @@ class Camera(TwinOf["AsyncCamera"]):
 
     @cached_property
     def mode(self) -> StateCell[str]:
-        """``"photo"``, ``"video"`` or ``"survey"`` (CAMERA_SETTINGS). Polled every 5 s while your program uses this
-        cell.
+        """Mode: ``"photo"``, ``"video"`` or ``"survey"`` (CAMERA_SETTINGS). Polled every 5 s while your program uses
+        this cell.
         """
         return StateCell(self._loop, self.aio.mode)
 
@@ -3299,7 +3303,7 @@ class Camera(TwinOf["AsyncCamera"]):
 
         Args:
             primary: ``"default"``, ``"rgb"``, ``"ir"`` or ``"ndvi"``.
-            secondary: the same; ``"default"`` shows no second picture.
+            secondary: one of the same names; ``"default"`` shows no second picture.
 
         Raises:
             CommandRejected: the camera refused, or has no such sensor.
@@ -4421,16 +4425,17 @@ class Vehicle(VehicleTwin):
         """Arm the motors and wait until HEARTBEAT reports armed: **propellers may start to turn**.
 
         If the present mode does not allow arming (RTL or LAND after a flight, OFFBOARD), the mode is changed first.
-        The command is sent only once, because a pilot may have disarmed the vehicle since. After a cancellation, or an
-        error other than a refusal, the command may still be executed. aerokit therefore monitors the vehicle for 15
-        seconds, as long as the connection is open. If this command arms the vehicle after all, aerokit disarms it.
-        Arming is attributed to this command if the vehicle accepts it, or reports armed in the next HEARTBEAT without a
-        takeover. A vehicle that was armed otherwise stays armed. Logger "aerokit" warns about the outcome.
+        The command is sent only once: a repetition might arm a vehicle that a pilot has just disarmed. After a
+        cancellation, or an error other than a refusal, the command may still be executed. aerokit therefore monitors
+        the vehicle for 15 seconds, as long as the connection is open. If this command arms the vehicle after all,
+        aerokit disarms it. Arming is attributed to this command if the vehicle accepts it, or reports armed in the next
+        HEARTBEAT without a takeover. A vehicle that was armed otherwise stays armed. Logger "aerokit" warns about the
+        outcome.
 
         Args:
             mode: the mode to arm in. None: the present mode; if it does not allow arming, the mode in which
                 ``take_off`` starts.
-            force: skip the vehicle's own arming checks. Dangerous.
+            force: skip the vehicle's own arming checks, which is dangerous.
             reason: why your program arms, at most 50 bytes. Logger "aerokit" reports the reason at INFO. It is also
                 sent to the vehicle as a STATUSTEXT right before the command, and ArduPilot writes this text into its
                 flight log. PX4 logs only texts that have the vehicle's own system id.
@@ -4791,7 +4796,9 @@ class Vehicle(VehicleTwin):
         order was given meanwhile or another party changed the mode. After a silence, aerokit waits for the next
         heartbeat, and orders a hold if the vehicle is still on its way. Sends MAV_CMD_DO_REPOSITION
         (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_REPOSITION), or SET_POSITION_TARGET_GLOBAL_INT to a
-        vehicle that does not support it. Args:
+        vehicle that does not support it.
+
+        Args:
             target: latitude and longitude, and an altitude above home or above mean sea level. The vehicle keeps its
                 present altitude if the target has none, or is ``vehicle.home.value``.
             speed_m_s: ground speed from now on, above 0; None keeps the present speed.
@@ -4978,9 +4985,9 @@ class Vehicle(VehicleTwin):
 
     @property
     def camera(self) -> Camera:
-        """The first camera found. A camera with its own component id takes precedence over those behind the autopilot.
+        """The first camera found. Cameras attached to the autopilot come after cameras with their own component id.
 
-        Its calls wait briefly until a camera is found. ``camera_at`` returns any other camera.
+        A call to this object waits briefly until a camera is found. ``camera_at`` returns any other camera.
         """
         return self._part("camera", Camera)
 
@@ -4988,7 +4995,7 @@ class Vehicle(VehicleTwin):
     def cameras(self) -> StateCell[tuple[int, ...]]:
         """The numbers of the cameras found so far, for ``camera_at``.
 
-        A number is a component id (100 to 105), or 1 to 6 for a camera behind the autopilot that has reported a
+        A number is a component id (100 to 105), or 1 to 6 for a camera attached to the autopilot that has reported a
         picture.
         """
         return self._part("cameras", StateCell)
@@ -4997,7 +5004,8 @@ class Vehicle(VehicleTwin):
         """Return the camera with this number. It need not have been found yet.
 
         Args:
-            number: its component id (100 to 105, at most 255), or 1 to 6 for a camera behind the autopilot.
+            number: component id of the camera (100 to 105, at most 255), or 1 to 6 for a camera attached to the
+                autopilot.
 
         Raises:
             InvalidArgument: no camera can have this number.
@@ -5021,7 +5029,7 @@ class Vehicle(VehicleTwin):
         """Fly by stick positions from your program (MANUAL_CONTROL): ``async with vehicle.sticks() as sticks: …``.
 
         Args:
-            initial: positions while the mode is entered; None centres all sticks.
+            initial: stick positions that are sent while the mode is entered; None centres all sticks.
             mode: the piloted mode. By default LOITER (ArduCopter), FBWA or QLOITER (ArduPlane), MANUAL (ArduPilot
                 Rover), ALT_HOLD (ArduSub), POSCTL (PX4).
             rate_hz: transmission rate of the latest positions, 2 to 400.
@@ -5067,7 +5075,7 @@ class Vehicle(VehicleTwin):
 
         Args:
             target: a function or coroutine function that returns a :class:`aerokit.TargetMeasurement`, or None while
-                the target is not visible; or an asynchronous iterable of these.
+                the target is not visible; or an asynchronous iterable of such results.
             rate_hz: rate at which the function is called, and the highest rate of LANDING_TARGET.
             acquire_timeout: seconds to wait until the target is visible. The landing is ordered only then.
             timeout: seconds until the vehicle is on the ground and disarmed; None: no limit.
@@ -5314,9 +5322,9 @@ def connect(
             (``RouteChangeRefused``), because it may belong to another sender.
         heartbeat: contents of our own HEARTBEAT, and the condition under which it is sent. None: no heartbeat is sent,
             so the vehicle sees no ground station. PX4 then sends no status texts, and a ``udpout:`` link stays silent.
-        share: addresses at which ground stations and other programs use the same link: ``["tcpin:127.0.0.1:5760"]``
-            (docs/hub.md). They should use other ids than this program. For an open connection use ``async with
-            aerokit.hub.shared(connection, […])``.
+        share: addresses at which ground stations and other programs can use the same link, such as
+            ``["tcpin:127.0.0.1:5760"]`` (docs/hub.md). These programs should use other ids than this program. For an
+            open connection use ``async with aerokit.hub.shared(connection, […])``.
 
     Raises:
         InvalidArgument: an argument is invalid. Nothing was opened.

@@ -102,9 +102,9 @@ async def connect(
             (``RouteChangeRefused``), because it may belong to another sender.
         heartbeat: contents of our own HEARTBEAT, and the condition under which it is sent. None: no heartbeat is sent,
             so the vehicle sees no ground station. PX4 then sends no status texts, and a ``udpout:`` link stays silent.
-        share: addresses at which ground stations and other programs use the same link: ``["tcpin:127.0.0.1:5760"]``
-            (docs/hub.md). They should use other ids than this program. For an open connection use ``async with
-            aerokit.hub.shared(connection, […])``.
+        share: addresses at which ground stations and other programs can use the same link, such as
+            ``["tcpin:127.0.0.1:5760"]`` (docs/hub.md). These programs should use other ids than this program. For an
+            open connection use ``async with aerokit.hub.shared(connection, […])``.
 
     Raises:
         InvalidArgument: an argument is invalid. Nothing was opened.
@@ -162,7 +162,7 @@ async def connect(
 
 
 def _hub(share: Iterable[str | Endpoint | Link], dialect: Dialect) -> Hub | None:
-    """Create the hub for ``share``, validated before anything is opened; None without ``share``."""
+    """Create the hub for ``share``, after validating ``share`` and before opening anything; None without ``share``."""
     endpoints = tuple(share)
     if not endpoints:
         return None
@@ -328,7 +328,7 @@ async def vehicles_on(
 ) -> AsyncIterator[Mapping[int, Vehicle]]:
     """Connect to every vehicle found on a connection, for the duration of the block.
 
-    A vehicle that falls silent stays in the mapping: its cells have ages, and ``link_state`` reports the silence.
+    A vehicle that falls silent stays in the mapping; its ``link_state`` and the ages of its cells show the silence.
     Vehicles that this program is already connected to are left out.
 
     Args:

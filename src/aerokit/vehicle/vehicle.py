@@ -113,9 +113,9 @@ class Vehicle(
 
     @property
     def camera(self) -> Camera:
-        """The first camera found. A camera with its own component id takes precedence over those behind the autopilot.
+        """The first camera found. Cameras attached to the autopilot come after cameras with their own component id.
 
-        Its calls wait briefly until a camera is found. ``camera_at`` returns any other camera.
+        A call to this object waits briefly until a camera is found. ``camera_at`` returns any other camera.
         """
         return self._cameras.first
 
@@ -123,7 +123,7 @@ class Vehicle(
     def cameras(self) -> StateCell[tuple[int, ...]]:
         """The numbers of the cameras found so far, for ``camera_at``.
 
-        A number is a component id (100 to 105), or 1 to 6 for a camera behind the autopilot that has reported a
+        A number is a component id (100 to 105), or 1 to 6 for a camera attached to the autopilot that has reported a
         picture.
         """
         return self._cameras.cell
@@ -132,7 +132,8 @@ class Vehicle(
         """Return the camera with this number. It need not have been found yet.
 
         Args:
-            number: its component id (100 to 105, at most 255), or 1 to 6 for a camera behind the autopilot.
+            number: component id of the camera (100 to 105, at most 255), or 1 to 6 for a camera attached to the
+                autopilot.
 
         Raises:
             InvalidArgument: no camera can have this number.
@@ -164,7 +165,7 @@ class Vehicle(
         """Fly by stick positions from your program (MANUAL_CONTROL): ``async with vehicle.sticks() as sticks: …``.
 
         Args:
-            initial: positions while the mode is entered; None centres all sticks.
+            initial: stick positions that are sent while the mode is entered; None centres all sticks.
             mode: the piloted mode. By default LOITER (ArduCopter), FBWA or QLOITER (ArduPlane), MANUAL (ArduPilot
                 Rover), ALT_HOLD (ArduSub), POSCTL (PX4).
             rate_hz: transmission rate of the latest positions, 2 to 400.
@@ -205,7 +206,7 @@ class Vehicle(
 
         Args:
             target: a function or coroutine function that returns a :class:`aerokit.TargetMeasurement`, or None while
-                the target is not visible; or an asynchronous iterable of these.
+                the target is not visible; or an asynchronous iterable of such results.
             rate_hz: rate at which the function is called, and the highest rate of LANDING_TARGET.
             acquire_timeout: seconds to wait until the target is visible. The landing is ordered only then.
             timeout: seconds until the vehicle is on the ground and disarmed; None: no limit.

@@ -61,7 +61,7 @@ class CameraDevice:
 
     @property
     def host(self) -> ServerHost:
-        """The component."""
+        """The component that serves the camera."""
         raise NotImplementedError
 
     def set_up_captures(self) -> None:

@@ -59,7 +59,7 @@ class GimbalMount:
 
     @property
     def host(self) -> ServerHost:
-        """The component."""
+        """The component that serves the gimbal."""
         raise NotImplementedError
 
     @property

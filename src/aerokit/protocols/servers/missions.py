@@ -68,9 +68,9 @@ class _Upload:
 class MissionServer:
     """Stores missions, fences and rally points. Downloads have no state; one upload runs at a time.
 
-    When ``judge`` has accepted an upload, it replaces the whole list. A missing item is requested again every half
-    second. An upload without progress for five seconds ends with OPERATION_CANCELLED. During an upload, other clients
-    are DENIED.
+    When ``judge`` has accepted an upload, the upload replaces the whole list. A missing item is requested again every
+    half second. An upload without progress for five seconds ends with OPERATION_CANCELLED. During an upload, other
+    clients are DENIED.
     """
 
     def __init__(

@@ -134,7 +134,9 @@ class CalibrationControl:
         return self._start("level", _acknowledged("place the vehicle level and keep it still"), 0, 0, 0, 0, 2)
 
     def barometer(self) -> Calibration:
-        """Calibrate the barometer: ArduPilot takes the present pressure as the ground's, PX4 uses the GPS altitude."""
+        """Calibrate the barometer: ArduPilot takes the present pressure for that of the ground, PX4 uses the GPS
+        altitude.
+        """
         return self._start("barometer", _acknowledged("shelter the vehicle from wind"), 0, 0, 1)
 
     def airspeed(self) -> Calibration:

@@ -84,7 +84,7 @@ async def by_texts(run: CalibrationRun, *params: float) -> AsyncGenerator[Calibr
 
 
 def _after(step: CalibrationStep, report: CalibrationReport) -> CalibrationStep:
-    """Return the step after a report of PX4."""
+    """Return the step that a report of PX4 leads to."""
     if report.kind == "progress":
         return step.replace(progress=report.progress)
     if report.kind == "pending":

@@ -313,7 +313,7 @@ def _exif_tags(capture: Capture) -> dict[int, Any]:
 
 
 def _gps_tags(capture: Capture) -> dict[int, Any]:
-    """Tags by their numbers in the EXIF standard."""
+    """Return the GPS tags of a capture by their numbers in the EXIF standard."""
     place = capture.place
     assert place is not None
     tags: dict[int, Any] = {

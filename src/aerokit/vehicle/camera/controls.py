@@ -277,8 +277,8 @@ class StorageMixin(CameraMixin):
     def __init__(self, link: CameraLink) -> None:
         super().__init__(link)
         self.mode: StateCell[str] = link.polled_cell("camera.mode", m.CameraSettings, SETTINGS_POLL_INTERVAL_S)
-        """``"photo"``, ``"video"`` or ``"survey"`` (CAMERA_SETTINGS). Polled every 5 s while your program uses this
-        cell.
+        """Mode: ``"photo"``, ``"video"`` or ``"survey"`` (CAMERA_SETTINGS). Polled every 5 s while your program uses
+        this cell.
         """
         self.zoom_percent: StateCell[float | None] = link.polled_cell(
             "camera.zoom_percent", m.CameraSettings, SETTINGS_POLL_INTERVAL_S

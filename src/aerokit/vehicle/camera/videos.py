@@ -208,7 +208,7 @@ class VideoMixin(CameraMixin):
 
         Args:
             primary: ``"default"``, ``"rgb"``, ``"ir"`` or ``"ndvi"``.
-            secondary: the same; ``"default"`` shows no second picture.
+            secondary: one of the same names; ``"default"`` shows no second picture.
 
         Raises:
             CommandRejected: the camera refused, or has no such sensor.

@@ -101,16 +101,17 @@ class ArmingActions(VehicleBase):
         """Arm the motors and wait until HEARTBEAT reports armed: **propellers may start to turn**.
 
         If the present mode does not allow arming (RTL or LAND after a flight, OFFBOARD), the mode is changed first.
-        The command is sent only once, because a pilot may have disarmed the vehicle since. After a cancellation, or an
-        error other than a refusal, the command may still be executed. aerokit therefore monitors the vehicle for 15
-        seconds, as long as the connection is open. If this command arms the vehicle after all, aerokit disarms it.
-        Arming is attributed to this command if the vehicle accepts it, or reports armed in the next HEARTBEAT without a
-        takeover. A vehicle that was armed otherwise stays armed. Logger "aerokit" warns about the outcome.
+        The command is sent only once: a repetition might arm a vehicle that a pilot has just disarmed. After a
+        cancellation, or an error other than a refusal, the command may still be executed. aerokit therefore monitors
+        the vehicle for 15 seconds, as long as the connection is open. If this command arms the vehicle after all,
+        aerokit disarms it. Arming is attributed to this command if the vehicle accepts it, or reports armed in the next
+        HEARTBEAT without a takeover. A vehicle that was armed otherwise stays armed. Logger "aerokit" warns about the
+        outcome.
 
         Args:
             mode: the mode to arm in. None: the present mode; if it does not allow arming, the mode in which
                 ``take_off`` starts.
-            force: skip the vehicle's own arming checks. Dangerous.
+            force: skip the vehicle's own arming checks, which is dangerous.
             reason: why your program arms, at most 50 bytes. Logger "aerokit" reports the reason at INFO. It is also
                 sent to the vehicle as a STATUSTEXT right before the command, and ArduPilot writes this text into its
                 flight log. PX4 logs only texts that have the vehicle's own system id.

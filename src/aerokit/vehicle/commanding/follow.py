@@ -80,7 +80,7 @@ class FollowedTarget:
         self._interval_s = 0.0
 
     def read(self) -> TargetState | None:
-        """Return the latest state of the target, after reading the vehicle or calling the function."""
+        """Read the vehicle or call the function that is the target, and return the target's latest state."""
         if isinstance(self._target, HasTelemetry):
             self._read_vehicle(self._target.telemetry)
         elif not isinstance(self._target, AsyncIterable) and (position := self._target()) is not None:

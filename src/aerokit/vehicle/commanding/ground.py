@@ -30,7 +30,7 @@ class ImpactDetector:
         self._impact_m_s: float | None = None
 
     def update(self) -> None:
-        """Evaluate the last velocity."""
+        """Process the vehicle's last reported velocity."""
         cell = self._session.telemetry.velocity
         velocity = cell.latest
         if velocity is None:

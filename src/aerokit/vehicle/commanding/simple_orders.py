@@ -76,7 +76,7 @@ class SimpleOrder(Snapshot):
     effect: Effect | None = None
 
     def check_supported(self, context: VehicleContext) -> None:
-        """Raise NotSupported if the firmware does not have the command."""
+        """Raise NotSupported if the firmware does not support the command."""
         autopilot = context.session.autopilot
         if self.command in autopilot.unsupported_commands:
             raise NotSupported(

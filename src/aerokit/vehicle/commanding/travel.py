@@ -56,7 +56,9 @@ class TravelActions(VehicleBase):
         order was given meanwhile or another party changed the mode. After a silence, aerokit waits for the next
         heartbeat, and orders a hold if the vehicle is still on its way. Sends MAV_CMD_DO_REPOSITION
         (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_REPOSITION), or SET_POSITION_TARGET_GLOBAL_INT to a
-        vehicle that does not support it. Args:
+        vehicle that does not support it.
+
+        Args:
             target: latitude and longitude, and an altitude above home or above mean sea level. The vehicle keeps its
                 present altitude if the target has none, or is ``vehicle.home.value``.
             speed_m_s: ground speed from now on, above 0; None keeps the present speed.

@@ -231,7 +231,7 @@ class Actuators(ReadOnly):
         session, arbiter = self._context.session, self._context.arbiter
         start: tuple[float, ...]
         stop: tuple[float, ...]
-        # A test with throttle 0 for 0 s ends a running test on ArduPilot; on PX4 a test of 0 s releases the output.
+        # On ArduPilot, a test with throttle 0 for 0 s ends a running test. On PX4, a test of 0 s releases the output.
         if MavCmd.DO_MOTOR_TEST in session.autopilot.unsupported_commands:
             command, start = MavCmd.ACTUATOR_TEST, (throttle_percent / 100, duration_s, 0, 0, number)
             stop = (math.nan, 0, 0, 0, number)

@@ -69,7 +69,7 @@ class Shell(ReadOnly):
         self._is_open = False
 
     def write(self, line: str) -> None:
-        """Send one line without waiting for its output, which :meth:`read` returns.
+        """Send one line without waiting for output. :meth:`read` returns the output.
 
         Args:
             line: at most 1000 bytes, without a line break.

@@ -34,7 +34,7 @@ TargetSource: TypeAlias = (
 """A function that is called at the rate of the stream, or an asynchronous iterable. None: no target is visible.
 """
 
-# A target counts as lost after this time without a measurement. ArduPilot's estimator keeps it for 2 s
+# A target counts as lost after this time without a measurement. ArduPilot's estimator keeps a target for 2 s
 # (AC_PrecLand.cpp).
 LOST_AFTER_S = 1.0
 POLL_INTERVAL_S = 0.2
@@ -54,10 +54,10 @@ class LandingReport(Snapshot):
     """Report of a precision landing, made when the vehicle is on the ground and disarmed.
 
     ``last_target`` is the last measurement, and ``unseen_s`` its age at the end: a camera rarely sees the target from
-    close by. ``losses`` are the earlier periods of more than a second without the target. ``climbed_m`` is how far the
-    vehicle climbed during the landing, in a retry of ArduPilot or a search of PX4. ``used_target`` is False if no
-    measurement was sent during the descent; the vehicle then landed where its firmware chose. ``texts`` are the
-    vehicle's status texts since the order.
+    close by. ``losses`` are the periods before it in which the target was not visible for more than a second.
+    ``climbed_m`` is how far the vehicle climbed during the landing, in a retry of ArduPilot or a search of PX4.
+    ``used_target`` is False if no measurement was sent during the descent; the vehicle then landed where its firmware
+    chose. ``texts`` are the vehicle's status texts since the order.
     """
 
     last_target: TargetMeasurement | None
@@ -113,7 +113,7 @@ class TargetLanding:
         self._error: Exception | None = None
 
     async def read(self, source: TargetSource, period_s: float) -> None:
-        """Read the source until it ends or fails. ``acquire`` and ``await_disarmed`` raise its exception."""
+        """Read the source until it ends or fails. ``acquire`` and ``await_disarmed`` raise the source's exception."""
         try:
             if isinstance(source, AsyncIterable):
                 async for target in source:
@@ -165,7 +165,7 @@ class TargetLanding:
         )
 
     def report(self, *, is_used: bool, texts: tuple[str, ...]) -> LandingReport:
-        """Return the report after the end of the landing."""
+        """Return the report, once the landing has ended."""
         unseen_s = self._now() - self._seen_at
         return LandingReport(self._last, unseen_s, tuple(self._losses), self._climbed_m, is_used, texts)
 

@@ -152,7 +152,7 @@ class MeasurementStream(Generic[MeasurementT]):
         return "used" if is_alone else "unknown"
 
     def send(self, measurement: MeasurementT) -> None:
-        """Send a measurement now, or at the end of the period if another one was already sent in this period.
+        """Send a measurement now, or at the end of the period if another measurement was already sent in it.
 
         Raises:
             InvalidArgument: a value is out of range; nothing was sent.

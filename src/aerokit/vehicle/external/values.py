@@ -1,8 +1,8 @@
 """Measurements that a program supplies to a vehicle, in SI units and degrees.
 
 ``measured_at`` is the time of the measurement on the clock of the event loop (``vehicle.connection.now()``); None means
-the time of the call of ``send``. ``variance`` fields are squared standard deviations. If one is None, the autopilot
-uses its parameters instead (VISO_POS_M_NSE …, EKF2_EVP_NOISE …).
+the time of the call of ``send``. ``variance`` fields are squared standard deviations. If a variance is None, the
+autopilot uses its parameters instead (VISO_POS_M_NSE …, EKF2_EVP_NOISE …).
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ Quaternion: TypeAlias = tuple[float, float, float, float]
 LocalFrame: TypeAlias = Literal["ned", "frd", "enu", "flu"]
 """Axes of a local frame.
 
-``ned``: north, east, down. ``frd``: forward, right, down of the vehicle at its start. ``enu``: east, north, up, and
-``flu``: forward, left, up, as in ROS (REP 103); the body axes are then forward, left, up too.
+``ned``: north, east, down. ``frd``: forward, right, down of the vehicle at its start. ``enu``: east, north, up.
+``flu``: forward, left, up. The last two are those of ROS (REP 103); with them, the body axes are forward, left, up.
 """
 RangeDirection: TypeAlias = Literal["down", "up", "forward", "back", "left", "right"]
 
@@ -177,9 +177,9 @@ class TargetMeasurement(Snapshot):
 class FlowMeasurement(Snapshot):
     """Optical flow of a camera that looks down (OPTICAL_FLOW, OPTICAL_FLOW_RAD).
 
-    ``x_rad`` and ``y_rad`` are the angles by which the ground moved about the body's forward and right axes within
-    ``interval_s``. ``gyro_rad`` are the angles by which the camera itself turned about all three axes. ``quality`` is
-    from 0 to 255.
+    ``x_rad`` and ``y_rad`` are the angles about the body's forward and right axes by which the ground moved in the
+    picture within ``interval_s``. ``gyro_rad`` are the angles by which the camera itself turned about all three axes.
+    ``quality`` is from 0 to 255.
     """
 
     x_rad: float

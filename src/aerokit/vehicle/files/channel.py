@@ -110,7 +110,7 @@ class FileChannel:
         *,
         idle_timeout_s: float,
     ) -> T:
-        """Open a file, use it and close it, within an operation; repeat if the vehicle closes it meanwhile."""
+        """Open a file, use it and close it, within an operation. Repeat this if the vehicle closes it meanwhile."""
         for attempt in range(1, MAX_OPEN_ATTEMPTS + 1):
             file = await self._open(opcode, path, idle_timeout_s)
             try:
@@ -131,7 +131,7 @@ class FileChannel:
                 raise
             else:
                 if opcode == MavFtpOpcode.OPENFILERO:
-                    self._close_soon(file.session, path)  # The caller need not wait until the file is closed.
+                    self._close_soon(file.session, path)  # the caller has its data and need not wait
                 else:
                     await self._close(file.session, path, idle_timeout_s)
                 return result
@@ -293,7 +293,7 @@ class LogChannel:
             raise FileTimeout(f"{what}: not done within {timeout:g} s", missing=missing()) from None
 
     def _end(self) -> None:
-        """Send LOG_REQUEST_END, and confirm it in the background before the next operation."""
+        """Send LOG_REQUEST_END. A background task confirms the end before the next operation starts."""
         transfers = self._transfers
         exchange = LogStop(transfers.system_id, transfers.component_id, is_sent=True, round_trip=transfers.round_trip)
         ended = asyncio.Event()

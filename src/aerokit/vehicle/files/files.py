@@ -64,8 +64,9 @@ class Files:
         self._channel = FileChannel(transfers)
 
     async def is_supported(self) -> bool:
-        """Return True if the vehicle reports support for MAVFTP, False if not or without an answer within three
-        seconds.
+        """Return True if the vehicle reports support for MAVFTP.
+
+        Without an answer within three seconds, the result is False.
         """
         capabilities = await self._transfers.capabilities()
         return capabilities is not None and bool(capabilities & CAPABILITY_FTP)
@@ -97,10 +98,10 @@ class Files:
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> None:
-        """Copy a file to this computer. It is written to ``<to>.part`` and renamed when it is complete.
+        """Copy a file to this computer. The copy is written to ``<to>.part`` and renamed when it is complete.
 
         With ``resume``, the download continues the ``<to>.part`` of an interrupted download, unless the vehicle's file
-        is shorter than it. If the vehicle can compute the CRC-32, it is compared with that of the result; if they
+        is shorter than it. The result is verified by its CRC-32 if the vehicle can compute that of its file; if they
         differ, the whole file is read again. Files whose names begin with ``@`` are always read completely.
 
         Raises:

@@ -39,8 +39,8 @@ MAX_UNANSWERED_REQUESTS = 4
 MAX_LOG_ID = 0xFFFF
 ERASE_RETRY_INTERVAL_S = 1.0
 ERASE_PATIENCE_S = 60.0
-# The time of a log that is being written is the vehicle's clock; the time of a finished log is that of its file. Two
-# times of the same log may therefore differ by this much.
+# The time of a log that is being written comes from the vehicle's clock, the time of a finished log from its file. The
+# two may differ by this much.
 MAX_CLOCK_DIFFERENCE = timedelta(days=1)
 ARDUPILOT_NAME = re.compile(r"(\d{8})\.BIN", re.IGNORECASE)
 PX4_LIST = "logdata.txt"
@@ -229,7 +229,9 @@ class Logs:
     async def _locate(
         self, log: LogEntry | int, method: LogMethod, idle_timeout_s: float, timeout: float | None
     ) -> tuple[str | None, LogEntry]:
-        """Return the path for MAVFTP (None: use LOG_*) and the entry. LOG_* requires an entry that is up to date."""
+        """Return the path of a log for MAVFTP (None: use LOG_*), and the entry. LOG_* requires an entry that is up to
+        date.
+        """
         prefers_messages = method == "log" or (method == "auto" and self._transfers.autopilot.prefers_log_messages)
         if isinstance(log, LogEntry) and not prefers_messages:
             path = await self._path(log, idle_timeout_s)
@@ -302,7 +304,7 @@ def _entry_of(log: LogMessage | ListedLog) -> LogEntry:
 
 
 def _is_different_log(before: LogEntry, now: LogEntry) -> bool:
-    # A log grows while it is written; it does not shrink or become much older.
+    # A log grows while it is written. If it is smaller or much older than before, it is another log.
     if now.size < before.size:
         return True
     if before.time_utc is None:

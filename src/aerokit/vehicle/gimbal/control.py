@@ -135,11 +135,11 @@ STATUS_HZ = 1.0
 class GimbalControl:
     """Control of a gimbal for the duration of its ``async with`` block (MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE).
 
-    Entering takes control from any other station and returns when the manager confirms it. Leaving releases it, without
-    waiting if the block exits by an error or cancellation. When another station takes control, aerokit publishes
-    ``GimbalControlLost``, and orders to the gimbal, including running ones, raise :class:`GimbalTaken`. Leaving the
-    block then releases nothing; it raises GimbalTaken too, unless your program has already seen the loss. Another
-    station that uses your own system and component id cannot be detected.
+    Entering takes control from any other station and returns when the manager confirms that you are in control. Leaving
+    releases control, without waiting if the block exits by an error or cancellation. When another station takes
+    control, aerokit publishes ``GimbalControlLost``, and orders to the gimbal, including running ones, raise
+    :class:`GimbalTaken`. Leaving the block then releases nothing; it raises GimbalTaken too, unless your program has
+    already seen the loss. Another station that uses your own system and component id cannot be detected.
 
     Entering raises:
         NotSupported: the vehicle has no gimbal manager, or its manager has no secondary control.
@@ -195,7 +195,8 @@ class GimbalControl:
     def raise_if_taken(self) -> None:
         """Raise GimbalTaken if control was lost.
 
-        Raises: GimbalTaken: another station is in control, or none.
+        Raises:
+            GimbalTaken: another station is in control, or none.
         """
         if self._taken is not None:
             self._was_raised = True

@@ -123,14 +123,14 @@ class RoiMixin(GimbalMixin):
         (GLOBAL_POSITION_INT).
 
         Args:
-            system_id: its MAVLink system id, 1 to 255.
+            system_id: MAVLink system id of the other vehicle, 1 to 255.
             wait: False: return when the manager has accepted the order.
             tolerance_deg: accepted deviation in each axis, above 0 to 45.
             timeout: seconds to wait.
 
         Raises:
             InvalidArgument: the system id or the tolerance is out of range. Nothing was sent.
-            NotSupported: the manager does not support it. Nothing was sent.
+            NotSupported: the manager does not support this command. Nothing was sent.
 
         Otherwise raises as :meth:`neutral`.
         """
@@ -303,7 +303,7 @@ class Gimbals:
         return self._gimbal(device)
 
     async def discover(self, *, timeout: float = 2.0) -> tuple[int, ...]:
-        """Ask all components which gimbals they manage (GIMBAL_MANAGER_INFORMATION); return :attr:`ids` afterwards.
+        """Ask all components which gimbals they manage (GIMBAL_MANAGER_INFORMATION), then return :attr:`ids`.
 
         Args:
             timeout: seconds to wait for answers; the call always takes this time.

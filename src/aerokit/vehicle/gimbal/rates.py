@@ -35,12 +35,12 @@ class GimbalRates(ValueStream[tuple[float, float]]):
     ``rate_hz`` (GIMBAL_MANAGER_SET_PITCHYAW, or GIMBAL_MANAGER_SET_ATTITUDE to PX4). Leaving the block in any way
     orders a rate of zero, so that the gimbal keeps its direction. The stream stops by itself, with a rate of zero, if
     no new rates are set for ``valid_for_s``, the event loop is blocked for ``max_lag_s``, or the vehicle is silent. It
-    stops without sending a rate of zero if another order is given to the gimbal, or control is lost. ``set`` and
+    stops without sending a rate of zero if another order to the gimbal is given, or if control is lost. ``set`` and
     leaving the block then raise :class:`SetpointStreamStopped` or :class:`GimbalTaken`.
 
     Entering raises:
         InvalidArgument: a rate is out of range. Nothing was sent.
-        NotSupported: the vehicle has no gimbal manager; older mounts turn to angles only.
+        NotSupported: the vehicle has no gimbal manager, and older mounts support only angles.
         CommandRejected: the manager refused.
         CommandTimeout: there was no answer.
         GimbalTaken: your program had control and lost it.

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.session.session import VehicleSession
     from aerokit.vehicle.session.transfers import Transfers
 
-# MISSION_CURRENT is sent at 1 Hz.
+# Two and a half periods of MISSION_CURRENT, which is sent at 1 Hz.
 PLAN_ID_MAX_AGE_S = 2.5
 
 # If the same item is reported as reached again within this time, the message is a repetition.

@@ -33,7 +33,7 @@ __all__ = ["MissionControl"]
 MAX_ITEM = 0xFFFF - 1
 LANDING_COMMANDS = (MavCmd.NAV_RETURN_TO_LAUNCH, MavCmd.NAV_LAND, MavCmd.NAV_VTOL_LAND)
 
-# MISSION_CURRENT is sent at 1 Hz or faster, and may be lost.
+# Seconds to wait for a report of the end, because MISSION_CURRENT is sent at 1 Hz or faster, and may be lost.
 END_GRACE_S = 2.0
 
 # A return may end at a rally point, whose position is unknown here, so it counts as finished after this time.
@@ -280,7 +280,7 @@ class MissionControl(VehiclePlan["Mission"]):
                 mode, it disarmed on the way, or it fell. ``reasons`` has the vehicle's status texts.
             OperationTimeout: the mission was not finished in time; or the armed vehicle has not moved for 12 s after it
                 descended to the ground at more than 3 m/s; or it has not moved for 60 s at a take-off or at a waypoint
-                without a hold. The last case is detected only if the items are known from an upload or a download.
+                without a hold. The last case is only detected if the items are known from an upload or a download.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
         """
         vehicle_context, session = self._vehicle_context, self._session

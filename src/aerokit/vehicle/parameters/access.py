@@ -38,7 +38,7 @@ FTP_PROBE_TIMEOUT_S, FTP_PROBE_ATTEMPTS = 2.0, 3
 ANSWER_DELAY_S = 0.1
 # Value of SET_MESSAGE_INTERVAL that restores the autopilot's default rate.
 DEFAULT_INTERVAL = 0
-# Late or repeated answers to a write may arrive for this long.
+# Seconds after a write in which late or repeated answers to it may arrive.
 ECHO_WINDOW_S = 3.0
 # ArduPilot answers this many reads at once. Further reads wait until it handles parameters again.
 MAX_READS_UNBOOSTED = 5
@@ -51,7 +51,7 @@ MAX_READ_BACK = 100
 
 
 class ParameterAccess:
-    """The parameters of one vehicle. Does not translate renamed parameters."""
+    """Access to the parameters of one vehicle by their names on it. Does not translate renamed parameters."""
 
     def __init__(self, transfers: Transfers, files: Files) -> None:
         self._transfers, self._files = transfers, files
@@ -123,7 +123,7 @@ class ParameterAccess:
 
     @contextmanager
     def _ftp_probe(self) -> Iterator[None]:
-        """Raise FileTimeout early if MAVFTP is not answered: some relays drop MAVFTP but forward the parameter list."""
+        """Raise FileTimeout early in the block if MAVFTP is not answered, because some relays drop only MAVFTP."""
         connection, round_trip = self._transfers.connection, self._transfers.round_trip
         timeout_s = max(FTP_PROBE_TIMEOUT_S, FTP_PROBE_ATTEMPTS * round_trip.timeout_s())
         answers: list[object] = []
@@ -253,7 +253,7 @@ class ParameterAccess:
     async def write(
         self, wanted: Iterable[Parameter], idle_timeout_s: float, on_progress: OnProgress | None = None
     ) -> dict[str, ParameterAnswer]:
-        """Set parameters and return the vehicle's values. Writes of other tasks wait."""
+        """Set parameters and return the vehicle's values. Writes by other tasks wait until this one is done."""
         wanted = tuple(wanted)
         if not wanted:
             return {}

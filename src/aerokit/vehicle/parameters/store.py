@@ -27,7 +27,7 @@ IN_FLIGHT_S = 1.0
 
 
 class ParameterStore:
-    """Parameters by name. Publishes :class:`ParameterChanged` when a known value changes."""
+    """The known parameters by name. Publishes :class:`ParameterChanged` when a known value changes."""
 
     updates: int
 
@@ -39,7 +39,7 @@ class ParameterStore:
         self.is_complete: bool = False
         # Number of values that have arrived in messages.
         self.updates = 0
-        # Number of parameters in the last message; ArduPilot may show and hide some at any time.
+        # Number of parameters according to the last message. ArduPilot may show and hide parameters at any time.
         self.count: int | None = None
         self._updated_at: dict[str, int] = {}
         self._replaced: dict[str, tuple[int | float, float]] = {}

@@ -212,7 +212,7 @@ class Transaction(_Block):
         return (await self.set_many({name: value}))[name]
 
     async def set_many(self, values: Mapping[str, float]) -> dict[str, ParameterWrite]:
-        """Set several parameters; raises the first error after all were tried."""
+        """Set several parameters. If some fail, the first error is raised after all were tried."""
         if not self._is_open:
             raise InvalidArgument("this transaction is not open: it has ended, or was not entered yet")
         results = await self._write(values)

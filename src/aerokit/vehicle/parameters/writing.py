@@ -53,7 +53,7 @@ class ResolvedParameter(Snapshot):
 
 
 def resolve_known(name: str, known: Mapping[str, Parameter]) -> ResolvedParameter | None:
-    """Return the known parameter that has this name, or an old or new form of it; None if there is none."""
+    """Return the known parameter that has this name or another name of the same parameter; None if unknown."""
     if name in known:
         return ResolvedParameter(name, known[name], False)
     from aerokit.parameters.renames import resolve_rename
@@ -94,7 +94,7 @@ class NameResolver:
         return translated
 
     def without_duplicates(self, values: Mapping[str, float], table: ParameterTable) -> dict[str, int | float]:
-        """Drop values that are also given under the vehicle's own name."""
+        """Drop values of parameters for which ``values`` also has a value under the vehicle's own name."""
         from aerokit.parameters.renames import resolve_rename
 
         renamed = {name: resolve_rename(name, table) for name in values}

@@ -116,7 +116,7 @@ class VehicleWatch:
         """Return the vehicle's time since boot at ``now``, extrapolated from the last message that had it; None if
         unknown.
 
-        Considers the speed of a simulation.
+        The speed of a simulation is taken into account.
         """
         if "time_boot_ms" not in self._times or self._first_time is None:
             return None
@@ -176,12 +176,12 @@ class VehicleWatch:
             self._note_time(frame, "time_boot_ms", int.from_bytes(frame.body[9:13], "little"))
 
     def _on_system_time(self, frame: Frame) -> None:
-        """Read ``time_boot_ms`` behind ``time_unix_usec``."""
+        """Read ``time_boot_ms``, which follows ``time_unix_usec`` in the payload."""
         if frame.component_id == self._component_id:
             self._note_time(frame, "time_boot_ms", int.from_bytes(frame.body[17:21], "little"))
 
     def _on_timesync(self, message: Timesync) -> None:
-        """Process answers to our TIMESYNC requests, which a vehicle without streams sends too."""
+        """Process answers to our TIMESYNC requests. A vehicle sends them even if it streams no messages."""
         frame = message.received_frame
         if message.tc1 != 0 and frame is not None and frame.component_id == self._component_id:
             self._note_time(frame, "TIMESYNC", message.tc1 // 1_000_000)

@@ -209,7 +209,7 @@ def system_time(message: messages.SystemTime) -> SystemTime:
 
 
 def sensor_health(message: messages.SysStatus, context: Context) -> SensorHealth:
-    """Return the sensor health; the autopilot's definition gives the bits their meaning."""
+    """Return the sensor health. The meaning of the bits depends on the autopilot."""
     bits = (
         message.onboard_control_sensors_present,
         message.onboard_control_sensors_enabled,

@@ -123,7 +123,7 @@ class Battery(Snapshot):
 
 
 class Power(Snapshot):
-    """Supply voltages of the board and of its servos, and MAV_POWER_STATUS bits; None: not measured."""
+    """Supply voltages of the board and of its servos, None if not measured, and MAV_POWER_STATUS bits."""
 
     board_v: float | None
     servos_v: float | None
@@ -138,7 +138,7 @@ class RcChannels(Snapshot):
 
 
 class ServoOutputs(Snapshot):
-    """Pulse widths to motors and servos in µs; ``outputs_us[0]`` is output 1, 0 means no pulses."""
+    """Pulse widths to motors and servos in µs. ``outputs_us[0]`` is output 1; a value of 0 means no pulses."""
 
     outputs_us: tuple[int, ...]
 
@@ -173,12 +173,12 @@ def range_finder(message: messages.Rangefinder, context: Context) -> tuple[Range
 
 
 def first_gps(message: messages.GpsRawInt, context: Context) -> tuple[GpsReceiver, ...]:
-    """Return the known receivers, with the first one replaced or added."""
+    """Return the known receivers, with the first receiver replaced or added."""
     return _with(context.before, _gps_receiver(message, 0), _index_of)
 
 
 def second_gps(message: messages.Gps2Raw, context: Context) -> tuple[GpsReceiver, ...]:
-    """Return the known receivers, with the second one replaced or added."""
+    """Return the known receivers, with the second receiver replaced or added."""
     return _with(context.before, _gps_receiver(message, 1), _index_of)
 
 
@@ -370,7 +370,7 @@ def _euler(q: tuple[float, ...]) -> tuple[float, float, float]:
 
 
 def _known(degrees: float) -> float | None:
-    """Round to hundredths, the resolution of MOUNT_STATUS."""
+    """Round to hundredths of a degree, the resolution of MOUNT_STATUS."""
     return round(degrees, 2) + 0.0 if math.isfinite(degrees) else None
 
 

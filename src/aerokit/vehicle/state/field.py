@@ -129,7 +129,7 @@ I16 = 0x7FFF
 
 
 class Context:
-    """Additional input of a decoder; ``before`` is the latest value of the state."""
+    """Additional input of a decoder. ``before`` is the value of the state before this message."""
 
     __slots__ = ("autopilot", "base_mode", "before", "home_is_known", "mode_names")
 
@@ -224,7 +224,7 @@ class StreamedMessage:
         """Decode the pending frames in the order of their arrival."""
         with self._lock:
             waiting: list[tuple[Frame, Message | None]] = []
-            # Removed only after decoding: the decoder may read the previous value, which calls this function
+            # A frame is removed only after decoding. The decoder may read the previous value, which calls this function
             # again.
             while self.pending:
                 came = self.pending.popitem()[1]

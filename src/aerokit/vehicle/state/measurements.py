@@ -50,9 +50,9 @@ class RawImu(Snapshot):
 class Odometry(Snapshot):
     """Pose in ``frame`` and velocity in ``child_frame`` (MAV_FRAME), as the estimator reports them.
 
-    Metres, m/s and degrees per second along x, y, z; ``quaternion`` is w, x, y, z. A covariance is the upper right
-    triangle of a 6×6 matrix, row by row (x, y, z, roll, pitch, yaw), None if unknown. ``quality_percent`` is None if
-    not reported, −1 if the odometry has failed.
+    Vectors are along x, y, z, in metres, m/s and degrees per second; ``quaternion`` is w, x, y, z. A covariance is the
+    upper right triangle of a 6×6 matrix, row by row (x, y, z, roll, pitch, yaw), None if unknown. ``quality_percent``
+    is None if not reported, −1 if the odometry has failed.
     """
 
     frame: int

@@ -112,12 +112,12 @@ class Telemetry(States):
 
     @property
     def cells(self) -> Mapping[str, StateCell[Any]]:
-        """Cells by name."""
+        """All state cells by name."""
         return self._cells
 
     @property
     def mode_names(self) -> Mapping[int, str]:
-        """Maps the custom_mode of each mode in AVAILABLE_MODES that no built-in table contains to its name."""
+        """Names of the modes in AVAILABLE_MODES that are in no built-in table, by custom_mode."""
         return self._mode_names
 
     @property
