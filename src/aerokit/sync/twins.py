@@ -492,7 +492,7 @@ class Guided(TwinOf["AsyncGuided"]):
 
     All streams have the same arguments. ``rate_hz`` (2 to 400) is the transmission rate of the latest set-point. The
     stream stops if it gets no new set-point for ``valid_for_s`` seconds, or if the event loop is late by ``max_lag_s``
-    seconds. A stream raises NotSupported for a kind of set-point that this type of vehicle does not support. Rates and
+    seconds. NotSupported is raised for a kind of set-point that this type of vehicle does not support. Rates and
     seconds are in real time: a simulation at ten times the speed needs ten times the rate.
     """
 
@@ -1028,7 +1028,7 @@ class GimbalRates(BlockTwin["AsyncGimbalRates"]):
         self._loop.call(self.aio.set, pitch_deg_s, yaw_deg_s)
 
     def turn(self, pitch_deg_s: float, yaw_deg_s: float, duration_s: float) -> None:
-        """Supply one pair of rates for ``duration_s`` seconds. Arguments and errors are as for :meth:`set`."""
+        """Supply one pair of rates for ``duration_s`` seconds. Arguments and errors as for :meth:`set`."""
         self._loop.run(self.aio.turn, pitch_deg_s, yaw_deg_s, duration_s)
 
 
@@ -2626,7 +2626,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
     def pause(self) -> None:
         """Hold and remember the current item; returns when HEARTBEAT reports the hold mode.
 
-        Raises OperationRejected if the vehicle is not flying its mission. Other errors are as for :meth:`Vehicle.hold`.
+        Raises OperationRejected if the vehicle is not flying its mission. Otherwise raises as :meth:`Vehicle.hold`.
         """
         self._loop.run(self.aio.pause)
 
@@ -3151,7 +3151,7 @@ class Camera(TwinOf["AsyncCamera"]):
         """Zoom for the duration of an ``async with`` block. The end of the block stops the zoom, also under
         cancellation.
 
-        Entering raises as :meth:`zoom_step`.
+        Entering raises the errors of :meth:`zoom_step`.
 
         Args:
             speed: −1 (out) to 1 (in); many cameras support only these two values.
@@ -3193,7 +3193,7 @@ class Camera(TwinOf["AsyncCamera"]):
         """Move the focus for the duration of an ``async with`` block. The end of the block stops it, also under
         cancellation.
 
-        Entering raises as :meth:`focus_step`.
+        Entering raises the errors of :meth:`focus_step`.
 
         Args:
             speed: −1 (nearer) to 1 (farther); many cameras support only these two values.
@@ -3254,7 +3254,7 @@ class Camera(TwinOf["AsyncCamera"]):
         """Record for the duration of an ``async with`` block. The end of the block stops recording, also under
         cancellation.
 
-        Entering raises as :meth:`start_video`.
+        Entering raises the errors of :meth:`start_video`.
 
         Raises:
             InvalidArgument: ``status_hz`` is not 0 to 10. Nothing was sent.
@@ -3636,7 +3636,7 @@ class Component(TwinOf["AsyncComponent"]):
         progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
     ) -> CommandAck:
-        """Send any MAV_CMD as COMMAND_LONG and return the ACCEPTED ack; see :meth:`aerokit.Vehicle.command`."""
+        """Send any MAV_CMD as COMMAND_LONG and return the ACCEPTED ack, like :meth:`aerokit.Vehicle.command`."""
         return self._loop.run(
             self.aio.command,
             command,
@@ -3685,7 +3685,7 @@ class Component(TwinOf["AsyncComponent"]):
         )
 
     def message(self, message_type: type[MessageT], *, rate_hz: float | None = None) -> StateCell[MessageT]:
-        """Return a cell with the component's latest message of a type; see :meth:`aerokit.Vehicle.message`."""
+        """Return a cell with the component's latest message of a type, like :meth:`aerokit.Vehicle.message`."""
         return StateCell(self._loop, self._loop.call(self.aio.message, message_type, rate_hz=rate_hz))
 
     def rate(self, message_type: type[Message], rate_hz: float) -> AbstractContextManager[None]:

@@ -84,7 +84,7 @@ class LensMixin(CameraMixin):
         """Zoom for the duration of an ``async with`` block. The end of the block stops the zoom, also under
         cancellation.
 
-        Entering raises as :meth:`zoom_step`.
+        Entering raises the errors of :meth:`zoom_step`.
 
         Args:
             speed: −1 (out) to 1 (in); many cameras support only these two values.
@@ -130,7 +130,7 @@ class LensMixin(CameraMixin):
         """Move the focus for the duration of an ``async with`` block. The end of the block stops it, also under
         cancellation.
 
-        Entering raises as :meth:`focus_step`.
+        Entering raises the errors of :meth:`focus_step`.
 
         Args:
             speed: −1 (nearer) to 1 (farther); many cameras support only these two values.

@@ -108,7 +108,7 @@ class VideoMixin(CameraMixin):
         """Record for the duration of an ``async with`` block. The end of the block stops recording, also under
         cancellation.
 
-        Entering raises as :meth:`start_video`.
+        Entering raises the errors of :meth:`start_video`.
 
         Raises:
             InvalidArgument: ``status_hz`` is not 0 to 10. Nothing was sent.

@@ -170,7 +170,7 @@ class Order:
         none.
         """
         self.has_lost_mode: bool = False
-        """True if the mode was changed to a mode that the order does not explain."""
+        """True if the vehicle has changed to a mode that the order does not explain."""
         self.mode_lost_at: float = -math.inf
         """Time of this change of the mode. CURRENT_MODE may report it before HEARTBEAT, which may also report
         disarming.

@@ -214,7 +214,7 @@ class Component(ReadOnly):
         progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
     ) -> CommandAck:
-        """Send any MAV_CMD as COMMAND_LONG and return the ACCEPTED ack; see :meth:`aerokit.Vehicle.command`."""
+        """Send any MAV_CMD as COMMAND_LONG and return the ACCEPTED ack, like :meth:`aerokit.Vehicle.command`."""
         return await self._sender.answered(
             self._session.commands.send_long,
             command,
@@ -286,7 +286,7 @@ class Component(ReadOnly):
         return self._session.subscriber.subscribe(types, capacity, overflow, rate_hz)
 
     def message(self, message_type: type[MessageT], *, rate_hz: float | None = None) -> StateCell[MessageT]:
-        """Return a cell with the component's latest message of a type; see :meth:`aerokit.Vehicle.message`."""
+        """Return a cell with the component's latest message of a type, like :meth:`aerokit.Vehicle.message`."""
         return self._session.subscriber.cell(message_type, rate_hz)
 
     @contextmanager

@@ -83,7 +83,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         self._set((pitch_deg_s, yaw_deg_s))
 
     async def turn(self, pitch_deg_s: float, yaw_deg_s: float, duration_s: float) -> None:
-        """Supply one pair of rates for ``duration_s`` seconds. Arguments and errors are as for :meth:`set`."""
+        """Supply one pair of rates for ``duration_s`` seconds. Arguments and errors as for :meth:`set`."""
         _check(pitch_deg_s, yaw_deg_s)
         await self._feed((pitch_deg_s, yaw_deg_s), duration_s)
 

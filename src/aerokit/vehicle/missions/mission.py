@@ -233,7 +233,7 @@ class MissionControl(VehiclePlan["Mission"]):
     async def pause(self) -> None:
         """Hold and remember the current item; returns when HEARTBEAT reports the hold mode.
 
-        Raises OperationRejected if the vehicle is not flying its mission. Other errors are as for :meth:`Vehicle.hold`.
+        Raises OperationRejected if the vehicle is not flying its mission. Otherwise raises as :meth:`Vehicle.hold`.
         """
         vehicle_context, session = self._vehicle_context, self._session
         mode = vehicle_context.sender.mode_for("mission.pause", "hold")

@@ -277,7 +277,7 @@ class ParameterWriter:
         *,
         is_first: bool,
     ) -> tuple[list[_PlannedWrite], dict[str, AerokitError]]:
-        """Return the planned writes and the errors. In the first round, an invalid value raises its error."""
+        """Return the planned writes and the errors. In the first round, an invalid value raises InvalidArgument."""
         plans: dict[str, _PlannedWrite] = {}
         errors: dict[str, AerokitError] = {}
         for name, resolved in found.items():

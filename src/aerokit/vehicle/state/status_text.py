@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 __all__ = ["StatusTextAssembler"]
 
 CHUNK_LENGTH = 50
-"""Bytes of text in one STATUSTEXT."""
+"""Number of bytes of text in one STATUSTEXT."""
 CHUNK_TIMEOUT_S = 2.0
 MAX_RECENT_TEXTS = 64
 # Maximum number of chunks of one text. A longer text is invalid, and is passed on in parts.
