@@ -108,7 +108,7 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     @property
     def may_have_changed_items(self) -> bool:
-        """True if the vehicle may have overwritten old items. False before it has requested any."""
+        """True if the vehicle may have overwritten old items. False until the vehicle has requested an item."""
         return self.was_started and not (self._is_partial and self._sent == self._first + 1)
 
     @property

@@ -315,8 +315,8 @@ class TakeoverCheck:
         self._take_off, self._hold = (session.autopilot.mode_for(p, is_vtol=is_vtol) for p in ("take_off", "hold"))
 
     def raise_if_changed(self, what: str) -> None:
-        """Raise OperationRejected if an order was given or the mode was changed; the end of a take-off may change the
-        mode.
+        """Raise OperationRejected if an order was given, or if the mode was changed other than by the end of a
+        take-off.
         """
         if self._arbiter.latest(STEERING) is not self._order:
             raise OperationRejected(f"{what}: {SUPERSEDED} before anything was ordered")
