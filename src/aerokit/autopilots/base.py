@@ -224,7 +224,10 @@ class Autopilot:
     lands_after_return = False
     """True if the return mode ends with a landing."""
     arrival_radius_m: float = 2.0
-    """Default distance in metres within which the vehicle counts as arrived. A fixed wing's includes its circle."""
+    """Default distance in metres within which the vehicle counts as arrived.
+
+    For a fixed wing, this distance includes the circle that the vehicle flies.
+    """
     mission_storage = "any"
     """Conversions that the autopilot applies to stored mission items: an :class:`aerokit.missions.ItemStorage`."""
     mission_upload_window = 1

@@ -241,7 +241,7 @@ def item_differences(
 ) -> tuple[str, ...]:
     """Describe each field that differs: ``"z is 20.0 instead of 30.0"``.
 
-    ``single_precision``: places were sent as 32-bit floats (MISSION_ITEM), whose rounding error is up to 1.7 m.
+    ``single_precision``: places were sent as 32-bit floats (MISSION_ITEM), whose steps are up to 1.7 m.
     """
     if wanted.command != found.command:
         return (f"the command is {found.name} instead of {wanted.name}",)

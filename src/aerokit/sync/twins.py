@@ -458,10 +458,10 @@ class SetpointStream(StreamTwin[SetpointT]):
     Entering the block changes to the set-point mode (GUIDED, OFFBOARD) with the initial set-point. Leaving the block in
     any way makes the vehicle hold.
 
-    The stream stops by itself if there is no new set-point for ``valid_for_s``, if the event loop is late by
-    ``max_lag_s``, if the vehicle leaves the mode, disarms or falls silent, and if the vehicle should move but stays in
-    place for twelve seconds. ``set`` and leaving the block then raise :class:`SetpointStreamStopped`. If a pilot or a
-    failsafe changed the mode, nothing more is sent to the vehicle.
+    The stream stops by itself if there is no new set-point for ``valid_for_s``, or if the event loop is late by
+    ``max_lag_s``. It also stops if the vehicle leaves the mode, disarms or falls silent, or stays in place for twelve
+    seconds although it should move. ``set`` and leaving the block then raise :class:`SetpointStreamStopped`. If a pilot
+    or a failsafe changed the mode, nothing more is sent to the vehicle.
     """
 
     @property
@@ -670,9 +670,9 @@ class FollowStream(BlockTwin["AsyncFollowStream"]):
     OFFBOARD on PX4. Leaving the block in any way makes the vehicle hold.
 
     The stream stops by itself, and the vehicle holds, when no new position of the target arrives for ``valid_for_s``,
-    when the source of positions ends or raises, when the target is farther away than ``max_distance_m``, and for the
-    same reasons as a set-point stream. If a pilot or a failsafe changes the mode, the stream stops and sends nothing
-    more. ``fly`` and leaving the block then raise :class:`SetpointStreamStopped`.
+    when the source of positions ends or raises, or when the target is farther away than ``max_distance_m``. The stream
+    also stops for the same reasons as a set-point stream. If a pilot or a failsafe changes the mode, the stream stops
+    and sends nothing more. ``fly`` and leaving the block then raise :class:`SetpointStreamStopped`.
 
     Entering raises:
         OperationRejected: the vehicle is not flying (nothing was sent), or its altitude is unknown (the vehicle holds).
@@ -715,7 +715,7 @@ class StickStream(BlockTwin["AsyncStickStream"]):
     If the program is killed, ArduPilot returns to the transmitter after RC_OVERRIDE_TIME (3 s), and PX4 treats the
     sticks as lost after COM_RC_LOSS_T (0.5 s). PX4 has no message that releases the sticks, so it treats every end of a
     stream as a loss of the sticks. Without another source of manual control, PX4 then executes NAV_RCL_ACT (return by
-    default). It does so even in its hold mode, unless bit 1 of COM_RCL_EXCEPT is set. ArduCopter without a transmitter
+    default). PX4 does so even in hold mode, unless bit 1 of COM_RCL_EXCEPT is set. ArduCopter without a transmitter
     executes FS_THR_ENABLE.
 
     Entering raises:
@@ -1436,8 +1436,9 @@ class Files(TwinOf["AsyncFiles"]):
         """Copy a file to this computer. The copy is written to ``<to>.part`` and renamed when it is complete.
 
         With ``resume``, the download continues the ``<to>.part`` of an interrupted download, unless the vehicle's file
-        is shorter than it. The result is verified by its CRC-32 if the vehicle can compute that of its file; if they
-        differ, the whole file is read again. Files whose names begin with ``@`` are always read completely.
+        is shorter than it. If the vehicle can compute the CRC-32 of its file, aerokit compares the CRC-32 of the copy
+        with it; if they differ, the whole file is read again. Files whose names begin with ``@`` are always read
+        completely.
 
         Raises:
             RemoteProtocolError: as for :meth:`read`.
@@ -1605,8 +1606,8 @@ class Logs(TwinOf["AsyncLogs"]):
     total; None for no limit). You can cancel any call; the vehicle then stops sending.
 
     ArduPilot answers LOG_* messages only while disarmed, and ends its current log when a log is read by these messages.
-    By MAVFTP, logs can also be read in flight. A log that is still being written is read up to its current end. If it
-    is larger than its entry says, logger "aerokit" reports that (INFO).
+    By MAVFTP, logs can also be read in flight. A log that is still being written is read up to its current end. If such
+    a log is larger than its entry says, logger "aerokit" reports that (INFO).
     """
 
     def list(self, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None) -> tuple[LogEntry, ...]:
@@ -2650,7 +2651,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
 
         Raises:
             OperationRejected: the vehicle no longer flies the mission: a pilot, a failsafe or another order changed the
-                mode, it disarmed on the way, or it fell. ``reasons`` has the vehicle's status texts.
+                mode, or the vehicle disarmed on the way or fell. ``reasons`` has the vehicle's status texts.
             OperationTimeout: the mission was not finished in time; or the armed vehicle has not moved for 12 s after it
                 descended to the ground at more than 3 m/s; or it has not moved for 60 s at a take-off or at a waypoint
                 without a hold. The last case is only detected if the items are known from an upload or a download.
@@ -4604,7 +4605,7 @@ class Vehicle(VehicleTwin):
         :meth:`orbit`.
 
         Args:
-            center: the point where the lines cross, at the altitude of the figure. If it has no altitude, the vehicle
+            center: the point where the lines cross, at the altitude of the figure. Without an altitude, the vehicle
                 keeps its present altitude.
             major_radius_m: half the length of the figure, above 0, at most 10,000.
             minor_radius_m: half the width of the figure, above 0, at most half of ``major_radius_m``.
@@ -4645,8 +4646,8 @@ class Vehicle(VehicleTwin):
         """Go to a place and stay there: a fixed wing circles, a multicopter hovers.
 
         Returns when the vehicle has arrived and has then flown ``turns`` turns or waited ``duration_s`` seconds, if one
-        of these is given. The vehicle stays until another order. After a cancellation or a time-out, aerokit orders it
-        to hold where it is.
+        of these is given. The vehicle stays until another order. After a cancellation or a time-out, aerokit orders the
+        vehicle to hold where it is.
 
         Sends MAV_CMD_DO_REPOSITION (ArduPilot in GUIDED, PX4 in LOITER). For a PX4 fixed wing with ``radius_m``, sends
         MAV_CMD_DO_ORBIT.

@@ -119,7 +119,7 @@ async def ardupilot_airspeed(run: CalibrationRun, *_: float) -> AsyncGenerator[C
 
 
 async def ardupilot_escs(run: CalibrationRun, *_: float) -> AsyncGenerator[CalibrationStep, None]:
-    """ArduCopter: set ESC_CALIBRATION to 3, so that it calibrates the ESCs while it boots."""
+    """ArduCopter: set ESC_CALIBRATION to 3, so that the vehicle calibrates the ESCs at its next boot."""
     run.check_ready()
     before = await _parameter(run, "ESC_CALIBRATION")
     yield run.step(None, "remove the propellers, then continue", needs_confirmation=True)

@@ -198,7 +198,7 @@ def finite_or_none(value: T) -> T | None:
 def place_of(
     latitude_e7: int, longitude_e7: int, altitude_amsl_m: float, altitude_relative_m: float | None
 ) -> Position | None:
-    """Decode a position; return None if it is invalid or so close to 0, 0 that the sender did not know it."""
+    """Decode a position; return None if it is invalid, or so close to 0, 0 that it stands for "unknown"."""
     latitude, longitude = latitude_e7 * 1e-7, longitude_e7 * 1e-7
     is_somewhere = abs(latitude) > MIN_COORDINATE_DEG or abs(longitude) > MIN_COORDINATE_DEG
     if not is_somewhere or abs(latitude) > 90.0 or abs(longitude) > 180.0:

@@ -300,8 +300,8 @@ class CommandArbiter:
     def changing_mode(self) -> Iterator[None]:
         """Distrust the reported mode until the vehicle has answered a command that changes the mode.
 
-        After a cancellation or a time-out, the mode stays in doubt. After a refusal, it is in doubt only if it was
-        before, by an earlier order that may still take effect.
+        After a cancellation or a time-out, the mode stays in doubt. After a refusal, the mode is in doubt only if an
+        earlier order may still change it.
         """
         was_in_doubt, self.mode_is_in_doubt = self.mode_is_in_doubt, True
         try:

@@ -133,9 +133,9 @@ class FollowStream(SteeringStream[TargetState]):
     OFFBOARD on PX4. Leaving the block in any way makes the vehicle hold.
 
     The stream stops by itself, and the vehicle holds, when no new position of the target arrives for ``valid_for_s``,
-    when the source of positions ends or raises, when the target is farther away than ``max_distance_m``, and for the
-    same reasons as a set-point stream. If a pilot or a failsafe changes the mode, the stream stops and sends nothing
-    more. ``fly`` and leaving the block then raise :class:`SetpointStreamStopped`.
+    when the source of positions ends or raises, or when the target is farther away than ``max_distance_m``. The stream
+    also stops for the same reasons as a set-point stream. If a pilot or a failsafe changes the mode, the stream stops
+    and sends nothing more. ``fly`` and leaving the block then raise :class:`SetpointStreamStopped`.
 
     Entering raises:
         OperationRejected: the vehicle is not flying (nothing was sent), or its altitude is unknown (the vehicle holds).

@@ -193,10 +193,10 @@ class SetpointStream(SteeringStream[SetpointT]):
     Entering the block changes to the set-point mode (GUIDED, OFFBOARD) with the initial set-point. Leaving the block in
     any way makes the vehicle hold.
 
-    The stream stops by itself if there is no new set-point for ``valid_for_s``, if the event loop is late by
-    ``max_lag_s``, if the vehicle leaves the mode, disarms or falls silent, and if the vehicle should move but stays in
-    place for twelve seconds. ``set`` and leaving the block then raise :class:`SetpointStreamStopped`. If a pilot or a
-    failsafe changed the mode, nothing more is sent to the vehicle.
+    The stream stops by itself if there is no new set-point for ``valid_for_s``, or if the event loop is late by
+    ``max_lag_s``. It also stops if the vehicle leaves the mode, disarms or falls silent, or stays in place for twelve
+    seconds although it should move. ``set`` and leaving the block then raise :class:`SetpointStreamStopped`. If a pilot
+    or a failsafe changed the mode, nothing more is sent to the vehicle.
     """
 
     _NAME, _VALUE = "set-point stream", "set-point"

@@ -119,7 +119,7 @@ class ManeuverActions(VehicleBase):
         :meth:`orbit`.
 
         Args:
-            center: the point where the lines cross, at the altitude of the figure. If it has no altitude, the vehicle
+            center: the point where the lines cross, at the altitude of the figure. Without an altitude, the vehicle
                 keeps its present altitude.
             major_radius_m: half the length of the figure, above 0, at most 10,000.
             minor_radius_m: half the width of the figure, above 0, at most half of ``major_radius_m``.
@@ -171,8 +171,8 @@ class ManeuverActions(VehicleBase):
         """Go to a place and stay there: a fixed wing circles, a multicopter hovers.
 
         Returns when the vehicle has arrived and has then flown ``turns`` turns or waited ``duration_s`` seconds, if one
-        of these is given. The vehicle stays until another order. After a cancellation or a time-out, aerokit orders it
-        to hold where it is.
+        of these is given. The vehicle stays until another order. After a cancellation or a time-out, aerokit orders the
+        vehicle to hold where it is.
 
         Sends MAV_CMD_DO_REPOSITION (ArduPilot in GUIDED, PX4 in LOITER). For a PX4 fixed wing with ``radius_m``, sends
         MAV_CMD_DO_ORBIT.

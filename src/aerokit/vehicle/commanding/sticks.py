@@ -64,7 +64,7 @@ class StickStream(SteeringStream[StickInput]):
     If the program is killed, ArduPilot returns to the transmitter after RC_OVERRIDE_TIME (3 s), and PX4 treats the
     sticks as lost after COM_RC_LOSS_T (0.5 s). PX4 has no message that releases the sticks, so it treats every end of a
     stream as a loss of the sticks. Without another source of manual control, PX4 then executes NAV_RCL_ACT (return by
-    default). It does so even in its hold mode, unless bit 1 of COM_RCL_EXCEPT is set. ArduCopter without a transmitter
+    default). PX4 does so even in hold mode, unless bit 1 of COM_RCL_EXCEPT is set. ArduCopter without a transmitter
     executes FS_THR_ENABLE.
 
     Entering raises:

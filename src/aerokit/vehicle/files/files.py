@@ -101,8 +101,9 @@ class Files:
         """Copy a file to this computer. The copy is written to ``<to>.part`` and renamed when it is complete.
 
         With ``resume``, the download continues the ``<to>.part`` of an interrupted download, unless the vehicle's file
-        is shorter than it. The result is verified by its CRC-32 if the vehicle can compute that of its file; if they
-        differ, the whole file is read again. Files whose names begin with ``@`` are always read completely.
+        is shorter than it. If the vehicle can compute the CRC-32 of its file, aerokit compares the CRC-32 of the copy
+        with it; if they differ, the whole file is read again. Files whose names begin with ``@`` are always read
+        completely.
 
         Raises:
             RemoteProtocolError: as for :meth:`read`.

@@ -89,8 +89,8 @@ class Logs:
     total; None for no limit). You can cancel any call; the vehicle then stops sending.
 
     ArduPilot answers LOG_* messages only while disarmed, and ends its current log when a log is read by these messages.
-    By MAVFTP, logs can also be read in flight. A log that is still being written is read up to its current end. If it
-    is larger than its entry says, logger "aerokit" reports that (INFO).
+    By MAVFTP, logs can also be read in flight. A log that is still being written is read up to its current end. If such
+    a log is larger than its entry says, logger "aerokit" reports that (INFO).
     """
 
     def __init__(self, transfers: Transfers, files: Files, context: VehicleContext) -> None:

@@ -277,7 +277,7 @@ class MissionControl(VehiclePlan["Mission"]):
 
         Raises:
             OperationRejected: the vehicle no longer flies the mission: a pilot, a failsafe or another order changed the
-                mode, it disarmed on the way, or it fell. ``reasons`` has the vehicle's status texts.
+                mode, or the vehicle disarmed on the way or fell. ``reasons`` has the vehicle's status texts.
             OperationTimeout: the mission was not finished in time; or the armed vehicle has not moved for 12 s after it
                 descended to the ground at more than 3 m/s; or it has not moved for 60 s at a take-off or at a waypoint
                 without a hold. The last case is only detected if the items are known from an upload or a download.

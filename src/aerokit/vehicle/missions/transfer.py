@@ -149,7 +149,7 @@ class PlanChannel:
         )
 
     async def _run(self, exchange: MissionExchange[ResultT]) -> ResultT:
-        """Run an exchange; if it is cancelled, cancel it on the vehicle, too."""
+        """Run an exchange. If the call is cancelled, also cancel the transfer on the vehicle."""
         connection = self._context.transfers.connection
         if self.mission_type != MavMissionType.MISSION and connection.mavlink_version == 1:
             raise NotSupported(

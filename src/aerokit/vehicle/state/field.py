@@ -161,8 +161,8 @@ def scaled(value: int, unknown: int, divisor: int) -> float | None:
     return None if value == unknown else value / divisor
 
 
-# A frame whose values are not read is decoded after at most this many seconds. A later frame, which would replace it,
-# may lack a value that it contains: without a fix, for example, the position is missing.
+# A frame whose values are not read is decoded after at most this many seconds, because the next frame replaces it and
+# may lack some of its values. Without a fix, for example, the position is missing.
 MAX_DECODE_DELAY_S = 5.0
 
 _HEADER_LENGTH = 9
