@@ -54,7 +54,8 @@ EVERY_SYSTEM = 0
 class Bus:
     """Delivers messages and events to the attached sinks, in the order in which they were attached.
 
-    ``wanted`` has the message ids with a sink and is updated in place: a framer that uses it skips all other frames.
+    ``wanted`` has the message ids for which a sink is attached, and is updated in place. A framer that uses this
+    mapping skips all other frames.
     """
 
     def __init__(self, dialect: Dialect = STANDARD) -> None:
@@ -84,7 +85,7 @@ class Bus:
         *,
         system_id: int = EVERY_SYSTEM,
     ) -> Detach:
-        """Like :meth:`attach_frames`, but also pass the message if it is decoded for another sink."""
+        """Like :meth:`attach_frames`, but also pass the decoded message if another sink needs it."""
         return self._attach((system_id, message_type.ID), (BOTH, sink))
 
     def create_on_first(
@@ -159,7 +160,7 @@ class Bus:
         return once(lambda: self._detach(key, entry))
 
     def _plan(self, frame: Frame) -> _DeliveryPlan:
-        """Return the sinks of the frame's system, then those of every system; none if the message is unknown."""
+        """Return the sinks for the frame's system, then the sinks for all systems. Empty if the message is unknown."""
         system_id, message_id = frame.system_id, frame.message_id
         sinks = self._sinks.get((system_id, message_id), ()) if system_id != EVERY_SYSTEM else ()
         sinks += self._sinks.get((EVERY_SYSTEM, message_id), ())
@@ -183,7 +184,7 @@ class Bus:
 
 
 def _drop(table: dict[Any, tuple[Any, ...]], key: object, sink: object) -> None:
-    """Remove one occurrence of the sink by a new tuple: a delivery in progress continues with the old one."""
+    """Remove one occurrence of the sink. A delivery in progress continues with the old tuple."""
     left = list(table[key])
     left.remove(sink)
     if left:
@@ -278,7 +279,7 @@ class Subscription(Generic[ItemT]):
     """Asynchronous iterator over received items, for one reader. Active inside its ``with`` block.
 
     The default, ``capacity=1`` with ``drop_oldest``, always yields the latest item; ``missed`` counts the dropped
-    ones. When the connection ends, queued items can still be read; after that, reading raises the connection's error.
+    items. When the connection ends, queued items can still be read; after that, reading raises the connection's error.
     """
 
     def __init__(
@@ -292,7 +293,7 @@ class Subscription(Generic[ItemT]):
             raise InvalidArgument(f"capacity = {capacity} is not allowed: at least 1")
         if overflow not in ("drop_oldest", "drop_newest", "error"):
             raise InvalidArgument(f"overflow = {overflow!r} is not allowed: 'drop_oldest', 'drop_newest' or 'error'")
-        # Explains in a time-out error why no items arrive; "" if unknown.
+        # Returns the reason why no items arrive, for time-out errors; "" if unknown.
         self._explain_timeout: Callable[[], str] = str
         self.missed: int = 0
         """Number of items dropped because the reader was slow."""

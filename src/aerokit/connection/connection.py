@@ -165,7 +165,7 @@ class Connection:
     def write_raw(self, data: bytes) -> None:
         """Write one complete frame of another sender unchanged, for programs that forward frames. Never blocks.
 
-        It goes to the peers that :meth:`send` would choose for its message. A signature is kept.
+        The frame goes to the peers that :meth:`send` would choose for the same message. A signature is kept.
 
         Raises:
             InvalidArgument: ``data`` is not exactly one MAVLink frame; nothing was sent.
@@ -258,7 +258,7 @@ class Connection:
         """Return a stream of these messages or events, of one system (0: of all), for use in a ``with`` block.
 
         Raises:
-            InvalidArgument: no type is given, or the dialect does not have it.
+            InvalidArgument: no type is given, or the dialect does not have a given type.
         """
         self.check_types(types)
 
@@ -269,7 +269,7 @@ class Connection:
         return subscription
 
     async def vehicles(self) -> AsyncGenerator[VehicleFound, None]:
-        """Yield every autopilot on the link once, until the connection ends. Those already known come first.
+        """Yield every autopilot on the link once, until the connection ends. Autopilots already known come first.
 
         ``async for found in connection.vehicles(): async with aerokit.connect(connection,
         system_id=found.system_id)…``
@@ -350,7 +350,7 @@ class Connection:
     def arrived_at(self) -> float:
         """Return the receive time of the message being delivered, on the clock of :meth:`now`.
 
-        It is earlier than now if the event loop was blocked: the message may have waited in the socket.
+        This time is earlier than now if the event loop was blocked, because the message may have waited in the socket.
         """
         return self._receiver.arrived_at()
 
@@ -377,7 +377,7 @@ class Connection:
     def close(self, error: Exception | None = None) -> None:
         """Close the link, cancel background tasks and raise ``error`` in all waiters. Never blocks; idempotent.
 
-        May be called inside the connection's block; the block continues, and its calls on the connection raise.
+        May be called inside the connection's block. The block continues, but its further calls on the connection raise.
         """
         self._end(error or ConnectionClosed("the connection was closed"))
         if self._is_on_link:
@@ -385,7 +385,7 @@ class Connection:
         self._observers.close()
 
     def fail(self, error: Exception) -> None:
-        """Close the connection because of an internal error of aerokit. Waiters get it as the cause of their error."""
+        """Close the connection because of an internal error of aerokit, which is the cause of the waiters' errors."""
         if not self.is_open and isinstance(error, AerokitError):
             return  # a background task failed because the connection was closed before
         logger.error("the connection is closed because of an internal error of aerokit", exc_info=error)
@@ -450,7 +450,7 @@ class Connection:
     def order_refused(self, message: str, reason: str, lease_holder: str | None, answers: tuple[bytes, ...]) -> None:
         """Called when the vehicle side of a zenoh network refused one of our commands."""
         self.bus.publish(OrderRefused(self._clock(), 0, message, reason, lease_holder))
-        for answer in answers:  # a framer would count them as received frames
+        for answer in answers:  # not through a framer, which would count them as received frames
             self.bus.deliver(Frame.parse(answer, self._clock()))
 
     def link_lost(self, error: LinkLost) -> None:
@@ -460,7 +460,7 @@ class Connection:
     # ------------------------------------------------------------------------------- internal
 
     async def _open_link(self) -> None:
-        """Open the link. If it is already open, it belongs to another connection and is not closed."""
+        """Open the link. A link that is already open belongs to another connection, so this one does not close it."""
         try:
             await self.link.open(self)
         except BusyError:

@@ -75,7 +75,7 @@ class ExchangeRun(Generic[ResultT]):
         self._after_step()
 
     def _expire(self) -> None:
-        # Timers may fire early by the clock's resolution; the exchange then must not wait again.
+        # A timer may fire early by the clock's resolution. The exchange must not wait again because of that.
         now = self._connection.now()
         now, self._deadline = max(now, now if self._deadline is None else self._deadline), None
         try:

@@ -116,7 +116,7 @@ _HEARTBEAT_ID = Heartbeat.ID
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
-# From this length on, a pause of the loop delays a heartbeat.
+# A pause of the loop of at least this length delays a heartbeat.
 BLOCKED_WARNING_S = 1.0
 
 BLOCKING_CODE_HINT = (
@@ -238,7 +238,7 @@ class FrameReceiver:
         framer.wanted = None if framer.keep_unknown else self._bus.wanted
 
     def _is_admitted(self, frame: Frame, is_other_peer: bool) -> bool:
-        # Only the first copy of a frame is checked: a second check would take another copy for a replay.
+        # Only the first copy of a frame is checked, because a second check would take the next copy for a replay.
         if self._multilink is not None and self._multilink.copies.was_admitted:
             return True
         is_admitted = self._gate.admits(frame, may_hand_over=not is_other_peer)
@@ -250,7 +250,7 @@ class FrameReceiver:
         return self._routes.claims_route(frame, peer, framer.counters_of(frame), self._gate.has_checked(frame))
 
     def _is_stale(self, framer: Framer, frame: Frame) -> bool:
-        """Return True if an out-of-order frame is to be dropped: sent by a second sender, or an outdated heartbeat."""
+        """Return True if an out-of-order frame is to be dropped: a second sender's frame or an outdated heartbeat."""
         is_foreign = frame in framer.foreign
         if not is_foreign and frame not in framer.late:
             return False

@@ -72,7 +72,7 @@ def discovery_event(
 
 
 BLOCKING_MAX_IDLE_S = 60.0
-"""Seconds without a call after which a blocking program's heartbeat pauses; longer than usual sleeps in flight."""
+"""Seconds without a call after which a blocking program's heartbeat pauses. Programs rarely sleep longer in flight."""
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
@@ -184,7 +184,7 @@ class LinkStateTracker:
             self._set(LinkState.SILENT, now)
 
     def mark_lost(self, now: float, *, publish: bool = True) -> None:
-        """Set LOST; without an event (``publish=False``) if the program closed the link itself."""
+        """Set LOST. ``publish=False`` publishes no event, because the program closed the link itself."""
         self._set(LinkState.LOST, now, publish=publish)
 
     def _set(self, state: LinkState, now: float, *, publish: bool = True) -> None:

@@ -21,7 +21,7 @@ BLOCKED_THRESHOLD_S = 0.25
 # enough, because some loops run timers before sockets.
 IDLE_ITERATIONS = 3
 
-# Platform → a clock that includes suspended time, and the loop's clock. On Windows, the loop's clock includes it too.
+# Platform → (clock that includes suspended time, clock of the loop). On Windows, the loop's clock includes that time.
 CLOCKS = {
     "linux": ("CLOCK_BOOTTIME", "CLOCK_MONOTONIC"),
     "darwin": ("CLOCK_MONOTONIC", "CLOCK_UPTIME_RAW"),
@@ -41,10 +41,10 @@ def suspended_s() -> float:
 class LoopWatch:
     """Detects pauses of the event loop by a timer that fires late.
 
-    Data may have waited during a pause. Until all waiting data has been read, the time at which the loop last ran
-    before the pause is therefore the receive time of data. Pauses shorter than ``CHECK_INTERVAL_S + LATE_THRESHOLD_S``
-    are not detected; ages may be too small by this time. ``on_blocked`` gets the length of pauses above
-    ``BLOCKED_THRESHOLD_S``, ``on_slept`` the time that the computer was suspended.
+    Data may arrive during a pause and wait. Until all of this data has been read, its receive time is the time at which
+    the loop last ran before the pause. Pauses shorter than ``CHECK_INTERVAL_S + LATE_THRESHOLD_S`` are not detected, so
+    ages may be too small by up to this time. ``on_blocked`` gets the length of pauses above ``BLOCKED_THRESHOLD_S``,
+    ``on_slept`` the time that the computer was suspended.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class LoopWatch:
         self._on_blocked, self._on_slept = on_blocked, on_slept
         self._suspended, self._suspended_before = suspended, max(suspended() for _ in range(3))
         self.late_after: float = math.inf
-        """Loop time up to which data is received in time; for data read later, call :meth:`arrival`."""
+        """Data read up to this loop time has not waited. For data read later, call :meth:`arrival`."""
         self._ran_at = self._due = self._loop.time()
         self._timer: asyncio.TimerHandle | None = None
         self._oldest: float | None = None  # set while data may have waited
@@ -100,7 +100,8 @@ class LoopWatch:
             self._on_blocked(late + CHECK_INTERVAL_S)
 
     def _has_slept(self) -> bool:
-        # A process that is preempted between reading the two clocks gets too small a value; the true one never shrinks.
+        # If the process is preempted between reading the two clocks, the value is too small. The true value never
+        # shrinks.
         before = self._suspended_before
         self._suspended_before = max(before, self._suspended())
         slept_s = self._suspended_before - before

@@ -28,9 +28,10 @@ CLAIM_MIN_FRAMES = 3
 
 
 class RouteClaim:
-    """A peer's claim to the route of one component, decided by its first frame after the owner's last frame.
+    """Claim of a peer to a component's route that belongs to another peer, the owner.
 
-    The decision is final until the owner sends again; otherwise a peer could try many sequence numbers.
+    The peer's first frame after the owner's last frame decides the claim. The decision is final until the owner sends
+    again, because otherwise a peer could try many sequence numbers.
     """
 
     __slots__ = (
@@ -129,8 +130,8 @@ class Routes:
        restart, with new numbers), or continues the stream as above from any host, or signs with our key;
     3. in the same case from any host, if the system has no vehicle object or the program allows it (``may_move``).
 
-    A peer refused by rule 2 (``RouteChangeRefused``) is judged again after the owner has sent again. A system with a
-    vehicle object keeps its route however long it is silent.
+    A peer refused by rule 2 (``RouteChangeRefused``) is judged again after the owner has sent again. The route of a
+    system with a vehicle object never expires.
 
     ``attached`` has the system ids with a vehicle object. ``boot_clocks`` maps components to functions from
     ``received_at`` to their time since boot in milliseconds. ``publish`` publishes events.
@@ -223,7 +224,7 @@ class Routes:
     def evictable_peers(self, peers: Iterable[Peer], now: float) -> list[Peer]:
         """Return the first peer without a live component (heartbeat in the last 30 s, or vehicle object), if any.
 
-        Its claims are forgotten, so they are reported again if it comes back.
+        The claims of that peer are forgotten, so they are reported again if the peer comes back.
         """
         live = {
             route.peer
@@ -256,7 +257,7 @@ class Routes:
     def _evidence(
         self, route: _Route, frame: Frame, counters: SourceStatistics | None
     ) -> tuple[int, bool | None, bool | None]:
-        """Return the owner's expected frame count, and whether number and clock continue its stream (None: unknown)."""
+        """Return the owner's expected frame count, and whether number and clock continue the stream (None: unknown)."""
         sequence_matches: bool | None = None
         silent_for = max(frame.received_at - route.heartbeat_at, 0.0)
         expected = 0
@@ -307,7 +308,7 @@ class Routes:
         return len(self._routes) < MAX_ROUTES
 
 
-_SAME_PEER = object()  # key of claims of a second sender behind the owner's own peer
+_SAME_PEER = object()  # key for claims of a second sender behind the same peer as the owner
 
 
 def _name(peer: Peer) -> str:

@@ -52,7 +52,7 @@ class SignatureGate:
 
     @contextmanager
     def key_handover(self, signing: Signing | None, system_id: int, component_id: int) -> Iterator[asyncio.Event]:
-        """Switch to ``signing`` when the component's frames, received during the block, show that it uses the new key.
+        """Switch to ``signing`` when frames received during the block show that the component uses the new key.
 
         The yielded event is set at the switch; before it, the old key signs and verifies. One frame signed with the
         new key is enough. If the key is removed, at least `MIN_UNSIGNED_FRAMES` unsigned frames over `MIN_UNSIGNED_S`
@@ -78,7 +78,10 @@ class SignatureGate:
         self.is_open = self._encoder.signing is None and self._handover is None
 
     def admits(self, frame: Frame, *, may_hand_over: bool = True) -> bool:
-        """Return True if a frame is admitted. With ``may_hand_over=False`` (another peer's frame), keep the key."""
+        """Return True if a frame is admitted.
+
+        ``may_hand_over=False`` is for frames of another peer, which must not complete a handover.
+        """
         handover = self._handover
         is_of_handover = handover is not None and may_hand_over and handover.concerns(frame)
         if handover is not None and is_of_handover and handover.is_shown_by(frame, self._unix_time()):
@@ -140,7 +143,7 @@ def _has_key(frame: Frame) -> bool:
 
 
 class _Handover:
-    """Handover of another key, or of none, to one component."""
+    """Change of one component to another key, or to no key."""
 
     def __init__(self, signing: Signing | None, source: tuple[int, int], taken: asyncio.Event) -> None:
         self.signing, self.taken = signing, taken
@@ -164,6 +167,6 @@ class _Handover:
 
 
 def check_signing(signing: Signing | None, mavlink_version: int) -> None:
-    """Raise InvalidArgument if this MAVLink version has no signatures."""
+    """Raise InvalidArgument if ``signing`` is given and this MAVLink version has no signatures."""
     if signing is not None and mavlink_version == 1:
         raise InvalidArgument("signing needs MAVLink 2: mavlink_version = 1 has no signatures")

@@ -30,7 +30,7 @@ vehicle_logger: logging.Logger = logging.getLogger("dronekit")
 
 ORDERS_TIMEOUT_S = 2.0  # close() waits for the answers to recent orders
 
-SAME_KIND = {"disarm": "arm"}  # a newer order of either kind replaces the older one
+SAME_KIND = {"disarm": "arm"}  # arming and disarming orders replace each other
 
 Work = Callable[..., Awaitable[object]]
 
@@ -71,7 +71,7 @@ class ClassicConnection:
     def send(self, message: Message, *, to: int | None = None) -> None:
         """Send a message, in the order of the calls, from any thread, without blocking.
 
-        InvalidArgument: a field is out of range; APIException: the connection is closed.
+        Raises InvalidArgument if a field is out of range, and APIException if the connection is closed.
         """
         message.encode()  # raises here, in the caller, rather than on the loop
         with classic_errors():
@@ -161,8 +161,8 @@ class BackgroundCall(concurrent.futures.Future[None]):
 class BackgroundCalls:
     """Runs coroutine functions on the loop in the background, and logs each failure as a warning.
 
-    A newer call of a kind cancels the previous one. This class does not decide which commands may still be sent; the
-    vehicle's :class:`aerokit.vehicle.commanding.arbiter.CommandArbiter` does.
+    A newer call cancels the previous call of the same kind. This class does not decide which commands may still be
+    sent: that is the task of the vehicle's :class:`aerokit.vehicle.commanding.arbiter.CommandArbiter`.
     """
 
     def __init__(self, loop: LoopThread) -> None:
@@ -269,7 +269,7 @@ RELEASE_COPIES = 3  # not acknowledged, and frames get lost
 
 
 class OverrideRelease:
-    """The channels that this connection overrides, by target; releases them when it ends.
+    """The channels that this connection overrides, by target; releases them when the connection ends.
 
     https://mavlink.io/en/messages/common.html#RC_CHANNELS_OVERRIDE
     """

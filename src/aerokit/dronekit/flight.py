@@ -123,7 +123,7 @@ class FlightMethods(VehicleAttributes):
     def simple_takeoff(self, alt: float | None = None) -> None:
         """Take off and climb to ``alt`` metres above home; returns immediately. For armed copters in GUIDED mode.
 
-        Without an altitude nothing is sent. ValueError: the altitude is not a finite number.
+        Without an altitude, nothing is sent. Raises ValueError if the altitude is not a finite number.
         """
         if alt is not None:
             self._dk_take_off(float(alt))
@@ -142,7 +142,7 @@ class FlightMethods(VehicleAttributes):
         return send((mode,), plan.command, *plan.params)
 
     def wait_simple_takeoff(self, alt: float | None = None, epsilon: float = 0.1, timeout: float | None = None) -> None:
-        """Call :meth:`simple_takeoff` and wait like :meth:`wait_for_alt`; TimeoutError as soon as it is rejected."""
+        """Call :meth:`simple_takeoff` and wait like :meth:`wait_for_alt`; TimeoutError as soon as the order fails."""
         if alt is not None:
             order = self._dk_take_off(float(alt))
             has_reached = self._dk_altitude_condition(float(alt), epsilon, is_relative=True)
@@ -197,7 +197,7 @@ class FlightMethods(VehicleAttributes):
 
     @property
     def airspeed(self) -> float | Any:
-        """Airspeed in m/s (VFR_HUD), None if unknown. Setting it works like :attr:`groundspeed`."""
+        """Airspeed in m/s (VFR_HUD), None if unknown. Setting it works like setting :attr:`groundspeed`."""
         speed = self._dk_vfr_hud.values("airspeed")[0]
         return None if speed is None or math.isnan(speed) else speed
 
@@ -269,7 +269,7 @@ class FlightMethods(VehicleAttributes):
         interval: float = 0.1,
         errmsg: str | None = None,
     ) -> None:
-        """Wait until ``condition()`` is true. It is called every ``interval`` seconds on the caller's thread.
+        """Wait until ``condition()`` is true: call it every ``interval`` seconds on the caller's thread.
 
         Raises TimeoutError with the text ``errmsg`` after ``timeout`` seconds (None: no limit).
         """

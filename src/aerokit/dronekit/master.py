@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from aerokit.transport.link import Peer
 
 MAX_MESSAGES = 1000
-MESSAGE_MAX_AGE_S = 5.0  # a program that rarely reads gets recent messages
-FIRST_LOOKUP_TIMEOUT_S = 1.0  # nothing was stored before the first access
+MESSAGE_MAX_AGE_S = 5.0  # older messages are dropped, so that a program that rarely reads gets recent ones
+FIRST_LOOKUP_TIMEOUT_S = 1.0  # time to wait for a message, because none is stored before the first access
 SIGNAL_CHECK_INTERVAL_S = 0.2  # longer waits are split, so that Ctrl-C and a closed connection are noticed
 
 
@@ -175,11 +175,11 @@ class Master:
         blocking: bool = False,
         timeout: float | None = None,
     ) -> Any:
-        """Return the next message of a type, of several or of any, that satisfies pymavlink's ``condition``.
+        """Return the next message of one type, several types or any type that satisfies pymavlink's ``condition``.
 
         From the first call on, the last 1,000 messages of the last five seconds are kept. Without a match, returns None
-        at once if ``blocking`` is false, otherwise after ``timeout`` seconds (None: no limit). APIException: the
-        connection was closed.
+        at once if ``blocking`` is false, otherwise after ``timeout`` seconds (None: no limit). Raises APIException if
+        the connection is closed.
         """
         names = {type} if isinstance(type, str) else None if type is None else set(type)
 
@@ -210,7 +210,7 @@ class Master:
         return value
 
     def location(self, relative_alt: bool = False) -> Any:
-        """Return ``lat``, ``lon`` (degrees), ``alt`` (metres) and ``heading`` (degrees) from messages received now.
+        """Return ``lat``, ``lon`` (degrees), ``alt`` (metres) and ``heading`` (degrees) from new messages.
 
         Waits for a 3D GPS fix. The altitude is above home (``relative_alt``) or above sea level.
         """
@@ -311,7 +311,7 @@ class Inbox(Mapping[str, Any]):
             self._came.notify_all()
 
     def _pop(self, end: float | None) -> Frame | None:
-        """Return the oldest frame that is not too old; None when the time is over."""
+        """Return the oldest frame that is recent enough; None when the time is over."""
         now = self._connection.connection.now
         while True:
             with self._came:

@@ -159,12 +159,12 @@ class ParameterValues:
         return {name: float(parameter.value) for name, parameter in self._known.copy().items()}
 
     def find(self, name: str) -> ResolvedParameter | None:
-        """Look up an upper-case name, also under its other names."""
+        """Look up a parameter by an upper-case name, which may be the old or the new one."""
         known = self._known
         return resolve_known(name if name in known else self._spelled.get(name, name), known)
 
     def get(self, name: str) -> float | None:
-        """Return the value of an upper-case name, without renaming, or None."""
+        """Return the value of exactly this upper-case name, or None."""
         known = self._known.get(name)
         return None if known is None else float(known.value)
 
@@ -248,7 +248,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
     ) -> float | None:
         """Return a value, or ``default`` if the vehicle has no such parameter.
 
-        The second argument is not the default: if false, only known values count, and nothing is requested.
+        The second argument is not the default. If it is false, only known values count, and nothing is requested.
         """
         if isinstance(name, str) and (value := self._values.get(name.upper())) is not None:
             return value

@@ -70,7 +70,7 @@ def uninstall() -> None:
 
 
 def _own_name(name: str) -> str | None:
-    """Return the name of an alias's module in aerokit, or None for other modules."""
+    """Return the name of the aerokit module for an alias such as ``dronekit.lib``, or None for other modules."""
     if name == SITL_ALIAS:
         return SITL_MODULE
     return PACKAGE + name.removeprefix(ALIAS) if name.startswith(f"{ALIAS}.") else None

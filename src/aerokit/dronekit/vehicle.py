@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 FIRST_VALUES = ("attitude", "location.global_relative_frame", "heading", "gps_0", "battery")
 
 # Seconds to wait for the first telemetry, because DroneKit programs read attributes right after connect(). Not every
-# vehicle reports all of them: after each value, wait at most the second time for the next one.
+# vehicle reports every value, so waiting also ends if no further value arrives within the second time.
 FIRST_VALUES_TIMEOUT_S, NEXT_VALUE_TIMEOUT_S = 1.0, 0.4
 
 CONNECT_TIMEOUT_S = 30.0
@@ -65,9 +65,10 @@ LEVELS = (logging.CRITICAL,) * 3 + (logging.ERROR, logging.WARNING, logging.INFO
 class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
     """A vehicle: attributes to read and to listen to, orders, parameters, missions.
 
-    Created by :func:`connect`; ``connect(…, vehicle_class=…)`` creates a subclass, whose constructor passes its one
-    argument on and may add listeners and attributes. Can be used from any thread. Callbacks run in order on a separate
-    thread, and may use the vehicle too. A context manager; :meth:`close` closes the connection.
+    Created by :func:`connect`; ``connect(…, vehicle_class=…)`` uses a subclass, whose constructor passes its one
+    argument on and may add listeners and attributes. The vehicle can be used from any thread. Callbacks run in order on
+    a separate thread, and may use the vehicle, too. The vehicle is a context manager; :meth:`close` closes the
+    connection.
     """
 
     def __init__(self, handler: MAVConnection) -> None:
@@ -157,7 +158,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
     def run(self, function: Callable[..., Awaitable[Any]], /, *args: Any, **kwargs: Any) -> Any:
         """Await a coroutine function on the vehicle's loop: ``vehicle.run(survey, vehicle.aio)``.
 
-        Ctrl-C cancels it. Its exceptions propagate unchanged.
+        Ctrl-C cancels the coroutine. Exceptions of the coroutine propagate unchanged.
         """
         return self._handler.loop.run(function, *args, **kwargs)
 

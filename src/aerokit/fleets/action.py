@@ -41,11 +41,11 @@ class FleetAction:
     Args:
         context: context of the fleet.
         name: appears in results, events and errors.
-        members: members to run it on; unavailable ones are skipped.
+        members: members that run the action; unavailable members are skipped.
         execute: called with each available member.
         timeout: seconds for each member; None: no limit.
         stagger_s: delay in seconds between the starts of consecutive members.
-        is_safe: the action ends a flight (hold, land, return), so that a failure does not stop the others.
+        is_safe: the action ends a flight (hold, land, return), so a member's failure does not stop the other members.
         holds_if_cancelled: on cancellation, members that have already finished hold, too.
     """
 
@@ -222,8 +222,8 @@ class FleetAction:
                     partial(self._send_order, member, self._orders[member.name]),
                     f"aerokit policy {member.name}",
                 )
-        # The policy's orders come first: they supersede those of the running actions, so that these send no hold when
-        # they are cancelled.
+        # The policy's orders come first. They supersede the orders of the running actions, so a cancelled action sends
+        # no hold.
         asyncio.get_running_loop().call_soon(self._cancel, [member for member in available if member.name in orders])
         if not self._orders:
             self._publish_completed()
@@ -357,7 +357,7 @@ ACTIONS_ON_GROUND = ("arm", "wait_ready", "upload")
 
 
 class SelectionBase:
-    """Members of a selection, and how it runs actions."""
+    """Members of a selection, and the execution of actions by them."""
 
     def __init__(self, context: FleetContext, names: tuple[str, ...] | None) -> None:
         self._context, self._names = context, names

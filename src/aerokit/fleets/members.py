@@ -69,7 +69,7 @@ class Member:
 
     @property
     def is_flown_by_program(self) -> bool:
-        """True while an order of this program flies it. Only then do policies and the distance monitor stop it."""
+        """True while this program's order flies the member. Only then do policies and the distance monitor stop it."""
         return self.is_available and self.vehicle.is_flown_by_program
 
     @property
@@ -97,7 +97,7 @@ class Member:
         ]
         if vehicle.is_silent:
             self._set_lost(vehicle.describe_link())
-        self.refresh()  # another program may have flown it before
+        self.refresh()  # another program may have flown the vehicle before
 
     def stop_monitoring(self) -> None:
         """Unsubscribe."""
@@ -162,7 +162,8 @@ class Member:
         return self.vehicle._arbiter.newest, self.vehicle.mode.latest
 
     def _refresh_soon(self, *_: object) -> None:
-        # Deferred until the whole HEARTBEAT is read: after a landing it reports disarming and a mode change together.
+        # Deferred until the whole HEARTBEAT is read, because it reports disarming and a mode change together after a
+        # landing.
         asyncio.get_running_loop().call_soon(self.refresh)
 
     def _on_silent(self, event: VehicleSilent) -> None:

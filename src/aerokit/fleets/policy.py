@@ -53,7 +53,7 @@ ORDERS: Mapping[str, PolicyOrder] = {
 
 
 class PolicyRules:
-    """The policy of a fleet and those of its groups. The group of the failed member selects the policy."""
+    """The policies of a fleet and of its groups. The group of the failed member selects the policy."""
 
     def __init__(self, policy: Policy, of_groups: Mapping[str, Policy]) -> None:
         for name, candidate in (
@@ -124,7 +124,7 @@ class FleetResult(Mapping[str, Any]):
         return not self.failed and not self.stopped
 
     def raise_for_errors(self) -> None:
-        """Raise FleetError if a member failed or was stopped; its ``errors`` has all of them."""
+        """Raise FleetError if a member failed or was stopped; ``FleetError.errors`` has all errors."""
         errors = {**self.failed, **self.stopped}
         if errors:
             done = len(self._outcomes) - len(errors)

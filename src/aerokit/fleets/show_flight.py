@@ -210,10 +210,10 @@ def _interpolate(samples: Sequence[tuple[float, LocalPoint]], at_s: float) -> Lo
 
 
 class TrackRecorder:
-    """Records each GLOBAL_POSITION_INT in its block as seconds of the show and metres from its origin.
+    """Records each GLOBAL_POSITION_INT during its block, as seconds of the show and metres from the show's origin.
 
-    Uses the vehicle's own time (``time_boot_ms``) with its measured clock, or the time of arrival if that is
-    implausible.
+    The time is the vehicle's own (``time_boot_ms``), converted by means of its measured clock. If that is implausible,
+    the time is the time of arrival.
     """
 
     def __init__(self, vehicle: Vehicle, clock: ClockOffset, origin: LocalOrigin, begin: float, base_m: float) -> None:

@@ -223,7 +223,7 @@ class Travel(SelectionBase):
         result: FleetResult | None = None
         for leg in legs:
             missing = [name for name in leg if not self.members[name].is_available]
-            if missing:  # its position is not under control, so it may be in the path of any other member
+            if missing:  # a missing member may be in the path of any other member
                 raise OperationRejected(
                     f"{action}: {', '.join(missing)} became unavailable between two legs; the others stay in their"
                     " layers"
@@ -272,7 +272,7 @@ class Missions(SelectionBase):
         Raises:
             InvalidArgument: a name is unknown, or a mission is invalid. Nothing was sent.
             OperationRejected: a member is unavailable, or paths come too close. Nothing was sent.
-            FleetError: an upload failed; ``start_missions`` will start none of them.
+            FleetError: an upload failed; ``start_missions`` will start no mission.
         """
         if max_concurrent < 1:
             raise InvalidArgument(f"max_concurrent = {max_concurrent!r} is not allowed: at least 1")
@@ -309,7 +309,7 @@ class Missions(SelectionBase):
             stagger_s: delay in seconds between the starts of consecutive members; None: all at once.
 
         Raises:
-            OperationRejected: no upload succeeded for all members, or a member is unavailable or not armed. Nothing was
+            OperationRejected: the last upload failed for a member, or a member is unavailable or not armed. Nothing was
                 sent.
         """
         names = tuple(name for name in self._context.missions if name in self.members)
@@ -330,7 +330,7 @@ class Missions(SelectionBase):
         """Wait until each member has finished its mission; see ``vehicle.mission.wait_finished``.
 
         Args:
-            timeout: seconds until all of them have; None: no limit.
+            timeout: seconds until all members have finished; None: no limit.
         """
         names = tuple(name for name in self._context.missions if name in self.members)
         return await self._run(

@@ -1,6 +1,6 @@
 """Parser of MAVLink XML, for the generator and for dialects that are loaded at run time.
 
-See https://mavlink.io/en/guide/xml_schema.html, and for the order of fields and for CRC_EXTRA
+Format: https://mavlink.io/en/guide/xml_schema.html. Field order and CRC_EXTRA:
 https://mavlink.io/en/guide/serialization.html.
 """
 
@@ -129,7 +129,7 @@ class EntryDefinition:
 
 @dataclass(frozen=True)
 class EnumDefinition:
-    """One enum, with the entries of one file, or of all files after `merged_enums`."""
+    """One enum. It has the entries of one file or, after `merged_enums`, of all files."""
 
     name: str
     entries: tuple[EntryDefinition, ...]

@@ -28,7 +28,7 @@ class Frame(FrameFields):
     """One frame with a valid checksum. Treat it as immutable, because all receivers share it."""
 
     # No constructor, for speed: the framer sets the attributes, and properties compute the rest.
-    if not TYPE_CHECKING:  # those of the base class
+    if not TYPE_CHECKING:  # type checkers see the attributes of the base class
         __slots__ = ()
 
     body: bytes

@@ -69,7 +69,7 @@ def _class_of(message: Any) -> type[Message]:
 
 @cache
 def _counterpart(message_id: int, crc_extra: int, given: Any) -> type[Message]:
-    """Return the standard's class if it has the same wire format, else one created from pymavlink's."""
+    """Return the standard's class if it has the same wire format, else a class created from pymavlink's class."""
     if message_id < 0 or not given.ordered_fieldnames:
         raise InvalidArgument(f"{given.__name__} is not a message that can be sent")
     standard = STANDARD.get(message_id)
@@ -189,7 +189,7 @@ class _RawText(str):
         return self._data
 
 
-# Searched for pymavlink's class of a message if the program's dialect has none. Together they cover all of STANDARD.
+# Dialects to search for pymavlink's class of a message if the program's dialect has none. They cover all of STANDARD.
 DIALECTS = ("ardupilotmega", "development")
 
 CHECKSUM_LENGTH = 2
@@ -201,7 +201,7 @@ Decoder = Callable[["Frame", float], Any]
 
 
 def to_pymavlink(frame: Frame, *, dialect: ModuleType | None = None, timestamp: float = 0.0) -> Any:
-    """Decode a frame to the pymavlink message, with the same fields, header, buffers and ``str()``. Never raises.
+    """Decode a frame to a pymavlink message, with header, buffers and ``str()`` as in pymavlink. Never raises.
 
     Args:
         frame: a received frame: ``message.received_frame``, or the argument of a frame observer.

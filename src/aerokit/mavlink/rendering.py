@@ -1,6 +1,7 @@
 """Renders definitions as Python source of message classes and enums.
 
-`generator` writes it to modules, `runtime_dialect` compiles it, so that both kinds of classes are the same.
+`generator` writes this source to modules, and `runtime_dialect` compiles it. Both kinds of classes are therefore the
+same.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ _MAX_UNPACKED_LENGTH = 4
 
 
 def render_message(message: MessageDefinition, *, docs: bool = True) -> str:
-    """Render the class of one message with its Struct. ``docs=False`` omits all texts but the first line."""
+    """Render the class of one message with its Struct. ``docs=False`` keeps only the first docstring line."""
     lines = [
         f"_S{message.id} = Struct({_format(message)!r})",
         "",

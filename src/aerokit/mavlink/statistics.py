@@ -25,8 +25,8 @@ IN_ORDER, LATE, OTHERS = range(3)
 class SourceStatistics(SourceFields):
     """Counters of one sender (system, component): frames received and lost.
 
-    Two senders with the same ids are detected by their sequence numbers: two streams advance independently. The one
-    with more frames counts as the sender, until it has been silent for 1.5 s.
+    Two senders with the same ids are detected by their sequence numbers: two streams advance independently. The stream
+    with more frames counts as that of the sender, until it has been silent for 1.5 s.
     """
 
     expected: int
@@ -64,7 +64,7 @@ class SourceStatistics(SourceFields):
         self.system_id: int = system_id
         self.component_id: int = component_id
         self.lost: int = 0
-        """Number of lost frames. A frame that arrives late is no longer counted."""
+        """Number of lost frames. A frame that arrives late is subtracted again."""
         self.expected = sequence
         """Sequence number of the next frame. It does not wrap at 255; its low byte is the number on the wire."""
         # How far `expected` has advanced without a received frame. `received` is derived from the two, so that counting
@@ -217,7 +217,7 @@ class SourceLimit:
         self._swept_at = -math.inf
 
     def join(self, statistics: FramerStatistics) -> None:
-        """Include the senders of these statistics."""
+        """Count the senders of these statistics, too."""
         self._statistics.add(statistics)
 
     def leave(self, statistics: FramerStatistics) -> None:
@@ -240,7 +240,8 @@ class SourceLimit:
 class FramerStatistics(CounterFields):
     """Counters of one framer.
 
-    Every byte is part of a valid frame or of a frame of an unknown message, bad, or still in the buffer.
+    Every byte received belongs to a valid frame or a frame of an unknown message, counts as bad, or is still in the
+    buffer.
     """
 
     unknown_ids: int
@@ -266,7 +267,7 @@ class FramerStatistics(CounterFields):
         self.unknown_ids = 0
         """Frames of messages that the dialect does not have. They may be noise, because they cannot be verified."""
         self.unknown_messages: dict[int, int] = {}
-        """Number of such frames by message id, for the first 64 ids."""
+        """Number of frames of unknown messages by message id, for the first 64 ids."""
         self.sources: dict[tuple[int, int], SourceStatistics] = {}
         """Counters by (system id, component id), for the first 1024 of 65,536 possible senders."""
         self._by_key: dict[int, SourceStatistics] = {}
@@ -280,11 +281,11 @@ class FramerStatistics(CounterFields):
 
     @property
     def by_key(self) -> dict[int, SourceStatistics]:
-        """Like :attr:`sources`, by system id + 256 · component id."""
+        """Like :attr:`sources`, but the key is system id + 256 · component id."""
         return self._by_key
 
     def add_source(self, key: int, sequence: int, may_stay: bool) -> SourceStatistics:
-        """Create the counters of a new sender. With ``may_stay`` False, they are not kept, but the frame is counted."""
+        """Create the counters of a new sender. If ``may_stay`` is False, the counters are not kept."""
         source = SourceStatistics(key & 0xFF, key >> 8, sequence)
         if may_stay:
             self._by_key[key] = self.sources[source.system_id, source.component_id] = source

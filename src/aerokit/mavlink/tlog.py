@@ -93,7 +93,7 @@ def _record_end(data: bytes, begin: int, earliest: int) -> int | None:
 
 
 def _looks_shifted(data: bytes, begin: int, end: int) -> bool:
-    """Return True if a record that begins inside this one is followed by another record, and so is the real one."""
+    """Return True if the real record begins inside this one, i.e. if another record follows directly after it."""
     for inside in range(begin + 1, end):
         true_end = _frame_end(data, inside)
         if true_end is not None and true_end > end and _frame_end(data, true_end) is not None:
@@ -102,7 +102,7 @@ def _looks_shifted(data: bytes, begin: int, end: int) -> bool:
 
 
 def _frame_end(data: bytes, begin: int) -> int | None:
-    """Return the end according to the header, which may be beyond the data. None if there is no header."""
+    """Return the end of a frame according to its header, which may be beyond the data. None if there is no header."""
     at = begin + 8
     if len(data) - at < 3 or data[at] not in _MAGICS or _TIME.unpack_from(data, begin)[0] > _LAST_TIME:
         return None

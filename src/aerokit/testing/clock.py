@@ -26,8 +26,8 @@ Rules:
   `aerokit.transport.memory_link_pair` in tests on virtual time.
 - The clock stands still during ``run_in_executor`` (``asyncio.to_thread``, name resolution). Other threads may wake
   the loop by ``call_soon_threadsafe``, but do not stop the clock.
-- If nothing can happen any more, `DeadlockError` names the waiting tasks. If real sockets or other threads could
-  still wake the loop, it waits `DEADLOCK_TIMEOUT_S` of real time first.
+- If nothing can happen any more, the loop raises `DeadlockError`, which names the waiting tasks. If real sockets or
+  other threads could still wake the loop, it first waits for `DEADLOCK_TIMEOUT_S` of real time.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         self._now = 0.0
         self._outside_calls = 0
         self._deadlock_timeout_s = deadlock_timeout_s
-        self._own_sources: int | None = None  # Size of the selector map while only the loop's self-pipe is registered.
+        self._own_sources: int | None = None  # size of the selector map with nothing but the loop's self-pipe
         super().__init__(_JumpingSelector(self))
         self._own_sources = len(self._selector_map())
         self._clock_resolution = 1e-9  # A rounding error in now + (when - now) must not miss a timer.
@@ -72,14 +72,14 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         return self._now
 
     def jump(self, when: float) -> bool:
-        """Advance the clock to ``when`` if nothing else is scheduled before; return True if the clock was advanced.
+        """Advance the clock to ``when`` if nothing is scheduled earlier. Return True if the clock was advanced.
 
         Call this in a callback instead of setting a timer for ``when``, to save an iteration of the loop.
         """
         if self._ready or self._stopping or self._outside_calls or self._debug:  # type: ignore[attr-defined]
             return False
         timers: list[asyncio.TimerHandle] = self._scheduled  # type: ignore[attr-defined]
-        while timers and timers[0].cancelled():  # asyncio does the same in the next iteration.
+        while timers and timers[0].cancelled():  # asyncio would remove them in the next iteration.
             self._timer_cancelled_count -= 1  # type: ignore[attr-defined]
             heappop(timers)._scheduled = False  # type: ignore[attr-defined]
         if timers and timers[0].when() <= when + self._clock_resolution:

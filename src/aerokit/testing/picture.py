@@ -64,7 +64,7 @@ def check_picture(path: str | PathLike[str]) -> None:
 def save_picture(tracks: Iterable[Drawable], path: str | PathLike[str]) -> None:
     """Draw tracks from above and their altitudes over time, as .svg or as .png (with Pillow).
 
-    Raises what `check_picture` raises, and OSError if the file cannot be written.
+    Raises the errors of `check_picture`, and OSError if the file cannot be written.
     """
     check_picture(path)
     tracks = list(tracks)

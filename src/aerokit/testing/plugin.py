@@ -6,7 +6,7 @@
 - ``dronekit_address``, ``dronekit``: on a socket, and `aerokit.dronekit` under DroneKit's name
 - ``@pytest.mark.simulated("plane", seed=3)``: selects the simulated vehicle
 
-Tests that use none of them are not affected, and do not import aerokit.
+Tests that use none of these are not affected, and do not import aerokit.
 """
 
 from __future__ import annotations

@@ -49,7 +49,7 @@ class RecordedParameters:
         return name in self.names or (name == HASH_NAME and self._hash)
 
     def value_message(self, name: str, index: int | None = None) -> m.ParamValue:
-        """Return the latest PARAM_VALUE, written or recorded; before the first recorded one, return that."""
+        """Return the latest PARAM_VALUE, written or recorded. Before the first recorded value, return the first one."""
         position, recorded = self._vehicle.position_s, None
         for time, value in self._vehicle.recording.parameters:
             if value.param_id == name and (recorded is None or time <= position):
@@ -214,7 +214,7 @@ class RecordedMissions:
         self._acknowledge(message, message.mission_type, result, channel)
 
     def _result(self, what: str, results: list[int], mission_type: int) -> int:
-        """Return the recorded results in order; the last one is repeated."""
+        """Return the next of the recorded results; the last one is repeated."""
         number = self._done.get((what, mission_type), 0)
         self._done[what, mission_type] = number + 1
         return results[min(number, len(results) - 1)]
@@ -241,18 +241,18 @@ _MESSAGE_REQUESTS = (MavCmd.SET_MESSAGE_INTERVAL, MavCmd.REQUEST_MESSAGE)
 class RecordedVehicle(SimulatedVehicle):
     """Plays a ``.tlog`` by the simulator's clock. Requests of clients do not change the streamed messages.
 
-    - Commands: a command gets the acknowledgements that were recorded for the same params, otherwise for any params,
-      with the recorded delay. The last acknowledgement repeats. Commands that were not recorded are UNSUPPORTED.
-      REQUEST_MESSAGE sends the latest recorded message.
-    - Parameters: the recorded parameters, renumbered without gaps. Only parameters that were set in the recording can
-      be set. A request for an unknown name gets PARAM_ERROR if the recorded vehicle sent that message, otherwise no
-      answer.
-    - Missions: the recorded missions. Uploads and clearing get their recorded result, or UNSUPPORTED.
+    - Commands: a command gets the acknowledgements that were recorded for the same params or, if there are none, for
+      any params, with the recorded delay. The last acknowledgement repeats. Commands that were not recorded are
+      UNSUPPORTED. REQUEST_MESSAGE sends the latest recorded message.
+    - Parameters: the vehicle has the recorded parameters, renumbered without gaps. Only parameters that were set in the
+      recording can be set. A request for an unknown name gets PARAM_ERROR if the recorded vehicle sent that message,
+      otherwise no answer.
+    - Missions: the vehicle has the recorded missions. An upload or clearing gets the recorded result, or UNSUPPORTED.
     - File operations are refused, the list of logs is empty, and rates cannot be changed. TIMESYNC and PING are
       answered.
 
-    ``system_id`` selects a vehicle of the recording, by default the first; ``start_s`` skips the beginning. At the end
-    the vehicle falls silent; with ``repeat`` the recording starts again. Faults apply, except those of sensors and
+    ``system_id`` selects a vehicle of the recording, by default the first. ``start_s`` skips the beginning. At the end,
+    the vehicle falls silent or, with ``repeat``, the recording starts again. Faults apply, except those of sensors and
     parameters.
 
     Raises InvalidArgument if there is no vehicle in the recording, OSError if it cannot be read.

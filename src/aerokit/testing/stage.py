@@ -24,8 +24,8 @@ _POLL_INTERVAL_S = 0.1
 class FlightScheduler(SimulatedVehicle):
     """A silent vehicle on the links that runs scheduled actions.
 
-    Its timers survive a reboot of a vehicle, and are not delayed while a vehicle is frozen. Pass it to the server
-    before the vehicles: it advances them to the time of each action.
+    Its timers survive a reboot of a vehicle, and are not delayed while a vehicle is frozen. Pass the scheduler to the
+    server before the vehicles, because it advances them to the time of each action.
     """
 
     def __init__(self, vehicles: Sequence[Any]) -> None:

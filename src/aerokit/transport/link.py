@@ -34,7 +34,7 @@ class Receiver(Protocol):
 
 @runtime_checkable
 class DrainListener(Receiver, Protocol):
-    """A receiver that is notified when written data does not leave."""
+    """A receiver that is notified when written data does not leave this machine."""
 
     def link_stalled(self, unsent_bytes: int) -> None:
         """Called when no waiting data has left for a second. Commands in it may arrive late or never."""
@@ -50,14 +50,14 @@ class OrderRefusalListener(Receiver, Protocol):
     def order_refused(self, message: str, reason: str, lease_holder: str | None, answers: tuple[bytes, ...]) -> None:
         """Called when a message with this name was not forwarded to the vehicle.
 
-        ``lease_holder`` is the client that has control, if that is the reason. ``answers`` are frames by which a
-        vehicle would reject the command; some messages have none.
+        ``lease_holder`` is the client that has control, if its control is the reason. ``answers`` are the frames by
+        which a vehicle would reject the command, if there are such frames.
         """
 
 
 @runtime_checkable
 class PeerKeeper(Receiver, Protocol):
-    """A receiver that decides by `Link.keep_peer` which peers a link remembers; the link forgets senders of noise.
+    """A receiver that decides by `Link.keep_peer` which peers a link remembers. Senders of noise are then forgotten.
 
     A link that wraps another one forwards `Link.keep_peer`, `Link.forget_peer` and `Link.host_of`.
     """
@@ -71,7 +71,7 @@ class BurstListener(Receiver, Protocol):
     """A receiver that processes the data of one read burst together. Used by links with `Link.reports_bursts`."""
 
     def burst_ended(self) -> None:
-        """Called after one or more ``bytes_received``, before the next one in a later loop iteration."""
+        """Called after the ``bytes_received`` calls of one burst, before those of a later loop iteration."""
 
 
 @runtime_checkable
@@ -329,8 +329,8 @@ def memory_link_pair(*, latency_s: float = 0.0) -> tuple[MemoryLink, MemoryLink]
     """Return two links that are connected to each other. Open both on the same event loop.
 
     Each write arrives unsplit and in order, ``latency_s`` seconds later, but never before `Link.write` returns. Data
-    for an end that is not open is dropped, as with UDP. When one end closes, the other receives the data written
-    before, and is then lost.
+    for an end that is not open is dropped, as with UDP. When one end closes, the other end first receives the data
+    written before, and then reports its loss.
     """
     near, far = MemoryLink("memory:near", latency_s), MemoryLink("memory:far", latency_s)
     near._far, far._far = far, near

@@ -75,7 +75,7 @@ class MultiLink(Link):
         self._is_available = [False] * len(self._links)
         self._kept: list[set[Peer]] = [set() for _ in self._links]
         self._openings: set[asyncio.Task[None]] = set()
-        self._foreign: set[int] = set()  # opened by another owner, which closes them
+        self._foreign: set[int] = set()  # links that another owner opened and closes
         self._is_opening = False
         self._last_loss: LinkLost | None = None
         self._lost_at: float | None = None

@@ -27,7 +27,7 @@ class Outbox:
     Args:
         send: writes bytes to the transport.
         pending: returns the number of unsent bytes in the transport and the kernel.
-        limit: bytes.
+        limit: maximum number of bytes kept.
         dropped: called with the number of dropped writes.
         stalled: called with True when no waiting data has left for `STALLED_AFTER_S`, with False when it leaves again.
     """
@@ -183,6 +183,6 @@ def kernel_unsent_bytes(fd: int) -> int:
     import fcntl
     import termios
 
-    with contextlib.suppress(OSError, ValueError):  # closed meanwhile
+    with contextlib.suppress(OSError, ValueError):  # the descriptor was closed meanwhile
         return int.from_bytes(fcntl.ioctl(fd, termios.TIOCOUTQ, bytes(4)), sys.byteorder)
     return 0

@@ -85,7 +85,7 @@ class ReconnectingLink(Link):
         self._link = make_link()
         self._backoff = Backoff(min_delay_s, max_delay_s)
         self._receiver: Receiver | None = None  # None: no callbacks
-        self._current: _CurrentReceiver | None = None  # receiver of the current link; callbacks of others are ignored
+        self._current: _CurrentReceiver | None = None  # callbacks of earlier links are ignored
         self._was_opened = self._is_closed = self._is_up = False
         self._lost_at: float | None = None  # None: not reported as lost
         self._reopening: asyncio.Task[None] | None = None

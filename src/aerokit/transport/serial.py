@@ -42,7 +42,7 @@ _MAX_BUFFER_S = 2.0  # data that waits for longer would be outdated when it arri
 
 
 class AddressError(SerialException, InvalidArgument):  # type: ignore[misc]  # pyserial has no types
-    """An invalid connection string, for programs that expect pyserial's error as pymavlink raises it."""
+    """An invalid connection string. Also a SerialException, because pymavlink raises that."""
 
 
 class SerialLink(BaseLink):

@@ -30,7 +30,7 @@ MAX_PENDING_BYTES = 256 * 1024
 """Write buffer per connection. Writes beyond it are dropped, as is data that has waited for a second."""
 
 SEND_BUFFER = 16 * 1024
-"""Kernel send buffer (Linux doubles it). It is small because its data cannot be discarded."""
+"""Kernel send buffer (Linux doubles it). The buffer is small because data in it cannot be discarded."""
 
 NOT_SENT_LOW_WATER = 1024
 """Limit of unsent data in the kernel (TCP_NOTSENT_LOWAT, where available)."""
@@ -180,7 +180,7 @@ class TcpListen(_TcpLink):
         return tuple(self._clients)
 
     def write(self, data: bytes, peer: Peer = None) -> None:
-        """See `Link.write`. Drops data for a client beyond `MAX_PENDING_BYTES`, or that has waited for a second."""
+        """See `Link.write`. For each client, drops data beyond `MAX_PENDING_BYTES` or older than a second."""
         if peer is None:
             for client in tuple(self._clients.values()):
                 client.write(data)

@@ -22,7 +22,7 @@ COPY_WINDOW_S = 3.0
 # A later copy, within this time, is a duplicate only if the first copy was accepted. Slow links deliver such copies.
 LATE_COPY_WINDOW_S = 10.0
 
-# Sequence numbers repeat after 256 frames; after half of them, equal bytes are another frame.
+# Sequence numbers repeat after 256 frames. Equal bytes at least half of that later are a different frame.
 COPY_WINDOW_FRAMES = 128
 
 
@@ -49,7 +49,7 @@ class Copies:
         """True if the last checked frame equals one that was accepted over another link some seconds ago."""
 
     def is_copy(self, frame: Frame, link: int) -> bool:
-        """Return True if an equal frame arrived over another link within the last seconds, and not over this one."""
+        """Return True if an equal frame arrived within the last seconds, over another link and not over this one."""
         sender = frame.component_id << 8 | frame.system_id
         key = frame.body, frame.checksum, frame.signature
         count = self._counts.get(sender, 0)
@@ -90,10 +90,10 @@ class Copies:
             self._current.is_accepted = True
 
 
-# After a change of links, requests sent over the former link are still answered over it for this time.
+# For this time after a change of links, answers to earlier requests may still arrive over the former link.
 ANSWER_TIMEOUT_S = 3.0
 
-# A component counts as reachable over a link for this time after a frame of it.
+# A component counts as reachable over a link for this time after its last frame there.
 COMPONENT_TTL_S = 10.0
 
 MAX_STREAMS = 1024
@@ -124,7 +124,7 @@ class _Stream:
         self.acknowledgements: dict[bytes, list[int]] = {}
 
     def is_repeated(self, payload: bytes, link: int) -> bool:
-        """Count an acknowledgement; return True if another link has delivered it as often as this one."""
+        """Count an acknowledgement. Return True if another link has delivered it at least as often as this one."""
         counts = self.acknowledgements.setdefault(payload, [0] * len(self.received_at))
         counts[link] += 1
         return counts[link] <= max(count for other, count in enumerate(counts) if other != link)
@@ -210,7 +210,7 @@ def _is_accepted_from_unused(frame: Frame, candidate: Candidate | None, choice: 
 
 
 def _may_be_equal(frame: Frame, link: int, choice: LinkChoice) -> bool:
-    """Return True if frames with equal bytes may be different frames, as heartbeats of separate streams are."""
+    """Return True if frames with equal bytes may be different frames, such as heartbeats of separate streams."""
     candidate = choice.used
     if candidate is None or candidate.link != link or frame.message_id != m.Heartbeat.ID:
         return False

@@ -19,7 +19,7 @@ UNPROBED_TIMEOUT_S = 2.5
 # Consecutive matching clock samples that prove that a second link leads to the same vehicle.
 MIN_CLOCK_MATCHES = 3
 
-# A vehicle that answers this many TIMESYNC probes, but not the request for its hardware id, does not support it.
+# A vehicle that answers this many TIMESYNC probes, but not the request for its hardware id, has none to report.
 MAX_TIMES_WITHOUT_HARDWARE = 3
 
 MAX_HARDWARE_REQUESTS = 20
@@ -50,7 +50,7 @@ class Candidate:
         self.is_doubted: bool = False
         """True if another vehicle with the same system id seems to be behind the link."""
         self.hardware: HardwareId | None = None
-        """Hardware id received over the link; None before that."""
+        """Hardware id received over the link; None if none was received."""
         self.is_other_hardware: bool = False
         """True if :attr:`hardware` belongs to another vehicle: neither clock nor copies can then prove the link."""
         self._hardware_requests = self._times_since_request = 0
@@ -112,7 +112,7 @@ class Candidate:
         return self._hardware_requests > 0 and self._times_since_request < MAX_TIMES_WITHOUT_HARDWARE
 
     def record_hardware(self, *, is_other: bool) -> None:
-        """Record whether the hardware id received over the link contradicts the vehicle's."""
+        """Record whether the hardware id received over the link contradicts that of the vehicle."""
         if is_other:
             self._doubt()
             self.was_proven = False
@@ -200,7 +200,7 @@ class LinkChoice:
         """Make this link, which received the system's first autopilot, the reference for all others."""
         self.needs_proof = True
         if candidate is not self.used:
-            self.used = None  # it leads to another component, e.g. a camera
+            self.used = None  # the old link leads to another component, e.g. a camera
             self.candidates = {candidate.link: candidate}
 
     def record_answer(self, link: int, at: float, vehicle_s: float, round_trip_s: float, now: float) -> None:
@@ -210,7 +210,8 @@ class LinkChoice:
         candidate.record_round_trip(round_trip_s, now)
         if candidate is self.used:
             if not self.clock.add(at, vehicle_s, round_trip_s):
-                # Another vehicle may have been switched on in its place; its hardware id is then accepted.
+                # The vehicle may have rebooted or been replaced by another one, so the next hardware id over this link
+                # is valid.
                 self._hardware_link = link
                 for other in self.candidates.values():
                     other.reset_proof()
@@ -252,7 +253,7 @@ class LinkChoice:
         return now - candidate.shared_at <= SHARED_MAX_AGE_S
 
     def choose(self, now: float) -> str | None:
-        """Select the link to use. Return the reason if it changes."""
+        """Select the link to use. Return the reason for a change; None without a change."""
         alive = sorted(
             (link for link in self.candidates.values() if self.may_be_used(link) and link.is_alive(now)),
             key=lambda candidate: (candidate.is_costly, candidate.cost_s),
@@ -306,7 +307,7 @@ class LinkChoice:
             self.hardware, self._hardware_link = hardware, used.link
 
     def _must_wait(self, used: Candidate, now: float) -> bool:
-        """Return True while a command in transit over the link in use could arrive after one over the other link."""
+        """Return True while a command in transit could arrive after a later command over the better link."""
         transit_s = (used.round_trip_s or 0.0) + JITTER_S
         waited_s = now - self._better_since - MIN_BETTER_S
         return now - self._command_at <= transit_s and waited_s <= MAX_SWITCH_DELAY_S

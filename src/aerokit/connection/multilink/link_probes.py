@@ -39,8 +39,8 @@ _AUTOPILOT = int(MavComponent.AUTOPILOT1)
 class LinkProbes:
     """Probes each link to a system twice a second, an idle costly link every five seconds.
 
-    Answers are recorded in ``choices``. A second vehicle under the same system id is reported once until it stops.
-    ``send(message, peer)`` sends a probe.
+    Answers are recorded in ``choices``. A second vehicle under the same system id is reported once, and again after a
+    pause. ``send(message, peer)`` sends a probe.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class LinkProbes:
             self._send(request, peer)
 
     def is_answer(self, frame: Frame, link: int) -> bool:
-        """Return True if this TIMESYNC answers one of our probes, over any link, and record it."""
+        """Return True if this TIMESYNC answers one of our probes over any link. Record such an answer."""
         message = self._bus.dialect.decode(frame)
         if not isinstance(message, m.Timesync) or not message.tc1 or message.ts1 not in self._pending:
             return False

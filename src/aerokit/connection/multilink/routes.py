@@ -316,7 +316,7 @@ class MultiLinkRoutes:
         if reason is None or used is None:
             return
         if before is not None:
-            self._link.discard_unsent_of(before.link)  # it must not arrive after commands over the new link
+            self._link.discard_unsent_of(before.link)  # old data must not arrive after commands over the new link
             self._merged.reset(system_id)
             name, former = self._link.names[used.link], self._link.names[before.link]
             log = logger.info if reason in ("better", "cheaper") else logger.warning

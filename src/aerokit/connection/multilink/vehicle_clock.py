@@ -35,7 +35,7 @@ class VehicleClock:
     def add(self, at: float, vehicle_s: float, round_trip_s: float) -> bool:
         """Add a sample from the link in use. Return False if the clock does not continue, i.e. the vehicle rebooted.
 
-        A clock that was paused for a moment continues, but later than expected.
+        A clock that was paused for a moment counts as continuing, although it is late.
         """
         continues = not self._samples or self._continues(at, vehicle_s, round_trip_s)
         self.is_steady = continues and self._fits(at, vehicle_s, round_trip_s) is not False
@@ -49,8 +49,8 @@ class VehicleClock:
     def matches(self, at: float, vehicle_s: float, round_trip_s: float) -> bool | None:
         """Return True if a sample from another link is this clock's time; ``at`` is the middle of the round trip.
 
-        None while the speed is unknown, because a simulation may run at any speed. The speed from before a pause or
-        reboot can confirm a sample, but not contradict it.
+        Return None while the speed is unknown, because a simulation may run at any speed. The speed from before a pause
+        or reboot can confirm a sample, but not contradict it.
         """
         fits = self._fits(at, vehicle_s, round_trip_s)
         return None if not fits and self._measured_speed is None else fits

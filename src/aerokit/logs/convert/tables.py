@@ -60,8 +60,8 @@ class _UnixLines:
         self._file.write(row[:-2] + "\n")
 
 
-# Places in a text where spreadsheets recognise a formula (owasp.org/www-community/attacks/CSV_Injection): at the
-# beginning, even after white space, and after the separators of other locales, which quotes do not protect.
+# Places in a text where spreadsheets recognise a formula (owasp.org/www-community/attacks/CSV_Injection). These are the
+# beginning, even after white space, and the places after separators of other locales, even in quotes.
 _FORMULA = re.compile(r"(^|[;\t])(?=[\s\0]*[=+\-@\uff1d\uff0b\uff0d\uff20])|^(?=[\t\r\n\0])")
 
 
@@ -141,7 +141,7 @@ Table = CsvTable | ParquetTable
 
 
 class FlightTableWriter:
-    """Writes one table, with a row for each position of each vehicle, which includes the newest other values."""
+    """Writes one table, with a row for each position of each vehicle. A row includes the newest other values."""
 
     def __init__(self, path: Path, log: LogReader, kind: type[Table]) -> None:
         self._table = kind(path, (*_SENDER[:2], *FLIGHT))

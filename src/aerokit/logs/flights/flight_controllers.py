@@ -85,7 +85,7 @@ class _RowReader(LogReader):
     _skipped = 0
 
     def _is_plausible_time(self, unix_s: float) -> bool:
-        """Return False and count the row as damaged if its time is impossible."""
+        """Return True if this time is possible. Otherwise, count the row as damaged."""
         is_plausible = 0 <= unix_s < _MAX_UNIX_S
         self._skipped += not is_plausible
         return is_plausible
@@ -181,7 +181,7 @@ def _ardupilot_attitude(fields: Mapping[str, Any], _: Any) -> States:
 
 
 def _known(value: float) -> float | None:
-    """Return None for NaN, which batteries without a sensor have."""
+    """Convert NaN, the value of batteries without a sensor, to None."""
     return value if math.isfinite(value) else None
 
 

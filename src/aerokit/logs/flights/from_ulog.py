@@ -212,7 +212,7 @@ class _Reader:
             self._flight.add_mode(time_s, name, reason, by_itself)
 
     def _failsafe_flags(self) -> None:
-        # Ignore the flags while disarmed: on the ground many are set without meaning.
+        # Ignore the flags while disarmed, because many flags are set without meaning on the ground.
         flight, flags = self._flight, self._topic("failsafe_flags")
         if flags is None:
             return

@@ -28,7 +28,7 @@ _HIGH_THROTTLE_PERCENT, _HIGH_TILT_DEG, _HIGH_ATTITUDE_ERROR_DEG = 90.0, 50.0, 2
 
 
 class FlightStatistics(Snapshot):
-    """Statistics of the time while the vehicle was armed, or of the whole log if it never was; None is unknown."""
+    """Statistics of the armed time, or of the whole log if the vehicle was never armed; None means unknown."""
 
     armed_s: float | None
     distance_m: float | None
@@ -46,7 +46,7 @@ class FlightStatistics(Snapshot):
     end_distance_m: float | None
     """Distance from home at the end."""
     start_voltage_v: float | None
-    """Voltage of the first battery at the start. The other battery values are also of the first battery."""
+    """Voltage of the first battery at the start. All battery values are those of the first battery."""
     end_voltage_v: float | None
     min_voltage_v: float | None
     start_remaining_percent: float | None

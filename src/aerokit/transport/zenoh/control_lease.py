@@ -148,7 +148,7 @@ class ClientFilter:
         self.refused: int = 0
         """Number of refused frames."""
         self.received_at: float = 0.0
-        """Time of the last data of the client; set by the owner."""
+        """Time of the last data of the client; set by the link that owns this filter."""
         self._client, self._lease = client, lease
         self._framer = _framer()
         self._nonce: int | None = None  # nonce of the program that uses this client name

@@ -46,7 +46,7 @@ logger: logging.Logger = logging.getLogger("aerokit")
 
 
 class ZenohListen(NetworkLink):
-    """``zenohin:`` link: serves the clients (`ZenohConnect`) of one name. Each client is a peer.
+    """``zenohin:`` link: serves the clients (`ZenohConnect`) that use its name. Each client is a peer.
 
     The link is not lost when clients or the network fail. Outdated datagrams, and commands while another client has
     control, are refused and counted, and the client is notified.
@@ -86,12 +86,12 @@ class ZenohListen(NetworkLink):
 
     @property
     def late_datagrams(self) -> int:
-        """Datagrams of clients that were refused as outdated."""
+        """Number of datagrams of clients that were refused as outdated."""
         return self._freshness.late
 
     @property
     def refused_frames(self) -> int:
-        """Frames of clients that were refused: outdated, or commands without control."""
+        """Number of refused frames of clients: outdated frames, and commands without control."""
         return self._refused + sum(client.refused for client in self._clients.values())
 
     def write(self, data: bytes, peer: Peer = None) -> None:

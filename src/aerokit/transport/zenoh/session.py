@@ -138,7 +138,7 @@ class NetworkLink(BaseLink):
     def __init__(self, address: str) -> None:
         super().__init__(address)
         self._session: Any = None
-        self._declared: list[Any] = []  # they end when they are garbage-collected
+        self._declared: list[Any] = []  # declarations end when they are garbage-collected
         self._queue: LoopQueue[Callable[[], object]] | None = None
         self._timer: asyncio.TimerHandle | None = None
 
@@ -228,7 +228,7 @@ def _config(zenoh: Any, address: str, options: NetworkOptions) -> Any:
     except zenoh.ZError as error:
         raise InvalidArgument(f"{address}: {_reason(error)}") from error
     for key, value in (_DROP_AT_ONCE, *(_SETTINGS if not options.config else ())):
-        with contextlib.suppress(zenoh.ZError):  # unknown to this version of zenoh
+        with contextlib.suppress(zenoh.ZError):  # this version of zenoh does not know the option
             config.insert_json5(key, json.dumps(value))
     return config
 
