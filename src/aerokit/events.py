@@ -401,7 +401,7 @@ class LinkState(enum.Enum):
     CONNECTED = "connected"
     """The vehicle sent a heartbeat, or the link delivered any frame, within the last 3.5 seconds."""
     SILENT = "silent"
-    """The link is open, but no heartbeat of the vehicle (no frame of the link) arrived within the last 3.5 seconds.
+    """The link is open, but silent for more than 3.5 seconds: no heartbeat of the vehicle, or no frame at all.
     """
     LOST = "lost"
     """The link failed or the connection was closed. With ``reconnect=True`` the state may become CONNECTED again."""

@@ -28,7 +28,7 @@ from aerokit.errors import InvalidArgument, LinkOpenError
 FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
 ClassT = TypeVar("ClassT")
 
-# A check, and a check with a description of what is allowed.
+# A rule is a check with a description of the allowed values.
 Check = Callable[[Any], bool]
 Rule = tuple[Check, str]
 

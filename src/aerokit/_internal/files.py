@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 MAX_FILE_SIZE = 16 << 20
-"""Size limit in bytes for files of parameters, metadata, plans and definitions; real ones have at most 5 MB."""
+"""Size limit in bytes for files of parameters, metadata, plans and definitions; real files have at most 5 MB."""
 
 _XZ_MAGIC = b"\xfd7zXZ\x00"
 _XZ_MEMORY_LIMIT = 128 << 20  # xz -9 needs 65 MB

@@ -94,7 +94,7 @@ class MessageKind(Enum):
     """How a queued message is treated."""
 
     TELEMETRY = "telemetry"
-    """Replaced by a newer one of the same sender."""
+    """Replaced by newer telemetry of the same sender with the same message id."""
     TRANSFER = "transfer"
     """Kept in order, never replaced: part of a transfer, an answer, a text."""
     ORDER = "order"

@@ -70,7 +70,7 @@ class VehicleSigning:
         raise NotImplementedError
 
     def may_change(self) -> bool:
-        """Return True if the key can be changed now; sends the reason if not."""
+        """Return True if the key can be changed now, otherwise send the reason."""
         raise NotImplementedError
 
     def on_key_changed(self) -> None:

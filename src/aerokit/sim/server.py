@@ -78,7 +78,7 @@ class SimulatorServer:
         self._owner: asyncio.Task[Any] | None = None
         self._cancels_owner = False
         self.on_datagram: Callable[[float, bytes, bool], object] | None = None
-        """Called with simulated time, bytes and direction of every datagram; True if a vehicle sent the datagram."""
+        """Called with simulated time, bytes and direction of every datagram. True as direction: sent by a vehicle."""
         self.failure: Exception | None = None
         """Exception of a vehicle that stopped the simulation; None while it runs."""
 

@@ -64,7 +64,7 @@ class ExtraComponent:
     type: int = MavType.GIMBAL
     autopilot: int = MavAutopilot.INVALID
     system_id: int | None = None
-    """None uses the vehicle's system id."""
+    """System id of the component; None: that of the vehicle."""
     base_mode: int = MavModeFlag(0)
     custom_mode: int = 0
     system_status: int = MavState.ACTIVE
@@ -222,12 +222,12 @@ class SimulatedVehicle:
         raise NotImplementedError
 
     def call_at(self, when: float, action: Callable[[], None]) -> None:
-        """Call a function at a simulated time; a reboot cancels it."""
+        """Call a function at a simulated time; a reboot cancels the call."""
         self._timer_count += 1
         heappush(self._timers, (when, self._timer_count, action))
 
     def call_later(self, delay: float, action: Callable[[], None]) -> None:
-        """Call a function after ``delay`` simulated seconds; a reboot cancels it."""
+        """Call a function after ``delay`` simulated seconds; a reboot cancels the call."""
         self.call_at(self.now + delay, action)
 
     def every(self, interval: float, action: Callable[[], None], *, first: float | None = None) -> None:

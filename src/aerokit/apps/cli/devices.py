@@ -133,9 +133,7 @@ def _plain(text: str) -> str:
 
 
 def _file_name(capture: Capture) -> str | None:
-    """Return ``INDEX-NAME``, from the last part of the address; None if that is a path, or not a portable file
-    name.
-    """
+    """Return ``INDEX-NAME``, made from the last part of the address; None if that is no portable file name."""
     base = unquote(capture.file_url.rpartition("/")[2]) or "capture.jpg"
     is_name = base.isprintable() and not set(base) & set('/\\:*?"<>|') and base.strip(" .") == base
     return f"{capture.index:05}-{base}" if is_name and len(base) <= _MAX_FILE_NAME else None

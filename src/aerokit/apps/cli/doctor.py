@@ -43,7 +43,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
 }
 """Modules of each extra. A test compares them with pyproject.toml."""
 
-# Number, usual purpose, and True for UDP.
+# Number of each port, its usual purpose, and True for UDP.
 _COMMON_PORTS = (
     (14550, "the port of ground stations such as QGroundControl and MAVProxy", True),
     (14540, "PX4's simulator sends to it", True),

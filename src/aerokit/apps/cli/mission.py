@@ -45,7 +45,7 @@ def begins_with_take_off(items: Sequence[MissionItem]) -> bool:
 
 
 def plan_warnings(plan: Plan) -> list[str]:
-    """Return what a vehicle will probably refuse, although the plan can be sent."""
+    """Return texts about parts of a plan that can be sent, but that a vehicle will probably refuse."""
     from aerokit.autopilots.ardupilot import COPTERS
 
     standard = frozenset(MavCmd)

@@ -108,7 +108,7 @@ def plain_warnings() -> Iterator[None]:
 
 
 def _describe_busy_computer(record: logging.LogRecord) -> bool:
-    """Replace the warning of a blocked event loop, which advises programmers: a command only waits for the computer."""
+    """Replace the text of the warning about a blocked event loop, which gives advice on code. Return True."""
     if str(record.msg).startswith("the event loop was blocked") and isinstance(record.args, tuple):
         record.msg = "this computer was busy for %.1f s: no messages or heartbeats were processed"
         record.args = record.args[:1]

@@ -147,7 +147,7 @@ async def _load(options: argparse.Namespace) -> int:
         await _download(vehicle, options)
         metadata = await metadata_for_check(vehicle, given, options)
         if metadata is not None:
-            # A backup may have unusual values that the vehicle has already.
+            # Only changes are checked, because a backup may have unusual values that the vehicle has already.
             differences = await vehicle.parameters.diff(wanted, idle_timeout_s=options.patience)
             check_values(metadata, {one.name: one.after for one in differences if one.after is not None})
         with progress_bar("parameters", "parameter") as show:
@@ -176,7 +176,7 @@ async def _read(vehicle: Vehicle, name: str, options: argparse.Namespace) -> Par
 def _hint(name: str, error: Exception, vehicle: Vehicle) -> str:
     """Suggest similar parameter names, or the command that lists them. Empty if the error contains a suggestion."""
     names = parameter_names(vehicle.autopilot.name)
-    is_lacking = "has no parameter" in str(error)  # the names are of all vehicle types
+    is_lacking = "has no parameter" in str(error)  # `names` are those of all vehicle types
     if "did you mean" in str(error) or (name.upper() in names and not is_lacking):
         return ""
     return (

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 # ArduPilot uses a new system id at once (GCS_Common.cpp, update_send), PX4 and old ArduPilots after a reboot.
 _SYSTEM_ID_NAMES = ("SYSID_THISMAV", "MAV_SYSID", "MAV_SYS_ID")
-# Limits the time that reading the metadata from the vehicle takes; over a slow radio it takes longer.
+# Maximum time for reading the metadata from the vehicle. Reading takes longer over a slow radio and is then given up.
 _FETCH_TIMEOUT_S = 10.0
 
 
@@ -45,7 +45,7 @@ def load_given(options: argparse.Namespace) -> Metadata | None:
 
 
 async def metadata_for_check(vehicle: Vehicle, given: Metadata | None, options: argparse.Namespace) -> Metadata | None:
-    """Return the metadata to check values with: the given one, or the vehicle's if it has some. None with --force."""
+    """Return the metadata for checking values: the given metadata, else that of the vehicle. None with --force."""
     if options.force:
         return None
     # ArduPilot has no component metadata.
@@ -60,7 +60,7 @@ async def _fetch(vehicle: Vehicle) -> Metadata | None:
         try:
             content = await vehicle.component(vehicle.component_id).metadata("parameter")
             return parse_metadata(json.dumps(content).encode(), "the vehicle's metadata")
-        except (NotSupported, CommandRejected, FileError):  # the vehicle has none
+        except (NotSupported, CommandRejected, FileError):  # the vehicle has no metadata
             return None
         except AerokitError as error:
             problem = str(error)
@@ -79,7 +79,7 @@ def check_values(metadata: Metadata | None, values: Mapping[str, float]) -> None
 
 
 def _problem(metadata: Metadata, name: str, value: float) -> str | None:
-    """Return why the value is not allowed, in the name and unit of the user."""
+    """Return the reason why the value is not allowed, with the name and unit that the user gave; None if it is."""
     entry, convert = _entry(metadata, name)
     problem = None if entry is None else entry.problem(convert(value))
     if problem is None or entry is None or entry.name == name:

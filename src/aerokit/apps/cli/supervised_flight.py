@@ -166,7 +166,7 @@ class SupervisedFlight(ABC):
         return DONE
 
     async def _watch_late_arming(self) -> None:
-        """Wait for an arm command that may still arrive; the library then disarms the vehicle while connected."""
+        """Stay connected while an arm command may still arrive, so that the library can disarm the vehicle."""
         if not self._may_arm_late:
             return
         self._print(

@@ -44,7 +44,7 @@ def age(seconds: float) -> str:
 
 
 class VehicleText:
-    """Texts of one vehicle. While it is silent, its values are dimmed, and one line shows the time of silence."""
+    """Texts of one vehicle. While the vehicle is silent, values are dimmed, and one line shows the time of silence."""
 
     def __init__(self, vehicle: Vehicle) -> None:
         self._vehicle = vehicle

@@ -45,7 +45,7 @@ ENUMS: dict[str, type[Enum]] = {
     "Odometry.child_frame": enums.MavFrame,
     "Aircraft.emitter": enums.AdsbEmitterType,
 }
-"""Integers that are published by their MAVLink enum names, if the number has one."""
+"""Fields whose integers are published as names of a MAVLink enum, if the number has a name."""
 
 
 def document() -> dict[str, Any]:

@@ -124,7 +124,7 @@ _BITS = {
         "ESTIMATOR_STATUS": EstimatorStatusFlags,
     }.items()
 }
-# With wait=false, wait this long, so that an order that is refused locally is answered with the reason.
+# Even with wait=false, wait this long, so that the answer has the reason if the order is refused locally.
 _REFUSAL_TIMEOUT_S = 0.2
 
 
@@ -243,8 +243,8 @@ Handler = Callable[["Request"], Awaitable[Response]]
 class Operation:
     """One method of one path.
 
-    ``name`` is its operationId and ``order`` the order that it gives. An operation that gives no order may have a
-    ``body``, which is an order whose body it shares.
+    ``name`` is the operationId, ``order`` is the order that the operation gives. If it gives none, ``body`` may name an
+    order with the same request body.
     """
 
     method: str
@@ -431,7 +431,7 @@ class HttpApi:
         return self._served.vehicle(system_id_of(request))
 
     def _is_refresh(self, request: Request) -> bool:
-        # Reading from the vehicle uses its link, so it needs the token, like an order.
+        # A refresh uses the vehicle's link, and therefore needs the token, like an order.
         is_new = query_flag(request, "refresh", default=False)
         if is_new:
             self._access.check(request.headers, needs_token=True)

@@ -35,7 +35,7 @@ MAX_RESULTS = 500
 MAX_USED_KEYS = 100_000
 """Maximum number of older keys that are stored to detect their reuse."""
 STATE_MAX_AGE_S = 5.0
-"""Maximum age in seconds of the state that the client of an order has seen."""
+"""Maximum age in seconds of the state on which a client bases an order."""
 _KEY = re.compile(r"[A-Za-z0-9._~-]{8,64}")
 
 
@@ -100,7 +100,7 @@ def parse_plan_body(values: Mapping[str, Any]) -> tuple[str, str, Plan]:
     """Return name, text and plan of a request body: an object of a .plan file, or the text of either format.
 
     Raises:
-        FileFormatError: neither format; the text names the position of the error.
+        FileFormatError: the body has neither format; the text names the position of the error.
         InvalidArgument: an item cannot be sent.
     """
     content, name = values["plan"], values.get("name")
@@ -195,7 +195,7 @@ class OrderRecord:
 
 
 class OrderRunner:
-    """Runs each order once, in a task of the server: a disconnecting client does not affect it."""
+    """Runs each order once, in a task of the server, so that a disconnecting client does not affect the order."""
 
     def __init__(self, served: ServedVehicles) -> None:
         self._served = served
@@ -206,7 +206,7 @@ class OrderRunner:
     def submit(
         self, vehicle: Vehicle, kind: OrderType, arguments: dict[str, Any], key: str, seen_at_s: float | None
     ) -> OrderRecord:
-        """Start an order, or return the one with this key. The arguments have been checked by ``kind.check``.
+        """Start an order, or return the earlier order with this key. The arguments have been checked by ``kind.check``.
 
         Raises:
             HttpProblem: the key is missing, or was used for another order; the client has seen an old state.

@@ -49,8 +49,8 @@ MIN_CHECK_INTERVAL_S = 5.0
 class ServedVehicles:
     """Follows the vehicles of a source, and keeps their recent events, texts and tracks.
 
-    Requests only the reasons for not arming: once, when a disarmed vehicle begins to report that its checks fail, and
-    when its failing sensors change.
+    Requests nothing but the reasons for not arming. These are requested when a disarmed vehicle begins to report
+    failing checks, and again when the failing sensors change.
 
     ``source``: a connection, whose vehicles are added as they appear; one vehicle; or a mapping from system id
     to vehicle, which may grow.
@@ -102,7 +102,7 @@ class ServedVehicles:
         return list(self._texts.get(system_id, ()))
 
     def track(self, system_id: int) -> list[tuple[float, float, bool]]:
-        """Return a track, the oldest position first: latitude, longitude, and True for the first one after a gap."""
+        """Return a track, the oldest position first: latitude, longitude, and True after a gap."""
         points = self._tracks.get(system_id, ())
         return [(at.latitude_deg, at.longitude_deg, is_after_gap) for at, is_after_gap in points]
 

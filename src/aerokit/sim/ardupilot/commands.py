@@ -200,7 +200,7 @@ class _CommonCommands:
         return _R.ACCEPTED
 
     def control_high_latency(self, command: ReceivedCommand) -> int:
-        """Refuse to start high-latency mode, which no port supports; accept to stop it."""
+        """Refuse to start high-latency mode, which no port supports. Accept requests to stop it."""
         if command.param1:
             return _R.FAILED
         self._vehicle.send_text(_NOTICE, "High Latency disabled")

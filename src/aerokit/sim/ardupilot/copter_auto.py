@@ -226,7 +226,7 @@ class CopterAuto(MissionMode):
         """Enter AUTO, which requires a mission; on the ground its first navigation command must be a take-off."""
         copter, run = self.vehicle, self.vehicle.mission
         if copter.mode is self:
-            return True  # Arming in AUTO enters it again.
+            return True  # Arming in AUTO enters the mode again.
         if not run.is_present and not force:
             return False
         if copter.is_armed and copter.is_landed and not run.starts_with_take_off():
@@ -347,7 +347,7 @@ class CopterAuto(MissionMode):
         return False
 
     def _place(self, item: MissionItem) -> Ned:
-        """Return the place of an item; zero coordinates keep the vehicle's current ones."""
+        """Return the place of an item; zero coordinates mean the vehicle's current coordinates."""
         leg = self._leg
         here: Ned = self.vehicle.motion.place
         if isinstance(leg, _FlyLeg) and leg.is_complete:

@@ -273,7 +273,7 @@ _FENCE_ACTIONS: dict[int, tuple[int, ...]] = {
 class CopterFence(ArduPilotFence[CopterHost]):
     """Fence. FENCE_ACTION: report only (0), RTL (1), LAND (2), SMART_RTL (3, 5), BRAKE (4).
 
-    It changes to LAND instead if the mode is refused, or more than 100 m outside the fence.
+    If the mode is refused, or the copter is more than 100 m outside the fence, it changes to LAND instead.
     """
 
     PERIOD_S: ClassVar[float] = 0.1
@@ -306,7 +306,7 @@ class CopterFence(ArduPilotFence[CopterHost]):
         return MavSeverity.WARNING, f"Mode change to {mode.name} failed: in fence recovery"
 
     def mode_changed(self) -> None:
-        """Suspend the fence's actions for ten seconds, unless it only reports."""
+        """Suspend the fence's actions for ten seconds, unless FENCE_ACTION only reports."""
         super().mode_changed()
         if self.vehicle.parameters["FENCE_ACTION"] != REPORT_ONLY:
             self.recover_by_hand()

@@ -167,8 +167,8 @@ class ArmingCheck(IntFlag):
 class ArduPilotArming(Generic[HostT]):
     """Arms and disarms. Runs the arming checks once a second and reports failures every 30 s while disarmed.
 
-    `common_reasons` has the checks of all firmwares, whose new failures are reported at once. A subclass adds its own
-    checks in `own_reasons` and `final_reasons`.
+    `common_reasons` has the checks of all firmwares. New failures of these checks are reported at once. A subclass adds
+    its own checks in `own_reasons` and `final_reasons`.
     """
 
     ARMED_TEXT: ClassVar[str] = "Throttle armed"

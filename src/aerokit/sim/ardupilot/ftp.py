@@ -85,7 +85,7 @@ class ArduPilotFtp(FtpRequestServer[FileTree]):
             self._vehicle.call_later(_WORKER_PERIOD_S, self._work)
 
     def _work(self) -> None:
-        """Process the queue. A burst continues by its own timer and calls this at its end."""
+        """Process the queue. A burst continues by its own timer, and calls this method when it ends."""
         while self._queue:
             request, channel = self._queue.popleft()
             if self._is_repeated(request):

@@ -76,7 +76,7 @@ class ArduPilotMode:
         return False
 
     def go_to(self, position: Ned) -> None:
-        """Go to a point of the world frame and stay there; only the guided mode implements it."""
+        """Go to a point of the world frame and stay there; only the guided mode implements this method."""
         raise NotImplementedError
 
     @property

@@ -126,7 +126,7 @@ class MissionRun:
 
     @property
     def is_being_flown(self) -> bool:
-        """True while the mission runs with armed motors; it cannot be cleared then."""
+        """True while the mission runs with armed motors. The mission cannot be cleared meanwhile."""
         return self.is_running and self._vehicle.motors.is_armed
 
     @property

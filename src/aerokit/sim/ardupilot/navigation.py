@@ -349,7 +349,7 @@ def simplify(path: Sequence[Ned], tolerance: float) -> list[Ned]:
 def prune(path: Sequence[Ned], tolerance: float) -> list[Ned]:
     """Return the path without loops: segments within ``tolerance`` metres of each other are joined.
 
-    Loops are removed in the order of their starts; of loops with the same start, only the longest.
+    Loops are removed in the order of their starts. If several loops have the same start, only the longest is removed.
     """
     points = list(path)
     first = 0

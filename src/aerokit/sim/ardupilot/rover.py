@@ -92,8 +92,8 @@ _DRIVES_ITSELF = frozenset(
 class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
     """Failsafes. FS_ACTION is executed FS_TIMEOUT after radio or ground station are lost, except in RTL and HOLD.
 
-    It is also executed on a disarmed rover. The firmware treats both links as one failsafe. If the check of the radio
-    is enabled, it reports a lost ground station as "Radio Failsafe" too.
+    The action is also executed on a disarmed rover. The firmware treats both links as one failsafe. If the check of the
+    radio is enabled, the firmware reports a lost ground station as "Radio Failsafe", too.
     """
 
     BATTERY_PRIORITIES: ClassVar[tuple[int, ...]] = (

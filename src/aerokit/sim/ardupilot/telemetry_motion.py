@@ -214,7 +214,7 @@ def _target_local(vehicle: ArduPilotVehicle) -> m.PositionTargetLocalNed | None:
 
 
 def _is_navigating(vehicle: ArduPilotVehicle) -> bool:
-    """Return True in modes with NAV_CONTROLLER_OUTPUT: on Plane all but MANUAL, on Rover those that navigate."""
+    """Return True in modes with NAV_CONTROLLER_OUTPUT: on Plane all but MANUAL, on Rover the navigating modes."""
     mode = vehicle.mode
     if vehicle.KIND == "plane":
         return mode.number != PlaneMode.MANUAL

@@ -52,7 +52,7 @@ _FORMAT_S, _FORMAT_PERCENTS = 0.5, (0, 25, 50, 75)
 
 
 def _format(camera: CameraBody, command: ReceivedCommand) -> int | CommandProgress:
-    """Takes two seconds; param 3 is 1 to reset the image log."""
+    """Format the card, which takes two seconds. Param 3 is 1 to reset the image log."""
     captures = camera.captures
     if command.param1 not in (0.0, 1.0) or not camera.card.is_inserted:
         return MavResult.DENIED

@@ -159,11 +159,11 @@ class SimulatedComponent:
         self.send(Statustext(severity, text[:50], 0, 0))
 
     def call_later(self, delay: float, action: Callable[[], None]) -> None:
-        """Call a function after ``delay`` simulated seconds; a reboot cancels it."""
+        """Call a function after ``delay`` simulated seconds; a reboot cancels the call."""
         self.vehicle.call_later(delay, action)
 
     def call_at(self, when: float, action: Callable[[], None]) -> None:
-        """Call a function at a simulated time; a reboot cancels it."""
+        """Call a function at a simulated time; a reboot cancels the call."""
         self.vehicle.call_at(when, action)
 
     def stream(self, message_id: int, interval_s: float, channel: Channel | None = None) -> None:

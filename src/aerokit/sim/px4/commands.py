@@ -278,7 +278,7 @@ class _Flight:
         return self._change(modes.ORBIT)
 
     def tune(self, command: ReceivedCommand) -> int | None:
-        """Start tuning, or report its progress. Complete tuning waits for disarming, as with MC_AT_APPLY 1."""
+        """Start tuning, or report its progress. A complete tuning waits for disarming, as with MC_AT_APPLY 1."""
         px4 = self._px4
         if command.param1 != 1.0 or command.param2 != 0.0:
             return MavResult.DENIED

@@ -232,7 +232,7 @@ class Px4Flight:
         self.target = (north, east, min(down, self.destination[2] - height))
         amsl = vehicle.frame.origin.altitude_m - self.target[2]
         text = f"RTL: start return at {amsl:.0f} m ({height:.0f} m above destination)"
-        vehicle.call_later(0.0, lambda: vehicle.info(text))  # PX4 sends it after the text of the command.
+        vehicle.call_later(0.0, lambda: vehicle.info(text))  # PX4 sends this text after that of the command.
 
     def _return(self) -> None:
         vehicle, motion = self._vehicle, self._vehicle.motion

@@ -100,7 +100,7 @@ def outside_fence(px4: Px4Host, items: Sequence[MissionItem]) -> int | None:
 
 
 def warning(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
-    """Return a warning if the first waypoint of a mission is far away, or None."""
+    """Return a warning if the first waypoint of a mission is far away, otherwise None."""
     for item in items:
         if item.command in _WITH_PLACE:
             north, east = px4.frame.to_local(round(item.x), round(item.y))

@@ -124,9 +124,9 @@ class Px4MissionLink:
     def on_request_list(self, request: m.MissionRequestList) -> None:
         """Start or restart a download.
 
-        A download of which all items were sent counts as complete. The firmware treats an upload in the same way once
-        as many items have arrived as are stored: it ends that upload, but refuses other uploads until a download times
-        out.
+        A download counts as complete once all items were sent. The firmware applies this rule to an upload, too, once
+        the number of received items equals the number of stored items. This upload then ends, but other uploads are
+        refused until a download times out.
         """
         if self._seq == self._server.count(self._type):
             self._state = TransferState.IDLE

@@ -42,7 +42,7 @@ RTL_LOITER_RAD RTL_MIN_DIST RTL_RETURN_ALT RTL_TYPE RWTO_RAMP_TIME SDLOG_MODE SY
 def px4_parameters(count: int | None = None, table: str = "quadrotor") -> SimParameters:
     """Return the parameters of a "quadrotor" (910) or an "airplane" (978).
 
-    ``count`` limits their number, but keeps all that the simulation reads.
+    ``count`` limits the number of parameters. All parameters that the simulation reads are kept.
     """
     data = pkgutil.get_data(__name__, f"{table}.param.csv")
     assert data is not None
