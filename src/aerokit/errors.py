@@ -166,10 +166,11 @@ class RollbackFailed(OperationRejected):
 
 
 class MissionRejected(OperationRejected):
-    """The vehicle refused a mission, a fence or rally points. The text says if the vehicle kept the old ones.
+    """The vehicle refused a mission, a fence or rally points.
 
-    ``result`` is the MAV_MISSION_RESULT (https://mavlink.io/en/messages/common.html#MAV_MISSION_RESULT); ``item`` is
-    the index of the refused item, or None if unknown.
+    The text says whether the vehicle kept the previous items. ``result`` is the MAV_MISSION_RESULT
+    (https://mavlink.io/en/messages/common.html#MAV_MISSION_RESULT); ``item`` is the index of the refused item, or None
+    if unknown.
     """
 
     def __init__(self, message: str, *, result: int, item: int | None = None, reasons: tuple[str, ...] = ()) -> None:

@@ -348,7 +348,7 @@ class LinkDrained(Event):
 class LinkSelected(Event):
     """The traffic to this system now uses ``link`` (its address), one of several links.
 
-    ``before`` is the previous link, None for the first one. ``reason`` is "first heard" for the first link. It is
+    ``before`` is the previous link; None if there was none. ``reason`` is "first heard" for the first link. It is
     "silent", "stalled" or "lost" if that happened to the previous link, "better" or "cheaper" if that is true of the
     new link, and "another vehicle" if AUTOPILOT_VERSION showed that the previous link leads to another vehicle. aerokit
     requests message rates again, because autopilots keep separate rates for each link.

@@ -272,7 +272,7 @@ def _nothing() -> None:
 ItemT = TypeVar("ItemT")
 
 Overflow = Literal["drop_oldest", "drop_newest", "error"]
-"""Policy for an item that arrives at a full queue: drop the oldest, drop the new one, or raise in the reader."""
+"""Policy for an item that arrives at a full queue: drop the oldest item, drop the new item, or raise in the reader."""
 
 
 class Subscription(Generic[ItemT]):

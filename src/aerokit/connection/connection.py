@@ -236,7 +236,7 @@ class Connection:
 
     @property
     def signing(self) -> Signing | None:
-        """Key that signs sent frames and verifies received ones; None: frames are neither signed nor verified.
+        """Key that signs sent frames and verifies received frames; None: frames are neither signed nor verified.
 
         ``signing.timestamp`` is the time stamp to store; ``signing.refused`` counts refused frames. May be set while
         the connection is open. Raises InvalidArgument with MAVLink 1, which has no signatures.
@@ -460,7 +460,7 @@ class Connection:
     # ------------------------------------------------------------------------------- internal
 
     async def _open_link(self) -> None:
-        """Open the link. A link that is already open belongs to another connection, so this one does not close it."""
+        """Open the link. A link that is already open belongs to another connection and stays open."""
         try:
             await self.link.open(self)
         except BusyError:

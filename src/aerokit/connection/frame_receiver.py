@@ -30,7 +30,7 @@ MAX_PEERS = 256
 """Maximum number of peers that have sent a valid frame."""
 
 MAX_UNVERIFIED_PEERS = 32
-"""Maximum number of tracked peers without a valid frame. A new one replaces the oldest."""
+"""Maximum number of tracked peers without a valid frame. A new peer replaces the oldest peer."""
 
 MAX_SENDERS = 2048
 """Maximum number of (system id, component id) pairs, over all peers, that have their own counters."""
@@ -81,7 +81,7 @@ class PeerTable:
         return framer, frames
 
     def reset(self) -> None:
-        """Reset the framers after the link was reopened, and register the peers at the new one."""
+        """Reset the framers after the link was reopened, and register the peers at the new link."""
         for framer in self:
             framer.reset()
         for peer in self.framers:
@@ -233,7 +233,7 @@ class FrameReceiver:
             self._update_framer(framer)
 
     def _update_framer(self, framer: Framer) -> None:
-        """Make the framer build all frames, unknown ones included, while there are observers."""
+        """Make the framer build all frames, including unknown messages, while there are observers."""
         framer.keep_unknown = self.observers.want_all
         framer.wanted = None if framer.keep_unknown else self._bus.wanted
 

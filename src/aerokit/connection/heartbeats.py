@@ -104,7 +104,7 @@ class ActivityMonitor:
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock, self._fed_at = clock, clock()
         self.pending_calls: set[object] = set()
-        """Calls that the program is waiting for; while there are any, it is not idle."""
+        """Calls that the program is waiting for. While there are pending calls, the program is not idle."""
 
     def feed(self) -> None:
         self._fed_at = self._clock()

@@ -31,8 +31,11 @@ if TYPE_CHECKING:
 CLOSE_TIMEOUT_S = 2.0
 
 OBSERVER_SYSTEM_ID = 254
-"""System id for tools that connect briefly while a vehicle flies. Not 255, the default of ArduPilot's MAV_GCS_SYSID:
-its failsafe (FS_GCS_ENABLE) acts five seconds after a ground station of that id has gone."""
+"""System id for tools that connect briefly while a vehicle flies.
+
+It is not 255, the default of ArduPilot's MAV_GCS_SYSID, because a failsafe (FS_GCS_ENABLE) acts five seconds after a
+ground station with that id has gone.
+"""
 
 
 @checked
@@ -61,7 +64,7 @@ async def open_connection(
         address: a connection string (``"udpin:0.0.0.0:14550"``, ``"/dev/ttyACM0,57600"``, …) or an unopened link; or a
             list of links to the same vehicles (docs/how-to/several-links.md). With a list, each frame is processed
             once, and commands use the best link that works. ``?costly=1`` in an address marks a link that is used only
-            when the others fail. A lost link is reopened while another one works.
+            when the others fail. A lost link is reopened while another link works.
         source_system: own system id, 1–255; ground stations use 255.
         source_component: own component id, 1–255. 0 is allowed for programs that have always used it (DroneKit).
         baud: bits per second of a serial link whose address does not give them, above 0.
@@ -188,7 +191,7 @@ def _check_distinct(addresses: Sequence[str | Link], targets: Sequence[Link | Li
 
 
 def _target_key(target: Link | LinkAddress) -> object:
-    """Return a key of the port or socket that an address opens; None if it opens a new one each time."""
+    """Return a key of the port or socket that an address opens; None if it opens a new socket each time."""
     if isinstance(target, Link):
         return id(target)
     is_new = (target.kind in ("udpin", "tcpin") and not target.port) or (target.kind == "pty" and not target.path)

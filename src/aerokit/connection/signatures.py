@@ -1,4 +1,4 @@
-"""``SignatureGate``: signs the frames of a connection and refuses received ones without a valid signature."""
+"""``SignatureGate``: signs the frames of a connection and refuses received frames without a valid signature."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ class ClassicConnection:
         self.supports_mavlink_2 = False
         """True once the vehicle has reported that it supports MAVLink 2, even if it still sends version 1."""
         self.note_sent: Callable[[Message], None] = lambda message: None
-        """Called on the loop with each sent message, because it may be an order that overrules earlier ones."""
+        """Called on the loop with each sent message, because it may overrule earlier orders."""
         self.vehicle: Any = None
         self._is_closed = threading.Event()
         self._closing = threading.Lock()

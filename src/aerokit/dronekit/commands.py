@@ -359,8 +359,8 @@ def _values_of(commands: Iterable[Command]) -> tuple[tuple[Any, ...], ...]:
 def _is_home_row(cmd: Command, home: LocationGlobal | None) -> bool:
     """Return True if a command is the home row of a waypoint file rather than a waypoint.
 
-    The home row is a waypoint above sea level, without parameters, that has ``current`` set, is all zeros, or is at
-    home.
+    The home row is a waypoint without parameters whose altitude is above sea level. It has ``current`` set, is all
+    zeros, or is at home.
     """
     if cmd.command != MavCmd.NAV_WAYPOINT or cmd.frame not in AMSL_FRAMES:
         return False

@@ -37,7 +37,7 @@ MessageT = TypeVar("MessageT", bound=Message)
 
 
 class Readiness:
-    """Records which attributes have a value, and waits for missing ones. Can be used from any thread."""
+    """Records which attributes have a value, and waits for missing values. Can be used from any thread."""
 
     def __init__(self) -> None:
         self.names: set[str] = set()
@@ -317,7 +317,7 @@ class VehicleCore(HasObservers):
         still_waiting_interval: float = 1,
         **_: Any,
     ) -> bool:
-        """Wait until attributes have values: these or, without names or with True, the five default ones.
+        """Wait until attributes have values. Without names, or with True, wait for five default attributes.
 
         Args:
             types: names of attributes, including your own; ``wait_ready(True)`` is ``'parameters'``, ``'gps_0'``,

@@ -242,7 +242,7 @@ class FlightMethods(VehicleAttributes):
         order.add_done_callback(self._dk_home_is_set)
 
     def _dk_home_is_set(self, order: Future[None]) -> None:
-        """Restore the reported home if the vehicle has rejected the new one."""
+        """Restore the reported home if the vehicle has rejected the new home."""
         if not order.cancelled() and isinstance(order.exception(), (CommandRejected, OperationTimeout)):
             self._home_location = self._dk_reported_home
 

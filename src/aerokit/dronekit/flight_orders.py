@@ -202,7 +202,7 @@ class CurrentCommand:
         return has_ended and not self._core.aio.is_armed
 
     async def _choose(self, seq: int) -> None:
-        """Send MISSION_SET_CURRENT once, as DroneKit does; if it is not confirmed, send a command with retries."""
+        """Send MISSION_SET_CURRENT once, like DroneKit. Without confirmation, send a command with retries."""
         aio = self._core.aio
         if not aio.autopilot.home_is_item_0:
             await aio.mission.set_current(max(seq - 1, 0))

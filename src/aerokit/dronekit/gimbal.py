@@ -27,7 +27,7 @@ class Gimbal(GimbalPrivates):
     """The first gimbal: its attitude, and orders to it.
 
     :attr:`pitch`, :attr:`roll` and :attr:`yaw` are None until the vehicle reports a gimbal. Orders return immediately.
-    A newer order replaces an unanswered one. A rejection is logged as a warning of the logger ``dronekit``. Raises
+    A newer order replaces an unanswered order. A rejection is logged as a warning of the logger ``dronekit``. Raises
     ValueError for invalid numbers and locations, and APIException while the link is down.
     """
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from aerokit.transport.link import Peer
 
 MAX_MESSAGES = 1000
-MESSAGE_MAX_AGE_S = 5.0  # older messages are dropped, so that a program that rarely reads gets recent ones
+MESSAGE_MAX_AGE_S = 5.0  # older messages are dropped, for programs that rarely read
 FIRST_LOOKUP_TIMEOUT_S = 1.0  # time to wait for a message, because none is stored before the first access
 SIGNAL_CHECK_INTERVAL_S = 0.2  # longer waits are split, so that Ctrl-C and a closed connection are noticed
 

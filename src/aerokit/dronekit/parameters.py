@@ -159,7 +159,7 @@ class ParameterValues:
         return {name: float(parameter.value) for name, parameter in self._known.copy().items()}
 
     def find(self, name: str) -> ResolvedParameter | None:
-        """Look up a parameter by an upper-case name, which may be the old or the new one."""
+        """Look up a parameter by an upper-case name, old or new."""
         known = self._known
         return resolve_known(name if name in known else self._spelled.get(name, name), known)
 

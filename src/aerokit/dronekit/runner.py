@@ -38,8 +38,9 @@ SITL_ALIAS, SITL_MODULE = "dronekit_sitl", "aerokit.dronekit.sitl"
 def install() -> None:
     """Make ``import dronekit`` and ``from dronekit.lib import …`` import :mod:`aerokit.dronekit`.
 
-    ``import dronekit_sitl`` imports :mod:`aerokit.dronekit.sitl`, unless another one was imported before. Takes
-    precedence over an installed DroneKit. Idempotent. For test runners (in ``conftest.py``) and embedding programs.
+    ``import dronekit_sitl`` imports :mod:`aerokit.dronekit.sitl`, unless another ``dronekit_sitl`` was imported before.
+    Takes precedence over an installed DroneKit. Idempotent. For test runners (in ``conftest.py``) and embedding
+    programs.
 
     Raises:
         ImportError: another ``dronekit`` was imported before.

@@ -111,7 +111,7 @@ class FleetAction:
 
     @property
     def orders(self) -> dict[str, str]:
-        """Orders of the policy by member name; empty if no member failed, or the others continue."""
+        """Orders of the policy by member name; empty if no member failed, or if the other members continue."""
         return dict(self._orders)
 
     @property

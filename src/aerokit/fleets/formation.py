@@ -351,7 +351,7 @@ class Formations(Travel):
         """Keep a formation while the leader moves: ``async with fleet.following(formation, leader="north/1"):``.
 
         Each follower is flown by velocity set-points. If the leader is lost or taken over, the followers hold. If a
-        follower fails, the fleet's policy decides about the others.
+        follower fails, the fleet's policy decides about the other followers.
 
         Args:
             formation: the places.

@@ -31,7 +31,7 @@ class MemberState(enum.Enum):
     TAKEN_OVER = "taken over"
     """A pilot, a failsafe or another program controls the member. The fleet sends it no orders until ``reclaim``."""
     FAILED = "failed"
-    """The member failed in its last action. It takes part in the next one."""
+    """The member failed in its last action. It takes part in the next action."""
     RELEASED = "released"
     """The program released the member. The fleet sends it no orders until ``reclaim``."""
 

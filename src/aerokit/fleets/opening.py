@@ -218,7 +218,7 @@ async def find_systems(
     given: int,
     timeout: float,
 ) -> dict[str, list[int]]:
-    """Return the system ids to connect to, by network: the requested ones, or all found that have no vehicle object.
+    """Return the system ids to connect to, by network: the requested ids, or all found without a vehicle object.
 
     Args:
         networks: connections by name.

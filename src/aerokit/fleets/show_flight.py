@@ -307,7 +307,7 @@ class Shows(Travel):
         """Fly a show: all members fly to their first points, start at the same instant, and hold at the end.
 
         The members have to be in the air. Their clocks are measured with TIMESYNC, so that delayed telemetry does not
-        count as deviation. If a member fails, the fleet's policy decides about the others, as in any action.
+        count as deviation. If a member fails, the fleet's policy decides about the other members, as in any action.
 
         Args:
             show: tracks by member's name; :meth:`Show.renamed` assigns tracks to members.

@@ -63,7 +63,7 @@ class Travel(SelectionBase):
             InvalidArgument: a name is unknown, or a target is too far away. Nothing was sent.
             ValueUnknownError: the position of a member is unknown. Nothing was sent.
             OperationRejected: paths come too close and cannot be separated: nothing was sent. Or a member became
-                unavailable between two legs in layers: the others stay in their layers.
+                unavailable between two legs in layers: the other members stay in their layers.
         """
         if speed_m_s is not None:
             check_range("speed_m_s", speed_m_s, 0, 1000, above=True)

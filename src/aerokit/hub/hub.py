@@ -52,8 +52,8 @@ class Hub:
     ```
 
     Each client of a listening endpoint is routed separately. Lost links are reopened. An endpoint that fails, stalls or
-    is flooded does not affect the others: its queue is bounded, newer telemetry replaces older telemetry, and a command
-    that has waited for a second is dropped.
+    is flooded does not affect other endpoints: its queue is bounded, newer telemetry replaces older telemetry, and a
+    command that has waited for a second is dropped.
 
     A hub runs in the asyncio loop in which it is entered, and can be entered once.
     """

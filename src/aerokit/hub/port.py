@@ -307,7 +307,7 @@ class Port:
 
 
 def joined(batch: list[bytes]) -> list[bytes]:
-    """Join pieces to larger ones of at most `MAX_JOINED_BYTES`. Larger pieces are not joined."""
+    """Join pieces to larger pieces of at most `MAX_JOINED_BYTES`. Larger pieces are not joined."""
     whole = b"".join(batch)
     if len(whole) <= MAX_JOINED_BYTES:
         return [whole] if whole else []

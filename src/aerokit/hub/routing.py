@@ -110,8 +110,8 @@ class Router(Generic[PortT]):
       within two seconds are dropped. Later copies are dropped if they prove a loop. Copies do not change routes.
     - SETUP_SIGNING, which contains a key, is not forwarded. Status messages of telemetry radios do not go to vehicles.
 
-    At most `MAX_ROUTES` senders are remembered. A new sender replaces one without heartbeats, or one that was silent
-    for `PEER_TTL_S`. If there is neither, messages for the new sender are dropped.
+    At most `MAX_ROUTES` senders are remembered. A new sender replaces a sender without heartbeats, or a sender that was
+    silent for `PEER_TTL_S`. If there is none, messages for the new sender are dropped.
 
     ``period(port, message_id)`` returns the minimum interval of a message at a port in seconds: None if the message
     does not go there, 0 without a limit. The interval applies per sender, to broadcasts only.
@@ -258,10 +258,10 @@ class Router(Generic[PortT]):
             self._report("route_changed", sender.source, node, before)
 
     def _is_copy(self, before: tuple[int, int, float], number: int, now: float, is_late: bool) -> bool:
-        """Return True if a frame is a copy of an earlier one, not the first frame of a restarted program.
+        """Return True if a frame is a copy of an earlier frame, not the first frame of a restarted program.
 
-        A restarted program starts its sequence numbers again. Its first command may equal an earlier one and must not
-        be lost. It arrives at a new port after the former port was removed, or at the same port after a while.
+        A restarted program starts its sequence numbers again. The first command may equal an earlier command and must
+        not be lost. It arrives at a new port after the former port was removed, or at the same port after a while.
         """
         first, count, at = before
         if first == number:

@@ -94,7 +94,7 @@ class EndpointStatistics(Snapshot):
     peers: int
     """Number of clients or senders."""
     frames_in: int
-    """Valid frames, including refused and duplicate ones."""
+    """Valid frames, including refused frames and duplicates."""
     bytes_in: int
     frames_out: int
     bytes_out: int

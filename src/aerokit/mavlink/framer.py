@@ -1,9 +1,9 @@
 """`Framer`: extracts frames from bytes.
 
 The input may be datagrams or a stream cut anywhere, with noise and text between frames. The framer never raises. At
-each byte that could start a frame, it applies these rules in order: a frame with a valid checksum is returned; after a
-plausible header, it waits for the rest; anything else is skipped one byte at a time, so that a valid frame after noise
-is found. https://mavlink.io/en/guide/serialization.html
+each byte that could start a frame, it applies these rules in order: a frame with a valid checksum is returned; if the
+header is plausible, the framer waits for the rest of the frame; anything else is skipped one byte at a time, so that a
+valid frame after noise is found. https://mavlink.io/en/guide/serialization.html
 """
 
 from __future__ import annotations
@@ -210,7 +210,7 @@ class PythonFramer:
         """Return the next valid frame from ``begin`` on, or keep possible beginnings of frames in ``_rest``."""
         size = len(data)
         hold = -1  # data is kept from here on
-        unknown = unknown_end = -1  # a whole frame of an unknown message, unless it contains a valid one
+        unknown = unknown_end = -1  # a whole frame of an unknown message, unless it contains a valid frame
         examined, candidates, bad_crcs = scan
         pending: list[tuple[int, int, int]] = []
         bad_crcs = list(bad_crcs)

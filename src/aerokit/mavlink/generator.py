@@ -310,7 +310,7 @@ def generate(folder: Path | None = None) -> dict[str, str]:
 
 
 def differences(folder: Path | None = None) -> list[str]:
-    """Return the committed files that differ from the generated ones."""
+    """Return the committed files that differ from the generated files."""
     files = generate(folder)
     present = {
         path.relative_to(FOLDER).as_posix()

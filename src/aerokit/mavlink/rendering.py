@@ -15,7 +15,7 @@ from aerokit.mavlink.frame import HEADER_LENGTH
 from aerokit.mavlink.message import STRUCT_CODES
 
 _WIDTH = 110
-# Arrays up to this length are unpacked into separate names, longer ones are sliced.
+# Arrays up to this length are unpacked into separate names; longer arrays are sliced.
 _MAX_UNPACKED_LENGTH = 4
 
 
@@ -196,7 +196,7 @@ def _default(f: FieldDefinition) -> str:
 
 
 def _init(message: MessageDefinition) -> list[str]:
-    # Parameters after one with a default need defaults too, so those without one become keyword-only.
+    # Parameters after a parameter with a default need a default, too. Parameters without a default become keyword-only.
     arguments: list[str] = []
     optional = False
     for f in message.fields:

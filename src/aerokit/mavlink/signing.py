@@ -268,7 +268,8 @@ class Signing:
         self._advance(max(self.timestamp, stamp))
 
     def _advance(self, timestamp: int) -> None:
-        # Store the timestamp before using it, so that the next program starts with a later one even after a crash.
+        # Store the timestamp before using it, so that the next program starts with a later timestamp even after a
+        # crash.
         if self._timestamp_file is not None:
             self._timestamp_file.reserve(timestamp, ONE_MINUTE // 2)  # a sender may be a minute behind
         self.timestamp = timestamp

@@ -66,7 +66,7 @@ class SourceStatistics(SourceFields):
         self.lost: int = 0
         """Number of lost frames. A frame that arrives late is subtracted again."""
         self.expected = sequence
-        """Sequence number of the next frame. It does not wrap at 255; its low byte is the number on the wire."""
+        """Sequence number of the next frame. Does not wrap at 255; the low byte is the number on the wire."""
         # How far `expected` has advanced without a received frame. `received` is derived from the two, so that counting
         # a frame needs a single addition.
         self._without = sequence
@@ -167,7 +167,7 @@ class SourceStatistics(SourceFields):
         self._missing, self._missing_at, self._skipped_over = 0, self.expected, 0
 
     def _continue_other(self, sequence: int, now: float) -> int:
-        # The other stream counts as the sender if it has more frames, or if the current one has timed out.
+        # The other stream counts as the sender if it has more frames, or if the current stream has timed out.
         count, was_first = self.received - self._since, self._other_count > self.received - self._since
         is_over = now - self._moved_at > _STREAM_TIMEOUT_S
         self._take_turns(now, 1)

@@ -93,7 +93,7 @@ def _record_end(data: bytes, begin: int, earliest: int) -> int | None:
 
 
 def _looks_shifted(data: bytes, begin: int, end: int) -> bool:
-    """Return True if the real record begins inside this one, i.e. if another record follows directly after it."""
+    """Return True if this record contains the start of the real record, which another record follows directly."""
     for inside in range(begin + 1, end):
         true_end = _frame_end(data, inside)
         if true_end is not None and true_end > end and _frame_end(data, true_end) is not None:

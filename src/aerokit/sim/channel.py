@@ -225,7 +225,7 @@ class Channel:
         return datagrams(self.take_pieces())
 
     def reset(self) -> None:
-        """Reset rates, partial frames and sequence numbers, as a reboot does; the outbox stays."""
+        """Reset rates, partial frames and sequence numbers because of a reboot; the outbox stays."""
         self.streams = Streams()
         self.reader = MessageReader(self._wanted)
         self._encoders.clear()

@@ -61,7 +61,7 @@ class LocalFrame:
 def true_place(vehicle: Any) -> GlobalPoint:
     """Return the true position of a simulated vehicle.
 
-    Raises InvalidArgument for a vehicle without one, such as a recording.
+    Raises InvalidArgument for a vehicle without a position, such as a recording.
     """
     frame, motion = getattr(vehicle, "frame", None), getattr(vehicle, "motion", None)
     if frame is None or motion is None:

@@ -132,7 +132,7 @@ class ArduPilotParameterServer(ParameterServer):
 
 
 def rounded(value: float, type_: int) -> float:
-    """Convert a float for an integer parameter as ArduPilot does: add 0.01 away from zero, then truncate."""
+    """Convert a float for an integer parameter like ArduPilot: add 0.01 away from zero, then truncate."""
     if type_ == MavParamType.REAL32:
         return value
     shifted = value + math.copysign(_ROUNDING_OFFSET, value)
@@ -145,7 +145,7 @@ _UNUSED_INDEX = 24400
 
 
 class Px4ParameterServer(ParameterServer):
-    """Parameter protocol of PX4; ``errors`` sends PARAM_ERROR, as PX4's main branch does and v1.16 does not.
+    """Parameter protocol of PX4; ``errors`` sends PARAM_ERROR, like PX4's main branch, but unlike v1.16.
 
     Values are stored unchecked. PARAM_SET is confirmed on the sender's port, and a change is broadcast shortly after.
     Setting _HASH_CHECK stops a running list. A second list request restarts the list without the hash.

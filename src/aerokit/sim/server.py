@@ -41,7 +41,7 @@ class SimulatorServer:
     An exception in a vehicle or a callback closes the links and cancels the task that runs the block; the block then
     raises the exception.
 
-    Raises LinkOpenError if a link cannot be opened, after closing the others.
+    Raises LinkOpenError if a link cannot be opened; the other links are closed again.
     """
 
     def __init__(

@@ -66,7 +66,7 @@ class FaultInjector:
         self._set("motor_failed", True, False, after_s, None)
 
     def drop_packets(self, share: float, *, after_s: float = 0.0, for_s: float | None = None) -> None:
-        """Lose this share of packets, 0 to 1, in both directions. The seed of the vehicle determines which ones."""
+        """Lose this share of packets, 0 to 1, in both directions. The vehicle's seed determines which packets."""
         if not 0.0 <= share <= 1.0:
             raise InvalidArgument(f"share = {share!r} is not allowed: 0 to 1")
         self._set("loss", share, 0.0, after_s, for_s)

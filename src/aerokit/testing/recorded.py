@@ -49,7 +49,7 @@ class RecordedParameters:
         return name in self.names or (name == HASH_NAME and self._hash)
 
     def value_message(self, name: str, index: int | None = None) -> m.ParamValue:
-        """Return the latest PARAM_VALUE, written or recorded. Before the first recorded value, return the first one."""
+        """Return the latest PARAM_VALUE, written or recorded. Before the first recorded value, return that value."""
         position, recorded = self._vehicle.position_s, None
         for time, value in self._vehicle.recording.parameters:
             if value.param_id == name and (recorded is None or time <= position):
@@ -141,7 +141,7 @@ class RecordedMissions:
             vehicle.on(kind, handler)
 
     def items(self, mission_type: int) -> tuple[AnyItem, ...] | None:
-        """Return the current plan, or the first one if none was recorded yet; None if the recording has none."""
+        """Return the current plan; before the first recorded plan, that plan; None if none was recorded."""
         if mission_type in self._written:
             return self._written[mission_type]
         position, found = self._vehicle.position_s, None
@@ -214,7 +214,7 @@ class RecordedMissions:
         self._acknowledge(message, message.mission_type, result, channel)
 
     def _result(self, what: str, results: list[int], mission_type: int) -> int:
-        """Return the next of the recorded results; the last one is repeated."""
+        """Return the next of the recorded results; the last result is repeated."""
         number = self._done.get((what, mission_type), 0)
         self._done[what, mission_type] = number + 1
         return results[min(number, len(results) - 1)]
@@ -368,7 +368,7 @@ class RecordedVehicle(SimulatedVehicle):
         return self._on_command(command)
 
     def _latest_message(self, message_id: int) -> Message | None:
-        """Return the latest message with this id, or the first one if none was played yet."""
+        """Return the latest message with this id. Before the first such message was played, return that message."""
         stream = self.recording.stream
         own = (self.system_id, self.component_id)
         for _, frame in (*reversed(stream[: self._next]), *stream[self._next :]):

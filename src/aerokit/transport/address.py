@@ -173,7 +173,7 @@ class _Parser:
         return self.bare(text)
 
     def split_scheme(self, text: str) -> tuple[str, str]:
-        """Return the scheme in lower case ("" if there is none), and the rest."""
+        """Return the scheme in lower case ("" if there is none), and the text after it."""
         if match := _URL.fullmatch(text):
             return match[1].lower(), match[2]
         match = _SCHEME.fullmatch(text)

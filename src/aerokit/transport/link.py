@@ -59,7 +59,7 @@ class OrderRefusalListener(Receiver, Protocol):
 class PeerKeeper(Receiver, Protocol):
     """A receiver that decides by `Link.keep_peer` which peers a link remembers. Senders of noise are then forgotten.
 
-    A link that wraps another one forwards `Link.keep_peer`, `Link.forget_peer` and `Link.host_of`.
+    A link that wraps another link forwards `Link.keep_peer`, `Link.forget_peer` and `Link.host_of`.
     """
 
     keeps_peers: bool

@@ -124,7 +124,7 @@ class Outbox:
             self._forward(self._joined())
 
     def _joined(self) -> bytes:
-        """Return the next write, joined with following ones up to `_MAX_JOINED_BYTES`."""
+        """Return the next write, joined with following writes up to `_MAX_JOINED_BYTES`."""
         data = self._next()
         while self._waiting and len(data) + len(self._waiting[0][1]) <= _MAX_JOINED_BYTES:
             data += self._next()

@@ -187,7 +187,7 @@ class _SerialProtocol(asyncio.Protocol):
 
 
 def _replace_calls(port: Any, on_failure: _OnFailure) -> None:
-    """Replace the methods of a port by ones that never block and report a lost device to ``on_failure``."""
+    """Replace the methods of a port by methods that never block and report a lost device to ``on_failure``."""
     port.flush = lambda: None
     if os.name == "posix":
         port.read = partial(_read, port.fileno(), on_failure)

@@ -48,7 +48,7 @@ class _TcpLink(BaseLink):
     def __init__(self, scheme: str, host: str, port: int) -> None:
         super().__init__(f"{scheme}:{host_and_port(host, port)}")
         self._host, self._port = host, port
-        self._streams: set[_Stream] = set()  # including closing ones
+        self._streams: set[_Stream] = set()  # including closing streams
         self._stalled: set[_Stream] = set()
 
     @property
@@ -194,12 +194,12 @@ class TcpListen(_TcpLink):
         return 0 if stream is None else stream.unsent_bytes
 
     def keep_peer(self, peer: Peer) -> None:
-        """See `Link.keep_peer`. A kept client is not replaced by another one."""
+        """See `Link.keep_peer`. A kept client is not replaced by a new client."""
         if peer in self._clients:
             self._kept.add(peer)
 
     def forget_peer(self, peer: Peer) -> None:
-        """See `Link.forget_peer`. The client may be replaced by another one."""
+        """See `Link.forget_peer`. The client may then be replaced by a new client."""
         self._kept.discard(peer)
 
     def has_peer(self, peer: Peer) -> bool:

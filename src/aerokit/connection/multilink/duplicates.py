@@ -98,7 +98,7 @@ COMPONENT_TTL_S = 10.0
 
 MAX_STREAMS = 1024
 
-# Answers to requests. They do not become outdated in transit as telemetry does.
+# Answers to requests. Unlike telemetry, they do not become outdated in transit.
 ANSWERS = frozenset(
     message_type.ID
     for message_type in (

@@ -154,7 +154,7 @@ class Candidate:
 # Two links that carried the same frame within this time carry one stream.
 SHARED_MAX_AGE_S = 5.0
 
-# A working link is replaced only if the cost of another one stays below this share of its cost for MIN_BETTER_S.
+# A working link is replaced only if another link costs less than this share of its cost for MIN_BETTER_S.
 MAX_COST_RATIO = 0.5
 MIN_BETTER_S = 3.0
 
@@ -165,7 +165,7 @@ MAX_SWITCH_DELAY_S = 10.0
 
 
 class LinkChoice:
-    """The links to one system, and the one in use.
+    """The links to one system, and the link in use.
 
     Systems with an autopilot need proof (``needs_proof``) that a second link leads to the same vehicle: a matching
     clock, or the same frames. Without proof, the frames of the link are refused, and no command is sent over it. A link
@@ -317,7 +317,7 @@ class LinkChoice:
         if former is not None:
             longer_s = ((to.round_trip_s or 0.0) - (former.round_trip_s or 0.0)) / 2
             self.fresh_after = former.received_at + longer_s + JITTER_S
-            # Both links lead to the same vehicle, otherwise the new one would not be used.
+            # Both links lead to the same vehicle; otherwise the new link would not be used.
             former.is_proven = not former.is_other_hardware
         self.former, self.used, self.changed_at, self._better = former, to, now, None
         self._adopt_hardware(to)

@@ -97,7 +97,7 @@ POLL_INTERVAL_S = 0.1
 # A link over which a system was silent for this time is neither probed nor counted until the next heartbeat.
 CANDIDATE_TIMEOUT_S = 30.0
 
-# Commands that must not arrive after a newer one.
+# Commands that must not arrive after a newer command.
 COMMANDS = frozenset(
     message_type.ID
     for message_type in (
@@ -208,7 +208,7 @@ class MultiLinkRoutes:
     def is_copy(self, frame: Frame, peer: Peer) -> bool:
         """Return True if this frame was already accepted over another link, or is our own.
 
-        PX4 forwards our heartbeats from one of its ports to the others.
+        PX4 forwards our heartbeats from one of its ports to its other ports.
         """
         if frame.system_id == self._own_source[0] and frame.component_id == self._own_source[1]:
             return True
@@ -276,7 +276,7 @@ class MultiLinkRoutes:
     # ---------------------------------------------------------------------------- internal
 
     def _link_to(self, choice: LinkChoice, source: tuple[int, int]) -> int:
-        """Return the link in use, or another link to the same system if only that one reaches the component."""
+        """Return the link in use, or another link to the same system if only that link reaches the component."""
         assert choice.used is not None
         if not self._routes[choice.used.link].has_route(source):
             for link, candidate in choice.candidates.items():

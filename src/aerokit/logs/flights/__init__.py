@@ -70,7 +70,7 @@ def read_flight(
 
     Args:
         log: a ``.tlog`` of a ground station or of ``record=``, a ``.bin`` of ArduPilot, a ``.ulg`` of PX4.
-        system_id: system id of the vehicle, if a ``.tlog`` contains several; None: the first one.
+        system_id: system id of the vehicle, if a ``.tlog`` contains several vehicles; None: the first vehicle.
         on_progress: called from time to time with the bytes that were read.
 
     Raises:

@@ -46,7 +46,7 @@ class TimeSeries:
         return f"<TimeSeries {', '.join(self.names)}: {len(self)} rows>"
 
     def add(self, time_s: float, *values: float) -> None:
-        """Add a row with one value for each column. A row older than the last one gets the time of the last one."""
+        """Add a row with one value for each column. A row older than the last row gets the time of the last row."""
         times = self.times
         if times and time_s < times[-1]:
             time_s = times[-1]

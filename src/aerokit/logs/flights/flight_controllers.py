@@ -187,7 +187,7 @@ def _known(value: float) -> float | None:
 
 def _ardupilot_battery(fields: Mapping[str, Any]) -> States:
     number = fields.get("Instance", fields.get("Inst", 0))
-    if number != 0:  # the state lists all batteries, but a row has only one
+    if number != 0:  # the state lists all batteries, but a row has a single battery
         return ()
     return (("batteries", (Battery(number, _known(fields["Volt"]), _known(fields["Curr"])),)),)
 

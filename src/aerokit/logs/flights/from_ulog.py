@@ -363,7 +363,7 @@ class _Reader:
         self._links()
 
     def _links(self) -> None:
-        # If there are several links, use the one that received the most messages.
+        # If there are several links, use the link that received the most messages.
         links = [topic for _, topic in self._topics("telemetry_status") if "rx_message_lost_rate" in topic]
         if links:
             best = max(links, key=lambda topic: float(topic.array("rx_message_count")[-1]))

@@ -197,7 +197,7 @@ class Calibrations:
         return self.compasses.is_running
 
     def reset(self) -> None:
-        """Cancel all calibrations, as a reboot does."""
+        """Cancel all calibrations, because of a reboot."""
         self.compasses.reset()
         self.accelerometers.reset()
 

@@ -99,7 +99,7 @@ class CopterThrow(CopterHold):
 
 
 class CopterFollow(CopterHold):
-    """FOLLOW: needs FOLL_ENABLE, and holds the position as the firmware does without a vehicle to follow."""
+    """FOLLOW: needs FOLL_ENABLE, and holds the position, like the firmware without a vehicle to follow."""
 
     def enter(self, *, force: bool) -> bool:
         if self.vehicle.parameters["FOLL_ENABLE"]:

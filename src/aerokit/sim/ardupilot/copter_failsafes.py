@@ -273,7 +273,7 @@ _FENCE_ACTIONS: dict[int, tuple[int, ...]] = {
 class CopterFence(ArduPilotFence[CopterHost]):
     """Fence. FENCE_ACTION: report only (0), RTL (1), LAND (2), SMART_RTL (3, 5), BRAKE (4).
 
-    If the mode is refused, or the copter is more than 100 m outside the fence, it changes to LAND instead.
+    If that mode is refused, or the copter is more than 100 m outside the fence, the mode is LAND instead.
     """
 
     PERIOD_S: ClassVar[float] = 0.1

@@ -125,7 +125,7 @@ class ArduPilotFailsafes(Generic[HostT]):
 
     @property
     def ground_station_silence(self) -> float:
-        """Seconds since the last heartbeat of the ground station; NaN before the first one."""
+        """Seconds since the last heartbeat of the ground station; NaN before the first heartbeat."""
         return self.vehicle.now - self.ground_station_seen_at
 
     def update(self) -> None:

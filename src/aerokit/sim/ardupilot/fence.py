@@ -388,7 +388,7 @@ class ArduPilotFence(Generic[HostT]):
 
 
 def _joined_names(kinds: int) -> str:
-    """Join names of fences as the firmware does: Max Alt, Circle and Polygon fences."""
+    """Join names of fences like the firmware: Max Alt, Circle and Polygon fences."""
     words = [name for kind, name in _NAMES.items() if kinds & kind]
     text = words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
     return f"{text} fence" + "s" * (len(words) > 1)

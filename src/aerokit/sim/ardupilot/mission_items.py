@@ -153,7 +153,7 @@ def _kept_turns(item: MissionItem) -> tuple[float, float, float, float]:
 
 
 def whole(value: float) -> int:
-    """Truncate towards zero, as C does; 0 for values beyond 32 bits."""
+    """Truncate towards zero, like C; 0 for values beyond 32 bits."""
     return int(value) if abs(value) < 2**31 else 0
 
 

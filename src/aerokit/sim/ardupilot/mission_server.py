@@ -83,7 +83,7 @@ class ArduPilotMissionServer:
         return [] if items is None else items.items()
 
     def replace(self, mission_type: int, items: Sequence[MissionItem], *, start: int = 0, clear: bool = True) -> int:
-        """Store items as a file upload does; return the MAV_MISSION_RESULT. Only missions support ``clear=False``."""
+        """Store items like a file upload; return the MAV_MISSION_RESULT. Only missions support ``clear=False``."""
         if mission_type == MavMissionType.MISSION:
             if clear:
                 self._clear(self.commands)
@@ -100,7 +100,7 @@ class ArduPilotMissionServer:
         return _R.ACCEPTED
 
     def reset(self) -> None:
-        """Drop uploads, as a reboot does; stored items stay."""
+        """Drop uploads because of a reboot; stored items stay."""
         self._uploads.clear()
 
     def _home(self) -> MissionItem:

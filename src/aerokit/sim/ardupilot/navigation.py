@@ -265,7 +265,7 @@ class SmartPath:
         self._vehicle.every(_PERIOD_S, self.update)
 
     def reset(self) -> None:
-        """Discard the path and start a new one at the vehicle, as arming does; inactive without a position."""
+        """Discard the path and start a new path at the vehicle; without a position, the path is inactive."""
         parameters = self._vehicle.parameters
         self._points.clear()
         self._cleaned, self.is_active, self._is_started = 0, False, True

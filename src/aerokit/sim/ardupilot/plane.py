@@ -58,7 +58,7 @@ _FULL_AMPERES = 25.0
 
 
 class PlaneEngine(ArduPilotMotors):
-    """Engine of a plane; its throttle is that of the motion model."""
+    """Engine of a plane, with the throttle of the motion model."""
 
     @property
     def current_a(self) -> float:

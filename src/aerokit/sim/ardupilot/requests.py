@@ -149,7 +149,7 @@ class ArduPilotMessageRequests:
         return f"MAV{self._vehicle.channels.index(channel) + 1}_"
 
     def restart(self) -> None:
-        """Restore the saved rates, as a reboot does."""
+        """Restore the saved rates, because of a reboot."""
         parameters = self._vehicle.parameters
         for name, (saved, present) in self._saved.items():
             if parameters[name] == present:

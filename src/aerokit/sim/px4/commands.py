@@ -68,7 +68,7 @@ _FAILURES = {
 
 
 def _inject_failure(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
-    """Acknowledge a failure of the motors or the battery, as SIH does; the failure has no effect."""
+    """Acknowledge a failure of the motors or the battery, like SIH. The failure has no effect."""
     if not px4.parameters.get("SYS_FAILURE_EN", 0):
         return MavResult.DENIED
     unit, kind = whole(command.param1), whole(command.param2)

@@ -323,7 +323,7 @@ class Px4MissionServer:
         self._link(channel).on_item(message)
 
     def reset(self) -> None:
-        """Drop transfers, as a reboot does; stored items stay."""
+        """Drop transfers because of a reboot; stored items stay."""
         self._links.clear()
         self.uploading = None
 

@@ -175,7 +175,7 @@ class Px4Storage:
             self.parameters.burst = self.ftp.burst = self.logs.burst = 1
 
     def restart(self) -> None:
-        """Drop transfers and sessions, as a reboot does; files stay."""
+        """Drop transfers and sessions because of a reboot; files stay."""
         self.parameters.restart()
         self.ftp.restart()
         self.logs.restart()

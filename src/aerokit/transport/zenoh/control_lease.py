@@ -133,7 +133,7 @@ class ControlLease:
         return self._holder == client
 
     def take(self, client: str, now: float) -> None:
-        """Give the lease to this client, even if another one holds it."""
+        """Give the lease to this client, even if another client holds it."""
         self._holder, self._received_at = client, now
 
     def release(self, client: str) -> None:
@@ -158,7 +158,7 @@ class ClientFilter:
     def receive(self, data: bytes, mode: ControlMode, now: float, nonce: int = 0) -> tuple[bytes, list[RefusalNotice]]:
         """Process a fresh datagram. Return the accepted frames, and the notices for the client.
 
-        ``nonce`` distinguishes programs that use the same client name by mistake; only the first one gets control.
+        ``nonce`` distinguishes programs that use the same client name by mistake; only the first program gets control.
         """
         is_namesake = self._is_namesake(nonce, mode, now)
         if not is_namesake:
@@ -271,7 +271,7 @@ class FreshnessChecker:
         self.late: int = 0
         """Datagrams refused because their stamp was too old, or from another vehicle side."""
         self.duplicates: int = 0
-        """Datagrams refused because an equal or later one was received before."""
+        """Datagrams refused because an equal or later datagram was received before."""
         self._number = 0
         self._sent: deque[tuple[int, float]] = deque()  # (number, time) of valid beacons
         self._sequences: OrderedDict[tuple[str, int], int] = OrderedDict()
@@ -283,7 +283,7 @@ class FreshnessChecker:
         return Beacon(self.epoch, self._number, now, lease_holder)
 
     def accepts(self, client: str, stamp: Stamp | None, now: float) -> bool:
-        """Return True if a datagram with this stamp is fresh and new. Refused ones are counted."""
+        """Return True if a datagram with this stamp is fresh and new. Refused datagrams are counted."""
         self._expire(now)
         is_fresh = (
             stamp is not None

@@ -36,7 +36,7 @@ MAX_CLIENTS = 64
 """Maximum number of clients. A further one is ignored unless a client has been silent for `CLIENT_TIMEOUT_S`."""
 
 CLIENT_TIMEOUT_S = 30.0
-"""Silence after which a client may be replaced by a new one."""
+"""Silence after which a client may be replaced by a new client."""
 
 _MIN_BEACON_INTERVAL_S = 0.02
 _RIVAL_TIMEOUT_S = 2.5 * BEACON_INTERVAL_S
@@ -205,7 +205,7 @@ class ZenohListen(NetworkLink):
             self._remove_client(str(oldest))
 
     def _on_client_joined(self, name: str) -> None:
-        # Send an extra beacon, so that the client need not wait for the next one.
+        # Send an extra beacon, so that the client need not wait for the next periodic beacon.
         if self._add_client(name) is not None and self._timer is not None:
             self._timer.cancel()
             delay_s = max(0.0, self._beacon_at + _MIN_BEACON_INTERVAL_S - self._now())

@@ -95,7 +95,7 @@ async def open_in_thread(work: Callable[[], ItemT], close: Callable[[ItemT], obj
 
 
 MAX_PAYLOAD_BYTES = 65535
-"""Maximum payload; larger ones are ignored. Both sides send single frames or the frames of one datagram."""
+"""Maximum payload; larger payloads are ignored. Both sides send single frames or the frames of one datagram."""
 
 _CONNECT_FAILED = "Unable to connect to any of"
 
