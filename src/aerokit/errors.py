@@ -62,7 +62,7 @@ class LinkLost(LinkError):
 
 
 class RecordingEnded(LinkLost):
-    """The recording being replayed has ended, or its next part cannot be read."""
+    """The recording being replayed has ended, or the rest of the file cannot be read."""
 
 
 class ConnectionClosed(AerokitError):
@@ -249,7 +249,7 @@ class StaleValueError(ValueUnknownError):
 
 
 class SubscriptionOverflow(AerokitError):
-    """A subscription with the policy ``error`` overflowed, because the program did not read it fast enough."""
+    """A subscription with the policy ``error`` overflowed, because the program read too slowly."""
 
 
 class SetpointStreamStopped(AerokitError):

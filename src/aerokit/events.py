@@ -71,9 +71,9 @@ class Event(Snapshot):
 
 
 class VehicleFound(Event):
-    """The first heartbeat of an autopilot arrived on the connection, even if no `Vehicle` is connected to it.
+    """The first heartbeat of an autopilot arrived on the connection, even if no `Vehicle` is connected.
 
-    ``vehicle_type`` is its MAV_TYPE, ``autopilot`` its MAV_AUTOPILOT.
+    ``vehicle_type`` is the MAV_TYPE, ``autopilot`` the MAV_AUTOPILOT in the heartbeat.
     """
 
     component_id: int
@@ -413,7 +413,7 @@ class LinkStatus(Snapshot):
     link: str
     """Address of the link."""
     state: LinkState
-    """SILENT: no vehicle was received for a second or two. LOST: closed; aerokit reopens it if possible."""
+    """SILENT: no vehicle was received for a second or two. LOST: the link is closed; aerokit reopens it if possible."""
     is_costly: bool
     """True if the link is used only when all others fail (``costly=1``)."""
     systems: tuple[int, ...]

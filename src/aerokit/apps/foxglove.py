@@ -191,7 +191,7 @@ class _TopicChannels:
             self._messages[frame.system_id, frame.component_id, message.ID] = message
 
     def publish(self, vehicles: Mapping[int, Vehicle]) -> None:
-        """Send all values that are newer than those already sent."""
+        """Send all values that are newer than the last values sent."""
         for system_id, vehicle in vehicles.items():
             self._publish_states(system_id, vehicle)
             self._publish_place(system_id, vehicle)

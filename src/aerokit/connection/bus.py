@@ -36,7 +36,7 @@ Detach = Callable[[], None]
 """Ends an attachment. Calling it a second time does nothing."""
 
 Sink = Callable[[Any], None]
-"""Callback for one message, frame or event. It must return quickly; it cannot await."""
+"""Callback for one message, frame or event. The callback must return quickly and cannot await."""
 
 EventT = TypeVar("EventT", bound=Event)
 
@@ -223,7 +223,7 @@ def copy_exception(error: ErrorT) -> ErrorT:
     """
     try:
         fresh = copy.copy(error)
-    except Exception:  # its constructor requires more than `args`
+    except Exception:  # the constructor of the exception requires more than `args`
         return error.with_traceback(None)
     fresh.__cause__, fresh.__suppress_context__ = error.__cause__, error.__suppress_context__
     return fresh

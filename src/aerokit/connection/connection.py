@@ -205,7 +205,7 @@ class Connection:
 
     @property
     def unsent_bytes(self) -> int:
-        """Number of written bytes that have not left this machine, if the link can measure it.
+        """Number of written bytes that have not left this machine, if the link can measure that number.
 
         A value that stays above 0 means that the link does not drain (TCP without a network, a serial port with flow
         control asserted); see :class:`LinkStalled`. Always 0 for UDP.
@@ -215,7 +215,7 @@ class Connection:
     def discard_unsent(self) -> None:
         """Discard data that was sent but has not left this program, e.g. an outdated command.
 
-        This applies to all waiting data, for all targets. Data in the system's TCP buffer cannot be discarded and
+        The call discards all waiting data, for all targets. Data in the system's TCP buffer cannot be discarded and
         stays in :attr:`unsent_bytes`.
         """
         self.link.discard_unsent()
@@ -291,7 +291,7 @@ class Connection:
         return [self._attach(item, sink, system_id) for item in types]
 
     def observe_frames(self, callback: FrameObserver) -> Detach:
-        """Call ``callback(frame, peer)`` with every received frame, after the subscribers of its message.
+        """Call ``callback(frame, peer)`` with every received frame, after the subscribers got the message.
 
         Frames with message ids outside the dialect are included, and their checksums are not checked. Frames that are
         refused because a second peer sends them under the ids of a known component are excluded. The callback must

@@ -200,7 +200,7 @@ class FrameReceiver:
                 observers.notify_received(frame, peer)
 
     def arrived_at(self) -> float:
-        """Return the receive time of the current frame: now, or earlier if it may have waited for a blocked loop."""
+        """Return the receive time of the current frame: now, or earlier if the frame may have waited in the socket."""
         return min(self._clock(), self._loop_watch.oldest_arrival)
 
     def statistics(self) -> Iterator[FramerStatistics]:

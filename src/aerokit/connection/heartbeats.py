@@ -82,9 +82,9 @@ class OwnHeartbeat(Snapshot):
 
     A vehicle's ground station failsafe acts when heartbeats stop. Heartbeats therefore pause when the program hangs,
     ``fed_within_s`` seconds after its last call or ``feed()``. None means 60 seconds in :mod:`aerokit.sync` and
-    :mod:`aerokit.dronekit`, whose event loop has its own thread, and no limit in asyncio, where a blocked loop sends
-    nothing anyway. Infinity means no limit. ``type`` is a MAV_TYPE: 6 for a ground station (GCS), 18 for a companion
-    computer (ONBOARD_CONTROLLER).
+    :mod:`aerokit.dronekit`, whose event loop runs on a thread of its own. In asyncio, None means no limit, because a
+    blocked loop sends nothing anyway. Infinity means no limit. ``type`` is a MAV_TYPE: 6 for a ground station (GCS), 18
+    for a companion computer (ONBOARD_CONTROLLER).
     """
 
     type: int = MavType.GCS.value
@@ -126,7 +126,7 @@ class HeartbeatWatchdog:
         self._paused_at: float | None = None
 
     def require(self, activity: ActivityMonitor, fed_within_s: float) -> None:
-        """Watch this activity too. ``fed_within_s`` is the limit if the settings have none."""
+        """Also watch this activity. ``fed_within_s`` is the limit if the settings have none."""
         self.activity = activity
         self._limit_s = fed_within_s if self._limit_s is None else self._limit_s
 
@@ -166,7 +166,7 @@ class LinkStateTracker:
         return self._cell.latest
 
     def record_activity(self, at: float) -> None:
-        """Record that something was received at this time: the state becomes CONNECTED."""
+        """Record that something was received at this time, which makes the state CONNECTED."""
         self._active_at = at
         if self._cell.latest is not LinkState.CONNECTED:
             self._set(LinkState.CONNECTED, at)

@@ -17,8 +17,8 @@ LATE_THRESHOLD_S = 0.1
 
 BLOCKED_THRESHOLD_S = 0.25
 
-# After this many loop iterations without a read, all data that waited during the pause has been read. One would not be
-# enough, because some loops run timers before sockets.
+# After this many loop iterations without a read, all data that waited during the pause has been read. One iteration
+# would not be enough, because some loops run timers before sockets.
 IDLE_ITERATIONS = 3
 
 # Platform → (clock that includes suspended time, clock of the loop). On Windows, the loop's clock includes that time.

@@ -98,7 +98,7 @@ MAX_ROUTES = 1024
 """Maximum number of components with a route. Messages to other components go to every peer."""
 
 MAX_CLAIMS = 256
-"""Maximum number of remembered claims. An evicted claim is reported again when it recurs."""
+"""Maximum number of remembered claims. An evicted claim is reported again when the peer repeats it."""
 
 SWEEP_INTERVAL_S = 1.0
 
@@ -124,8 +124,8 @@ class Routes:
     The first peer that sends a HEARTBEAT under these ids owns the route; frames of other peers under the same ids are
     dropped (``DuplicateSender``). Another peer takes over the route (``RouteChanged``)
 
-    1. at once, if it is another port of the same host and continues the owner's stream: three frames that continue its
-       sequence numbers and, where known, its time since boot, while the owner is silent for the time of three frames;
+    1. at once, if it is another port of the same host and continues the owner's stream: three frames continue the
+    sequence numbers and, where known, the time since boot, while the owner is silent for the time of three frames;
     2. after 3.5 s without a heartbeat, or when a TCP client has disconnected: if it is on the same host (a reboot or
        restart, with new numbers), or continues the stream as above from any host, or signs with our key;
     3. in the same case from any host, if the system has no vehicle object or the program allows it (``may_move``).
@@ -199,7 +199,7 @@ class Routes:
         return route is not None and route.peer != peer
 
     def claims_route(self, frame: Frame, peer: Peer, counters: SourceStatistics | None, is_signed: bool) -> bool:
-        """Return True if ``peer``, which does not own the route, takes it over with this frame; see the class."""
+        """Return True if ``peer`` takes over a route of another peer with this frame; see the class for the rules."""
         source, now = (frame.system_id, frame.component_id), frame.received_at
         route = self._routes[source]
         is_silent = now - route.heartbeat_at > ROUTE_TIMEOUT_S or not self._link.has_peer(route.peer)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
-# A vehicle that still has its key sends a signed heartbeat each second.
+# Unsigned frames prove a removed key, because a vehicle with a key sends a signed heartbeat each second.
 MIN_UNSIGNED_FRAMES = 3
 MIN_UNSIGNED_S = 2.0
 
@@ -54,9 +54,9 @@ class SignatureGate:
     def key_handover(self, signing: Signing | None, system_id: int, component_id: int) -> Iterator[asyncio.Event]:
         """Switch to ``signing`` when frames received during the block show that the component uses the new key.
 
-        The yielded event is set at the switch; before it, the old key signs and verifies. One frame signed with the
-        new key is enough. If the key is removed, at least `MIN_UNSIGNED_FRAMES` unsigned frames over `MIN_UNSIGNED_S`
-        without a signed one are needed, because any sender could forge a few.
+        The yielded event is set at the switch. Before the switch, the old key signs and verifies. One frame signed with
+        the new key is enough. If the key is removed, at least `MIN_UNSIGNED_FRAMES` unsigned frames over
+        `MIN_UNSIGNED_S` without a signed one are needed, because any sender could forge a few.
 
         Raises:
             BusyError: another handover is in progress.

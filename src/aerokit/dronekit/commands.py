@@ -109,7 +109,7 @@ class Command(_MissionItem):
 
 
 class SequenceState(Snapshot):
-    """Content of a CommandSequence. Replaced as a whole."""
+    """Content of a CommandSequence. A change replaces the whole object."""
 
     items: tuple[Command, ...] = ()
     home: Command | None = None
@@ -189,7 +189,7 @@ class CommandSequence:
     def next(self) -> int:
         """``seq`` of the current command: ``commands[commands.next - 1]``; 0 before the mission starts.
 
-        Setting it makes that command the next (0: restart) without waiting.
+        Setting the attribute selects the next command (0: restart), without waiting.
         """
         return self._current.seq
 

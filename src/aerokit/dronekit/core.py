@@ -62,7 +62,7 @@ class Readiness:
             self.names.discard(name)
 
     def fail(self, name: str, error: APIException) -> None:
-        """Record that the attribute gets no value; programs that wait for it raise this error."""
+        """Record that the attribute gets no value. Programs that wait for the attribute raise this error."""
         with self._changed:
             self._failures[name] = error
             self._changed.notify_all()
@@ -120,7 +120,7 @@ class LatestMessage(Generic[MessageT]):
             self._listeners.append(listeners)
 
     def take(self, frame: Frame, message: MessageT | None = None) -> None:
-        """Receive a frame of the vehicle's system, with its message if that is decoded already (loop thread)."""
+        """Receive a frame of the vehicle's system, with the message if the frame is decoded already (loop thread)."""
         if frame.component_id != self.component_id:
             return
         if self._needs_message():

@@ -95,7 +95,7 @@ class FlightMethods(VehicleAttributes):
         return order is not None and order.kind == ARMING[value] and not order.done()
 
     def arm(self, wait: bool = True, timeout: float | None = None) -> None:
-        """Arm the motors: **propellers may start to turn**. With ``wait``, wait until HEARTBEAT reports armed.
+        """Arm the motors: **propellers may start to turn**. With ``wait``, wait until HEARTBEAT reports that.
 
         Raises TimeoutError after ``timeout`` seconds, or as soon as the vehicle refuses; the text has its reasons.
         """

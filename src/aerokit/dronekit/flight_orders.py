@@ -1,6 +1,6 @@
 """Orders that move a vehicle, maintenance orders, and checks of their arguments.
 
-Flight modes have the names that DroneKit programs use: pymavlink's, which are the autopilots' own.
+Flight modes have the names that DroneKit programs use: those of pymavlink, which are the autopilots' own names.
 """
 
 from __future__ import annotations
@@ -128,9 +128,10 @@ async def go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: 
 
 
 def reposition_modes(aio: AsyncVehicle) -> tuple[Mode, ...]:
-    """Return the modes in which a reposition command may be sent. The command itself sets the first of them (PX4).
+    """Return the modes in which a reposition command may be sent.
 
-    Empty if the command does not change the mode. The vehicle then refuses the command in wrong modes.
+    The command itself sets the first of these modes (PX4). Empty if the command does not change the mode. The vehicle
+    then refuses the command in wrong modes.
     """
     if not aio.autopilot.repositions_amsl:
         return ()

@@ -34,7 +34,7 @@ SIGNAL_CHECK_INTERVAL_S = 0.2  # longer waits are split, so that Ctrl-C and a cl
 
 
 class Master:
-    """The part of pymavlink's ``mavfile`` that old programs use. New programs find all of it on the vehicle.
+    """The part of pymavlink's ``mavfile`` that old programs use. New programs use the vehicle itself.
 
     Methods that send return immediately and do not report the result.
     """

@@ -194,7 +194,7 @@ class MessageListeners(Listeners):
         self._attach_now()
 
     def remove(self, name: str, listener: AttributeListener) -> None:
-        """Remove a listener; ignored if it is not registered."""
+        """Remove a listener; ignored if the listener is not registered."""
         with contextlib.suppress(ValueError):
             super().remove(name, listener)
         self._attach_now()

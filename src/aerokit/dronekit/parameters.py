@@ -42,7 +42,7 @@ MIN_ATTEMPT_S = 1.0  # longer on slow links
 LAST_ATTEMPT_SHARE = 0.5
 ROUND_TRIPS = 3
 
-ROUNDING = 0.01  # ArduPilot adds this before it truncates a value to an integer
+ROUNDING = 0.01  # ArduPilot adds this value before it truncates a number to an integer
 
 
 class ParameterDownload:

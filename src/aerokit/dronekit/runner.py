@@ -297,7 +297,7 @@ def _restored_sys() -> Iterator[None]:
 
 
 def _print_program_traceback(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
-    """Print a traceback without the frames of this module, as Python does for its own."""
+    """Print a traceback without the frames of this module, like Python for its own frames."""
     error.__traceback__ = _without_our_frames(traceback)
     sys.__excepthook__(kind, error, error.__traceback__)
 

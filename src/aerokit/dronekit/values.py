@@ -176,7 +176,7 @@ class Version(_Value):
 
     Args:
         raw_version: flight_sw_version of AUTOPILOT_VERSION, with one byte each for ``major``, ``minor``, ``patch`` and
-            ``release``; None if unknown, then all four are None.
+            ``release``; None if unknown; all four are then None.
         autopilot_type: MAV_AUTOPILOT of the heartbeat, or None.
         vehicle_type: MAV_TYPE of the heartbeat, or None.
     """

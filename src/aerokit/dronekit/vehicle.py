@@ -86,7 +86,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
 
     @property
     def channels(self) -> Channels:
-        """RC channels by number; ``.overrides`` overrides them."""
+        """RC channels by number; ``.overrides`` sets overrides."""
         return self._channels
 
     @property
@@ -144,7 +144,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
     def sync(self) -> sync.Vehicle:
         """The blocking API (:class:`aerokit.sync.Vehicle`) on the same connection.
 
-        Programs can move to it function by function: ``vehicle.sync.take_off(10)`` returns at altitude. Raises
+        Programs can move to this API function by function: ``vehicle.sync.take_off(10)`` returns at altitude. Raises
         APIException before the vehicle is connected.
         """
         if self._dk_held is None:
@@ -172,7 +172,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         self._message_listeners.add(name, fn)
 
     def remove_message_listener(self, name: str, fn: AttributeListener) -> None:
-        """Remove a listener; ignored if it is not registered."""
+        """Remove a listener; ignored if the listener is not registered."""
         self._message_listeners.remove(name, fn)
 
     def on_message(self, name: str | list[str] | tuple[str, ...]) -> Callable[[AttributeListener], AttributeListener]:
@@ -349,8 +349,8 @@ def connect(
     Args:
         ip: connection string: ``'127.0.0.1:14550'`` and ``'udp:…'`` listen, ``'tcp:127.0.0.1:5760'``,
             ``'/dev/ttyACM0'``, ``'com14'`` … (docs/addresses.md).
-        wait_ready: True waits for ``parameters``, ``gps_0``, ``armed``, ``mode`` and ``attitude``; a list waits for
-            these names; otherwise does not wait.
+        wait_ready: True waits for ``parameters``, ``gps_0``, ``armed``, ``mode`` and ``attitude``; a list waits for the
+            names in it. With any other value, ``connect`` does not wait.
         timeout: seconds for ``wait_ready``.
         still_waiting_callback: called with the set of missing names.
         still_waiting_interval: seconds between these calls.
@@ -413,7 +413,7 @@ def connect(
 
 
 def _print_texts(handler: MAVConnection, status_printer: Callable[[str], object]) -> None:
-    # Through the logger `autopilot`, as in DroneKit, so that its level applies.
+    # Texts go through the logger `autopilot`, as in DroneKit, so that the logger's level applies.
     logger, printer = logging.getLogger("autopilot"), ErrprinterHandler(status_printer)
     logger.addHandler(printer)
     handler.on_close(lambda: logger.removeHandler(printer))

@@ -301,7 +301,7 @@ class FleetContext:
         self.bus: Bus = Bus()
         self.background: BackgroundTasks = BackgroundTasks(on_error)
         self.actions: list[FleetAction] = []
-        self.missions: dict[str, Mission] = {}  # last upload, once every member has accepted its mission
+        self.missions: dict[str, Mission] = {}  # missions of the last upload, set once every member has accepted
         self.is_closed: bool = False
 
     def start(self) -> None:

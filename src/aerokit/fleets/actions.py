@@ -77,7 +77,7 @@ class Actions(SelectionBase):
         return await self._run("arm", lambda member: member.vehicle.arm(timeout=timeout), stagger_s=stagger_s)
 
     async def disarm(self, *, timeout: float = 10.0) -> FleetResult:
-        """Disarm; refused in the air; see :meth:`aerokit.Vehicle.disarm`.
+        """Disarm; see :meth:`aerokit.Vehicle.disarm`. Vehicles in the air refuse.
 
         Args:
             timeout: seconds for each member.

@@ -99,8 +99,8 @@ class Travel(SelectionBase):
         Args:
             targets: as for :meth:`go_to`.
             min_distance_m: minimum distance between any two members in metres; None: that of the fleet.
-            by: ``"layers"``: separate crossing paths by altitude; ``"corridors"``: by time, which needs ``speed_m_s``;
-                ``"refuse"``: refuse crossing paths.
+            by: ``"layers"`` separates crossing paths by altitude, ``"corridors"`` by time, which needs ``speed_m_s``.
+                ``"refuse"`` refuses crossing paths.
             speed_m_s: ground speed of all members.
             max_altitude_m: highest layer in metres above sea level; None: no limit.
             slack_s: for corridors: how early or late a member may be relative to another, in seconds.

@@ -120,7 +120,7 @@ class Dialect:
         return decoder(body, frame)
 
     def extended_by(self, other: Dialect) -> Dialect:
-        """Return a dialect with the messages of both. InvalidArgument if they define an id differently."""
+        """Return a dialect with the messages of both dialects. InvalidArgument if an id is defined differently."""
         for message_id in self.rows.keys() & other.rows.keys():
             if self.rows[message_id] != other.rows[message_id]:
                 raise InvalidArgument(

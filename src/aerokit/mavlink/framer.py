@@ -1,9 +1,13 @@
 """`Framer`: extracts frames from bytes.
 
 The input may be datagrams or a stream cut anywhere, with noise and text between frames. The framer never raises. At
-each byte that could start a frame, it applies these rules in order: a frame with a valid checksum is returned; if the
-header is plausible, the framer waits for the rest of the frame; anything else is skipped one byte at a time, so that a
-valid frame after noise is found. https://mavlink.io/en/guide/serialization.html
+each byte that could start a frame, it applies these rules in order:
+
+- A frame with a valid checksum is returned.
+- After a plausible header, the framer waits for the rest of the frame.
+- Anything else is skipped one byte at a time, so that a valid frame after noise is found.
+
+https://mavlink.io/en/guide/serialization.html
 """
 
 from __future__ import annotations

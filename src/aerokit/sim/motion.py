@@ -1,7 +1,7 @@
 """Local frame and motion of a simulated multicopter: a point mass that leans as its acceleration requires.
 
 Modelled: limits of speed, acceleration and turn rate; braking before a target, by the square-root controller of
-ArduPilot and PX4; drag, for which the copter leans forward in steady flight; constant wind with gusts; ground. Not
+ArduPilot and PX4; drag, against which the copter leans in steady flight; constant wind with gusts; ground. Not
 modelled: propeller dynamics, attitude control loops, ground effect, drift.
 """
 

@@ -57,9 +57,9 @@ _ROUNDING_OFFSET = 0.01
 class ArduPilotParameterServer(ParameterServer):
     """Parameter protocol of ArduPilot.
 
-    Without ``errors``, requests for an unknown name or with a value that is not a number get no answer, as in the
-    development version of 4.7. With ``errors``, the answer is PARAM_ERROR, as in the released version, and PARAM_SET is
-    confirmed on the sender's port in addition to the broadcast.
+    A request may have an unknown name, or a value that is not a number. Without ``errors``, such a request gets no
+    answer, as in the development version of 4.7. With ``errors``, the answer is PARAM_ERROR, as in the released
+    version, and PARAM_SET is confirmed on the sender's port in addition to the broadcast.
 
     A queue holds 20 read requests, of which one is served each millisecond; further requests are lost. The banner
     texts precede a list.

@@ -1,4 +1,4 @@
-"""``FaultModel``: effects of a bad radio on frames; ``FaultyPath``: applies them to one direction, without I/O."""
+"""``FaultModel``: faults of a radio link; ``FaultyPath``: applies them to frames in one direction, without I/O."""
 
 from __future__ import annotations
 

@@ -131,7 +131,7 @@ class SimulatedFleet(Sequence[Flight]):
         return self._nearest()[0]
 
     def assert_stayed_apart(self, distance_m: float) -> None:
-        """Assert that no two vehicles came nearer to each other than this, in space. They start 5 m apart."""
+        """Assert that no two vehicles came nearer to each other than this distance, in space."""
         __tracebackhide__ = True
         nearest, time_s, names = self._nearest()
         assert nearest >= distance_m, f"{names} came nearer than {distance_m:g} m: {nearest:.1f} m at {time_s:.1f} s"

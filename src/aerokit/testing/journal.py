@@ -15,7 +15,7 @@ MessageT = TypeVar("MessageT", bound=Message)
 
 @dataclass(frozen=True)
 class SentText:
-    """A complete status text of the vehicle; it may have been lost in transit."""
+    """A complete status text of the vehicle, which may have been lost in transit."""
 
     time_s: float
     """Simulated seconds."""

@@ -52,7 +52,7 @@ class Drawable(Protocol):
 def check_picture(path: str | PathLike[str]) -> None:
     """Check a file name.
 
-    Raises InvalidArgument if the suffix is neither .svg nor .png, AerokitError for .png if Pillow is not installed.
+    Raises InvalidArgument unless the suffix is .svg or .png, and AerokitError for .png without Pillow.
     """
     suffix = Path(path).suffix.lower()
     if suffix not in (".svg", ".png"):

@@ -127,7 +127,7 @@ def dronekit() -> Iterator[ModuleType]:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
-    """Open ``flight`` and ``fleet`` before pytest-asyncio runs the test, if it has the asyncio marker."""
+    """Open ``flight`` and ``fleet`` before pytest-asyncio runs the test, if the test has the asyncio marker."""
     fleets = _fleets(item)
     if not fleets or item.get_closest_marker("asyncio") is None:
         return (yield)

@@ -141,7 +141,7 @@ class RecordedMissions:
             vehicle.on(kind, handler)
 
     def items(self, mission_type: int) -> tuple[AnyItem, ...] | None:
-        """Return the current plan; before the first recorded plan, that plan; None if none was recorded."""
+        """Return the current plan, or the first recorded plan before that; None if the recording has no plan."""
         if mission_type in self._written:
             return self._written[mission_type]
         position, found = self._vehicle.position_s, None

@@ -39,7 +39,7 @@ class FlightScheduler(SimulatedVehicle):
             vehicle.journal = journal
 
     def step(self, now: float) -> None:
-        """Advance all vehicles to each action, and run it."""
+        """For each due action, advance all vehicles to the time of the action, then run it."""
         while (due := self.next_due) <= now:
             for vehicle in self._vehicles:
                 vehicle.step(max(due, vehicle.now))
@@ -64,7 +64,7 @@ class FlightScheduler(SimulatedVehicle):
             action()
 
     def do_when(self, condition: Callable[[], bool], action: Callable[[], None]) -> None:
-        """Run an action once, when a condition is true; it is checked ten times per simulated second."""
+        """Run an action once, when a condition is true. The condition is checked ten times per simulated second."""
         if condition():
             action()
         else:

@@ -37,7 +37,7 @@ class DrainListener(Receiver, Protocol):
     """A receiver that is notified when written data does not leave this machine."""
 
     def link_stalled(self, unsent_bytes: int) -> None:
-        """Called when no waiting data has left for a second. Commands in it may arrive late or never."""
+        """Called when no waiting data has left for a second. Commands in the data may arrive late or never."""
 
     def link_drained(self, stalled_s: float) -> None:
         """Called when data leaves again, after ``stalled_s`` seconds."""
@@ -134,7 +134,7 @@ class Link(ABC):
     def unsent_bytes(self) -> int:
         """Written bytes that have not left this machine: in the link, in its transport and, on Linux, in the kernel.
 
-        Commands in them may still arrive. 0 does not mean that the other end has received everything.
+        Commands in these bytes may still arrive. 0 does not mean that the other end has received everything.
         """
         return 0
 

@@ -200,7 +200,7 @@ class ReconnectingLink(Link):
             logger.warning("%s; reopening it", error)
             if isinstance(self._receiver, InterruptionListener):
                 self._receiver.link_interrupted(error)
-        if self._reopening is None and self._receiver is not None:  # not closed by the callback above
+        if self._reopening is None and self._receiver is not None:  # the callback above has not closed the link
             self._reopening = asyncio.get_running_loop().create_task(self._reopen(), name="aerokit reopening")
 
     # ----------------------------------------------------------------------- reopening

@@ -121,7 +121,7 @@ class SerialLink(BaseLink):
             raise serial.SerialException(*error.args) from error
 
     def _device_failed(self, error: OSError) -> None:
-        # Reported in a later loop iteration, because this may run inside write().
+        # Report the loss in a later loop iteration, because this method may run inside write().
         if self._loop is not None and self._transport is not None:
             self._transport.pause_reading()
             self._loop.call_soon(self._lose, f"the device failed: {error.strerror or error}", error)
@@ -177,7 +177,7 @@ class _SerialProtocol(asyncio.Protocol):
             self._link._outbox.pause()
 
     def resume_writing(self) -> None:
-        # In a later loop iteration, because the transport is in the middle of a write.
+        # Report the failure in a later loop iteration, because the transport is in the middle of a write.
         if self._link._outbox is not None and self._link._loop is not None:
             with contextlib.suppress(RuntimeError):  # the loop is closed
                 self._link._loop.call_soon(self._link._outbox.resume)

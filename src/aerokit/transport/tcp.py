@@ -318,7 +318,7 @@ class _Stream(asyncio.Protocol):
 
     def connection_made(self, transport: Any) -> None:  # not every loop's transport inherits from Transport
         self._transport = transport
-        self.peer = transport.get_extra_info("peername") or f"client {id(self):#x}"  # it may have disconnected already
+        self.peer = transport.get_extra_info("peername") or f"client {id(self):#x}"  # None after a disconnection
         transport.set_write_buffer_limits(high=0)  # data that cannot be sent at once waits in the outbox
         sock = transport.get_extra_info("socket")
         with contextlib.suppress(OSError):

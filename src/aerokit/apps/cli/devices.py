@@ -107,7 +107,7 @@ async def _photo(options: argparse.Namespace) -> int:
 
 
 async def _show(options: argparse.Namespace, camera: Camera, capture: Capture) -> bool:
-    """Print a picture, and download it with ``--to``. Return False if it was not taken or not downloaded."""
+    """Print a picture, and download it with ``--to``. Return False if taking or downloading it failed."""
     place, to = capture.place, options.to
     where = "position unknown" if place is None else f"{place.latitude_deg:.7f} {place.longitude_deg:.7f}"
     text = f"{capture.index:>5}  {where}  {_plain(capture.file_url)}".rstrip()
@@ -140,7 +140,7 @@ def _file_name(capture: Capture) -> str | None:
 
 
 def _write_new(to: Path, name: str, content: bytes) -> Path:
-    """Write to a new file; append a number to the name if it exists."""
+    """Write to a new file; append a number to the name if the file exists."""
     stem, dot, ending = name.rpartition(".")
     at, target = 1, to / name
     while True:

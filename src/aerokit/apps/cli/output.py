@@ -244,7 +244,7 @@ def remove_if_empty(path: str) -> None:
 
 @contextmanager
 def new_recording(path: str | None) -> Iterator[None]:
-    """Create the recording of ``--record``, and delete it after the block if it is empty; None: do nothing."""
+    """Create the recording of ``--record``, and delete an empty one after the block. ``path`` None: do nothing."""
     if path is None:
         yield
         return

@@ -216,7 +216,7 @@ async def _missing_for_flight(vehicle: Vehicle) -> list[str]:
             try:
                 await _request(vehicle, message, cell)
             except CommandTimeout as error:
-                # A vehicle that does not answer this request would not answer the others either.
+                # A vehicle that does not answer this request would not answer the other requests either.
                 return [str(error), *vehicle.missing_for_flight()]
     return list(dict.fromkeys([*await vehicle.why_not_armable(), *vehicle.missing_for_flight()]))
 

@@ -32,7 +32,7 @@ _MIN_SPAN_M = 20.0
 
 
 def number(value: float | None, digits: int = 1, unit: str = "", sign: str = "-") -> str:
-    """Format a number, without a sign if it rounds to 0. ``sign`` is that of format specifications."""
+    """Format a number, without a sign if it rounds to 0. ``sign`` is as in format specifications."""
     if value is None:
         return UNKNOWN
     rounded = round(value, digits) + 0.0  # -0.0 + 0.0 is 0.0

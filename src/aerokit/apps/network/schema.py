@@ -122,9 +122,7 @@ def _schema_of(kind: Any, values: dict[str, dict[str, Any]]) -> dict[str, Any]:
 
 
 def _named(name: str) -> dict[str, Any] | None:
-    """Return the schema of an integer with names: the name, a list of names for flags, or the number if it has no
-    name.
-    """
+    """Return the schema of an integer with names. Values are a name, a list of names (flags), or else the number."""
     enum = ENUMS.get(name)
     if enum is None:
         return None

@@ -243,8 +243,8 @@ Handler = Callable[["Request"], Awaitable[Response]]
 class Operation:
     """One method of one path.
 
-    ``name`` is the operationId, ``order`` is the order that the operation gives. If it gives none, ``body`` may name an
-    order with the same request body.
+    ``name`` is the operationId, ``order`` is the order that the operation gives. An operation without an order may have
+    ``body``: an order with the same request body.
     """
 
     method: str

@@ -83,7 +83,7 @@ def _token_of(headers: Headers) -> str | None:
 
 
 def content_policy(tiles: str | None) -> str:
-    """Return the Content-Security-Policy of all responses; it allows images from the tile server."""
+    """Return the Content-Security-Policy of all responses, which allows images from the tile server."""
     pictures = "'self'"
     if tiles is not None:
         place = urlsplit(tiles)

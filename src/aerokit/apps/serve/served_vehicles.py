@@ -52,8 +52,8 @@ class ServedVehicles:
     Requests nothing but the reasons for not arming. These are requested when a disarmed vehicle begins to report
     failing checks, and again when the failing sensors change.
 
-    ``source``: a connection, whose vehicles are added as they appear; one vehicle; or a mapping from system id
-    to vehicle, which may grow.
+    ``source`` is a connection (its vehicles are added as they appear), one vehicle, or a mapping from system id to
+    vehicle, which may grow.
     """
 
     def __init__(self, source: Connection | Vehicle | Mapping[int, Vehicle]) -> None:

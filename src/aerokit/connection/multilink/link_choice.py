@@ -1,4 +1,4 @@
-"""``LinkChoice``: which of several links is used for a system, and which of them lead to the same vehicle. Sans-IO."""
+"""``LinkChoice``: selects a link to a system, and checks which links lead to the same vehicle. Sans-IO."""
 
 from __future__ import annotations
 
@@ -197,7 +197,7 @@ class LinkChoice:
         return candidate
 
     def start_with(self, candidate: Candidate) -> None:
-        """Make this link, which received the system's first autopilot, the reference for all others."""
+        """Make this link the reference for all other links, because it received the system's first autopilot."""
         self.needs_proof = True
         if candidate is not self.used:
             self.used = None  # the old link leads to another component, e.g. a camera
@@ -211,7 +211,7 @@ class LinkChoice:
         if candidate is self.used:
             if not self.clock.add(at, vehicle_s, round_trip_s):
                 # The vehicle may have rebooted or been replaced by another one, so the next hardware id over this link
-                # is valid.
+                # is accepted.
                 self._hardware_link = link
                 for other in self.candidates.values():
                     other.reset_proof()

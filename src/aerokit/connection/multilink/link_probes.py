@@ -77,7 +77,7 @@ class LinkProbes:
         if not is_attached and not self._take_budget(now):
             return
         self._probed_at[key] = now
-        # Our time in nanoseconds; the last digits make it unique per system and link.
+        # The number is our time in nanoseconds, with last digits that are unique per system and link.
         number = int(now * 1e9) // 1000 * 1000 + (system_id * len(self._names) + candidate.link) % 1000
         if number <= 0 or number in self._pending:
             return

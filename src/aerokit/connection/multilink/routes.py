@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from aerokit.transport.link import Peer
     from aerokit.transport.multilink import MultiLink
 
-STATUS_INTERVAL_S = 0.95  # once a second, checked ten times a second
+STATUS_INTERVAL_S = 0.95  # a little below one second, because the time is checked ten times a second
 
 
 class LinkStates:
@@ -106,7 +106,7 @@ COMMANDS = frozenset(
     )
 )  # fmt: skip
 
-# Broadcasts without effect on a vehicle: they go to every peer on every link.
+# Broadcasts without effect on a vehicle. These go to every peer on every link.
 BROADCASTS = frozenset(message_type.ID for message_type in (m.Heartbeat, m.Timesync, m.Ping))
 
 

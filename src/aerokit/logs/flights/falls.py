@@ -52,9 +52,13 @@ class Fall(Snapshot):
 def falls(flight: FlightLog) -> list[Fall]:
     """Return the falls and hard landings of a flight, the oldest first; none without heights and sink rates.
 
-    A descent counts if the vehicle sank at more than 3 m/s, was stopped within 0.6 s, and one of these is true: the
-    vehicle stayed at that height until it was disarmed; it stayed armed and less than 3 m above home for 30 s; or the
-    autopilot reported a crash. A descent near the ground also counts if the log ends in it.
+    A descent counts if the vehicle sank at more than 3 m/s, was stopped within 0.6 s, and one of these is true:
+
+    - The vehicle stayed at that height until it was disarmed.
+    - The vehicle stayed armed and less than 3 m above home for 30 s.
+    - The autopilot reported a crash.
+
+    A descent near the ground also counts if the log ends in it.
     """
     if not flight.armed:
         return []

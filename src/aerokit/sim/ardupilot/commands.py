@@ -277,7 +277,7 @@ class HomeAndOrigin:
         return _R.ACCEPTED
 
     def _on_origin(self, message: m.SetGpsGlobalOrigin, channel: Channel) -> None:
-        """Set the origin and send it to the requester. Invalid values are ignored, as is a second request."""
+        """Set the origin and send it to the requester. Invalid values and second requests are ignored."""
         vehicle = self._vehicle
         place = (message.latitude, message.longitude)
         point = vehicle.point(*place, message.altitude / 1000.0, MavFrame.GLOBAL)

@@ -223,7 +223,7 @@ class CopterAuto(MissionMode):
         return True
 
     def enter(self, *, force: bool) -> bool:
-        """Enter AUTO, which requires a mission; on the ground its first navigation command must be a take-off."""
+        """Enter AUTO, which requires a mission. On the ground, its first navigation command must be a take-off."""
         copter, run = self.vehicle, self.vehicle.mission
         if copter.mode is self:
             return True  # Arming in AUTO enters the mode again.
@@ -397,7 +397,7 @@ class CopterAuto(MissionMode):
         leg.enter(force=True)
 
     def _delay(self, item: MissionItem) -> None:
-        # A delay until a time of day is not simulated; it counts as no delay.
+        # A delay until a time of day is not simulated, so it counts as no delay.
         seconds = max(0.0, item.param1)
         self._delay_until = self.vehicle.now + seconds
         self.vehicle.info(f"Delaying {int(seconds)} sec")

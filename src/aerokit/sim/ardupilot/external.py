@@ -33,7 +33,7 @@ class ArduPilotExternal:
         self.latest: dict[type[Message], Message] = {}
         self._navigation_at = self._target_at = -math.inf
         self._target: tuple[float, float] = (0.0, 0.0)
-        self.wind: tuple[float, float] | None = None  # Speed in m/s, and direction in degrees that it comes from.
+        self.wind: tuple[float, float] | None = None  # Speed in m/s, and direction in degrees that the wind comes from.
 
     def listen(self) -> None:
         vehicle = self._vehicle

@@ -66,7 +66,7 @@ class BatteryFailsafe:
         return None
 
     def _below(self, level: int) -> int:
-        """Return the level if the battery has been below its limits for long enough, else 0."""
+        """Return the level if the battery has been below the limits of this level for long enough, else 0."""
         volts, charge = self._is_below(level)
         low_for = self._voltage_low[level].seconds(volts, self._vehicle.now)
         timer = self._vehicle.parameters["BATT_LOW_TIMER"]

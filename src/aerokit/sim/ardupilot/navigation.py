@@ -98,7 +98,7 @@ class ArduPilotNavigation:
         return (local[0] + north, local[1] + east, local[2] + down)
 
     def set_home(self, point: Ned, *, lock: bool) -> None:
-        """Set home and broadcast it; with ``lock`` later arming does not move it."""
+        """Set home and broadcast it. With ``lock``, later arming does not move home."""
         self.home = point
         self.home_is_locked = self.home_is_locked or lock
         self._vehicle.missions.commands.add_home()
@@ -383,7 +383,7 @@ def _distance_to_line(point: Ned, start: Ned, end: Ned) -> float:
 
 
 def _closest_approach(one: Ned, one_end: Ned, other: Ned, other_end: Ned) -> tuple[float, Ned] | None:
-    """Return the distance of two line segments and the midpoint between them; None if they are parallel."""
+    """Return the distance of two line segments and the midpoint between them; None for parallel segments."""
     line1, line2, between = _minus(one_end, one), _minus(other_end, other), _minus(one, other)
     a, b, c = _dot(line1, line1), _dot(line1, line2), _dot(line2, line2)
     d, e = _dot(line1, between), _dot(line2, between)

@@ -57,8 +57,8 @@ class ZenohConnect(NetworkLink):
         name: name of the vehicle side in the fleet.
         options: connection to the network.
         client: name of this program, unique on the network; "": the name of this computer and a number.
-        control: "free": acquire control with the first command, if no other client has it; "take": take control when
-            the link opens; "never": read only.
+        control: "free" acquires control with the first command, if no other client has it. "take" takes control when
+            the link opens. "never" is read only.
         open_timeout_s: time-out for finding the vehicle side, above 0.
 
     Raises:
