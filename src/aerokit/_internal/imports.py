@@ -14,8 +14,8 @@ _OTHER_PACKAGES = ("aero", "engine", "stability")
 def installation_problem(folder: str, *, is_ours: bool = True) -> str | None:
     """Describe what is wrong with the installation in ``folder`` and how to repair it; None if nothing is wrong.
 
-    PyPI has another project called aerokit, for compressible flow. It installs into the same folder, so that with both
-    installed neither may work. ``is_ours`` is True if the ``__init__.py`` there is this library's.
+    PyPI has another project called aerokit, for compressible flow. Both projects install into the same folder, so
+    neither may work if both are installed. ``is_ours`` is True if the ``__init__.py`` there is this library's.
     """
     others = [name for name in _OTHER_PACKAGES if os.path.isfile(os.path.join(folder, name, "__init__.py"))]
     if is_ours and not others:

@@ -1,4 +1,4 @@
-"""Formations: positions relative to a leader, flown once (``form``) or kept while it moves (``following``)."""
+"""Formations: positions relative to a leader, flown once (``form``) or kept while the leader moves (``following``)."""
 
 from __future__ import annotations
 

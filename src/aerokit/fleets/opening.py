@@ -313,7 +313,7 @@ class MemberConnections:
         self._all_closed = asyncio.Event()
 
     async def open(self, systems: Sequence[tuple[str, Connection, int]]) -> list[tuple[str, Vehicle]]:
-        """Connect to all systems, given as network, connection and system id; keeps their order."""
+        """Connect to all systems, given as network, connection and system id. The result is in the same order."""
         for number, (network, connection, system_id) in enumerate(systems):
             self._running += 1
             self._tasks.start(partial(self._run, number, network, connection, system_id))

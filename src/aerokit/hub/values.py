@@ -100,7 +100,7 @@ class EndpointStatistics(Snapshot):
     bytes_out: int
     """Bytes written; writes that the link dropped are counted in ``dropped["link"]``."""
     lost: int
-    """Frames lost before they arrived here, by sequence numbers."""
+    """Number of frames that were lost before this endpoint, by sequence numbers."""
     bad_bytes: int
     """Bytes outside valid frames."""
     waiting: int

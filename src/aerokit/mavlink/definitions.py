@@ -196,7 +196,7 @@ def read_dialect(path: Path, search: Sequence[Path] = ()) -> list[DialectDefinit
 
 
 def read_xml(path: Path) -> DialectDefinition:
-    """Read one file without its includes. InvalidArgument if it is not MAVLink XML."""
+    """Read one file without its includes. Raises InvalidArgument if the file is not MAVLink XML."""
     from xml.etree.ElementTree import ParseError  # not needed for definitions from pymavlink
 
     from defusedxml import ElementTree as DefusedXml

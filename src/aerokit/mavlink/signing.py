@@ -120,7 +120,7 @@ class Refusal(Enum):
 
 
 class Signing:
-    """Signs the frames sent on one link, verifies those received on it, and counts those refused.
+    """Signs the sent frames of one link, verifies the received frames, and counts refused frames.
 
     Each link needs a separate object, because the object stores timestamps. For further links with the same key, create
     the objects with :meth:`for_link`. An object can be reused after its link is closed.
@@ -138,7 +138,7 @@ class Signing:
         """Create signing for one link.
 
         Args:
-            key: the key; the other side must have the same one.
+            key: the key; the other side must have the same key.
             link_id: distinguishes the links of one sender, 0–255. Programs with the same system and component id need
                 different link ids.
             timestamp: the last value of :attr:`timestamp` with this key (10 µs since 2015), for computers whose clock
@@ -308,7 +308,7 @@ class TimestampFile:
         self._write(self.timestamp)
 
     def reserve(self, timestamp: int, ahead: int) -> None:
-        """Ensure that the file has a later timestamp. If it has not, write ``timestamp + ahead``."""
+        """Ensure that the file has a later timestamp than this: if needed, write ``timestamp + ahead``."""
         if timestamp < self.timestamp:
             return
         self.timestamp = min(timestamp + ahead, self._maximum)

@@ -265,7 +265,7 @@ class FramerStatistics(CounterFields):
         self.bad_crcs: int = 0
         """Positions that look like a frame of a known message, with a wrong checksum."""
         self.unknown_ids = 0
-        """Frames of messages that the dialect does not have. They may be noise, because they cannot be verified."""
+        """Frames of messages that the dialect does not have. Such frames cannot be verified and may be noise."""
         self.unknown_messages: dict[int, int] = {}
         """Number of frames of unknown messages by message id, for the first 64 ids."""
         self.sources: dict[tuple[int, int], SourceStatistics] = {}

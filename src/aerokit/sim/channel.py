@@ -100,7 +100,7 @@ class Streams:
         self._token = 0
 
     def set_interval(self, message_id: int, interval_s: float, now: float) -> None:
-        """Send a message every ``interval_s`` seconds, starting now; 0 stops it."""
+        """Send a message every ``interval_s`` seconds, starting now; 0 stops the stream."""
         self._token += 1
         if interval_s <= 0.0:
             self._intervals.pop(message_id, None)
@@ -160,7 +160,7 @@ class Channel:
         self._wanted = wanted
         self._own = (system_id, component_id)
         self.reader: MessageReader = MessageReader(wanted)
-        """Decodes incoming bytes; vehicles on one link may share it."""
+        """Decodes incoming bytes; vehicles on one link may share a reader."""
         self._encoders: dict[tuple[int, int], FrameEncoder] = {}
         self._outbox: list[bytes] = []
         self.closes_clients: bool = False

@@ -158,7 +158,7 @@ class Link(ABC):
         return
 
     def host_of(self, peer: Peer) -> object:
-        """Return what identifies the peer's host: its IP address, or the peer itself if it has none."""
+        """Return an identifier of the peer's host: the IP address, or the peer itself if there is none."""
         return peer[0] if isinstance(peer, tuple) else peer
 
     def has_peer(self, peer: Peer) -> bool:

@@ -46,11 +46,11 @@ class AddressError(SerialException, InvalidArgument):  # type: ignore[misc]  # p
 
 
 class SerialLink(BaseLink):
-    """A serial port, 8N1, opened exclusively. Unplugging it is a lost link.
+    """A serial port, 8N1, opened exclusively. Unplugging the device counts as a lost link.
 
-    ``baud`` is in bits per second. It matters for UARTs, not for USB ports such as /dev/ttyACM0. ``rtscts`` enables
-    hardware flow control. The write buffer holds about two seconds of data (at least 4096 bytes), and drops data after
-    a second.
+    ``baud`` is in bits per second. The rate matters for UARTs, not for USB ports such as /dev/ttyACM0. ``rtscts``
+    enables hardware flow control. The write buffer holds about two seconds of data (at least 4096 bytes), and drops
+    data after a second.
     """
 
     def __init__(self, device: str, baud: int = 57600, *, rtscts: bool = False) -> None:
@@ -247,9 +247,9 @@ _HINTS = {
 class PtyLink(BaseLink):
     """One end of a pseudo-terminal. Another program opens the other end; `address` has its name once the link is open.
 
-    ``path`` is the name of a symbolic link to the other end. It is removed when the link is closed. A dangling symbolic
-    link of that name is replaced; any other existing file is a LinkOpenError. Baud rates have no effect. Programs may
-    open and close the other end repeatedly; unread data is dropped. Not available on Windows.
+    ``path`` is the name of a symbolic link to the other end, which is removed when this link is closed. A dangling
+    symbolic link of that name is replaced; any other existing file is a LinkOpenError. Baud rates have no effect.
+    Programs may open and close the other end repeatedly; unread data is dropped. Not available on Windows.
     """
 
     def __init__(self, path: str = "") -> None:

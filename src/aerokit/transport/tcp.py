@@ -27,7 +27,7 @@ CONNECT_TIMEOUT_S = 10.0
 """Default time-out of `TcpConnect.open`."""
 
 MAX_PENDING_BYTES = 256 * 1024
-"""Write buffer per connection. Writes beyond it are dropped, as is data that has waited for a second."""
+"""Write buffer per connection. Writes beyond this size are dropped, and so is data that has waited for a second."""
 
 SEND_BUFFER = 16 * 1024
 """Kernel send buffer (Linux doubles it). The buffer is small because data in it cannot be discarded."""
@@ -156,8 +156,8 @@ class TcpConnect(_TcpLink):
 class TcpListen(_TcpLink):
     """``tcpin:`` link: serves clients. Each client is a peer; the link is not lost when clients disconnect.
 
-    With port 0 the system chooses one; `address` and `local_address` have it once the link is open. ``peers`` are the
-    IP addresses and networks that may connect; None: all.
+    With port 0, the system chooses a port. `address` and `local_address` have this port once the link is open.
+    ``peers`` are the IP addresses and networks that may connect; None: all.
     """
 
     def __init__(self, host: str, port: int, *, peers: PeerFilter | None = None) -> None:

@@ -155,8 +155,8 @@ class _UdpLink(BaseLink):
 class UdpListen(_UdpLink):
     """``udpin:`` link: binds a port. Each sender is a peer, and gets what is written to all.
 
-    With port 0 the system chooses one; `address` and `local_address` have it once the link is open. ``peers`` are the
-    IP addresses and networks to accept; None: all.
+    With port 0, the system chooses a port. `address` and `local_address` have this port once the link is open.
+    ``peers`` are the IP addresses and networks to accept; None: all.
     """
 
     def __init__(self, host: str, port: int, *, peers: PeerFilter | None = None) -> None:

@@ -241,7 +241,7 @@ Handler = Callable[["Request"], Awaitable[Response]]
 
 @dataclass(frozen=True)
 class Operation:
-    """One method of one path.
+    """One HTTP method of one path.
 
     ``name`` is the operationId, ``order`` is the order that the operation gives. An operation without an order may have
     ``body``: an order with the same request body.

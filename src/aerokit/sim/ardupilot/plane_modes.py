@@ -329,7 +329,7 @@ class PlaneTakeOff(PlaneNavigatingMode):
 
 
 class PlaneAutoland(PlaneNavigatingMode):
-    """AUTOLAND: lands at home in the direction of the take-off. It can only be entered in flight.
+    """AUTOLAND: lands at home in the direction of the take-off. The mode can only be entered in flight.
 
     If the plane is armed again after landing, it disarms at once.
     """

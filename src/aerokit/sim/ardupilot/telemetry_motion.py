@@ -243,7 +243,7 @@ def _terrain_report(vehicle: ArduPilotVehicle) -> m.TerrainReport:
 
 
 def _terrain_request(vehicle: ArduPilotVehicle) -> m.TerrainRequest | None:
-    """Build a request for all terrain data around the vehicle, because it has none."""
+    """Build a request for all terrain data around the vehicle, because no data is stored."""
     place = vehicle.navigation.position
     if place is None:
         return None

@@ -54,7 +54,7 @@ class Px4Calibration:
 
     @property
     def is_running(self) -> bool:
-        """True during a calibration; HEARTBEAT reports it and arming is denied."""
+        """True during a calibration, which HEARTBEAT reports and during which arming is denied."""
         return bool(self._sensor)
 
     def command(self, command: ReceivedCommand) -> int:
