@@ -29,7 +29,7 @@ def write_atomically(path: str | os.PathLike[str], text: str) -> None:
         with part.open("x", encoding="utf-8", newline="\n") as file:
             file.write(text)
             file.flush()
-            os.fsync(file.fileno())  # otherwise a power failure may leave an empty file under the new name
+            os.fsync(file.fileno())  # without fsync, a power failure may leave an empty file under the new name
         part.replace(target)
     finally:
         part.unlink(missing_ok=True)

@@ -60,7 +60,7 @@ class ExchangeRun(Generic[ResultT]):
     def receive(self, message: Message) -> None:
         try:
             self._exchange.receive(message, self._connection.now())
-        finally:  # the bus logs exceptions of the program's callbacks; the exchange continues
+        finally:  # the exchange continues after an exception of a program's callback, which the bus logs
             self._after_step()
 
     def link_chosen(self, system_id: int, event: LinkSelected) -> None:

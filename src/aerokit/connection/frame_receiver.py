@@ -149,7 +149,7 @@ class FrameReceiver:
         self.observers: FrameObservers = FrameObservers(self._update_framers)
         self._loop_watch = LoopWatch(self._on_blocked, self._on_slept)
         self._is_closed = False
-        bus.require_frames(Heartbeat)  # for routes and diagnosis
+        bus.require_frames(Heartbeat)  # routes and diagnosis need heartbeats
 
     def start(self) -> None:
         self._loop_watch.start()

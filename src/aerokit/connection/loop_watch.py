@@ -80,7 +80,8 @@ class LoopWatch:
 
     def arrival(self, now: float) -> float:
         """Return ``now``, or the earliest possible receive time if data that is read now may have waited."""
-        # Data that is read in time postpones the timer: waking a sleeping process costs as much as a few messages.
+        # Data that is read in time postpones the timer, because waking a sleeping process costs as much as a few
+        # messages.
         has_slept = self._has_slept()
         if self._oldest is None and not has_slept and now <= self._due + LATE_THRESHOLD_S:
             if self._timer is not None:

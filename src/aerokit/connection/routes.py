@@ -48,7 +48,7 @@ class RouteClaim:
         self._expected: int | None = None
         self._sequence_matches: bool | None = None
         self._clock_matches: bool | None = None
-        self._frames, self._since = 0, 0.0  # since the owner's last frame
+        self._frames, self._since = 0, 0.0  # counted since the owner's last frame
         self.is_duplicate_reported: bool = False
         self.is_refusal_reported: bool = False
 

@@ -73,7 +73,7 @@ class ClassicConnection:
 
         Raises InvalidArgument if a field is out of range, and APIException if the connection is closed.
         """
-        message.encode()  # raises here, in the caller, rather than on the loop
+        message.encode()  # errors are raised here, in the caller, rather than on the loop
         with classic_errors():
             self.connection.raise_if_ended()
             self.calls.post(self._send, message, to)
@@ -231,7 +231,7 @@ class BackgroundCalls:
             await work()
         except Exception as error:
             if not isinstance(error, ConnectionClosed):
-                text = str(error)  # the exception itself would keep frames, and so the vehicle, alive
+                text = str(error)  # the exception itself would keep stack frames, and thus the vehicle, alive
                 if isinstance(error, CommandRejected) and self.describe is not None:
                     text += f" ({self.describe()})"  # a rejection rarely names its cause
                 vehicle_logger.warning("%s: %s", order.kind, text)
@@ -265,7 +265,7 @@ RELEASE_UPPER = 0xFFFE  # releases a channel above 8, for which 0 means "ignore"
 CHANNELS_OF_MAVLINK_1 = 8
 CHANNELS = 18
 
-RELEASE_COPIES = 3  # not acknowledged, and frames get lost
+RELEASE_COPIES = 3  # the message is not acknowledged, and frames get lost
 
 
 class OverrideRelease:

@@ -175,7 +175,7 @@ class CommandSequence:
             values = _values_of(self._held.items)
             if not self._held.is_changed and values == self._uploaded:
                 return
-            held = self._held = self._held.replace(is_changed=True)  # until the vehicle has confirmed it
+            held = self._held = self._held.replace(is_changed=True)  # until the vehicle has confirmed
         aio = self._core.check_link()
         # DroneKit has no such limit, and its programs must run unchanged.
         options = {"timeout": timeout, "max_distance_m": math.inf}
@@ -375,7 +375,7 @@ def _is_at(cmd: Command, home: LocationGlobal | None) -> bool:
     try:
         away = max(abs(cmd.x - home.lat), abs(cmd.y - home.lon) * math.cos(math.radians(home.lat)))
         return bool(away <= HOME_TOLERANCE_DEG and abs(cmd.z - home.alt) <= HOME_TOLERANCE_M)
-    except TypeError:  # not numbers: upload() reports it
+    except TypeError:  # upload() reports values that are not numbers
         return False
 
 

@@ -223,7 +223,7 @@ class Core:
         """Start receiving once the vehicle is connected (loop thread). The loop gets weak references only."""
         self.aio_or_none, self._tasks = aio, tasks
         self.handler.target_system = aio.system_id
-        _ = aio.parameters  # created first, so that its table has a value before our handlers are called
+        _ = aio.parameters  # created first, so that the parameter table has a value before our handlers are called
         for message_type, latest in self._latest.items():
             latest.component_id = aio.component_id
             aio.connection.bus.attach_lazily(message_type, weak_callback(latest.take), system_id=aio.system_id)
@@ -237,7 +237,7 @@ class Core:
         self.listeners.notify("last_heartbeat", age)
         if (age > SILENCE_WARNING_S) != self._is_silent:
             self._is_silent = not self._is_silent
-            post = self.handler.listener_thread.post  # log handlers of the program may block
+            post = self.handler.listener_thread.post  # because log handlers of the program may block
             if self._is_silent:
                 post(self.logger.warning, "Link timeout, no heartbeat in last %d seconds", SILENCE_WARNING_S)
             else:

@@ -302,7 +302,7 @@ class Inbox(Mapping[str, Any]):
         return is_young and self._connection.connection.is_open and not self._connection.loop.is_current
 
     def _take(self, frame: Frame, peer: Peer) -> None:
-        # On the loop's thread.
+        # Runs on the loop's thread.
         if self._connection.is_of_another_vehicle(frame.system_id):
             return
         with self._came:

@@ -111,7 +111,7 @@ class Listeners:
                 try:
                     listener(self._owner, attr_name, value)
                 except BaseException:
-                    # Including SystemExit, which would end the listener thread only.
+                    # This includes SystemExit, which would end the listener thread only.
                     logger.exception("Exception in %s handler for %s", self.kind, attr_name)
 
     def _keep_owner(self) -> None:

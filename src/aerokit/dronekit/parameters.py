@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.parameters.writing import ResolvedParameter
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
-VERSION_TIMEOUT_S = 1.0  # for AUTOPILOT_VERSION, which shows whether the list is available as a file
+VERSION_TIMEOUT_S = 1.0  # time to wait for AUTOPILOT_VERSION, which shows whether the list is available as a file
 READ_TIMEOUT_S = 30.0
 RETRY_DELAY_S = 1.0
 
@@ -306,7 +306,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
         found = self._values.find(name)
         own, converted = name if found is None else found.name, number
         if found is not None and found.renamed is not None:
-            converted = found.renamed.to_vehicle(number)  # not rounded: set_parameter converts to integers
+            converted = found.renamed.to_vehicle(number)  # not rounded here, because set_parameter converts to integers
             warn_of_rename(found.renamed)
         core = self._core
         if retries <= 0:
@@ -365,7 +365,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
         self._take(message.param_id)
 
     def _on_changed(self, event: ParameterChanged) -> None:
-        # Includes downloads that the program started with vehicle.aio.
+        # This includes downloads that the program started with vehicle.aio.
         if event.system_id == self._core.target_system:
             self._take(event.name)
 

@@ -161,7 +161,7 @@ def main(arguments: Sequence[str], prog: str = "python -m aerokit.dronekit") -> 
         return FAILED
     sys.excepthook = _print_program_traceback
     if not getattr(sys.flags, "safe_path", False):
-        del sys.path[:1]  # the folder of this command
+        del sys.path[:1]  # remove the folder of this command
     run = _run_module if options.module else _run_file
     try:
         run(options.program, rest)

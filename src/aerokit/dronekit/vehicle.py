@@ -282,7 +282,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         end = no_more_at = now + FIRST_VALUES_TIMEOUT_S
         missing = wanted
         while (still := wanted - ready.names) and now < min(end, no_more_at):
-            if still < missing:  # includes values that arrived before this wait
+            if still < missing:  # also true for values that arrived before this loop
                 missing, no_more_at = still, now + NEXT_VALUE_TIMEOUT_S
             ready.wait_for_change(wanted, min(end, no_more_at) - now)
             now = time.monotonic()

@@ -335,7 +335,8 @@ class Formations(Travel):
         for follower in followers:
             offset = formation.offset_of(follower.name, heading)
             there = here.offset(north_m=offset.north_m, east_m=offset.east_m, up_m=offset.up_m)
-            # Above sea level, because the homes of the followers may be at other altitudes than the leader's.
+            # Targets are above sea level, because the homes of followers may be at other altitudes than the leader's
+            # home.
             targets[follower.name] = (
                 there
                 if there.altitude_amsl_m is None

@@ -56,7 +56,7 @@ class Member:
         """The cause of the state; empty while it is ACTIVE."""
         self._lost_at = 0.0
         self._control_when_reclaimed: tuple[object, object] | None = None
-        # MAV_STATE when the program reclaimed the member: this failsafe does not count as a takeover.
+        # MAV_STATE at the time of `reclaim`. If this is a failsafe, it does not count as a takeover.
         self._ignored_failsafe: int | None = None
         self._detach: list[Detach] = []
         self._publish: Callable[[FleetEvent], None] = lambda _: None
@@ -145,7 +145,7 @@ class Member:
 
     def _takeover_reason(self) -> str:
         vehicle = self.vehicle
-        if vehicle.is_confirmed_disarmed:  # nothing to take over on the ground
+        if vehicle.is_confirmed_disarmed:  # on the ground, there is nothing to take over
             return ""
         state = vehicle.system_status.latest
         if state not in FAILSAFE_STATES:

@@ -41,7 +41,7 @@ TooCloseAction = Literal["hold", "report"]
 """Reaction to two members that come too close to each other in flight."""
 Source = str | Link | Connection | Vehicle
 
-DISCOVERY_S = 2.5  # two heartbeats at 1 Hz
+DISCOVERY_S = 2.5  # time for two heartbeats at 1 Hz
 WAIT_WARNING_S = 5.0
 
 

@@ -221,7 +221,7 @@ class TrackRecorder:
         position = origin.to_position((0.0, 0.0, base_m))
         self._latitude, self._longitude = position.latitude_deg, position.longitude_deg
         self._north_m, self._east_m = _metres_per_degree(origin, self._latitude, self._longitude)
-        self.samples: list[tuple[float, LocalPoint]] = []  # from the start of the show
+        self.samples: list[tuple[float, LocalPoint]] = []  # times count from the start of the show
         self._latest: tuple[float, LocalPoint, LocalPoint] | None = None
         self._detach: Detach | None = None
 

@@ -178,7 +178,7 @@ STANDARD_OFFSETS: dict[tuple[int, int | None], tuple[int, ...]] = {
     (79, 80): (126,),
 }  # fmt: skip
 
-# An offset beyond the end of every frame: the field does not exist.
+# An offset beyond the end of every frame, for a field that does not exist.
 NO_FIELD = 1 << 16
 
 # Offsets in `Frame.body` of the target's system id and component id.

@@ -46,7 +46,7 @@ class FrameQueue:
         self._frames: dict[int, QueuedFrame] = {}
         self._bytes = 0
         self._count = 0
-        self._orders = self._telemetry = 0  # numbers of such frames, so that needless searches are skipped
+        self._orders = self._telemetry = 0  # numbers of queued frames, so that needless searches are skipped
 
     def __len__(self) -> int:
         return len(self._frames)
@@ -157,7 +157,7 @@ class SigningGateway:
 MAX_JOINED_BYTES = 1200
 """Frames sent together are joined up to this size, so that their datagram is not fragmented."""
 UNLIMITED = 1 << 62
-_INCOMPLETE = -1 << 62  # equals no number of bytes
+_INCOMPLETE = -1 << 62  # a value that equals no number of bytes
 MAX_RATE_LIMITS = 4096
 """Maximum number of (sender, message) pairs whose rate is tracked."""
 

@@ -63,8 +63,7 @@ class ForwardingPlan(Generic[PortT]):
         self.rate_limited: tuple[tuple[PortT, float], ...] = rate_limited
         """Ports that get at most one frame per interval, with the interval in seconds."""
         self.reason: str = reason
-        """Reason for dropping the frames, a key of `EndpointStatistics.dropped`; "" if the only reason is a missing
-        destination.
+        """Reason for dropping the frames, a key of `EndpointStatistics.dropped`; "" if only the destination is missing.
         """
         self.is_plain: bool = not (rate_limited or reason)
         """True if each frame goes to `outs`, and nothing else is to be done."""

@@ -112,7 +112,8 @@ class RecentFrames:
     __slots__ = ("ends_at", "newer", "older")
 
     def __init__(self) -> None:
-        # Sender, sequence number and checksum as one number → port number, number of ports created so far, time.
+        # Maps sender, sequence number and checksum (as one number) to (port number, number of ports created so far,
+        # time).
         self.newer: dict[int, tuple[int, int, float]] = {}
         self.older: dict[int, tuple[int, int, float]] = {}
         self.ends_at: float = float("-inf")

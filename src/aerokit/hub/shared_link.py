@@ -112,7 +112,7 @@ class SharedLink(Link):
             self._receiver.bytes_received(unsigned, None)
 
     def _on_end(self, error: Exception) -> None:
-        # In the next loop iteration, because the connection may have ended inside a write.
+        # Report the loss in the next loop iteration, because the connection may have ended inside a write.
         self._loss_report = asyncio.get_running_loop().call_soon(self._report_loss, error)
 
     def _report_loss(self, error: Exception) -> None:

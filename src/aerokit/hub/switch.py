@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.framer import Framer
 
-# Interval at which full links are polled. It is doubled while no link accepts data.
+# Interval at which full links are polled. The interval is doubled while no link accepts data.
 MIN_POLL_INTERVAL_S = 0.01
 MAX_POLL_INTERVAL_S = 0.08
 

@@ -82,7 +82,7 @@ class MessageDefinition:
     fields: tuple[FieldDefinition, ...]
     description: str = ""
     origin: str = ""  # name of the XML file without suffix
-    remarks: tuple[str, ...] = ()  # deprecated, superseded, work in progress
+    remarks: tuple[str, ...] = ()  # e.g. that the message is deprecated, superseded or work in progress
 
     @property
     def class_name(self) -> str:
@@ -137,7 +137,7 @@ class EnumDefinition:
     description: str = ""
     origin: str = ""
     remarks: tuple[str, ...] = ()
-    own_prefix: str = ""  # see `prefix`; empty: derived from the entries
+    own_prefix: str = ""  # value of `prefix`; empty: derive the prefix from the entries
 
     @property
     def class_name(self) -> str:
@@ -238,7 +238,7 @@ def merged_enums(dialects: Iterable[DialectDefinition]) -> list[EnumDefinition]:
 def _find_include(include: str, file: Path, search: Sequence[Path]) -> Path:
     folders = [file.parent, *search]
     for folder in folders:
-        if os.path.isfile(folder / include):  # unlike Path.is_file, it does not raise for long names
+        if os.path.isfile(folder / include):  # unlike Path.is_file, os.path.isfile does not raise for long names
             return folder / include
     looked = ", ".join(str(folder) for folder in folders)
     raise InvalidArgument(f"{file.name} includes {include}, which is in none of: {looked}")

@@ -41,7 +41,7 @@ class Frame(FrameFields):
     """System id of the sender, 0..255 (0 is invalid)."""
     component_id: int
     """Component id of the sender, 0..255."""
-    _raw: bytes  # only if `raw` cannot be reconstructed: MAVLink 1, signed or parsed frames
+    _raw: bytes  # set only if `raw` cannot be reconstructed: for MAVLink 1, signed frames and parsed frames
     received_at: float
     """Time in seconds that was passed to the framer with the data."""
 

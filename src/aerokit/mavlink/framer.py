@@ -40,7 +40,7 @@ _magics = re.compile(rb"\xfe|\xfd(?=\Z|.\Z|.[\x00\x01])", re.DOTALL).finditer
 # Verdicts about a position in the data.
 _GOOD = 0  # a whole frame with a valid checksum
 _WAIT = 1  # the beginning of a plausible frame
-_IMPLAUSIBLE = 2  # the beginning of an implausible frame: wait, but examine what follows
+_IMPLAUSIBLE = 2  # the beginning of an implausible frame: wait for the rest, but also examine the bytes that follow
 _UNKNOWN = 3  # looks like a whole frame of an unknown message
 _BAD_CRC = 4
 _NOISE = 5
@@ -213,7 +213,7 @@ class PythonFramer:
     def _search(self, data: bytes, begin: int, scan: _ScanState) -> _Found | None:
         """Return the next valid frame from ``begin`` on, or keep possible beginnings of frames in ``_rest``."""
         size = len(data)
-        hold = -1  # data is kept from here on
+        hold = -1  # position from which data is kept
         unknown = unknown_end = -1  # a whole frame of an unknown message, unless it contains a valid frame
         examined, candidates, bad_crcs = scan
         pending: list[tuple[int, int, int]] = []

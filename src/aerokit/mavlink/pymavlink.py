@@ -97,7 +97,7 @@ def _values(message_class: type[Message], message: Any) -> dict[str, Any]:
 
 
 def _has(message: Any, name: str) -> bool:
-    # Not hasattr alone, because every class of pymavlink has an attribute ``id``.
+    # hasattr alone would not do, because every class of pymavlink has an attribute ``id``.
     if name in getattr(message, "__dict__", ()):
         return True
     return hasattr(message, name) and not hasattr(type(message), "ordered_fieldnames")

@@ -67,8 +67,8 @@ class SourceStatistics(SourceFields):
         """Number of lost frames. A frame that arrives late is subtracted again."""
         self.expected = sequence
         """Sequence number of the next frame. Does not wrap at 255; the low byte is the number on the wire."""
-        # How far `expected` has advanced without a received frame. `received` is derived from the two, so that counting
-        # a frame needs a single addition.
+        # How far `expected` has advanced without a received frame. `received` is derived from both numbers, so that
+        # counting a frame needs a single addition.
         self._without = sequence
         self._missing = 0  # bit n is set if the frame n + 1 before `_missing_at` is missing
         self._missing_at = sequence
@@ -148,7 +148,7 @@ class SourceStatistics(SourceFields):
         return was_missing
 
     def _on_repeated(self, sequence: int, now: float) -> int:
-        # One such frame is a repetition; several in direct succession mean that the sender rebooted.
+        # A single frame like this is a repetition. Several in direct succession mean that the sender rebooted.
         follows = sequence == (self._late_sequence + 1) & 0xFF
         self._late_run = self._late_run + 1 if follows and self._late_at == self.received else 0
         is_near = (self.expected - sequence) & 0xFF <= _MAX_GAP
@@ -185,7 +185,7 @@ class SourceStatistics(SourceFields):
         return LATE if was_first else OTHERS
 
     def _swap(self, sequence: int, now: float, count: int, other_count: int) -> None:
-        self.lost = max(0, self.lost - self._skipped_over)  # below 0 if skipped frames arrived late
+        self.lost = max(0, self.lost - self._skipped_over)  # the difference is below 0 if skipped frames arrived late
         self._other, self._other_count, self._other_at = self.expected & 0xFF, count, now
         self._since, self._returns = self.received - other_count, 0
         self._continue_at(sequence)

@@ -48,7 +48,7 @@ def _records(file: BinaryIO) -> Iterator[tuple[float, bytes]]:
     data, begin, ended, earliest = b"", 0, False, 0
     end: int | None
     while True:
-        if not ended and len(data) - begin < 2 * _MAX_RECORD:  # a record and the header of the next
+        if not ended and len(data) - begin < 2 * _MAX_RECORD:  # room for a record and the header of the next record
             block = file.read(_BLOCK)
             ended = not block
             data, begin = data[begin:] + block, 0
@@ -58,7 +58,7 @@ def _records(file: BinaryIO) -> Iterator[tuple[float, bytes]]:
             if records:
                 yield from records
                 continue
-        # Fast path for unsigned MAVLink 2: takes half the time of `_record_end`.
+        # Fast path for unsigned MAVLink 2, which takes half the time of `_record_end`.
         try:
             end = begin + 20 + data[begin + 9]
             if (

@@ -16,7 +16,7 @@ from aerokit._internal.rotations import euler_from_quaternion as euler_from_quat
 from aerokit._internal.rotations import quaternion_from_euler as quaternion_from_euler
 from aerokit.errors import InvalidArgument
 
-_METRES_PER_DEGREE_E7 = 0.011131884502145034  # ArduPilot's LOCATION_SCALING_FACTOR: the same sphere and rounding.
+_METRES_PER_DEGREE_E7 = 0.011131884502145034  # ArduPilot's LOCATION_SCALING_FACTOR, for the same sphere and rounding.
 
 
 Ned = tuple[float, float, float]

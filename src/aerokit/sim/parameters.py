@@ -79,7 +79,7 @@ class SimParameters:
     def __getitem__(self, name: str) -> float:
         try:
             return self._rows[name].value  # type: ignore[union-attr]
-        except AttributeError:  # The row is still a line of text.
+        except AttributeError:  # The row has not been parsed yet.
             return self.row(name).value
 
     def get(self, name: str, default: float) -> float:

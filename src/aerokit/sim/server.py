@@ -17,7 +17,7 @@ from aerokit.sim.channel import Channel, SharedMessageReader, datagrams
 from aerokit.sim.vehicle import TICK_S, SimulatedVehicle
 from aerokit.transport import Link, MemoryLink, Peer, TcpListen, create_link, memory_link_pair
 
-# Minimum timer delay in loop time, for many vehicles or above real time: several ticks then run in one callback.
+# Minimum timer delay in loop time. With many vehicles or above real time, several ticks then run in one callback.
 _MIN_WAIT_S = 0.001
 _BATCH_THRESHOLD = 10
 # Output of this many simulated seconds is sent together for more than `_BATCH_THRESHOLD` vehicles.
@@ -193,7 +193,7 @@ class SimulatorServer:
         loop = self._loop
         if self._jump is None or loop is None or self._loop_time(min(self._dues)) < loop.time() + _INSTANT_S:
             self._schedule()
-        else:  # The receivers of the datagrams run first; they might not answer.
+        else:  # The receivers of the datagrams run first, but might not answer.
             loop.call_soon(self._continue_run, _EXTRA_TURNS)
 
     def _continue_run(self, turns: int) -> None:

@@ -48,8 +48,8 @@ class Outbox:
         self._waiting_bytes = 0
         self._forwarded = 0  # bytes written to the transport
         self._left = 0  # bytes that had left this machine at the last poll
-        self._progress_at = 0.0  # last progress, or start of waiting
-        self._is_full = False  # between pause() and resume()
+        self._progress_at = 0.0  # time of the last progress, or of the start of waiting
+        self._is_full = False  # True between pause() and resume()
         self._is_stalled = self._is_closed = False
         self._timer: asyncio.TimerHandle | None = None
 

@@ -87,7 +87,7 @@ class ReconnectingLink(Link):
         self._receiver: Receiver | None = None  # None: no callbacks
         self._current: _CurrentReceiver | None = None  # callbacks of earlier links are ignored
         self._was_opened = self._is_closed = self._is_up = False
-        self._lost_at: float | None = None  # None: not reported as lost
+        self._lost_at: float | None = None  # None while the link is not reported as lost
         self._reopening: asyncio.Task[None] | None = None
         self._stable_timer: asyncio.TimerHandle | None = None
         self._dropped = 0

@@ -156,11 +156,11 @@ class SerialLink(BaseLink):
     def _close_port(self, transport: Any) -> None:
         unsent = self._waiting_to_be_sent(transport)
         with contextlib.suppress(RuntimeError):  # the loop is closed
-            transport.pause_reading()  # a second call, because the first has no effect before the first loop iteration
+            transport.pause_reading()  # again, because the first call has no effect before the first loop iteration
             transport.flush()
         if unsent:
             with contextlib.suppress(Exception):
-                self._port.reset_output_buffer()  # otherwise close() waits up to 30 s until the buffer is sent
+                self._port.reset_output_buffer()  # with data in the buffer, close() would wait for up to 30 s
         self._port.close()
         self._released.set()
 

@@ -164,7 +164,7 @@ class TcpListen(_TcpLink):
         super().__init__("tcpin", host, port)
         self._allowed = AllowedPeers(peers)
         self._kept: set[Peer] = set()
-        self._socket: socket.socket | None = None  # until the server owns it
+        self._socket: socket.socket | None = None  # None once the server owns the socket
         self._server: asyncio.AbstractServer | None = None
         self._local_address = ("", 0)
         self._clients: dict[Peer, _Stream] = {}

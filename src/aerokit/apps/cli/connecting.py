@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from aerokit.transport.link import Link
     from aerokit.vehicle.vehicle import Vehicle
 
-# HEARTBEAT is sent once a second.
+# Long enough to receive the heartbeats of all vehicles, which come once a second.
 _OTHER_VEHICLES_TIMEOUT_S = 1.5
 SIGNING_KEY_VARIABLE = "AEROKIT_SIGNING_KEY"
 """Environment variable with the signing key: a passphrase, or 64 hexadecimal digits."""

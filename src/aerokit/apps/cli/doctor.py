@@ -112,7 +112,7 @@ def _users_of(device: str) -> list[str]:
             opened = {os.readlink(f"{process}/fd/{descriptor}") for descriptor in os.listdir(f"{process}/fd")}
             if os.path.realpath(device) in opened:
                 users.append(f"{Path(process, 'comm').read_text().strip()} (process {number})")
-        except OSError:  # another user's process, or one that has ended
+        except OSError:  # the process belongs to another user, or has ended
             continue
     return users
 

@@ -136,7 +136,7 @@ class MqttLink(BaseLink):
             client.username_pw_set(where.user, where.password)
         self._answered = loop.create_future()
 
-        def connect() -> Any:  # name resolution, connection and TLS handshake block
+        def connect() -> Any:  # runs on a thread, because name resolution, connection and TLS handshake block
             if where.scheme == "mqtts":
                 client.tls_set_context(ssl.create_default_context())
             client.connect(where.host, where.port, KEEPALIVE_S)
@@ -206,7 +206,7 @@ class MqttLink(BaseLink):
         loop = asyncio.get_running_loop()
         loop.remove_reader(sock)
         loop.remove_writer(sock)
-        if client is self._client:  # lost: unsent data must not arrive when the network is back
+        if client is self._client:  # the connection was lost; unsent data must not arrive when the network is back
             discard_on_close(sock)
 
     def _answer(self, text: str) -> None:

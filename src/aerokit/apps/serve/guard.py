@@ -205,7 +205,7 @@ class _HttpConnection(H11Protocol):
     def handle_events(self) -> None:
         before = self.scope
         super().handle_events()
-        if self.scope is not before:  # the headers of a new request are complete
+        if self.scope is not before:  # True once the headers of a new request are complete
             self._stop_timer()
             if self._has_token():
                 self._anonymous.pop(self, None)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from aerokit.connection.multilink.link_choice import Candidate, LinkChoice
     from aerokit.mavlink.frame import Frame
 
-MAX_REMEMBERED = 4096  # frames: 10 s at 400 frames per second
+MAX_REMEMBERED = 4096  # frames, i.e. 10 s at 400 frames per second
 
 # A copy within this time is always a duplicate.
 COPY_WINDOW_S = 3.0
@@ -22,7 +22,7 @@ COPY_WINDOW_S = 3.0
 # A later copy, within this time, is a duplicate only if the first copy was accepted. Slow links deliver such copies.
 LATE_COPY_WINDOW_S = 10.0
 
-# Sequence numbers repeat after 256 frames. Equal bytes at least half of that later are a different frame.
+# Sequence numbers repeat after 256 frames. Equal bytes after at least half as many frames are a different frame.
 COPY_WINDOW_FRAMES = 128
 
 
@@ -30,7 +30,7 @@ class _Seen:
     __slots__ = ("at", "count", "is_accepted", "is_admitted", "links")
 
     def __init__(self, at: float, links: int, count: int) -> None:
-        self.at, self.links = at, links  # one bit for each link
+        self.at, self.links = at, links  # links: one bit for each link
         self.count = count  # the sender's frame count when this frame arrived
         self.is_admitted = self.is_accepted = False
 

@@ -160,7 +160,7 @@ MIN_BETTER_S = 3.0
 
 JITTER_S = 0.05
 
-# Maximum wait for a moment without a command in transit: set-points may be sent continuously.
+# Maximum wait for a moment without a command in transit, because set-points may be sent continuously.
 MAX_SWITCH_DELAY_S = 10.0
 
 

@@ -27,10 +27,10 @@ logger: logging.Logger = logging.getLogger("aerokit")
 
 PROBE_INTERVAL_S = 0.5
 IDLE_COSTLY_PROBE_INTERVAL_S = 5.0
-TIMER_TOLERANCE_S = 0.05  # probe() is called ten times a second
+TIMER_TOLERANCE_S = 0.05  # for probe(), which is called only ten times a second
 MAX_PENDING = 256
 
-# Probes per second to all systems without a vehicle object: forged system ids must not saturate a slow radio.
+# Probes per second to all systems without a vehicle object, so that forged system ids cannot saturate a slow radio.
 UNATTACHED_RATE_HZ = 40.0
 
 _AUTOPILOT = int(MavComponent.AUTOPILOT1)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 MAX_SAMPLES = 20
 TOLERANCE_S = 0.1
 MAX_SPEED_ERROR = 0.02  # simulations do not keep their nominal speed exactly
-MAX_DRIFT_S = 0.5  # otherwise any clock would match after a long enough silence
+MAX_DRIFT_S = 0.5  # without this limit, any clock would match after a long enough silence
 REAL_TIME_TOLERANCE = 0.05  # a measured speed of 1 ± this counts as 1: the error adds up in a long silence
 MIN_SPAN_S = 1.0
 MAX_SPEED = 200.0  # maximum speed of a simulation, relative to real time

@@ -115,7 +115,7 @@ def convert(
         kinds = ("folder", "file") if to.is_dir() else ("file", "folder")
         raise InvalidArgument(f"{to} is a {kinds[0]} and cannot be replaced by a {kinds[1]}")
     on_bytes = _byte_callback(source, on_progress)
-    # In the target's directory, so that it can be renamed.
+    # The temporary folder is in the target's directory, so that the result can be renamed.
     with tempfile.TemporaryDirectory(dir=to.parent, prefix=f".{to.name}.") as folder:
         part = Path(folder) / to.name
         if not to.suffix:

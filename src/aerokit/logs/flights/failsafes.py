@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 # Evidence of the same kind within this time belongs to one failsafe.
 _SAME_KIND_GAP_S = 8.0
-# Evidence of the kind "general" belongs to the same failsafe as specific evidence that is at most this far away.
+# Evidence of the kind "general" belongs to the failsafe of specific evidence if they are at most this time apart.
 _GENERAL_GAP_S = 3.0
 _REACTION_TIMEOUT_S = 12.0
 _CONTEXT_S = 10.0

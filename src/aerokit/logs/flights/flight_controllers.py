@@ -62,7 +62,7 @@ def opened_bin(path: Path, on_percent: Callable[[float], object] | None = None) 
 
 def close_bin(reader: Any) -> None:
     for name in ("data_map", "filehandle"):
-        with suppress(AttributeError, BufferError):  # never opened, or still referenced by a traceback
+        with suppress(AttributeError, BufferError):  # the file was never opened, or is still referenced by a traceback
             getattr(reader, name).close()
 
 
@@ -154,7 +154,7 @@ class BinReader(_RowReader):
         try:
             with redirect_stdout(sys.stderr):  # see opened_bin
                 return reader.recv_msg()
-        except Exception as error:  # arbitrary errors for a damaged row
+        except Exception as error:  # pymavlink raises arbitrary errors for a damaged row
             self.notes.append(f"damaged at byte {reader.offset}; the rest was skipped: {error}")
             return None
 

@@ -36,7 +36,7 @@ _ARMED, _DISARMED = 10, 11  # events in old logs without ARM
 _HOME = 1
 # A position closer to 0° N 0° E means that the estimator has no position yet.
 _NULL_ISLAND_DEG = 0.01
-_INDEXING_SHARE = 0.3  # share of the total time, for the progress
+_INDEXING_SHARE = 0.3  # share of the total time that indexing takes, for the progress
 
 
 def read_bin_flight(flight: FlightLog, system_id: int | None, on_bytes: Callable[[int], object]) -> None:

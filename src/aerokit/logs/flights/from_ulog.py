@@ -71,7 +71,7 @@ _FLAGS = {
     "vtol_fixed_wing_system_failure": ("transition", "fixed-wing system failure"),
 }
 _WARNINGS = {1: "low", 2: "critical", 3: "emergency", 4: "failed"}
-_LOADING_SHARE = 0.9  # share of the total time, for the progress
+_LOADING_SHARE = 0.9  # share of the total time that loading takes, for the progress
 _BUFFER = 1 << 20
 
 

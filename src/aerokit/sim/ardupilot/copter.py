@@ -125,7 +125,7 @@ _refusing = partial(
     entry_severity=MavSeverity.WARNING,
 )
 
-# In the order of AVAILABLE_MODES. SPORT and AUTOROTATE do not exist, as in the firmware for quadrotors.
+# Modes in the order of AVAILABLE_MODES. SPORT and AUTOROTATE do not exist, as in the firmware for quadrotors.
 _MODES: tuple[Callable[[Any], ArduPilotMode], ...] = (
     _refusing(
         CopterMode.AUTO_RTL, "AUTO RTL", entry_texts=("Unable to start landing sequence",),

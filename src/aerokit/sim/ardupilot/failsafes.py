@@ -97,7 +97,7 @@ class ArduPilotFailsafes(Generic[HostT]):
         self.battery: BatteryFailsafe = BatteryFailsafe(vehicle, self.BATTERY_PRIORITIES, self.act_on_battery)
         self.ground_station = False
         self.estimator = False
-        self.radio = False  # True while the RC link counts as lost; the vehicle cannot be armed then.
+        self.radio = False  # True while the RC link counts as lost, which also prevents arming.
         self.ground_station_seen_at: float = math.nan
         """Time of the last heartbeat of the ground station MAV_GCS_SYSID."""
         self.radio_received_at: float = math.nan  # Time of the last RC pulses or overrides.
@@ -176,7 +176,7 @@ class ArduPilotArming(Generic[HostT]):
 
     def __init__(self, vehicle: HostT) -> None:
         self.vehicle = vehicle
-        self.passes: bool = False  # Health of the pre-arm checks in SYS_STATUS.
+        self.passes: bool = False  # True if SYS_STATUS reports healthy pre-arm checks.
         self._reported_at = -math.inf
         self._passed_common = self._is_news = False
         self._needs_no_arming = False

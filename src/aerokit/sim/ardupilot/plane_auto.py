@@ -187,7 +187,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         plane.info(f"Landing approach start at {plane.altitude_m:.1f}m")
 
     def _return(self, _: MissionItem) -> None:
-        # ArduPlane changes the mode (`start_command` in commands_logic.cpp), which stops the mission.
+        # ArduPlane changes the mode (`start_command` in commands_logic.cpp). This stops the mission.
         self.vehicle.set_mode(PlaneMode.RTL)
 
     def _wait(self, _: MissionItem) -> None:

@@ -109,7 +109,7 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
 
     @property
     def is_any_active(self) -> bool:
-        return bool(self._triggered) or self.estimator  # On Rover a low battery is not MAV_STATE_CRITICAL.
+        return bool(self._triggered) or self.estimator  # On Rover, a low battery does not cause MAV_STATE_CRITICAL.
 
     def update(self) -> None:
         self._check_radio()

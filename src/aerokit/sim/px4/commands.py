@@ -24,13 +24,13 @@ from aerokit.sim.px4.payload import gimbal_commands
 from aerokit.sim.px4.telemetry import available_modes
 
 _C = MavCmd
-# Accepted without a visible effect.
+# Commands that are accepted without a visible effect.
 _ACCEPTED = (
     _C.NAV_ROI, _C.NAV_VTOL_TAKEOFF, _C.DO_SET_ACTUATOR, _C.DO_SET_ROI_LOCATION, _C.DO_SET_ROI_WPNEXT_OFFSET,
     _C.DO_SET_ROI_NONE, _C.DO_SET_ROI, _C.DO_SET_SAFETY_SWITCH_STATE,
 )  # fmt: skip
 
-# Not answered, because the modules that handle them do not run in this configuration.
+# Commands without an answer, because their modules do not run in this configuration.
 _UNANSWERED = (
     _C.NAV_DELAY, _C.DO_DIGICAM_CONTROL, _C.DO_MOUNT_CONFIGURE, _C.DO_MOUNT_CONTROL, _C.DO_SET_CAM_TRIGG_DIST,
     _C.DO_SET_CAM_TRIGG_INTERVAL, _C.PREFLIGHT_UAVCAN, _C.REQUEST_CAMERA_INFORMATION, _C.SET_CAMERA_MODE,

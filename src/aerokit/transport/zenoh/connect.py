@@ -120,7 +120,7 @@ class ZenohConnect(NetworkLink):
         raise LinkOpenError(f"cannot open {self.address}: {self._describe_missing()}")
 
     def _declare(self, queue: LoopQueue[Callable[[], object]], zenoh: Any, session: Any) -> None:
-        # Runs on a thread, as do the callbacks.
+        # This function and the callbacks run on threads.
         def callback(process: Callable[[bytes, bytes, bool], object]) -> Callable[[Any], None]:
             def on_sample(sample: Any) -> None:
                 is_put, payload = sample.kind == zenoh.SampleKind.PUT, payload_of(sample)

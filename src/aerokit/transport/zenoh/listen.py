@@ -124,8 +124,8 @@ class ZenohListen(NetworkLink):
         self._send_beacon()
 
     def _find_rivals(self, queue: LoopQueue[Callable[[], object]], zenoh: Any, session: Any) -> None:
-        # Runs on a thread. A liveliness token alone does not prove that the name is in use, because the token of a
-        # killed program remains for a while.
+        # This function runs on a thread. A liveliness token alone does not prove that the name is in use, because the
+        # token of a killed program remains for a while.
         def on_beacon(sample: Any) -> None:
             payload = payload_of(sample)
             if len(payload) <= MAX_PAYLOAD_BYTES:

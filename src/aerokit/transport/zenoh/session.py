@@ -20,7 +20,7 @@ ItemT = TypeVar("ItemT")
 MAX_QUEUED = 2048
 """Maximum number of items that wait for a blocked event loop. A further item replaces the oldest."""
 
-_MAX_PER_ITERATION = 256  # so that other tasks can run
+_MAX_PER_ITERATION = 256  # a limit, so that other tasks can run
 
 
 class LoopQueue(Generic[ItemT]):
@@ -99,18 +99,18 @@ MAX_PAYLOAD_BYTES = 65535
 
 _CONNECT_FAILED = "Unable to connect to any of"
 
-_ENDPOINTS = re.compile(r"[a-z]+/[^\s,()\[\]]+")  # zenoh 1.6 writes "[tcp/a:1]", others "[Single(tcp/a:1)]"
+_ENDPOINTS = re.compile(r"[a-z]+/[^\s,()\[\]]+")  # zenoh 1.6: "[tcp/a:1]", other versions: "[Single(tcp/a:1)]"
 
 _TX = "transport/link/tx/queue"
 
-# Without this, each put that drops data may block the loop for a millisecond.
+# Without this setting, each put that drops data may block the loop for a millisecond.
 _DROP_AT_ONCE = (f"{_TX}/congestion_control/drop/wait_before_drop", 0)
 
 _SETTINGS = (
     # Batches of up to 64 KB: enough for a burst of 1000 frames, and the maximum that a broken connection delays.
     (f"{_TX}/size/data", 4),
     (f"{_TX}/size/real_time", 4),
-    ("transport/shared_memory/enabled", False),  # its pool for large messages takes 16 MB
+    ("transport/shared_memory/enabled", False),  # the memory pool for large messages would take 16 MB
 )
 
 
