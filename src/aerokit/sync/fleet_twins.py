@@ -125,7 +125,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
             InvalidArgument: a name is unknown, or a target is too far away. Nothing was sent.
             ValueUnknownError: the position of a member is unknown. Nothing was sent.
             OperationRejected: paths come too close and cannot be separated: nothing was sent. Or a member became
-                unavailable between two legs in layers: the others stay in their layers.
+                unavailable between two legs in layers: the other members stay in their layers.
         """
         return self._loop.run(
             self.aio.go_to,
@@ -154,8 +154,8 @@ class Selection(SelectionTwin["AsyncSelection"]):
         Args:
             targets: as for :meth:`go_to`.
             min_distance_m: minimum distance between any two members in metres; None: that of the fleet.
-            by: ``"layers"``: separate crossing paths by altitude; ``"corridors"``: by time, which needs ``speed_m_s``;
-                ``"refuse"``: refuse crossing paths.
+            by: ``"layers"`` separates crossing paths by altitude, ``"corridors"`` by time, which needs ``speed_m_s``.
+                ``"refuse"`` refuses crossing paths.
             speed_m_s: ground speed of all members.
             max_altitude_m: highest layer in metres above sea level; None: no limit.
             slack_s: for corridors: how early or late a member may be relative to another, in seconds.
@@ -201,7 +201,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
         """Fly a show: all members fly to their first points, start at the same instant, and hold at the end.
 
         The members have to be in the air. Their clocks are measured with TIMESYNC, so that delayed telemetry does not
-        count as deviation. If a member fails, the fleet's policy decides about the others, as in any action.
+        count as deviation. If a member fails, the fleet's policy decides about the other members, as in any action.
 
         Args:
             show: tracks by member's name; :meth:`Show.renamed` assigns tracks to members.
@@ -263,7 +263,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
         """Keep a formation while the leader moves: ``async with fleet.following(formation, leader="north/1"):``.
 
         Each follower is flown by velocity set-points. If the leader is lost or taken over, the followers hold. If a
-        follower fails, the fleet's policy decides about the others.
+        follower fails, the fleet's policy decides about the other followers.
 
         Args:
             formation: the places.
@@ -394,7 +394,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
         return self._loop.run(self.aio.arm, timeout=timeout, stagger_s=stagger_s)
 
     def disarm(self, *, timeout: float = 10.0) -> FleetResult:
-        """Disarm; refused in the air; see :meth:`aerokit.Vehicle.disarm`.
+        """Disarm; see :meth:`aerokit.Vehicle.disarm`. Vehicles in the air refuse.
 
         Args:
             timeout: seconds for each member.

@@ -380,7 +380,7 @@ class Connection(ConnectionTwin):
 
     @property
     def signing(self) -> Signing | None:
-        """Key that signs sent frames and verifies received ones; None: frames are neither signed nor verified.
+        """Key that signs sent frames and verifies received frames; None: frames are neither signed nor verified.
 
         ``signing.timestamp`` is the time stamp to store; ``signing.refused`` counts refused frames. May be set while
         the connection is open. Raises InvalidArgument with MAVLink 1, which has no signatures.
@@ -407,7 +407,7 @@ class Connection(ConnectionTwin):
 
     @property
     def unsent_bytes(self) -> int:
-        """Number of written bytes that have not left this machine, if the link can measure it.
+        """Number of written bytes that have not left this machine, if the link can measure that number.
 
         A value that stays above 0 means that the link does not drain (TCP without a network, a serial port with flow
         control asserted); see :class:`LinkStalled`. Always 0 for UDP.
@@ -417,7 +417,7 @@ class Connection(ConnectionTwin):
     def discard_unsent(self) -> None:
         """Discard data that was sent but has not left this program, e.g. an outdated command.
 
-        This applies to all waiting data, for all targets. Data in the system's TCP buffer cannot be discarded and
+        The call discards all waiting data, for all targets. Data in the system's TCP buffer cannot be discarded and
         stays in :attr:`unsent_bytes`.
         """
         self._loop.call(self.aio.discard_unsent)
@@ -5187,7 +5187,7 @@ def open_connection(
         address: a connection string (``"udpin:0.0.0.0:14550"``, ``"/dev/ttyACM0,57600"``, …) or an unopened link; or a
             list of links to the same vehicles (docs/how-to/several-links.md). With a list, each frame is processed
             once, and commands use the best link that works. ``?costly=1`` in an address marks a link that is used only
-            when the others fail. A lost link is reopened while another one works.
+            when the others fail. A lost link is reopened while another link works.
         source_system: own system id, 1–255; ground stations use 255.
         source_component: own component id, 1–255. 0 is allowed for programs that have always used it (DroneKit).
         baud: bits per second of a serial link whose address does not give them, above 0.
