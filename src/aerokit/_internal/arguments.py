@@ -183,7 +183,7 @@ def _named_rule(name: str, names: Mapping[str, Any]) -> Rule:
 
 
 def _generic_rule(name: str, inner: ast.expr, names: Mapping[str, Any]) -> Rule:
-    if name in _SIMPLE:  # Callable[[int], None], PathLike[str]
+    if name in _SIMPLE:  # e.g. Callable[[int], None] or PathLike[str]
         return _SIMPLE[name]
     parts = inner.elts if isinstance(inner, ast.Tuple) else [inner]
     rules = [_rule(part, names) for part in parts]

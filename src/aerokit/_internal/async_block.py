@@ -40,7 +40,7 @@ class _Block(AbstractAsyncContextManager[T]):
     async def __aenter__(self) -> T:
         try:
             asyncio.get_running_loop()
-        except RuntimeError:  # trio.run, for example
+        except RuntimeError:  # there is no asyncio loop, e.g. in trio.run
             raise InvalidArgument(
                 f"{self._name}(…) requires asyncio, and no asyncio event loop is running here: start the program with"
                 " asyncio.run(…), or, on trio, use aerokit.sync in a thread (trio.to_thread.run_sync)"

@@ -89,7 +89,7 @@ class ExchangeRun(Generic[ResultT]):
         try:
             for message in exchange.take_outbox():
                 self._connection.send(message)
-        except Exception as error:  # otherwise the caller of result() would never get it
+        except Exception as error:  # passed on to the caller of result()
             exchange.abort(error)
         if exchange.done:
             self._connection.deadlines.cancel(self._expire)

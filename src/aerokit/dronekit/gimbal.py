@@ -72,7 +72,7 @@ class Gimbal(GimbalPrivates):
         Args:
             pitch: degrees from the horizon: 0 is level, -90 straight down.
             roll: degrees from the horizon. If not 0, a command is used that stabilises yaw relative to the vehicle:
-                ``yaw`` is correct when the command is sent, and follows the vehicle afterwards.
+                the camera points at ``yaw`` at first, but then turns with the vehicle.
             yaw: degrees clockwise from north.
         """
         angles = [_checked(name, value) for name, value in (("pitch", pitch), ("yaw", yaw), ("roll", roll))]

@@ -1,8 +1,9 @@
 """Generates the modules of messages and enums from pymavlink's XML and additions.
 
 pymavlink contains ArduPilot's fork of the standard. The XML files in the folder ``additions`` contain the definitions
-of the standard that are missing in the fork. Where the two differ in units, enums, values or deprecation, the additions
-take precedence. Descriptions are taken from pymavlink if it has them. ArduPilot's own definitions are kept.
+of the standard that are missing in the fork. Where fork and additions differ in units, enums, values or deprecation,
+the additions take precedence. Descriptions are taken from pymavlink if it has them. ArduPilot's own definitions are
+kept.
 
     python -m aerokit.mavlink.generator            # write the modules
     python -m aerokit.mavlink.generator --check    # compare only; exit code 1 if the modules differ

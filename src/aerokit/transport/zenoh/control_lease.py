@@ -260,7 +260,7 @@ MAX_DELAY_S = 2.0
 
 _MAX_NONCES = 256
 
-_MAX_DRIFT = 0.001  # relative drift of two clocks; quartz is ten times better
+_MAX_DRIFT = 0.001  # maximum relative drift of two clocks; quartz clocks are ten times better
 
 
 class FreshnessChecker:
