@@ -56,7 +56,7 @@ class SignatureGate:
 
         The yielded event is set at the switch. Before the switch, the old key signs and verifies. One frame signed with
         the new key is enough. If the key is removed, at least `MIN_UNSIGNED_FRAMES` unsigned frames over
-        `MIN_UNSIGNED_S` without a signed one are needed, because any sender could forge a few.
+        `MIN_UNSIGNED_S` without a signed frame are needed, because any sender could forge a few unsigned frames.
 
         Raises:
             BusyError: another handover is in progress.

@@ -240,8 +240,8 @@ class Master:
 class Inbox(Mapping[str, Any]):
     """The last message of every type by name, and a queue of unread messages, as pymavlink objects.
 
-    Receives from the first access on; look-ups in the first second wait for a message. Contains messages of the
-    vehicle, of radios and of ground stations, but not of other vehicles.
+    Messages are received from the first access on. Look-ups in the first second wait for a message. Contains messages
+    of the vehicle, of radios and of ground stations, but not of other vehicles.
     """
 
     def __init__(self, connection: ClassicConnection) -> None:

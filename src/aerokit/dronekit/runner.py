@@ -110,9 +110,10 @@ RUNPY_FILES = (runpy.__file__, "<frozen runpy>")
 def run_script(path: str | os.PathLike[str], arguments: Sequence[str] = ()) -> None:
     """Run a DroneKit program in this process, and return when its main program has ended.
 
-    Its environment is that of ``python program.py arguments…``: ``sys.argv``, its folder first in ``sys.path``,
-    ``__name__ == '__main__'``. ``import dronekit`` imports :mod:`aerokit.dronekit`, also afterwards. A folder or zip
-    file with a ``__main__.py`` is a program, too. Afterwards ``sys`` is restored, and open vehicles are closed.
+    The program's environment is that of ``python program.py arguments…``: ``sys.argv``, its folder first in
+    ``sys.path``, ``__name__ == '__main__'``. ``import dronekit`` imports :mod:`aerokit.dronekit`, also afterwards. A
+    folder or zip file with a ``__main__.py`` is a program, too. Afterwards ``sys`` is restored, and open vehicles are
+    closed.
 
     Args:
         path: the program.

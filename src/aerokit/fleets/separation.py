@@ -52,7 +52,7 @@ class Deconfliction(Snapshot):
     - ``"corridors"``: each vehicle starts after its delay in ``delays_s``;
     - ``"refused"``: the conflicts cannot be resolved.
 
-    ``conflicts`` are those of the original paths. Heights are metres above sea level.
+    ``conflicts`` has the conflicts of the original paths. Heights are metres above sea level.
     """
 
     decision: Literal["clear", "layers", "corridors", "refused"]

@@ -36,7 +36,7 @@ ORDER_MAX_AGE_S = 1.0
 
 
 class Filters:
-    """Select the messages that an endpoint sends: those that match ``only`` (all if empty) and not ``block``.
+    """Selects the messages that an endpoint sends: those that match ``only`` (all if empty) and not ``block``.
 
     Patterns may contain wildcards: ``"GPS_*"``. ``rates`` maps patterns to the maximum rate per sender in Hz; the first
     matching pattern applies. Wildcards do not limit `ANSWERS`.

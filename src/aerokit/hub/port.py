@@ -175,7 +175,7 @@ class Port:
     """One peer of one endpoint.
 
     While the link accepts data, frames are collected in ``batch`` until the end of the loop iteration. While more than
-    ``hold_above`` bytes are unsent (`UNLIMITED`: not checked), frames wait in a `FrameQueue`.
+    ``hold_above`` bytes are unsent, frames wait in a `FrameQueue`. `UNLIMITED` turns this check off.
 
     ``endpoint`` is the endpoint's name, ``period(message_id)`` is `Filters.period`. ``report(kind, text)`` publishes an
     event of the endpoint; ``on_drop(reason, frame)`` is called for each frame dropped from the queue.

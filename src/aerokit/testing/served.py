@@ -116,9 +116,9 @@ def hosted_flight(
 ) -> Iterator[ServedFlight]:
     """Serve a vehicle on an address while the block runs; ``options`` are those of the vehicle.
 
-    Timeouts of the vehicle for the client are multiplied by ``speedup``, except those in ``parameters``; see
-    `aerokit.sim.kinds.scale_timeouts`. Raises InvalidArgument for a wrong kind or address, LinkOpenError if the
-    address cannot be opened, and on exit an exception of the vehicle that was not raised before.
+    Timeouts after which the vehicle reacts to a silent client are multiplied by ``speedup``, except those in
+    ``parameters``; see `aerokit.sim.kinds.scale_timeouts`. Raises InvalidArgument for a wrong kind or address,
+    LinkOpenError if the address cannot be opened, and on exit an exception of the vehicle that was not raised before.
     """
     from anyio.from_thread import start_blocking_portal
 

@@ -263,9 +263,9 @@ async def mqtt_publisher(address: str) -> AsyncIterator[Publisher]:
     """Connect to an MQTT broker while the block lasts.
 
     States are published to the topics ``aerokit/FLEET/NAME/state/…``, with QoS 0, not retained.
-    ``aerokit/FLEET/NAME/alive`` is retained: "online" within the block, "offline" after it or after the broker has lost
-    the connection. A lost connection is reopened; values published meanwhile are dropped. The event loop must support
-    ``add_reader``: on Windows only ``asyncio.SelectorEventLoop`` does.
+    ``aerokit/FLEET/NAME/alive`` is retained: "online" within the block, "offline" after the block or once the broker
+    has lost the connection. A lost connection is reopened; values published meanwhile are dropped. The event loop must
+    support ``add_reader``; on Windows, only ``asyncio.SelectorEventLoop`` has it.
 
     Args:
         address: ``"mqtt://10.0.0.5:1883/fleet/alpha"``, ``"mqtt://user:password@…"``; ``mqtts`` for TLS (port

@@ -375,7 +375,7 @@ class HttpApi:
                     del self._plans[vehicle, kind]
 
     async def _check_plan(self, request: Request) -> Response:
-        self._access.check(request.headers, needs_token=True)  # before the body is read, because large plans take time to parse
+        self._access.check(request.headers, needs_token=True)  # checked first, because large plans take time to parse
         arguments = await read_body(request, UPLOAD.max_body_size)
         UPLOAD.check(arguments)
         _, _, plan = parse_plan_body(arguments)

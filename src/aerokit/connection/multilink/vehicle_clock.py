@@ -1,7 +1,7 @@
 """``VehicleClock`` and ``HardwareId``: evidence that two links lead to the same vehicle.
 
-The time in a TIMESYNC answer counts from boot on ArduPilot and PX4. Two vehicles with the same system id therefore
-differ by more than the round-trip time.
+The time in a TIMESYNC answer counts from boot on ArduPilot and PX4. The times of two vehicles with the same system id
+therefore differ by more than the round-trip time.
 """
 
 from __future__ import annotations

@@ -33,8 +33,8 @@ class _Refused(Exception):
 class ArduPilotFtp(FtpRequestServer[FileTree]):
     """MAVFTP with the limits of the firmware (GCS_FTP.cpp).
 
-    A worker processes the queue every 2 ms. The queue holds five requests; more are lost, also during a burst. A burst
-    cannot be stopped. The answer to a repeated sequence number is the last reply.
+    A worker processes the queue every 2 ms. The queue holds five requests; further requests are lost, also during a
+    burst. A burst cannot be stopped. The answer to a repeated sequence number is the last reply.
 
     The client chooses the session number. A session with an open file blocks other sessions until its client closes
     it, or has sent nothing for 3 s. A close is always acknowledged, even if writing failed. `Faults.no_ftp` turns the

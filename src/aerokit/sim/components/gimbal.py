@@ -35,7 +35,7 @@ class SimulatedGimbal(SimulatedComponent, GimbalMount):
     Only the component in control can command the gimbal; initially no component is. Take control with
     MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE. Commands of other components are DENIED, their messages are ignored.
 
-    - ``component_id``: MAVLink reserves 154 and 171 to 175 for gimbals; ``system_id``: None uses the vehicle's
+    - ``component_id``: MAVLink reserves 154 and 171 to 175 for gimbals; ``system_id``: None uses that of the vehicle
     - ``roll_deg``, ``pitch_deg``, ``yaw_deg``: minimum and maximum angle; roll and pitch relative to the horizon
     - ``slew_deg_s``: turn rate
     - ``attitude_rate_hz``: rate of GIMBAL_DEVICE_ATTITUDE_STATUS
