@@ -208,9 +208,9 @@ class FlightLog:
     velocity_target: TimeSeries = field(default_factory=lambda: TimeSeries("north_m_s", "east_m_s", "down_m_s"))
     attitude_target: TimeSeries = field(default_factory=lambda: TimeSeries("roll_deg", "pitch_deg", "yaw_deg"))
     batteries: dict[int, TimeSeries] = field(default_factory=dict)
-    """By battery number, from 0: ``voltage_v``, ``current_a``, ``used_mah``, ``remaining_percent``."""
+    """Time series by battery number, from 0: ``voltage_v``, ``current_a``, ``used_mah``, ``remaining_percent``."""
     gps: dict[int, TimeSeries] = field(default_factory=dict)
-    """By receiver number: ``fix_type`` (GPS_FIX_TYPE), ``satellites``, ``hdop``, ``accuracy_m``."""
+    """Time series by receiver number: ``fix_type`` (GPS_FIX_TYPE), ``satellites``, ``hdop``, ``accuracy_m``."""
     vibration: TimeSeries = field(default_factory=lambda: TimeSeries("x_m_s2", "y_m_s2", "z_m_s2", "clips"))
     """Vibration levels, and the count of accelerometer clipping. PX4 logs one level, stored as ``x_m_s2``."""
     estimator: TimeSeries = field(
