@@ -146,6 +146,7 @@ def test_page_commands_flight(browser: Any, copters: tuple[list[SimulatedCopter]
         page.locator("#panel tr").nth(5).wait_for()
         assert page.locator("#tiles-of-state dd > span").first.inner_text() == "STABILIZE"
 
+        places = boxes_of_orders(page)
         take_off = page.locator("button[data-order='take_off']")
         assert (take_off.is_disabled(), take_off.locator("small").inner_text()) == (True, "Arm first")
         page.click("button[data-order='arm']")
@@ -166,9 +167,16 @@ def test_page_commands_flight(browser: Any, copters: tuple[list[SimulatedCopter]
                 seen.add((disarm.is_disabled(), disarm.locator("small").inner_text()))
         assert seen == {(True, "Land first")}
         wait_done(page, "Vehicle 1: take off to 20 m: done")
+        assert boxes_of_orders(page) == places
+        assert_toasts_beside_orders(page)
         values_have_units(page)
         order(page, "mission/start")
-        wait_done(page, "mission start")
+        wait_done(page, "Vehicle 1: mission started at item 0")
+        for name in ("mission/start", "mission/resume"):
+            button = page.locator(f"button[data-order='{name}'][disabled]")
+            button.wait_for()
+            assert button.locator("small").inner_text() == "Running"
+        assert page.locator("button[data-order='mission/pause']").is_enabled()
         page.locator("tr.current", has_text=re.compile("^[34]")).wait_for(timeout=90_000)
         picture(page, "mission")
         fly_to_a_click(page, first)
@@ -180,6 +188,15 @@ def test_page_commands_flight(browser: Any, copters: tuple[list[SimulatedCopter]
         with page.expect_response("**/api/vehicles/1/track") as track:
             page.reload()
         assert len(track.value.json()["points"]) > 20
+
+
+def boxes_of_orders(page: Any) -> list[Any]:
+    return list(page.locator("#orders button").evaluate_all("all => all.map(e => e.getBoundingClientRect().toJSON())"))
+
+
+def assert_toasts_beside_orders(page: Any) -> None:
+    orders, toasts = page.locator("#orders").bounding_box(), page.locator("#toasts").bounding_box()
+    assert toasts["y"] + toasts["height"] <= orders["y"] or orders["y"] + orders["height"] <= toasts["y"]
 
 
 def values_have_units(page: Any) -> None:
@@ -209,13 +226,68 @@ def fly_to_a_click(page: Any, copter: SimulatedCopter) -> None:
     page.click("button[data-order='pick']")
     box = page.locator("#map").bounding_box()
     page.mouse.click(box["x"] + box["width"] * 0.55, box["y"] + box["height"] * 0.55)
-    asked = re.search(r"(-?\d+\.\d+), (-?\d+\.\d+)", page.locator("dialog p").inner_text())
+    where = page.locator("dialog .where")
+    where.filter(has_text=re.compile(r"^\d+ m (north|east|south|west)\S* of the vehicle$")).wait_for()
+    assert page.locator("dialog").bounding_box()["x"] > box["x"] + box["width"] * 0.55  # the position stays visible
+    page.wait_for_function(TARGET_IS_DRAWN, arg=[0.55, 0.55])
+    picture(page, "go-to")
+    asked = re.search(r"(-?\d+\.\d+), (-?\d+\.\d+)", page.locator("dialog p").first.inner_text())
     assert asked is not None
     page.click("dialog .yes")
     wait_done(page, "go to")
     place = true_point(copter)
     assert place.latitude_deg == pytest.approx(float(asked[1]), abs=3e-5)
     assert place.longitude_deg == pytest.approx(float(asked[2]), abs=3e-5)
+
+
+# Whether the mark of a target is on the map at this fraction of its width and height.
+TARGET_IS_DRAWN = """([x, y]) => {
+    const map = document.getElementById("map"), sample = document.createElement("canvas").getContext("2d");
+    sample.fillStyle = getComputedStyle(document.documentElement).getPropertyValue("--accent");
+    sample.fillRect(0, 0, 1, 1);
+    const accent = sample.getImageData(0, 0, 1, 1).data.join();
+    const pixels = map.getContext("2d").getImageData(map.width * x - 12, map.height * y - 12, 24, 24).data;
+    let count = 0;
+    for (let at = 0; at < pixels.length; at += 4) count += pixels.slice(at, at + 4).join() === accent;
+    return count > 30;
+}"""
+RTL_ALT = {"DisplayName": "Altitude", "Description": "", "Units": "cm", "Range": {"low": "30", "high": "300000"}}
+
+
+def test_page_needs_confirmation_outside_metadata(
+    browser: Any, copters: tuple[list[SimulatedCopter], str], tmp_path: Path
+) -> None:
+    (_, second), address = copters
+    metadata = tmp_path / "apm.pdef.json"
+    metadata.write_text(json.dumps({"": {"RTL_ALT": RTL_ALT}}))
+    before = second.parameters["RTL_ALT"]
+    with serving(address, "--metadata", str(metadata)) as server, opened(browser, server["page"]) as page:
+        page.locator(".vehicle", has_text="2 ArduCopter").click()
+        page.get_by_role("tab", name="Parameters").click()
+        page.fill("input[type=search]", "rtl_alt")
+        page.locator("tr", has_text="30 … 300000").click()
+        value, yes, problem = (page.locator(f"dialog {each}") for each in ("input[name=value]", ".yes", ".problem"))
+        assert (problem.is_hidden(), yes.is_enabled()) == (True, True)
+        value.fill("-99999")
+        text = "RTL_ALT = -99999 is not in 30..300000 cm"
+        assert (problem.inner_text(), yes.is_disabled()) == (text, True)
+        check_contrast(page)
+        value.press("Enter")
+        assert page.locator("dialog[open]").count() == 1
+        picture(page, "out-of-range")
+
+        headers = {"Authorization": f"Bearer {server['token']}", "Idempotency-Key": "beside-the-page"}
+        url = f"{server['url'].rstrip('/')}/api/vehicles/2/parameters/RTL_ALT"
+        answer = page.request.put(url, headers=headers, data={"value": -99999})
+        assert (answer.status, answer.json()["detail"].partition(";")[0]) == (400, text)
+        assert second.parameters["RTL_ALT"] == before
+
+        page.check("dialog input[name=force]")
+        yes.click()
+        wait_done(page, "RTL_ALT to -99999")
+        assert second.parameters["RTL_ALT"] == -99999
+        page.request.put(url, headers={**headers, "Idempotency-Key": "restore-it"}, data={"value": before})
+        assert second.parameters["RTL_ALT"] == before
 
 
 def test_page_sets_parameter_after_confirmation(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
@@ -332,6 +404,66 @@ def test_page_shows_why_vehicle_is_not_ready(browser: Any, copters: tuple[list[S
         page.locator("#readiness.good", has_text="Ready to arm").wait_for(timeout=30_000)
 
 
+def test_page_disables_take_off_without_position(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
+    (_, second), address = copters
+    delay, second.parameters["DISARM_DELAY"] = second.parameters["DISARM_DELAY"], 0
+    with serving(address) as server, opened(browser, server["page"], 390, 844) as page:
+        page.locator(".vehicle", has_text="2 ArduCopter").click()
+        page.locator("#readiness.good", has_text="Ready to arm").wait_for(timeout=30_000)
+        places = boxes_of_orders(page)
+        order(page, "arm")
+        wait_done(page, "arm")
+        assert boxes_of_orders(page) == places
+        assert_toasts_beside_orders(page)
+        page.locator("#readiness", has_text="Armed: propellers may turn").wait_for()
+        page.locator("button[data-order='take_off']:enabled").wait_for()
+        second.faults.gps_lost = True
+        try:
+            page.locator("button[data-order='take_off'][disabled]", has_text="No position").wait_for(timeout=30_000)
+            page.locator("#readiness", has_text="Armed: propellers may turn").wait_for()
+        finally:
+            second.faults.gps_lost = False
+            second.parameters["DISARM_DELAY"] = delay
+        order(page, "disarm")
+        wait_done(page, "disarm")
+        page.locator("#readiness.good", has_text="Ready to arm").wait_for(timeout=30_000)
+
+
+READINESS = """async (vehicle) => {
+    const { showReadiness } = await import("/static/readiness.js");
+    const box = document.createElement("section");
+    box.id = "shown";
+    document.getElementById("shown")?.remove();
+    document.getElementById("readiness").after(box);
+    const known = { firmware: "ArduCopter", link: { state: "connected", heartbeat_age_s: 0 }, missing_for_flight: [] };
+    const show = (more) => showReadiness(box, { ...known, states: {}, ...vehicle, ...more }, { isOpen: true });
+    show({});
+    if (box.querySelector("details")) {
+        box.querySelector("details").open = true;
+        show({ missing_for_flight: [...vehicle.missing_for_flight, "a seventh"] });
+    }
+    return box.innerText.split("\\n").filter(Boolean);
+}"""
+
+
+def test_readiness_shows_all_reasons_and_notes(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
+    with serving(copters[1]) as server, opened(browser, server["page"]) as page:
+        reasons = [f"Reason {number}" for number in range(1, 7)]
+        rows = page.evaluate(READINESS, {"missing_for_flight": reasons})
+        assert rows == ["Not ready", *reasons[:4], "and 3 more", *reasons[4:], "A seventh"]
+        armed = {"armed": {"value": True, "age_s": 0}, "landed_state": {"value": "ON_GROUND", "age_s": 0}}
+        assert page.evaluate(READINESS, {"states": armed}) == ["Armed: propellers may turn"]
+        after_return = {"mode": "RTL", "arms_in": "GUIDED"}
+        assert page.evaluate(READINESS, {"unarmable_mode": after_return}) == [
+            "Ready to arm",
+            "Arm changes the mode to GUIDED first: ArduCopter cannot arm in RTL",
+        ]
+        assert page.evaluate(READINESS, {"unarmable_mode": {"mode": "RTL", "arms_in": None}}) == [
+            "Not ready",
+            "ArduCopter cannot arm in RTL",
+        ]
+
+
 def test_disarm_needs_known_ground(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
     expected = {"ON_GROUND": "", "TAKEOFF": "Land first", "LANDING": "Land first", "IN_AIR": "Land first"}
     with serving(copters[1]) as server, opened(browser, server["page"]) as page:
@@ -344,7 +476,8 @@ def test_disarm_needs_known_ground(browser: Any, copters: tuple[list[SimulatedCo
         for landed, text in expected.items():
             assert page.evaluate(obstacles, [landed, 0, 2, "connected"]) == text
         assert page.evaluate(obstacles, ["ON_GROUND", 10, 2, "connected"]) == "Unknown if landed"
-        assert page.evaluate(obstacles, ["ON_GROUND", 0, 2, "silent"]) == "Silent"
+        assert page.evaluate(obstacles, ["ON_GROUND", 0, 2, "silent"]) == "Unknown if landed"
+        assert page.evaluate(obstacles, [None, 0, 10, "silent"]) == ""
         assert page.evaluate(obstacles, [None, 0, 10, "connected"]) == ""  # a rover has no landed state
 
 

@@ -16,7 +16,7 @@ from aerokit.apps.cli.params_metadata import (
     about,
     about_text,
     add_metadata,
-    check_values,
+    check_given,
     load_given,
     metadata_for_check,
     reboot_note,
@@ -130,11 +130,11 @@ async def _diff(options: argparse.Namespace) -> int:
 async def _set(options: argparse.Namespace) -> int:
     given = load_given(options)
     if not options.force:
-        check_values(given, dict(options.values))
+        check_given(given, dict(options.values))
     async with connected(options, changes=True) as vehicle:
         if given is None:
             given = await metadata_for_check(vehicle, None, options)
-            check_values(given, dict(options.values))
+            check_given(given, dict(options.values))
         results = await vehicle.parameters.set_many(dict(options.values), idle_timeout_s=options.patience)
     return _emit_results(options, results.values(), vehicle, given)
 
@@ -149,7 +149,7 @@ async def _load(options: argparse.Namespace) -> int:
         if metadata is not None:
             # A backup may have unusual values that the vehicle has already.
             differences = await vehicle.parameters.diff(wanted, idle_timeout_s=options.patience)
-            check_values(metadata, {one.name: one.after for one in differences if one.after is not None})
+            check_given(metadata, {one.name: one.after for one in differences if one.after is not None})
         with progress_bar("parameters", "parameter") as show:
             results = await vehicle.parameters.upload(wanted, idle_timeout_s=options.patience, on_progress=show)
     if options.json:

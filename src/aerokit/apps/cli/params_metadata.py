@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import anyio
 
-from aerokit.errors import AerokitError, CommandRejected, FileError, InvalidArgument, NotSupported
+from aerokit.apps.parameter_values import check_values, metadata_entry
+from aerokit.errors import AerokitError, CommandRejected, FileError, NotSupported
 
 if TYPE_CHECKING:
     import argparse
     from collections.abc import Mapping
 
-    from aerokit.parameters import Metadata, Parameter, ParameterMetadata
+    from aerokit.parameters import Metadata, Parameter
     from aerokit.vehicle.vehicle import Vehicle
 
 # ArduPilot uses a new system id at once (GCS_Common.cpp, update_send), PX4 and old ArduPilots after a reboot.
@@ -69,40 +70,16 @@ async def _fetch(vehicle: Vehicle) -> Metadata | None:
     return None
 
 
-def check_values(metadata: Metadata | None, values: Mapping[str, float]) -> None:
+def check_given(metadata: Metadata | None, values: Mapping[str, float]) -> None:
     """Raise InvalidArgument with all values that the metadata does not allow. Unknown names are accepted."""
-    if metadata is None:
-        return
-    problems = [problem for name, value in values.items() if (problem := _problem(metadata, name, value))]
-    if problems:
-        raise InvalidArgument(f"{'; '.join(problems)}; nothing was set; --force sets such values too")
-
-
-def _problem(metadata: Metadata, name: str, value: float) -> str | None:
-    """Return why the value is not allowed, in the name and unit of the user."""
-    entry, convert = _entry(metadata, name)
-    problem = None if entry is None else entry.problem(convert(value))
-    if problem is None or entry is None or entry.name == name:
-        return problem
-    return f"{name} = {value:g}: {problem}"
-
-
-def _entry(metadata: Metadata, name: str) -> tuple[ParameterMetadata | None, Any]:
-    """Return the metadata of a parameter under any of its names, and the conversion to its unit."""
-    from aerokit.parameters.renames import resolve_rename
-
-    for spelled in (name, name.upper()):
-        if spelled in metadata:
-            return metadata[spelled], lambda value: value
-    renamed = resolve_rename(name.upper(), metadata)
-    return (None, lambda value: value) if renamed is None else (metadata[renamed.name], renamed.to_vehicle)
+    check_values(metadata, values, "--force")
 
 
 def reboot_note(metadata: Metadata | None, name: str, value: float) -> str:
     """Return what is still to do until the new value takes effect; empty if nothing is known."""
     if name.upper() in _SYSTEM_ID_NAMES:
         return f"the system id changes at the next reboot at the latest; then connect with --system-id {value:g}"
-    entry = None if metadata is None else _entry(metadata, name)[0]
+    entry = None if metadata is None else metadata_entry(metadata, name)[0]
     return "takes effect after a reboot" if entry is not None and entry.reboot_required else ""
 
 
