@@ -259,7 +259,8 @@ def test_page_needs_confirmation_outside_metadata(
 ) -> None:
     (_, second), address = copters
     metadata = tmp_path / "apm.pdef.json"
-    metadata.write_text(json.dumps({"": {"RTL_ALT": RTL_ALT}}))
+    climb = {"DisplayName": "", "Description": "", "Units": "m/s", "Range": {"low": "0.1", "high": "10"}}
+    metadata.write_text(json.dumps({"": {"RTL_ALT": RTL_ALT, "WP_SPD_UP": climb}}))
     before = second.parameters["RTL_ALT"]
     with serving(address, "--metadata", str(metadata)) as server, opened(browser, server["page"]) as page:
         page.locator(".vehicle", has_text="2 ArduCopter").click()
@@ -288,6 +289,13 @@ def test_page_needs_confirmation_outside_metadata(
         assert second.parameters["RTL_ALT"] == -99999
         page.request.put(url, headers={**headers, "Idempotency-Key": "restore-it"}, data={"value": before})
         assert second.parameters["RTL_ALT"] == before
+
+        page.fill("input[type=search]", "wpnav_speed_up")  # the metadata has its other name
+        page.locator("tr", has_text="WPNAV_SPEED_UP").click()
+        value.fill("99999")
+        yes.click()
+        problem.filter(has_text="WPNAV_SPEED_UP = 99999: WP_SPD_UP = 999.99 is not in 0.1..10 m/s").wait_for()
+        assert yes.is_disabled()
 
 
 def test_page_sets_parameter_after_confirmation(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:

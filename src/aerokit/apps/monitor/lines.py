@@ -111,7 +111,7 @@ class VehicleText:
                 (40, cell(vehicle.gps, lambda receivers: _gps(receivers[0]))),
             ]
         if not self._silent_s and more:
-            columns.append((0, self._missing() if vehicle.missing_for_flight() else Text("ready")))
+            columns.append((0, self._missing() if vehicle.missing_for_flight() else self._ready()))
         for width, column in columns:
             column.pad_right(width - len(column))
             text.append_text(column)
@@ -128,6 +128,9 @@ class VehicleText:
     def _armed(self) -> Text:
         style = DANGER if self._vehicle.armed.latest else ""
         return self.cell(self._vehicle.armed, lambda is_armed: "ARMED" if is_armed else "disarmed", style)
+
+    def _ready(self) -> Text:
+        return Text("armed" if self._vehicle.armed.latest else "ready")
 
     def _speeds(self) -> Text:
         ground, climb = self._vehicle.ground_speed_m_s, self._vehicle.climb_m_s

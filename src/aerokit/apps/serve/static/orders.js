@@ -159,7 +159,7 @@ export class Orders {
 
   // The server refuses values that metadata of the parameter's other name does not allow, which the page does not have.
   confirmRefused(wanted, { value }, problem) {
-    this.confirm({ ...wanted, fields: [["value", "New value", value, "any"]], problem: (given) => (given.value === value ? problem.detail : wanted.problem(given)) });
+    this.confirm({ ...wanted, fields: [["value", "New value", value, "any"]], problem: (given) => (given.value === value ? problem.detail.split("; nothing was set")[0] : wanted.problem(given)) });
   }
 
   async give(id, wanted, body, key) {
