@@ -461,10 +461,15 @@ def test_readiness_shows_all_reasons_and_notes(browser: Any, copters: tuple[list
         assert rows == ["Not ready", *reasons[:4], "and 3 more", *reasons[4:], "A seventh"]
         armed = {"armed": {"value": True, "age_s": 0}, "landed_state": {"value": "ON_GROUND", "age_s": 0}}
         assert page.evaluate(READINESS, {"states": armed}) == ["Armed: propellers may turn"]
-        after_return = {"mode": "RTL", "arms_in": "GUIDED"}
+        after_return = {"mode": "RTL", "arms_in": "GUIDED", "unless": None}
         assert page.evaluate(READINESS, {"unarmable_mode": after_return}) == [
             "Ready to arm",
             "Arm changes the mode to GUIDED first: ArduCopter cannot arm in RTL",
+        ]
+        after_mission = {"mode": "AUTO", "arms_in": "GUIDED", "unless": "AUTO_OPTIONS"}
+        assert page.evaluate(READINESS, {"unarmable_mode": after_mission}) == [
+            "Ready to arm",
+            "Arm changes the mode to GUIDED first: ArduCopter cannot arm in AUTO unless AUTO_OPTIONS allows it",
         ]
         assert page.evaluate(READINESS, {"unarmable_mode": {"mode": "RTL", "arms_in": None}}) == [
             "Not ready",
@@ -483,8 +488,8 @@ def test_disarm_needs_known_ground(browser: Any, copters: tuple[list[SimulatedCo
         }"""
         for landed, text in expected.items():
             assert page.evaluate(obstacles, [landed, 0, 2, "connected"]) == text
-        assert page.evaluate(obstacles, ["ON_GROUND", 10, 2, "connected"]) == "Unknown if landed"
-        assert page.evaluate(obstacles, ["ON_GROUND", 0, 2, "silent"]) == "Unknown if landed"
+        assert page.evaluate(obstacles, ["ON_GROUND", 10, 2, "connected"]) == "May be flying"
+        assert page.evaluate(obstacles, ["ON_GROUND", 0, 2, "silent"]) == "May be flying"
         assert page.evaluate(obstacles, [None, 0, 10, "silent"]) == ""
         assert page.evaluate(obstacles, [None, 0, 10, "connected"]) == ""  # a rover has no landed state
 

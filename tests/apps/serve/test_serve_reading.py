@@ -375,9 +375,11 @@ async def test_state_names_unarmable_mode_and_running_mission() -> None:
             return found["unarmable_mode"], found["is_flying_mission"]
 
         assert await state() == (None, False)
-        await stage.submit("mode", {"mode": "LAND"})
-        assert await state() == ({"mode": "LAND", "arms_in": "GUIDED"}, False)
         await stage.flight.vehicle.mission.upload(Mission([take_off(altitude_relative_m=10)]))
+        await stage.submit("mode", {"mode": "LAND"})
+        assert await state() == ({"mode": "LAND", "arms_in": "GUIDED", "unless": None}, False)
+        await stage.submit("mode", {"mode": "AUTO"})
+        assert (await state())[0] == {"mode": "AUTO", "arms_in": "GUIDED", "unless": "AUTO_OPTIONS"}
         await stage.submit("mode", {"mode": "GUIDED"})
         await stage.submit("arm")
         assert (await stage.submit("mission/start")).status_code == 200

@@ -193,8 +193,7 @@ class ServedVehicles:
         """Return the overview of a vehicle, with the conditions missing for flight and the mission progress.
 
         ``mission_item`` counts items without home, unlike the state ``mission_current``, which counts them as on the
-        wire, where ArduPilot's item 0 is home. ``unarmable_mode`` is None if the mode allows arming, otherwise its name
-        and that of the mode which ``arm`` changes to first.
+        wire, where ArduPilot's item 0 is home. ``unarmable_mode`` is None if ``arm`` does not change the mode.
         """
         mission = vehicle.mission
         return {
@@ -234,10 +233,12 @@ def _is_flying_mission(vehicle: Vehicle) -> bool:
 
 
 def _unarmable_mode(vehicle: Vehicle) -> dict[str, str | None] | None:
-    mode, better = vehicle.mode.latest, vehicle.autopilot.mode_to_arm_in()
-    if mode is None or mode.name not in vehicle.autopilot.unarmable_modes:
+    """Return the mode if ``arm`` leaves it, the mode in which ``arm`` arms, and the parameter that allows the former."""
+    autopilot, mode = vehicle.autopilot, vehicle.mode.latest
+    if mode is None or mode.name not in autopilot.unarmable_modes.union(autopilot.armable_by_option):
         return None
-    return {"mode": mode.name, "arms_in": None if better is None else better.name}
+    better, option = autopilot.mode_to_arm_in(), autopilot.armable_by_option.get(mode.name)
+    return {"mode": mode.name, "arms_in": None if better is None else better.name, "unless": option}
 
 
 async def _run_checks(vehicle: Vehicle) -> None:

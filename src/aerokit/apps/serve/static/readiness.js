@@ -30,13 +30,13 @@ export function obstacle(order, vehicle, page) {
   const isOnGround = landed === "ON_GROUND", isFlying = FLYING.has(landed);
   const mission = valueOf(vehicle, "mission_current"), isSurface = SURFACE_TYPES.has(vehicle.vehicle_type);
   // Motors that stop in the air make the vehicle fall: the page disarms only what is known to stand.
-  if (!isConnected(vehicle)) return order === "disarm" && !isSurface ? "Unknown if landed" : SAFE_ORDERS.has(order) ? "" : "Silent";
+  if (!isConnected(vehicle)) return order === "disarm" && !isSurface ? "May be flying" : SAFE_ORDERS.has(order) ? "" : "Silent";
   switch (order) {
     case "arm":
       if (isArmed) return "Armed";
       return vehicle.missing_for_flight.length && valueOf(vehicle, "sensors")?.prearm_checks_pass === false ? "Not ready" : "";
     case "disarm":
-      return isArmed === false ? "Disarmed" : isSurface || isOnGround ? "" : isFlying ? "Land first" : "Unknown if landed";
+      return isArmed === false ? "Disarmed" : isSurface || isOnGround ? "" : isFlying ? "Land first" : "May be flying";
     case "take_off":
       return isSurface ? "Does not fly" : isArmed === false ? "Arm first" : isFlying ? "Flying" : lacksPosition(vehicle) ? "No position" : "";
     case "go_to":
@@ -83,7 +83,8 @@ function readiness(vehicle, page, heartbeatAge) {
     const title = landed === "ON_GROUND" ? "Armed: propellers may turn" : FLYING.has(landed) ? "Flying" : "Armed";
     return [missing.length || landed === "ON_GROUND" ? "warn" : "good", title, missing];
   }
-  const mode = vehicle.unarmable_mode, cannot = mode && `${vehicle.firmware} cannot arm in ${mode.mode}`;
+  const mode = vehicle.unarmable_mode, unless = mode?.unless ? ` unless ${mode.unless} allows it` : "";
+  const cannot = mode && `${vehicle.firmware} cannot arm in ${mode.mode}${unless}`;
   if (cannot && !mode.arms_in) return ["warn", "Not ready", [cannot, ...missing]];
   const note = cannot ? [`Arm changes the mode to ${mode.arms_in} first: ${cannot}`] : [];
   return missing.length ? ["warn", "Not ready", [...missing, ...note]] : ["good", "Ready to arm", note];
