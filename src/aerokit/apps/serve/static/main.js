@@ -33,6 +33,7 @@ byId("tabs").append(...tabButtons);
 function open(panel) {
   tab = panel;
   TABS.forEach(([, each], index) => tabButtons[index].setAttribute("aria-selected", String(each === panel)));
+  panel.show(selected(), page.receivedAt); // at once, because it has the values from when it was last open
   byId("panel").replaceChildren(panel.node);
   draw();
 }
