@@ -123,7 +123,7 @@ class MissionServer:
         """Drop transfers, as a reboot does; stored items stay."""
         self._uploads.clear()
 
-    def opaque_id(self, mission_type: int) -> int:
+    def id(self, mission_type: int) -> int:
         """Return a checksum of a list; 0 if it is empty. It does not depend on the current item."""
         items = self.lists.get(mission_type, ())
         if items and mission_type not in self._opaque_ids:
@@ -132,9 +132,9 @@ class MissionServer:
         return self._opaque_ids[mission_type] if items else 0
 
     def current_message(self) -> m.MissionCurrent:
-        fence, rally = self.opaque_id(MavMissionType.FENCE), self.opaque_id(MavMissionType.RALLY)
+        fence, rally = self.id(MavMissionType.FENCE), self.id(MavMissionType.RALLY)
         return m.MissionCurrent(
-            self.current, self.count(0), mission_id=self.opaque_id(0), fence_id=fence, rally_points_id=rally
+            self.current, self.count(0), mission_id=self.id(0), fence_id=fence, rally_points_id=rally
         )
 
     def store(self, mission_type: int, items: Sequence[MissionItem]) -> None:
@@ -156,14 +156,14 @@ class MissionServer:
         return self._capacity
 
     def count(self, mission_type: int) -> int:
-        return len(self.lists[mission_type])
+        return len(self.lists.get(mission_type, ()))
 
     def _result(self, message: AnyListMessage, channel: Channel) -> int:
         return _R.ACCEPTED if message.mission_type in self.lists else _R.UNSUPPORTED
 
     def _item(self, mission_type: int, seq: int) -> MissionItem | int:
-        items = self.lists[mission_type]
-        return items[seq] if seq < len(items) else _R.INVALID_SEQUENCE
+        items = self.lists.get(mission_type, ())
+        return items[seq] if 0 <= seq < len(items) else _R.INVALID_SEQUENCE
 
     def _message(self, item: MissionItem, request: AnyRequest) -> AnyItem:
         seq, (system, component), kind = request.seq, sender_of(request), request.mission_type
@@ -191,7 +191,7 @@ class MissionServer:
         if (result := self._result(request, channel)) != _R.ACCEPTED:
             self._acknowledge(to, kind, result, channel)
         else:
-            self._host.send(m.MissionCount(*to, self.count(kind), kind, self.opaque_id(kind)), channel)
+            self._host.send(m.MissionCount(*to, self.count(kind), kind, self.id(kind)), channel)
 
     def _on_request(self, request: AnyRequest, channel: Channel) -> None:
         result = self._result(request, channel)
@@ -242,7 +242,7 @@ class MissionServer:
 
     def _end(self, upload: MissionUpload, result: int) -> None:
         self._drop(upload)
-        opaque_id = self.opaque_id(upload.mission_type) if result == _R.ACCEPTED else 0
+        opaque_id = self.id(upload.mission_type) if result == _R.ACCEPTED else 0
         self._acknowledge(upload.client, upload.mission_type, result, upload.channel, opaque_id)
 
     def _request_item(self, upload: MissionUpload) -> None:
@@ -256,14 +256,20 @@ class MissionServer:
         self._host.call_at(due, lambda: self._check(upload))
 
     def _check(self, upload: MissionUpload) -> None:
-        if self._uploads.get(self._key(upload.mission_type)) is not upload or upload.is_judged:
+        if not self._is_watched(upload):
             return
         if self._host.now >= upload.received_at + self.timeout_s:
             self._time_out(upload)
             return
         if self._host.now >= upload.requested_at + self.retry_interval_s:
-            self._request_item(upload)
+            self._repeat(upload)
         self._watch(upload)
+
+    def _is_watched(self, upload: MissionUpload) -> bool:
+        return self._uploads.get(self._key(upload.mission_type)) is upload and not upload.is_judged
+
+    def _repeat(self, upload: MissionUpload) -> None:
+        self._request_item(upload)
 
     def _time_out(self, upload: MissionUpload) -> None:
         self._end(upload, _R.OPERATION_CANCELLED)
@@ -271,16 +277,16 @@ class MissionServer:
     def _on_item(self, message: AnyItem, channel: Channel) -> None:
         upload = self._uploads.get(self._key(message.mission_type))
         if upload is None or message.mission_type != upload.mission_type:
-            self._on_unexpected(message, _R.ERROR, channel)
+            self._answer_item(message, _R.ERROR, channel)
         elif message.seq != upload.next:
-            self._on_unexpected(message, _R.INVALID_SEQUENCE, upload.channel)
+            self._answer_item(message, _R.INVALID_SEQUENCE, upload.channel)
         elif sender_of(message) != upload.client:
-            self._on_unexpected(message, _R.DENIED, upload.channel)
+            self._answer_item(message, _R.DENIED, upload.channel)
         elif not upload.is_judged:
             self._receive_item(upload, message)
 
-    def _on_unexpected(self, message: AnyItem, result: int, channel: Channel) -> None:
-        """Handle an item that is not part of the upload: by default ignore it, the right one is requested again."""
+    def _answer_item(self, message: AnyItem, result: int, channel: Channel) -> None:
+        """Answer an item that no upload expects. It is ignored here; the expected item is requested again."""
 
     def _receive_item(self, upload: MissionUpload, message: AnyItem) -> None:
         if (result := self._put(upload, message)) != _R.ACCEPTED:

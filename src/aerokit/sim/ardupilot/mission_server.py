@@ -187,22 +187,18 @@ class ArduPilotMissionServer(MissionServer):
 
     def _on_item(self, message: AnyItem, channel: Channel) -> None:
         item, kind = _without_floats(message), message.mission_type
-        result: int = _R.ACCEPTED
         if isinstance(item, int):
-            result = item
+            self._answer_item(message, item, channel)
         elif kind == MavMissionType.MISSION and message.current in (_GUIDED_TARGET, _ALTITUDE_CHANGE):
-            self._acknowledge(sender_of(message), kind, self._guide(item, message.current), channel)
-            return
+            self._answer_item(message, self._guide(item, message.current), channel)
         elif kind not in self._lists:
-            result = _R.UNSUPPORTED
-        if result != _R.ACCEPTED:
-            self._on_unexpected(message, result, channel)
-            return
-        if isinstance(message, m.MissionItem) and kind in self._uploads:
-            self._warn_once(message, "got MISSION_ITEM; GCS should send MISSION_ITEM_INT")
-        super()._on_item(message, channel)
+            self._answer_item(message, _R.UNSUPPORTED, channel)
+        else:
+            if isinstance(message, m.MissionItem) and kind in self._uploads:
+                self._warn_once(message, "got MISSION_ITEM; GCS should send MISSION_ITEM_INT")
+            super()._on_item(message, channel)
 
-    def _on_unexpected(self, message: AnyItem, result: int, channel: Channel) -> None:
+    def _answer_item(self, message: AnyItem, result: int, channel: Channel) -> None:
         self._acknowledge(sender_of(message), message.mission_type, result, channel)
 
     def _put(self, upload: MissionUpload, message: AnyItem) -> int:
