@@ -121,11 +121,11 @@ class RecordedMissions(MissionServer):
     def count(self, mission_type: int) -> int:
         return len(self.items(mission_type) or ())
 
-    def _result(self, message: AnyListMessage, channel: Channel) -> int:
+    def _refusal(self, message: AnyListMessage, channel: Channel) -> int | None:
         kind = message.mission_type
         is_upload = isinstance(message, m.MissionCount)
         is_recorded = kind in self._vehicle.recording.uploads if is_upload else self.items(kind) is not None
-        return MavMissionResult.ACCEPTED if is_recorded else MavMissionResult.UNSUPPORTED
+        return None if is_recorded else MavMissionResult.UNSUPPORTED
 
     def _item(self, mission_type: int, seq: int) -> MissionItem | int:
         items = self.items(mission_type) or ()

@@ -153,15 +153,19 @@ class MissionServer:
         return True
 
     def capacity(self, mission_type: int) -> int:
+        """Return the maximum number of items."""
         return self._capacity
 
     def count(self, mission_type: int) -> int:
+        """Return the number of stored items; 0 for an unknown type."""
         return len(self.lists.get(mission_type, ()))
 
-    def _result(self, message: AnyListMessage, channel: Channel) -> int:
-        return _R.ACCEPTED if message.mission_type in self.lists else _R.UNSUPPORTED
+    def _refusal(self, message: AnyListMessage, channel: Channel) -> int | None:
+        """Return the MAV_MISSION_RESULT that refuses a transfer, else None."""
+        return None if message.mission_type in self.lists else _R.UNSUPPORTED
 
     def _item(self, mission_type: int, seq: int) -> MissionItem | int:
+        """Return a stored item, or the MAV_MISSION_RESULT that reports its absence."""
         items = self.lists.get(mission_type, ())
         return items[seq] if 0 <= seq < len(items) else _R.INVALID_SEQUENCE
 
@@ -175,6 +179,7 @@ class MissionServer:
         )
 
     def _put(self, upload: MissionUpload, message: AnyItem) -> int:
+        """Store the expected item of an upload; return the MAV_MISSION_RESULT."""
         upload.uses_int = isinstance(message, m.MissionItemInt)
         upload.items.append(from_wire(message))
         return _R.ACCEPTED
@@ -188,14 +193,14 @@ class MissionServer:
 
     def _on_request_list(self, request: m.MissionRequestList, channel: Channel) -> None:
         kind, to = request.mission_type, sender_of(request)
-        if (result := self._result(request, channel)) != _R.ACCEPTED:
-            self._acknowledge(to, kind, result, channel)
+        if (refusal := self._refusal(request, channel)) is not None:
+            self._acknowledge(to, kind, refusal, channel)
         else:
             self._host.send(m.MissionCount(*to, self.count(kind), kind, self.id(kind)), channel)
 
     def _on_request(self, request: AnyRequest, channel: Channel) -> None:
-        result = self._result(request, channel)
-        item = self._item(request.mission_type, request.seq) if result == _R.ACCEPTED else result
+        refusal = self._refusal(request, channel)
+        item = self._item(request.mission_type, request.seq) if refusal is None else refusal
         if isinstance(item, int):
             self._refuse_item(request, item, channel)
         else:
@@ -207,11 +212,11 @@ class MissionServer:
     def _on_count(self, count: m.MissionCount, channel: Channel) -> None:
         client, kind = sender_of(count), count.mission_type
         before = self._uploads.get(self._key(kind))
-        result = self._result(count, channel)
-        if result == _R.ACCEPTED and before is not None and (before.client != client or before.is_judged):
-            result = _R.DENIED
-        if result != _R.ACCEPTED:
-            self._acknowledge(client, kind, result, channel)
+        refusal = self._refusal(count, channel)
+        if refusal is None and before is not None and (before.client != client or before.is_judged):
+            refusal = _R.DENIED
+        if refusal is not None:
+            self._acknowledge(client, kind, refusal, channel)
             return
         if before is not None:
             self._drop(before)
@@ -238,6 +243,7 @@ class MissionServer:
         self._watch(upload)
 
     def _drop(self, upload: MissionUpload) -> None:
+        """End an upload without an answer."""
         self._uploads.pop(self._key(upload.mission_type), None)
 
     def _end(self, upload: MissionUpload, result: int) -> None:
@@ -299,6 +305,7 @@ class MissionServer:
             self._finish(upload)
 
     def _finish(self, upload: MissionUpload) -> None:
+        """Handle the arrival of the last item."""
         upload.is_judged = True
 
         def answer(result: int) -> None:

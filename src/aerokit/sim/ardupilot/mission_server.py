@@ -113,14 +113,14 @@ class ArduPilotMissionServer(MissionServer):
     def _key(self, mission_type: int) -> int:
         return mission_type
 
-    def _result(self, message: AnyListMessage, channel: Channel) -> int:
+    def _refusal(self, message: AnyListMessage, channel: Channel) -> int | None:
         kind = message.mission_type
         if kind in self._lists and kind != MavMissionType.MISSION and channel.version == 1:
             self._warn("Need mavlink2 for item transfer")
             return _R.UNSUPPORTED
         if kind in self._uploads and not isinstance(message, (m.MissionCount, m.MissionRequest)):
             return _R.DENIED
-        return _R.ACCEPTED if kind in self._lists else _R.UNSUPPORTED
+        return None if kind in self._lists else _R.UNSUPPORTED
 
     def _on_request(self, request: AnyRequest, channel: Channel) -> None:
         if request.mission_type in self._lists:
@@ -158,12 +158,12 @@ class ArduPilotMissionServer(MissionServer):
 
     def _on_write_partial_list(self, request: m.MissionWritePartialList, channel: Channel) -> None:
         kind, start, end = request.mission_type, request.start_index, request.end_index
-        result = self._result(request, channel)
-        if result == _R.ACCEPTED and not 0 <= start <= end <= self.count(kind):
+        refusal = self._refusal(request, channel)
+        if refusal is None and not 0 <= start <= end <= self.count(kind):
             self._warn("Flight plan update rejected")
-            result = _R.ERROR
-        if result != _R.ACCEPTED:
-            self._acknowledge(sender_of(request), kind, result, channel)
+            refusal = _R.ERROR
+        if refusal is not None:
+            self._acknowledge(sender_of(request), kind, refusal, channel)
             return
         self._lists[kind].begin_update()
         self._start(self._begin(request, channel, start, end + 1))
