@@ -19,8 +19,8 @@ from aerokit.protocols.servers.missions import (
     AnyItem,
     AnyListMessage,
     AnyRequest,
+    ListUpload,
     MissionServer,
-    MissionUpload,
     item_from,
     item_message_float,
 )
@@ -58,7 +58,7 @@ class RecordedParameters(ParameterProtocolServer):
         self._hash = is_whole and HASH_NAME in uncounted
 
     def value_message(self, name: str, index: int) -> m.ParamValue:
-        """Return the PARAM_VALUE as last written or recorded; before its first record, return that record."""
+        """Return the latest PARAM_VALUE, written or recorded; before the first recorded one, return that."""
         position, recorded = self._vehicle.position_s, self._recorded[name]
         latest = next((value for time, value in reversed(recorded) if time <= position), recorded[0][1])
         written = self._written.get(name, latest.param_value)
@@ -135,18 +135,18 @@ class RecordedMissions(MissionServer):
         recorded = (self.items(request.mission_type) or ())[request.seq]
         return _item_message(recorded, request.seq, sender_of(request), isinstance(request, m.MissionRequest))
 
-    def _put(self, upload: MissionUpload, message: AnyItem) -> int:
+    def _put(self, upload: ListUpload, message: AnyItem) -> int:
         self._received[message.seq :] = [message]
         return MavMissionResult.ACCEPTED
 
-    def _finish(self, upload: MissionUpload) -> None:
+    def _finish(self, upload: ListUpload) -> None:
         kind = upload.mission_type
         result = self._recorded_result("upload", self._vehicle.recording.uploads[kind], kind)
         if result == MavMissionResult.ACCEPTED:
             self._written[kind] = tuple(self._received[: upload.end])
         self._end(upload, result)
 
-    def _time_out(self, upload: MissionUpload) -> None:
+    def _time_out(self, upload: ListUpload) -> None:
         self._drop(upload)
 
     def _on_clear(self, request: m.MissionClearAll, channel: Channel) -> None:

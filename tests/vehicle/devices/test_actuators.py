@@ -203,7 +203,7 @@ async def test_unanswered_motor_test_is_neither_repeated_nor_stopped() -> None:
 
 
 async def test_motor_test_cancelled_after_its_end_sends_no_stop() -> None:
-    """A stop without a test would be another test, which arms the motors."""
+    """Without a running test, the stop command would start another test, which arms the motors."""
     async with on_ground() as flight:
         with anyio.move_on_after(SPIN["duration_s"] + 0.1):
             await flight.vehicle.actuators.test_motor(1, **SPIN)

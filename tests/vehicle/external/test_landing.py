@@ -160,7 +160,7 @@ async def test_disarming_in_the_air_is_no_precision_landing() -> None:
             simulated.arming.disarm(force=True)
 
         group.start_soon(disarm)
-        with pytest.raises(OperationRejected, match="land_on: it was disarmed in the air"):
+        with pytest.raises(OperationRejected, match="land_on: the vehicle was disarmed in the air"):
             await flight.vehicle.land_on(camera(simulated.motion))
 
 

@@ -350,6 +350,6 @@ async def test_block_left_with_answered_arm_is_silent(
 async def test_land_and_return_default_timeouts_apply(flying: Flight, order: str, longest_s: float) -> None:
     flying.copter.motion.step = lambda *_, **__: None  # type: ignore[method-assign]
     begin = now()
-    with pytest.raises(OperationTimeout, match=f"{order}: not done within {longest_s:g} s; it is at 10.0 m"):
+    with pytest.raises(OperationTimeout, match=f"{order}: not done within {longest_s:g} s; the vehicle is at 10.0 m"):
         await getattr(flying.vehicle, order)()
     assert longest_s <= now() - begin < longest_s + 3.0

@@ -1,4 +1,4 @@
-"""Missions, fences and rally points: messages of items, and a server (https://mavlink.io/en/services/mission.html)."""
+"""Server for missions, fences and rally points (https://mavlink.io/en/services/mission.html)."""
 
 from __future__ import annotations
 
@@ -47,12 +47,13 @@ MAX_ITEMS = 2000
 _TYPES = (MavMissionType.MISSION, MavMissionType.FENCE, MavMissionType.RALLY)
 _R = MavMissionResult
 
-# Decides about an uploaded list: (MAV_MISSION_TYPE, items, answer); ``answer`` takes the MAV_MISSION_RESULT.
+# Accepts or refuses an uploaded list: called with MAV_MISSION_TYPE, items, and a function that takes the
+# MAV_MISSION_RESULT.
 Judge = Callable[[int, tuple[MissionItem, ...], Callable[[int], None]], None]
 
 
 @dataclass(eq=False)
-class MissionUpload:
+class ListUpload:
     """A list that a client uploads."""
 
     client: tuple[int, int]
@@ -67,15 +68,15 @@ class MissionUpload:
     uses_int: bool = True
     items: list[MissionItem] = field(default_factory=list)
     is_judged: bool = False
-    """True while ``judge`` decides."""
+    """True from the call of ``judge`` until its answer."""
 
 
 class MissionServer:
-    """Stores missions, fences and rally points; downloads need no state, and one upload runs at a time.
+    """Stores missions, fences and rally points. Downloads have no state; one upload runs at a time.
 
-    An upload replaces a list as a whole after ``judge`` has accepted it. Items are requested again every
-    ``retry_interval_s``; an upload without progress for ``timeout_s`` ends with OPERATION_CANCELLED. Another client is
-    DENIED meanwhile. Firmwares with other habits override methods.
+    When ``judge`` has accepted an upload, it replaces the whole list. A missing item is requested again every
+    ``retry_interval_s`` seconds. An upload without progress for ``timeout_s`` seconds ends with OPERATION_CANCELLED.
+    During an upload, other clients are DENIED. Firmwares with other habits override methods.
     """
 
     retry_interval_s: ClassVar[float] = 0.5
@@ -92,15 +93,15 @@ class MissionServer:
         capacity: int = MAX_ITEMS,
     ) -> None:
         self.lists: dict[int, tuple[MissionItem, ...]] = dict.fromkeys(_TYPES, ())
-        """MAV_MISSION_TYPE → items; call `store` to change them."""
-        self._opaque_ids: dict[int, int] = {}  # Kept, because MISSION_CURRENT reports them at its stream rate.
+        """Maps MAV_MISSION_TYPE to items; call `store` to change them."""
+        self._opaque_ids: dict[int, int] = {}  # Cached, because MISSION_CURRENT reports them at its stream rate.
         self.current: int = 0
         """Index of the current item of the mission."""
         self._host = host
         self._judge = judge
         self._may_set_current = on_set_current
         self._capacity = capacity
-        self._uploads: dict[int, MissionUpload] = {}
+        self._uploads: dict[int, ListUpload] = {}
 
     def listen(self) -> None:
         on = self._host.on
@@ -124,7 +125,7 @@ class MissionServer:
         self._uploads.clear()
 
     def id(self, mission_type: int) -> int:
-        """Return a checksum of a list; 0 if it is empty. It does not depend on the current item."""
+        """Return the opaque id: a checksum of a list, or 0 for an empty list. The current item does not change it."""
         items = self.lists.get(mission_type, ())
         if items and mission_type not in self._opaque_ids:
             messages = (_item_message(item, seq, (0, 0), mission_type, current=False) for seq, item in enumerate(items))
@@ -145,7 +146,7 @@ class MissionServer:
             self.current = 0
 
     def set_current(self, seq: int) -> bool:
-        """Ask the component to continue at an item, and announce it; False if it is refused."""
+        """Let the component continue at an item, and announce the item; return False if the component refuses."""
         if not 0 <= seq < self.count(MavMissionType.MISSION) or not self._may_set_current(seq):
             return False
         self.current = seq
@@ -178,7 +179,7 @@ class MissionServer:
             item, seq, target_system=system, target_component=component, mission_type=kind, current=current
         )
 
-    def _put(self, upload: MissionUpload, message: AnyItem) -> int:
+    def _put(self, upload: ListUpload, message: AnyItem) -> int:
         """Store the expected item of an upload; return the MAV_MISSION_RESULT."""
         upload.uses_int = isinstance(message, m.MissionItemInt)
         upload.items.append(from_wire(message))
@@ -232,36 +233,36 @@ class MissionServer:
     def _refuse_size(self, count: m.MissionCount, channel: Channel) -> None:
         self._acknowledge(sender_of(count), count.mission_type, _R.NO_SPACE, channel)
 
-    def _begin(self, message: AnyListMessage, channel: Channel, first: int, end: int) -> MissionUpload:
+    def _begin(self, message: AnyListMessage, channel: Channel, first: int, end: int) -> ListUpload:
         now, kind = self._host.now, message.mission_type
-        upload = MissionUpload(sender_of(message), channel, kind, first, end, now, now, self.requests_int)
+        upload = ListUpload(sender_of(message), channel, kind, first, end, now, now, self.requests_int)
         self._uploads[self._key(kind)] = upload
         return upload
 
-    def _start(self, upload: MissionUpload) -> None:
+    def _start(self, upload: ListUpload) -> None:
         self._request_item(upload)
         self._watch(upload)
 
-    def _drop(self, upload: MissionUpload) -> None:
+    def _drop(self, upload: ListUpload) -> None:
         """End an upload without an answer."""
         self._uploads.pop(self._key(upload.mission_type), None)
 
-    def _end(self, upload: MissionUpload, result: int) -> None:
+    def _end(self, upload: ListUpload, result: int) -> None:
         self._drop(upload)
         opaque_id = self.id(upload.mission_type) if result == _R.ACCEPTED else 0
         self._acknowledge(upload.client, upload.mission_type, result, upload.channel, opaque_id)
 
-    def _request_item(self, upload: MissionUpload) -> None:
+    def _request_item(self, upload: ListUpload) -> None:
         upload.requested_at = self._host.now
         request = m.MissionRequestInt if upload.uses_int else m.MissionRequest
         self._host.send(request(*upload.client, upload.next, upload.mission_type), upload.channel)
 
-    def _watch(self, upload: MissionUpload) -> None:
+    def _watch(self, upload: ListUpload) -> None:
         """Schedule the next retry or the time-out."""
         due = min(upload.requested_at + self.retry_interval_s, upload.received_at + self.timeout_s)
         self._host.call_at(due, lambda: self._check(upload))
 
-    def _check(self, upload: MissionUpload) -> None:
+    def _check(self, upload: ListUpload) -> None:
         if not self._is_watched(upload):
             return
         if self._host.now >= upload.received_at + self.timeout_s:
@@ -271,13 +272,13 @@ class MissionServer:
             self._repeat(upload)
         self._watch(upload)
 
-    def _is_watched(self, upload: MissionUpload) -> bool:
+    def _is_watched(self, upload: ListUpload) -> bool:
         return self._uploads.get(self._key(upload.mission_type)) is upload and not upload.is_judged
 
-    def _repeat(self, upload: MissionUpload) -> None:
+    def _repeat(self, upload: ListUpload) -> None:
         self._request_item(upload)
 
-    def _time_out(self, upload: MissionUpload) -> None:
+    def _time_out(self, upload: ListUpload) -> None:
         self._end(upload, _R.OPERATION_CANCELLED)
 
     def _on_item(self, message: AnyItem, channel: Channel) -> None:
@@ -294,7 +295,7 @@ class MissionServer:
     def _answer_item(self, message: AnyItem, result: int, channel: Channel) -> None:
         """Answer an item that no upload expects. It is ignored here; the expected item is requested again."""
 
-    def _receive_item(self, upload: MissionUpload, message: AnyItem) -> None:
+    def _receive_item(self, upload: ListUpload, message: AnyItem) -> None:
         if (result := self._put(upload, message)) != _R.ACCEPTED:
             self._end(upload, result)
             return
@@ -304,7 +305,7 @@ class MissionServer:
         else:
             self._finish(upload)
 
-    def _finish(self, upload: MissionUpload) -> None:
+    def _finish(self, upload: ListUpload) -> None:
         """Handle the arrival of the last item."""
         upload.is_judged = True
 
@@ -320,7 +321,7 @@ class MissionServer:
             answer(_R.INVALID)
 
     def _on_ack(self, ack: m.MissionAck, channel: Channel) -> None:
-        """End the client's own upload; the end of a download needs nothing."""
+        """End the client's own upload. At the end of a download there is nothing to do."""
         upload = self._uploads.get(0)
         if upload is not None and sender_of(ack) == upload.client and not upload.is_judged and ack.type != _R.ACCEPTED:
             self._drop(upload)
@@ -337,7 +338,7 @@ class MissionServer:
             self._clear([kind], client, kind, channel)
 
     def _clear(self, kinds: list[int], client: tuple[int, int], answered: int, channel: Channel) -> None:
-        """Empty these lists one after the other, each with the consent of ``judge``."""
+        """Clear these lists one after the other, each if ``judge`` accepts it."""
         if not kinds:
             self._acknowledge(client, answered, _R.ACCEPTED, channel)
             return

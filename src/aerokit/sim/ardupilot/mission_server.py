@@ -17,8 +17,8 @@ from aerokit.protocols.servers.missions import (
     AnyItem,
     AnyListMessage,
     AnyRequest,
+    ListUpload,
     MissionServer,
-    MissionUpload,
     item_from,
     item_message_float,
     item_message_int,
@@ -151,7 +151,7 @@ class ArduPilotMissionServer(MissionServer):
         super()._refuse_size(count, channel)
         self._warn(f"Only {self.capacity(count.mission_type)} items are supported")
 
-    def _begin(self, message: AnyListMessage, channel: Channel, first: int, end: int) -> MissionUpload:
+    def _begin(self, message: AnyListMessage, channel: Channel, first: int, end: int) -> ListUpload:
         if isinstance(message, m.MissionCount):
             self._lists[message.mission_type].begin(message.count)
         return super()._begin(message, channel, first, end)
@@ -168,20 +168,20 @@ class ArduPilotMissionServer(MissionServer):
         self._lists[kind].begin_update()
         self._start(self._begin(request, channel, start, end + 1))
 
-    def _start(self, upload: MissionUpload) -> None:
+    def _start(self, upload: ListUpload) -> None:
         self._warnings -= {(kind, upload.mission_type) for kind in (m.MissionItem, m.MissionRequest)}
         super()._start(upload)
 
-    def _drop(self, upload: MissionUpload) -> None:
+    def _drop(self, upload: ListUpload) -> None:
         super()._drop(upload)
         self._lists[upload.mission_type].abandon()
 
-    def _request_item(self, upload: MissionUpload) -> None:
+    def _request_item(self, upload: ListUpload) -> None:
         upload.requested_at = self._vehicle.now
         if self._vehicle.is_initialised:
             super()._request_item(upload)
 
-    def _time_out(self, upload: MissionUpload) -> None:
+    def _time_out(self, upload: ListUpload) -> None:
         self._warn(f"{self._lists[upload.mission_type].name} upload timeout")
         super()._time_out(upload)
 
@@ -201,12 +201,12 @@ class ArduPilotMissionServer(MissionServer):
     def _answer_item(self, message: AnyItem, result: int, channel: Channel) -> None:
         self._acknowledge(sender_of(message), message.mission_type, result, channel)
 
-    def _put(self, upload: MissionUpload, message: AnyItem) -> int:
+    def _put(self, upload: ListUpload, message: AnyItem) -> int:
         item = _without_floats(message)
         assert not isinstance(item, int)
         return self._lists[upload.mission_type].put(message.seq, item, upload.end - 1)
 
-    def _finish(self, upload: MissionUpload) -> None:
+    def _finish(self, upload: ListUpload) -> None:
         result = self._lists[upload.mission_type].finish(self._warn)
         if upload.mission_type == MavMissionType.MISSION:
             self._vehicle.info("Flight plan received")

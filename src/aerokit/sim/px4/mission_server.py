@@ -17,8 +17,8 @@ from aerokit.protocols.servers.missions import (
     AnyItem,
     AnyListMessage,
     AnyRequest,
+    ListUpload,
     MissionServer,
-    MissionUpload,
     item_from,
     item_message_float,
     item_message_int,
@@ -44,7 +44,7 @@ class TransferState(Enum):
 
 
 @dataclass(eq=False)
-class _Link(MissionUpload):
+class _Link(ListUpload):
     """The latest transfer of a link, an upload or a download; the firmware reads it even after its end."""
 
     state: TransferState = TransferState.IDLE
@@ -144,7 +144,7 @@ class Px4MissionServer(MissionServer):
         self._watch(link)
         return link
 
-    def _drop(self, upload: MissionUpload) -> None:
+    def _drop(self, upload: ListUpload) -> None:
         super()._drop(upload)
         self._link(upload.channel).state = TransferState.IDLE
 
@@ -166,33 +166,33 @@ class Px4MissionServer(MissionServer):
             message = item_message_float(given, (item.x * scale, item.y * scale), seq, to, kind, int(current))
         self._px4.send(message, link.channel)
 
-    def _watch(self, upload: MissionUpload) -> None:
+    def _watch(self, upload: ListUpload) -> None:
         due = upload.received_at + self.timeout_s
         if self._link(upload.channel).is_retried:
             due = min(due, max(self._px4.now, upload.requested_at) + self.retry_interval_s)
         self._px4.call_at(due, lambda: self._check(upload))
 
-    def _is_watched(self, upload: MissionUpload) -> bool:
-        link = self._links.get(upload.channel)
+    def _is_watched(self, upload: ListUpload) -> bool:
+        link = self._link(upload.channel)
         return link is upload and link.state is not TransferState.IDLE
 
-    def _repeat(self, upload: MissionUpload) -> None:
+    def _repeat(self, upload: ListUpload) -> None:
         link = self._link(upload.channel)
         if link.state is TransferState.GETTING:
             self._request_item(link)
         elif link.is_retried:
             self._send_count(link)
 
-    def _time_out(self, upload: MissionUpload) -> None:
+    def _time_out(self, upload: ListUpload) -> None:
         self._warn("Mission sync timeout")
         self._drop(upload)
 
     def _on_request_list(self, request: m.MissionRequestList, channel: Channel) -> None:
         """Start or restart a download.
 
-        A download of which all items were sent counts as complete. The firmware misjudges an upload in the same way,
-        once as many items have arrived as are stored: it ends that upload, but refuses other uploads until a download
-        times out.
+        A download of which all items were sent counts as complete. The firmware treats an upload in the same way once
+        as many items have arrived as are stored: it ends that upload, but refuses other uploads until a download times
+        out.
         """
         link = self._link(channel)
         if link.next == self.count(link.mission_type):
@@ -293,7 +293,7 @@ class Px4MissionServer(MissionServer):
             self._warn(f"IGN MISSION_ITEM: {why}")
             self._answer(link, _R.ERROR)
 
-    def _put(self, upload: MissionUpload, message: AnyItem) -> int:
+    def _put(self, upload: ListUpload, message: AnyItem) -> int:
         link, item = self._link(upload.channel), item_from(message)
         is_int = isinstance(message, m.MissionItemInt)
         place = item if is_int else item.replace(x=float(item.x), y=float(item.y))
@@ -309,7 +309,7 @@ class Px4MissionServer(MissionServer):
             link.current = message.seq
         return _R.ACCEPTED
 
-    def _finish(self, upload: MissionUpload) -> None:
+    def _finish(self, upload: ListUpload) -> None:
         link = self._link(upload.channel)
         self._store(link.mission_type, link.items, link.opaque_id, link.current)
         self._end(link, _R.ACCEPTED)

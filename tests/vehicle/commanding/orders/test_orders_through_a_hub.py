@@ -1,4 +1,4 @@
-"""The order table through a hub, with bad links on either side; and dangers that only a hub has.
+"""The order table through a hub, with bad links on either side, and failures that only a hub can have.
 
 `nox -s orders -- SEEDS` flies every row with many seeds.
 """

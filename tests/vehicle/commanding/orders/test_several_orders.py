@@ -1,4 +1,4 @@
-"""Several orders at once, some cancelled, on a bad link, and a pilot: only the newest is sent, nothing against him."""
+"""Several orders at once, some cancelled, on a bad link: only the newest is sent, and none after a pilot's takeover."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def kind_of(message: Message) -> Hashable:
 
 @dataclass(frozen=True)
 class Choice:
-    """One order of a program, and its messages on ArduCopter and on PX4; empty: it does not steer."""
+    """An order of a program, and its messages on ArduCopter and on PX4; no messages mean that it does not steer."""
 
     name: str
     give: Callable[[aerokit.Vehicle], Awaitable[object]]
