@@ -283,7 +283,7 @@ async def test_disarming_ends_wait_finished() -> None:
         await reaches(flight, 1)
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(lambda: flight.vehicle.disarm(force=True))
-            with pytest.raises(OperationRejected, match="not armed"):
+            with pytest.raises(OperationRejected, match=r"not ended \(at item \d of 3\), but the vehicle is disarmed"):
                 await flight.vehicle.mission.wait_finished()
 
 

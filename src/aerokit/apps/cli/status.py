@@ -77,6 +77,8 @@ def _vehicle_lines(vehicle: Vehicle, missing: Sequence[str]) -> list[str]:
 
 def _readiness(vehicle: Vehicle, missing: Sequence[str]) -> list[str]:
     if not missing:
+        if vehicle.armed.latest:
+            return _aligned("ready", ["armed already; arming checks do not apply"])
         return _aligned("ready", ["no reason against arming is reported"])
     sensors = vehicle.sensors.latest
     can_arm = sensors is not None and sensors.prearm_checks_pass is True
