@@ -271,6 +271,10 @@ class ArduCopter(ArduPilot):
             *("RTL", "SMART_RTL", "SYSTEMID"),
         )
     )
+    armable_by_option: Mapping[str, str] = {"AUTO": "AUTO_OPTIONS"}
+    modes_without_position: frozenset[str] = frozenset(
+        ("ACRO", "ALT_HOLD", "FLOWHOLD", "GUIDED_NOGPS", "SPORT", "STABILIZE")
+    )
 
     def take_off(self, altitude_relative_m: float, home_altitude_amsl_m: float | None, *, is_vtol: bool) -> TakeOff:
         # The vehicle stays in GUIDED after the take-off.
@@ -358,6 +362,7 @@ class ArduRover(ArduPilot):
     arrival_radius_m: float = 4.0
     arming_mode: ClassVar[str | None] = "HOLD"
     unarmable_modes: frozenset[str] = frozenset(("RTL", "SMART_RTL", "INITIALISING"))
+    modes_without_position: frozenset[str] = frozenset(("HOLD", "MANUAL"))
 
     def _purpose_name(self, purpose: Purpose, is_vtol: bool) -> str | None:
         if purpose == "hold" and self.vehicle_type == MavType.SURFACE_BOAT:

@@ -269,6 +269,10 @@ class Autopilot:
     """Mode to which the vehicle changes after landing; None if it stays in the landing mode."""
     unarmable_modes: frozenset[str] = frozenset()
     """Modes in which the autopilot refuses to arm, or disarms at once."""
+    armable_by_option: Mapping[str, str] = {}
+    """Maps modes that allow arming only if a parameter says so to that parameter."""
+    modes_without_position: frozenset[str] = frozenset()
+    """Modes in which the autopilot arms without an estimate of the position."""
     prearm_depends_on_mode = False
     """True if the pre-arm bit of SYS_STATUS applies to the current mode only."""
     modes_with_rc: frozenset[str] | None = None

@@ -385,7 +385,7 @@ def connect(
             use_native=use_native,
             heartbeat=heartbeat,
         )
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, KeyboardInterrupt) as error:
         raise error.with_traceback(None) from None  # internal frames do not help the user
     handler.overrides.is_enabled = release_overrides
     try:
@@ -403,8 +403,10 @@ def connect(
                 still_waiting_callback=still_waiting_callback,
                 still_waiting_interval=still_waiting_interval,
             )
-    except BaseException:
+    except BaseException as error:
         handler.close()
+        if isinstance(error, KeyboardInterrupt) and vehicle_class is None:
+            raise error.with_traceback(None) from error.__cause__
         raise
     return vehicle
 

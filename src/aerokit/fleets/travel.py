@@ -314,7 +314,7 @@ class Missions(SelectionBase):
         """
         names = tuple(name for name in self._context.missions if name in self.members)
         if not names:
-            raise OperationRejected("start_missions: no missions were uploaded to all members; call upload() first")
+            raise OperationRejected("start_missions: no upload has succeeded for every member; call upload() first")
         members = self._require_available(dict.fromkeys(names))
         disarmed = [name for name in names if not members[name].vehicle.is_armed]
         if disarmed:

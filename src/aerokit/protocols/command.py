@@ -29,7 +29,7 @@ __all__ = [
 ]
 
 MAX_ATTEMPTS = 4
-"""Maximum number of sendings of a command that may be repeated."""
+"""Maximum number of transmissions of a command that may be repeated."""
 
 _ARM, _RELATIVE, _STEP = (0, 1.0), (3, 1.0), (0, 0.0)
 
@@ -162,13 +162,13 @@ class CommandExchange(Exchange[CommandAck]):
         message: the command.
         own_system: our system id.
         own_component: our component id.
-        attempts: maximum number of sendings; None: four, or one for an order in `UNREPEATABLE_COMMANDS`.
+        attempts: maximum number of transmissions; None: four, or one for an order in `UNREPEATABLE_COMMANDS`.
         attempt_timeout: seconds for each attempt; None: one, or four for an order in `UNREPEATABLE_COMMANDS`.
         progress_timeout: seconds without any answer, after IN_PROGRESS, until the command fails.
         on_progress: called with each progress report.
         earlier_answers: number of acknowledgements to ignore, because they belong to an earlier, abandoned command of
             the same number. Once this command is repeated, because they did not arrive, every acknowledgement counts.
-        acks_per_sending: number of acknowledgements that the vehicle sends for each sending; the first one counts.
+        acks_per_sending: number of acknowledgements that the vehicle sends for each transmission; the first one counts.
         min_timeout_s: lower limit of ``attempt_timeout``, for slow links.
         order_status: the state of the order; None for a request.
         is_sent: True if the command was already sent, just before :meth:`start`.
@@ -271,7 +271,7 @@ class CommandExchange(Exchange[CommandAck]):
             self._fail(CommandTimeout(self._timeout_text(now)))
 
     def _expire_order(self, order_status: OrderStatus, now: float) -> None:
-        # Until the time is up, each new HEARTBEAT repeats an order that has not ended.
+        # Until the time is up, an order that has not ended is repeated after each new HEARTBEAT.
         until = self._started + self._attempts * self._attempt_timeout
         if order_status.end:
             self._fail(CommandTimeout(f"{self._timeout_text(now)}; not sent again: {order_status.end}"))

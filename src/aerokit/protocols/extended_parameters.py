@@ -58,7 +58,7 @@ def setting_of(message: ParamExtValue | ParamExtAck) -> Setting:
 
 
 class SettingList(ValueList[dict[str, Setting], Setting]):
-    """Download of all settings: requests the list once, and missing indices, in a window, as soon as a gap appears.
+    """Download of all settings: requests the list once, then missing indices as soon as a gap appears.
 
     If the component reports another number of settings than before, values received before the change are requested
     again. A component without settings does not answer, so its transfer times out.

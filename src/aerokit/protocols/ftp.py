@@ -377,7 +377,7 @@ class FtpRequest(FtpExchange[FtpMessage]):
             self._end(reply)
 
     def _renumber(self, now: float) -> None:
-        # The server repeated its previous reply, because its previous request had the same sequence number.
+        # The server repeated its previous reply, because the request before had the same sequence number.
         if self._renumbered < MAX_RENUMBERED:
             self._renumbered += 1
             self._request = self._request.replace(sequence=self._client.next_sequence())
@@ -403,7 +403,7 @@ class FtpRequest(FtpExchange[FtpMessage]):
             return True  # the session does not exist any more
         if self.attempts == 1:
             return False
-        # An earlier sending may have removed it, and the answer was lost.
+        # An earlier transmission may have removed the file, and only the answer was lost.
         if opcode in (MavFtpOpcode.REMOVEFILE, MavFtpOpcode.REMOVEDIRECTORY):
             return code == MavFtpErr.FILENOTFOUND
         return opcode == MavFtpOpcode.CREATEDIRECTORY and code == MavFtpErr.FILEEXISTS

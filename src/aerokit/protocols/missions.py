@@ -1,7 +1,7 @@
 """Base class of mission, fence and rally transfers, and the exchanges that need no items.
 
 See https://mavlink.io/en/services/mission.html. The three kinds differ only in ``mission_type``. Items are those on the
-wire: where a mission's item 0 is home, it is included.
+wire, including item 0 if it is home.
 """
 
 from __future__ import annotations

@@ -172,7 +172,7 @@ class RequestWindow(Generic[KeyT]):
             self._waiting = {**dict.fromkeys(keys), **self._waiting}
 
     def _on_second_answer(self, key: KeyT) -> None:
-        # The first answer belonged to the first sending, which was considered lost too early.
+        # The first answer belonged to the first transmission, which was considered lost too early.
         seconds = self._ambiguous.pop(key, None)
         if seconds is not None:
             self._round_trip.add_sample(seconds)

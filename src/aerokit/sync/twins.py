@@ -1183,7 +1183,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         self._loop.run(self.aio.neutral, wait=wait, timeout=timeout)
 
     def retract(self, *, wait: bool = True, timeout: float = 10.0) -> None:
-        """Retract the gimbal; returns when it rests there.
+        """Retract the gimbal; returns when it rests in the retracted position.
 
         Args:
             wait: False: return when the manager has accepted the order.
@@ -1893,7 +1893,7 @@ class Gripper(TwinOf["AsyncGripper"]):
     """One gripper: ``vehicle.gripper()`` (MAV_CMD_DO_GRIPPER).
 
     PX4 acknowledges when the gripper has moved (PD_GRIPPER_EN). ArduPilot (GRIP_ENABLE) acknowledges at once and
-    reports the end by a status text. For an electro-permanent gripper it reports only the begin, and the call returns
+    reports the end by a status text. For an electro-permanent gripper it reports only the start, and the call returns
     three seconds later. Orders are sent once. The gripper may have moved after a cancelled call.
     """
 
@@ -2634,7 +2634,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
 
         Raises:
             OperationRejected: the vehicle no longer flies the mission: a pilot, a failsafe or another order changed the
-                mode, or it disarmed on the way. ``reasons`` has the vehicle's status texts.
+                mode, it disarmed on the way, or it fell. ``reasons`` has the vehicle's status texts.
             OperationTimeout: the mission was not finished in time; or the armed vehicle has not moved for 12 s after a
                 descent at more than 3 m/s that ended on the ground; or it has not moved for 60 s at a take-off or at a
                 waypoint without a hold (only if the items are known from an upload or a download).
@@ -4911,7 +4911,7 @@ class Vehicle(VehicleTwin):
             NotSupported: this type of vehicle has no landing mode. Nothing was sent.
             CommandRejected: the vehicle refused the mode.
             CommandTimeout: there was no acknowledgement.
-            OperationRejected: the mode changed meanwhile, or the vehicle was disarmed in the air.
+            OperationRejected: the mode changed meanwhile, or the vehicle fell.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the vehicle was not on the ground in time.
         """
@@ -5045,7 +5045,7 @@ class Vehicle(VehicleTwin):
             CommandRejected: the vehicle refused the mode.
             CommandTimeout: there was no acknowledgement.
             OperationRejected: a parameter makes the vehicle ignore the target (nothing else was sent); or, after the
-                start, the mode changed, another order was given, or the vehicle was disarmed in the air.
+                start, the mode changed, another order was given, or the vehicle fell.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the target was not visible in time (the landing was not ordered), or the vehicle was not
                 on the ground in time.

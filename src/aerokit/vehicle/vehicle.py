@@ -215,7 +215,7 @@ class Vehicle(
             CommandRejected: the vehicle refused the mode.
             CommandTimeout: there was no acknowledgement.
             OperationRejected: a parameter makes the vehicle ignore the target (nothing else was sent); or, after the
-                start, the mode changed, another order was given, or the vehicle was disarmed in the air.
+                start, the mode changed, another order was given, or the vehicle fell.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the target was not visible in time (the landing was not ordered), or the vehicle was not
                 on the ground in time.

@@ -543,6 +543,27 @@ async def test_land_of_vehicle_disarmed_in_the_air_is_rejected(is_px4: bool) -> 
             await flight.vehicle.land()
 
 
+@pytest.mark.parametrize("name", ["land", "return_to_launch"])
+async def test_fall_on_the_way_to_the_ground_is_rejected(name: str) -> None:
+    async with in_the_air(30.0) as flight, anyio.create_task_group() as group:
+        await flight.vehicle.go_to(north_of_home(flight, 40.0, 30.0))
+
+        async def fail() -> None:
+            await anyio.sleep(4.0)
+            flight.copter.faults.motor_failed = True
+
+        group.start_soon(fail)
+        with pytest.raises(OperationRejected, match=rf"{name}: the vehicle hit the ground at \d+\.\d m/s"):
+            await getattr(flight.vehicle, name)()
+
+
+async def test_fast_descent_before_landing_is_no_fall() -> None:
+    copter = SimulatedCopter(boot_time_s=0.0, parameters={"LAND_SPEED_HIGH": 500.0, "LAND_SPEED": 200.0})
+    async with open_flight(copter) as flight:
+        await flight.take_off(60.0)
+        await flight.vehicle.land()
+
+
 async def disarm_later(flight: Any, seconds: float) -> None:
     await anyio.sleep(seconds)
     if isinstance(flight, Flight):

@@ -315,3 +315,25 @@ async def test_px4_mode_with_sticks_names_missing_rc_receiver() -> None:
         flight.px4.switch_to(POSITION)
         await anyio.sleep(2.0)
         assert "RC receiver (missing) is not healthy (SYS_STATUS)" in await flight.vehicle.why_not_armable()
+
+
+async def test_lost_gps_is_named_where_it_prevents_arming() -> None:
+    async with open_flight() as flight:
+        await flight.vehicle.wait_ready()
+        flight.copter.faults.gps_lost = True
+        await anyio.sleep(20)
+        assert "no GPS receiver has a 3D fix (GPS_RAW_INT)" in flight.vehicle.missing_for_flight()
+        assert await flight.vehicle.why_not_armable() == []
+        await flight.vehicle.arm()  # in STABILIZE
+        await flight.vehicle.disarm()
+
+
+async def test_lost_gps_prevents_arming_in_guided() -> None:
+    async with open_flight() as flight:
+        await flight.vehicle.wait_ready()
+        await flight.vehicle.set_mode("GUIDED")
+        flight.copter.faults.gps_lost = True
+        await anyio.sleep(20)
+        assert "no GPS receiver has a 3D fix (GPS_RAW_INT)" in await flight.vehicle.why_not_armable()
+        with pytest.raises(CommandRejected, match="no GPS receiver has a 3D fix"):
+            await flight.vehicle.arm()

@@ -82,10 +82,11 @@ def _readiness(vehicle: Vehicle, missing: Sequence[str]) -> list[str]:
         return _aligned("ready", ["no reason against arming is reported"])
     sensors = vehicle.sensors.latest
     can_arm = sensors is not None and sensors.prearm_checks_pass is True
-    is_about_estimates = all(text.startswith("the estimator has no ") for text in missing)
+    is_about_estimates = all(text.startswith(("the estimator has no ", "no GPS receiver has ")) for text in missing)
     # ArduCopter arms in STABILIZE without a position, for example.
     note = [f"for autonomous flight; {vehicle.mode_name} allows arming:"] if can_arm and is_about_estimates else []
-    return _aligned("missing", [*note, *missing])
+    plain = [text.replace("arm() changes to", "aerokit changes to") for text in missing]
+    return _aligned("missing", [*note, *plain])
 
 
 def _component_line(heartbeat: Heartbeat, system_id: int, component_id: int) -> tuple[dict[str, Any], str]:

@@ -191,7 +191,7 @@ class RunningCommands:
         return len(self._running)
 
     def start(self, command: ReceivedCommand, cancel: Callable[[], None]) -> RunningCommand | None:
-        """Register a command; return None if it must not be executed, which the sender has then been told."""
+        """Register a command; if it must not be executed, inform the sender and return None."""
         running = self._running.get(command.command)
         if running is not None and _is_repeated(command, running.command):
             self._server.answer(command, MavResult.IN_PROGRESS, running.progress)

@@ -294,7 +294,7 @@ class GimbalRequests:
 
 
 def _owner(before: Owner, wanted: tuple[int, int], sender: Owner) -> Owner:
-    """Return the component in control after one pair of params; (0, 0) is none."""
+    """Return the component that is in control after a pair of params of the command; (0, 0) if none."""
     if _SENDER in wanted:
         return sender
     if _RELEASE in wanted:

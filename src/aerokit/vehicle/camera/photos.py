@@ -30,7 +30,7 @@ CHECK_INTERVAL_S, STATUS_TIMEOUT_S = 1.0, 2.0
 STATUS_ATTEMPTS, FIRST_STATUS_ATTEMPTS = 8, 3
 # Maximum number of checks without a result, after which a silent series has failed.
 MAX_SILENT_CHECKS = 6
-# The camera may be ahead of the newest capture by twice the number that the interval of the series allows, plus this.
+# The camera may have taken twice as many pictures since the newest capture as its interval allows, plus this many.
 MAX_EXTRA_CAPTURES = 10
 # After this many unanswered requests in a row, the remaining gap is skipped.
 MAX_UNANSWERED = 3

@@ -13,10 +13,10 @@ from aerokit.mavlink.enums import MavLandedState
 from aerokit.position import Position
 from aerokit.vehicle.commanding.arbiter import MODE_GRACE_S
 from aerokit.vehicle.commanding.context import VehicleBase
+from aerokit.vehicle.commanding.ground import GroundCheck
 from aerokit.vehicle.commanding.progress import (
     MAX_SILENCE_S,
     POSITION_MAX_AGE_S,
-    GroundCheck,
     StallDetector,
     await_progress,
 )
@@ -187,7 +187,7 @@ class FlightActions(VehicleBase):
             NotSupported: this type of vehicle has no landing mode. Nothing was sent.
             CommandRejected: the vehicle refused the mode.
             CommandTimeout: there was no acknowledgement.
-            OperationRejected: the mode changed meanwhile, or the vehicle was disarmed in the air.
+            OperationRejected: the mode changed meanwhile, or the vehicle fell.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the vehicle was not on the ground in time.
         """

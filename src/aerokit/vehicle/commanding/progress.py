@@ -94,46 +94,6 @@ def _height_when_disarmed(session: VehicleSession) -> str:
     return f" {height_m:.1f} m above home" if is_falling else ""
 
 
-class GroundCheck:
-    """Distinguishes a vehicle on the ground from one that was disarmed in the air.
-
-    ArduCopter and PX4 report ON_GROUND whenever they are disarmed (AP_Arming_Copter.cpp, MulticopterLandDetector.cpp).
-    """
-
-    def __init__(self, session: VehicleSession) -> None:
-        self._session = session
-        self._reported_at: float | None = None
-
-    def confirms(self, is_reported: bool) -> bool:
-        """Return True if the vehicle is reported on the ground, and does not sink half a second later.
-
-        If no velocity is received, the report is accepted as it is.
-        """
-        now, velocity = self._session.connection.now(), self._session.telemetry.velocity
-        if not is_reported:
-            self._reported_at = None
-            return False
-        if self._reported_at is None:
-            self._reported_at = now
-        if now - velocity.updated_at > POSITION_MAX_AGE_S:
-            return True
-        return velocity.updated_at >= self._reported_at + FALL_EVIDENT_S and self._sink_m_s() < FALL_SINK_M_S
-
-    def trouble(self, before: Callable[[], str | None]) -> str | None:
-        """Return a clause if the vehicle is reported down, but sinks disarmed; before that report, ``before()``."""
-        telemetry = self._session.telemetry
-        if self._reported_at is None:
-            return before()
-        is_newer = telemetry.velocity.updated_at > self._reported_at
-        if not is_newer or not telemetry.is_confirmed_disarmed or self._sink_m_s() < FALL_SINK_M_S:
-            return None
-        return f"the vehicle was disarmed in the air and sinks at {self._sink_m_s():.1f} m/s"
-
-    def _sink_m_s(self) -> float:
-        velocity = self._session.telemetry.velocity.latest
-        return 0.0 if velocity is None else velocity.down_m_s
-
-
 class ChangeSignal:
     """Wakes a waiter when any of these cells changes, or the connection ends."""
 

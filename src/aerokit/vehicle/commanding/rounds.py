@@ -110,7 +110,7 @@ class RoundFlight:
         stall, stays = StallDetector(session), self._context.sender.stays_in(order, mode)
 
         def on_status(status: OrbitExecutionStatus) -> None:
-            """Recognise a wrong radius: PX4 accepts one that it does not allow, and flies another."""
+            """Recognise a wrong radius: PX4 accepts a radius above its limit, but flies another one."""
             flown_m = abs(status.radius)
             is_wrong = circle_m and abs(flown_m - circle_m) > RADIUS_ERROR_M
             self._wrong_circle = (

@@ -27,7 +27,7 @@ class Gripper(ReadOnly):
     """One gripper: ``vehicle.gripper()`` (MAV_CMD_DO_GRIPPER).
 
     PX4 acknowledges when the gripper has moved (PD_GRIPPER_EN). ArduPilot (GRIP_ENABLE) acknowledges at once and
-    reports the end by a status text. For an electro-permanent gripper it reports only the begin, and the call returns
+    reports the end by a status text. For an electro-permanent gripper it reports only the start, and the call returns
     three seconds later. Orders are sent once. The gripper may have moved after a cancelled call.
     """
 

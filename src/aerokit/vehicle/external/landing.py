@@ -14,7 +14,8 @@ import anyio
 from aerokit._internal.arguments import check_kind, check_range
 from aerokit._internal.values import Snapshot
 from aerokit.errors import OperationTimeout, ValueUnknownError
-from aerokit.vehicle.commanding.progress import GroundCheck, await_progress
+from aerokit.vehicle.commanding.ground import GroundCheck
+from aerokit.vehicle.commanding.progress import await_progress
 from aerokit.vehicle.commanding.streams import TakeoverCheck
 from aerokit.vehicle.external.values import TargetMeasurement
 
@@ -41,7 +42,7 @@ POLL_INTERVAL_S = 0.2
 class TargetLoss(Snapshot):
     """One time during which the target was not visible.
 
-    ``height_m`` is the vehicle's height above home at its start; None if unknown.
+    ``height_m`` is the vehicle's height above home at the start of this time; None if unknown.
     """
 
     seconds: float

@@ -216,7 +216,7 @@ class GimbalOrders:
             detach()
 
     async def find_manager(self) -> int:
-        """Return the manager, after asking the device whether it manages itself if no manager is known."""
+        """Return the manager. If none is known, first ask the device whether it manages itself."""
         device = self.device
         if device.manager_id is None and device.component_id:
             with suppress(CommandRejected, CommandTimeout):

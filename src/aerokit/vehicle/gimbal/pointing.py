@@ -275,7 +275,7 @@ class PointingMixin(GimbalMixin):
         await self._rest("neutral", NEUTRAL, MavMountMode.NEUTRAL, wait=wait, timeout=timeout)
 
     async def retract(self, *, wait: bool = True, timeout: float = 10.0) -> None:
-        """Retract the gimbal; returns when it rests there.
+        """Retract the gimbal; returns when it rests in the retracted position.
 
         Args:
             wait: False: return when the manager has accepted the order.

@@ -131,7 +131,7 @@ class PlanContext:
 class MissionTracker:
     """Cells and events for mission progress. Item numbers do not count home.
 
-    ArduCopter, if it lands at the end, disarms and goes back to its first item without reporting that the mission is
+    If ArduCopter lands at the end, it disarms and returns to its first item, without reporting that the mission is
     complete. PX4 reports completion until the next mission has started, reports an active mission even in its landing
     mode, and sends each MISSION_ITEM_REACHED ten times.
     """

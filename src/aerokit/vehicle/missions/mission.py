@@ -11,6 +11,7 @@ from aerokit.errors import CommandRejected, InvalidArgument, OperationRejected, 
 from aerokit.mavlink.enums import MavCmd, MavLandedState, MavResult, MissionState
 from aerokit.position import Position
 from aerokit.vehicle.commanding.arbiter import MODE_GRACE_S
+from aerokit.vehicle.commanding.ground import ImpactDetector
 from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, await_progress
 from aerokit.vehicle.missions.plans import VehiclePlan
 from aerokit.vehicle.missions.stalling import MissionStallDetector
@@ -65,8 +66,12 @@ class MissionEndDetector:
         self._grace_until = session.connection.now() + MODE_GRACE_S
         self._was_in_mode = False
         self._left_at: float | None = None
+        self._impact = ImpactDetector(session)
 
     def has_ended(self) -> bool:
+        self._impact.update()
+        if self._impact.text() and self._is_on_ground:
+            return False
         if self._tracker.is_complete:
             at_home = self._ends_in_air and (self._session.autopilot.mission_completes_at_home or self._is_home)
             return not self._ends_by_landing or self._is_on_ground or at_home
@@ -86,6 +91,8 @@ class MissionEndDetector:
         session, now = self._session, self._session.connection.now()
         if self._vehicle_context.arbiter.newest not in (self._order, order):
             return "another order was given"
+        if self._is_on_ground and (impact := self._impact.text()):
+            return f"{impact}, {self.describe()}"
         is_in_mode = session.telemetry.is_in(self._mode)
         self._was_in_mode = self._was_in_mode or is_in_mode
         if not session.telemetry.is_confirmed_disarmed and (
@@ -267,7 +274,7 @@ class MissionControl(VehiclePlan["Mission"]):
 
         Raises:
             OperationRejected: the vehicle no longer flies the mission: a pilot, a failsafe or another order changed the
-                mode, or it disarmed on the way. ``reasons`` has the vehicle's status texts.
+                mode, it disarmed on the way, or it fell. ``reasons`` has the vehicle's status texts.
             OperationTimeout: the mission was not finished in time; or the armed vehicle has not moved for 12 s after a
                 descent at more than 3 m/s that ended on the ground; or it has not moved for 60 s at a take-off or at a
                 waypoint without a hold (only if the items are known from an upload or a download).
@@ -277,7 +284,7 @@ class MissionControl(VehiclePlan["Mission"]):
         mode = vehicle_context.sender.mode_for("mission.wait_finished", "mission")
         items = (self._context.caches[0].items or ())[self._context.offset_of(0) :]
         end = MissionEndDetector(vehicle_context, self._tracker, mode, items)
-        with session.streaming("mission_current", "landed_state"):
+        with session.streaming("mission_current", "landed_state", "position"):
             await await_progress(
                 session,
                 "mission.wait_finished",
@@ -321,7 +328,7 @@ class MissionControl(VehiclePlan["Mission"]):
             raise InvalidArgument(f"item = {item!r} is not allowed: 0 to {last}")
 
     async def _set_current(self, item: int, timeout: float, order: Order, *, keeps_jump_counts: bool = True) -> None:
-        """Set the current item. ArduPilot's item 0 resets its jump counts, unless ``keeps_jump_counts``."""
+        """Set the current item. Item 0 also resets ArduPilot's jump counts, unless ``keeps_jump_counts``."""
         vehicle_context, session = self._vehicle_context, self._session
         seq = item + self._context.offset_of(0)
         if session.autopilot.sets_current_by_command:

@@ -221,7 +221,8 @@ class ParameterAccess:
     def _boosted(self, *, after_s: float = 0.0) -> Iterator[None]:
         """Raise the rate at which ArduPilot handles parameters, by SET_MESSAGE_INTERVAL of PARAM_VALUE.
 
-        Sent after ``after_s`` seconds, if the block lasts that long, and restored at its end.
+        The rate is raised after ``after_s`` seconds, if the block lasts that long, and restored at the end of the
+        block.
         """
         interval_s = self._transfers.autopilot.parameter_interval_s
         if interval_s is None or after_s == math.inf:
