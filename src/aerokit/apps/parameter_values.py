@@ -6,7 +6,6 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from aerokit.errors import InvalidArgument
-from aerokit.parameters.renames import resolve_rename
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -37,6 +36,8 @@ def _problem(metadata: Metadata, name: str, value: float) -> str | None:
 
 def metadata_entry(metadata: Metadata, name: str) -> tuple[ParameterMetadata | None, Callable[[float], float]]:
     """Return the metadata of a parameter under any of its names, and the conversion to its unit."""
+    from aerokit.parameters.renames import resolve_rename
+
     for spelled in (name, name.upper()):
         if spelled in metadata:
             return metadata[spelled], lambda value: value

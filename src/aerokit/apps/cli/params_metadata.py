@@ -16,12 +16,14 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from aerokit.parameters import Metadata, Parameter
+    from aerokit.vehicle.parameters.parameters import ParameterWrite
     from aerokit.vehicle.vehicle import Vehicle
 
 # ArduPilot uses a new system id at once (GCS_Common.cpp, update_send), PX4 and old ArduPilots after a reboot.
 _SYSTEM_ID_NAMES = ("SYSID_THISMAV", "MAV_SYSID", "MAV_SYS_ID")
 # Limits the time that reading the metadata from the vehicle takes; over a slow radio it takes longer.
 _FETCH_TIMEOUT_S = 10.0
+RANGES_NOT_CHECKED = "ranges not checked (--metadata FILE checks them)"
 
 
 def add_metadata(command: argparse.ArgumentParser, *, checks: bool = False) -> None:
@@ -73,6 +75,17 @@ async def _fetch(vehicle: Vehicle) -> Metadata | None:
 def check_given(metadata: Metadata | None, values: Mapping[str, float]) -> None:
     """Raise InvalidArgument with all values that the metadata does not allow. Unknown names are accepted."""
     check_values(metadata, values, "--force")
+
+
+def with_range_note(metadata: Metadata | None, result: ParameterWrite) -> str:
+    """Return the note of a result; if the value was set without a check of its range, the note says so."""
+    text = ""
+    if metadata is None:
+        text = RANGES_NOT_CHECKED.replace("ranges", "range").replace("them", "it")
+    elif metadata_entry(metadata, result.name)[0] is None:
+        text = "range not checked (the metadata does not have this parameter)"
+    is_set = result.error is None and result.outcome != "unchanged"
+    return "; ".join(filter(None, (result.note, text if is_set else "")))
 
 
 def reboot_note(metadata: Metadata | None, name: str, value: float) -> str:

@@ -233,7 +233,7 @@ def _is_flying_mission(vehicle: Vehicle) -> bool:
 
 
 def _unarmable_mode(vehicle: Vehicle) -> dict[str, str | None] | None:
-    """Return the mode if ``arm`` leaves it, the mode in which ``arm`` arms, and the parameter that allows the former."""
+    """Return the mode if ``arm`` leaves it, the mode in which ``arm`` arms, and the parameter that allows the mode."""
     autopilot, mode = vehicle.autopilot, vehicle.mode.latest
     if mode is None or mode.name not in autopilot.unarmable_modes.union(autopilot.armable_by_option):
         return None
