@@ -81,6 +81,11 @@ _LEAN_TIME_CONSTANT_S = 0.15
 _TURN_GAIN_PER_S = 2.0
 _TERMINAL_SPEED_M_S = 25.0
 _APPROACH_PER_S, _MAX_APPROACH_M_S = 0.8, 1.5
+# Up to these, and farther from the ground than the time that a vehicle descends, a step of 0.1 s is as good as five
+# of 0.02 s: the error in position is below 1 mm.
+_STEADY_JERK_M_S3 = 4.0
+_STEADY_LEAN_RATE_RAD_S = 0.15
+_STEADY_ABOVE_GROUND_S = 0.3
 
 
 def wrap_pi(angle: float) -> float:
@@ -163,6 +168,7 @@ class Motion:
         self.impact_speed_m_s: float = 0.0
         """Vertical speed at the last touchdown."""
         self._gust_north = self._gust_east = 0.0
+        self._jerk_m_s3 = math.inf
         self._wanted = (0.0, 0.0, 0.0)
         self._leaning: tuple[float, float] | None = None
         self._accelerating = False
@@ -213,6 +219,17 @@ class Motion:
         return self.down >= self.ground_down
 
     @property
+    def is_steady(self) -> bool:
+        """True in flight while acceleration and lean hardly change, so that long steps are exact."""
+        height_m = self.ground_down - self.down
+        return (
+            self._jerk_m_s3 < _STEADY_JERK_M_S3
+            and not self.wind.gusts_m_s
+            and abs(self.roll_rate) + abs(self.pitch_rate) < _STEADY_LEAN_RATE_RAD_S
+            and height_m > max(0.0, self.velocity_down * _STEADY_ABOVE_GROUND_S)
+        )
+
+    @property
     def airspeed_m_s(self) -> float:
         """Horizontal speed through the air."""
         return math.hypot(
@@ -235,6 +252,8 @@ class Motion:
             drag = GRAVITY_M_S2 / _TERMINAL_SPEED_M_S
             north, east = -drag * self.velocity_north, -drag * self.velocity_east
             down = GRAVITY_M_S2 - drag * self.velocity_down
+        change = abs(north - self.acceleration_north) + abs(east - self.acceleration_east)
+        self._jerk_m_s3 = (change + abs(down - self.acceleration_down)) / dt
         self._integrate(north, east, down, dt)
         self._lean(north, east, dt, powered=powered)
         self._turn(dt, powered=powered)
