@@ -77,14 +77,14 @@ HOME = (-35.363261, 149.165230, 584.09)
 GRAVITY_M_S2 = 9.80665
 _DRAG_PER_S = 0.33  # Deceleration divided by airspeed: a 450 mm quadrotor leans 20 degrees at 10 m/s.
 _VELOCITY_TIME_CONSTANT_S = 0.3
-_LEAN_TIME_CONSTANT_S = 0.15
+_LEAN_KEPT_PER_S = (1.0 - 0.02 / 0.15) ** 50  # A time constant of 0.15 s.
 _TURN_GAIN_PER_S = 2.0
 _TERMINAL_SPEED_M_S = 25.0
 _APPROACH_PER_S, _MAX_APPROACH_M_S = 0.8, 1.5
 # Up to these, and farther from the ground than the time that a vehicle descends, a step of 0.1 s is as good as five
 # of 0.02 s: the error in position is below 1 mm.
 _STEADY_JERK_M_S3 = 4.0
-_STEADY_LEAN_RATE_RAD_S = 0.15
+_STEADY_LEAN_RATE_RAD_S = 0.4
 _STEADY_ABOVE_GROUND_S = 0.3
 
 
@@ -338,7 +338,7 @@ class Motion:
             limit = self.limits.lean_rad
             pitch = _clamp(-math.atan2(north * cos_yaw + east * sin_yaw, GRAVITY_M_S2), limit)
             roll = _clamp(math.atan2(east * cos_yaw - north * sin_yaw, GRAVITY_M_S2), limit)
-        share = dt / _LEAN_TIME_CONSTANT_S if dt < _LEAN_TIME_CONSTANT_S else 1.0
+        share = 1.0 - _LEAN_KEPT_PER_S**dt
         roll_step, pitch_step = (roll - self.roll) * share, (pitch - self.pitch) * share
         self.roll += roll_step
         self.pitch += pitch_step
