@@ -193,12 +193,12 @@ async def test_earliest_of_several_event_sources_runs_first() -> None:
 
 
 @pytest.mark.anyio
-async def test_timer_runs_before_event_source_of_same_instant() -> None:
+async def test_event_source_runs_before_timer_of_same_instant() -> None:
     order: list[str] = []
     source = Metronome(lambda: order.append("source"))
     source.loop.call_later(0.5, order.append, "timer")
     await asyncio.sleep(0.6)
-    assert order == ["timer", "source"]
+    assert order == ["source", "timer"]
     source.end()
 
 

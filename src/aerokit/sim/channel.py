@@ -108,7 +108,7 @@ class Streams:
         else:
             self._intervals[message_id] = (interval_s, self._token)
             heappush(self._heap, (now, self._token, message_id, now, 0))
-        self._update_next_due()
+        self.take_due(-math.inf)
 
     def interval(self, message_id: int) -> float:
         """Return the interval in seconds; 0 if the message is not streamed."""
@@ -124,36 +124,30 @@ class Streams:
             (due + seconds, token, message_id, start + seconds, count)
             for due, token, message_id, start, count in self._heap
         ]
-        self._update_next_due()
+        self.take_due(-math.inf)
 
     def take_due(self, now: float) -> list[int]:
         """Return the message ids that are due, and schedule each again."""
         ids: list[int] = []
         heap, intervals = self._heap, self._intervals
-        while self.next_due <= now:
-            _, token, message_id, start, count = heap[0]
-            interval = intervals[message_id][0]
+        while heap:
+            due, token, message_id, start, count = heap[0]
+            current = intervals.get(message_id)
+            if current is None or current[1] != token:  # The stream was stopped or replaced.
+                heappop(heap)
+                continue
+            if due > now:
+                self.next_due = due
+                return ids
+            ids.append(message_id)
             # Rounded, so that streams of different rates are due at the same instants.
-            following = round(start + (count + 1) * interval, 9)
+            following = round(start + (count + 1) * current[0], 9)
             if following > now:
                 heapreplace(heap, (following, token, message_id, start, count + 1))
             else:
-                heapreplace(heap, (now + interval, token, message_id, now, 1))
-            ids.append(message_id)
-            self._update_next_due()
-        return ids
-
-    def _update_next_due(self) -> None:
-        """Update `next_due`; drops entries of streams that were stopped or replaced."""
-        heap, intervals = self._heap, self._intervals
-        while heap:
-            due, token, message_id, _, _ = heap[0]
-            current = intervals.get(message_id)
-            if current is not None and current[1] == token:
-                self.next_due = due
-                return
-            heappop(heap)
+                heapreplace(heap, (now + current[0], token, message_id, now, 1))
         self.next_due = math.inf
+        return ids
 
 
 _DATAGRAM_SIZE = 1200

@@ -82,8 +82,8 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         """Call ``run`` whenever the clock would pass ``next_due()``; return a function that ends this.
 
         It does the same as a timer, in a fraction of the time: it takes neither timers nor iterations of the loop.
-        ``next_due`` returns seconds of this clock, infinity for never, and later ones after each ``run``. Timers of
-        the same instant come first.
+        ``next_due`` returns seconds of this clock, infinity for never, and later ones after each ``run``. It comes
+        before the timers of the same instant.
         """
         source = (next_due, asyncio.Handle(run, (), self))
         self._sources.append(source)
@@ -105,11 +105,11 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
             self._now = max(self._now, self._next_timer())
         end = self._now + self._clock_resolution
         if timers and timers[0]._when < end:
+            ready.extend(handle for next_due, handle in self._sources if next_due() < end)
             while timers and timers[0]._when < end:
                 timer = heappop(timers)
                 timer._scheduled = False
                 ready.append(timer)
-            ready.extend(handle for next_due, handle in self._sources if next_due() < end)
         for _ in range(len(ready)):
             handle = ready.popleft()
             if not handle._cancelled:
@@ -130,7 +130,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         return timers[0]._when if timers else math.inf
 
     def _run_sources(self) -> bool:
-        """Run the events of the sources before the next timer, until a callback is ready; return True if any ran."""
+        """Run events before the instant of the next timer, until a callback is ready; return True if any ran."""
         sources, ready, has_run = self._sources, self._ready, False  # type: ignore[attr-defined]
         is_alone = self._is_alone
         while sources and not ready:
