@@ -84,7 +84,7 @@ _APPROACH_PER_S, _MAX_APPROACH_M_S = 0.8, 1.5
 # Up to these, and farther from the ground than the time that a vehicle descends, a step of 0.1 s is as good as five
 # of 0.02 s: the error in position is below 1 mm.
 _STEADY_JERK_M_S3 = 4.0
-_STEADY_LEAN_RATE_RAD_S = 0.4
+_STEADY_LEAN_RATE_RAD_S = 0.6
 _STEADY_ABOVE_GROUND_S = 0.3
 
 

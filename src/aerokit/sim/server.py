@@ -276,6 +276,8 @@ class _Port:
     def take_datagrams(self, *, together: bool) -> list[bytes]:
         """Return the datagrams to send. With ``together``, many vehicles share datagrams, as a router joins them."""
         active = [channel for channel in self.channels if channel.has_output]
+        if not active:
+            return []
         if together and len(self.channels) > _BATCH_THRESHOLD:
             return datagrams(piece for channel in active for piece in channel.take_pieces())
         return [datagram for channel in active for datagram in channel.take_datagrams()]
