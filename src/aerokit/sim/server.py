@@ -152,12 +152,9 @@ class SimulatorServer:
             self._fail(error)
             raise
 
-    def _on_timer(self) -> None:
+    def _on_due(self) -> None:
         self._skip_lateness()
         self._timer = None
-        self._on_due()
-
-    def _on_due(self) -> None:
         try:
             self._run(max(self.now, min(self._dues)))  # A timer may fire slightly early.
         except Exception as error:
@@ -238,13 +235,14 @@ class SimulatorServer:
         if self._min_wait_s:
             when = max(when, loop.time() + self._min_wait_s)
         self._timer_due, self._timer_at = due, when
-        self._timer = loop.call_at(when, self._on_timer)
+        self._timer = loop.call_at(when, self._on_due)
 
     def _skip_lateness(self) -> None:
         """Except in real time, skip the time by which the timer is late, beyond what is caught up."""
-        if self._loop is None or self._timer is None or self._speedup == 1.0:
+        if self._loop is None or self._speedup == 1.0 or (self._timer is None and self._end_source is None):
             return
-        late = self._loop.time() - self._timer_at - _MAX_CATCH_UP_S / self._speedup
+        due_at = self._next_loop_time() if self._timer is None else self._timer_at
+        late = self._loop.time() - due_at - _MAX_CATCH_UP_S / self._speedup
         if late > 0:
             self._started_at += late
             self._timer_at += late
