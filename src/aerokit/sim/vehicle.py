@@ -23,7 +23,7 @@ from aerokit.sim.channel import Channel
 from aerokit.sim.faults import Faults
 
 TICK_S = 0.02
-"""Interval of motion, modes and failsafes (50 Hz) while the vehicle moves."""
+"""Interval of motion and modes (50 Hz) while the vehicle moves; in steady flight several make one long tick."""
 
 _STEADY_TICKS = 5
 
@@ -228,7 +228,11 @@ class SimulatedVehicle:
 
     @property
     def is_steady(self) -> bool:
-        """True if one long tick does as well as several: up to 0.1 s, but never past an event."""
+        """True if a long tick does as well as several short ones.
+
+        It lasts at most 0.1 s. It ends before anything is received, streamed or due, so that samples are as recent as
+        with short ticks.
+        """
         return False
 
     def call_at(self, when: float, action: Callable[[], None]) -> None:
@@ -256,7 +260,7 @@ class SimulatedVehicle:
         self.call_at(start, repeat)
 
     def set_ticking(self, ticking: bool) -> None:
-        """Start or stop calling ``tick`` at 50 Hz."""
+        """Start or stop calling ``tick`` at 50 Hz, and in steady flight at 10 Hz or more."""
         if ticking == (self._ticks_from != math.inf):
             return
         self._ticks_from, self._ticks_done = self.now if ticking else math.inf, 0
