@@ -238,7 +238,7 @@ class SimulatorServer:
         self._timer = loop.call_at(when, self._on_due)
 
     def _skip_lateness(self) -> None:
-        """Except in real time, skip the time by which the timer is late, beyond what is caught up."""
+        """Except in real time, skip the lateness of the timer beyond ``_MAX_CATCH_UP_S``."""
         if self._loop is None or self._speedup == 1.0 or (self._timer is None and self._end_source is None):
             return
         due_at = self._next_loop_time() if self._timer is None else self._timer_at
