@@ -146,9 +146,11 @@ class FrameReceiver:
         self.framers: dict[Peer, Framer] = self._peers.framers
         self.heartbeats: dict[tuple[int, int], Heartbeat] = {}
         """Last HEARTBEAT of every (system id, component id) on the link."""
-        self.observers: FrameObservers = FrameObservers(self._update_framers)
+        self.observers: FrameObservers = FrameObservers(self._on_observers_changed)
         self._loop_watch = LoopWatch(self._on_blocked, self._on_slept)
         self._is_closed = False
+        self._needs_checks = multilink is not None
+        gate.on_change = self._update_checks
         bus.require_frames(Heartbeat)  # for routes and diagnosis
 
     def start(self) -> None:
@@ -158,6 +160,7 @@ class FrameReceiver:
 
     def close(self) -> None:
         self._is_closed = True
+        self._update_checks()
         self._loop_watch.close()
 
     def reset(self) -> None:
@@ -165,15 +168,32 @@ class FrameReceiver:
         self._peers.reset()
 
     def receive(self, data: bytes, peer: Peer) -> None:
-        framer, multilink, observers = self.framers.get(peer), self._multilink, self.observers
         now = self._clock()
         if now > self._loop_watch.late_after:
             now = self._loop_watch.arrival(now)
+        framer = self.framers.get(peer)
         if framer is not None:
             frames = framer.receive(data, now)
         else:
             framer, frames = self._peers.receive_unverified(peer, data, now)
-        framers, gate, deliver = self.framers, self._gate, self._bus.deliver
+            self._update_checks()
+        if not frames:
+            return
+        if self._needs_checks or framer.late or framer.foreign:
+            self._check_and_deliver(iter(frames), framer, peer)
+            return
+        waiting, deliver = iter(frames), self._bus.deliver
+        for frame in waiting:
+            if frame.message_id == _HEARTBEAT_ID:
+                self._record_heartbeat(framer, frame, peer)
+            deliver(frame)
+            if self._needs_checks:  # a sink has closed the connection, set a key or added an observer
+                self.observers.notify_received(frame, peer)
+                self._check_and_deliver(waiting, framer, peer)
+
+    def _check_and_deliver(self, frames: Iterator[Frame], framer: Framer, peer: Peer) -> None:
+        """Deliver the frames that pass all checks, and pass them to the recording and the observers."""
+        framers, multilink, gate, observers = self.framers, self._multilink, self._gate, self.observers
         has_stale = bool(framer.late or framer.foreign)
         for frame in frames:
             if self._is_closed:  # a sink closed the receiver while processing an earlier frame
@@ -195,7 +215,7 @@ class FrameReceiver:
                 observers.record_received(frame.raw, self._clock())
             if frame.message_id == _HEARTBEAT_ID:
                 self._record_heartbeat(framer, frame, peer)
-            deliver(frame)
+            self._bus.deliver(frame)
             if observers.received:
                 observers.notify_received(frame, peer)
 
@@ -228,7 +248,18 @@ class FrameReceiver:
         logger.warning("the computer slept for %.0f s: all values of vehicles are now older by this time", seconds)
         self._bus.publish(ComputerSlept(self._clock(), 0, seconds))
 
-    def _update_framers(self) -> None:
+    def _update_checks(self) -> None:
+        """Determine whether each frame must be checked for its route and signature, recorded or observed."""
+        self._needs_checks = (
+            self._is_closed
+            or self._multilink is not None
+            or not self._gate.is_open
+            or self.observers.want_all
+            or len(self.framers) > 1
+        )
+
+    def _on_observers_changed(self) -> None:
+        self._update_checks()
         for framer in self._peers:
             self._update_framer(framer)
 

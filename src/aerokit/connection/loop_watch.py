@@ -61,6 +61,7 @@ class LoopWatch:
         self._ran_at = self._due = self._loop.time()
         self._timer: asyncio.TimerHandle | None = None
         self._oldest: float | None = None  # set while data may have waited
+        self._check_sleep_at = -math.inf
         self._has_read = False
         self._idle_iterations = 0
 
@@ -80,6 +81,10 @@ class LoopWatch:
 
     def arrival(self, now: float) -> float:
         """Return ``now``, or the earliest possible receive time if data that is read now may have waited."""
+        if self._oldest is not None and now < self._check_sleep_at:
+            self._has_read = True
+            return self._oldest
+        self._check_sleep_at = now + CHECK_INTERVAL_S / 2
         # Data that is read in time postpones the timer: waking a sleeping process costs as much as a few messages.
         has_slept = self._has_slept()
         if self._oldest is None and not has_slept and now <= self._due + LATE_THRESHOLD_S:
