@@ -180,18 +180,19 @@ class FrameReceiver:
         if not frames:
             return
         if self._needs_checks or framer.late or framer.foreign:
-            self._check_and_deliver(iter(frames), framer, peer)
+            self._check_and_deliver(frames, framer, peer)
             return
-        waiting, deliver = iter(frames), self._bus.deliver
-        for frame in waiting:
+        deliver = self._bus.deliver
+        for frame in frames:
             if frame.message_id == _HEARTBEAT_ID:
                 self._record_heartbeat(framer, frame, peer)
             deliver(frame)
             if self._needs_checks:  # a sink has closed the connection, set a key or added an observer
                 self.observers.notify_received(frame, peer)
-                self._check_and_deliver(waiting, framer, peer)
+                self._check_and_deliver(frames[frames.index(frame) + 1 :], framer, peer)
+                return
 
-    def _check_and_deliver(self, frames: Iterator[Frame], framer: Framer, peer: Peer) -> None:
+    def _check_and_deliver(self, frames: Iterable[Frame], framer: Framer, peer: Peer) -> None:
         """Deliver the frames that pass all checks, and pass them to the recording and the observers."""
         framers, multilink, gate, observers = self.framers, self._multilink, self._gate, self.observers
         has_stale = bool(framer.late or framer.foreign)
@@ -221,7 +222,8 @@ class FrameReceiver:
 
     def arrived_at(self) -> float:
         """Return the receive time of the current frame: now, or earlier if it may have waited for a blocked loop."""
-        return min(self._clock(), self._loop_watch.oldest_arrival)
+        now, oldest = self._clock(), self._loop_watch.oldest_arrival
+        return now if now < oldest else oldest
 
     def statistics(self) -> Iterator[FramerStatistics]:
         return (framer.statistics for framer in self._peers)

@@ -209,7 +209,8 @@ class StreamedMessage:
             self._look_at = frame.received_at + MAX_DECODE_DELAY_S
             # Observers must be called in the loop's thread, so the decoding is not left to another one.
             with self._lock:
-                self.catch_up()
+                if self.pending:
+                    self.catch_up()
                 self._apply(frame, message)
             return
         instance_at = self._number_at
