@@ -49,6 +49,7 @@ MESSAGE, FRAME, BOTH = range(3)
 _DeliveryPlan = tuple[int, tuple[Callable[..., None], ...]]
 
 EVERY_SYSTEM = 0
+_HEARTBEAT_ID = 0
 
 
 class Bus:
@@ -59,6 +60,8 @@ class Bus:
 
     def __init__(self, dialect: Dialect = STANDARD) -> None:
         self.dialect = dialect
+        self.one_at_a_time = False
+        """True to end :meth:`deliver_all` after the current frame."""
         self.wanted: dict[int, int] = {}  # message id → number of sinks
         self._sinks: dict[tuple[int, int], tuple[_Entry, ...]] = {}
         self._plans: dict[int, _DeliveryPlan] = {}  # cache, by system and message id
@@ -119,19 +122,37 @@ class Bus:
 
     def deliver(self, frame: Frame) -> None:
         """Deliver a frame, decoded if needed. Exceptions of sinks are logged; the other sinks still get it."""
-        try:
-            kind, sinks = self._plans[frame.system_id << 24 | frame.message_id]
-        except KeyError:
-            kind, sinks = self._plan(frame)
-        if kind == BOTH:
-            self._deliver_both(frame)
-            return
-        item = frame if kind == FRAME else self.dialect.decode(frame)
-        for sink in sinks:
+        self.deliver_all((frame,), _ignore)
+
+    def deliver_all(
+        self, frames: Iterable[Frame], before_heartbeat: Callable[..., None], *context: object
+    ) -> Frame | None:
+        """Deliver the frames in order, like :meth:`deliver`, and return None.
+
+        Calls ``before_heartbeat(frame, *context)`` with each HEARTBEAT before it is delivered. If a sink sets
+        :attr:`one_at_a_time`, the frame that it got is returned; those behind it are not delivered.
+        """
+        plans, decode = self._plans, self.dialect.decode
+        for frame in frames:
+            message_id = frame.message_id
+            if message_id == _HEARTBEAT_ID:
+                before_heartbeat(frame, *context)
             try:
-                sink(item)
-            except Exception:
-                _report(sink)
+                kind, sinks = plans[frame.system_id << 24 | message_id]
+            except KeyError:
+                kind, sinks = self._plan(frame)
+            if kind == BOTH:
+                self._deliver_both(frame)
+            else:
+                item = frame if kind == FRAME else decode(frame)
+                for sink in sinks:
+                    try:
+                        sink(item)
+                    except Exception:
+                        _report(sink)
+            if self.one_at_a_time:
+                return frame
+        return None
 
     def _deliver_both(self, frame: Frame) -> None:
         message = self.dialect.decode(frame)
@@ -212,7 +233,7 @@ def once(action: Callable[[], None]) -> Detach:
     return detach
 
 
-def _ignore(message: object) -> None:
+def _ignore(item: object) -> None:
     pass
 
 

@@ -149,7 +149,7 @@ class FrameReceiver:
         self.observers: FrameObservers = FrameObservers(self._on_observers_changed)
         self._loop_watch = LoopWatch(self._on_blocked, self._on_slept)
         self._is_closed = False
-        self._needs_checks = multilink is not None
+        bus.one_at_a_time = multilink is not None
         gate.on_change = self._update_checks
         bus.require_frames(Heartbeat)  # for routes and diagnosis
 
@@ -179,18 +179,13 @@ class FrameReceiver:
             self._update_checks()
         if not frames:
             return
-        if self._needs_checks or framer.late or framer.foreign:
+        if self._bus.one_at_a_time or framer.late or framer.foreign:
             self._check_and_deliver(frames, framer, peer)
             return
-        deliver = self._bus.deliver
-        for frame in frames:
-            if frame.message_id == _HEARTBEAT_ID:
-                self._record_heartbeat(framer, frame, peer)
-            deliver(frame)
-            if self._needs_checks:  # a sink has closed the connection, set a key or added an observer
-                self.observers.notify_received(frame, peer)
-                self._check_and_deliver(frames[frames.index(frame) + 1 :], framer, peer)
-                return
+        last = self._bus.deliver_all(frames, self._record_heartbeat, framer, peer)
+        if last is not None:  # a sink has closed the connection, set a key or added an observer
+            self.observers.notify_received(last, peer)
+            self._check_and_deliver(frames[frames.index(last) + 1 :], framer, peer)
 
     def _check_and_deliver(self, frames: Iterable[Frame], framer: Framer, peer: Peer) -> None:
         """Deliver the frames that pass all checks, and pass them to the recording and the observers."""
@@ -215,7 +210,7 @@ class FrameReceiver:
                     continue
                 observers.record_received(frame.raw, self._clock())
             if frame.message_id == _HEARTBEAT_ID:
-                self._record_heartbeat(framer, frame, peer)
+                self._record_heartbeat(frame, framer, peer)
             self._bus.deliver(frame)
             if observers.received:
                 observers.notify_received(frame, peer)
@@ -252,7 +247,7 @@ class FrameReceiver:
 
     def _update_checks(self) -> None:
         """Determine whether each frame must be checked for its route and signature, recorded or observed."""
-        self._needs_checks = (
+        self._bus.one_at_a_time = (
             self._is_closed
             or self._multilink is not None
             or not self._gate.is_open
@@ -295,7 +290,7 @@ class FrameReceiver:
                 return True
         return frame.message_id == Heartbeat.ID and (is_foreign or self._routes.is_outdated(frame))
 
-    def _record_heartbeat(self, framer: Framer, frame: Frame, peer: Peer) -> None:
+    def _record_heartbeat(self, frame: Frame, framer: Framer, peer: Peer) -> None:
         heartbeat = self._bus.dialect.decode(frame)
         if frame.system_id == 0 or not isinstance(heartbeat, Heartbeat):
             return
