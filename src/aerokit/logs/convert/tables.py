@@ -6,7 +6,9 @@ import csv
 import math
 import re
 from datetime import datetime, timezone
+from functools import lru_cache
 from importlib import import_module
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, TextIO
 
 from aerokit.logs.flights.records import TableColumn
@@ -65,6 +67,9 @@ class _UnixLines:
 _FORMULA = re.compile(r"(^|[;\t])(?=[\s\0]*[=+\-@\uff1d\uff0b\uff0d\uff20])|^(?=[\t\r\n\0])")
 
 
+_NUMBERS = (float, int)
+
+
 def _csv_cell(value: Any) -> Any:
     if isinstance(value, str):
         return _FORMULA.sub(r"\1'", value)
@@ -87,8 +92,8 @@ class CsvTable:
 
     def add(self, unix_s: float, values: Sequence[Any]) -> None:
         """Add a row; the time is ISO 8601 in UTC with microseconds."""
-        shown = [_csv_cell(value) for value in values]
-        self._writer.writerow([_utc(unix_s).isoformat(timespec="microseconds"), *shown])
+        shown = [value if type(value) in _NUMBERS and value == value else _csv_cell(value) for value in values]
+        self._writer.writerow([_iso_time(unix_s), *shown])
 
     def close(self) -> None:
         self._file.close()
@@ -174,6 +179,7 @@ class MessageTablesWriter:
 
     def __init__(self, path: Path, log: LogReader, kind: type[Table]) -> None:
         self._path, self._log, self._kind = path, log, kind
+        log.needs_states = False
         self._tables: dict[str, tuple[Table, Callable[[LogRecord], list[Any]]]] = {}
         self.written: int = 0
 
@@ -200,8 +206,17 @@ class MessageTablesWriter:
             table.discard()
 
 
-def _utc(unix_s: float) -> datetime:
-    return datetime.fromtimestamp(unix_s, timezone.utc)
+def _iso_time(unix_s: float) -> str:
+    fraction, second = math.modf(unix_s)
+    microseconds = round(fraction * 1e6)
+    if not 0 <= microseconds < 1_000_000:
+        return datetime.fromtimestamp(unix_s, timezone.utc).isoformat(timespec="microseconds")
+    return f"{_iso_second(second)}.{microseconds:06}+00:00"
+
+
+@lru_cache(maxsize=1)
+def _iso_second(unix_s: float) -> str:
+    return datetime.fromtimestamp(unix_s, timezone.utc).isoformat()[:19]
 
 
 def _row_of(columns: Sequence[TableColumn], record: LogRecord) -> Callable[[LogRecord], list[Any]]:
@@ -210,11 +225,17 @@ def _row_of(columns: Sequence[TableColumn], record: LogRecord) -> Callable[[LogR
         names = [column.field for column in columns]
         return lambda record: [_cell(record.fields.get(name)) for name in names]
     parts = [column.field.partition(".") for column in columns]
-    places = [(name, int(index) if index else None) for name, _, index in parts]
+    fields = attrgetter("NAME", *(name for name, _, _ in parts))  # of at least two names, so that it returns a tuple
+    elements = [(place, int(index)) for place, (_, _, index) in enumerate(parts) if index]
+    texts = [place for place, column in enumerate(columns) if column.kind == "str"]
 
     def row(record: LogRecord) -> list[Any]:
-        values = ((getattr(record.message, name), index) for name, index in places)
-        return [_cell(value) if index is None else value[index] for value, index in values]
+        _, *values = fields(record.message)
+        for place, index in elements:
+            values[place] = values[place][index]
+        for place in texts:
+            values[place] = _cell(values[place])
+        return values
 
     return row
 
