@@ -65,8 +65,8 @@ FOUR = joined(*map(attitude, range(4)))
 
 async def test_sinks_are_called_frame_by_frame_in_order(connection: Connection) -> None:
     calls: list[str] = []
-    for name in "ab":
-        connection.attach([Attitude], lambda x, name=name: calls.append(f"{name}{x.time_boot_ms}"))
+    connection.attach([Attitude], lambda message: calls.append(f"a{message.time_boot_ms}"))
+    connection.attach([Attitude], lambda message: calls.append(f"b{message.time_boot_ms}"))
     connection.attach([SystemTime], lambda _: calls.append("time"))
     connection.bytes_received(joined(attitude(1), SystemTime(0, 0), attitude(2)), None)
     assert calls == ["a1", "b1", "time", "a2", "b2"]

@@ -83,7 +83,8 @@ class TlogReader(LogReader):
 
     def entries(self, on_bytes: Callable[[int], object]) -> Iterator[LogRecord]:
         """Yield all messages of the standard with valid checksums."""
-        framer, decode, count, states = self._framer, STANDARD.decode, 0, ()
+        framer, decode, count = self._framer, STANDARD.decode, 0
+        states: tuple[tuple[str, Any], ...] = ()
         with self.path.open("rb") as file:
             for unix_s, raw in read_tlog(file):
                 count += 1
