@@ -29,7 +29,8 @@ def tests(session: nox.Session) -> None:
 def exhaustive(session: nox.Session) -> None:
     """Run the rows of long tables, and the slow tests, that `pytest` skips; three minutes."""
     session.install("-e", ".[test]")
-    session.run("pytest", "-q", "-m", "exhaustive", *session.posargs)
+    # The rows of one file take up to a minute: an idle worker takes over some of them.
+    session.run("pytest", "-q", "-m", "exhaustive", "--dist", "worksteal", *session.posargs)
 
 
 MEETS_OTHERS = (

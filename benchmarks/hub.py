@@ -9,6 +9,9 @@ frames over UDP on 127.0.0.1 and forwards each to 1, 4 or 16 receivers.
 
 - ``out_N``: frames forwarded to N receivers per second of processor time. Frames of a recorded ArduCopter are sent at
   600 Hz, ten at a time. The hubs take turns, and neither may lose frames. MAVProxy runs without modules and log.
+- ``dense_N``: the same with 20 frames in each datagram, as another hub or a companion computer sends them.
+- ``…_floor``: against a Python program that only reads the datagrams and writes them to each receiver, joined. This is
+  the limit for every hub in Python; most of it is the cost of a wake-up.
 - ``latency_…``: median and 99th percentile of the time from sending a frame to receiving it at the first of four
   receivers, at 100 Hz.
 
@@ -42,16 +45,35 @@ from aerokit.mavlink.messages import Heartbeat, SystemTime
 from aerokit.mavlink.tlog import read_tlog
 
 ROOT = Path(__file__).parent.parent
-OUTS = (1, 4, 16)
-NAMES = (*(f"out_{count}" for count in OUTS), "latency_median", "latency_p99")
+# Receivers, and frames per datagram.
+LOADS = {"out_1": (1, 1), "out_4": (4, 1), "out_16": (16, 1), "dense_1": (1, 20), "dense_4": (4, 20)}
+NAMES = (*LOADS, "latency_median", "latency_p99")
 PYTHON = os.environ.get("AEROKIT_MAVPROXY_PYTHON", sys.executable)
 MAVPROXY = Path(PYTHON).parent / "mavproxy.py"
 ROUTERD = os.environ.get("AEROKIT_MAVLINK_ROUTERD", "")
 PIECE = 10
 SENT_HZ = 600
 WARM_UP = 600
-TICKS_S = 1 / os.sysconf("SC_CLK_TCK")
 HEARTBEAT = FrameEncoder(1, 1).encode(Heartbeat(2, 3, 81, 0, 3))
+FLOOR = """
+import asyncio, select, socket, sys
+async def main():
+    source, sink = (socket.socket(type=socket.SOCK_DGRAM) for _ in range(2))
+    poll = select.poll()
+    source.bind(("127.0.0.1", int(sys.argv[1])))
+    source.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+    poll.register(source, select.POLLIN)
+    outs = [("127.0.0.1", int(port)) for port in sys.argv[2:]]
+    def forward():
+        pieces = [source.recvfrom(65535)[0]]
+        while sum(map(len, pieces)) < 1000 and poll.poll(0):
+            pieces.append(source.recvfrom(65535)[0])
+        for out in outs:
+            sink.sendto(b"".join(pieces), out)
+    asyncio.get_running_loop().add_reader(source, forward)
+    await asyncio.Event().wait()
+asyncio.run(main())
+"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -65,9 +87,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not set(wanted) <= set(NAMES):
         parser.error(f"the names are {', '.join(NAMES)}")
     rows: list[Row] = []
-    for count in OUTS:
-        if f"out_{count}" in wanted:
-            rows += _throughput(count, options.quick)
+    for name in LOADS:
+        if name in wanted:
+            rows += _throughput(name, options.quick)
     if any(name.startswith("latency") for name in wanted):
         rows += [row for row in _latencies(options.quick) if row["name"] in wanted]
     print(table.printed(rows))
@@ -80,15 +102,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
 # ------------------------------------------------------------------------------- frames per CPU-second
 
 
-def _throughput(count: int, quick: bool) -> list[Row]:
-    frames = 2_000 if quick else 12_000
-    figures: dict[str, list[float]] = {name: [] for name in _present()}
+def _throughput(load: str, quick: bool) -> list[Row]:
+    count, per_datagram = LOADS[load]
+    datagrams = _datagrams(WARM_UP + (2_000 if quick else 12_000), per_datagram)
+    figures: dict[str, list[float]] = {name: [] for name in _present(is_dense=per_datagram > 1)}
     for _ in range(1 if quick else 3):
         for name in figures:
             with _hub(name, count) as (process, sender, receivers):
-                figures[name].append(_frames_per_second(process, sender, receivers, frames))
+                figures[name].append(_frames_per_second(process, sender, receivers, datagrams, per_datagram))
             print(
-                f"out_{count} {name}: {figures[name][-1]:.0f} frames per CPU-second",
+                f"{load} {name}: {figures[name][-1]:.0f} frames per CPU-second",
                 file=sys.stderr,
                 flush=True,
             )
@@ -96,48 +119,67 @@ def _throughput(count: int, quick: bool) -> list[Row]:
     own, rows = medians.pop("aerokit"), []
     for name, peer in medians.items():
         what, text, aim = _PEERS[name]
-        rows.append(row(f"out_{count}{what}", own, peer, text, unit="frames/CPU-s", ratio=own / peer, aim=aim))
+        rows.append(row(f"{load}{what}", own, peer, text, unit="frames/CPU-s", ratio=own / peer, aim=aim))
     return rows
 
 
 # For each peer: suffix of the row's name, name of the peer, and target.
-_PEERS = {"mavproxy": ("", "MAVProxy --out", 10.0), "routerd": ("_routerd", "mavlink-router", 0.0)}
+_PEERS = {
+    "mavproxy": ("", "MAVProxy --out", 10.0),
+    "routerd": ("_routerd", "mavlink-router", 0.0),
+    "floor": ("_floor", "reading and writing", 0.0),
+}
 
 
-def _present(*, with_routerd: bool = True) -> list[str]:
-    there = {"aerokit": True, "mavproxy": MAVPROXY.exists(), "routerd": with_routerd and bool(ROUTERD)}
+def _present(*, is_dense: bool) -> list[str]:
+    """Return the hubs to measure. MAVProxy would lose frames of dense datagrams."""
+    there = {"aerokit": True, "mavproxy": MAVPROXY.exists() and not is_dense, "routerd": bool(ROUTERD), "floor": True}
     return [name for name, is_there in there.items() if is_there]
 
 
 def _frames_per_second(
-    process: subprocess.Popen[bytes], sender: socket.socket, receivers: list[socket.socket], frames: int
+    process: subprocess.Popen[bytes],
+    sender: socket.socket,
+    receivers: list[socket.socket],
+    datagrams: list[bytes],
+    per_datagram: int,
 ) -> float:
     """Return the number of frames per second of processor time. RuntimeError if more than 0.5 % were lost."""
-    recorded = _recorded(WARM_UP + frames)
     counts = [0] * len(receivers)
-    _send(recorded[:WARM_UP], sender, receivers, counts)
+    _send(datagrams[:WARM_UP], per_datagram, sender, receivers, counts)
     before, counts = _cpu_s(process.pid), [0] * len(receivers)
-    _send(recorded[WARM_UP:], sender, receivers, counts)
-    used = _cpu_s(process.pid) - before
+    _send(datagrams[WARM_UP:], per_datagram, sender, receivers, counts)
+    used, frames = _cpu_s(process.pid) - before, (len(datagrams) - WARM_UP) * per_datagram
     if min(counts) < frames * 0.995:
         raise RuntimeError(f"{frames - min(counts)} of {frames} frames were lost: {process.args!r}")
     return frames / used
 
 
-def _send(frames: Sequence[bytes], sender: socket.socket, receivers: list[socket.socket], counts: list[int]) -> None:
-    """Send frames in pieces, and count the received ones, until all have arrived or none arrives for a second."""
+def _send(
+    datagrams: Sequence[bytes],
+    per_datagram: int,
+    sender: socket.socket,
+    receivers: list[socket.socket],
+    counts: list[int],
+) -> None:
+    """Send datagrams in pieces, and count received frames, until all have arrived or none arrives for a second."""
     began = time.perf_counter()
-    for sent in range(0, len(frames), PIECE):
-        for raw in frames[sent : sent + PIECE]:
-            sender.send(raw)
+    for sent in range(0, len(datagrams), PIECE):
+        for datagram in datagrams[sent : sent + PIECE]:
+            sender.send(datagram)
         while time.perf_counter() - began < (sent + PIECE) / SENT_HZ:
             _count(receivers, counts)
             time.sleep(0.001)
     for _ in range(100):
-        if min(counts) >= len(frames):
+        if min(counts) >= len(datagrams) * per_datagram:
             return
         time.sleep(0.01)
         _count(receivers, counts)
+
+
+def _datagrams(count: int, per_datagram: int) -> list[bytes]:
+    frames = _recorded(count * per_datagram)
+    return [b"".join(frames[begin : begin + per_datagram]) for begin in range(0, len(frames), per_datagram)]
 
 
 def _recorded(count: int) -> list[bytes]:
@@ -173,7 +215,7 @@ def _count(receivers: list[socket.socket], counts: list[int]) -> None:
 
 
 def _latencies(quick: bool) -> list[Row]:
-    series: dict[str, list[float]] = {name: [] for name in _present(with_routerd=False)}
+    series: dict[str, list[float]] = {name: [] for name in ("aerokit", "mavproxy") if name in _present(is_dense=False)}
     for _ in range(1 if quick else 5):
         for name, found in series.items():
             with _hub(name, 4) as (_, sender, receivers):
@@ -241,6 +283,8 @@ def _command(name: str, port: int, outs: Sequence[str], folder: str) -> list[str
     master = f"udpin:127.0.0.1:{port}"
     if name == "aerokit":
         return [sys.executable, "-m", "aerokit", "hub", master, *(f"udpout:{out}" for out in outs)]
+    if name == "floor":
+        return [sys.executable, "-c", FLOOR, str(port), *(out.rpartition(":")[2] for out in outs)]
     if name == "routerd":
         return [ROUTERD, "-t", "0", *(part for out in outs for part in ("-e", out)), f"127.0.0.1:{port}"]
     quiet = [
@@ -291,9 +335,9 @@ def _bound() -> socket.socket:
 
 
 def _cpu_s(pid: int) -> float:
-    """Return the processor time of a process, in user and system mode."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) * TICKS_S
+    """Return the processor time of all threads of a process, in nanosecond resolution (Linux)."""
+    schedules = Path(f"/proc/{pid}/task").glob("*/schedstat")
+    return sum(int(schedule.read_text().split()[0]) for schedule in schedules) / 1e9
 
 
 if __name__ == "__main__":

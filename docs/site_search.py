@@ -26,8 +26,8 @@ STANDARD = ("reference/messages", "reference/enums")
 """Pages whose titles often differ only in the last word: ``GLOBAL_POSITION_INT``, ``GLOBAL_POSITION_INT_COV``."""
 MAX_TEXT = 300
 """Maximum number of characters of a section's text."""
-MAX_REFERENCE_TEXT = 120
-TITLES_ONLY = ("reference/sync", "reference/fleets", "reference/enums", "about/changelog")
+MAX_REFERENCE_TEXT = 110
+TITLES_ONLY = ("reference/sync", "reference/fleets", "reference/enums", "reference/onboard", "about/changelog")
 """Prefixes of pages whose titles are indexed without text."""
 WITHOUT_MEMBERS = (
     "reference/sim.",
@@ -40,6 +40,8 @@ WITHOUT_MEMBERS = (
 COMMON_MEMBERS = (".replace", ".to_dict")
 """Members that all value classes have, which are not indexed."""
 BOOST = {
+    "reference/onboard": 0.4,
+    "reference/external": 0.5,
     "how-to/": 2,
     "from-dronekit": 0.3,
     "coming-from/": 0.5,
@@ -84,7 +86,7 @@ def _shortened(entry: dict[str, Any]) -> dict[str, Any]:
     boost = entry.get("boost", 1) * _boost(location)
     title = TAG.sub("", entry["title"])
     if is_reference:
-        boost *= (1 + BREVITY_BOOST / len(title)) ** (6 if location.startswith(STANDARD) else 1.5)
+        boost *= (1 + BREVITY_BOOST / len(title)) ** (8 if location.startswith(STANDARD) else 1.5)
         boost *= EXAMPLE_BOOST if title in _names_with_example() else 1
         boost *= CLASS_BOOST if CLASS_NAME.fullmatch(title) else 1
     return {**entry, "title": title, "text": _cut(text, limit), "boost": round(boost, 2)}

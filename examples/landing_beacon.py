@@ -15,7 +15,7 @@ import aerokit
 
 
 async def detections() -> AsyncIterator[tuple[float, float, float]]:
-    """Yield the angles to the pad, in degrees to the right and to the tail, and its distance; replace it by yours."""
+    """Yield degrees to the right, degrees to the tail and distance of the pad; replace this by your detector."""
     for number in range(100):
         angle = number / 10
         yield 3.0 * math.cos(angle), 3.0 * math.sin(angle), max(0.2, 10.0 - number / 10)

@@ -21,6 +21,7 @@ if sys.dont_write_bytecode:  # else each worker and each child process would com
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a background job of a script: some tests interrupt themselves
     signal.signal(signal.SIGINT, signal.default_int_handler)
+gc.disable()  # until all tests are collected: nothing of them is garbage, and each worker collects all
 settings.register_profile("aerokit", deadline=None, max_examples=40, derandomize=True)
 settings.load_profile("aerokit")
 
@@ -60,6 +61,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             if rows[test] % sample.args[0]:
                 item.add_marker(pytest.mark.exhaustive)
             rows[test] += 1
+
+
+def pytest_collection_finish() -> None:
+    gc.enable()
 
 
 def pytest_report_header() -> str:

@@ -89,6 +89,7 @@ def run_on_virtual_time(name: str, *arguments: Any) -> None:
     run_virtual(main())
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", ON_VIRTUAL_TIME)
 def test_example_on_virtual_time_prints_expected_output(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     arguments, expected = ON_VIRTUAL_TIME[name]
@@ -122,6 +123,7 @@ def command(name: str, *arguments: str) -> list[str]:
     return [sys.executable, "-W", "error", str(EXAMPLES / f"{name}.py"), *arguments]
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", AS_PROGRAMS)
 def test_example_as_program_prints_expected_output(name: str, tmp_path: Path) -> None:
     with served_copter() as address:

@@ -77,6 +77,7 @@ def test_metadata_describes_any_value(value: float) -> None:
     assert isinstance(known.describe(value), str)
 
 
+@pytest.mark.exhaustive
 def test_decompression_bomb_is_rejected() -> None:
     packer = lzma.LZMACompressor(preset=0)
     zeros = bytes(MEGABYTE)

@@ -23,12 +23,12 @@ def run(*arguments: str, peer: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.exhaustive
 def test_aerokit_alone_forwards_everything(tmp_path: Path) -> None:
-    """Without a competitor the report has no rows; the test checks that no frame was lost."""
+    """Without a competitor the only row is that of the floor; the test checks that no frame was lost."""
     path = tmp_path / "bench.json"
     done = run("--quick", "out_4", "latency_p99", "--output", str(path), peer="/nowhere/python")
     assert done.returncode == 0, done.stderr
     assert "out_4 aerokit: " in done.stderr
-    assert json.loads(path.read_text()) == []
+    assert [row["name"] for row in json.loads(path.read_text())] == ["out_4_floor"]
 
 
 def test_wrong_name_is_refused() -> None:
@@ -42,4 +42,7 @@ def test_row_compares_with_mavproxy(tmp_path: Path) -> None:
     path = tmp_path / "bench.json"
     assert run("--quick", "out_1", "--output", str(path), peer=PEER or "").returncode == 0
     rows: list[dict[str, Any]] = json.loads(path.read_text())
-    assert [(row["name"], row["peer_name"], row["aim"]) for row in rows] == [("out_1", "MAVProxy --out", 10.0)]
+    assert [(row["name"], row["peer_name"], row["aim"]) for row in rows] == [
+        ("out_1", "MAVProxy --out", 10.0),
+        ("out_1_floor", "reading and writing", 0.0),
+    ]

@@ -228,7 +228,7 @@ class FleetError(OperationRejected):
 
 
 class InvalidArgument(AerokitError, ValueError):
-    """An argument is invalid. The text has its name, its value and what is allowed. Nothing was sent."""
+    """An argument is invalid. The text has its name, its value and the allowed values. Nothing was sent."""
 
 
 class FileFormatError(AerokitError, ValueError):

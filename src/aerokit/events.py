@@ -139,8 +139,7 @@ class RouteChangeRefused(Event):
 
 class FrameRefused(Event):
     """A frame was dropped because it has no valid signature of our key. Published once for each reason.
-
-    ``connection.signing.refused`` counts all of them.
+    ``connection.signing.refused`` counts all refused frames.
     """
 
     component_id: int
@@ -182,7 +181,7 @@ class LandedStateChanged(Event):
 class MissionItemReached(Event):
     """The vehicle reached mission item ``item``, counted from 0 without home.
 
-    Autopilots may not report items that they pass without stopping.
+    Some autopilots do not report items that they pass without stopping.
     """
 
     item: int
@@ -308,7 +307,10 @@ class HeartbeatResumed(Event):
 
 
 class LinkInterrupted(Event):
-    """The link failed and aerokit is reopening it (``reconnect=True``). Data sent meanwhile is lost."""
+    """The link failed, and aerokit is reopening it (``reconnect=True``).
+
+    Data that is sent before the link is open again is lost.
+    """
 
     error: AerokitError
 
@@ -339,9 +341,9 @@ class LinkSelected(Event):
     """The traffic to this system now uses ``link`` (its address), one of several links.
 
     ``before`` is the previous link, None for the first one. ``reason`` is "first heard" for the first link; "silent",
-    "stalled" or "lost" if the previous link was; "better", "cheaper" than a costly previous link; or "another vehicle"
-    if AUTOPILOT_VERSION showed another vehicle behind the previous link. aerokit requests message rates again, because
-    autopilots keep separate rates for each link.
+    "stalled" or "lost" if the previous link became so; "better" or "cheaper" if the new link is; or "another vehicle"
+    if AUTOPILOT_VERSION showed that the previous link leads to another vehicle. aerokit requests message rates again,
+    because autopilots keep separate rates for each link.
     """
 
     link: str

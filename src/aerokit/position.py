@@ -57,7 +57,7 @@ class Position(Snapshot):
 class Home(Snapshot):
     """The home position (HOME_POSITION); ``north_m`` … are from the local origin, None if not reported.
 
-    Calls that take a Position take it too. ``go_to`` keeps the present altitude on the way to it.
+    Calls that take a Position also take a Home. ``go_to`` then keeps the vehicle's present altitude.
     """
 
     latitude_deg: float
@@ -74,12 +74,12 @@ class Home(Snapshot):
 
 
 def point_at(place: Position | Home) -> Position:
-    """Return the position of a place; home's has an altitude above mean sea level."""
+    """Return the position of a place. That of home has an altitude above mean sea level."""
     return place.position.replace(altitude_amsl_m=place.altitude_amsl_m) if isinstance(place, Home) else place
 
 
 def travel_target(place: Position | Home) -> Position:
-    """Return the position to fly to: without an altitude for home, so that the vehicle keeps the present one."""
+    """Return the position to fly to. That of home has no altitude, so that the vehicle keeps its present one."""
     return place.position if isinstance(place, Home) else place
 
 

@@ -62,11 +62,11 @@ async def open_video(
     """Open a video stream for the duration of an ``async with`` block. A slow reader gets the latest frame.
 
     ``async with open_video(stream.uri, vehicle) as video: async for frame in video: …``. A thread decodes the stream.
-    It ends with the block, or, if no frame arrives then, at its next timeout.
+    The thread ends with the block; if no frame arrives at that time, it ends at its next timeout.
 
     Args:
         uri: anything that FFmpeg reads: ``rtsp://…``, ``udp://0.0.0.0:5600``, the path of a file.
-            ``vehicle.camera.streams`` lists those of a camera.
+            ``vehicle.camera.streams`` lists the addresses of a camera's streams.
         vehicle: adds its position and attitude to the frames.
         timeout: seconds until the stream must be open, above 0 to 3600.
         idle_timeout_s: seconds without data after which the stream counts as lost, above 0 to 3600.

@@ -49,7 +49,7 @@ def test_transfer_ends_with_exact_content_and_leaves_nothing(case: Case, loss: f
         assert verdict.error is None
 
 
-@pytest.mark.sampled(24)
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name.replace(" ", "-"))
 def test_transfer_time_stays_near_ideal_with_losses(case: Case) -> None:
     for loss, most in ((0.05, 2.0), (0.2, 4.0)):

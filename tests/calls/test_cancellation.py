@@ -59,7 +59,7 @@ def rows() -> Iterator[Any]:
             yield row if (owner, autopilot) in BY_DEFAULT else exhaustive(row)
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("points", [2, exhaustive(POINTS)])
 @pytest.mark.parametrize(("names", "autopilot"), list(rows()))
 def test_cancelled_at_any_await(names: list[str], autopilot: str, points: int, tmp_path: Path) -> None:

@@ -66,7 +66,7 @@ def rows() -> Iterator[Any]:
         yield row if owner in BY_DEFAULT else exhaustive(row)
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.sampled(6)
 @pytest.mark.parametrize("pairs", list(rows()))
 def test_loop_watch_error_is_raised(pairs: list[tuple[str, str]], tmp_path: Path) -> None:
     faults = run_virtual(faults_of(pairs, tmp_path))

@@ -54,7 +54,7 @@ async def first(values: AsyncIterator[Any], condition: Callable[[Any], bool] = l
 
 
 async def step(name: str, work: Awaitable[object]) -> bool:
-    """Report the result of one step; the next ones run in any case."""
+    """Report the result of one step; the next steps run even if it fails."""
     try:
         result = await asyncio.wait_for(work, STEP_TIMEOUT_S)
     except Exception as error:  # of either library
@@ -209,7 +209,7 @@ async def use_metadata(metadata: ComponentMetadataAsync) -> str:
 
 
 async def until_available(read: Callable[[], Awaitable[Any]]) -> Any:
-    """Read until MAVSDK has polled the camera, which takes it some seconds."""
+    """Repeat a read until MAVSDK has polled the camera, which takes some seconds."""
     while True:
         try:
             return await read()

@@ -25,7 +25,7 @@ from aerokit.sim import SimulatedCopter
 BLOCKING_MAX_IDLE_S = 60.0
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.exhaustive
 @pytest.mark.anyio
 @pytest.mark.parametrize("limit_s", [None, exhaustive(float("inf"))])
 async def test_heartbeat_in_asyncio_needs_no_feeding(limit_s: float | None) -> None:

@@ -407,6 +407,7 @@ async def test_peer_is_named_as_by_its_member_link() -> None:
         assert [moved.before, moved.after] == said
 
 
+@pytest.mark.exhaustive
 async def test_forged_ids_cost_few_probes() -> None:
     radios = Radios(2)
     received = ReceivedMessages(radios)

@@ -238,6 +238,7 @@ async def test_own_frames_forwarded_by_vehicle_are_ignored() -> None:
         assert (connection.source_system, connection.source_component) not in connection.heartbeats
 
 
+@pytest.mark.sampled(2)
 async def test_transfers_continue_over_the_next_link(vehicle: SimulatedVehicle) -> None:
     slow = FaultModel(delay_s=0.1, bandwidth=30_000)
     radios = Radios(2, models=[slow, slow])

@@ -53,7 +53,7 @@ def waiting(request: pytest.FixtureRequest) -> Iterator[dict[str, Future[Any]]]:
         yield {name: pool.submit(function) for name, function in slow.items() if name in chosen}
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("version", [1, 2])
 @pytest.mark.parametrize("case", QUICK, ids=lambda case: case.name)
 def test_scenario(case: Scenario, version: int) -> None:

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import os
+import signal
 import socket
 import subprocess
 import sys
+import threading
 import traceback
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import serial
+from ctrl_c import interrupt_soon
 from flight_controller import FlightController
 
 import aerokit.dronekit as dronekit
@@ -76,6 +79,17 @@ def test_connect_failure_has_short_traceback(failing: object, monkeypatch: pytes
     assert caught.tb.tb_next is not None
     shown = "".join(traceback.format_exception(caught.type, caught.value, caught.tb.tb_next))
     assert shown.count("\n") <= MAX_LINES, shown
+
+
+@pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="needs POSIX signals")
+def test_ctrl_c_during_connect_has_short_traceback() -> None:
+    before = threading.enumerate()
+    timer = interrupt_soon()
+    with pytest.raises(KeyboardInterrupt) as caught:
+        dronekit.connect("udpin:127.0.0.1:0")
+    timer.join()
+    assert len(caught.traceback) <= 3
+    assert [thread for thread in threading.enumerate() if thread not in before] == []
 
 
 def test_error_in_vehicle_class_has_full_traceback(fc: FlightController) -> None:

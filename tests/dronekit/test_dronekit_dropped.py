@@ -111,6 +111,7 @@ USES: dict[str, Callable[[dronekit.Vehicle], object]] = {
 }
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("use", USES.values(), ids=USES)
 def test_dropped_vehicle_is_not_kept_by_previous_use(address: str, use: Callable[[dronekit.Vehicle], object]) -> None:
     vehicle = dronekit.connect(address)

@@ -90,7 +90,7 @@ def test_example_imports_dronekit_only(name: str) -> None:
     assert "from aerokit" not in text
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize("name", EXPECTED)
 def test_example(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     speedup, arguments, expected = EXPECTED[name]

@@ -36,6 +36,7 @@ def north(by_m: float) -> Any:
     return target
 
 
+@pytest.mark.exhaustive
 async def test_ten_members_land_by_policy_after_one_is_lost() -> None:
     async with open_stage(10, on_error="land_others") as stage:
         fleet = stage.fleet

@@ -61,7 +61,7 @@ async def arming_fails(stage: Stage) -> None:
     await stage.fleet.arm()
 
 
-@pytest.mark.sampled(4)
+@pytest.mark.sampled(8)
 @pytest.mark.parametrize("fail", [barrier_fails, barrier_is_cancelled, upload_fails, reading_fails, arming_fails])
 @pytest.mark.parametrize("policy", ["hold_others", "land_others", "return_others"])
 async def test_pilots_member_gets_no_orders_from_policies(

@@ -16,7 +16,7 @@ __all__ = ["CORRECTION_TARGETS"]
 
 
 def fuzz_rtcm(data: bytes) -> None:
-    """Only whole messages are found, and their fragments contain them."""
+    """Only whole messages are found, and fragments contain the same bytes."""
     reader = RtcmReader()
     found = [message for begin in range(0, len(data), 100) for message in reader.feed(data[begin : begin + 100])]
     assert all(crc24q(message) == 0 for message in found)
@@ -28,7 +28,7 @@ def fuzz_rtcm(data: bytes) -> None:
 
 
 def fuzz_ntrip(data: bytes) -> None:
-    """An answer of a caster ends, or raises what the client catches."""
+    """An answer of a caster is read to its end, or raises an error that the client catches."""
 
     async def read() -> None:
         reader = asyncio.StreamReader()
@@ -46,7 +46,7 @@ def fuzz_ntrip(data: bytes) -> None:
 
 
 def fuzz_calibration_text(data: bytes) -> None:
-    """A text is a report with valid values, or none."""
+    """A text is a report with valid values, or no report."""
     report = parse_report(data.decode(errors="replace"))
     assert report is None or report.progress is None or 0 <= report.progress <= 1
 

@@ -33,7 +33,7 @@ def test_known_fuzz_inputs(path: Path) -> None:
     TARGETS[path.parent.name](path.read_bytes())
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("examples", [8, exhaustive(40)])
 @pytest.mark.parametrize("name", TARGETS)
 def test_random_fuzz_inputs(name: str, examples: int) -> None:

@@ -1,4 +1,4 @@
-"""CalibrationControl, successful and failing ones."""
+"""Calls of CalibrationControl that succeed, and calls that fail."""
 
 from __future__ import annotations
 

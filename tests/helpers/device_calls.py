@@ -49,7 +49,7 @@ class DeviceCall(NamedTuple):
     wrong: Give | None = None
 
     def errors(self) -> Table:
-        """Provocations of NotSupported, if one autopilot does not have it."""
+        """Provocations of NotSupported, if one of the autopilots lacks the order."""
         if self.on == BOTH:
             return {}
         absent = "px4" if self.on == COPTER else "ardupilot"
@@ -193,7 +193,7 @@ class Winch(SimulatedComponent):
 
 
 class Light(SimulatedComponent):
-    """A light that reports its state; ``is_stuck`` keeps it."""
+    """A light that reports its state; with ``is_stuck``, the state never changes."""
 
     TYPE = MavType.ILLUMINATOR
     is_on = is_stuck = False
@@ -244,7 +244,7 @@ DEVICES: dict[str, tuple[Do, Place]] = {
 
 
 async def _high(stage: Stage) -> None:
-    """High enough for a parachute."""
+    """Climb high enough for a parachute."""
     await airborne(stage)
     if (stage.vehicle.position.value.altitude_relative_m or 0) < 15:
         here = stage.vehicle.position.value
@@ -312,7 +312,7 @@ def _fitted(*troubles: Callable[[Stage], object]) -> Callable[[Stage], None]:
 
 
 def _superseded(do: Do, other: Give, after_s: float = 0.3) -> Do:
-    """Another order for the device is given meanwhile."""
+    """Give another order for the device during the call."""
 
     async def both(stage: Stage) -> None:
         async def later() -> None:
@@ -362,7 +362,7 @@ def _silent_soon(stage: Stage) -> None:
 
 
 def _stays_armed(stage: Stage) -> None:
-    """The pilot arms during the test."""
+    """Let the pilot arm during the motor test."""
     accepted(C.DO_MOTOR_TEST)(stage)
     copter: Any = stage.simulated
     asyncio.get_running_loop().call_later(0.3, lambda: copter.motors.set_armed(True, copter.now))
@@ -384,7 +384,7 @@ async def _write_lines(shell: Any) -> None:
 
 
 def _deaf(stage: Stage) -> None:
-    """The shell does not answer."""
+    """Let the shell not answer."""
     stage.simulated.handlers[m.SerialControl.ID] = lambda *_: None
 
 
@@ -395,7 +395,7 @@ async def _run_in_deaf_shell(stage: Stage) -> None:
 
 
 def _winch_errors(name: str) -> Table:
-    """Those of an order to a winch that is a component."""
+    """Return the provoked errors of an order to a winch that is a component."""
     key, do = f"Winch.{name}", _winch(name)
     rows = {
         (key, "NotSupported"): P(lambda stage: getattr(stage.vehicle.winch(), name)(), before=fit),

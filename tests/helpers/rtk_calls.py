@@ -21,7 +21,7 @@ DATA = b"HTTP/1.1 200 OK\r\nContent-Type: gnss/data\r\n\r\n" + rtcm(25)
 
 
 class _Writer:
-    """The program's end of the connection; a real transport closes in the next iteration of the loop, too."""
+    """The program's end of the connection. Like a real transport, it closes in the next loop iteration."""
 
     def write(self, data: bytes) -> None:
         pass

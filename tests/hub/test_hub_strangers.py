@@ -254,7 +254,7 @@ def test_silent_sender_makes_room_in_a_full_table() -> None:
 # ------------------------------------------------------------------------------------ the rule
 
 
-@pytest.mark.sampled(6)
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("seed", range(6))
 @virtual
 async def test_orders_reach_vehicle_despite_random_impostors(seed: int) -> None:

@@ -40,7 +40,7 @@ def limits(choice: Choice) -> dict[str, Any]:
 
 
 async def test_sticks_move_multicopter(choice: Choice) -> None:
-    """It flies forward by the stick, and holds at the end of the block."""
+    """The vehicle flies forward while the stick is forward, and holds at the end of the block."""
     if choice.kind.name not in MULTICOPTERS:
         pytest.skip("no multicopter")
     async with ready(choice) as vehicle:
@@ -54,7 +54,7 @@ async def test_sticks_move_multicopter(choice: Choice) -> None:
 
 
 async def test_body_rates_turn_multicopter(choice: Choice) -> None:
-    """It turns at the rate that is streamed 400 times a second; ArduPilot's planes and boats do not take rates."""
+    """The vehicle turns at the rate that is streamed at 400 Hz; ArduPilot's planes and boats do not take rates."""
     if choice.kind.name == "px4_plane":
         pytest.skip("PX4 takes rates in OFFBOARD for planes too; not flown")
     async with ready(choice) as vehicle:
@@ -72,7 +72,7 @@ async def test_body_rates_turn_multicopter(choice: Choice) -> None:
 
 
 async def test_precision_landing_ends_on_target(choice: Choice) -> None:
-    """It lands on a place that a simulated camera reports."""
+    """The vehicle lands at a place that a simulated camera reports."""
     if choice.kind.name not in MULTICOPTERS:
         pytest.skip("no multicopter")
     async with ready(choice) as vehicle:

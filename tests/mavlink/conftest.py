@@ -27,7 +27,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 @pytest.fixture(scope="module")
 def wire(request: pytest.FixtureRequest) -> Iterator[str]:
-    """Replace what is compiled by the Python code, if the parameter says so."""
+    """Replace the compiled code by the Python code if the parameter is "python"."""
     with pytest.MonkeyPatch.context() as patch:
         if request.param == "python":
             patch.setattr(encoder.FrameEncoder, "_encode_frame", None)

@@ -151,6 +151,7 @@ def test_private_message_round_trip(private: Dialect) -> None:
     assert Framer().receive(raw) == [], "it is not in the standard"
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("changes", "complaint"),
     [

@@ -49,7 +49,7 @@ def message_id(raw: bytes) -> int:
     return int.from_bytes(raw[7:10], "little")
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.sampled(6)
 @pytest.mark.parametrize("flight", FLIGHTS)
 def test_recorded_frames_match_pymavlink(flight: str) -> None:
     added = added_peer()

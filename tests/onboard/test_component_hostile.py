@@ -29,7 +29,7 @@ SENDER = (200, 77)
 
 
 def random_frame(kind: type[Message], rng: random.Random, target: tuple[int, int]) -> bytes:
-    """Return a frame with random bytes that is addressed to the component; its texts may be no UTF-8."""
+    """Return a frame with random bytes, addressed to the component; its texts may be invalid UTF-8."""
     payload = bytearray(rng.choice((0, 1, 2, 255, rng.randrange(256))) for _ in range(kind.LENGTH))
     for name, value in zip(("target_system", "target_component"), target, strict=True):
         message = kind.decode(bytes(kind.LENGTH))

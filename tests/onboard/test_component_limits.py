@@ -1,4 +1,4 @@
-"""Bounds of what a stranger may ask of a component."""
+"""Limits on what any station can request from a component."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ async def test_fifth_file_of_a_client_is_refused(tmp_path: Path) -> None:
 
 
 async def test_file_is_opened_with_session_and_number_of_mavproxy(tmp_path: Path) -> None:
-    """MAVProxy closes a session that is not open, and opens a file, both with number 0 and a session of its own."""
+    """MAVProxy closes a session that is not open, then opens a file, both with number 0 and its own session."""
     (tmp_path / "a").write_bytes(b"1")
     async with payload_and_station() as (payload, station):
         payload.serve_files(tmp_path)

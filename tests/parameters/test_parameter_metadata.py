@@ -295,7 +295,5 @@ def test_px4_hash_ignores_volatile_parameters() -> None:
 def test_values_without_range_are_the_allowed_ones() -> None:
     entry = ParameterMetadata("FS_THR_ENABLE", values={0: "Disabled", 1: "Enabled always RTL"})
     assert entry.problem(1) is None
-    assert entry.problem(99) == (
-        "FS_THR_ENABLE = 99 is none of the documented values: 0 Disabled, 1 Enabled always RTL"
-    )
+    assert entry.problem(99) == ("FS_THR_ENABLE = 99 is not a documented value: 0 Disabled, 1 Enabled always RTL")
     assert ParameterMetadata("FLAGS", values={0: "None"}, bitmask={0: "One", 1: "Two"}).problem(3) is None

@@ -119,7 +119,9 @@ def test_setting_list_requests_gap_by_index() -> None:
     assert [request.param_index for request in channel.all(m.ParamExtRequestRead)] == [5, 8, 11]
     assert channel.kinds()["PARAM_EXT_REQUEST_LIST"] == 1
     first = next(at for at, message in channel.sent if isinstance(message, m.ParamExtRequestRead))
-    assert first == pytest.approx(RTT_S + 6 * FakeCamera.tick_s)  # when the next one arrived, not at the end
+    assert first == pytest.approx(
+        RTT_S + 6 * FakeCamera.tick_s
+    )  # requested when the next setting arrived, not at the end
 
 
 def test_setting_list_retries_unstarted_list() -> None:
@@ -283,7 +285,7 @@ def test_setting_write_waits_for_progress() -> None:
 
 
 def test_setting_write_ignores_values_in_flight() -> None:
-    """Another station reads meanwhile."""
+    """Another station reads the setting at the same time."""
     camera = Slow(table_of(1))
     channel = Channel(camera)
     for tenth in range(5, 35):

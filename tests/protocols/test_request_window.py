@@ -103,7 +103,7 @@ def test_window_shrinks_when_answers_are_slow(seconds: float | None, size: float
 
 
 def test_window_halves_at_high_loss() -> None:
-    """In sixteenths: of 22 in a row three quarters count as lost, and 11 more of a half."""
+    """The average loss (1/16 for each message) exceeds 3/4 after 22 losses from 0, and after 11 losses from 1/2."""
     window, sizes = AdaptiveWindow(start=40, min_size=8), list[int]()
     for _ in range(60):
         window.on_loss()

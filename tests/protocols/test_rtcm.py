@@ -1,4 +1,4 @@
-"""RTCM 3 messages: whole ones only, and their fragments, compared with pymavlink's frames."""
+"""RTCM 3 messages: checks of complete messages, and fragments, compared with pymavlink's frames."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_fragments_end_with_short_or_fourth_one(size: int, lengths: list[int]) -
 
 @pytest.mark.parametrize("size", [25, 180, 181, 200, 500, 720])
 def test_frames_equal_those_of_mavsdk_rule_by_pymavlink(size: int) -> None:
-    """MAVSDK (rtk_impl.cpp): 180 bytes a message, flag bit 0 if there are several, then number and sequence."""
+    """The rule of rtk_impl.cpp: 180 bytes; flags: bit 0 for several fragments, then fragment and sequence number."""
     mavlink = pytest.importorskip("pymavlink.dialects.v20.common")
     message, sequence = rtcm(size), 5
     sender = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
@@ -72,10 +72,10 @@ def test_several_messages_are_split() -> None:
 @pytest.mark.parametrize(
     ("data", "reason"),
     [
-        (b"", "whole RTCM 3"),
-        (b"no rtcm at all", "whole RTCM 3"),
-        (EXAMPLE_1005[:-1], "25 bytes, 24 were given"),
-        (EXAMPLE_1005 + b"\xd3", "whole RTCM 3"),
+        (b"", "not the start of an RTCM 3 message"),
+        (b"no rtcm at all", "not the start of an RTCM 3 message"),
+        (EXAMPLE_1005[:-1], "25 bytes, but only 24 were given"),
+        (EXAMPLE_1005 + b"\xd3", "not the start of an RTCM 3 message"),
         (EXAMPLE_1005[:-1] + b"\0", "CRC-24Q"),
         (rtcm(721), "721 bytes"),
     ],

@@ -1,4 +1,4 @@
-"""Every transfer over many bad links, by seed."""
+"""Each kind of transfer over many random bad links."""
 
 from __future__ import annotations
 

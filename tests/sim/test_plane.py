@@ -100,6 +100,7 @@ async def test_autoland_on_ground_is_refused() -> None:
             await vehicle.set_mode("AUTOLAND")
 
 
+@pytest.mark.exhaustive
 async def test_arming_after_autoland_disarms_again() -> None:
     """Match the firmware, where the landing is still complete. `arm` leaves the mode first."""
     plane = SimulatedPlane(boot_time_s=1.0)

@@ -359,6 +359,7 @@ def test_mission_beyond_the_fence_is_rejected() -> None:
     assert client.command(MavCmd.MISSION_START) == MavResult.DENIED
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(("kind", "north"), [(0, 30.0), (1, 30.0), (3, 30.0), (4, 0.0)])
 def test_return_uses_nearest_rally_point(kind: int, north: float) -> None:
     px4, client = flying()

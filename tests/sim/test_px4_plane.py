@@ -158,6 +158,7 @@ def test_constant_wind_does_not_displace_the_circle() -> None:
     assert away_m(plane, north, east) == pytest.approx(80.0, abs=25.0)
 
 
+@pytest.mark.exhaustive
 def test_vehicle_object_flies_the_plane() -> None:
     async def fly() -> None:
         plane = SimulatedPx4Plane(boot_time_s=1.0, fast_rate_hz=5.0)

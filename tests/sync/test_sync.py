@@ -348,10 +348,13 @@ def test_ctrl_c_cancels_call_and_vehicle_holds(vehicle: aerokit.sync.Vehicle) ->
 
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="needs POSIX signals")
 def test_ctrl_c_cancels_connect() -> None:
+    before = threading.enumerate()
     timer = interrupt_soon()
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(KeyboardInterrupt) as caught:
         aerokit.sync.connect("udpin:127.0.0.1:0", timeout=60)
     timer.join()
+    assert len(caught.traceback) <= 4, "without the places where the library waited"
+    assert [thread for thread in threading.enumerate() if thread not in before] == []
 
 
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="needs POSIX signals")

@@ -1,12 +1,13 @@
 """Run-time checks of arguments: public methods reject values of a wrong type before they do anything.
 
 Only calls that lead to a vehicle, a network or a link are checked, because a wrong value must not stop a command
-half-way. Values come from keyboards, files and JSON, and many programs run without a type checker. Type checkers also
-accept a timeout of 0, or one string where several names are expected. Other functions raise Python's own errors.
+half-way. Type checkers do not suffice: values come from keyboards, files and JSON, many programs run without a type
+checker, and type checkers accept a timeout of 0, or one string where several names are expected. Other functions raise
+Python's own errors.
 
-The annotations define what is allowed. They are evaluated as text, so that nothing is imported for it: classes of this
-package are compared by name; callables, mappings and iterables by their abilities. Parameters whose names denote a time
-must be above zero. Methods check other ranges themselves.
+The annotations define what is allowed. They are evaluated as text, so that the checks import nothing: a class of this
+package is compared by name; a callable, mapping or iterable by its protocol. Parameters whose names denote a time must
+be above zero. Methods check other ranges themselves.
 """
 
 from __future__ import annotations
@@ -232,7 +233,7 @@ def _are_items(is_item: Check, value: object) -> bool:
 
 
 def check_kind(name: str, value: object, kind: type) -> None:
-    """Raise InvalidArgument unless ``value`` is an instance of ``kind``, where the annotation is a type variable."""
+    """Raise InvalidArgument unless ``value`` is an instance of ``kind``. For annotations that are type variables."""
     if not isinstance(value, kind):
         raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: {with_article(kind.__name__)}")
 

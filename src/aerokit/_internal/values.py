@@ -1,7 +1,7 @@
 """``Snapshot``: base class of immutable values, like a frozen dataclass but faster to define and to create.
 
-Thirty frozen dataclasses with slots take longer to import than the rest of the package. Only ``__init__`` is generated
-here, when the first value of a class is created; all other methods are shared.
+Defining thirty frozen dataclasses with slots takes longer than importing the rest of the package. Here only
+``__init__`` is generated for each class, when its first value is created; all other methods are shared.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Choice of the wire: compiled (`aerokit._wire`, built from ``_wire.c``) or pure Python, decided once, at import.
+"""Selects the code for frames and messages at import: compiled (`aerokit._wire`, from ``_wire.c``) or pure Python.
 
 The Python code is the reference, and is used where the extension is not built, was built from other sources, or is
 switched off by the environment variable ``AEROKIT_PURE=1``.
@@ -44,7 +44,7 @@ class _CounterFields:
 
 
 class Copyable:
-    """Lets objects with compiled fields be copied and pickled, in the form in which those with slots are."""
+    """Lets objects with compiled fields be copied and pickled like objects with slots."""
 
     __slots__ = ()
 

@@ -247,7 +247,8 @@ class ArduCopter(ArduPilot):
     sticks: StickRules | None = StickRules()
     setpoints: SetpointRules = SetpointRules(body_yaw_is_relative=True, attitude_rate=True, trajectory=True)
     reposition: Reposition | None = Reposition(relative_altitude=True, yaw=False, speed=False)
-    # An airspeed changes the ground speed (GCS_MAVLink_Copter.cpp, handle_MAV_CMD_DO_CHANGE_SPEED).
+    # ArduCopter treats SPEED_TYPE_AIRSPEED as the ground speed (GCS_MAVLink_Copter.cpp,
+    # handle_MAV_CMD_DO_CHANGE_SPEED).
     speed_types: frozenset[int] = frozenset((SpeedType.GROUNDSPEED, SpeedType.CLIMB_SPEED))
     condition_yaw = True
     lands_after_return = True
@@ -270,6 +271,10 @@ class ArduCopter(ArduPilot):
             *("RTL", "SMART_RTL", "SYSTEMID"),
         )
     )
+    armable_by_option: Mapping[str, str] = {"AUTO": "AUTO_OPTIONS"}
+    modes_without_position: frozenset[str] = frozenset(
+        ("ACRO", "ALT_HOLD", "FLOWHOLD", "GUIDED_NOGPS", "SPORT", "STABILIZE")
+    )
 
     def take_off(self, altitude_relative_m: float, home_altitude_amsl_m: float | None, *, is_vtol: bool) -> TakeOff:
         # The vehicle stays in GUIDED after the take-off.
@@ -277,7 +282,7 @@ class ArduCopter(ArduPilot):
         return TakeOff(guided, MavCmd.NAV_TAKEOFF, (0, 0, 0, 0, 0, 0, altitude_relative_m), None)
 
     def landed_state_of(self, heartbeat: Heartbeat) -> int | None:
-        # STANDBY is reported on the ground only, ACTIVE in the air only. A failsafe (CRITICAL) hides both.
+        # STANDBY means on the ground, ACTIVE in the air. During a failsafe, CRITICAL replaces both.
         return _landed_state(heartbeat)
 
     def return_altitude_parameters(self, *, is_vtol: bool) -> tuple[tuple[str, float], ...]:
@@ -327,7 +332,7 @@ class ArduPlane(ArduPilot):
 
     def return_altitude_parameters(self, *, is_vtol: bool) -> tuple[tuple[str, float], ...]:
         if self._can_hover(is_vtol):
-            return (("Q_RTL_ALT", 1.0),)  # It returns in QRTL.
+            return (("Q_RTL_ALT", 1.0),)  # This vehicle returns in QRTL.
         return (("RTL_ALTITUDE", 1.0), ("ALT_HOLD_RTL", 100.0))
 
     def _can_hover(self, is_vtol: bool) -> bool:
@@ -357,6 +362,7 @@ class ArduRover(ArduPilot):
     arrival_radius_m: float = 4.0
     arming_mode: ClassVar[str | None] = "HOLD"
     unarmable_modes: frozenset[str] = frozenset(("RTL", "SMART_RTL", "INITIALISING"))
+    modes_without_position: frozenset[str] = frozenset(("HOLD", "MANUAL"))
 
     def _purpose_name(self, purpose: Purpose, is_vtol: bool) -> str | None:
         if purpose == "hold" and self.vehicle_type == MavType.SURFACE_BOAT:

@@ -72,8 +72,9 @@ VTOLS = (
 class TakeOff(Snapshot):
     """Take-off procedure of a vehicle.
 
-    Change to ``mode`` (None: keep the current mode), arm, then send ``command`` with ``params`` (None: arming in
-    ``mode`` suffices). The vehicle then changes to ``mode_after`` by itself; None if it stays in ``mode``.
+    First change to ``mode`` (None: keep the current mode), then arm, then send ``command`` with ``params`` (None: the
+    vehicle takes off when armed in ``mode``). Afterwards the vehicle changes to ``mode_after`` by itself (None: it
+    stays in ``mode``).
     """
 
     mode: Mode | None
@@ -112,9 +113,9 @@ class SetpointRules(Snapshot):
 class StickRules(Snapshot):
     """Interpretation of MANUAL_CONTROL.
 
-    - ``signed_throttle``: the throttle is from −1000 to 1000; otherwise from 0 to 1000.
-    - ``release``: "axes" without a value, or overriding "channels" with 0, returns the sticks to the transmitter;
-      "none": there is no such message.
+    - ``signed_throttle``: the throttle ranges from −1000 to 1000; otherwise from 0 to 1000.
+    - ``release``: message that releases the sticks to the transmitter: MANUAL_CONTROL with "axes" without a value,
+      RC_CHANNELS_OVERRIDE with "channels" of 0, or "none".
     """
 
     signed_throttle: bool = False
@@ -122,10 +123,10 @@ class StickRules(Snapshot):
 
 
 class GimbalRules(Snapshot):
-    """Implementation of the gimbal protocol v2 by a gimbal manager. The defaults follow the standard.
+    """Support of the gimbal protocol v2 by the autopilot's gimbal manager. The defaults follow the standard.
 
     - ``has_secondary``: there is secondary control.
-    - ``supports_retract``: it executes the retract command.
+    - ``supports_retract``: it executes GIMBAL_MANAGER_FLAGS_RETRACT.
     - ``supports_pitchyaw``: rates are sent by GIMBAL_MANAGER_SET_PITCHYAW; otherwise by GIMBAL_MANAGER_SET_ATTITUDE.
     - ``supports_roi_sysid``: it supports MAV_CMD_DO_SET_ROI_SYSID.
     - ``roi_per_gimbal``: a region of interest applies to the named gimbal; otherwise always to the first one.
@@ -171,7 +172,7 @@ def mode_numbers(params: Sequence[float]) -> list[int]:
 
 
 class Autopilot:
-    """Description of an autopilot and vehicle type. This base class describes unknown ones.
+    """Description of an autopilot and vehicle type. The base class describes unknown autopilots.
 
     An object describes one vehicle, from its first HEARTBEAT. It has no state and does no IO.
     """
@@ -190,23 +191,23 @@ class Autopilot:
     sticks: StickRules | None = None
     """None if MANUAL_CONTROL is not known to work."""
     actuators_until: tuple[int, int] | None = None
-    """First version (major, minor) without SET_ACTUATOR_CONTROL_TARGET; None if no version supports it."""
+    """First version (major, minor) that no longer has SET_ACTUATOR_CONTROL_TARGET; None if no version has it."""
     reposition: Reposition | None = None
     """Behaviour of MAV_CMD_DO_REPOSITION; None if it is not known to work."""
     home_is_item_0 = False
     """True if item 0 of a mission is home."""
     acks_per_command: ClassVar[Mapping[int, int]] = {}
-    """Maps a MAV_CMD to the number of COMMAND_ACKs for each transmission, where it is not 1."""
+    """Maps a MAV_CMD to the number of COMMAND_ACKs for each transmission, unless it is 1."""
     signing_key_restriction = ""
-    """Restriction on the links on which SETUP_SIGNING is accepted, as a clause; empty if there is none."""
+    """Clause for error texts: the links on which SETUP_SIGNING is accepted; empty if there is no restriction."""
     runs_prearm_checks = False
     """True if MAV_CMD_RUN_PREARM_CHECKS (401) repeats the failing checks as status texts."""
     calibrates_compasses_by_command = False
     """True if MAV_CMD_DO_START_MAG_CAL (42424) calibrates compasses; otherwise PREFLIGHT_CALIBRATION does."""
     speed_types: frozenset[int] = frozenset((SpeedType.GROUNDSPEED,))
-    """SPEED_TYPEs of MAV_CMD_DO_CHANGE_SPEED (178) that change this speed, and no other."""
+    """SPEED_TYPEs of MAV_CMD_DO_CHANGE_SPEED (178) that the autopilot applies to the speed of that name."""
     circles_by: Literal["orbit", "reposition", "setpoints"] | None = None
-    """Way to circle a place: MAV_CMD_DO_ORBIT (34), DO_REPOSITION (192) with a radius, or set-points; None: there is
+    """Way to circle a place: MAV_CMD_DO_ORBIT (34), DO_REPOSITION (192) with a radius, or set-points; None if there is
     none.
     """
     tunes_by_command = False
@@ -220,7 +221,7 @@ class Autopilot:
     lands_after_return = False
     """True if the return mode ends with a landing."""
     arrival_radius_m: float = 2.0
-    """Distance in metres at which the vehicle counts as arrived by default; includes the radius of its circle."""
+    """Default distance in metres within which the vehicle counts as arrived. A fixed wing's includes the circle."""
     mission_storage = "any"
     """Conversions that the autopilot applies to stored mission items: an :class:`aerokit.missions.ItemStorage`."""
     mission_upload_window = 1
@@ -234,9 +235,9 @@ class Autopilot:
     overwrites_plans_in_place: frozenset[int] = frozenset((0, 1, 2))
     """MAV_MISSION_TYPEs whose old items are overwritten during an upload; others are kept until it is complete."""
     mission_completes_at_home = False
-    """True if a mission that ends with a return is complete at home, rather than when the return begins."""
+    """True if a mission that ends with a return is complete at home, False if it is when the return begins."""
     mission_starts_by_command = False
-    """True if MAV_CMD_MISSION_START (300) starts the mission, also on the ground, without arming."""
+    """True if MAV_CMD_MISSION_START (300) starts the mission even on the ground; it does not arm."""
     sets_current_by_command = False
     """True if MAV_CMD_DO_SET_MISSION_CURRENT (224) is supported."""
     repeats_item_reached = False
@@ -268,10 +269,14 @@ class Autopilot:
     """Mode to which the vehicle changes after landing; None if it stays in the landing mode."""
     unarmable_modes: frozenset[str] = frozenset()
     """Modes in which the autopilot refuses to arm, or disarms at once."""
+    armable_by_option: Mapping[str, str] = {}
+    """Maps modes that allow arming only if a parameter says so to that parameter."""
+    modes_without_position: frozenset[str] = frozenset()
+    """Modes in which the autopilot arms without an estimate of the position."""
     prearm_depends_on_mode = False
-    """True if the pre-arm bit of SYS_STATUS is about the current mode only."""
+    """True if the pre-arm bit of SYS_STATUS applies to the current mode only."""
     modes_with_rc: frozenset[str] | None = None
-    """Modes that require an RC receiver, or MANUAL_CONTROL; None if its health bit is about arming in any mode."""
+    """Modes that require an RC receiver or MANUAL_CONTROL; None if the receiver's health bit matters in every mode."""
     camera_by_trigger_only = False
     """True if the autopilot's own camera supports only DO_DIGICAM_CONTROL and DO_TRIGGER_CONTROL."""
     video_addresses_camera = False
@@ -353,8 +358,9 @@ class Autopilot:
         return None
 
     def return_altitude_parameters(self, *, is_vtol: bool) -> tuple[tuple[str, float], ...]:
-        """Return the names of the parameter with the altitude of a return, newest first, and the number of its units in
-        a metre; empty if there is none.
+        """Return the names, newest first, of the parameter for the altitude of a return, each with its units per metre.
+
+        Empty if there is no such parameter.
         """
         return ()
 
@@ -382,7 +388,7 @@ class Autopilot:
         return bool(health & PREARM_CHECK) if present & enabled & PREARM_CHECK else None
 
     def missing_estimates(self, flags: int) -> tuple[str, ...]:
-        """Return the estimates that are missing for arming in a mode that needs a position; empty if none are.
+        """Return the missing estimates that prevent arming in a mode that needs a position; empty if there are none.
 
         ``flags`` are those of EKF_STATUS_REPORT or ESTIMATOR_STATUS.
         """
@@ -418,15 +424,14 @@ class Autopilot:
         )
 
     def encodes_parameters_bytewise(self, capabilities: int | None) -> bool:
-        """Return True if integer parameters are sent as their bytes instead of as a number in a float."""
+        """Return True if integer parameters are encoded bytewise, False if they are cast to float."""
         if capabilities is not None and capabilities & (_BYTEWISE | _C_CAST):
             return bool(capabilities & _BYTEWISE)
         return self._bytewise_by_default
 
     _bytewise_by_default = False
     parameter_interval_s: float | None = None
-    """Shortest interval in seconds between PARAM_VALUEs that MAV_CMD_SET_MESSAGE_INTERVAL can set for a transfer; None
-    if the command has no effect."""
+    """Minimum interval between PARAM_VALUEs in seconds, for MAV_CMD_SET_MESSAGE_INTERVAL; None if it has no effect."""
     has_parameter_hash = False
     """True if the parameter ``_HASH_CHECK`` is a checksum of all others."""
 
@@ -440,14 +445,14 @@ class Autopilot:
         return message.NAME not in self.unsupported_messages
 
     calibration_protocol: str = ""
-    """How calibrations report: ``"acknowledgements"`` (ArduPilot), status ``"texts"`` (PX4), or ``""``: unknown."""
+    """Reports of calibrations: ``"acknowledgements"`` (ArduPilot), status ``"texts"`` (PX4), or ``""`` if unknown."""
 
     unsupported_commands: frozenset[int] = frozenset()
-    """MAV_CMDs without a handler in the firmware. Actions that need one raise NotSupported before anything is sent."""
+    """MAV_CMDs that the firmware does not handle. Actions that need one raise NotSupported before anything is sent."""
     reports_gripper_by_text: bool = False
-    """True if a gripper is acknowledged at once and its end reported by status text; otherwise the ack comes then."""
+    """True if a status text reports the end of a gripper's movement, False if the acknowledgement does."""
     highres_imu_field_ut: float = 100.0
-    """Microtesla for 1 in the magnetic field of HIGHRES_IMU, which is in gauss, but not on ArduPilot."""
+    """Microtesla per unit of the magnetic field in HIGHRES_IMU; the unit is gauss, except on ArduPilot."""
     has_shell: bool = False
     """True if SERIAL_CONTROL reaches a system shell."""
     winch_actions: frozenset[int] = frozenset(range(10))

@@ -1,4 +1,4 @@
-"""`ExternalRules`: the measurements of a companion computer that an autopilot accepts, and the parameters they need."""
+"""`ExternalRules`: the external measurements that an autopilot accepts, and the parameters that they require."""
 
 from __future__ import annotations
 
@@ -26,11 +26,12 @@ ExternalKind: TypeAlias = Literal[
 
 
 class ExternalRule(Snapshot):
-    """Parameters that decide about one kind of measurement.
+    """Parameters that decide whether the autopilot uses one kind of measurement.
 
-    - ``required``: alternative names of a parameter, and the values with which the autopilot reads the messages
-    - ``sole_source``: names of parameters, and the values with which the estimator has no other source of the position
-      or velocity, for parameters that the vehicle has
+    - ``required``: for each parameter, its alternative names, and the values with which the autopilot reads the
+      messages
+    - ``sole_source``: for each parameter, its name, and the values with which the estimator has no other source of
+      position or velocity; parameters that the vehicle does not have are ignored
     """
 
     required: tuple[tuple[tuple[str, ...], tuple[float, ...]], ...] = ()
@@ -80,7 +81,7 @@ ARDUPILOT_EXTERNAL = ExternalRules(
         "landing_target": ExternalRule(((("PLND_ENABLED",), (1.0,)), (("PLND_TYPE",), (1.0,)))),
         "optical_flow": ExternalRule(((("FLOW_TYPE",), (5.0,)),)),
     },
-    ned_frame=MavFrame.LOCAL_FRD,  # GCS_Common.cpp, handle_odometry: the only frame; the estimator reads it as NED
+    ned_frame=MavFrame.LOCAL_FRD,  # the only frame of GCS_Common.cpp, handle_odometry; the estimator reads it as NED
     origin_is_final=True,  # GCS_Common.cpp, set_ekf_origin
 )
 
@@ -109,6 +110,6 @@ PX4_EXTERNAL = ExternalRules(
     has_mocap=False,  # EKF2.hpp subscribes to vehicle_visual_odometry only
     has_vision_speed=False,
     flow_in_radians=True,
-    constant_position_at_rest=True,  # seen in flight; ArduPilot sets it only without aiding
+    constant_position_at_rest=True,  # measured in flight; ArduPilot sets the flag only without aiding
     target_is_local=True,  # mavlink_receiver.cpp, handle_message_landing_target
 )

@@ -104,7 +104,7 @@ def is_armed(base_mode: int) -> bool:
 
 
 def base_mode_name(base_mode: int) -> str:
-    """Return a name for a mode without custom_mode, from its MAV_MODE_FLAG bits."""
+    """Return the name of a mode that has no custom_mode, from its MAV_MODE_FLAG bits."""
     for bit, name in ((4, "AUTO"), (8, "GUIDED"), (16, "STABILIZE"), (64, "MANUAL")):
         if base_mode & bit:
             return name

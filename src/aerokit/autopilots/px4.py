@@ -94,7 +94,7 @@ class Px4(Autopilot):
     signing_key_restriction = "PX4 accepts a signing key only on its USB port, and before 1.17 on no port"
     modes = MODES
     modes_are_numbered = False
-    # The MAVLink module acknowledges with ACCEPTED at once, then the commander with the result.
+    # The MAVLink module acknowledges with ACCEPTED at once; the commander acknowledges later with the result.
     acks_per_command: ClassVar[Mapping[int, int]] = {MavCmd.DO_SET_MODE: 2}
     setpoints: SetpointRules = SetpointRules(stream_before_mode=True, attitude_rate=True, trajectory=True)
     sticks: StickRules | None = StickRules(release="none")
@@ -112,7 +112,7 @@ class Px4(Autopilot):
     prearm_depends_on_mode = True
     # Commander.cpp repeats the failing checks as texts (measured with 1.17 in simulation).
     runs_prearm_checks = True
-    # mode_requirements.cpp; the bit of the receiver is about these modes also in other modes (modeCheck.cpp).
+    # The modes of mode_requirements.cpp. The receiver's health bit refers to these modes in every mode (modeCheck.cpp).
     modes_with_rc: frozenset[str] | None = frozenset(
         ("MANUAL", "ALTCTL", "POSCTL", "POSITION_SLOW", "ALTITUDE_CRUISE", "ACRO", "STABILIZED", "RATTITUDE", "SIMPLE")
     )
@@ -142,7 +142,7 @@ class Px4(Autopilot):
     )
 
     has_shell = True
-    # DO_WINCH is passed on to the system, where no module handles it.
+    # PX4's MAVLink module passes DO_WINCH on, but no other module handles it.
     unsupported_commands: frozenset[int] = frozenset(
         (
             *(_C.DO_SET_SERVO, _C.DO_REPEAT_SERVO, _C.DO_SET_RELAY, _C.DO_REPEAT_RELAY, _C.DO_MOTOR_TEST),
@@ -156,11 +156,11 @@ class Px4(Autopilot):
         self.circles_by: Literal["orbit", "reposition", "setpoints"] | None = None if self._cannot_fly else "orbit"
         self.lands_after_return: bool = not self._cannot_fly and vehicle_type != MavType.FIXED_WING
         if vehicle_type == MavType.FIXED_WING or vehicle_type in VTOLS:
-            # Only the fixed-wing controller has an airspeed. PX4 takes every other type for the cruise speed
-            # (navigator_main.cpp), also that of a climb.
+            # Only the fixed-wing controller uses an airspeed. PX4 applies every other SPEED_TYPE to the cruise speed,
+            # even CLIMB_SPEED (navigator_main.cpp).
             self.speed_types: frozenset[int] = frozenset((SpeedType.AIRSPEED, SpeedType.GROUNDSPEED))
         if vehicle_type == MavType.FIXED_WING:
-            self.arrival_radius_m: float = 120.0  # it circles with NAV_LOITER_RAD, 80 m by default
+            self.arrival_radius_m: float = 120.0  # a plane circles with NAV_LOITER_RAD, 80 m by default
 
     def mode(self, custom_mode: int, base_mode: int, extra: Mapping[int, str] = NO_MODES) -> Mode:
         """Return the mode of these numbers. An external mode's own name takes precedence over EXTERNAL1 etc."""
@@ -225,7 +225,7 @@ class Px4(Autopilot):
         )
 
     def prearm_checks_pass(self, present: int, enabled: int, health: int) -> bool:
-        # PX4 sets the bit in ``health`` only, if the vehicle can be armed in its current mode.
+        # PX4 sets the bit only in ``health``, if the vehicle can be armed in its current mode.
         return bool(health & PREARM_CHECK)
 
     def missing_estimates(self, flags: int) -> tuple[str, ...]:
@@ -251,5 +251,5 @@ class Px4(Autopilot):
         return self.vehicle_type in (MavType.GROUND_ROVER, MavType.SURFACE_BOAT, MavType.SUBMARINE)
 
     def _git_hash(self, custom_version: bytes) -> str:
-        # The commit hash is stored in reverse order, after three bytes with the vendor's version.
+        # The bytes of the commit hash are in reverse order, after three bytes with the vendor's version.
         return custom_version[3:8][::-1].hex() if any(custom_version[3:8]) else ""

@@ -87,7 +87,7 @@ class Bus:
         *,
         system_id: int = EVERY_SYSTEM,
     ) -> Detach:
-        """Like :meth:`attach_frames`, but pass the message as second argument if another sink needs it decoded."""
+        """Like :meth:`attach_frames`, but also pass the message if it is decoded for another sink."""
         return self._attach((system_id, message_type.ID), (BOTH, sink))
 
     def create_on_first(

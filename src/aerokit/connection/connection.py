@@ -104,7 +104,7 @@ class Connection:
         self.attached: set[int] = set()
         """System ids that have a vehicle object on this connection."""
         self.components: set[tuple[int, int]] = set()
-        """(system id, component id) of the components that this program is on this connection."""
+        """(system id, component id) of the components that this program provides on this connection."""
         # (system id, component id) → function from loop time to milliseconds since boot; None while unknown.
         self.boot_clocks: dict[tuple[int, int], Callable[[float], float | None]] = {}
         self.link_state: StateCell[LinkState] = StateCell("link_state", self.now, "frame")
@@ -194,7 +194,7 @@ class Connection:
             self._heartbeat.activity.feed()
 
     def _use_activity_monitor(self, activity: ActivityMonitor) -> None:
-        """Pause our heartbeat when the program's own threads hang; the loop's thread would keep running."""
+        """Pause our heartbeat when the program's own threads hang, although the loop's thread keeps running."""
         if self._heartbeat is not None:
             self._heartbeat.require(activity, BLOCKING_MAX_IDLE_S)
 
@@ -450,7 +450,7 @@ class Connection:
     def order_refused(self, message: str, reason: str, lease_holder: str | None, answers: tuple[bytes, ...]) -> None:
         """Called when the vehicle side of a zenoh network refused one of our commands."""
         self.bus.publish(OrderRefused(self._clock(), 0, message, reason, lease_holder))
-        for answer in answers:  # not through a framer: its counters are for received frames only
+        for answer in answers:  # a framer would count them as received frames
             self.bus.deliver(Frame.parse(answer, self._clock()))
 
     def link_lost(self, error: LinkLost) -> None:

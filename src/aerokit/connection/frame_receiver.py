@@ -266,8 +266,7 @@ class FrameReceiver:
         framer.wanted = None if framer.keep_unknown else self._bus.wanted
 
     def _is_admitted(self, frame: Frame, is_other_peer: bool) -> bool:
-        # Copies of one frame are checked once: the accepted copy need not be the first, and a second check would take
-        # it for a replay.
+        # Only the first copy of a frame is checked: a second check would take another copy for a replay.
         if self._multilink is not None and self._multilink.copies.was_admitted:
             return True
         is_admitted = self._gate.admits(frame, may_hand_over=not is_other_peer)

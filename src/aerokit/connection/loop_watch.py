@@ -17,11 +17,11 @@ LATE_THRESHOLD_S = 0.1
 
 BLOCKED_THRESHOLD_S = 0.25
 
-# After this many loop iterations without a read, all data that waited during the pause has been read. It is more than
-# one because loops differ in whether timers or sockets come first.
+# After this many loop iterations without a read, all data that waited during the pause has been read. One would not be
+# enough, because some loops run timers before sockets.
 IDLE_ITERATIONS = 3
 
-# Platform → a clock that includes suspended time, and the loop's clock. The loop's clock of Windows includes it.
+# Platform → a clock that includes suspended time, and the loop's clock. On Windows, the loop's clock includes it too.
 CLOCKS = {
     "linux": ("CLOCK_BOOTTIME", "CLOCK_MONOTONIC"),
     "darwin": ("CLOCK_MONOTONIC", "CLOCK_UPTIME_RAW"),
@@ -48,9 +48,9 @@ class LoopWatch:
     """Detects pauses of the event loop by a timer that fires late.
 
     Data may have waited during a pause. Until all waiting data has been read, the time at which the loop last ran
-    before the pause is therefore the receive time of data. Pauses shorter than
-    ``CHECK_INTERVAL_S + LATE_THRESHOLD_S`` are not detected; ages may be too small by that. ``on_blocked`` gets the
-    length of pauses above ``BLOCKED_THRESHOLD_S``, ``on_slept`` the time that the computer was suspended.
+    before the pause is therefore the receive time of data. Pauses shorter than ``CHECK_INTERVAL_S + LATE_THRESHOLD_S``
+    are not detected; ages may be too small by this time. ``on_blocked`` gets the length of pauses above
+    ``BLOCKED_THRESHOLD_S``, ``on_slept`` the time that the computer was suspended.
     """
 
     def __init__(

@@ -119,7 +119,7 @@ async def open_connection(
 def _import_messages() -> None:
     """Import the messages that vehicles send, before the link opens.
 
-    With the first frames it would block the event loop: 20 ms of CPU time, 200 ms the first time without bytecode.
+    An import at the first frames would block the event loop: 20 ms of CPU time, 200 ms without cached bytecode.
     """
     for name in ("ardupilotmega", "common_more"):
         import_module(f"aerokit.mavlink.messages.{name}")

@@ -28,9 +28,9 @@ CLAIM_MIN_FRAMES = 3
 
 
 class RouteClaim:
-    """A peer's claim to the route of one component, judged by its first frame after the owner's last one.
+    """A peer's claim to the route of one component, decided by its first frame after the owner's last frame.
 
-    The verdict stays until the owner sends again: otherwise a peer could try out sequence numbers.
+    The decision is final until the owner sends again; otherwise a peer could try many sequence numbers.
     """
 
     __slots__ = (
@@ -256,7 +256,7 @@ class Routes:
     def _evidence(
         self, route: _Route, frame: Frame, counters: SourceStatistics | None
     ) -> tuple[int, bool | None, bool | None]:
-        """Return the owner's expected frame count, and if sequence number and clock match it (None: unknown)."""
+        """Return the owner's expected frame count, and whether number and clock continue its stream (None: unknown)."""
         sequence_matches: bool | None = None
         silent_for = max(frame.received_at - route.heartbeat_at, 0.0)
         expected = 0

@@ -176,7 +176,7 @@ class CommandSequence:
                 return
             held = self._held = self._held.replace(is_changed=True)  # until the vehicle has confirmed it
         aio = self._core.check_link()
-        # DroneKit has no such limit, and its programs run unchanged.
+        # DroneKit has no such limit, and its programs must run unchanged.
         options = {"timeout": timeout, "max_distance_m": math.inf}
         self._core.run(aio.mission.upload, _mission_of(held.items, aio), **options)
         with self._lock:

@@ -68,7 +68,7 @@ class Readiness:
             self._changed.notify_all()
 
     def failure_of(self, names: set[str]) -> APIException | None:
-        """Return the error because of which one of these attributes gets no value, or None."""
+        """Return the error that leaves one of these attributes without a value, or None."""
         return next(filter(None, map(self._failures.get, names)), None)
 
     def wait_for_change(self, wanted: set[str], at_most_s: float) -> None:

@@ -253,7 +253,7 @@ class Maintenance(VehicleCore):
         self._dk_calibrate(MavCmd.PREFLIGHT_CALIBRATION, 0, 0, 1)
 
     def send_calibrate_accelerometer(self, simple: bool = False) -> None:
-        """Calibrate the accelerometers in six attitudes, which the vehicle requests by text, or, ``simple``, level."""
+        """Calibrate the accelerometers in six poses that the vehicle requests by text; with ``simple``, level only."""
         self._dk_calibrate(MavCmd.PREFLIGHT_CALIBRATION, 0, 0, 0, 0, 4 if simple else 1)
 
     def _dk_calibrate(self, command: int, *params: float) -> None:

@@ -260,7 +260,7 @@ def _raise_classic(error: LinkOpenError) -> NoReturn:
 
 
 def mavudpin_multi(device: str, baud: int | None = None, **_: Any) -> MAVConnection:
-    """Listen for UDP. Like any listening connection it answers all senders."""
+    """Open a listening UDP connection, which answers all senders."""
     return MAVConnection(f"udpin:{device}")
 
 

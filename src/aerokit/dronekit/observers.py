@@ -36,9 +36,9 @@ _changing = threading.Lock()  # acquired while listeners are added and removed
 class Listeners:
     """Listeners by attribute or message name. Can be used from any thread.
 
-    Listeners run on the listener thread, in the order of the values, those of a name before those of ``'*'``. They may
-    block, raise and remove themselves. Without a listener thread they run on the notifying thread. ``on_value(name)``
-    is called for every value, with or without listeners.
+    Listeners run on the listener thread, in the order of the values. For each value, the listeners of its name run
+    before those of ``'*'``. Listeners may block, raise and remove themselves. Without a listener thread they run on the
+    notifying thread. ``on_value(name)`` is called for every value, with or without listeners.
     """
 
     kind = "attribute"  # in log messages
@@ -61,7 +61,7 @@ class Listeners:
             self._keep_owner()
 
     def remove(self, name: str, listener: AttributeListener) -> None:
-        """Remove a listener; ValueError if the name has other listeners only."""
+        """Remove a listener; ValueError if the name has listeners, but not this one."""
         with _changing:
             present = self.by_name.get(name)
             if present is None:
@@ -79,7 +79,7 @@ class Listeners:
         return name in self.by_name or EVERY_NAME in self.by_name
 
     def notify(self, name: str, value: Any, cache: bool = False, *, waits: bool = False) -> None:
-        """Notify listeners of a value: with ``cache`` only if it changed, without ``cache`` unless under high load.
+        """Notify listeners of a value: with ``cache``, if it changed; without ``cache``, unless the load is high.
 
         Returns immediately or, with ``waits``, after the listeners have run.
         """
@@ -99,7 +99,7 @@ class Listeners:
             enqueue(self.deliver, name, value)
 
     def announce(self, name: str) -> None:
-        """Like :meth:`notify` with the owner's attribute, which is read only if there are listeners."""
+        """Call :meth:`notify` with the value of the owner's attribute, which is read only if there are listeners."""
         if self.has_listener(name):
             self.notify(name, attrgetter(name)(self._owner))
         elif self._on_value is not None:
@@ -157,7 +157,7 @@ class HasObservers:
         self._dk_listeners.add(self._dk_normalized(attr_name), observer)
 
     def remove_attribute_listener(self, attr_name: str, observer: AttributeListener) -> None:
-        """Remove a listener; ValueError if the name has other listeners only."""
+        """Remove a listener; ValueError if the name has listeners, but not this one."""
         self._dk_listeners.remove(self._dk_normalized(attr_name), observer)
 
     def on_attribute(self, name: str | list[str] | tuple[str, ...]) -> Callable[[ListenerT], ListenerT]:

@@ -104,7 +104,7 @@ class ParameterDownload:
     async def _read(self, name: str) -> bool:
         """Request a parameter under all its names; return True if it was received or the vehicle reported it missing.
 
-        While the list is being sent, a missing answer proves nothing.
+        While the list is being sent, a missing answer does not show that the parameter is missing.
         """
         from aerokit.parameters.renames import other_names
 
@@ -155,7 +155,7 @@ class ParameterValues:
         return len(self._known)
 
     def copy(self) -> dict[str, float]:
-        """Return a new dict of name → value, in the vehicle's spelling and units."""
+        """Return a new dict of values by name, in the vehicle's spelling and units."""
         return {name: float(parameter.value) for name, parameter in self._known.copy().items()}
 
     def find(self, name: str) -> ResolvedParameter | None:
@@ -213,7 +213,7 @@ WAIT_TIMEOUT_S = 30.0
 
 
 class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers):
-    """Name → value: ``vehicle.parameters['RTL_ALT']``, ``vehicle.parameters['RTL_ALT'] = 30``.
+    """Maps names to values: ``vehicle.parameters['RTL_ALT']``, ``vehicle.parameters['RTL_ALT'] = 30``.
 
     Names are upper-cased, values are floats. The list is downloaded in the background after connecting, and stays valid
     through reboots and lost links; changes that the vehicle reports are included. Reading a missing value requests only
@@ -360,7 +360,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
         self._reading.begin()
 
     def _on_value(self, message: ParamValue) -> None:
-        # aerokit's own table has stored it before, with integers as integers.
+        # The parameter table of aerokit, which stores integers as int, has processed this message before.
         self._count = message.param_count
         self._take(message.param_id)
 

@@ -17,7 +17,7 @@ SILENCE_S = 5.0  # DroneKit's limit
 class OverridableProperty(Generic[T]):
     """A property that an instance attribute of the same name overrides.
 
-    For names that DroneKit 2.9 does not have: subclasses of its Vehicle may use them.
+    It is used for names that DroneKit 2.9 lacks, because subclasses of its Vehicle may use these names.
     """
 
     def __init__(self, getter: Callable[[Any], T]) -> None:

@@ -101,7 +101,7 @@ class Battery(_Value):
     """The main battery: ``voltage`` in volts, ``current`` in amperes or None, ``level`` in percent or None.
 
     The constructor takes the fields of SYS_STATUS: millivolts (65535, unknown, becomes 65.535 V), hundredths of an
-    ampere, and percent; -1 for the latter two is unknown.
+    ampere, and percent. A current or percentage of -1 is unknown.
     """
 
     _text = "Battery:voltage={0.voltage},current={0.current},level={0.level}"

@@ -65,9 +65,9 @@ LEVELS = (logging.CRITICAL,) * 3 + (logging.ERROR, logging.WARNING, logging.INFO
 class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
     """A vehicle: attributes to read and to listen to, orders, parameters, missions.
 
-    Created by :func:`connect`; ``connect(…, vehicle_class=…)`` creates a subclass, which passes its one argument on and
-    may add listeners and attributes. Can be used from any thread. Callbacks run in order on a separate thread, and may
-    use the vehicle too. A context manager; :meth:`close` closes the connection.
+    Created by :func:`connect`; ``connect(…, vehicle_class=…)`` creates a subclass, whose constructor passes its one
+    argument on and may add listeners and attributes. Can be used from any thread. Callbacks run in order on a separate
+    thread, and may use the vehicle too. A context manager; :meth:`close` closes the connection.
     """
 
     def __init__(self, handler: MAVConnection) -> None:
@@ -312,7 +312,7 @@ async def _found(
 
 
 async def _request_capabilities(aio: AsyncVehicle) -> None:
-    # Old firmware needs this command; repeated until the version arrives.
+    # Old firmware needs this command; it is repeated until the version arrives.
     for _ in range(5):
         if aio.telemetry.version.is_known:
             return
@@ -385,7 +385,7 @@ def connect(
             use_native=use_native,
             heartbeat=heartbeat,
         )
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, KeyboardInterrupt) as error:
         raise error.with_traceback(None) from None  # internal frames do not help the user
     handler.overrides.is_enabled = release_overrides
     try:
@@ -403,8 +403,10 @@ def connect(
                 still_waiting_callback=still_waiting_callback,
                 still_waiting_interval=still_waiting_interval,
             )
-    except BaseException:
+    except BaseException as error:
         handler.close()
+        if isinstance(error, KeyboardInterrupt) and vehicle_class is None:
+            raise error.with_traceback(None) from error.__cause__
         raise
     return vehicle
 

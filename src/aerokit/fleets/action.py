@@ -45,7 +45,7 @@ class FleetAction:
         execute: called with each available member.
         timeout: seconds for each member; None: no limit.
         stagger_s: delay in seconds between the starts of consecutive members.
-        is_safe: the action ends a flight (hold, land, return): a failure does not stop the others.
+        is_safe: the action ends a flight (hold, land, return), so that a failure does not stop the others.
         holds_if_cancelled: on cancellation, members that have already finished hold, too.
     """
 
@@ -364,13 +364,13 @@ class SelectionBase:
 
     @property
     def members(self) -> Mapping[str, Member]:
-        """Name → member, in the order in which they were given or found."""
+        """Maps names to members, in the order in which they were given or found."""
         members = self._context.members
         return dict(members) if self._names is None else {name: members[name] for name in self._names}
 
     @property
     def vehicles(self) -> Mapping[str, Vehicle]:
-        """Name → vehicle."""
+        """Maps names to vehicles."""
         return {name: member.vehicle for name, member in self.members.items()}
 
     def __len__(self) -> int:

@@ -115,7 +115,7 @@ class PathsCompared(FleetEvent):
 
 
 class TooClose(FleetEvent):
-    """``member`` and ``other`` are closer than the fleet's minimum distance; ``ordered`` are those ordered to hold."""
+    """``member`` and ``other`` are closer than the minimum distance; ``ordered`` are the members ordered to hold."""
 
     other: str
     distance_m: float

@@ -29,9 +29,9 @@ __all__ = ["Fleet", "Selection"]
 class Selection(Actions, Missions, Formations, Shows):
     """Some members of a fleet: ``fleet.group("alpha")``, ``fleet["north/*"]``.
 
-    Every action runs on all available members at once: those that are not lost, taken over or released. It returns a
-    :class:`FleetResult` when all of them are done. If a member fails, the fleet's policy orders what the others do, and
-    the action ends when they have done it. If the action is cancelled, all of them hold.
+    Every action runs on all available members at once, which are those that are not lost, taken over or released. The
+    action returns a :class:`FleetResult` when all of them are done. If a member fails, the fleet's policy sends orders
+    to the others, and the action ends when they have executed these. If the action is cancelled, all members hold.
     """
 
     def __getitem__(self, pattern: str) -> Selection:
@@ -107,13 +107,13 @@ class Fleet(Selection):
         """Send RTCM corrections (RTK, DGPS) as GPS_RTCM_DATA, once on each link.
 
         Args:
-            rtcm: one or more whole RTCM 3 messages, each of 720 bytes at most.
+            rtcm: one or more complete RTCM 3 messages of at most 720 bytes each.
 
         Returns:
             The number of MAVLink messages sent on each link.
 
         Raises:
-            InvalidArgument: a message is incomplete, damaged or longer, or ``rtcm`` is empty. Nothing was sent.
+            InvalidArgument: a message is incomplete, damaged or too long, or ``rtcm`` is empty. Nothing was sent.
             ConnectionClosed, LinkLost: a link has ended; the links before it got the corrections.
         """
         messages, count = rtcm_messages(rtcm), 0

@@ -241,7 +241,7 @@ class Following:
                 self._check_leader()
                 position_of(self._leader, LEADER_MAX_AGE_S)
             except (OperationRejected, ValueUnknownError) as error:
-                following = self._action.active  # they hold because their streams are cancelled below
+                following = self._action.active  # these members hold, because their streams are cancelled below
                 skipped = {
                     member.name: member.status if member.reason else "it does not follow"
                     for member in self._followers

@@ -66,8 +66,8 @@ async def fleet(
     system 7 of network "north". Several networks can therefore use the same system ids.
 
     Args:
-        *sources: addresses, links or open connections, on which all vehicles that are found become members; or
-            vehicles. A mapping names the networks or vehicles; other networks are named ``"1"``, ``"2"`` …
+        *sources: addresses, links or open connections, on which all vehicles found become members; or vehicle objects.
+            A mapping gives names to networks or vehicles; other networks are named ``"1"``, ``"2"`` …
         count: number of vehicles to wait for, in total; None: at least one on each network, plus those found in the
             next 2.5 seconds.
         system_ids: use these system ids only, on all networks or by network name; None: all that are found.
@@ -82,7 +82,7 @@ async def fleet(
         rates: message class → Hz, requested from each member instead of the default rates; ``{}`` requests nothing.
 
     Raises:
-        InvalidArgument: an argument is wrong, or two vehicles have the same name.
+        InvalidArgument: an argument is not allowed, or two vehicles have the same name.
         BusyError: this program already has a vehicle object for one of ``system_ids`` on that connection.
         LinkOpenError: a link could not be opened.
         LinkLost, ConnectionClosed: a link closed while waiting.

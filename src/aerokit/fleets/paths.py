@@ -135,17 +135,17 @@ def horizontal_distance(one: tuple[LocalPoint, LocalPoint], other: tuple[LocalPo
 
 
 def _lower_bound(one: tuple[PathPoint, PathPoint], other: tuple[PathPoint, PathPoint]) -> float:
-    """Return a lower bound of their distance: that of the midpoints minus half of both lengths."""
+    """Return a lower bound of the distance between two legs: that of their midpoints minus half of both lengths."""
     middles = [tuple((a + b) / 2 for a, b in zip(leg[0].place, leg[1].place, strict=True)) for leg in (one, other)]
     lengths = math.dist(one[0].place, one[1].place) + math.dist(other[0].place, other[1].place)
     return math.dist(*middles) - lengths / 2
 
 
 def _closest(one: tuple[PathPoint, PathPoint], other: tuple[PathPoint, PathPoint], slack_s: float) -> Approach | None:
-    """Return the closest approach of two legs; None if no two of their times are within the slack.
+    """Return the closest approach of two legs at times at most ``slack_s`` apart; None if there are no such times.
 
     With s and t from 0 to 1 along the legs, the squared distance is a convex function of both. The time condition
-    cuts a strip out of the unit square, so the minimum is inside it or on the border of the remaining polygon.
+    limits the unit square to a strip. The minimum is inside this polygon or on its border.
     """
     a, b = one[0].place, other[0].place
     along = [one[1].place[i] - a[i] for i in range(3)]

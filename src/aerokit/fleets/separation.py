@@ -160,7 +160,7 @@ def separate_by_time(
         order = [
             blocked,
             *(route for route in order if route is not blocked),
-        ]  # retry with the blocked one first
+        ]  # Retry with the blocked route first.
     return Deconfliction("refused", refusal, min_distance_m, conflicts)
 
 

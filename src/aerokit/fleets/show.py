@@ -60,7 +60,7 @@ class Show(Snapshot):
         return find_conflicts(list(self.tracks.values()), min_distance_m, slack_s=slack_s)
 
     def renamed(self, names: Mapping[str, str]) -> Self:
-        """Return the show with other names: name in the show → name of the fleet member.
+        """Return the show with other names; ``names`` maps names in the show to names of fleet members.
 
         Raises:
             InvalidArgument: a name is missing, or two tracks get the same name.

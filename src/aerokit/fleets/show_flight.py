@@ -61,7 +61,7 @@ POSITION_MAX_AGE_S = 2.0
 TIMESYNC_INTERVAL_S = 0.1
 TIMESYNC_TIMEOUT_S = 2.0
 
-# If `time_boot_ms` differs more than this from the arrival, it does not use the clock that TIMESYNC measured.
+# If `time_boot_ms` differs by more than this from the time of arrival, it is not on the clock that TIMESYNC measures.
 MAX_CLOCK_ERROR_S = 1.0
 
 
@@ -121,7 +121,7 @@ async def measure_clock(vehicle: Vehicle, *, requests: int = 8) -> ClockOffset:
 
 # ------------------------------------------------------------------------------------------ report
 
-# On slower legs a lag cannot be distinguished from a position error.
+# Minimum speed to compute a lag. On slower legs, a lag cannot be distinguished from a position error.
 MIN_LAG_SPEED_M_S = 0.3
 
 RELATIVE_ERROR_SAMPLES = 60
@@ -242,7 +242,7 @@ class TrackRecorder:
         """Return the latest position, extrapolated to now by its velocity.
 
         Raises:
-            StaleValueError: it is older than two seconds.
+            StaleValueError: no position was received in the last two seconds.
         """
         now = self._vehicle.connection.now()
         if self._latest is None or now - self._latest[0] > POSITION_MAX_AGE_S:

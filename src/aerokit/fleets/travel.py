@@ -51,8 +51,8 @@ class Travel(SelectionBase):
         A fleet with a ``min_distance_m`` compares the paths first, and separates crossing paths by altitude.
 
         Args:
-            targets: member's name → target, where other members stay where they are; or a function that returns a
-                member's target.
+            targets: mapping of member names to targets; members without a target stay where they are. Or a function
+                that returns a member's target.
             speed_m_s: ground speed; None: unchanged.
             max_distance_m: reject targets farther than this from the vehicle.
             timeout: seconds for each member and leg; None: no limit.
@@ -223,7 +223,7 @@ class Travel(SelectionBase):
         result: FleetResult | None = None
         for leg in legs:
             missing = [name for name in leg if not self.members[name].is_available]
-            if missing:  # its position is not under control, so it may be in the path of any other
+            if missing:  # its position is not under control, so it may be in the path of any other member
                 raise OperationRejected(
                     f"{action}: {', '.join(missing)} became unavailable between two legs; the others stay in their"
                     " layers"
@@ -314,7 +314,7 @@ class Missions(SelectionBase):
         """
         names = tuple(name for name in self._context.missions if name in self.members)
         if not names:
-            raise OperationRejected("start_missions: no missions were uploaded to all members; call upload() first")
+            raise OperationRejected("start_missions: no upload has succeeded for every member; call upload() first")
         members = self._require_available(dict.fromkeys(names))
         disarmed = [name for name in names if not members[name].vehicle.is_armed]
         if disarmed:

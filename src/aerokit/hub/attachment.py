@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 
 from aerokit.connection.frame_receiver import MAX_PEERS, PeerTable
 from aerokit.hub.message_rules import Filters, MessageKind
-from aerokit.hub.port import UNLIMITED, EndpointCounters, Port, SigningGateway
+from aerokit.hub.port import UNLIMITED, EndpointCounters, Port, SigningGateway, joined
 from aerokit.hub.senders import IdentityGuard
 from aerokit.hub.values import EndpointStatistics
+from aerokit.mavlink.frame import MAGIC_V1, MAGIC_V2
 from aerokit.transport import ReconnectingLink, create_link
 
 if TYPE_CHECKING:
@@ -34,6 +35,9 @@ DEFAULT_HOLD_ABOVE = 16 * 1024
 # These links send or drop data at once, so that their unsent bytes need not be checked.
 UNBUFFERED_KINDS = ("udpin", "udpout", "udpbcast")
 
+# First bytes of frames.
+_MAGICS = (bytes((MAGIC_V2,)), bytes((MAGIC_V1,)))
+
 
 class Attachment:
     """One endpoint with its link. Failures of the link do not affect other endpoints.
@@ -56,7 +60,9 @@ class Attachment:
         self.name: str = endpoint.name or self.link.address
         self.keeps_peers = True
         self.is_open: bool = False
-        self._is_on_link = self._is_single = False
+        self._is_on_link = self._is_single = self._reports_bursts = False
+        self._burst: list[bytes] = []
+        self._burst_peer: Peer = None
         self._ports: dict[Peer, Port] = {}
         self._guard = IdentityGuard(self.link, self._report_peer)
         self._peers = PeerTable(
@@ -113,6 +119,29 @@ class Attachment:
     # -------------------------------------------------------------------- called by the link
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
+        # Hot path. The datagrams of one burst of a peer are processed together.
+        if self._burst:
+            if peer == self._burst_peer and data[:1] in _MAGICS:
+                self._burst.append(data)
+                return
+            self._receive_burst()
+        if self._reports_bursts and peer in self._peers.framers and data[:1] in _MAGICS:
+            self._burst.append(data)
+            self._burst_peer = peer
+        else:
+            self._receive(data, peer)
+
+    def burst_ended(self) -> None:
+        self._receive_burst()
+        self._switch.flush()
+
+    def _receive_burst(self) -> None:
+        if self._burst:
+            burst, self._burst = self._burst, []
+            for data in joined(burst):
+                self._receive(data, self._burst_peer)
+
+    def _receive(self, data: bytes, peer: Peer) -> None:
         try:
             now, port_peer = self._now(), None if self._is_single else peer
             framer = self._peers.framers.get(port_peer)
@@ -128,9 +157,6 @@ class Attachment:
                     self.link.keep_peer(peer)
         except Exception as error:
             self._report(self, "internal_error", f"internal error of aerokit: {error!r}")
-
-    def burst_ended(self) -> None:
-        self._switch.flush()
 
     def peer_joined(self, peer: Peer) -> None:
         if peer not in self._ports:
@@ -163,12 +189,14 @@ class Attachment:
     # ------------------------------------------------------------------------------------ ports
 
     def _on_up(self) -> None:
-        self.is_open = True
+        self.is_open, self._reports_bursts = True, self.link.reports_bursts
         self._is_single = self.link.has_peer(None)
         if self._is_single and None not in self._ports:
             self._add_port(None)
 
     def _on_down(self) -> None:
+        if self._burst:  # the link was lost before the burst ended
+            self.burst_ended()
         self.is_open = False
         for peer in tuple(self._ports):
             self._forget(peer)

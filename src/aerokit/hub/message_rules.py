@@ -36,10 +36,10 @@ ORDER_MAX_AGE_S = 1.0
 
 
 class Filters:
-    """Messages that go out of an endpoint: those that match ``only`` (all if empty) and not ``block``.
+    """Select the messages that an endpoint sends: those that match ``only`` (all if empty) and not ``block``.
 
-    Patterns may contain wildcards: ``"GPS_*"``. ``rates`` maps patterns to the maximum rate per sender in Hz; the
-    first matching pattern applies. `ANSWERS` are limited only by their exact name.
+    Patterns may contain wildcards: ``"GPS_*"``. ``rates`` maps patterns to the maximum rate per sender in Hz; the first
+    matching pattern applies. Wildcards do not limit `ANSWERS`.
 
     Raises:
         InvalidArgument: a pattern matches no message of the dialect, or a rate is not above 0 and at most 1000.
@@ -63,7 +63,7 @@ class Filters:
                 raise InvalidArgument(f"rates: {pattern} = {hz:g} Hz is not allowed: above 0, at most {MAX_RATE_HZ:g}")
 
     def period(self, message_id: int) -> float | None:
-        """Return the minimum interval of a message in seconds: None if it does not go out, 0 if there is no limit."""
+        """Return the minimum interval of a message in seconds: None if it is not sent, 0 if there is no limit."""
         if not (self._only or self._block or self._rates):
             return 0.0
         if message_id not in self._dialect.rows:
@@ -142,8 +142,8 @@ def kind_of(name: str, *, is_for_one: bool) -> MessageKind:
     return MessageKind.TRANSFER
 
 
-# Payload offsets of the target's system id and, if there is one, component id → message ids. This is a table because
-# importing all message definitions takes a third of a second, which would happen in flight.
+# Payload offsets of the target's system id and (if any) component id → message ids. This is a table because importing
+# all message definitions in flight would block the loop for a third of a second.
 STANDARD_OFFSETS: dict[tuple[int, int | None], tuple[int, ...]] = {
     (0, None): (5,),
     (0, 1): (21, 43, 45, 47, 121, 122, 123, 156, 161, 176, 183, 186, 216, 218, 258, 321, 323, 12900, 12903, 12905,
@@ -184,7 +184,7 @@ NO_FIELD = 1 << 16
 # Offsets in `Frame.body` of the target's system id and component id.
 FieldOffsets = tuple[int, int]
 
-_SYSTEM_FIELDS = {"MANUAL_CONTROL": "target"}  # the only message with another field name
+_SYSTEM_FIELDS = {"MANUAL_CONTROL": "target"}  # the only message whose target field has another name
 
 
 class TargetFields:
@@ -193,7 +193,7 @@ class TargetFields:
     def __init__(self, dialect: Dialect) -> None:
         self._dialect = dialect
         self.offsets: dict[int, FieldOffsets | None] = {}
-        """Message id → offsets; None: the message has no target. Filled on demand for other dialects."""
+        """Maps message ids to offsets; None means no target. Messages of other dialects are added on demand."""
         if dialect is STANDARD:
             self.offsets.update(dict.fromkeys(dialect.rows))
             for (system, component), message_ids in STANDARD_OFFSETS.items():
@@ -203,7 +203,7 @@ class TargetFields:
     def look_up(self, message_id: int) -> FieldOffsets | None:
         """Return the offsets of a message; None if it has no target, or is not in the dialect."""
         if message_id not in self._dialect.rows:
-            return None  # not stored, because noise may contain any number
+            return None  # not stored, because noise may contain any message id
         offsets = self.offsets[message_id] = _field_offsets(self._dialect[message_id])
         return offsets
 

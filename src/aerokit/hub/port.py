@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from aerokit.hub.senders import IdentityGuard
     from aerokit.hub.values import HubEventKind
     from aerokit.mavlink.dialect import Dialect
+    from aerokit.mavlink.framer import Framer
     from aerokit.mavlink.signing import Signing
     from aerokit.transport.link import Link, Peer
 
@@ -35,7 +36,7 @@ class QueuedFrame(NamedTuple):
 
 
 class FrameQueue:
-    """Queue in which newer telemetry replaces older telemetry of the same message and sender.
+    """Queue in which newer telemetry replaces older telemetry with the same message id and sender.
 
     When the queue is full, the oldest telemetry is dropped first, then the new frame.
     """
@@ -156,6 +157,7 @@ class SigningGateway:
 MAX_JOINED_BYTES = 1200
 """Frames sent together are joined up to this size, so that their datagram is not fragmented."""
 UNLIMITED = 1 << 62
+_INCOMPLETE = -1 << 62  # equals no number of bytes
 MAX_RATE_LIMITS = 4096
 """Maximum number of (sender, message) pairs whose rate is tracked."""
 
@@ -211,12 +213,16 @@ class Port:
         self.writes_single_frames = False
         """True to write each frame separately, because autopilots read datagrams into small buffers."""
         self.batch: list[bytes] = []
+        """Data to write: single frames, or pieces of several."""
+        self.joined_frames = 0
+        """Number of frames in ``batch`` above the number of its pieces."""
         self.node: RouterPort[Port] | None = None
         self._dialect = dialect
         self._hold_above, self._may_hold = hold_above, hold_above < UNLIMITED
         self._on_drop = on_drop
         self._queue = FrameQueue()
         self._due: dict[int, float] = {}
+        self._framed_bytes = _INCOMPLETE
 
     @property
     def is_holding(self) -> bool:
@@ -225,6 +231,18 @@ class Port:
     @property
     def waiting(self) -> int:
         return len(self._queue)
+
+    @property
+    def joins_frames(self) -> bool:
+        """True if frames are written together, so that they may be collected in one piece."""
+        return self.gateway is None and not self.writes_single_frames
+
+    def is_whole(self, framer: Framer, data: bytes) -> bool:
+        """Return True if ``data``, the last that was received, consists of nothing but whole valid frames."""
+        before = self._framed_bytes
+        statistics = framer.statistics
+        self._framed_bytes = _INCOMPLETE if framer.waiting else statistics.bytes - statistics.bad_bytes
+        return self._framed_bytes - len(data) == before
 
     def must_hold(self) -> bool:
         return self._may_hold and (bool(self._queue) or self._is_full())
@@ -252,20 +270,11 @@ class Port:
         if self.gateway is not None:
             batch = self._signed(batch, unix_time)
         counters, write, peer = self.counters, self.link.write, self.peer
-        counters.frames_out += len(batch)
-        if len(batch) == 1 or self.writes_single_frames:
-            for raw in batch:
-                counters.bytes_out += len(raw)
-                write(raw, peer)
-            return
-        data = b"".join(batch)
-        counters.bytes_out += len(data)
-        if len(data) <= MAX_JOINED_BYTES:
-            if data:
-                write(data, peer)
-            return
-        for chunk in _chunks(batch):
-            write(chunk, peer)
+        counters.frames_out += len(batch) + self.joined_frames
+        self.joined_frames = 0
+        for piece in batch if len(batch) == 1 or self.writes_single_frames else joined(batch):
+            counters.bytes_out += len(piece)
+            write(piece, peer)
 
     def drain(self, now: float, unix_time: float) -> None:
         """Write queued frames while the link accepts them, and drop late commands."""
@@ -279,6 +288,7 @@ class Port:
     def close(self) -> None:
         self._drop(self._queue.clear())
         self.batch.clear()
+        self.joined_frames = 0
         self._due.clear()
 
     def _is_full(self) -> bool:
@@ -296,7 +306,11 @@ class Port:
             self._on_drop(reason, frame)
 
 
-def _chunks(batch: list[bytes]) -> list[bytes]:
+def joined(batch: list[bytes]) -> list[bytes]:
+    """Join pieces to larger ones of at most `MAX_JOINED_BYTES`. Pieces that are larger themselves stay alone."""
+    whole = b"".join(batch)
+    if len(whole) <= MAX_JOINED_BYTES:
+        return [whole] if whole else []
     chunks: list[bytes] = []
     chunk: list[bytes] = []
     size = 0

@@ -30,16 +30,17 @@ if TYPE_CHECKING:
 PortT = TypeVar("PortT")
 
 MAX_PLANS = 4096
-"""Cached plans per port."""
+"""Maximum number of cached plans per port."""
 
 _SETUP_SIGNING = 256
 _RADIOS = (109, 166)
+_NOBODY = Sender(0, 0, -math.inf)
 
 
 class ForwardingPlan(Generic[PortT]):
     """Cached routing decision for all frames with the same message, sender, port and target."""
 
-    __slots__ = ("key", "message_id", "outs", "rate_limited", "reason", "target")
+    __slots__ = ("identity", "is_plain", "key", "message_id", "outs", "rate_limited", "reason", "sender", "target")
 
     def __init__(
         self,
@@ -49,6 +50,7 @@ class ForwardingPlan(Generic[PortT]):
         outs: tuple[PortT, ...] = (),
         rate_limited: tuple[tuple[PortT, float], ...] = (),
         reason: str = "",
+        sender: Sender = _NOBODY,
     ) -> None:
         self.key: int = key
         """Key of sender and message, for any target."""
@@ -56,47 +58,61 @@ class ForwardingPlan(Generic[PortT]):
         self.target: tuple[int, int] = target
         """System id and component id; 0 means all."""
         self.outs: tuple[PortT, ...] = outs
-        """Ports that get each frame."""
+        """Ports that get each frame. Equal ones of one port are the same object, so that they are cheap to compare."""
         self.rate_limited: tuple[tuple[PortT, float], ...] = rate_limited
         """Ports that get at most one frame per interval, with the interval in seconds."""
         self.reason: str = reason
         """Reason for dropping the frames, a key of `EndpointStatistics.dropped`; "" if there is only no destination."""
+        self.is_plain: bool = not (rate_limited or reason)
+        """True if each frame goes to `outs`, and nothing else is to be done."""
+        self.sender: Sender = sender
+        """The sender, in the plans of `RouterPort.streams`."""
+        self.identity: int = sender.source << 24
+        """The sender's part of the numbers in `RecentFrames`."""
 
 
 class RouterPort(Generic[PortT]):
     """A port with the router's data about it."""
 
-    __slots__ = ("echoes", "loop_until", "number", "plans", "port")
+    __slots__ = ("destinations", "echoes", "loop_until", "number", "plans", "port", "streams")
 
     def __init__(self, port: PortT, number: int) -> None:
         self.port: PortT = port
         self.number: int = number
         """Unique number above 0."""
         self.plans: dict[int, ForwardingPlan[PortT]] = {}
+        self.streams: dict[bytes, ForwardingPlan[PortT]] = {}
+        """Sender and message, as in a frame → plan, for broadcasts of senders that are reached by this port."""
+        self.destinations: dict[tuple[PortT, ...], tuple[PortT, ...]] = {}
         self.echoes: dict[int, int] = {}
-        """Sender → surplus of returning frames over new ones at this port."""
+        """Maps senders to the number of returning frames minus the number of new frames at this port."""
         self.loop_until: float = -math.inf
         """Returning frames are dropped until this time."""
 
+    def forget_plans(self) -> None:
+        self.plans.clear()
+        self.streams.clear()
+        self.destinations.clear()
+
 
 class Router(Generic[PortT]):
-    """Learns the ports at which each sender is received, and plans the destinations of frames.
+    """Learns at which ports each sender is received, and plans the destinations of frames.
 
     - A broadcast goes to all other ports. A broadcast command skips ports through which it would reach a vehicle twice.
     - A message for one component or system goes to the ports at which its target was received. It is dropped if the
       target is unknown. A message for an unknown component of a known system goes to the ports of the system.
-    - A vehicle that is received at several ports is reached by the first one until that is silent for 3.5 s, so that
-      no command arrives twice. A message for a system goes to its autopilot in this way, and also to ports with only
-      other components of the system. Ground stations that share ids all get their messages.
+    - A vehicle that is received at several ports gets messages through the first port until that is silent for 3.5 s,
+      so that no command arrives twice. A message for a system goes to its autopilot in this way, and also to ports that
+      only reach other components of it. Ground stations that share ids all get their messages.
     - A frame never goes back to its port, and is forwarded once. Copies at other ports within two seconds are
       dropped, and later copies if they prove a loop. Copies do not change routes.
     - SETUP_SIGNING, which contains a key, is not forwarded. Status messages of telemetry radios do not go to vehicles.
 
-    At most `MAX_ROUTES` senders are remembered. A new one replaces one without heartbeats, or one that was silent for
-    `PEER_TTL_S`; if there is none, messages for the new one are dropped.
+    At most `MAX_ROUTES` senders are remembered. A new sender replaces one without heartbeats, or one that was silent
+    for `PEER_TTL_S`. If there is neither, messages for the new sender are dropped.
 
-    ``period(port, message_id)`` returns the minimum interval of a message at a port in seconds: None if it does not go
-    there, 0 without a limit. The interval applies per sender, to broadcasts only.
+    ``period(port, message_id)`` returns the minimum interval of a message at a port in seconds: None if the message
+    does not go there, 0 without a limit. The interval applies per sender, to broadcasts only.
     """
 
     def __init__(self, targets: TargetFields, period: Callable[[PortT, int], float | None]) -> None:
@@ -114,7 +130,7 @@ class Router(Generic[PortT]):
         self.on_vehicle: Callable[[PortT], object] | None = None
         """Called when an autopilot is received at a port for the first time."""
         self.on_change: Callable[[HubEventKind, int, PortT, PortT | None], object] | None = None
-        """Called with the kind of event, the sender, its port and its former port (None if that was removed)."""
+        """Called with the kind of event, the sender, its port, and its former port (None: removed)."""
 
     def add(self, port: PortT) -> RouterPort[PortT]:
         self._count += 1
@@ -131,12 +147,37 @@ class Router(Generic[PortT]):
 
     def forget_plans(self) -> None:
         for node in self._nodes.values():
-            node.plans.clear()
+            node.forget_plans()
 
     def senders_at(self, node: RouterPort[PortT]) -> list[tuple[int, int]]:
         return sorted(
             (sender.system_id, sender.component_id) for sender in self._senders.values() if node.number in sender.ports
         )
+
+    def route_all(
+        self, node: RouterPort[PortT], frames: list[Frame], now: float, late: list[Frame]
+    ) -> list[ForwardingPlan[PortT]]:
+        """Return the plans for frames received together at ``node``. ``late``: those with a number out of order."""
+        # Hot path: what :meth:`route` does for a new frame of a stream; it does the rest.
+        recent, streams, number = self._recent, node.streams, node.number
+        if late or node.echoes or now >= recent.ends_at or len(recent.newer) + len(frames) > MAX_RECENT_FRAMES:
+            return [self.route(node, frame, now, frame in late) for frame in frames]
+        newer, older, here, plans = recent.newer, recent.older, (number, self._count, now), []
+        for frame in frames:
+            body = frame.body
+            plan = streams.get(body[4:9])
+            if plan is not None:
+                identity = plan.identity | body[3] << 16 | frame.checksum
+                is_new = identity not in newer and identity not in older
+                if is_new or (newer.get(identity) or older[identity])[0] == number:  # equal by chance
+                    newer[identity] = here
+                    plan.sender.received_at = now
+                    plans.append(plan)
+                    continue
+            plans.append(self.route(node, frame, now))
+            if node.echoes:
+                streams = {}
+        return plans
 
     def route(self, node: RouterPort[PortT], frame: Frame, now: float, is_late: bool = False) -> ForwardingPlan[PortT]:
         """Return the plan for a frame received at ``node``. ``is_late``: its sequence number is out of order."""
@@ -289,15 +330,18 @@ class Router(Generic[PortT]):
             elif period is not None:
                 rate_limited.append((port, period))
         if len(node.plans) >= MAX_PLANS:
-            node.plans.clear()
-        plan = ForwardingPlan(plan_key, message_id, ids, tuple(outs), tuple(rate_limited))
+            node.forget_plans()
+        shared_outs, sender = node.destinations.setdefault(tuple(outs), tuple(outs)), self._senders.get(source, _NOBODY)
+        plan = ForwardingPlan(plan_key, message_id, ids, shared_outs, tuple(rate_limited), sender=sender)
         node.plans[key] = plan
+        if message_id and sender.number == node.number and self._offsets.get(message_id) is None:
+            node.streams[source.to_bytes(2, "little") + message_id.to_bytes(3, "little")] = plan
         return plan
 
     def _ports_to(self, system_id: int, component_id: int, source: int, here: int) -> dict[int, None]:
         """Return the numbers of the ports by which a component or system is reached, for a frame of ``source``.
 
-        A sender never gets its own frame, which arrived at port ``here``, even if it is reached by another port.
+        A sender never gets its own frame (received at port ``here``), even if another port reaches the sender.
         """
         own = self._senders.get(source)
         exact = self._senders.get(system_id | component_id << 8) if component_id else None
@@ -307,8 +351,8 @@ class Router(Generic[PortT]):
         autopilots = [sender for sender in known if sender.is_autopilot]
         found: dict[int, None] = {}
         for sender in sorted(known, key=lambda sender: not sender.is_autopilot):
-            # A component at a port that is already chosen is reached there. Ports at which the autopilot is also
-            # received are skipped, because it would get the command twice.
+            # A component is already reached if one of its ports is chosen. Ports at which the autopilot is received too
+            # are skipped, because it would get the command twice.
             is_reached = sender.is_vehicle and any(sender.is_at(number) for number in found)
             if not is_reached:
                 found.update(
@@ -319,7 +363,7 @@ class Router(Generic[PortT]):
         return found
 
     def _would_be_second(self, number: int) -> bool:
-        """Return True if all autopilots received at a port are reached by other ports."""
+        """Return True if other ports reach all autopilots that are received at this port."""
         here = [sender for sender in self._senders.values() if sender.is_autopilot and sender.is_at(number)]
         return bool(here) and all(sender.number != number for sender in here)
 

@@ -64,9 +64,9 @@ class Sender:
         self.received_at: float = now
         """Time of the last frame at that port."""
         self.ports: dict[int, float] = {number: now}
-        """Port number → time of the last frame there. For `number`, see :attr:`received_at` instead."""
+        """Maps port numbers to the time of the last frame there; for `number`, use :attr:`received_at`."""
         self.is_vehicle: bool = False
-        """True if its HEARTBEAT is not of a ground station. Messages then go to one port only."""
+        """True if its HEARTBEAT is not that of a ground station. Messages for it then go to one port only."""
         self.is_autopilot: bool = False
         self.reported: set[int] = set()
         """Ports already known to lead to this autopilot."""
@@ -76,7 +76,7 @@ class Sender:
         return (self.number,) if self.is_vehicle else self.ports
 
     def is_at(self, number: int) -> bool:
-        """Return True if it was recently received at a port, by the time of its last frame."""
+        """Return True if this port received the sender shortly before the sender's last frame."""
         return number == self.number or self.ports.get(number, -math.inf) >= self.received_at - ROUTE_TIMEOUT_S
 
     def record_at_other_port(self, number: int, now: float) -> bool:
@@ -107,7 +107,7 @@ class Sender:
 
 
 class RecentFrames:
-    """Recent frames in two generations of `LOOP_WINDOW_S` each. A whole generation expires, without a search."""
+    """Recent frames in two generations of `LOOP_WINDOW_S` each. A generation expires as a whole, without a search."""
 
     __slots__ = ("ends_at", "newer", "older")
 
@@ -125,7 +125,7 @@ class RecentFrames:
 
 
 REPEAT_EVENT_S = 60.0
-"""Minimum interval of events about duplicate senders of one autopilot, for any number of peers."""
+"""Minimum interval of events about duplicate senders under the ids of one autopilot, for any number of peers."""
 
 
 class IdentityGuard:

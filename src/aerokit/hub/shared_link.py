@@ -89,13 +89,13 @@ class SharedLink(Link):
         """See `Link.wait_closed`."""
 
     def _check_ids(self, frame: Frame) -> None:
-        """Report another station with our ids, because both would process the vehicle's answers to the other."""
+        """Report another station with our ids, because each would process the vehicle's answers to the other."""
         ours = self._connection.source_system, self._connection.source_component
         if (frame.system_id, frame.component_id) == ours:
             self._is_duplicate_reported = True
             logger.warning(
-                "another station on the shared link uses this program's ids %d/%d, so that both process the answers to"
-                " the other; give this program other ids (source_system=, source_component=)",
+                "another station on the shared link uses this program's ids %d/%d, so that each processes the answers"
+                " to the other; give this program other ids (source_system=, source_component=)",
                 *ours,
             )
             self._connection.bus.publish(DuplicateSender(self._connection.now(), *ours))

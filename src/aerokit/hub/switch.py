@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import time
+from operator import attrgetter
 from typing import TYPE_CHECKING
 
 from aerokit.hub.message_rules import TargetFields
+from aerokit.hub.port import MAX_JOINED_BYTES
 from aerokit.hub.routing import Router
-from aerokit.mavlink.frame import MAGIC_V2
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -24,8 +25,10 @@ if TYPE_CHECKING:
 MIN_POLL_INTERVAL_S = 0.01
 MAX_POLL_INTERVAL_S = 0.08
 
-# Frames are written after this many of a burst, before its end.
+# Frames of a long burst are written each time this many have been collected.
 MAX_BURST_FRAMES = 256
+
+_message_id = attrgetter("message_id")
 
 
 class Switch:
@@ -86,37 +89,14 @@ class Switch:
                     guard.admits(frame, framer, peer)
             port.counters.dropped["read_only"] += len(frames)
             return
-        late, route, recording, gateway = framer.late, self.router.route, self.recording, port.gateway
-        size = len(data) - 3
-        for frame in frames:
-            is_late = bool(late) and frame in late
-            if gateway is not None:
-                admitted = gateway.admitted(frame, self.unix_time())
-                if admitted is None:
-                    continue
-                frame = admitted
-            if (
-                guard is not None
-                and (guard.is_shared or frame.message_id == 0)
-                and not guard.admits(frame, framer, peer)
-            ):
-                port.counters.dropped["foreign"] += 1
-                continue
-            plan = route(node, frame, now, is_late)
-            # Most datagrams are one frame, which need not be reassembled.
-            body = frame.body
-            raw = data if len(body) == size and data[1:-2] == body and data[0] == MAGIC_V2 else frame.raw
-            for out in plan.outs:
-                if batch := out.batch:
-                    batch.append(raw)
-                else:
-                    self._start_batch(out, raw, plan, now)
-            if plan.rate_limited:
-                self._forward_limited(raw, plan, now)
-            elif plan.reason:
-                port.counters.dropped[plan.reason] += 1
-            if recording is not None and plan.reason != "duplicate":
-                recording.write(raw, now)
+        late, is_whole = framer.late, port.is_whole(framer, data)
+        if port.gateway is not None or (guard is not None and (guard.is_shared or 0 in map(_message_id, frames))):
+            count, (frames, late) = len(frames), self._admitted(port, framer, frames)
+            is_whole = is_whole and port.gateway is None and len(frames) == count
+        plans = self.router.route_all(node, frames, now, late)
+        if not (is_whole and self.recording is None and self._forward_together(plans, data)):
+            for frame, plan in zip(frames, plans, strict=True):
+                self._forward(port, frame.raw, plan, now)
         if self._dirty:
             if len(frames) > MAX_BURST_FRAMES:
                 self.flush()
@@ -137,7 +117,57 @@ class Switch:
                 except Exception as error:  # e.g. the time stamps of a key are exhausted; other ports continue
                     self._on_error(port, error)
 
+    def _admitted(self, port: Port, framer: Framer, frames: list[Frame]) -> tuple[list[Frame], list[Frame]]:
+        """Return the frames that the sender may send, without signatures, and those of them that are out of order."""
+        admitted: list[Frame] = []
+        late: list[Frame] = []
+        gateway, guard, peer = port.gateway, port.guard, port.peer
+        for received in frames:
+            frame = received if gateway is None else gateway.admitted(received, self.unix_time())
+            if frame is None:
+                continue
+            if guard is None or not (guard.is_shared or frame.message_id == 0) or guard.admits(frame, framer, peer):
+                admitted.append(frame)
+                if received in framer.late:
+                    late.append(frame)
+            else:
+                port.counters.dropped["foreign"] += 1
+        return admitted, late
+
+    def _forward_together(self, plans: list[ForwardingPlan[Port]], data: bytes) -> bool:
+        """Forward the frames of ``data`` unchanged if all go to the same ports in one datagram. Return False if not."""
+        outs = plans[0].outs
+        for plan in plans:
+            if plan.outs is not outs or not plan.is_plain:
+                return False
+        if len(plans) > 1 and not (len(data) <= MAX_JOINED_BYTES and all(out.joins_frames for out in outs)):
+            return False
+        for out in outs:
+            if not out.batch and out.must_hold():
+                return False
+        for out in outs:
+            if not out.batch:
+                self._dirty.append(out)
+            out.batch.append(data)
+            out.joined_frames += len(plans) - 1
+        return True
+
+    def _forward(self, port: Port, raw: bytes, plan: ForwardingPlan[Port], now: float) -> None:
+        for out in plan.outs:
+            if batch := out.batch:
+                batch.append(raw)
+            else:
+                self._start_batch(out, raw, plan, now)
+        if plan.rate_limited:
+            self._forward_limited(raw, plan, now)
+        elif plan.reason:
+            port.counters.dropped[plan.reason] += 1
+        if self.recording is not None and plan.reason != "duplicate":
+            self.recording.write(raw, now)
+
     def _start_batch(self, out: Port, raw: bytes, plan: ForwardingPlan[Port], now: float) -> None:
+        if out.node is None:
+            return  # removed since the frame was routed
         if out.must_hold():
             out.hold(raw, plan, now)
             if out not in self._holding:

@@ -32,13 +32,13 @@ class Endpoint(Snapshot):
     name: str = ""
     """Name of the endpoint; empty: its address."""
     only: tuple[str, ...] = ()
-    """Patterns of messages that go out here, e.g. ``("HEARTBEAT", "GPS_*")``; empty: all."""
+    """Patterns of messages that this endpoint sends, e.g. ``("HEARTBEAT", "GPS_*")``; empty: all."""
     block: tuple[str, ...] = ()
-    """Patterns of messages that do not go out here."""
+    """Patterns of messages that this endpoint does not send."""
     rates: Mapping[str, float] = {}
-    """Pattern → maximum rate per sender in Hz, above 0 and at most 1000. Messages with a target are not limited."""
+    """Maximum rate per sender in Hz by pattern, above 0 and at most 1000. Messages with a target are not limited."""
     read_only: bool = False
-    """True to forward nothing that is received here, not even heartbeats."""
+    """True to forward nothing that this endpoint receives, not even heartbeats."""
     signing: Signing | None = None
     """Key that signs frames sent here; frames received without its signature are refused.
 
@@ -106,7 +106,7 @@ class EndpointStatistics(Snapshot):
     waiting: int
     """Frames that wait because the link is full."""
     dropped: Mapping[str, int]
-    """Reason → number of dropped frames.
+    """Number of dropped frames by reason.
 
     Received: ``no_route`` (unknown target), ``duplicate``, ``loop``, ``read_only``, ``refused`` (signature),
     ``foreign`` (another peer has the ids of this autopilot), ``secret`` (SETUP_SIGNING), ``unknown`` (message outside

@@ -1,9 +1,9 @@
 """`Framer`: extracts frames from bytes.
 
 The input may be datagrams or a stream cut anywhere, with noise and text between frames. The framer never raises. At
-each byte that could start a frame it follows one order: a valid checksum wins, a plausible header is waited for, and
-anything else is skipped one byte at a time, so that a valid frame after noise is found.
-https://mavlink.io/en/guide/serialization.html
+each byte that could start a frame, it applies these rules in order: a frame with a valid checksum is returned; after a
+plausible header, it waits for the rest; anything else is skipped one byte at a time, so that a valid frame after noise
+is found. https://mavlink.io/en/guide/serialization.html
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _magics = re.compile(rb"\xfe|\xfd(?=\Z|.\Z|.[\x00\x01])", re.DOTALL).finditer
 _GOOD = 0  # a whole frame with a valid checksum
 _WAIT = 1  # the beginning of a plausible frame
 _IMPLAUSIBLE = 2  # the beginning of an implausible frame: wait, but examine what follows
-_UNKNOWN = 3  # a whole frame of an unknown message, if it is a frame
+_UNKNOWN = 3  # looks like a whole frame of an unknown message
 _BAD_CRC = 4
 _NOISE = 5
 
@@ -258,7 +258,7 @@ class PythonFramer:
         return frames
 
     def _skip_unknown(self, data: bytes, begin: int, end: int) -> None:
-        # The sender sent this frame, so its sequence number is not lost.
+        # The frame was received, although it is unknown, so its sequence number does not count as lost.
         if self.keep_unknown:
             self._unknown.append(data[begin:end])
         if data[begin] == MAGIC_V2:
@@ -313,8 +313,8 @@ class PythonFramer:
 
 
 def _earliest(hold: int, unknown: int, here: int) -> int:
-    """Return where the data to keep begins if a plausible frame begins at ``here``: at any earlier candidate."""
-    if unknown >= 0:  # earlier than `hold`, because it is only set if nothing is held
+    """Return the start of the data to keep: the earliest candidate for a frame, at ``here`` or before."""
+    if unknown >= 0:  # earlier than `hold`, because it is set only while `hold` is not
         return unknown
     return here if hold < 0 else hold
 

@@ -1,7 +1,7 @@
 """Telemetry logs (``.tlog``): each frame is preceded by eight bytes, big-endian, with microseconds since 1970.
 
-The format of QGroundControl, Mission Planner, MAVProxy and pymavlink. Times are arguments, because there is no clock
-here.
+QGroundControl, Mission Planner, MAVProxy and pymavlink use this format. Times are arguments, because this module has no
+clock.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ _MAGICS = (MAGIC_V1, MAGIC_V2)
 _BLOCK = 1 << 16
 _MAX_RECORD = 8 + 280
 # The search for the next record after garbage ignores times before the year 2000, because zeros in the header of a
-# frame look like such a time. Where a record is expected, these times are accepted: the clock may never have been set.
+# frame look like such a time. Where a record is expected, these times are accepted, because the clock may not have been
+# set.
 _FIRST_TIME = 946_684_800_000_000  # the year 2000
 _LAST_TIME = 4_102_444_800_000_000  # the year 2100; a larger number is not a timestamp
 _LAST = (_LAST_TIME - (1 << 48)).to_bytes(8, "big")[:2]  # a time with these or smaller first bytes is before _LAST_TIME

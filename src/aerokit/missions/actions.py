@@ -1,6 +1,6 @@
 """Builders for items without a place: speed, delays, headings, servos, relays, jumps, cameras, transitions.
 
-Invalid arguments raise :class:`~aerokit.errors.InvalidArgument` with the argument and what is allowed.
+Invalid arguments raise :class:`~aerokit.errors.InvalidArgument`, which names the argument and the allowed values.
 https://mavlink.io/en/messages/common.html#mav_commands
 """
 
@@ -49,7 +49,9 @@ def delay(duration_s: float) -> MissionItem:
     https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_DELAY
     """
     if duration_s == 0:
-        raise InvalidArgument("duration_s = 0 is not allowed: above 0, because ArduPilot reads 0 as a time of day")
+        raise InvalidArgument(
+            "duration_s = 0 is not allowed: it must be above 0, because ArduPilot then uses a time of day instead"
+        )
     return action_item(MavCmd.NAV_DELAY, in_range("duration_s", duration_s, 0, _MAX_DURATION_S), -1.0, -1.0, -1.0)
 
 
@@ -180,7 +182,7 @@ def enable_fence(enable: bool = True) -> MissionItem:
 
 
 def set_camera_trigger_distance(distance_m: float, *, trigger_now: bool = False) -> MissionItem:
-    """Take a photo every ``distance_m`` metres from here on; 0 stops. ``trigger_now``: also take one at once.
+    """Take a photo every ``distance_m`` metres from here on; 0 stops. With ``trigger_now``, also take one at once.
 
     https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_CAM_TRIGG_DIST
     """

@@ -36,11 +36,11 @@ def check_items(items: Sequence[MissionItem], mission_type: int = 0, *, home_is_
     Args:
         items: the items, without home.
         mission_type: the MAV_MISSION_TYPE.
-        home_is_item_0: True for ArduPilot missions, where one item fewer fits; False for other autopilots, where the
-            place 0°, 0° does not mean "the current position"; None if unknown.
+        home_is_item_0: True for ArduPilot missions, which have room for one item fewer; False for other autopilots, for
+            which 0°, 0° does not mean "the current position"; None if unknown.
 
     Raises:
-        InvalidArgument: the text names item, field, value and what is allowed.
+        InvalidArgument: an item cannot be sent; the text names item, field, value and the allowed values.
     """
     check_count(len(items), home_is_item_0=bool(home_is_item_0))
     for index, item in enumerate(items):

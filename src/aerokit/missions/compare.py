@@ -1,8 +1,8 @@
-"""Comparison of items that tolerates what the protocol and the vehicle's storage change.
+"""Comparison of items that tolerates the changes that the protocol and the vehicle's storage make.
 
 The tables follow the conversions in the firmware (ArduPilot 4.7 AP_Mission, PX4 1.17 mavlink_mission), verified on
-vehicles. A string has one letter for each of the seven numbers of an item. Numbers without a letter, and those with
-``-``, are lost and read back as 0. The other letters are:
+vehicles. A string has one letter for each of the seven numbers of an item. A number without a letter, or with ``-``, is
+not stored, and is read back as 0. The other letters are:
 
 - ``f`` unchanged; ``h`` 16-bit float; ``2`` always 2; ``?`` 1 if above 0, else 0; ``g`` 1 or -1, the sign;
 - ``u`` ``b`` unsigned integer of 16 or 8 bits; ``s`` ``i`` signed integer of 16 or 8 bits; ``U`` 16 bits that wrap;

@@ -205,8 +205,8 @@ class MissionItem(Snapshot):
     def position(self) -> Position | None:
         """Position of the item, with the altitude above home or above mean sea level, depending on the frame.
 
-        None for commands without a place, for local frames, and for 0°, 0°, which means "the current position". An
-        altitude above terrain is only in ``z``.
+        None for commands without a place, for local frames, and for 0°, 0°, which means "the current position". The
+        position has no altitude if the frame is relative to terrain; use ``z``.
         """
         if xy_scale(self.command, self.frame) != 10_000_000 or (self.x, self.y) in (
             (0, 0),
@@ -251,8 +251,8 @@ def place_item(
 ) -> MissionItem:
     """Create an item at a place. ``altitudes`` are relative to home, to mean sea level and to terrain; one is given.
 
-    A Position supplies latitude, longitude, and the altitude if none is given; Home supplies no altitude. If no place
-    is given and none ``is_needed``, the item has 0°, 0°, which ArduPilot understands as the current position.
+    A Position supplies latitude, longitude, and the altitude if no altitude is given; Home supplies no altitude. If no
+    place is given, and ``is_needed`` is False, the item has 0°, 0°, which means the current position to ArduPilot.
     """
     if isinstance(latitude_deg, (Position, Home)):
         if longitude_deg is not None:

@@ -34,7 +34,8 @@ class _ItemSequence(Snapshot):
     def differences(self, found: Self, storage: ItemStorage = ItemStorage.ANY) -> tuple[str, ...]:
         """Describe how ``found``, read from a vehicle, differs from this plan, with one text for each difference.
 
-        Ignores home, and what the protocol and the ``storage`` of the autopilot change. Empty if they are the same.
+        Ignores home, and the changes that the protocol and the autopilot's ``storage`` make. Empty if there is no
+        difference.
         """
         return plan_differences(self.items, found.items, storage)
 
@@ -45,12 +46,12 @@ class _ItemSequence(Snapshot):
     def check(self, *, home_is_item_0: bool | None = None) -> None:
         """Check that all items can be sent.
 
-        NaN is accepted where the standard defines it as "not given": headings and reserved parameters. Pass
-        ``home_is_item_0``, True for missions of ArduPilot and False for those of others, to check more: ArduPilot has
-        room for one item fewer, and for others 0°, 0° does not mean "the current position".
+        NaN is accepted where the standard defines it as "not given": headings and reserved parameters. If you know the
+        autopilot, pass ``home_is_item_0`` to check more. True is for missions of ArduPilot, which has room for one item
+        fewer; False is for other autopilots, for which 0°, 0° does not mean "the current position".
 
         Raises:
-            InvalidArgument: the text names item, field, value and what is allowed.
+            InvalidArgument: an item cannot be sent; the text names item, field, value and the allowed values.
         """
         check_items(self.items, self.MISSION_TYPE, home_is_item_0=home_is_item_0)
 
@@ -262,7 +263,7 @@ class RallyPoints(_ItemSequence):
         return tuple(item.position for item in self.items if item.position is not None)
 
     def check(self, *, home_is_item_0: bool | None = None) -> None:
-        """Raise :class:`InvalidArgument` if the points cannot be sent; the text has item, field and what is allowed."""
+        """Raise :class:`InvalidArgument` if the points cannot be sent; the text has item, field and allowed values."""
         super().check()
 
     def to_items(self, *, home_is_item_0: bool = False) -> tuple[MissionItem, ...]:
@@ -278,10 +279,11 @@ class RallyPoints(_ItemSequence):
 class Plan(Snapshot):
     """A mission with its fence and rally points, as in one QGroundControl ``.plan`` file.
 
-    ``mission.home`` is the planned home position. ``firmware_type`` (MAV_AUTOPILOT) and ``vehicle_type`` (MAV_TYPE) are
-    those it was planned for; ``cruise_speed_m_s`` (planes) and ``hover_speed_m_s`` (copters) are assumptions of the
-    planner. ``source`` is the text of the file from which the plan was read. Writing changes only what differs from it,
-    so that surveys and unknown fields are kept. It is ignored when plans are compared.
+    ``mission.home`` is the planned home position. ``firmware_type`` (MAV_AUTOPILOT) and ``vehicle_type`` (MAV_TYPE)
+    describe the vehicle that the plan was made for; ``cruise_speed_m_s`` (planes) and ``hover_speed_m_s`` (copters) are
+    assumptions of the planner. ``source`` is the text of the file from which the plan was read. When the plan is
+    written, only differences from this text are changed, so that surveys and unknown fields are kept. Comparisons of
+    plans ignore ``source``.
     """
 
     mission: Mission = Mission()

@@ -2,11 +2,11 @@
 
 A place is a :class:`~aerokit.Position`, or a latitude and a longitude in degrees (WGS 84). It needs exactly one
 altitude in metres: ``altitude_relative_m`` above home, ``altitude_amsl_m`` above mean sea level, or
-``altitude_terrain_m`` above the terrain (ArduPilot with terrain data; PX4 refuses it). If none is given, the altitude
-of the Position is used, the one above home if it has both; for landings, the altitude is that of the ground.
-``take_off``, ``vtol_take_off`` and ``loiter_to_altitude`` also accept only an altitude above home: ``take_off(10)``.
-``yaw_deg`` is a heading in degrees from north; None leaves it to the vehicle. Invalid arguments raise
-:class:`~aerokit.errors.InvalidArgument` with the argument and what is allowed.
+``altitude_terrain_m`` above the terrain (ArduPilot with terrain data; PX4 refuses it). If no altitude is given, that of
+the Position is used (above home, if it has both). For landings, the altitude is that of the ground. ``take_off``,
+``vtol_take_off`` and ``loiter_to_altitude`` also accept only an altitude above home: ``take_off(10)``. ``yaw_deg`` is a
+heading in degrees from north; None leaves it to the vehicle. Invalid arguments raise
+:class:`~aerokit.errors.InvalidArgument`, which names the argument and the allowed values.
 https://mavlink.io/en/messages/common.html#mav_commands
 """
 
@@ -65,9 +65,9 @@ def waypoint(
 ) -> MissionItem:
     """Fly to a place and hold there for ``hold_s`` seconds (0 to 65,535; whole seconds on ArduPilot, not on Plane).
 
-    ``acceptance_radius_m`` is the distance at which the place counts as reached (0: the vehicle's setting; not
-    ArduCopter). ``pass_by_m`` is the distance at which a plane may pass the place, negative on the other side.
-    ArduPlane stores whole metres up to 255 of both. https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_WAYPOINT
+    ``acceptance_radius_m`` is the distance at which the place counts as reached (0: the vehicle's setting); ArduCopter
+    ignores it. ``pass_by_m`` is the distance at which a plane may pass the place, negative on the other side. ArduPlane
+    stores both in whole metres up to 255. https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_WAYPOINT
     """
     return place_item(
         MavCmd.NAV_WAYPOINT,
@@ -268,8 +268,8 @@ def land(
     """Land at a place, or at the current position if none is given (ArduPilot; PX4 needs the place).
 
     The altitude is that of the ground there, by default that of home; the altitude of a Position is ignored.
-    ``abort_altitude_m`` is the altitude to climb to if a plane aborts the landing (0 to 65,535 m, 0: its setting).
-    ``precision`` requests a precision landing from PX4: 0 no, 1 opportunistic, 2 required.
+    ``abort_altitude_m`` (0 to 65,535 m) is the altitude to which a plane climbs if it aborts the landing; 0 means its
+    setting. ``precision`` requests a precision landing from PX4: 0 no, 1 opportunistic, 2 required.
     https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_LAND
     """
     return place_item(
@@ -467,8 +467,8 @@ def loiter_turns(
 ) -> MissionItem:
     """Circle around a place 0 to 255 times with a radius of up to 2,550 m (ArduPilot; PX4 refuses it).
 
-    ArduPilot stores whole turns or a fraction below 1, and tens of metres above 255 m. Negative: counter-clockwise.
-    https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_LOITER_TURNS
+    ArduPilot stores whole turns, or fractions below one turn; a radius above 255 m is stored in tens of metres. A
+    negative radius means counter-clockwise. https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_LOITER_TURNS
     """
     return place_item(
         MavCmd.NAV_LOITER_TURNS,

@@ -322,7 +322,7 @@ class JsonValue:
             raise self.error(" or ".join(json.dumps(choice) for choice in choices))
 
     def _as_float(self) -> float:
-        # Infinity, which every caller rejects, if it is not a number.
+        # Return infinity, which every caller rejects, for a value that is not a number.
         if not isinstance(self.value, (int, float)) or isinstance(self.value, bool):
             return math.inf
         try:

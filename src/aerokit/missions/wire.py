@@ -205,10 +205,10 @@ def pack_items(
 ) -> bytes:
     """Encode items (with the vehicle's numbering) as a packed plan.
 
-    A whole plan has ``first`` 0 and no options. ArduPilot accepts :data:`NO_CLEAR` for missions only: items from
-    index ``first`` on are replaced or appended, others are kept. Jump targets must then be below the number of items
-    in the file (4.7). ArduPilot processes the file when it is closed, and clears the old mission first, so that a
-    file refused half-way leaves half a mission.
+    A whole plan has ``first`` 0 and no options. ArduPilot accepts :data:`NO_CLEAR` only for missions: items from index
+    ``first`` on are replaced or appended, others are kept. Jump targets must then be below the number of items in the
+    file (4.7). ArduPilot processes a file when it is closed, and clears the old mission first. If it refuses an item,
+    the items before it are the new mission.
     """
     if len(items) + first > MAX_ITEMS:
         raise InvalidArgument(f"{len(items) + first} items are too many: at most {MAX_ITEMS} are possible")
@@ -243,7 +243,7 @@ def unpack_items(data: bytes, mission_type: int | None = None) -> tuple[MissionI
     """Decode the items of a packed plan, counted as the vehicle counts them.
 
     Raises:
-        RemoteProtocolError: the data is no packed plan, is truncated, or has another ``mission_type``.
+        RemoteProtocolError: the data is not a packed plan, is truncated, or has another ``mission_type``.
     """
     header = read_header(data)
     if mission_type is not None and header.mission_type != mission_type:

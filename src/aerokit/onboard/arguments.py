@@ -1,4 +1,4 @@
-"""Arguments of command handlers: read from the annotations of a function, checked before it is called."""
+"""Arguments of command handlers: read from the annotations of a function, and checked before each call."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class CommandArgument(Snapshot):
     range: Range
 
     def convert(self, value: float) -> object:
-        """Convert a parameter; InvalidArgument, with the name and what is allowed, if it is not allowed."""
+        """Convert a parameter to the argument's type; raise InvalidArgument if its value is not allowed."""
         if not math.isfinite(value):
             if self.is_optional and value != value:
                 return None
@@ -85,7 +85,7 @@ def arguments_of(function: Callable[..., Any]) -> tuple[CommandArgument, ...]:
     found = []
     for number, parameter in enumerate(parameters[1:], start=1):
         if parameter.kind not in (parameter.POSITIONAL_ONLY, parameter.POSITIONAL_OR_KEYWORD):
-            raise InvalidArgument(f"{name}(): argument {parameter.name} must be positional")
+            raise InvalidArgument(f"{name}(): argument {parameter.name} must be a positional argument")
         found.append(_argument(name, parameter.name, number, _hint(function, parameter)))
     return tuple(found)
 
@@ -100,8 +100,8 @@ def _hint(function: Callable[..., Any], parameter: inspect.Parameter) -> Any:
         return get_type_hints(holder, inner.__globals__, local, include_extras=True)["hint"]
     except NameError as error:
         raise InvalidArgument(
-            f"the annotation of {parameter.name} of {inner.__name__}() cannot be read: {error};"
-            " define its types at the level of the module"
+            f"the annotation of argument {parameter.name} of {inner.__name__}() cannot be evaluated: {error};"
+            " define its types at module level"
         ) from None
 
 
@@ -125,5 +125,7 @@ def _argument(function: str, name: str, number: int, hint: Any) -> CommandArgume
             f"{function}(): argument {name} must be annotated with float, int, bool or an enum of integers"
         )
     if number > MAX_ARGUMENTS:
-        raise InvalidArgument(f"{function}(): a command has seven parameters, {name} would be number {number}")
+        raise InvalidArgument(
+            f"{function}(): argument {name} would be parameter {number}, but a command has seven parameters"
+        )
     return CommandArgument(name, number, hint, is_optional, range_)

@@ -1,4 +1,4 @@
-"""An autopilot of the program's own: the commands that ground stations give to fly it."""
+"""``AutopilotDriver``: base class for your program's vehicle, which ground stations command."""
 
 from __future__ import annotations
 
@@ -14,15 +14,16 @@ if TYPE_CHECKING:
     from aerokit.onboard.services import ComponentServices
 
 FORCES = (21196, 2989)
-"""Values of param 2 that force arming or disarming: that of the standard, and ArduPilot's for arming."""
+"""Values of param 2 that force arming or disarming: the standard's, and the one that ArduPilot uses for arming."""
 _REBOOT, _SHUTDOWN = 1, 2
 
 
 class AutopilotDriver:
-    """Base class of a program's vehicle; pass an instance to :meth:`OnboardComponent.add_autopilot`.
+    """Base class for your program's vehicle; pass an instance to :meth:`OnboardComponent.add_autopilot`.
 
-    Override what it can do, as coroutines; other commands are UNSUPPORTED. A coroutine returns when the vehicle has
-    begun to obey. It refuses by raising an error. HEARTBEAT reports armed and mode after the coroutine has returned.
+    Override the coroutines for the commands that the vehicle has; other commands are UNSUPPORTED. A coroutine returns
+    when the vehicle has started to execute the command, or raises an exception to refuse it. HEARTBEAT reports the new
+    armed state and mode after the coroutine has returned.
     """
 
     async def arm(self, force: bool) -> None:
@@ -30,7 +31,7 @@ class AutopilotDriver:
         raise NotImplementedError
 
     async def disarm(self, force: bool) -> None:
-        """Stop the motors; ``force`` also in flight."""
+        """Stop the motors; with ``force`` even in flight."""
         raise NotImplementedError
 
     async def set_mode(self, custom_mode: int) -> None:
@@ -38,7 +39,7 @@ class AutopilotDriver:
         raise NotImplementedError
 
     async def take_off(self, altitude_m: float | None) -> None:
-        """Take off to an altitude above home; None: to the default one."""
+        """Take off to an altitude above home; None means the default altitude."""
         raise NotImplementedError
 
     async def land(self) -> None:
@@ -65,7 +66,7 @@ class AutopilotDriver:
 def add_autopilot(
     services: ComponentServices, driver: AutopilotDriver, report: Callable[[bool | None, int | None], None]
 ) -> None:
-    """Serve the commands of a vehicle. ``report(armed, custom_mode)`` changes the heartbeat; None: unchanged."""
+    """Serve the commands of a vehicle. ``report(armed, custom_mode)`` changes the heartbeat; None changes nothing."""
 
     async def call(name: str, *arguments: object) -> None:
         if not overrides(driver, AutopilotDriver, name):

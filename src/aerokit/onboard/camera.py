@@ -1,4 +1,4 @@
-"""A camera for a component: the program writes what is its own, the protocol is served for it."""
+"""``CameraDriver``: base class for your program's camera, for which aerokit serves the camera protocol."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 class Photo(Snapshot):
     """A picture that a camera has taken.
 
-    ``url`` is where other programs get the file: ``mftp:///DCIM/1.jpg`` for a file of `serve_files`, or http. Angles
-    are those of the camera, in degrees, yaw from north; None if unknown.
+    ``url`` is the address of the file for other programs: ``mftp:///DCIM/1.jpg`` for a file of `serve_files`, or an
+    HTTP address. The angles are those of the camera in degrees, yaw from north; None if unknown.
     """
 
     url: str = ""
@@ -57,10 +57,11 @@ class Storage(Snapshot):
 
 
 class CameraDriver:
-    """Base class of a program's camera; pass an instance to :meth:`OnboardComponent.add_camera`.
+    """Base class for your program's camera; pass an instance to :meth:`OnboardComponent.add_camera`.
 
-    Override what the camera can do, as coroutines; the capabilities that it reports follow from that. An error of a
-    method is the result of the command, and a status text. The methods are called one at a time for each command.
+    Override the coroutines for the functions that the camera has; aerokit derives the reported capabilities from them.
+    An exception of a method becomes the result of the command, and a status text. A method is not called again before
+    its previous call for the same command has returned.
 
     Args:
         vendor: at most 32 bytes.
@@ -69,9 +70,10 @@ class CameraDriver:
         focal_length_mm: NaN if unknown.
         sensor_mm: width and height of the sensor; NaN if unknown.
         streams: addresses of video streams, ``rtsp://192.168.0.10:8554/main``.
-        has_modes: True if the camera takes pictures and videos only in the mode for them (:meth:`set_mode`).
-        definition: camera definition file (XML) with the settings that PARAM_EXT serves; None: no settings.
-        gimbal_id: component id of the gimbal that carries it; 0: none.
+        has_modes: True if the camera takes pictures only in image mode and videos only in video mode
+            (:meth:`set_mode`).
+        definition: camera definition file (XML) with the settings that aerokit serves by PARAM_EXT; None: no settings.
+        gimbal_id: component id of the gimbal that carries the camera; 0: none.
     """
 
     def __init__(
@@ -117,10 +119,10 @@ class CameraDriver:
         raise NotImplementedError
 
     async def set_mode(self, mode: int) -> None:
-        """Change the CAMERA_MODE: 0 image, 1 video. Called only with ``has_modes``."""
+        """Change the CAMERA_MODE: 0 image, 1 video. Called only if ``has_modes`` is true."""
 
     async def zoom_to(self, percent: float) -> None:
-        """Zoom to a share of the range, 0 to 100."""
+        """Zoom to a percentage of the range, 0 to 100."""
         raise NotImplementedError
 
     async def zoom_at(self, rate: float) -> None:
@@ -128,7 +130,7 @@ class CameraDriver:
         raise NotImplementedError
 
     async def focus_to(self, percent: float) -> None:
-        """Focus at a share of the range, 0 to 100."""
+        """Focus at a percentage of the range, 0 to 100."""
         raise NotImplementedError
 
     async def focus_at(self, rate: float) -> None:
@@ -136,7 +138,7 @@ class CameraDriver:
         raise NotImplementedError
 
     async def focus_distance(self, metres: float) -> None:
-        """Focus at a distance, above 0."""
+        """Focus at a distance in metres, above 0."""
         raise NotImplementedError
 
     async def autofocus(self) -> None:
@@ -144,14 +146,17 @@ class CameraDriver:
         raise NotImplementedError
 
     async def track(self, place: tuple[float, ...]) -> None:
-        """Track a point (x, y, radius), a rectangle (left, top, right, bottom), shares of the image, or nothing ()."""
+        """Track a point (x, y, radius) or a rectangle (left, top, right, bottom), or stop tracking (empty tuple).
+
+        The numbers are fractions of the image, 0 to 1.
+        """
         raise NotImplementedError
 
     async def switch_stream(self, number: int, on: bool) -> None:
         """Start or stop a video stream; numbers begin at 1."""
 
     def storage(self) -> Storage | None:
-        """Return the memory; None if there is none."""
+        """Return the state of the camera's memory; None if it has none."""
         return None
 
     async def format_storage(self) -> None:
@@ -170,7 +175,7 @@ def _has(camera: CameraDriver, name: str) -> bool:
 
 
 def capabilities_of(camera: CameraDriver) -> int:
-    """Return the CAMERA_CAP_FLAGS of what the program's class overrides."""
+    """Return the CAMERA_CAP_FLAGS for the methods that the camera's class overrides."""
     flags = CameraCapFlags(0)
     if _has(camera, "take_photo"):
         flags |= CameraCapFlags.CAPTURE_IMAGE
@@ -196,7 +201,7 @@ _AUTO = (SetFocusType.AUTO, SetFocusType.AUTO_SINGLE, SetFocusType.AUTO_CONTINUO
 
 
 class CameraAdapter(CameraDevice):
-    """Serves the camera protocol for a program's camera."""
+    """Serves the camera protocol for a `CameraDriver`."""
 
     def __init__(
         self, camera: CameraDriver, host: ComponentHost, tasks: BackgroundTasks, call: Callable[..., Any]
@@ -302,7 +307,7 @@ class CameraAdapter(CameraDevice):
     async def _move(
         self, kind: int, value: float, now: float, to: Callable[[float], Any], at: Callable[[float], Any]
     ) -> bool:
-        """Move zoom or focus. The numbers of CAMERA_ZOOM_TYPE are those of SET_FOCUS_TYPE."""
+        """Move zoom or focus, because CAMERA_ZOOM_TYPE and SET_FOCUS_TYPE have the same numbers."""
         if kind == CameraZoomType.STEP and math.isfinite(now):
             kind, value = CameraZoomType.RANGE, max(0.0, min(100.0, now + value * _STEP_PERCENT))
         low, move = (0.0, to) if kind == CameraZoomType.RANGE else (-1.0, at)

@@ -1,4 +1,4 @@
-"""Commands of a component: handlers that are coroutines, with progress, cancellation and results."""
+"""Command handlers of a component, which may be coroutines: progress, cancellation and results."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _RELATIVE = frozenset((MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_AL
 
 
 class CommandResult(Snapshot):
-    """Result of a command handler: MAV_RESULT, and two numbers whose meaning depends on the command."""
+    """Result of a command handler: a MAV_RESULT, and two numbers whose meaning depends on the command."""
 
     result: int = MavResult.ACCEPTED.value
     progress: int = 0
@@ -57,7 +57,7 @@ class CommandRequest:
 
     @property
     def params(self) -> tuple[float, ...]:
-        """Parameters 1 to 7; positions are in degrees, whatever message brought them."""
+        """Parameters 1 to 7; positions are in degrees for COMMAND_LONG and COMMAND_INT."""
         numbers = list(self._command.params)
         if self._command.frame is not None and self._command.frame not in (MavFrame.MISSION, MavFrame.LOCAL_NED):
             numbers[4:6] = (number / 1e7 for number in numbers[4:6])
@@ -77,10 +77,10 @@ class CommandRequest:
             return Position(latitude, longitude, altitude_amsl_m=known)
         if frame in _RELATIVE:
             return Position(latitude, longitude, altitude_relative_m=known)
-        raise InvalidArgument(f"frame {frame} is not allowed: a global frame")
+        raise InvalidArgument(f"frame = {frame} is not allowed: a global MAV_FRAME")
 
     def report_progress(self, percent: int) -> None:
-        """Send IN_PROGRESS with this percentage (0 to 100) now, and from then on."""
+        """Send IN_PROGRESS with this percentage (0 to 100) now, and repeat it until the next report."""
         if not 0 <= percent <= 100:
             raise InvalidArgument(f"percent = {percent} is not allowed: 0 to 100")
         self._report(percent)
@@ -90,7 +90,7 @@ class CommandRequest:
 
 
 def outcome_of(value: object) -> Outcome:
-    """Convert what a handler has returned: None is ACCEPTED."""
+    """Convert the return value of a handler to a result; None becomes ACCEPTED."""
     if value is None or value is True:
         return Outcome(MavResult.ACCEPTED)
     if isinstance(value, CommandResult):
@@ -117,13 +117,13 @@ def result_of(error: BaseException) -> int:
 
 
 class ComponentCommands:
-    """Commands of one component. Handlers run as tasks that end with the component."""
+    """Command handlers of one component, which run as tasks until the component closes."""
 
     def __init__(self, host: ComponentHost, tasks: BackgroundTasks) -> None:
         self.uses_threads = False
         """True to call plain functions in threads, for blocking programs."""
         self.handlers: dict[int, CommandHandler] = {}
-        """MAV_CMD → handler; protocol servers add their own."""
+        """Maps MAV_CMD to handler; protocol servers add theirs."""
         self.server: CommandDispatcher = CommandDispatcher(host, self.handlers)
         self._running = RunningCommands(host, self.server)
         self._host, self._tasks = host, tasks
@@ -133,14 +133,14 @@ class ComponentCommands:
         """Register a handler.
 
         Raises:
-            InvalidArgument: the command has a handler, or the function's arguments cannot be read.
+            InvalidArgument: the command already has a handler, or an annotation of the function is not supported.
         """
         if command in self.handlers:
             raise InvalidArgument(f"{command_name(command)} already has a handler")
         self.handlers[command] = partial(self._execute, function, arguments_of(function))
 
     def add_guarded(self, handlers: Mapping[int, CommandHandler]) -> None:
-        """Register handlers of a protocol server that call the program; an error of the program is the result."""
+        """Register handlers of a protocol server that call the program's code, whose exceptions become results."""
 
         def guard(handler: CommandHandler) -> CommandHandler:
             def guarded(command: ReceivedCommand) -> int | CommandProgress | None:
@@ -155,12 +155,12 @@ class ComponentCommands:
         self.handlers.update({command: guard(handler) for command, handler in handlers.items()})
 
     async def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Call a function of the program: a coroutine function, or a plain one, in a thread if ``uses_threads``."""
+        """Call a function or coroutine function of the program; with ``uses_threads``, a function runs in a thread."""
         found = self.begin(function, *arguments)
         return await found if inspect.isawaitable(found) else found
 
     def begin(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Like `call`, but return the result of a plain function at once, or an awaitable."""
+        """Like `call`, but return either the result of a plain function or an awaitable."""
         if inspect.iscoroutinefunction(function) or not self.uses_threads:
             return function(*arguments)
         return self._call_in_thread(function, *arguments)
@@ -190,7 +190,7 @@ class ComponentCommands:
             nonlocal is_cancelled
             if task:
                 task[0].cancel()
-            elif not is_cancelled:  # the task has not begun yet
+            elif not is_cancelled:  # The task has not started yet.
                 is_cancelled = True
                 if inspect.iscoroutine(answer):
                     answer.close()
@@ -199,13 +199,13 @@ class ComponentCommands:
         running = self._running.start(command, cancel)
         if running is None:
             return
-        started = running  # not None, also for the closure
+        started = running  # Tells type checkers that it is not None in the closure.
         loop = asyncio.get_running_loop() if self.uses_threads else None
 
         def report(percent: int) -> None:
             if loop is None:
                 self._running.report(started, percent)
-            else:  # called in a thread
+            else:  # Called from a thread.
                 loop.call_soon_threadsafe(self._running.report, started, percent)
 
         request = CommandRequest(command, report)

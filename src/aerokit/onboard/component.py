@@ -1,4 +1,4 @@
-"""``OnboardComponent``: this program as a MAVLink component: heartbeat, commands, parameters, files, messages."""
+"""``OnboardComponent``: your program as a MAVLink component with commands, parameters, files and messages."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 HEARTBEAT_INTERVAL_S = 1.0
 MAX_UNSENT_BYTES = 8192
-"""Bursts of files pause while more bytes wait in the link."""
+"""MAVFTP bursts pause while more bytes than this wait in the link."""
 MAX_METADATA_BYTES = 1 << 20
 MAVLINK_VERSION = 3
 
@@ -44,10 +44,10 @@ HandlerT = TypeVar("HandlerT", bound=Callable[..., Any])
 
 @checks_arguments
 class OnboardComponent:
-    """This program as one MAVLink component, returned by :func:`aerokit.component`.
+    """Your program as one MAVLink component, returned by :func:`aerokit.component`.
 
-    It sends its own heartbeat, executes commands, and offers parameters, files, missions and messages. Requests for
-    anything else get the standard's answers: UNSUPPORTED, DENIED, DOES_NOT_EXIST.
+    The component sends its own heartbeat, executes commands, and serves parameters, files, missions and messages. It
+    answers requests for anything else as MAVLink requires: UNSUPPORTED, DENIED, DOES_NOT_EXIST.
     """
 
     def __init__(
@@ -132,11 +132,11 @@ class OnboardComponent:
 
     @property
     def time_boot_ms(self) -> int:
-        """Milliseconds since the component started, for messages."""
+        """Milliseconds since the component started, for the field ``time_boot_ms`` of messages."""
         return self._host.time_boot_ms
 
     def set_state(self, state: int, *, base_mode: int = 0, custom_mode: int = 0) -> None:
-        """Change what the heartbeat reports, and send it at once.
+        """Change the state and mode in the heartbeat, and send a heartbeat at once.
 
         Args:
             state: MAV_STATE: ACTIVE, STANDBY, CALIBRATING, CRITICAL …
@@ -163,19 +163,21 @@ class OnboardComponent:
     def command(self, command: int) -> Callable[[HandlerT], HandlerT]:
         """Decorator: execute a MAV_CMD by a function or coroutine function.
 
-        Its first argument is the :class:`~aerokit.onboard.CommandRequest`, the others are the command's parameters in
-        order, or as :class:`~aerokit.onboard.Param` says. They are annotated with float, int, bool or an enum, with
-        ``| None`` if the parameter may be missing, and with ``Annotated[float, Range(0, 50)]``. A command with other
-        values is DENIED, and the function is not called.
+        The function's first argument is the :class:`~aerokit.onboard.CommandRequest`. The other arguments are the
+        command's parameters in order, or as :class:`~aerokit.onboard.Param` says. Annotate each with float, int, bool
+        or an enum, add ``| None`` if the parameter may be missing, and limit it by ``Annotated[float, Range(0, 50)]``.
+        A command with other values is DENIED without a call of the function.
 
-        While a coroutine runs, the sender gets IN_PROGRESS. COMMAND_CANCEL cancels it (CANCELLED). It returns None for
-        ACCEPTED, a MAV_RESULT or a :class:`~aerokit.onboard.CommandResult`. Errors are the result and a status text:
-        InvalidArgument and ValueError are DENIED, BusyError is TEMPORARILY_REJECTED, NotSupported is UNSUPPORTED,
-        others are FAILED. A second command of the same kind is TEMPORARILY_REJECTED meanwhile; a repeated transmission
-        is not executed again.
+        The function returns None for ACCEPTED, a MAV_RESULT, or a :class:`~aerokit.onboard.CommandResult`. An exception
+        becomes the result and a status text: InvalidArgument and ValueError DENIED, BusyError TEMPORARILY_REJECTED,
+        NotSupported UNSUPPORTED, all others FAILED.
+
+        While a coroutine runs, the sender gets IN_PROGRESS, and COMMAND_CANCEL cancels the coroutine (CANCELLED).
+        Another command with the same MAV_CMD is TEMPORARILY_REJECTED meanwhile; a repeated transmission is not executed
+        again.
 
         Raises:
-            InvalidArgument: the command has a handler, or the function's arguments cannot be read.
+            InvalidArgument: the command already has a handler, or an annotation of the function is not supported.
         """
 
         def register(function: HandlerT) -> HandlerT:
@@ -189,13 +191,13 @@ class OnboardComponent:
     def message(
         self, message_type: type[Message], *, hz: float = 0.0
     ) -> Callable[[Callable[[], Message | None]], Callable[[], Message | None]]:
-        """Decorator: send a message that a function returns, on request and at the intervals that others set.
+        """Decorator: send the message that a function returns, on request and at intervals that other programs set.
 
-        The function returns None while it has no values. ``hz`` is the rate at which it is sent to all from the start,
-        0 to 200; 0: only on request.
+        The function returns None while it has no values. ``hz`` (0 to 200) is the rate at which the message is sent to
+        all from the start; 0 sends it only on request.
 
         Raises:
-            InvalidArgument: ``hz`` is out of range, or the message has a function already.
+            InvalidArgument: ``hz`` is out of range, or the message already has a function.
         """
 
         def register(function: Callable[[], Message | None]) -> Callable[[], Message | None]:
@@ -215,7 +217,7 @@ class OnboardComponent:
         self._host.send(message)
 
     def send_text(self, text: str, *, severity: int = MavSeverity.INFO.value) -> None:
-        """Send a status text (STATUSTEXT) to all: ASCII, at most 254 characters; the rest is cut.
+        """Send a status text in ASCII to all (STATUSTEXT); a text of more than 254 characters is cut.
 
         Raises:
             InvalidArgument: ``severity`` is not a MAV_SEVERITY, 0 to 7.
@@ -224,10 +226,10 @@ class OnboardComponent:
         self._host.send_text(severity, text)
 
     def send_event(self, event_id: int, arguments: bytes = b"", *, severity: int = MavSeverity.INFO.value) -> None:
-        """Send an event (EVENT) to all; receivers that missed it get it again on request.
+        """Send an event to all (EVENT). A receiver that missed it can request it again.
 
         Args:
-            event_id: id in the component's event metadata: component id << 24, plus a number.
+            event_id: id in the component's event metadata, ``component_id << 24`` plus a number.
             arguments: at most 40 bytes.
             severity: MAV_SEVERITY, 0 to 7.
 
@@ -239,36 +241,37 @@ class OnboardComponent:
     # ------------------------------------------------------------------------- files and missions
 
     def serve_files(self, directory: str | Path, *, writable: bool = False) -> None:
-        """Offer the files of one directory by MAVFTP; nothing outside it can be reached, not even by links.
+        """Serve the files of one directory by MAVFTP; clients cannot leave it, not even by symbolic links.
 
-        Files are read and written on the event loop, in blocks of 239 bytes: use a local disk.
+        Files are read and written on the event loop, in blocks of 239 bytes, so the directory should be on a local
+        disk.
 
         Args:
             directory: existing directory.
-            writable: True to let every sender write, rename and remove files there.
+            writable: True if any sender may write, rename and remove files in the directory.
 
         Raises:
-            InvalidArgument: it is not a directory, or a directory is served already.
+            InvalidArgument: there is no such directory, or the component already serves one.
         """
         root = Path(directory)
         if not root.is_dir():
             raise InvalidArgument(f"directory = {str(directory)!r} is not an existing directory")
         if self._ftp.files.has_root:
-            raise InvalidArgument("serve_files was called twice")
+            raise InvalidArgument("serve_files was called before: a component serves one directory")
         self._ftp.files = DirectoryFiles(root, self._memory, is_writable=writable)
 
     def set_metadata(self, kind: MetadataKind, content: bytes) -> None:
-        """Offer a metadata file (JSON) by MAVFTP, and list it in the general metadata.
+        """Serve a metadata file (JSON) by MAVFTP, and list it in the general metadata file.
 
         https://mavlink.io/en/services/component_information.html
 
         Args:
-            kind: ``"commands"``, ``"peripherals"``, ``"events"`` or ``"actuators"``. The file of the parameters follows
-                from them.
-            content: the file, at most 1 MiB.
+            kind: ``"commands"``, ``"peripherals"``, ``"events"`` or ``"actuators"``. aerokit writes the file for the
+                parameters itself.
+            content: the content of the file, at most 1 MiB.
 
         Raises:
-            InvalidArgument: the file is larger, or the kind is another one.
+            InvalidArgument: the content is too large, or the kind is unknown.
         """
         if len(content) > MAX_METADATA_BYTES:
             raise InvalidArgument(f"content has {len(content)} bytes, at most {MAX_METADATA_BYTES} are allowed")
@@ -279,7 +282,7 @@ class OnboardComponent:
 
     @property
     def missions(self) -> ComponentMissions:
-        """Missions, fences and rally points that other programs upload and download; served from the first use on."""
+        """Missions, fences and rally points that other programs upload and download. The first access serves them."""
         if self._missions is None:
             self._missions = ComponentMissions(self._host, self._tasks, self._commands)
             self._streams.builders[m.MissionCurrent.ID] = self._missions._build_current
@@ -289,18 +292,18 @@ class OnboardComponent:
     # ---------------------------------------------------------------------------- ready-made parts
 
     def add_autopilot(self, driver: AutopilotDriver) -> None:
-        """Execute a ground station's commands by a program's vehicle: arm, mode, take-off, landing, return, reboot.
+        """Serve a ground station's commands to a vehicle: arm, mode, take-off, landing, return, reboot.
 
-        The component should have component id 1, a vehicle's ``type``, and ``autopilot=MavAutopilot.GENERIC``.
-        HEARTBEAT follows: armed after ``arm``, the mode after ``set_mode``. Send telemetry by :meth:`message`.
+        Open the component with component id 1, a vehicle's ``type``, and ``autopilot=MavAutopilot.GENERIC``. HEARTBEAT
+        reports armed after ``arm``, and the new mode after ``set_mode``. Send telemetry by :meth:`message`.
 
         Args:
-            driver: an instance of the program's class, see :class:`~aerokit.onboard.AutopilotDriver`.
+            driver: an instance of your subclass of :class:`~aerokit.onboard.AutopilotDriver`.
 
         Raises:
-            InvalidArgument: one of the commands has a handler.
+            InvalidArgument: one of these commands already has a handler.
         """
-        from aerokit.onboard.autopilot import add_autopilot  # Imported here because few components are one.
+        from aerokit.onboard.autopilot import add_autopilot  # Imported here, because few components need it.
 
         add_autopilot(self._services, driver, self._report_flight)
 
@@ -313,53 +316,54 @@ class OnboardComponent:
         self.set_state(before.system_status, base_mode=int(flags), custom_mode=mode)
 
     def add_camera(self, camera: CameraDriver) -> None:
-        """Serve the camera protocol: photos, series, videos, storage, streams, zoom, focus, tracking, settings.
+        """Serve the camera protocol: photos, videos, storage, streams, zoom, focus, tracking, settings.
 
         https://mavlink.io/en/services/camera.html
 
         Args:
-            camera: an instance of the program's class, see :class:`~aerokit.onboard.CameraDriver`.
+            camera: an instance of your subclass of :class:`~aerokit.onboard.CameraDriver`.
 
         Raises:
-            InvalidArgument: the component has a camera, or its definition file and parameters exclude each other.
+            InvalidArgument: the component already has a camera, or has parameters although the camera has a definition
+                file.
             FileFormatError: the definition file is damaged.
         """
-        from aerokit.onboard.parts import add_camera  # Imported here because few components have one.
+        from aerokit.onboard.parts import add_camera  # Imported here, because few components need it.
 
         add_camera(self._services, camera)
 
     def add_gimbal(self, gimbal: GimbalDriver) -> None:
-        """Serve the gimbal protocol v2, as gimbal device and gimbal manager in one component.
+        """Serve the gimbal protocol v2, as a gimbal device and its gimbal manager in one component.
 
         https://mavlink.io/en/services/gimbal_v2.html
 
         Args:
-            gimbal: an instance of the program's class, see :class:`~aerokit.onboard.GimbalDriver`.
+            gimbal: an instance of your subclass of :class:`~aerokit.onboard.GimbalDriver`.
 
         Raises:
-            InvalidArgument: the component has a gimbal.
+            InvalidArgument: the component already has a gimbal.
         """
-        from aerokit.onboard.parts import add_gimbal  # Imported here because few components have one.
+        from aerokit.onboard.parts import add_gimbal  # Imported here, because few components need it.
 
         add_gimbal(self._services, gimbal)
 
     def add_winch(self, winch: WinchDriver) -> None:
-        """Execute DO_WINCH by a program's winch, and send WINCH_STATUS at 5 Hz.
+        """Serve DO_WINCH by your subclass of :class:`~aerokit.onboard.WinchDriver`, and send WINCH_STATUS at 5 Hz.
 
         Raises:
-            InvalidArgument: the component has a winch.
+            InvalidArgument: the component already has a winch.
         """
-        from aerokit.onboard.devices import add_winch  # Imported here because few components have one.
+        from aerokit.onboard.devices import add_winch  # Imported here, because few components need it.
 
         add_winch(self._services, winch)
 
     def add_gripper(self, grab: Callable[[], Awaitable[Any]], release: Callable[[], Awaitable[Any]]) -> None:
-        """Execute DO_GRIPPER by two coroutine functions, which return when the gripper has moved.
+        """Serve DO_GRIPPER by two coroutine functions, which return when the gripper has moved.
 
         Raises:
-            InvalidArgument: the component has a gripper.
+            InvalidArgument: the component already has a gripper.
         """
-        from aerokit.onboard.devices import add_gripper  # Imported here because few components have one.
+        from aerokit.onboard.devices import add_gripper  # Imported here, because few components need it.
 
         add_gripper(self._services, grab, release)
 
@@ -367,21 +371,22 @@ class OnboardComponent:
         """Answer ARM_AUTHORIZATION_REQUEST (https://mavlink.io/en/services/arm_authorization.html).
 
         Args:
-            authorize: function or coroutine function of the vehicle's system id. It returns for how many seconds (at
-                most 255) arming is allowed, or raises an error, whose text is sent as status text: DENIED. It may also
-                return a :class:`~aerokit.onboard.CommandResult` with a MAV_ARM_AUTH_DENIED_REASON as ``detail``.
+            authorize: function or coroutine function, called with the vehicle's system id. It returns the number of
+                seconds for which arming is allowed, at most 255. An exception denies arming, and its text is sent as
+                status text. To give a reason, return a :class:`~aerokit.onboard.CommandResult` with a
+                MAV_ARM_AUTH_DENIED_REASON as ``detail``.
 
         Raises:
-            InvalidArgument: the component has an arm authorizer.
+            InvalidArgument: the component already has an arm authorizer.
         """
-        from aerokit.onboard.devices import add_arm_authorizer  # Imported here because few components are one.
+        from aerokit.onboard.devices import add_arm_authorizer  # Imported here, because few components need it.
 
         add_arm_authorizer(self._services, authorize)
 
     @property
     def sources(self) -> ComponentSources:
-        """Sends measurements to the autopilot: obstacles, traffic, landing targets, GNSS corrections."""
-        from aerokit.onboard.sources import ComponentSources  # Imported here because few components measure.
+        """Measurements for the autopilot: obstacles, traffic, landing targets, GNSS corrections."""
+        from aerokit.onboard.sources import ComponentSources  # Imported here, because few components need it.
 
         if self._sources is None:
             self._sources = ComponentSources(self._host)

@@ -24,7 +24,7 @@ _TEMPERATURE_UNKNOWN = 0x7FFF
 
 
 class WinchReport(Snapshot):
-    """State of a winch for WINCH_STATUS; None for unknown values. ``flags`` are MAV_WINCH_STATUS_FLAG bits."""
+    """State of a winch for WINCH_STATUS; unknown values are None. ``flags`` are MAV_WINCH_STATUS_FLAG bits."""
 
     length_m: float | None = None
     speed_m_s: float | None = None
@@ -33,10 +33,10 @@ class WinchReport(Snapshot):
 
 
 class WinchDriver:
-    """Base class of a program's winch; pass an instance to :meth:`OnboardComponent.add_winch`.
+    """Base class for your program's winch; pass an instance to :meth:`OnboardComponent.add_winch`.
 
-    Override what the winch can do, as coroutines; other actions are UNSUPPORTED. A coroutine returns when the action
-    has ended: the sender gets IN_PROGRESS meanwhile, and can cancel it.
+    Override the coroutines for the actions that the winch has; other actions are UNSUPPORTED. A coroutine returns when
+    the action has ended. Until then the sender gets IN_PROGRESS, and can cancel the command.
     """
 
     async def relax(self) -> None:
@@ -44,11 +44,11 @@ class WinchDriver:
         raise NotImplementedError
 
     async def pay_out(self, length_m: float, rate_m_s: float) -> None:
-        """Wind the line out (positive length) or in, at this rate, which is above 0."""
+        """Wind the line out (positive length) or in (negative length); the rate is above 0."""
         raise NotImplementedError
 
     async def set_rate(self, rate_m_s: float) -> None:
-        """Wind out (positive) or in at this rate until the next command."""
+        """Wind the line out (positive rate) or in (negative rate) until the next command."""
         raise NotImplementedError
 
     async def lock(self) -> None:
@@ -80,7 +80,7 @@ class WinchDriver:
         raise NotImplementedError
 
     def report(self) -> WinchReport:
-        """Return the state; called at 5 Hz."""
+        """Return the state of the winch; called at 5 Hz."""
         return WinchReport()
 
 
@@ -147,7 +147,7 @@ def add_arm_authorizer(services: ComponentServices, authorize: Authorize) -> Non
 
     async def arm_authorization(request: CommandRequest, system_id: int) -> CommandResult:
         try:
-            # PX4 sends 0 for itself (ArmAuthorization.cpp).
+            # PX4 sends system id 0 for itself (ArmAuthorization.cpp).
             seconds = await services.commands.call(authorize, system_id or request.sender[0])
         except Exception as error:
             services.host.send_text(MavSeverity.WARNING, f"arming denied: {error_text(error)}")
@@ -158,7 +158,7 @@ def add_arm_authorizer(services: ComponentServices, authorize: Authorize) -> Non
             return seconds
         if not 0 < seconds <= MAX_AUTHORIZATION_S:
             raise ValueError(f"the authorizer returned {seconds!r}, not 1 to {MAX_AUTHORIZATION_S} seconds")
-        # The standard has the seconds in `progress`; PX4 reads them from `result_param2` (ArmAuthorization.cpp).
+        # The standard puts the seconds into `progress`; PX4 reads them from `result_param2` (ArmAuthorization.cpp).
         return CommandResult(MavResult.ACCEPTED, progress=math.ceil(seconds), detail=math.ceil(seconds))
 
     services.commands.add(MavCmd.ARM_AUTHORIZATION_REQUEST, arm_authorization)

@@ -20,13 +20,13 @@ _UNAVAILABLE = 0  # MAV_EVENT_ERROR_REASON_UNAVAILABLE
 
 
 def check_severity(severity: int) -> None:
-    """Raise InvalidArgument unless it is a MAV_SEVERITY."""
+    """Raise InvalidArgument unless ``severity`` is a MAV_SEVERITY."""
     if not MavSeverity.EMERGENCY <= severity <= MavSeverity.DEBUG:
         raise InvalidArgument(f"severity = {severity} is not allowed: 0 (EMERGENCY) to 7 (DEBUG)")
 
 
 class EventSender:
-    """Sends EVENT, and sends the last 64 events again on request."""
+    """Sends EVENT messages, and repeats any of the last 64 events on request."""
 
     def __init__(self, host: ComponentHost) -> None:
         self._host = host
@@ -72,7 +72,7 @@ def answer_pings(host: ComponentHost) -> None:
     """Answer PING requests and TIMESYNC requests."""
 
     def on_ping(ping: m.Ping, channel: Channel) -> None:
-        if ping.target_system == 0 and ping.target_component == 0:  # else it is the answer to another component
+        if ping.target_system == 0 and ping.target_component == 0:  # With a target, it is an answer.
             host.send(m.Ping(ping.time_usec, ping.seq, *channel), channel)
 
     def on_timesync(message: m.Timesync, channel: Channel) -> None:

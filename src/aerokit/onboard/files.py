@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
 
 MAX_FILE_BYTES = 1 << 30
-"""Size limit of a file that a client writes."""
+"""Maximum size of a file that a client writes."""
 MAX_ENTRIES = 10_000
-"""Entries of a directory that are listed."""
+"""Maximum number of directory entries that are listed."""
 _NO_LINK = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0)
-# Numbers of Linux, which MAVFTP clients expect on every platform.
+# Linux's error numbers, which MAVFTP clients expect on every platform.
 _NUMBERS = {errno.ENOTEMPTY: 39, errno.ELOOP: ENOENT, errno.ENAMETOOLONG: 36}
 
 
@@ -64,11 +64,11 @@ class _DiskFile(FileHandle):
 
 
 class DirectoryFiles:
-    """The regular files below one directory, and files in memory beside them.
+    """Serves the regular files below one directory, and files in memory.
 
-    Links are neither followed nor listed, wherever they lead, and ``..`` is refused, so that nothing outside the
-    directory can be read, written or named. Devices and pipes cannot be opened. ``memory`` has files that the component
-    itself offers; they hide files of the same path and cannot be changed.
+    Symbolic links are neither followed nor listed, and ``..`` is refused, so that clients cannot reach anything outside
+    the directory. Devices and pipes cannot be opened. ``memory`` has the component's own files; they hide files with
+    the same path, and clients cannot change them.
     """
 
     def __init__(self, root: Path | None, memory: FileTree, *, is_writable: bool) -> None:
@@ -78,7 +78,7 @@ class DirectoryFiles:
 
     @property
     def has_root(self) -> bool:
-        """True if a directory is served, not only files in memory."""
+        """True if a directory is served in addition to the files in memory."""
         return self._root is not None
 
     def __contains__(self, path: str) -> bool:
@@ -173,7 +173,7 @@ class DirectoryFiles:
         return target
 
     def _path(self, path: str) -> Path:
-        """Return the path below the root; FileFault if it leads out of it or over a link."""
+        """Return the path below the root; raise FileFault if it leaves the root or contains a symbolic link."""
         if self._root is None:
             raise FileFault(ENOENT)
         target = self._root

@@ -1,4 +1,4 @@
-"""A gimbal device with its gimbal manager for a component."""
+"""``GimbalDriver``: base class for your program's gimbal, for which aerokit serves the gimbal protocol."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ _FULL_TURN_DEG = (-180.0, 180.0)
 
 
 class GimbalTarget(Snapshot):
-    """Target of a gimbal: angles or rates, in degrees and degrees per second.
+    """Target of a gimbal: angles in degrees, or rates in degrees per second.
 
     Roll and pitch are relative to the horizon; yaw is relative to the vehicle's nose, or to north if ``yaw_locked``.
-    ``angles`` is None for rates, ``rates`` is None for angles.
+    One of ``angles`` and ``rates`` is None.
     """
 
     angles: tuple[float, float, float] | None
@@ -35,18 +35,18 @@ class GimbalTarget(Snapshot):
 
 
 class GimbalDriver:
-    """Base class of a program's gimbal; pass an instance to :meth:`OnboardComponent.add_gimbal`.
+    """Base class for your program's gimbal; pass an instance to :meth:`OnboardComponent.add_gimbal`.
 
-    Override :meth:`point` and :meth:`attitude`. Only the program in control can point it: others are DENIED, as the
-    protocol says (DO_GIMBAL_MANAGER_CONFIGURE).
+    Override :meth:`point` and :meth:`attitude`. Only the component in control (DO_GIMBAL_MANAGER_CONFIGURE) can point
+    the gimbal; others are DENIED.
 
     Args:
         vendor: at most 32 bytes.
         model: at most 32 bytes.
-        roll_deg: smallest and greatest angle.
-        pitch_deg: smallest and greatest angle.
-        yaw_deg: smallest and greatest angle.
-        max_rate_deg_s: rate for a full deflection of manual control.
+        roll_deg: minimum and maximum roll angle.
+        pitch_deg: minimum and maximum pitch angle.
+        yaw_deg: minimum and maximum yaw angle.
+        max_rate_deg_s: maximum rate, which full deflection in manual control commands.
         attitude_hz: rate of GIMBAL_DEVICE_ATTITUDE_STATUS, 0 to 100.
     """
 
@@ -63,9 +63,11 @@ class GimbalDriver:
     ) -> None:
         for name, (low, high) in (("roll_deg", roll_deg), ("pitch_deg", pitch_deg), ("yaw_deg", yaw_deg)):
             if not -360.0 <= low <= high <= 360.0:
-                raise InvalidArgument(f"{name} = ({low}, {high}) is not allowed: a smallest and a greatest angle")
+                raise InvalidArgument(f"{name} = ({low}, {high}) is not allowed: minimum and maximum, −360 to 360")
         if not max_rate_deg_s > 0 or not 0 <= attitude_hz <= 100:
-            raise InvalidArgument("max_rate_deg_s must be above 0, attitude_hz 0 to 100")
+            raise InvalidArgument(
+                f"max_rate_deg_s = {max_rate_deg_s}, attitude_hz = {attitude_hz} are not allowed: above 0, and 0 to 100"
+            )
         self.vendor: str = vendor
         self.model: str = model
         self.limits_deg: tuple[tuple[float, float], ...] = (roll_deg, pitch_deg, yaw_deg)
@@ -73,7 +75,7 @@ class GimbalDriver:
         self.attitude_hz: float = attitude_hz
 
     def point(self, target: GimbalTarget) -> None:
-        """Begin to turn to a target, within the limits. Called on the event loop: return at once."""
+        """Start to turn to a target within the limits. Called on the event loop; must return at once."""
         raise NotImplementedError
 
     def attitude(self) -> tuple[float, float, float]:
@@ -85,12 +87,12 @@ class GimbalDriver:
         return 0.0
 
     def look_at(self, position: Position | None) -> None:
-        """Begin to point at a position, None: ahead. Override it if the gimbal can; otherwise it is UNSUPPORTED."""
+        """Start to point at a position, or ahead for None. If it is not overridden, such commands are UNSUPPORTED."""
         raise NotImplementedError
 
 
 class GimbalAdapter(GimbalMount):
-    """Serves the gimbal protocol for a program's gimbal."""
+    """Serves the gimbal protocol for a `GimbalDriver`."""
 
     def __init__(self, gimbal: GimbalDriver, host: ComponentHost) -> None:
         self.vendor: str = gimbal.vendor
@@ -132,7 +134,7 @@ class GimbalAdapter(GimbalMount):
     def point(self, angles: Angles, flags: int, *, locked: bool) -> None:
         limited = [max(low, min(high, angle)) for angle, (low, high) in zip(angles, self.limits, strict=True)]
         if locked:
-            limited[2] = angles[2]  # the limits are relative to the nose
+            limited[2] = angles[2]  # The yaw limits are relative to the nose, not to north.
         roll, pitch, yaw = map(math.degrees, limited)
         retracted = bool(flags & Flags.RETRACT)
         self._apply(GimbalTarget((roll, pitch, yaw), None, locked, retracted), flags)

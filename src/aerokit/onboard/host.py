@@ -1,4 +1,4 @@
-"""``ComponentHost``: one component on a connection, for which the protocol servers work."""
+"""``ComponentHost``: receives and sends messages for one component on a connection."""
 
 from __future__ import annotations
 
@@ -23,15 +23,16 @@ logger: logging.Logger = logging.getLogger("aerokit")
 
 TEXT_SIZE = 50
 MAX_TEXT_SIZE = 254
-"""Characters of a status text; the rest is cut."""
+"""Maximum number of characters of a status text; longer texts are cut."""
 _COMMANDS = (m.CommandLong.ID, m.CommandInt.ID)
 
 
 class ComponentHost:
     """Delivers messages that are addressed to one component of a connection, and sends its messages.
 
-    A channel is the (system id, component id) of the sender. ``accepts`` are the system ids whose messages are
-    processed; None: all. ``knows_command`` decides whether a command to all components is for this one.
+    A channel is the (system id, component id) of a sender. ``accepts`` has the system ids whose messages are processed;
+    None means all. ``knows_command`` decides whether this component executes a command that is addressed to all
+    components.
     """
 
     def __init__(
@@ -60,7 +61,7 @@ class ComponentHost:
         return int((self.now - self._started_at) * 1000.0) & 0xFFFFFFFF
 
     def on(self, message_class: type[Message], handler: Handler) -> None:
-        """Call a handler with messages that are addressed to this component or to all, and their sender."""
+        """Call a handler with each message to this component or to all components, and with its sender."""
 
         def on_message(message: Message) -> None:
             sender = sender_of(message)
@@ -80,7 +81,7 @@ class ComponentHost:
         return component != 0 or message.ID not in _COMMANDS or self.knows_command(message.command)  # type: ignore[attr-defined]
 
     def send(self, message: Message, channel: Channel = None) -> None:
-        """Send to a system, or to all if ``channel`` is None. Does nothing after the end of the connection."""
+        """Send a message to one system, or to all if ``channel`` is None. Does nothing after the connection ended."""
         if self._is_closed or not self.connection.is_open:
             return
         to = None if channel is None else channel[0]
@@ -90,7 +91,7 @@ class ComponentHost:
             self.connection.send_as(self._encoder, message, to=to)
 
     def send_text(self, severity: int, text: str) -> None:
-        """Send a STATUSTEXT to all; more than 50 characters are sent in chunks."""
+        """Send a STATUSTEXT to all; a text of more than 50 characters is sent in chunks."""
         data = "".join(char if char.isprintable() else " " for char in text)
         data = data.encode("ascii", "replace").decode()[:MAX_TEXT_SIZE]
         if len(data) <= TEXT_SIZE:
@@ -99,11 +100,11 @@ class ComponentHost:
         self._text_id = self._text_id % 0xFFFF + 1
         for number, start in enumerate(range(0, len(data), TEXT_SIZE)):
             self.send(m.Statustext(severity, data[start : start + TEXT_SIZE], self._text_id, number))
-        if len(data) % TEXT_SIZE == 0:  # a full last chunk is followed by an empty one
+        if len(data) % TEXT_SIZE == 0:  # An empty chunk follows a full last one.
             self.send(m.Statustext(severity, "", self._text_id, len(data) // TEXT_SIZE))
 
     def report_error(self, what: str, error: Exception) -> None:
-        """Send an error of the program's code as status text, and log it unless it is an error of aerokit."""
+        """Send an exception of the program's code as status text, and log it unless it is one of aerokit's."""
         text = f"{what}: {error_text(error)}"
         if not isinstance(error, AerokitError):
             logger.error("component %d/%d: %s", self.system_id, self.component_id, text, exc_info=error)
@@ -129,7 +130,7 @@ class ComponentHost:
         self._detachments.clear()
 
     def _guarded(self, action: Callable[[], Any]) -> None:
-        """Run a server's code: an error in it is logged, and the component continues."""
+        """Run a server's code; log an exception, so that the component continues."""
         try:
             action()
         except AerokitError as error:
@@ -139,5 +140,5 @@ class ComponentHost:
 
 
 def error_text(error: Exception) -> str:
-    """Return the text of an error, or its type if it has none."""
+    """Return the text of an exception, or the name of its type if it has none."""
     return str(error) or type(error).__name__

@@ -27,7 +27,7 @@ GENERAL_PATH, PARAMETER_PATH = "/general.json", "/parameter.json"
 class Identity(Snapshot):
     """Name and versions of a component.
 
-    ``version`` has three or four numbers, ``"1.4.2"``. ``uid`` is a serial number of 64 bits, 0 if there is none.
+    ``version`` has three or four numbers: ``"1.4.2"``. ``uid`` is a 64-bit serial number, 0 if there is none.
     """
 
     vendor: str = "aerokit"
@@ -48,7 +48,7 @@ class Identity(Snapshot):
 
     @property
     def version_number(self) -> int:
-        """The version as AUTOPILOT_VERSION has it: a byte for each number."""
+        """The version as in AUTOPILOT_VERSION: one byte for each number."""
         parts = [*self.version.split("."), "0", "0", "0"][:4]
         if not all(part.isdecimal() and int(part) <= 255 for part in parts):
             raise InvalidArgument(f"version = {self.version!r} is not allowed: numbers up to 255, such as '1.4.2'")
@@ -63,7 +63,7 @@ class IdentityMessages:
         self.capabilities: int = int(Can.MAVLINK2 | Can.COMMAND_INT)
         """MAV_PROTOCOL_CAPABILITY of the protocols that are served."""
         self.metadata: dict[int, tuple[str, Callable[[], bytes]]] = {}
-        """COMP_METADATA_TYPE → path and content of a metadata file."""
+        """Maps COMP_METADATA_TYPE to path and content of a metadata file."""
         self._host, self._identity, self._memory = host, identity, memory
 
     def builders(self) -> dict[int, Builder]:
@@ -103,7 +103,7 @@ class IdentityMessages:
         )
 
     def update_files(self) -> int:
-        """Write the metadata files, and return the checksum of the general one."""
+        """Write the metadata files, and return the checksum of the general metadata file."""
         entries = []
         for kind, (path, content) in self.metadata.items():
             data = content()
@@ -120,6 +120,6 @@ class IdentityMessages:
         return [m.ComponentMetadata(self._host.time_boot_ms, checksum, f"mftp://{GENERAL_PATH}")]
 
     def offer(self, kind: CompMetadataType, path: str, content: Callable[[], bytes]) -> None:
-        """Offer a metadata file; ``content()`` is called for each request."""
+        """Serve a metadata file; ``content()`` is called for each request."""
         self.metadata[kind] = (path, content)
         self.update_files()

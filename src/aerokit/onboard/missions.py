@@ -27,7 +27,7 @@ _NAMES = {"mission": MavMissionType.MISSION, "fence": MavMissionType.FENCE, "ral
 class ComponentMissions:
     """Missions, fences and rally points that other programs upload to this component.
 
-    By default every valid list is accepted and stored. :meth:`on_upload` sets a function that decides.
+    By default every valid list is accepted and stored. :meth:`on_upload` registers a function that may refuse a list.
     """
 
     def __init__(self, host: ComponentHost, tasks: BackgroundTasks, commands: ComponentCommands) -> None:
@@ -42,7 +42,7 @@ class ComponentMissions:
         return self._server.lists[_type_of(kind)]
 
     def replace(self, items: Sequence[MissionItem], kind: str = "mission") -> None:
-        """Replace a list from this program.
+        """Replace the items of one kind.
 
         Raises:
             InvalidArgument: there is no such kind.
@@ -52,16 +52,16 @@ class ComponentMissions:
     def on_upload(
         self, function: Callable[[str, tuple[MissionItem, ...]], Any]
     ) -> Callable[[str, tuple[MissionItem, ...]], Any]:
-        """Decorator: ``function(kind, items)`` decides about every upload, before it is stored and acknowledged.
+        """Decorator: ``function(kind, items)`` accepts or refuses each upload, before it is stored and acknowledged.
 
-        It refuses a list by raising InvalidArgument (INVALID, and a status text) or by returning a MAV_MISSION_RESULT.
-        It may be a coroutine function. An empty list is a request to clear.
+        To refuse a list, the function raises InvalidArgument (result INVALID, and a status text) or returns a
+        MAV_MISSION_RESULT. It may be a coroutine function. An empty list is a request to clear the list.
         """
         self._on_upload = function
         return function
 
     def on_set_current(self, function: Callable[[int], object]) -> Callable[[int], object]:
-        """Decorator: ``function(index)`` continues the mission at an item. Without it, such requests are refused."""
+        """Decorator: ``function(index)`` continues the mission at an item; without it, such requests are refused."""
         self._on_current = function
         return function
 
@@ -131,7 +131,7 @@ class ComponentMissions:
 
     def _current_command(self, request: CommandRequest, index: int) -> None:
         if not self._server.set_current(index):
-            raise InvalidArgument(f"item {index} is not possible")
+            raise InvalidArgument(f"the mission cannot continue at item {index}")
 
 
 def _result_of(verdict: object) -> int:

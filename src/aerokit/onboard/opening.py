@@ -1,4 +1,4 @@
-"""``aerokit.component``: this program as a MAVLink component, for the duration of an ``async with`` block."""
+"""``aerokit.component``: makes your program a MAVLink component for the duration of an ``async with`` block."""
 
 from __future__ import annotations
 
@@ -50,24 +50,25 @@ async def component(
     peers: PeerFilter | None = None,
     may_move: bool = False,
 ) -> AsyncIterator[OnboardComponent]:
-    """Be a MAVLink component for the duration of the ``async with`` block: a payload, a camera, a companion computer.
+    """Make your program a MAVLink component, such as a camera, for the duration of the ``async with`` block.
 
-    Runs in the current asyncio loop. Other programs get answers while the loop runs, also while your block waits. When
-    the block ends, running commands are cancelled and answered, and the heartbeat stops.
+    The component runs on the current event loop, and answers other programs while your block waits. When the block
+    ends, running commands are cancelled and answered, and the heartbeat stops.
 
     Args:
         address: a connection string, a link or a list of them, as for :func:`aerokit.open_connection`.
-        connection: an open connection, instead of an address: for several components, or a component beside a ground
-            station, on one link. The arguments after ``accepts`` are not allowed then.
-        system_id: own system id, 1 to 255: that of the vehicle that carries the component.
-        component_id: own component id (MAV_COMPONENT), 1 to 255.
+        connection: an open connection instead of an address. Use it for several components on one link, or for a
+            component and a ground station. The arguments after ``accepts`` are not allowed then.
+        system_id: system id of the component, 1 to 255; use that of the vehicle that carries it.
+        component_id: component id (MAV_COMPONENT), 1 to 255.
         type: MAV_TYPE of the heartbeat: ONBOARD_CONTROLLER, CAMERA, GIMBAL, WINCH, GRIPPER …
         autopilot: MAV_AUTOPILOT of the heartbeat; INVALID for everything that is not a flight controller.
         identity: vendor, model and versions that the component reports.
-        parameters_file: JSON file that keeps the parameters; it is replaced atomically after each change. None: the
-            parameters start with their defaults.
+        parameters_file: JSON file that stores the parameters; it is replaced atomically after each change. None:
+            parameters are not stored.
         bytewise: True to encode integers in PARAM_VALUE bytewise, as PX4 does; False to cast them to float, as
-            ArduPilot does. The component announces it; clients that judge by the autopilot expect bytewise.
+            ArduPilot does. The component's capabilities announce the encoding. Clients that decide by the ``autopilot``
+            field expect bytewise.
         accepts: system ids whose messages are processed; None: all. Without signing, senders can claim any id.
         baud: bits per second of a serial link whose address has none.
         dialect: the messages that are decoded.
@@ -79,8 +80,8 @@ async def component(
         may_move: True to accept a silent sender from another IP address.
 
     Raises:
-        InvalidArgument: an argument is wrong; nothing was opened.
-        BusyError: the connection has a component with these ids already.
+        InvalidArgument: an argument is not allowed; nothing was opened.
+        BusyError: the connection already has a component with these ids.
         LinkOpenError: the link or the recording could not be opened.
         FileFormatError, OSError: ``parameters_file`` cannot be read.
     """
@@ -91,7 +92,7 @@ async def component(
         raise InvalidArgument("pass either an address or connection=…")
     own = (baud, mavlink_version, record, reconnect, peers, may_move, signing)
     if connection is not None and own != (57600, 2, None, False, None, False, None):
-        raise InvalidArgument("the connection is open: pass the arguments of the link to open_connection")
+        raise InvalidArgument("the arguments of a link are not allowed with connection=…: pass them to open_connection")
     async with AsyncExitStack() as stack:
         if connection is None:
             assert address is not None
@@ -114,7 +115,7 @@ async def component(
         connection.raise_if_ended()
         key = (system_id, component_id)
         if key in connection.components:
-            raise BusyError(f"this connection has a component {system_id}/{component_id} already")
+            raise BusyError(f"this connection already has a component {system_id}/{component_id}")
         found = OnboardComponent(
             connection,
             system_id=system_id,

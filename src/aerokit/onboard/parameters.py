@@ -1,4 +1,4 @@
-"""Parameters of a component: typed, with ranges and metadata, served by PARAM and PARAM_EXT."""
+"""``ComponentParameters``: typed parameters with ranges and metadata, served by PARAM and PARAM_EXT."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ class _Row:
 
 @checks_arguments
 class ComponentParameters(Mapping[str, ParameterValue]):
-    """Parameters that this component offers: name → value. Other programs read and set them by MAVLink.
+    """Parameters of a component, a mapping of names to values. Other programs read and set them by MAVLink.
 
-    Numbers are served by PARAM, texts and numbers by PARAM_EXT. A value that is out of range, of another type or
-    refused by ``on_set`` is not stored, and the sender gets the reason: PARAM_ERROR, or PARAM_EXT_ACK.
+    PARAM serves numbers, PARAM_EXT numbers and texts. A value that is out of range, of another type, or refused by
+    ``on_set`` is not stored, and PARAM_ERROR or PARAM_EXT_ACK reports the reason to the sender.
     """
 
     def __init__(self, host: ComponentHost, path: Path | None, *, bytewise: bool) -> None:
@@ -75,29 +75,31 @@ class ComponentParameters(Mapping[str, ParameterValue]):
         reboot_required: bool = False,
         on_set: Callable[..., object] | None = None,
     ) -> None:
-        """Offer a parameter. The type of ``default`` is its type: int (32 bits), float (32 bits) or str (128 bytes).
+        """Add a parameter with the type of ``default``: int (32 bits), float (32 bits) or str (128 bytes).
 
         Args:
             name: 1 to 16 ASCII characters without spaces.
-            default: value until another program or :meth:`set` changes it, or the file has one.
-            minimum: smallest allowed number; None: the minimum of the type.
-            maximum: greatest allowed number; None: the maximum of the type.
-            unit: for the metadata, ``"m/s"``.
-            description: for the metadata.
-            values: names of the allowed numbers; others are refused.
+            default: value until another program or :meth:`set` changes it. A value in the parameters file takes
+                precedence.
+            minimum: minimum of a number; None: the minimum of the type.
+            maximum: maximum of a number; None: the maximum of the type.
+            unit: unit for the metadata, such as ``"m/s"``.
+            description: description for the metadata.
+            values: maps each allowed number to its name; other numbers are refused.
             read_only: True if only this program can change it.
-            reboot_required: for the metadata.
-            on_set: called in the loop with a value that another program sets, before it is stored. It refuses the
-                value by raising InvalidArgument.
+            reboot_required: for the metadata: True if a change takes effect after a reboot.
+            on_set: called on the event loop with a value that another program sets, before it is stored. It raises
+                InvalidArgument to refuse the value.
 
         Raises:
-            InvalidArgument: the name is invalid or taken, the default is not allowed, or there are 1000 parameters.
+            InvalidArgument: the name is invalid or in use, the default is not allowed, or the component already has
+                1000 parameters.
         """
         check_name(name)
         if self._is_excluded:
             raise InvalidArgument("a component has either parameters or the settings of a camera definition")
         if name in self._rows:
-            raise InvalidArgument(f"parameter {name} was added twice")
+            raise InvalidArgument(f"parameter {name} was added before")
         if len(self._rows) >= MAX_COMPONENT_PARAMETERS:
             raise InvalidArgument(f"a component has at most {MAX_COMPONENT_PARAMETERS} parameters")
         if isinstance(default, bool) or type(default) not in _TYPES:
@@ -120,11 +122,11 @@ class ComponentParameters(Mapping[str, ParameterValue]):
             try:
                 row.value = self._checked(row, self._stored[name])
             except InvalidArgument as error:
-                logger.warning("%s: the default is used: %s", self._path, error)
+                logger.warning("%s: the stored value is not used, but the default: %s", self._path, error)
         self._rows[name] = row
         if fits_param_value(row.type):
             self._small_names.append(name)
-        if self._extended is None:  # not before, because a camera may serve its own settings by PARAM_EXT
+        if self._extended is None:  # Not earlier, because a camera may serve its own settings by PARAM_EXT.
             self._extended = TypedExtendedServer(self._host, _Store(self))
 
     def _give_way(self) -> None:
@@ -134,7 +136,7 @@ class ComponentParameters(Mapping[str, ParameterValue]):
         self._is_excluded = True
 
     def set(self, name: str, value: int | float | str) -> None:
-        """Change a value from this program, and announce it. ``on_set`` is not called.
+        """Change a value, and announce it to other programs. ``on_set`` is not called.
 
         Raises:
             InvalidArgument: there is no such parameter, or the value is not allowed.
@@ -144,7 +146,7 @@ class ComponentParameters(Mapping[str, ParameterValue]):
         self._classic.publish(name)
 
     def metadata(self, name: str) -> ParameterMetadata:
-        """Return unit, range and description of a parameter; InvalidArgument if there is none of this name."""
+        """Return unit, range and description of a parameter; raise InvalidArgument if there is no such parameter."""
         return self._row(name).metadata
 
     def __getitem__(self, name: str) -> ParameterValue:
@@ -194,7 +196,7 @@ class ComponentParameters(Mapping[str, ParameterValue]):
         return json.dumps({**self._stored, **values}, indent=1) + "\n"
 
     async def _save(self, path: Path) -> None:
-        """Write the file in a thread, because a memory card may need seconds, until it has the last change."""
+        """Write the file until it has the last change, in a thread, because a memory card may need seconds."""
         try:
             while self._is_dirty:
                 self._is_dirty = False
@@ -218,7 +220,7 @@ class ComponentParameters(Mapping[str, ParameterValue]):
 
 
 class _Store:
-    """The parameters, as the protocol servers use them."""
+    """Gives the protocol servers access to the parameters."""
 
     def __init__(self, parameters: ComponentParameters) -> None:
         self._parameters = parameters
@@ -263,7 +265,7 @@ class _Store:
 
 
 def _as_stored(limit: float | None, default: ParameterValue) -> float | None:
-    """Round a limit as values are, so that the limit itself is allowed."""
+    """Round a limit to 32 bits as values are rounded, so that the limit itself is allowed."""
     return to_float32(limit) if limit is not None and isinstance(default, float) else limit
 
 
@@ -284,13 +286,13 @@ def _metadata_entry(row: _Row) -> dict[str, Any]:
 
 
 def _read(path: Path | None) -> dict[str, Any]:
-    """Return the stored values; empty if there is no file yet."""
+    """Return the stored values; an empty dictionary if there is no file yet."""
     if path is None or not path.exists():
         return {}
     try:
         content = json.loads(read_text(path))
     except ValueError as error:
-        raise FileFormatError(f"{path} is not a file of parameters: {error}") from None
+        raise FileFormatError(f"{path} is not a parameter file: {error}") from None
     if not isinstance(content, dict):
-        raise FileFormatError(f"{path} is not a file of parameters: it is not a JSON object")
+        raise FileFormatError(f"{path} is not a parameter file: it is not a JSON object")
     return content

@@ -1,4 +1,4 @@
-"""Joins the ready-made parts to the servers of a component."""
+"""Connects cameras and gimbals to the servers of a component."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ DEFINITION_PATH = "/camera_definition.xml"
 
 
 class DefinedSettings(DefinedParameterServer):
-    """Settings of a program's camera."""
+    """Settings of a `CameraDriver` with a definition file."""
 
     def __init__(self, host: ComponentHost, definition: CameraDefinition, changed: Callable[[str, SettingValue], Any]):
         self._changed = changed
@@ -44,7 +44,7 @@ def add_camera(services: ComponentServices, camera: CameraDriver) -> CameraAdapt
     host, streams = services.host, services.streams
     adapter = CameraAdapter(camera, host, services.tasks, services.commands.call)
     if m.CameraInformation.ID in streams.builders:
-        raise InvalidArgument("this component has a camera already: open another component for the second one")
+        raise InvalidArgument("this component already has a camera: open another component for the second one")
     if camera.definition is not None:
         definition = parse_definition(camera.definition)
         services.parameters._give_way()
@@ -71,7 +71,7 @@ def add_gimbal(services: ComponentServices, gimbal: GimbalDriver) -> GimbalAdapt
     """Serve a gimbal."""
     streams = services.streams
     if m.GimbalManagerInformation.ID in streams.builders:
-        raise InvalidArgument("this component has a gimbal already: open another component for the second one")
+        raise InvalidArgument("this component already has a gimbal: open another component for the second one")
     adapter = GimbalAdapter(gimbal, services.host)
     streams.builders.update(gimbal_builders(adapter))
     services.commands.add_guarded(gimbal_commands(adapter))

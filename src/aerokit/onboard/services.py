@@ -1,4 +1,4 @@
-"""``ComponentServices``: the protocol servers of one component, which its parts share."""
+"""``ComponentServices``: the protocol servers that the parts of one component share."""
 
 from __future__ import annotations
 
@@ -38,7 +38,11 @@ class ComponentServices:
         self.memory: FileTree = FileTree()
 
     def add_message(self, message_type: type[Message], function: Callable[[], Message | None], hz: float) -> None:
-        """Send a message on request, and at a rate; InvalidArgument for a rate above 200 Hz or a second function."""
+        """Send a message on request and at a rate.
+
+        Raises:
+            InvalidArgument: the rate is above 200 Hz, or the message already has a function.
+        """
         if not 0.0 <= hz <= 1.0 / MIN_STREAM_INTERVAL_S:
             raise InvalidArgument(f"hz = {hz} is not allowed: 0 to {1.0 / MIN_STREAM_INTERVAL_S:g}")
         if message_type.ID in self.streams.builders:
@@ -51,7 +55,7 @@ class ComponentServices:
             try:
                 message = function()
             except Exception:
-                if not is_failing:  # one line in the log, not one for each message
+                if not is_failing:  # Log the first failure only.
                     logger.exception("the function for %s failed", message_type.NAME)
                 is_failing = True
                 return []

@@ -22,7 +22,7 @@ _NOT_MEASURED = 0xFFFF
 
 @checks_arguments
 class ComponentSources:
-    """Sends measurements as this component. Each call sends one message to all; call it at the sensor's rate."""
+    """Sends measurements as this component. Each call sends one message to all; call it as often as you measure."""
 
     def __init__(self, host: ComponentHost) -> None:
         self._host = host
@@ -41,14 +41,15 @@ class ComponentSources:
         max_m: float,
         sensor_type: int = 0,
     ) -> None:
-        """Send the distances to obstacles around the vehicle (OBSTACLE_DISTANCE), clockwise from above.
+        """Send the distances to obstacles around the vehicle, clockwise as seen from above (OBSTACLE_DISTANCE).
 
         Args:
-            distances_m: at most 72 distances; None where nothing was measured, infinity where nothing is in range.
+            distances_m: at most 72 distances in metres; None if there was no measurement, infinity if nothing is in
+                range.
             increment_deg: angle between two distances, above 0.
             first_deg: direction of the first distance from the nose.
-            min_m: smallest distance that the sensor measures, 0 to 655 m.
-            max_m: greatest distance that the sensor measures, at most 655 m.
+            min_m: minimum range of the sensor, 0 to 655 m.
+            max_m: maximum range of the sensor, at most 655 m.
             sensor_type: MAV_DISTANCE_SENSOR: 0 laser, 1 ultrasound, 2 infrared, 3 radar.
 
         Raises:
@@ -85,11 +86,11 @@ class ComponentSources:
         emitter_type: int = 0,
         age_s: int = 0,
     ) -> None:
-        """Send an aircraft that a receiver has detected (ADSB_VEHICLE).
+        """Report an aircraft that a receiver has detected (ADSB_VEHICLE).
 
         Args:
             icao: ICAO address, 0 to 16777215.
-            position: position with its altitude above mean sea level, if known.
+            position: position, with the altitude above mean sea level if known.
             callsign: at most 8 characters.
             heading_deg: course over ground from north, 0 to 360.
             speed_m_s: horizontal speed, 0 to 655.
@@ -136,12 +137,12 @@ class ComponentSources:
     def send_landing_target(
         self, right_deg: float, down_deg: float, distance_m: float, *, target_number: int = 0
     ) -> None:
-        """Send the direction of a landing beacon from the camera or receiver (LANDING_TARGET), in the body frame.
+        """Send the direction and distance of a landing beacon relative to the vehicle's body (LANDING_TARGET).
 
         Args:
-            right_deg: angle to the right of straight down, -90 to 90.
-            down_deg: angle towards the tail from straight down, -90 to 90: positive is behind, as image y is.
-            distance_m: distance to the beacon, 0 or more.
+            right_deg: angle from straight down to the right, -90 to 90.
+            down_deg: angle from straight down towards the tail, -90 to 90; downwards in the camera's image.
+            distance_m: distance to the beacon in metres, 0 or more.
             target_number: number of the beacon, 0 to 255.
 
         Raises:
@@ -162,10 +163,10 @@ class ComponentSources:
         """Send GNSS corrections (RTCM 3) in GPS_RTCM_DATA messages.
 
         Args:
-            rtcm: whole RTCM messages, of at most 720 bytes each.
+            rtcm: complete RTCM messages of at most 720 bytes each.
 
         Raises:
-            InvalidArgument: a message is incomplete, damaged or longer; nothing was sent.
+            InvalidArgument: a message is incomplete, damaged or too long; nothing was sent.
             ConnectionClosed, LinkLost: the connection has ended.
         """
         for message in rtcm_messages(rtcm):
@@ -182,5 +183,5 @@ def _centimetres(distance_m: float | None, far: int) -> int:
     if distance_m is None or math.isnan(distance_m):
         return _NOT_MEASURED
     if distance_m < 0:
-        raise InvalidArgument(f"distances_m has {distance_m}: 0 or more, or None")
+        raise InvalidArgument(f"distances_m contains {distance_m}; allowed: 0 or more, or None")
     return far if math.isinf(distance_m) else min(far, round(distance_m * 100))

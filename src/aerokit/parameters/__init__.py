@@ -1,6 +1,6 @@
 """Parameters as values: tables, encoding, files and metadata.
 
-Nothing here communicates with a vehicle; ``vehicle.parameters`` does, and uses these values.
+This package does not communicate with a vehicle; ``vehicle.parameters`` does, with these values.
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ MAX_DEFINITION_SIZE, MAX_ELEMENTS = 1 << 20, 20_000
 
 
 class SettingRange(Snapshot):
-    """A restriction: while the option is selected and ``condition`` holds, ``setting`` accepts only ``options``.
+    """A restriction of an option: while it is selected and ``condition`` holds, ``setting`` accepts only ``options``.
 
     ``condition`` has tests such as ``CAM_EXPMODE=1``, joined by AND and OR. An empty one always holds.
     """
@@ -208,7 +208,7 @@ def load_definition(path: str | os.PathLike[str]) -> CameraDefinition:
     If a setting is defined twice, the first definition counts. Invalid numbers and conditions are ignored.
 
     Raises:
-        FileFormatError: the file is no definition file, or has more than 1 MB (decompressed) or 20,000 elements.
+        FileFormatError: the file is not a definition file, or has more than 1 MB (decompressed) or 20,000 elements.
         OSError: the file cannot be read.
     """
     return parse_definition(read_bounded(path), os.fspath(path))

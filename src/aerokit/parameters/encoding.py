@@ -123,7 +123,7 @@ class _ExactParamValue(ParamValue):
 
 
 def _exact(message: _M, kind: type[_ExactParamSet] | type[_ExactParamValue], bits: bytes) -> _M:
-    """Return the message, or a copy that keeps the bits where a Python float cannot."""
+    """Return the message, or a copy with the exact bits if its Python float lacks them."""
     if _FLOAT.pack(message.param_value) == bits:
         return message
     exact = kind(**message.to_dict())

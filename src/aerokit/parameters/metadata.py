@@ -84,7 +84,7 @@ class ParameterMetadata(Snapshot):
             return None
         if not has_range:
             known = ", ".join(f"{number:g} {text}" for number, text in self.values.items())
-            return f"{self.name} = {value:g} is none of the documented values: {known}"
+            return f"{self.name} = {value:g} is not a documented value: {known}"
         bounds = f"{'' if low is None else f'{low:g}'}..{'' if high is None else f'{high:g}'}"
         return f"{self.name} = {value:g} is not in {bounds} {self.unit}".rstrip()
 
@@ -138,7 +138,7 @@ def load_metadata(path: str | os.PathLike[str]) -> Metadata:
     If a parameter is defined several times, for different frame types, the first definition counts.
 
     Raises:
-        FileFormatError: the file is no metadata file, or has more than 16 MB (decompressed).
+        FileFormatError: the file is not a metadata file, or has more than 16 MB (decompressed).
         OSError: the file cannot be read.
     """
     return parse_metadata(read_bounded(path), os.fspath(path))

@@ -74,7 +74,7 @@ class PackEntry(NamedTuple):
 def unpack_parameters(data: bytes, *, start: int = 0) -> ParameterTable:
     """Decode a downloaded file. ``start`` is the index of its first parameter, as requested in the path.
 
-    If defaults were requested, every parameter has one: the file omits those that equal the value.
+    If defaults were requested, every returned parameter has one; the file omits defaults that equal the value.
 
     Raises:
         RemoteProtocolError: the file is damaged, or has another number of parameters than its header. ArduPilot sends
@@ -122,8 +122,8 @@ def pack_for_download(
     """Encode ``@PARAM/param.pck`` for these parameters. ``block_size``: data bytes per read. Values are not
     validated.
 
-    ``count`` 0 means all from ``start`` on. PX4 keeps a value and its default in one block; ArduPilot, and
-    ``whole_defaults=False``, only the default. InvalidArgument if ``start`` is beyond the list.
+    ``count`` 0 means all from ``start`` on. PX4 keeps a value and its default in the same block. ArduPilot
+    (``whole_defaults=False``) may separate them, but splits neither. InvalidArgument if ``start`` is beyond the list.
     """
     rows = list(_rows(parameters))
     if not 0 <= start < len(rows):

@@ -147,9 +147,9 @@ def replacement_of(name: str) -> str:
 
 
 def resolve_rename(name: str, known: Container[str]) -> Renamed | None:
-    """Find the name under which a vehicle with the ``known`` names has parameter ``name``.
+    """Find the name of parameter ``name`` on a vehicle whose parameters have the ``known`` names.
 
-    None if ``name`` is known, or if no other name of the parameter is.
+    None if ``name`` itself is known, or if no other name of the parameter is known.
     """
     if name in known:
         return None

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from aerokit.protocols.exchange import RoundTrip
 
-# Answers arrive in the order of their requests. A request is lost if this many later requests were answered before it.
+# Number of later requests whose answers show that a request was lost, because answers arrive in order.
 OVERTAKEN = 3
 
 # ArduPilot queues five requests, drops further ones, and processes them every 2 ms.
@@ -17,7 +17,7 @@ BURST_SIZE = 4
 # Pause between requests beyond a burst.
 SPACING_S = 0.002
 
-# An answer faster than this fraction of the fastest round trip belongs to an earlier sending of the request.
+# An answer that arrives within this fraction of the fastest round trip belongs to an earlier transmission.
 MIN_ROUND_TRIP_FRACTION = 0.5
 
 # Consecutive timeouts before requests back off, because radios lose single frames.
@@ -47,7 +47,7 @@ class AdaptiveWindow:
         self._size = max(self._size, min(size, self._max_size / 2))
 
     def on_answer(self, seconds: float | None) -> None:
-        """Record an answer ``seconds`` after its request; None if it may answer any of several sendings."""
+        """Record an answer. ``seconds`` is the time since its request; None if several transmissions are possible."""
         self._loss -= self._loss / 16
         if seconds is None:
             return
@@ -141,7 +141,7 @@ class BlockRequests:
             self._requeue_overtaken(block.number)
 
     def _answered_sending(self, block: _Block, now: float) -> float | None:
-        """Return the time of the sending that was answered; None if several sendings are possible."""
+        """Return the time of the transmission that was answered; None if several are possible."""
         if block.attempts == 1:
             return block.sent_at
         fastest_s = self._round_trip.fastest_s or 0.0

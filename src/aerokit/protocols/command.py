@@ -29,12 +29,12 @@ __all__ = [
 ]
 
 MAX_ATTEMPTS = 4
-"""Maximum number of sendings of a command that may be repeated."""
+"""Maximum number of transmissions of a command that may be repeated."""
 
 _ARM, _RELATIVE, _STEP = (0, 1.0), (3, 1.0), (0, 0.0)
 
-# MAV_CMD → effect of a repetition, and the parameter (index, value) for which it has this effect; None: always.
-# docs/reliability.md has the same table.
+# Maps MAV_CMD to the effect of a repetition, and to the parameter (index, value) with which it has this effect (None:
+# always). docs/reliability.md has the same table.
 UNREPEATABLE_COMMANDS: Mapping[int, tuple[str, tuple[int, float] | None]] = {
     MavCmd.COMPONENT_ARM_DISARM: ("arms a vehicle that a pilot has disarmed since", _ARM),
     MavCmd.CONDITION_YAW: ("turns by the same angle again", _RELATIVE),
@@ -50,9 +50,9 @@ UNREPEATABLE_COMMANDS: Mapping[int, tuple[str, tuple[int, float] | None]] = {
     MavCmd.PREFLIGHT_CALIBRATION: ("calibrates again", None),
     MavCmd.PREFLIGHT_STORAGE: ("writes, reads or resets all parameters again", None),
     MavCmd.PREFLIGHT_REBOOT_SHUTDOWN: ("reboots again", None),
-    MavCmd.DO_FLIGHTTERMINATION: ("stops the motors of a flight that began since", None),
+    MavCmd.DO_FLIGHTTERMINATION: ("stops the motors of a flight that began meanwhile", None),
     MavCmd.START_RX_PAIR: ("starts pairing again", None),
-    MavCmd.STORAGE_FORMAT: ("erases what was stored since", None),
+    MavCmd.STORAGE_FORMAT: ("erases what was stored meanwhile", None),
     MavCmd.SET_CAMERA_ZOOM: ("zooms another step", _STEP),
     MavCmd.SET_CAMERA_FOCUS: ("focuses another step", _STEP),
     MavCmd.IMAGE_START_CAPTURE: ("takes another picture, or starts another series", None),
@@ -60,9 +60,9 @@ UNREPEATABLE_COMMANDS: Mapping[int, tuple[str, tuple[int, float] | None]] = {
     MavCmd.LOGGING_START: ("starts another log", None),
     MavCmd.DO_START_MAG_CAL: ("calibrates again", None),
     MavCmd.FIXED_MAG_CAL_YAW: ("calibrates again", None),
-    MavCmd.DO_GRIPPER: ("moves a gripper that was moved by another station since", None),
-    MavCmd.DO_PARACHUTE: ("releases a parachute that was forbidden since", (0, 2.0)),
-    MavCmd.INJECT_FAILURE: ("injects a failure that was ended since", None),
+    MavCmd.DO_GRIPPER: ("moves a gripper that another station has moved meanwhile", None),
+    MavCmd.DO_PARACHUTE: ("releases a parachute that was disabled meanwhile", (0, 2.0)),
+    MavCmd.INJECT_FAILURE: ("injects a failure again that was ended meanwhile", None),
     MavCmd.DO_WINCH: ("pays out the same length again", None),
     MavCmd.FLASH_BOOTLOADER: ("writes the bootloader again", None),
     MavCmd.PAYLOAD_CONTROL_DEPLOY: ("drops another payload", None),
@@ -162,13 +162,13 @@ class CommandExchange(Exchange[CommandAck]):
         message: the command.
         own_system: our system id.
         own_component: our component id.
-        attempts: maximum number of sendings; None: four, or one for an order in `UNREPEATABLE_COMMANDS`.
+        attempts: maximum number of transmissions; None: four, or one for an order in `UNREPEATABLE_COMMANDS`.
         attempt_timeout: seconds for each attempt; None: one, or four for an order in `UNREPEATABLE_COMMANDS`.
         progress_timeout: seconds without any answer, after IN_PROGRESS, until the command fails.
         on_progress: called with each progress report.
         earlier_answers: number of acknowledgements to ignore, because they belong to an earlier, abandoned command of
             the same number. Once this command is repeated, because they did not arrive, every acknowledgement counts.
-        acks_per_sending: number of acknowledgements that the vehicle sends for each sending; the first one counts.
+        acks_per_sending: number of acknowledgements that the vehicle sends for each transmission; the first one counts.
         min_timeout_s: lower limit of ``attempt_timeout``, for slow links.
         order_status: the state of the order; None for a request.
         is_sent: True if the command was already sent, just before :meth:`start`.
@@ -271,7 +271,7 @@ class CommandExchange(Exchange[CommandAck]):
             self._fail(CommandTimeout(self._timeout_text(now)))
 
     def _expire_order(self, order_status: OrderStatus, now: float) -> None:
-        # Until the time is up, each new HEARTBEAT repeats an order that has not ended.
+        # Until the time is up, an order that has not ended is repeated after each new HEARTBEAT.
         until = self._started + self._attempts * self._attempt_timeout
         if order_status.end:
             self._fail(CommandTimeout(f"{self._timeout_text(now)}; not sent again: {order_status.end}"))
@@ -303,7 +303,7 @@ class CommandExchange(Exchange[CommandAck]):
         self.deadline = now + wait_s
 
     def _with_confirmation(self, confirmation: int) -> Message:
-        # COMMAND_INT has no such field.
+        # COMMAND_INT has no field `confirmation`.
         message = self._message
         if confirmation == 0 or not isinstance(message, CommandLong):
             return message

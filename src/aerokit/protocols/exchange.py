@@ -144,7 +144,7 @@ class RoundTrip:
         return min(backed_off, max(self._max_s, first))
 
 
-# The probability that a radio loses this many messages in a row is negligible: the vehicle has stopped sending.
+# If this many messages in a row are missing, the vehicle has stopped sending: radios hardly ever lose so many.
 SILENT_MESSAGES = 10
 
 
@@ -292,8 +292,8 @@ class Transfer(Exchange[ResultT]):
 # No answer arrives in less than this fraction of the fastest round trip so far.
 MIN_ROUND_TRIP_FRACTION = 0.5
 
-# After more early answers than this, the vehicle has become faster. Without the limit, a vehicle that was slow at first
-# would get requests until the idle timeout.
+# After more early answers than this, they are accepted, because the vehicle has become faster. Without this limit, a
+# vehicle that was slow at first would get requests until the idle timeout.
 MAX_EARLY_ANSWERS = 2
 
 

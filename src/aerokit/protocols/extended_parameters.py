@@ -58,7 +58,7 @@ def setting_of(message: ParamExtValue | ParamExtAck) -> Setting:
 
 
 class SettingList(ValueList[dict[str, Setting], Setting]):
-    """Download of all settings: requests the list once, and missing indices, in a window, as soon as a gap appears.
+    """Download of all settings: requests the list once, then missing indices as soon as a gap appears.
 
     If the component reports another number of settings than before, values received before the change are requested
     again. A component without settings does not answer, so its transfer times out.
@@ -185,10 +185,9 @@ class SettingWrite(Transfer[Setting]):
     """Set one setting. The result is the setting as the component reports it afterwards.
 
     A PARAM_EXT_ACK with the requested value, or a refusal, completes the write. IN_PROGRESS extends the wait. If no
-    answer arrives, the value is read; PARAM_EXT_SET is never simply repeated. It is sent again only if the component
-    reports the value from ``before``. Any other value was rounded or clamped by the component, or set by another
-    station. It is the result once it is reported twice. So retries are bounded, and a later change by another station
-    is not undone.
+    answer arrives, the value is read. PARAM_EXT_SET is sent again only if the component still reports the value
+    ``before``. If it reports any other value twice, this is the result: the component rounded or clamped the value, or
+    another station set it. Retries are therefore bounded, and a later change by another station is not undone.
 
     Raises from ``result()``:
         ParameterRejected: the component refused (``code`` is the PARAM_ACK), or keeps the previous value.

@@ -1,7 +1,7 @@
 """MAVFTP messages, errors and single requests (https://mavlink.io/en/services/ftp.html).
 
-A retried request keeps its sequence number: servers keep their last reply and repeat it, so that no operation is
-executed twice. A new request gets a new number.
+A retried request keeps its sequence number. A server keeps its last reply, and repeats it for the same number, so that
+no operation is executed twice. A new request gets a new number.
 """
 
 from __future__ import annotations
@@ -377,7 +377,7 @@ class FtpRequest(FtpExchange[FtpMessage]):
             self._end(reply)
 
     def _renumber(self, now: float) -> None:
-        # The server took this request for its previous one, which had the same sequence number, and repeated its reply.
+        # The server repeated its previous reply, because the request before had the same sequence number.
         if self._renumbered < MAX_RENUMBERED:
             self._renumbered += 1
             self._request = self._request.replace(sequence=self._client.next_sequence())
@@ -403,7 +403,7 @@ class FtpRequest(FtpExchange[FtpMessage]):
             return True  # the session does not exist any more
         if self.attempts == 1:
             return False
-        # An earlier sending may have removed it, and the answer was lost.
+        # An earlier transmission may have removed the file, and only the answer was lost.
         if opcode in (MavFtpOpcode.REMOVEFILE, MavFtpOpcode.REMOVEDIRECTORY):
             return code == MavFtpErr.FILENOTFOUND
         return opcode == MavFtpOpcode.CREATEDIRECTORY and code == MavFtpErr.FILEEXISTS

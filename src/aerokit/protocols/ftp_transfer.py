@@ -36,15 +36,15 @@ WINDOW_DURING_BURST = 4
 MAX_GAPS = 512
 BURST_BLOCKS = 500
 BUSY_BLOCKS = 3
-# A slow radio carries a few blocks in this time.
+# Seconds to wait for the first block; even a slow radio carries a few blocks in this time.
 FIRST_BLOCK_TIMEOUT_S = 0.5
 SHORT_FILE = 20 * DATA_SIZE
 MAX_REPEATED_BURSTS = 3
-# Bursts whose blocks may still arrive.
+# Maximum number of bursts whose blocks may still arrive.
 MAX_BURSTS = 32
 # Beyond this distance, the sequence number of a block is ambiguous.
 MAX_BLOCK_DISTANCE = SEQUENCES // 2 * DATA_SIZE
-# The probability of losing this many blocks in a row is negligible: the burst has not started, or has ended.
+# If this many blocks in a row are missing, the burst has not started, or has ended: radios hardly ever lose so many.
 FIRST_BLOCKS, SILENT_BLOCKS = 4, 10
 
 
@@ -181,7 +181,7 @@ class FtpDownload(FtpExchange[int]):
 
     def _stop_bursting(self) -> None:
         self._is_bursting = False
-        # The interval between blocks shows how many fit into a round trip.
+        # The interval between blocks shows how many blocks fit into a round trip.
         if self._interval.smoothed_s and self.round_trip.smoothed_s:
             self._requests.window.widen(self.round_trip.smoothed_s / self._interval.smoothed_s)
 

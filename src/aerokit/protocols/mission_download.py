@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 __all__ = ["DownloadResult", "MissionDownload"]
 
 MAX_RESTARTS = 8
-# An answer that arrives within this fraction of a round trip belongs to an earlier message.
+# An answer that arrives within this fraction of a round trip answers an earlier message.
 MIN_ROUND_TRIP_FRACTION = 0.8
 
 
@@ -155,7 +155,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
         if result == MavMissionResult.DENIED:
             self._wait_while_busy(result, now)
         elif result == MavMissionResult.ERROR:
-            # An earlier ERROR answers something that was sent before, for example a repeated item of an upload.
+            # An ERROR that arrives earlier answers a previous message, for example a repeated item of an upload.
             if now - self._list_at >= MIN_ROUND_TRIP_FRACTION * (self.round_trip.smoothed_s or 0.0):
                 self._restart_after_error(now)
         elif result not in (

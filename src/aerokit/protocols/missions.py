@@ -1,7 +1,7 @@
 """Base class of mission, fence and rally transfers, and the exchanges that need no items.
 
 See https://mavlink.io/en/services/mission.html. The three kinds differ only in ``mission_type``. Items are those on the
-wire: where a mission's item 0 is home, it is included.
+wire, including item 0 if it is home.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ __all__ = [
 
 ResultT = TypeVar("ResultT")
 
-# How long a vehicle may stay busy with a transfer that its ground station has dropped: ArduPilot 8 s, PX4 5 s.
+# Maximum time for which a vehicle is busy with a transfer that its ground station has dropped: ArduPilot 8 s, PX4 5 s.
 BUSY_TIMEOUT_S = 9.0
 
 BUSY_RETRY_INTERVAL_S = 1.0
@@ -75,7 +75,7 @@ RESULTS: dict[int, str] = {
 class MissionExchange(Transfer[ResultT]):
     """A transfer with one component. Ignores messages to other systems and of other mission types.
 
-    Indices in errors are the program's, which are ``offset`` lower than those on the wire.
+    Errors contain the program's indices: those on the wire minus ``offset``.
     """
 
     def __init__(

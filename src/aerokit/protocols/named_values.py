@@ -41,7 +41,7 @@ ANSWERS_TO_SETTLE, ANSWERS_TO_SETTLE_UNCHANGED = 2, 8
 
 
 class ValueList(Transfer[ResultT], Generic[ResultT, ValueT]):
-    """Download of a list: requests it once, and missing indices, in a window, as soon as a gap appears."""
+    """Download of a list: requests the list once, then missing indices as soon as a gap appears."""
 
     list_request_name: ClassVar[str]
     noun: ClassVar[str]
@@ -130,7 +130,7 @@ class ValueList(Transfer[ResultT], Generic[ResultT, ValueT]):
 
 
 class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTimeout"]], Generic[ValueT]):
-    """Request some names, with a window of them in flight. The result has one answer for each, in the order given.
+    """Request the values of some names, several at a time. The result has one answer for each name, in the same order.
 
     After ``idle_timeout_s`` seconds without progress, the missing answers become ParameterTimeout errors.
     """

@@ -52,12 +52,11 @@ MAX_REFUSALS = 2
 
 
 class ParameterList(ValueList[ParameterTable, Parameter]):
-    """Download of all parameters: requests the list once, and missing indices, in a window, as soon as a gap appears.
+    """Download of all parameters: requests the list once, then missing indices as soon as a gap appears.
 
-    The vehicle reports the number of parameters. It may change during the transfer (ArduPilot reveals a group when it
-    is enabled, PX4 counts a parameter once it is used), and with it the indices after the change. If a name then has
-    two indices or none, values received before the change are requested again. Values with index 65535 are not part of
-    the list.
+    The vehicle reports the number of parameters. The number may change during the transfer (ArduPilot reveals a group
+    when it is enabled, PX4 counts a parameter once it is used), which shifts indices. If a name then has two indices or
+    none, values received before the change are requested again. Values with index 65535 are not part of the list.
 
     Raises from ``result()``:
         ParameterTimeout: no progress for ``idle_timeout_s`` seconds; ``missing`` has the missing indices.
@@ -143,7 +142,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
             self._count = min(self._count, index)
 
     def _note_count(self, count: int, is_streamed: bool) -> None:
-        # ArduPilot's stream keeps the count from its beginning, so that only a changed streamed count is news.
+        # ArduPilot's stream keeps the count from its start, so only a different count in the stream is a change.
         if count == (self._streamed_count if is_streamed else self._count):
             return
         if is_streamed:

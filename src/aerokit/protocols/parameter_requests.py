@@ -189,13 +189,13 @@ WRITE_WINDOW = 10
 class ParameterWrites(ParameterRequests):
     """Set some parameters. The result has the value of each afterwards, as the vehicle reports it.
 
-    An answer with the requested value and type completes a write. If none arrives, the value is read; PARAM_SET is
-    never simply repeated. It is sent again only if the vehicle reports the value from ``before``, the last known one.
-    Any other value was rounded or clamped by the vehicle, or set by another station. It is the result once it is
-    reported twice. So retries are bounded, and a later change by another station is not undone.
+    An answer with the requested value and type completes a write. If none arrives, the value is read. PARAM_SET is sent
+    again only if the vehicle still reports the last known value (``before``). If it reports any other value twice, this
+    is the result: the vehicle rounded or clamped the value, or another station set it. Retries are therefore bounded,
+    and a later change by another station is not undone.
 
-    ``recent`` has names that were written a moment ago. Because echoes of that write may still arrive, the first
-    matching answer is verified by another read.
+    ``recent`` has names that were written a moment ago. Answers to that write may still arrive, so the first matching
+    answer is verified by another read.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Windowed requests that are independent of each other: which to send when, and which to repeat."""
+"""Window of independent requests: decides which to send, when, and which to repeat."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ DEFAULT_SIZE = 20
 MAX_GROWTH = 5
 # An answer that takes longer than QUEUED_FACTOR times the fastest one plus QUEUED_MARGIN_S has waited in a queue.
 QUEUED_FACTOR, QUEUED_MARGIN_S = 1.5, 0.02
-# When this few requests are left, those at their third attempt or later are sent twice: on a bad radio the transfer
-# would otherwise wait for them alone.
+# When only this many requests are left, those at their third attempt or later are sent twice. Otherwise a transfer over
+# a bad radio would wait long for a few requests.
 FEW_LEFT, DUPLICATE_FROM_ATTEMPT = 5, 3
-# The last few are repeated after at most this time, or two round trips, because it costs little.
+# The last few requests are repeated after at most this time, or two round trips, because it costs little.
 FEW_LEFT_TIMEOUT_S = 0.5
 # Maximum wait for an answer: a queue that delays answers may be empty after this time.
 MAX_TIMEOUT_S = 2.0
-# Answers arrive in the order of their requests. A request is lost if this many later requests were answered before it.
+# Number of later requests whose answers show that a request was lost, because answers arrive in order.
 OVERTAKEN = 3
 
 
@@ -133,7 +133,7 @@ class RequestWindow(Generic[KeyT]):
         return due
 
     def _on_silence(self, now: float) -> None:
-        # Nothing arrives at all, so the link may be down: send fewer requests at a time, and less often.
+        # Nothing arrives, so the link may be down: send fewer requests at a time, and less often.
         self._limit = self._size
         if now >= self._silent_until:
             self._silences += 1
@@ -172,7 +172,7 @@ class RequestWindow(Generic[KeyT]):
             self._waiting = {**dict.fromkeys(keys), **self._waiting}
 
     def _on_second_answer(self, key: KeyT) -> None:
-        # The first answer belonged to the first sending, which was considered lost too early.
+        # The first answer belonged to the first transmission, which was considered lost too early.
         seconds = self._ambiguous.pop(key, None)
         if seconds is not None:
             self._round_trip.add_sample(seconds)

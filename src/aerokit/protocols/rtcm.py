@@ -1,4 +1,4 @@
-"""RTCM 3 messages (RTCM 10403): their frames with CRC-24Q, and their fragments in GPS_RTCM_DATA."""
+"""RTCM 3 messages (RTCM 10403): framing with CRC-24Q, and fragmentation into GPS_RTCM_DATA."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["MAX_MESSAGE_SIZE", "RtcmReader", "crc24q", "fragments", "message_num
 PREAMBLE, HEADER_SIZE, CRC_SIZE = 0xD3, 3, 3
 FRAGMENT_SIZE, MAX_FRAGMENTS = 180, 4
 MAX_MESSAGE_SIZE = FRAGMENT_SIZE * MAX_FRAGMENTS
-"""Bytes of the longest RTCM message that GPS_RTCM_DATA can carry; RTCM 3 itself allows 1029."""
+"""Maximum bytes of an RTCM message that GPS_RTCM_DATA can carry. RTCM 3 itself allows 1029."""
 
 
 def _crc_table() -> tuple[int, ...]:
@@ -33,7 +33,7 @@ _TABLE = _crc_table()
 
 
 def crc24q(data: bytes) -> int:
-    """Return the CRC-24Q of RTCM 3; 0 for a whole frame with its CRC."""
+    """Return the CRC-24Q of RTCM 3, which is 0 for a complete frame including its CRC."""
     crc = 0
     for byte in data:
         crc = (crc << 8 & 0xFFFFFF) ^ _TABLE[crc >> 16 ^ byte]
@@ -46,7 +46,7 @@ def message_number(frame: bytes) -> int | None:
 
 
 def _frame_size(data: bytes, begin: int) -> int | None:
-    """Return the size of the frame that begins here; None if no frame does. Needs three bytes."""
+    """Return the size of the frame that begins at ``begin``; None if no frame begins there. Needs three bytes."""
     # The six bits before the length are reserved and zero.
     if data[begin] != PREAMBLE or data[begin + 1] & 0xFC:
         return None
@@ -54,7 +54,7 @@ def _frame_size(data: bytes, begin: int) -> int | None:
 
 
 def rtcm_messages(data: bytes) -> list[bytes]:
-    """Split bytes that consist of whole RTCM 3 messages into the messages.
+    """Split bytes into the RTCM 3 messages of which they consist.
 
     Raises:
         InvalidArgument: ``data`` is empty, a message is incomplete, damaged, or longer than 720 bytes.
@@ -65,15 +65,17 @@ def rtcm_messages(data: bytes) -> list[bytes]:
         size = _frame_size(data, begin) if len(data) - begin > HEADER_SIZE else None
         where = f"rtcm (byte {begin} of {len(data)})"
         if size is None:
-            raise InvalidArgument(f"{where} is not allowed: whole RTCM 3 messages, which begin with 0xD3")
+            raise InvalidArgument(f"{where} is not allowed: not the start of an RTCM 3 message, which is 0xD3")
         frame = data[begin : begin + size]
         if len(frame) < size:
-            raise InvalidArgument(f"{where} is not allowed: the message has {size} bytes, {len(frame)} were given")
+            raise InvalidArgument(
+                f"{where} is not allowed: the message has {size} bytes, but only {len(frame)} were given"
+            )
         if crc24q(frame):
             raise InvalidArgument(f"{where} is not allowed: the CRC-24Q of the message is wrong")
         if size > MAX_MESSAGE_SIZE:
             raise InvalidArgument(
-                f"{where} is not allowed: the message has {size} bytes, GPS_RTCM_DATA carries {MAX_MESSAGE_SIZE}"
+                f"{where} is not allowed: the message has {size} bytes, but GPS_RTCM_DATA carries {MAX_MESSAGE_SIZE}"
             )
         found.append(frame)
         begin += size
@@ -81,7 +83,7 @@ def rtcm_messages(data: bytes) -> list[bytes]:
 
 
 class RtcmReader:
-    """Finds RTCM 3 messages in a stream of bytes, which may arrive in any pieces and contain other bytes.
+    """Finds RTCM 3 messages in a stream of bytes, which may be split anywhere and contain other bytes.
 
     ``skipped_bytes`` counts bytes that belong to no message.
     """
@@ -91,7 +93,7 @@ class RtcmReader:
         self.skipped_bytes: int = 0
 
     def feed(self, data: bytes) -> Iterator[bytes]:
-        """Take bytes, and yield the messages that are complete. At most one message (1029 bytes) is kept."""
+        """Process bytes, and yield each complete message. At most one incomplete message (1029 bytes) is kept."""
         buffer, begin = self._buffer + data, 0
         while True:
             start = buffer.find(PREAMBLE, begin)
@@ -114,8 +116,8 @@ class RtcmReader:
 def fragments(message: bytes, sequence: int) -> list[GpsRtcmData]:
     """Return one RTCM message of 1 to 720 bytes as GPS_RTCM_DATA messages.
 
-    Flags: bit 0 is set for a fragment, bits 1 and 2 are the fragment number, bits 3 to 7 the sequence number. The
-    receiver takes a message as complete after four fragments or after one that is not full. An empty fragment
+    Flags: bit 0 is set for a fragment, bits 1 and 2 are the fragment number, bits 3 to 7 the sequence number. A
+    receiver considers a message complete after four fragments, or after one that is not full. An empty fragment
     therefore follows a full last one.
     """
     from aerokit.mavlink.messages import GpsRtcmData

@@ -24,7 +24,7 @@ from aerokit.sim.channel import Channel
 from aerokit.sim.vehicle import SimulatedVehicle
 
 SAMPLE_LOG = b"aerokit simulator: sample log, contains no flight\n"
-"""Begin of each simulated log."""
+"""First bytes of each simulated log."""
 _BLOCK = 90
 
 

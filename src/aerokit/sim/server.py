@@ -272,7 +272,7 @@ class SimulatorServer:
         self._timer = loop.call_at(when, self._on_timer)
 
     def _skip_lateness(self) -> None:
-        """Except in real time, skip the time by which the timer is late, beyond what is caught up."""
+        """Except in real time, skip the lateness of the timer beyond ``_MAX_CATCH_UP_S``."""
         if self._loop is None or self._timer is None or self._speedup == 1.0:
             return
         late = self._loop.time() - self._timer_at - _MAX_CATCH_UP_S / self._speedup

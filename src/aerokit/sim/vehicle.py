@@ -98,7 +98,7 @@ class SimulatedVehicle:
         self.components: tuple[AttachableComponent, ...] = tuple(components)
         self.journal: VehicleJournal | None = None
         self.handlers: dict[int, Handler] = {}
-        """Message id → handler."""
+        """Handlers by message id."""
         self._observers: dict[int, list[Handler]] = {}
         self._timers: list[tuple[float, int, Callable[[], None]]] = []
         self._timer_count = 0
@@ -267,7 +267,7 @@ class SimulatedVehicle:
                         self.send(message, channel)
 
     def _skip_to(self, now: float) -> None:
-        """Advance the time and delay all events as much, like a program that hung."""
+        """Advance the time and delay all events equally, like a program that hung."""
         late = now - self.now
         if late <= 0:
             return

@@ -371,9 +371,11 @@ def opened(
     loop = address._loop if is_connection else LoopThread()
     try:
         held: OpenContext[Any] = loop.open_context(open_async(address.aio if is_connection else address, **options))
-    except BaseException:
+    except BaseException as error:
         if not is_connection:
             loop.close()
+        if isinstance(error, KeyboardInterrupt):  # the places where this library waited do not help a user
+            raise error.with_traceback(None) from error.__cause__
         raise
     if not is_connection:
         connection: Connection = getattr(held.value, "connection", held.value)

@@ -31,7 +31,7 @@ class ComponentTwin(OpenedTwin["OnboardComponent"]):
         thread: the sender gets CANCELLED, and the function runs on to its end.
 
         Raises:
-            InvalidArgument: the command has a handler, or the function's arguments cannot be read.
+            InvalidArgument: the command already has a handler, or an annotation of the function is not supported.
         """
 
         def register(function: FunctionT) -> FunctionT:
@@ -41,16 +41,16 @@ class ComponentTwin(OpenedTwin["OnboardComponent"]):
         return register
 
     def message(self, message_type: type[Message], *, hz: float = 0.0) -> Callable[[FunctionT], FunctionT]:
-        """Decorator: send a message that a function returns, on request and at the intervals that others set.
+        """Decorator: send the message that a function returns, on request and at intervals that other programs set.
 
-        The function runs on the loop's thread and must return at once; None while it has no values.
+        The function runs on the loop's thread and must return at once. It returns None while it has no values.
 
         Args:
             message_type: the message.
             hz: rate at which it is sent to all from the start, 0 to 200; 0: only on request.
 
         Raises:
-            InvalidArgument: ``hz`` is out of range, or the message has a function already.
+            InvalidArgument: ``hz`` is out of range, or the message already has a function.
         """
 
         def register(function: FunctionT) -> FunctionT:

@@ -56,10 +56,10 @@ __all__ = [
 
 
 class ComponentParameters(TwinOf["AsyncComponentParameters"]):
-    """Parameters that this component offers: name → value. Other programs read and set them by MAVLink.
+    """Parameters of a component, a mapping of names to values. Other programs read and set them by MAVLink.
 
-    Numbers are served by PARAM, texts and numbers by PARAM_EXT. A value that is out of range, of another type or
-    refused by ``on_set`` is not stored, and the sender gets the reason: PARAM_ERROR, or PARAM_EXT_ACK.
+    PARAM serves numbers, PARAM_EXT numbers and texts. A value that is out of range, of another type, or refused by
+    ``on_set`` is not stored, and PARAM_ERROR or PARAM_EXT_ACK reports the reason to the sender.
     """
 
     def add(
@@ -76,23 +76,25 @@ class ComponentParameters(TwinOf["AsyncComponentParameters"]):
         reboot_required: bool = False,
         on_set: Callable[..., object] | None = None,
     ) -> None:
-        """Offer a parameter. The type of ``default`` is its type: int (32 bits), float (32 bits) or str (128 bytes).
+        """Add a parameter with the type of ``default``: int (32 bits), float (32 bits) or str (128 bytes).
 
         Args:
             name: 1 to 16 ASCII characters without spaces.
-            default: value until another program or :meth:`set` changes it, or the file has one.
-            minimum: smallest allowed number; None: the minimum of the type.
-            maximum: greatest allowed number; None: the maximum of the type.
-            unit: for the metadata, ``"m/s"``.
-            description: for the metadata.
-            values: names of the allowed numbers; others are refused.
+            default: value until another program or :meth:`set` changes it. A value in the parameters file takes
+                precedence.
+            minimum: minimum of a number; None: the minimum of the type.
+            maximum: maximum of a number; None: the maximum of the type.
+            unit: unit for the metadata, such as ``"m/s"``.
+            description: description for the metadata.
+            values: maps each allowed number to its name; other numbers are refused.
             read_only: True if only this program can change it.
-            reboot_required: for the metadata.
-            on_set: called in the loop with a value that another program sets, before it is stored. It refuses the
-                value by raising InvalidArgument.
+            reboot_required: for the metadata: True if a change takes effect after a reboot.
+            on_set: called on the event loop with a value that another program sets, before it is stored. It raises
+                InvalidArgument to refuse the value.
 
         Raises:
-            InvalidArgument: the name is invalid or taken, the default is not allowed, or there are 1000 parameters.
+            InvalidArgument: the name is invalid or in use, the default is not allowed, or the component already has
+                1000 parameters.
         """
         self._loop.call(
             self.aio.add,
@@ -109,7 +111,7 @@ class ComponentParameters(TwinOf["AsyncComponentParameters"]):
         )
 
     def set(self, name: str, value: int | float | str) -> None:
-        """Change a value from this program, and announce it. ``on_set`` is not called.
+        """Change a value, and announce it to other programs. ``on_set`` is not called.
 
         Raises:
             InvalidArgument: there is no such parameter, or the value is not allowed.
@@ -117,7 +119,7 @@ class ComponentParameters(TwinOf["AsyncComponentParameters"]):
         self._loop.call(self.aio.set, name, value)
 
     def metadata(self, name: str) -> ParameterMetadata:
-        """Return unit, range and description of a parameter; InvalidArgument if there is none of this name."""
+        """Return unit, range and description of a parameter; raise InvalidArgument if there is no such parameter."""
         return self._loop.call(self.aio.metadata, name)
 
     def __getitem__(self, name: str) -> ParameterValue:
@@ -141,7 +143,7 @@ class ComponentParameters(TwinOf["AsyncComponentParameters"]):
 class ComponentMissions(TwinOf["AsyncComponentMissions"]):
     """Missions, fences and rally points that other programs upload to this component.
 
-    By default every valid list is accepted and stored. :meth:`on_upload` sets a function that decides.
+    By default every valid list is accepted and stored. :meth:`on_upload` registers a function that may refuse a list.
     """
 
     def items(self, kind: str = "mission") -> tuple[MissionItem, ...]:
@@ -149,7 +151,7 @@ class ComponentMissions(TwinOf["AsyncComponentMissions"]):
         return self._loop.call(self.aio.items, kind)
 
     def replace(self, items: Sequence[MissionItem], kind: str = "mission") -> None:
-        """Replace a list from this program.
+        """Replace the items of one kind.
 
         Raises:
             InvalidArgument: there is no such kind.
@@ -160,15 +162,15 @@ class ComponentMissions(TwinOf["AsyncComponentMissions"]):
         self,
         function: Callable[[str, tuple[MissionItem, ...]], Any],
     ) -> Callable[[str, tuple[MissionItem, ...]], Any]:
-        """Decorator: ``function(kind, items)`` decides about every upload, before it is stored and acknowledged.
+        """Decorator: ``function(kind, items)`` accepts or refuses each upload, before it is stored and acknowledged.
 
-        It refuses a list by raising InvalidArgument (INVALID, and a status text) or by returning a MAV_MISSION_RESULT.
-        It may be a coroutine function. An empty list is a request to clear.
+        To refuse a list, the function raises InvalidArgument (result INVALID, and a status text) or returns a
+        MAV_MISSION_RESULT. It may be a coroutine function. An empty list is a request to clear the list.
         """
         return self._loop.call(self.aio.on_upload, function)
 
     def on_set_current(self, function: Callable[[int], object]) -> Callable[[int], object]:
-        """Decorator: ``function(index)`` continues the mission at an item. Without it, such requests are refused."""
+        """Decorator: ``function(index)`` continues the mission at an item; without it, such requests are refused."""
         return self._loop.call(self.aio.on_set_current, function)
 
     @property
@@ -190,7 +192,7 @@ class ComponentMissions(TwinOf["AsyncComponentMissions"]):
 
 
 class ComponentSources(TwinOf["AsyncComponentSources"]):
-    """Sends measurements as this component. Each call sends one message to all; call it at the sensor's rate."""
+    """Sends measurements as this component. Each call sends one message to all; call it as often as you measure."""
 
     def send_obstacles(
         self,
@@ -202,14 +204,15 @@ class ComponentSources(TwinOf["AsyncComponentSources"]):
         max_m: float,
         sensor_type: int = 0,
     ) -> None:
-        """Send the distances to obstacles around the vehicle (OBSTACLE_DISTANCE), clockwise from above.
+        """Send the distances to obstacles around the vehicle, clockwise as seen from above (OBSTACLE_DISTANCE).
 
         Args:
-            distances_m: at most 72 distances; None where nothing was measured, infinity where nothing is in range.
+            distances_m: at most 72 distances in metres; None if there was no measurement, infinity if nothing is in
+                range.
             increment_deg: angle between two distances, above 0.
             first_deg: direction of the first distance from the nose.
-            min_m: smallest distance that the sensor measures, 0 to 655 m.
-            max_m: greatest distance that the sensor measures, at most 655 m.
+            min_m: minimum range of the sensor, 0 to 655 m.
+            max_m: maximum range of the sensor, at most 655 m.
             sensor_type: MAV_DISTANCE_SENSOR: 0 laser, 1 ultrasound, 2 infrared, 3 radar.
 
         Raises:
@@ -239,11 +242,11 @@ class ComponentSources(TwinOf["AsyncComponentSources"]):
         emitter_type: int = 0,
         age_s: int = 0,
     ) -> None:
-        """Send an aircraft that a receiver has detected (ADSB_VEHICLE).
+        """Report an aircraft that a receiver has detected (ADSB_VEHICLE).
 
         Args:
             icao: ICAO address, 0 to 16777215.
-            position: position with its altitude above mean sea level, if known.
+            position: position, with the altitude above mean sea level if known.
             callsign: at most 8 characters.
             heading_deg: course over ground from north, 0 to 360.
             speed_m_s: horizontal speed, 0 to 655.
@@ -277,12 +280,12 @@ class ComponentSources(TwinOf["AsyncComponentSources"]):
         *,
         target_number: int = 0,
     ) -> None:
-        """Send the direction of a landing beacon from the camera or receiver (LANDING_TARGET), in the body frame.
+        """Send the direction and distance of a landing beacon relative to the vehicle's body (LANDING_TARGET).
 
         Args:
-            right_deg: angle to the right of straight down, -90 to 90.
-            down_deg: angle towards the tail from straight down, -90 to 90: positive is behind, as image y is.
-            distance_m: distance to the beacon, 0 or more.
+            right_deg: angle from straight down to the right, -90 to 90.
+            down_deg: angle from straight down towards the tail, -90 to 90; downwards in the camera's image.
+            distance_m: distance to the beacon in metres, 0 or more.
             target_number: number of the beacon, 0 to 255.
 
         Raises:
@@ -295,20 +298,20 @@ class ComponentSources(TwinOf["AsyncComponentSources"]):
         """Send GNSS corrections (RTCM 3) in GPS_RTCM_DATA messages.
 
         Args:
-            rtcm: whole RTCM messages, of at most 720 bytes each.
+            rtcm: complete RTCM messages of at most 720 bytes each.
 
         Raises:
-            InvalidArgument: a message is incomplete, damaged or longer; nothing was sent.
+            InvalidArgument: a message is incomplete, damaged or too long; nothing was sent.
             ConnectionClosed, LinkLost: the connection has ended.
         """
         self._loop.call(self.aio.send_corrections, rtcm)
 
 
 class OnboardComponent(ComponentTwin):
-    """This program as one MAVLink component, returned by :func:`aerokit.component`.
+    """Your program as one MAVLink component, returned by :func:`aerokit.component`.
 
-    It sends its own heartbeat, executes commands, and offers parameters, files, missions and messages. Requests for
-    anything else get the standard's answers: UNSUPPORTED, DENIED, DOES_NOT_EXIST.
+    The component sends its own heartbeat, executes commands, and serves parameters, files, missions and messages. It
+    answers requests for anything else as MAVLink requires: UNSUPPORTED, DENIED, DOES_NOT_EXIST.
     """
 
     @cached_property
@@ -333,11 +336,11 @@ class OnboardComponent(ComponentTwin):
 
     @property
     def time_boot_ms(self) -> int:
-        """Milliseconds since the component started, for messages."""
+        """Milliseconds since the component started, for the field ``time_boot_ms`` of messages."""
         return self.aio.time_boot_ms
 
     def set_state(self, state: int, *, base_mode: int = 0, custom_mode: int = 0) -> None:
-        """Change what the heartbeat reports, and send it at once.
+        """Change the state and mode in the heartbeat, and send a heartbeat at once.
 
         Args:
             state: MAV_STATE: ACTIVE, STANDBY, CALIBRATING, CRITICAL …
@@ -359,7 +362,7 @@ class OnboardComponent(ComponentTwin):
         self._loop.call(self.aio.send, message)
 
     def send_text(self, text: str, *, severity: int = MavSeverity.INFO.value) -> None:
-        """Send a status text (STATUSTEXT) to all: ASCII, at most 254 characters; the rest is cut.
+        """Send a status text in ASCII to all (STATUSTEXT); a text of more than 254 characters is cut.
 
         Raises:
             InvalidArgument: ``severity`` is not a MAV_SEVERITY, 0 to 7.
@@ -367,10 +370,10 @@ class OnboardComponent(ComponentTwin):
         self._loop.call(self.aio.send_text, text, severity=severity)
 
     def send_event(self, event_id: int, arguments: bytes = b"", *, severity: int = MavSeverity.INFO.value) -> None:
-        """Send an event (EVENT) to all; receivers that missed it get it again on request.
+        """Send an event to all (EVENT). A receiver that missed it can request it again.
 
         Args:
-            event_id: id in the component's event metadata: component id << 24, plus a number.
+            event_id: id in the component's event metadata, ``component_id << 24`` plus a number.
             arguments: at most 40 bytes.
             severity: MAV_SEVERITY, 0 to 7.
 
@@ -380,93 +383,95 @@ class OnboardComponent(ComponentTwin):
         self._loop.call(self.aio.send_event, event_id, arguments, severity=severity)
 
     def serve_files(self, directory: str | Path, *, writable: bool = False) -> None:
-        """Offer the files of one directory by MAVFTP; nothing outside it can be reached, not even by links.
+        """Serve the files of one directory by MAVFTP; clients cannot leave it, not even by symbolic links.
 
-        Files are read and written on the event loop, in blocks of 239 bytes: use a local disk.
+        Files are read and written on the event loop, in blocks of 239 bytes, so the directory should be on a local
+        disk.
 
         Args:
             directory: existing directory.
-            writable: True to let every sender write, rename and remove files there.
+            writable: True if any sender may write, rename and remove files in the directory.
 
         Raises:
-            InvalidArgument: it is not a directory, or a directory is served already.
+            InvalidArgument: there is no such directory, or the component already serves one.
         """
         self._loop.call(self.aio.serve_files, directory, writable=writable)
 
     def set_metadata(self, kind: MetadataKind, content: bytes) -> None:
-        """Offer a metadata file (JSON) by MAVFTP, and list it in the general metadata.
+        """Serve a metadata file (JSON) by MAVFTP, and list it in the general metadata file.
 
         https://mavlink.io/en/services/component_information.html
 
         Args:
-            kind: ``"commands"``, ``"peripherals"``, ``"events"`` or ``"actuators"``. The file of the parameters follows
-                from them.
-            content: the file, at most 1 MiB.
+            kind: ``"commands"``, ``"peripherals"``, ``"events"`` or ``"actuators"``. aerokit writes the file for the
+                parameters itself.
+            content: the content of the file, at most 1 MiB.
 
         Raises:
-            InvalidArgument: the file is larger, or the kind is another one.
+            InvalidArgument: the content is too large, or the kind is unknown.
         """
         self._loop.call(self.aio.set_metadata, kind, content)
 
     @cached_property
     def missions(self) -> ComponentMissions:
-        """Missions, fences and rally points that other programs upload and download; served from the first use on."""
+        """Missions, fences and rally points that other programs upload and download. The first access serves them."""
         return ComponentMissions(self._loop, self._loop.call(lambda: self.aio.missions))
 
     def add_autopilot(self, driver: AutopilotDriver) -> None:
-        """Execute a ground station's commands by a program's vehicle: arm, mode, take-off, landing, return, reboot.
+        """Serve a ground station's commands to a vehicle: arm, mode, take-off, landing, return, reboot.
 
-        The component should have component id 1, a vehicle's ``type``, and ``autopilot=MavAutopilot.GENERIC``.
-        HEARTBEAT follows: armed after ``arm``, the mode after ``set_mode``. Send telemetry by :meth:`message`.
+        Open the component with component id 1, a vehicle's ``type``, and ``autopilot=MavAutopilot.GENERIC``. HEARTBEAT
+        reports armed after ``arm``, and the new mode after ``set_mode``. Send telemetry by :meth:`message`.
 
         Args:
-            driver: an instance of the program's class, see :class:`~aerokit.onboard.AutopilotDriver`.
+            driver: an instance of your subclass of :class:`~aerokit.onboard.AutopilotDriver`.
 
         Raises:
-            InvalidArgument: one of the commands has a handler.
+            InvalidArgument: one of these commands already has a handler.
         """
         self._loop.call(self.aio.add_autopilot, driver)
 
     def add_camera(self, camera: CameraDriver) -> None:
-        """Serve the camera protocol: photos, series, videos, storage, streams, zoom, focus, tracking, settings.
+        """Serve the camera protocol: photos, videos, storage, streams, zoom, focus, tracking, settings.
 
         https://mavlink.io/en/services/camera.html
 
         Args:
-            camera: an instance of the program's class, see :class:`~aerokit.onboard.CameraDriver`.
+            camera: an instance of your subclass of :class:`~aerokit.onboard.CameraDriver`.
 
         Raises:
-            InvalidArgument: the component has a camera, or its definition file and parameters exclude each other.
+            InvalidArgument: the component already has a camera, or has parameters although the camera has a definition
+                file.
             FileFormatError: the definition file is damaged.
         """
         self._loop.call(self.aio.add_camera, camera)
 
     def add_gimbal(self, gimbal: GimbalDriver) -> None:
-        """Serve the gimbal protocol v2, as gimbal device and gimbal manager in one component.
+        """Serve the gimbal protocol v2, as a gimbal device and its gimbal manager in one component.
 
         https://mavlink.io/en/services/gimbal_v2.html
 
         Args:
-            gimbal: an instance of the program's class, see :class:`~aerokit.onboard.GimbalDriver`.
+            gimbal: an instance of your subclass of :class:`~aerokit.onboard.GimbalDriver`.
 
         Raises:
-            InvalidArgument: the component has a gimbal.
+            InvalidArgument: the component already has a gimbal.
         """
         self._loop.call(self.aio.add_gimbal, gimbal)
 
     def add_winch(self, winch: WinchDriver) -> None:
-        """Execute DO_WINCH by a program's winch, and send WINCH_STATUS at 5 Hz.
+        """Serve DO_WINCH by your subclass of :class:`~aerokit.onboard.WinchDriver`, and send WINCH_STATUS at 5 Hz.
 
         Raises:
-            InvalidArgument: the component has a winch.
+            InvalidArgument: the component already has a winch.
         """
         self._loop.call(self.aio.add_winch, winch)
 
     def add_gripper(self, grab: Callable[[], Awaitable[Any]], release: Callable[[], Awaitable[Any]]) -> None:
-        """Execute DO_GRIPPER by two coroutine functions, which return when the gripper has moved.
+        """Serve DO_GRIPPER by two coroutine functions, which return when the gripper has moved.
 
         Raises:
-            InvalidArgument: the component has a gripper.
+            InvalidArgument: the component already has a gripper.
         """
         self._loop.call(self.aio.add_gripper, grab, release)
 
@@ -474,18 +479,19 @@ class OnboardComponent(ComponentTwin):
         """Answer ARM_AUTHORIZATION_REQUEST (https://mavlink.io/en/services/arm_authorization.html).
 
         Args:
-            authorize: function or coroutine function of the vehicle's system id. It returns for how many seconds (at
-                most 255) arming is allowed, or raises an error, whose text is sent as status text: DENIED. It may also
-                return a :class:`~aerokit.onboard.CommandResult` with a MAV_ARM_AUTH_DENIED_REASON as ``detail``.
+            authorize: function or coroutine function, called with the vehicle's system id. It returns the number of
+                seconds for which arming is allowed, at most 255. An exception denies arming, and its text is sent as
+                status text. To give a reason, return a :class:`~aerokit.onboard.CommandResult` with a
+                MAV_ARM_AUTH_DENIED_REASON as ``detail``.
 
         Raises:
-            InvalidArgument: the component has an arm authorizer.
+            InvalidArgument: the component already has an arm authorizer.
         """
         self._loop.call(self.aio.add_arm_authorizer, authorize)
 
     @cached_property
     def sources(self) -> ComponentSources:
-        """Sends measurements to the autopilot: obstacles, traffic, landing targets, GNSS corrections."""
+        """Measurements for the autopilot: obstacles, traffic, landing targets, GNSS corrections."""
         return ComponentSources(self._loop, self._loop.call(lambda: self.aio.sources))
 
     def serve_forever(self) -> None:
@@ -519,24 +525,25 @@ def component(
     peers: PeerFilter | None = None,
     may_move: bool = False,
 ) -> OnboardComponent:
-    """Be a MAVLink component for the duration of the ``with`` block: a payload, a camera, a companion computer.
+    """Make your program a MAVLink component, such as a camera, for the duration of the ``with`` block.
 
-    Runs in the current asyncio loop. Other programs get answers while the loop runs, also while your block waits. When
-    the block ends, running commands are cancelled and answered, and the heartbeat stops.
+    The component runs on the current event loop, and answers other programs while your block waits. When the block
+    ends, running commands are cancelled and answered, and the heartbeat stops.
 
     Args:
         address: a connection string, a link or a list of them, as for :func:`aerokit.open_connection`.
-        connection: an open connection, instead of an address: for several components, or a component beside a ground
-            station, on one link. The arguments after ``accepts`` are not allowed then.
-        system_id: own system id, 1 to 255: that of the vehicle that carries the component.
-        component_id: own component id (MAV_COMPONENT), 1 to 255.
+        connection: an open connection instead of an address. Use it for several components on one link, or for a
+            component and a ground station. The arguments after ``accepts`` are not allowed then.
+        system_id: system id of the component, 1 to 255; use that of the vehicle that carries it.
+        component_id: component id (MAV_COMPONENT), 1 to 255.
         type: MAV_TYPE of the heartbeat: ONBOARD_CONTROLLER, CAMERA, GIMBAL, WINCH, GRIPPER …
         autopilot: MAV_AUTOPILOT of the heartbeat; INVALID for everything that is not a flight controller.
         identity: vendor, model and versions that the component reports.
-        parameters_file: JSON file that keeps the parameters; it is replaced atomically after each change. None: the
-            parameters start with their defaults.
+        parameters_file: JSON file that stores the parameters; it is replaced atomically after each change. None:
+            parameters are not stored.
         bytewise: True to encode integers in PARAM_VALUE bytewise, as PX4 does; False to cast them to float, as
-            ArduPilot does. The component announces it; clients that judge by the autopilot expect bytewise.
+            ArduPilot does. The component's capabilities announce the encoding. Clients that decide by the ``autopilot``
+            field expect bytewise.
         accepts: system ids whose messages are processed; None: all. Without signing, senders can claim any id.
         baud: bits per second of a serial link whose address has none.
         dialect: the messages that are decoded.
@@ -548,8 +555,8 @@ def component(
         may_move: True to accept a silent sender from another IP address.
 
     Raises:
-        InvalidArgument: an argument is wrong; nothing was opened.
-        BusyError: the connection has a component with these ids already.
+        InvalidArgument: an argument is not allowed; nothing was opened.
+        BusyError: the connection already has a component with these ids.
         LinkOpenError: the link or the recording could not be opened.
         FileFormatError, OSError: ``parameters_file`` cannot be read.
     """

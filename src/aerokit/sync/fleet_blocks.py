@@ -39,7 +39,7 @@ class SelectionTwin(TwinOf[SelectionT]):
 
     @cached_property
     def vehicles(self) -> Mapping[str, Vehicle]:
-        """Name → vehicle."""
+        """Maps names to vehicles."""
         return {name: _vehicle(self._loop, vehicle) for name, vehicle in self.aio.vehicles.items()}
 
     def __len__(self) -> int:

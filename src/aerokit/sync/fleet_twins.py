@@ -87,14 +87,14 @@ class Following(BlockTwin["AsyncFollowing"]):
 class Selection(SelectionTwin["AsyncSelection"]):
     """Some members of a fleet: ``fleet.group("alpha")``, ``fleet["north/*"]``.
 
-    Every action runs on all available members at once: those that are not lost, taken over or released. It returns a
-    :class:`FleetResult` when all of them are done. If a member fails, the fleet's policy orders what the others do, and
-    the action ends when they have done it. If the action is cancelled, all of them hold.
+    Every action runs on all available members at once, which are those that are not lost, taken over or released. The
+    action returns a :class:`FleetResult` when all of them are done. If a member fails, the fleet's policy sends orders
+    to the others, and the action ends when they have executed these. If the action is cancelled, all members hold.
     """
 
     @property
     def members(self) -> Mapping[str, Member]:
-        """Name → member, in the order in which they were given or found."""
+        """Maps names to members, in the order in which they were given or found."""
         return self.aio.members
 
     def go_to(
@@ -112,8 +112,8 @@ class Selection(SelectionTwin["AsyncSelection"]):
         A fleet with a ``min_distance_m`` compares the paths first, and separates crossing paths by altitude.
 
         Args:
-            targets: member's name → target, where other members stay where they are; or a function that returns a
-                member's target.
+            targets: mapping of member names to targets; members without a target stay where they are. Or a function
+                that returns a member's target.
             speed_m_s: ground speed; None: unchanged.
             max_distance_m: reject targets farther than this from the vehicle.
             timeout: seconds for each member and leg; None: no limit.
@@ -531,13 +531,13 @@ class Fleet(FleetTwin, Selection):
         """Send RTCM corrections (RTK, DGPS) as GPS_RTCM_DATA, once on each link.
 
         Args:
-            rtcm: one or more whole RTCM 3 messages, each of 720 bytes at most.
+            rtcm: one or more complete RTCM 3 messages of at most 720 bytes each.
 
         Returns:
             The number of MAVLink messages sent on each link.
 
         Raises:
-            InvalidArgument: a message is incomplete, damaged or longer, or ``rtcm`` is empty. Nothing was sent.
+            InvalidArgument: a message is incomplete, damaged or too long, or ``rtcm`` is empty. Nothing was sent.
             ConnectionClosed, LinkLost: a link has ended; the links before it got the corrections.
         """
         return self._loop.call(self.aio.send_corrections, rtcm)
@@ -605,8 +605,8 @@ def fleet(
     system 7 of network "north". Several networks can therefore use the same system ids.
 
     Args:
-        *sources: addresses, links or open connections, on which all vehicles that are found become members; or
-            vehicles. A mapping names the networks or vehicles; other networks are named ``"1"``, ``"2"`` …
+        *sources: addresses, links or open connections, on which all vehicles found become members; or vehicle objects.
+            A mapping gives names to networks or vehicles; other networks are named ``"1"``, ``"2"`` …
         count: number of vehicles to wait for, in total; None: at least one on each network, plus those found in the
             next 2.5 seconds.
         system_ids: use these system ids only, on all networks or by network name; None: all that are found.
@@ -621,7 +621,7 @@ def fleet(
         rates: message class → Hz, requested from each member instead of the default rates; ``{}`` requests nothing.
 
     Raises:
-        InvalidArgument: an argument is wrong, or two vehicles have the same name.
+        InvalidArgument: an argument is not allowed, or two vehicles have the same name.
         BusyError: this program already has a vehicle object for one of ``system_ids`` on that connection.
         LinkOpenError: a link could not be opened.
         LinkLost, ConnectionClosed: a link closed while waiting.

@@ -154,7 +154,7 @@ def tree(module: str) -> ast.Module:
 
 @cache
 def imports_of(module: str) -> dict[str, tuple[str, str]]:
-    """Return the imports of a module: local name → module and name there."""
+    """Return the imports of a module: each local name, with the module and the name there."""
     found: dict[str, tuple[str, str]] = {}
     for node in ast.walk(tree(module)):
         if isinstance(node, ast.ImportFrom) and node.module:

@@ -455,11 +455,13 @@ class Connection(ConnectionTwin):
 class SetpointStream(StreamTwin[SetpointT]):
     """Sends the latest set-point at a fixed rate while the ``async with`` block supplies set-points.
 
-    Entering the block changes to the set-point mode (GUIDED, OFFBOARD) with the initial set-point. Leaving it in any
-    way makes the vehicle hold. The stream stops by itself without a new set-point for ``valid_for_s``, if the event
-    loop is late by ``max_lag_s``, if the vehicle leaves the mode, disarms or falls silent, and if it should move but
-    stays in place for twelve seconds. Then ``set`` and leaving the block raise :class:`SetpointStreamStopped`. After a
-    pilot or a failsafe has changed the mode, nothing more is sent to the vehicle.
+    Entering the block changes to the set-point mode (GUIDED, OFFBOARD) with the initial set-point. Leaving the block in
+    any way makes the vehicle hold.
+
+    The stream stops by itself if there is no new set-point for ``valid_for_s``, if the event loop is late by
+    ``max_lag_s``, if the vehicle leaves the mode, disarms or falls silent, and if the vehicle should move but stays in
+    place for twelve seconds. ``set`` and leaving the block then raise :class:`SetpointStreamStopped`. If a pilot or a
+    failsafe changed the mode, nothing more is sent to the vehicle.
     """
 
     @property
@@ -488,10 +490,10 @@ class SetpointStream(StreamTwin[SetpointT]):
 class Guided(TwinOf["AsyncGuided"]):
     """Opens set-point streams: ``async with vehicle.guided.velocity() as stream: stream.set(...)``.
 
-    Every stream takes ``rate_hz`` (transmission rate of the latest set-point, 2 to 400), ``valid_for_s`` (how long a
-    set-point may be resent without a new one) and ``max_lag_s`` (how late the event loop may be). NotSupported is
-    raised for a kind that this type of vehicle does not support. Rates and seconds are in real time: a simulation at
-    ten times the speed needs ten times the rate.
+    All streams have the same arguments. ``rate_hz`` (2 to 400) is the transmission rate of the latest set-point. The
+    stream stops if it gets no new set-point for ``valid_for_s`` seconds, or if the event loop is late by ``max_lag_s``
+    seconds. NotSupported is raised for a kind of set-point that this type of vehicle does not support. Rates and
+    seconds are in real time: a simulation at ten times the speed needs ten times the rate.
     """
 
     def velocity(
@@ -606,8 +608,8 @@ class Guided(TwinOf["AsyncGuided"]):
     ) -> SetpointStream[AttitudeRateSetpoint]:
         """Stream body rates with thrust (SET_ATTITUDE_TARGET without an attitude).
 
-        ArduCopter and PX4 obey them. Nothing levels the vehicle: it keeps turning until the next set-point, or until it
-        holds, which is ordered after ``valid_for_s`` without one.
+        ArduCopter and PX4 execute them. The autopilot does not level the vehicle: it keeps turning until the next
+        set-point, or until aerokit orders a hold, after ``valid_for_s`` without a new one.
         """
         return SetpointStream(
             self._loop,
@@ -650,10 +652,10 @@ class Guided(TwinOf["AsyncGuided"]):
     ) -> SetpointStream[ActuatorSetpoint]:
         """Stream actuator controls (SET_ACTUATOR_CONTROL_TARGET).
 
-        PX4 obeys them up to version 1.13; newer ones, and ArduPilot, ignore the message.
+        PX4 executes them up to version 1.13; newer versions, and ArduPilot, ignore the message.
 
         Raises:
-            NotSupported: this firmware does not obey them, or its version is not known yet. Nothing was sent.
+            NotSupported: this firmware ignores the message, or its version is not known yet. Nothing was sent.
         """
         return SetpointStream(
             self._loop,
@@ -665,15 +667,17 @@ class FollowStream(BlockTwin["AsyncFollowStream"]):
     """Follows a target while its ``async with`` block runs; opened by :meth:`aerokit.Vehicle.follow`.
 
     Entering the block waits for the first position of the target, and changes the mode: to GUIDED on ArduPilot, to
-    OFFBOARD on PX4. Leaving it in any way makes the vehicle hold. It stops by itself, and the vehicle holds, when no
-    new position of the target arrives for ``valid_for_s``, when the target's positions end or raise, when it is farther
-    away than ``max_distance_m``, and for the reasons of set-point streams. After a pilot or a failsafe has changed the
-    mode, nothing more is sent. ``fly`` and leaving the block then raise :class:`SetpointStreamStopped`.
+    OFFBOARD on PX4. Leaving the block in any way makes the vehicle hold.
+
+    The stream stops by itself, and the vehicle holds, when no new position of the target arrives for ``valid_for_s``,
+    when the source of positions ends or raises, when the target is farther away than ``max_distance_m``, and for the
+    same reasons as a set-point stream. If a pilot or a failsafe changes the mode, the stream stops and sends nothing
+    more. ``fly`` and leaving the block then raise :class:`SetpointStreamStopped`.
 
     Entering raises:
-        OperationRejected: the vehicle is not flying (nothing was sent), or its altitude is unknown (it holds).
+        OperationRejected: the vehicle is not flying (nothing was sent), or its altitude is unknown (the vehicle holds).
         OperationTimeout: no position of the target was known within ``valid_for_s``. The vehicle holds.
-        InvalidArgument: a height is wanted, and the target has no altitude. The vehicle holds.
+        InvalidArgument: ``height_m`` was given, but the target has no altitude. The vehicle holds.
     """
 
     @property
@@ -692,10 +696,10 @@ class FollowStream(BlockTwin["AsyncFollowStream"]):
         return self._loop.call(lambda: self.aio.distance_m)
 
     def fly(self, duration_s: float | None = None) -> None:
-        """Follow for ``duration_s`` seconds; None: until it stops by itself.
+        """Follow the target for ``duration_s`` seconds; None: until the stream stops by itself.
 
         Raises:
-            SetpointStreamStopped: it has stopped; the text has the reason.
+            SetpointStreamStopped: the stream has stopped; the error text has the reason.
         """
         self._loop.run(self.aio.fly, duration_s)
 
@@ -703,21 +707,23 @@ class FollowStream(BlockTwin["AsyncFollowStream"]):
 class StickStream(BlockTwin["AsyncStickStream"]):
     """Sends the latest stick positions at a fixed rate while the ``async with`` block supplies them.
 
-    Entering the block sends the initial positions for a second and then changes to the mode. Leaving it in any way
-    orders the vehicle to hold and releases the sticks. If the stream stops by itself (no new positions, a blocked event
-    loop, a silent vehicle), ``set`` and leaving the block raise :class:`SetpointStreamStopped`. If a pilot or a
+    Entering the block sends the initial positions for a second and then changes to the mode. Leaving the block in any
+    way orders the vehicle to hold and releases the sticks. If the stream stops by itself (no new positions, a blocked
+    event loop, a silent vehicle), ``set`` and leaving the block raise :class:`SetpointStreamStopped`. If a pilot or a
     failsafe changes the mode, the sticks are released at once and no hold is ordered.
 
     If the program is killed, ArduPilot returns to the transmitter after RC_OVERRIDE_TIME (3 s), and PX4 treats the
-    sticks as lost after COM_RC_LOSS_T (0.5 s). PX4 has no release, so every end of a stream is such a loss: without
-    another source of manual control it acts as NAV_RCL_ACT says (return by default), also in its hold mode unless
-    COM_RCL_EXCEPT has bit 1. ArduCopter without a transmitter acts on the loss as FS_THR_ENABLE says.
+    sticks as lost after COM_RC_LOSS_T (0.5 s). PX4 has no message that releases the sticks, so it treats every end of a
+    stream as a loss. Without another source of manual control, it then acts as NAV_RCL_ACT says (return by default),
+    even in its hold mode unless bit 1 of COM_RCL_EXCEPT is set. ArduCopter without a transmitter acts as FS_THR_ENABLE
+    says.
 
     Entering raises:
         InvalidArgument: a position is out of range. Nothing was sent.
         NotSupported: this type of vehicle has no sticks. Nothing was sent.
-        OperationRejected: a parameter makes the vehicle ignore the sticks, or keep them for ever; the text names it.
-        ParameterTimeout: the vehicle did not report these parameters. Nothing else was sent.
+        OperationRejected: a parameter makes the vehicle ignore the sticks, or never release them; the error text names
+            it.
+        ParameterTimeout: the vehicle did not report the parameters that decide about this. Nothing else was sent.
         CommandRejected: the vehicle refused the mode.
         BusyError: another set-point stream is open.
     """
@@ -728,10 +734,10 @@ class StickStream(BlockTwin["AsyncStickStream"]):
         return self.aio.is_running
 
     def set(self, sticks: StickInput) -> None:
-        """Move the sticks; the positions are sent at the next tick and repeated until ``valid_for_s`` has passed.
+        """Set the stick positions, which are sent at the next tick and repeated until ``valid_for_s`` has passed.
 
         Raises:
-            InvalidArgument: a position is out of range; the previous ones remain in force until they expire.
+            InvalidArgument: a position is out of range; the previous positions stay in force until they expire.
             SetpointStreamStopped: the stream has ended by itself, or the block was left.
         """
         self._loop.call(self.aio.set, sticks)
@@ -742,17 +748,19 @@ class StickStream(BlockTwin["AsyncStickStream"]):
 
 
 class MeasurementStream(MeasurementTwin[MeasurementT]):
-    """Sends the measurements that you give to ``send``, each once, at most ``rate_hz`` times a second.
+    """Sends each measurement passed to ``send`` once, at most ``rate_hz`` measurements a second.
 
-    A measurement is never repeated: without new ones nothing is sent, and the vehicle acts as without its sensor. Of
-    several measurements within one period only the newest is sent. One that is older than ``valid_for_s`` when it
-    could be sent is dropped, after a blocked event loop for example; while the vehicle is silent all are dropped.
-    ``sent`` and ``dropped`` count them. The stream does not end by itself; it ends with the block.
+    A measurement is never repeated: if your program supplies no new one, nothing is sent, and the vehicle acts as if
+    its sensor had failed. Of several measurements within one period, only the newest is sent. A measurement is dropped
+    if it is older than ``valid_for_s`` when its turn comes, for example after the event loop was blocked. While the
+    vehicle is silent, all measurements are dropped. ``sent`` and ``dropped`` count them. The stream ends only with the
+    block.
 
     Entering raises:
         NotSupported: this firmware does not read such measurements. Nothing was sent.
-        OperationRejected: a parameter makes the vehicle ignore them; the text names it. Nothing else was sent.
-        ParameterTimeout: the vehicle did not report these parameters.
+        OperationRejected: a parameter makes the vehicle ignore such measurements; the error text names it. No
+            measurement was sent.
+        ParameterTimeout: the vehicle did not report the parameters that decide about this.
     """
 
     @property
@@ -762,7 +770,7 @@ class MeasurementStream(MeasurementTwin[MeasurementT]):
 
     @property
     def dropped(self) -> int:
-        """Number of measurements that were not sent: replaced by a newer one, too old, or during a silence."""
+        """Number of measurements that were not sent: replaced, too old, or given while the vehicle was silent."""
         return self.aio.dropped
 
     @property
@@ -772,22 +780,22 @@ class MeasurementStream(MeasurementTwin[MeasurementT]):
 
     @property
     def estimator_use(self) -> EstimatorUse:
-        """Use of these measurements by the vehicle's estimator.
+        """Use of these measurements by the vehicle's estimator: ``"used"``, ``"not used"`` or ``"unknown"``.
 
-        No message reports this. It is derived from EKF_STATUS_REPORT or ESTIMATOR_STATUS and from the parameters at
-        the beginning of the block. "used": the estimator has a position or velocity, and its parameters allow no other
-        source. "not used": it has none. "unknown" in all other cases, such as with a GPS beside, for sensors that are
-        not a position, or without a recent report.
+        No message reports this, so aerokit derives it from EKF_STATUS_REPORT or ESTIMATOR_STATUS and from the
+        parameters at the beginning of the block. ``"used"``: the estimator has a position, and its parameters allow no
+        other source of it. ``"not used"``: the estimator has no position. ``"unknown"``: all other cases, for example
+        if the vehicle also has a GPS, for sensors that supply no position, or without a recent report.
         """
         return self.aio.estimator_use
 
     def send(self, measurement: MeasurementT) -> None:
-        """Send a measurement now, or at the end of the period if one was sent within it.
+        """Send a measurement now, or at the end of the period if another one was already sent in this period.
 
         Raises:
             InvalidArgument: a value is out of range; nothing was sent.
             SetpointStreamStopped: the block was left or not entered.
-            ValueUnknownError: a landing target for PX4, whose attitude or local position is unknown.
+            ValueUnknownError: PX4's attitude or local position is unknown, which a landing target requires.
             ConnectionClosed: the connection has ended.
         """
         self._loop.call(self.aio.send, measurement)
@@ -796,9 +804,9 @@ class MeasurementStream(MeasurementTwin[MeasurementT]):
 class External(TwinOf["AsyncExternal"]):
     """Supplies the vehicle with measurements: ``async with vehicle.external.odometry() as stream: stream.send(…)``.
 
-    ``rate_hz`` (above 0, to 400) is the highest rate at which measurements are sent, ``valid_for_s`` the age at which
-    one is dropped. Time stamps are those of the event loop's clock, and aerokit answers the vehicle's TIMESYNC
-    requests with it meanwhile.
+    ``rate_hz`` (above 0, at most 400) is the maximum rate at which measurements are sent. A measurement older than
+    ``valid_for_s`` is dropped. Time stamps are those of the event loop's clock. While a stream is open, aerokit answers
+    the vehicle's TIMESYNC requests with this clock.
     """
 
     def odometry(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[OdometryMeasurement]:
@@ -816,14 +824,14 @@ class External(TwinOf["AsyncExternal"]):
         )
 
     def vision_speed(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[SpeedMeasurement]:
-        """Supply a velocity (VISION_SPEED_ESTIMATE; ODOMETRY without a pose to PX4)."""
+        """Supply a velocity (VISION_SPEED_ESTIMATE; for PX4 ODOMETRY without a pose)."""
         return MeasurementStream(
             self._loop,
             self._loop.call(self.aio.vision_speed, rate_hz=rate_hz, valid_for_s=valid_for_s),
         )
 
     def motion_capture(self, *, rate_hz: float = 50.0, valid_for_s: float = 0.2) -> MeasurementStream[PoseMeasurement]:
-        """Supply a pose by motion capture (ATT_POS_MOCAP; VISION_POSITION_ESTIMATE to PX4)."""
+        """Supply a pose from motion capture (ATT_POS_MOCAP; for PX4 VISION_POSITION_ESTIMATE)."""
         return MeasurementStream(
             self._loop,
             self._loop.call(self.aio.motion_capture, rate_hz=rate_hz, valid_for_s=valid_for_s),
@@ -844,14 +852,14 @@ class External(TwinOf["AsyncExternal"]):
         )
 
     def obstacle_points(self, *, rate_hz: float = 10.0, valid_for_s: float = 0.5) -> MeasurementStream[ObstaclePoints]:
-        """Supply places of obstacles (OBSTACLE_DISTANCE_3D). ArduPilot needs PRX1_TYPE 2; PX4 does not read them."""
+        """Supply positions of obstacles (OBSTACLE_DISTANCE_3D). ArduPilot needs PRX1_TYPE 2; PX4 does not read them."""
         return MeasurementStream(
             self._loop,
             self._loop.call(self.aio.obstacle_points, rate_hz=rate_hz, valid_for_s=valid_for_s),
         )
 
     def range_finder(self, *, rate_hz: float = 20.0, valid_for_s: float = 0.2) -> MeasurementStream[RangeMeasurement]:
-        """Supply a distance (DISTANCE_SENSOR). ArduPilot needs RNGFND1_TYPE 10 and its orientation."""
+        """Supply a distance (DISTANCE_SENSOR). ArduPilot needs RNGFND1_TYPE 10 and RNGFND1_ORIENT."""
         return MeasurementStream(
             self._loop,
             self._loop.call(self.aio.range_finder, rate_hz=rate_hz, valid_for_s=valid_for_s),
@@ -863,9 +871,9 @@ class External(TwinOf["AsyncExternal"]):
         rate_hz: float = 20.0,
         valid_for_s: float = 0.3,
     ) -> MeasurementStream[TargetMeasurement]:
-        """Supply the place of a landing target (LANDING_TARGET). ArduPilot needs PLND_ENABLED and PLND_TYPE 1.
+        """Supply the position of a landing target (LANDING_TARGET). ArduPilot needs PLND_ENABLED and PLND_TYPE 1.
 
-        ``vehicle.land_on`` does this and lands.
+        ``vehicle.land_on`` opens this stream itself and lands the vehicle.
         """
         return MeasurementStream(
             self._loop,
@@ -873,7 +881,7 @@ class External(TwinOf["AsyncExternal"]):
         )
 
     def optical_flow(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[FlowMeasurement]:
-        """Supply optical flow (OPTICAL_FLOW; OPTICAL_FLOW_RAD to PX4).
+        """Supply optical flow (OPTICAL_FLOW; for PX4 OPTICAL_FLOW_RAD).
 
         ArduPilot needs FLOW_TYPE 5, PX4 EKF2_OF_CTRL.
         """
@@ -890,19 +898,19 @@ class External(TwinOf["AsyncExternal"]):
         speed_accuracy_m_s: float = 1.0,
         direction_accuracy_deg: float = 15.0,
     ) -> None:
-        """Supply an estimate of the wind (MAV_CMD_EXTERNAL_WIND_ESTIMATE); returns when it is acknowledged.
+        """Supply an estimate of the wind (MAV_CMD_EXTERNAL_WIND_ESTIMATE); returns at the acknowledgement.
 
-        No message reports the effect. ArduPilot applies it to its simpler estimator (DCM), PX4 to EKF2.
+        No message reports the effect. ArduPilot uses the estimate in its simpler estimator (DCM), PX4 in EKF2.
 
         Args:
             speed_m_s: horizontal speed, 0 to 100.
-            direction_deg: direction that it comes from, 0 to 360.
+            direction_deg: direction that the wind comes from, 0 to 360 clockwise from north.
             speed_accuracy_m_s: one standard deviation, 0 to 100.
             direction_accuracy_deg: one standard deviation, 0 to 180.
 
         Raises:
             InvalidArgument: a value is out of range. Nothing was sent.
-            CommandRejected: the vehicle refused, or does not support it.
+            CommandRejected: the vehicle refused, or does not support the command.
             CommandTimeout: there was no acknowledgement.
         """
         self._loop.run(
@@ -916,18 +924,18 @@ class External(TwinOf["AsyncExternal"]):
     def set_origin(self, origin: Position, *, timeout: float = 10.0) -> None:
         """Set the origin of the estimator's local frame, and wait until GPS_GLOBAL_ORIGIN reports it.
 
-        A vehicle without GPS needs it for global positions. SET_GPS_GLOBAL_ORIGIN is sent once; it has no
-        acknowledgement. Returns at once if the vehicle has this origin already. After a cancellation the vehicle may
-        have accepted it.
+        A vehicle without GPS needs the origin to compute global positions. SET_GPS_GLOBAL_ORIGIN is sent once, because
+        it has no acknowledgement. Returns at once if the vehicle has this origin already. The vehicle may have accepted
+        the origin of a cancelled call.
 
         Args:
             origin: latitude, longitude and altitude above mean sea level.
             timeout: seconds until the vehicle reports it.
 
         Raises:
-            InvalidArgument: the place has no altitude above mean sea level. Nothing was sent.
+            InvalidArgument: the origin has no altitude above mean sea level. Nothing was sent.
             OperationRejected: ArduPilot has another origin and keeps it until a reboot. Nothing was sent.
-            OperationTimeout: the vehicle did not report it.
+            OperationTimeout: the vehicle did not report the origin in time.
         """
         self._loop.run(self.aio.set_origin, origin, timeout=timeout)
 
@@ -946,7 +954,7 @@ class GimbalControl(BlockTwin["AsyncGimbalControl"]):
         BusyError: your program already has this control in another block. Nothing was sent.
         CommandRejected: the manager refused.
         CommandTimeout: there was no answer.
-        OperationTimeout: it was accepted, but the manager does not confirm that you are in control.
+        OperationTimeout: the manager accepted the command, but does not confirm that you are in control.
     """
 
     @property
@@ -989,7 +997,8 @@ class GimbalRates(BlockTwin["AsyncGimbalRates"]):
     (GIMBAL_MANAGER_SET_PITCHYAW, or GIMBAL_MANAGER_SET_ATTITUDE to PX4). Leaving, in any way, orders a rate of zero:
     the gimbal keeps its direction. The stream stops by itself, with a rate of zero, if no new rates are set for
     ``valid_for_s``, the event loop is blocked for ``max_lag_s``, or the vehicle is silent. It stops without sending a
-    rate of zero if another order is given to the gimbal, or control is lost. Then ``set`` and leaving the block raise.
+    rate of zero if another order is given to the gimbal, or control is lost. ``set`` and leaving the block then raise
+    :class:`SetpointStreamStopped` or :class:`GimbalTaken`.
 
     Entering raises:
         InvalidArgument: a rate is out of range. Nothing was sent.
@@ -1069,7 +1078,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
 
         Raises:
             InvalidArgument: the tolerance is out of range. Nothing was sent.
-            NotSupported: the manager supports it for its first gimbal only. Nothing was sent.
+            NotSupported: the manager supports regions of interest for its first gimbal only. Nothing was sent.
             ValueUnknownError: the target needs home or the vehicle's altitude, which is unknown. Nothing was sent.
 
         Otherwise raises as :meth:`neutral`.
@@ -1128,8 +1137,8 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         Args:
             pitch_deg: from the horizon, −360 to 360: 0 is level, −90 straight down.
             yaw_deg: −360 to 360, clockwise from north (``frame="earth"``) or from the nose (``"vehicle"``).
-            roll_deg: from the horizon, −360 to 360. Other values than 0 need the mount command, which turns the camera
-                with the vehicle: a yaw from north is right only at the time of the order.
+            roll_deg: from the horizon, −360 to 360. A roll other than 0 needs the mount command, whose yaw turns with
+                the vehicle: a yaw from north is right only at the time of the order.
             frame: reference of the yaw, which the gimbal keeps afterwards.
             wait: False: return when the manager has accepted the order.
             tolerance_deg: accepted deviation in each axis, above 0 to 45.
@@ -1174,7 +1183,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         self._loop.run(self.aio.neutral, wait=wait, timeout=timeout)
 
     def retract(self, *, wait: bool = True, timeout: float = 10.0) -> None:
-        """Retract the gimbal; returns when it rests there.
+        """Retract the gimbal; returns when it rests in the retracted position.
 
         Args:
             wait: False: return when the manager has accepted the order.
@@ -1230,7 +1239,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         Args:
             pitch_deg_s: the first rate in degrees per second, −720 to 720; positive is up.
             yaw_deg_s: the first rate in degrees per second, −720 to 720; positive is to the right.
-            frame: whether the yaw keeps to north (``"earth"``) or turns with the vehicle (``"vehicle"``).
+            frame: ``"earth"`` if the yaw is held relative to north, ``"vehicle"`` if it turns with the vehicle.
             rate_hz: how often the latest rates are sent, 2 to 100.
             valid_for_s: stop if no new rates are set for this time.
             max_lag_s: stop if the event loop is blocked for this time.
@@ -1302,9 +1311,10 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
         return self.aio.end
 
     def command(self, command: int, *params: float, component_id: int | None = None) -> None:
-        """Send a COMMAND_LONG of this order; returns when it is acknowledged or the order's effect is reported.
+        """Send a COMMAND_LONG of this order; returns at the acknowledgement, or when the order's effect is reported.
 
-        It is not sent again after a newer order about the same subject, or after another party changed the mode.
+        The command is not sent again after a newer order about the same subject, or after another party changed the
+        mode.
 
         Args:
             command: the MAV_CMD.
@@ -1357,10 +1367,10 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
         self._loop.run(self.aio.set_mode, mode, timeout=timeout, component_id=component_id)
 
     def wait_confirmed(self, timeout: float) -> None:
-        """Wait until HEARTBEAT reports the order's effect; returns at once if it was in effect already.
+        """Wait until HEARTBEAT reports the order's effect, which may be at once.
 
         Raises:
-            CommandRejected: the vehicle accepted first and refused then, as PX4 may do.
+            CommandRejected: the vehicle first accepted and then refused, as PX4 may do.
             OperationTimeout: the effect was not reported within ``timeout`` seconds.
         """
         self._loop.run(self.aio.wait_confirmed, timeout)
@@ -1377,13 +1387,13 @@ class Files(TwinOf["AsyncFiles"]):
     Every method raises:
         InvalidArgument: a path is empty, contains NUL, cannot be encoded, or has more than 238 bytes. Nothing was sent.
         FileError: the vehicle refused; see ``code`` and ``errno``.
-        FileTimeout: it did not finish; ``missing`` has the missing ranges.
+        FileTimeout: the operation did not finish; ``missing`` has the missing ranges.
 
     :meth:`is_supported` raises none of them.
     """
 
     def is_supported(self) -> bool:
-        """Return True if the vehicle reports MAVFTP; False also if it does not answer within three seconds."""
+        """Return True if the vehicle reports MAVFTP; False if it does not, or does not answer within three seconds."""
         return self._loop.run(self.aio.is_supported)
 
     def read(
@@ -1472,7 +1482,7 @@ class Files(TwinOf["AsyncFiles"]):
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> None:
-        """Write a file. An existing file is replaced; its content is lost with the first message.
+        """Write a file. An existing file is replaced; its old content is lost as soon as the write begins.
 
         ``verify`` compares the CRC-32 afterwards, if the vehicle can compute it. It cannot for files whose names
         begin with ``@``: the vehicle evaluates them when they are closed, and does not report the result.
@@ -1565,20 +1575,20 @@ class Files(TwinOf["AsyncFiles"]):
 
 
 class LogStream(LogStreamTwin):
-    """The flight log that PX4 sends while its ``async with`` block runs (LOGGING_DATA): an async iterator over bytes.
+    """PX4's flight log, received while PX4 writes it (LOGGING_DATA): an async iterator over bytes.
 
-    Written to a file one after the other, the bytes are a valid ULog file at any time. Lost messages are marked there
-    as dropouts; ``lost`` counts them. The iterator ends with the connection. PX4 sends one such log at a time.
+    If you append all bytes to a file, it is a valid ULog file at any time. Lost messages are marked in it as dropouts;
+    ``lost`` counts them. The iterator ends with the connection. PX4 sends one such log at a time.
 
     Entering raises:
-        NotSupported: ArduPilot. Nothing was sent.
+        NotSupported: the vehicle runs ArduPilot. Nothing was sent.
         CommandRejected: PX4 streams to another station, or the port is too slow (below 5 kB/s).
-        CommandTimeout: there was no acknowledgement; the stream that may have begun is stopped.
+        CommandTimeout: there was no acknowledgement; aerokit stops the stream, which may have begun.
     """
 
     @property
     def lost(self) -> int:
-        """Number of LOGGING_DATA messages that were not received, or that the reader was too slow for."""
+        """Number of LOGGING_DATA messages that were lost, or dropped because your program read too slowly."""
         return self.aio.lost
 
 
@@ -1614,7 +1624,8 @@ class Logs(TwinOf["AsyncLogs"]):
     ) -> None:
         """Copy a log to this computer. A log that is still being written is read up to its current end.
 
-        Until it is complete it is ``<to>.part`` by MAVFTP, ``<to>.log<id>-<time>.part`` by the LOG_* messages.
+        Until the download is complete, the local file is named ``<to>.part`` (MAVFTP) or ``<to>.log<id>-<time>.part``
+        (LOG_*).
 
         Args:
             log: an entry of :meth:`list`, or its id.
@@ -1630,7 +1641,7 @@ class Logs(TwinOf["AsyncLogs"]):
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
             FileError: there is no such log, or it was requested by MAVFTP and cannot be identified.
-            FileTimeout: it did not arrive; ``missing`` has the missing ranges.
+            FileTimeout: the log did not arrive completely; ``missing`` has the missing ranges.
             OSError: the local file cannot be written.
         """
         self._loop.run(
@@ -1680,7 +1691,7 @@ class Logs(TwinOf["AsyncLogs"]):
         self._loop.run(self.aio.erase, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
     def stream(self, *, idle_timeout_s: float = IDLE_TIMEOUT_S) -> LogStream:
-        """Receive the log that PX4 writes, for the duration of an ``async with`` block (MAV_CMD_LOGGING_START).
+        """Receive the flight log while PX4 writes it, during an ``async with`` block (MAV_CMD_LOGGING_START).
 
         ``async with vehicle.logs.stream() as stream: async for data in stream: file.write(data)``
 
@@ -1694,16 +1705,16 @@ class Logs(TwinOf["AsyncLogs"]):
 
 
 class Actuators(TwinOf["AsyncActuators"]):
-    """Outputs of the vehicle besides its flight controls: ``vehicle.actuators``.
+    """Outputs of the vehicle other than its flight controls: ``vehicle.actuators``.
 
-    ArduPilot has servos, relays, landing gear and a parachute; PX4 has actuators. After a cancellation the vehicle may
-    have executed the order.
+    ArduPilot has servos, relays, landing gear and a parachute; PX4 has actuators. The vehicle may have executed the
+    order of a cancelled call.
     """
 
     def set_servo(self, number: int, pulse_us: int) -> None:
         """Set the pulse width of a servo output, and return when SERVO_OUTPUT_RAW reports it (MAV_CMD_DO_SET_SERVO).
 
-        ArduPilot only. The output must have no function, or follow a stick (SERVOn_FUNCTION 0, 1, 51 to 66).
+        ArduPilot only. The output must have no function, or pass a stick through (SERVOn_FUNCTION 0, 1, 51 to 66).
 
         Args:
             number: output, 1 to 32.
@@ -1714,16 +1725,17 @@ class Actuators(TwinOf["AsyncActuators"]):
             NotSupported: the firmware does not have the command. Nothing was sent.
             CommandRejected: the vehicle refused, for example because the output has another function.
             CommandTimeout: there was no acknowledgement.
-            OperationRejected: a newer order for this output was given.
-            OperationTimeout: the vehicle reports another state.
+            OperationRejected: your program gave a newer order for this output.
+            OperationTimeout: SERVO_OUTPUT_RAW still reports another pulse width.
         """
         self._loop.run(self.aio.set_servo, number, pulse_us)
 
     def repeat_servo(self, number: int, pulse_us: int, *, count: int, period_s: float) -> None:
         """Move a servo ``count`` times to a pulse width and back to its trim (MAV_CMD_DO_REPEAT_SERVO).
 
-        Returns when ArduPilot has acknowledged and begins; no message reports the end. It has one cycle at a time: the
-        next order of this kind replaces it. Never sent twice, because each copy starts a new cycle. ArduPilot only.
+        ArduPilot only. Returns when ArduPilot has acknowledged and begins, because no message reports the end.
+        ArduPilot repeats one output at a time: the next order of this kind replaces the previous one. The command is
+        never sent twice, because each copy starts again.
 
         Args:
             number: output, 1 to 32, as for :meth:`set_servo`.
@@ -1739,8 +1751,8 @@ class Actuators(TwinOf["AsyncActuators"]):
     def set_relay(self, number: int, on: bool) -> None:
         """Switch a relay, and return when RELAY_STATUS reports it (MAV_CMD_DO_SET_RELAY).
 
-        Firmware without RELAY_STATUS (before ArduPilot 4.5) only acknowledges. ArduPilot only; it refuses a relay
-        without a pin. Raises as :meth:`set_servo`.
+        ArduPilot only; it refuses a relay without a pin. With firmware before 4.5, which has no RELAY_STATUS, the call
+        returns at the acknowledgement. Raises as :meth:`set_servo`.
 
         Args:
             number: relay from 0 (RELAY1_PIN) to 15.
@@ -1749,10 +1761,10 @@ class Actuators(TwinOf["AsyncActuators"]):
         self._loop.run(self.aio.set_relay, number, on)
 
     def repeat_relay(self, number: int, *, count: int, period_s: float) -> None:
-        """Switch a relay over and back ``count`` times (MAV_CMD_DO_REPEAT_RELAY).
+        """Toggle a relay and toggle it back, ``count`` times (MAV_CMD_DO_REPEAT_RELAY).
 
-        Returns when ArduPilot has acknowledged and begins. Never sent twice. ArduPilot only.
-        Raises as :meth:`repeat_servo`.
+        ArduPilot only. Returns when ArduPilot has acknowledged and begins. The command is never sent twice. Raises as
+        :meth:`repeat_servo`.
 
         Args:
             number: relay from 0 to 15.
@@ -1766,10 +1778,11 @@ class Actuators(TwinOf["AsyncActuators"]):
         self._loop.run(self.aio.set_actuator, number, value)
 
     def set_actuators(self, *values: float | None) -> None:
-        """Set actuators by number: the first value is for "Peripheral via Actuator Set 1" (MAV_CMD_DO_SET_ACTUATOR).
+        """Set up to six actuators: the first value is for "Peripheral via Actuator Set 1" (MAV_CMD_DO_SET_ACTUATOR).
 
-        Returns when PX4 has acknowledged, because no message reports the values. It acknowledges also if no output has
-        this function (PWM_MAIN_FUNCn 301 to 306). PX4 only; ArduPilot has servos. Raises as :meth:`repeat_servo`.
+        PX4 only; for ArduPilot use ``set_servo``. Returns when PX4 has acknowledged, because no message reports the
+        values. PX4 acknowledges even if no output has this function (PWM_MAIN_FUNCn 301 to 306). Raises as
+        :meth:`repeat_servo`.
 
         Args:
             values: one to six values, −1 to 1; None leaves an actuator as it is.
@@ -1779,11 +1792,11 @@ class Actuators(TwinOf["AsyncActuators"]):
     def raise_landing_gear(self) -> None:
         """Retract the landing gear (MAV_CMD_AIRFRAME_CONFIGURATION); returns at the acknowledgement.
 
-        ArduCopter and ArduPlane only. They report the gear by no message, and accept the order also if there is no
-        landing gear (LGR_ENABLE), or while they stand on it.
+        ArduCopter and ArduPlane only. No message reports the position of the gear. Both accept the order even if there
+        is no landing gear (LGR_ENABLE), and even while the vehicle stands on it.
 
         Raises:
-            NotSupported: PX4, Rover and Sub. Nothing was sent.
+            NotSupported: the firmware (PX4, Rover or Sub) does not have the command. Nothing was sent.
             OperationRejected: the vehicle is disarmed, or on the ground. Nothing was sent.
             CommandRejected: the vehicle refused.
             CommandTimeout: there was no acknowledgement.
@@ -1801,35 +1814,37 @@ class Actuators(TwinOf["AsyncActuators"]):
     def set_lights(self, on: bool, *, component_id: int = MavComponent.ILLUMINATOR) -> None:
         """Switch an illuminator, and return when ILLUMINATOR_STATUS reports it (MAV_CMD_ILLUMINATOR_ON_OFF).
 
-        For lights that are a MAVLink component. ArduPilot and PX4 do not have the command; lights on an output of
-        ArduPilot are servos or relays. Raises as :meth:`set_servo`.
+        Only for lights that are MAVLink components, because ArduPilot and PX4 do not have the command. Switch lights on
+        an output of ArduPilot by ``set_servo`` or ``set_relay``. Raises as :meth:`set_servo`.
 
         Args:
             on: the new state.
-            component_id: the light, 1 to 255; MAV_COMP_ID_ILLUMINATOR is 243.
+            component_id: component id of the light, 1 to 255; MAV_COMP_ID_ILLUMINATOR is 243.
         """
         self._loop.run(self.aio.set_lights, on, component_id=component_id)
 
     def test_motor(self, number: int, *, throttle_percent: float, duration_s: float, intent: SpinIntent) -> None:
-        """Spin one motor of a disarmed vehicle, and return when it has stopped; remove the propellers.
+        """Spin one motor of a disarmed vehicle, and return when it has stopped; remove the propellers first.
 
-        Sent once: a copy would spin it again. If the call is cancelled or fails, aerokit orders the motor to stop at
-        once; without that, it stops after ``duration_s``. ArduCopter reports armed during the test, and the call
-        returns when it reports disarmed. PX4 acknowledges only, so the call returns after ``duration_s``.
+        ArduPilot: MAV_CMD_DO_MOTOR_TEST. PX4: MAV_CMD_ACTUATOR_TEST, if COM_MOT_TEST_EN is 1. The command is sent once,
+        because a copy would spin the motor again.
 
-        ArduPilot: MAV_CMD_DO_MOTOR_TEST. PX4: MAV_CMD_ACTUATOR_TEST, if COM_MOT_TEST_EN is 1.
+        The motor stops after ``duration_s``. If the call is cancelled or fails while the motor may turn, aerokit orders
+        the motor to stop at once. ArduCopter reports armed during the test, and the call returns when it reports
+        disarmed. PX4 reports nothing about the test, so the call returns after ``duration_s``.
 
         Args:
-            number: 1 to 12. ArduCopter counts clockwise from the front, PX4 by output function (Motor 1).
+            number: 1 to 12. ArduCopter counts motors clockwise from the front; PX4 uses the number of the output
+                function (Motor 1).
             throttle_percent: 0 to 100.
             duration_s: seconds, above 0, at most 3.
             intent: must be ``"spin motor"``, so that no other call can be mistaken for it.
 
         Raises:
             InvalidArgument: a value is out of range, or the intent is another one. Nothing was sent.
-            OperationRejected: the vehicle is armed, or not known to be disarmed: nothing was sent. Or a newer order
-                for its motors was given.
-            CommandRejected: it refused (not landed, safety switch, COM_MOT_TEST_EN).
+            OperationRejected: the vehicle is armed, or not known to be disarmed (nothing was sent); or your program
+                started another motor test.
+            CommandRejected: the vehicle refused (not landed, safety switch, COM_MOT_TEST_EN).
             CommandTimeout: there was no acknowledgement; the motor may have turned.
             OperationTimeout: the vehicle still reports armed four seconds after the end.
         """
@@ -1842,17 +1857,17 @@ class Actuators(TwinOf["AsyncActuators"]):
         )
 
     def release_parachute(self, *, intent: ReleaseIntent) -> None:
-        """Release the parachute and stop the motors; return when ArduPilot reports that it was released.
+        """Release the parachute and stop the motors; return when ArduPilot reports the release (MAV_CMD_DO_PARACHUTE).
 
-        MAV_CMD_DO_PARACHUTE. ArduPilot accepts the command also where it then refuses to release: on the ground, below
-        CHUTE_ALT_MIN, or if the parachute is disabled. ArduCopter and ArduPlane only. **The vehicle falls.**
+        **The vehicle falls.** ArduCopter and ArduPlane only. ArduPilot accepts the command and then refuses the release
+        by a status text if the vehicle is on the ground or below CHUTE_ALT_MIN, or if the parachute is disabled.
 
         Args:
             intent: must be ``"release parachute"``, so that no other call can be mistaken for it.
 
         Raises:
             InvalidArgument: the intent is another one. Nothing was sent.
-            NotSupported: PX4, Rover and Sub. Nothing was sent.
+            NotSupported: the firmware (PX4, Rover or Sub) does not have the command. Nothing was sent.
             OperationRejected: the vehicle refused after the acknowledgement; ``reasons`` has its status texts.
             CommandRejected: the vehicle refused.
             CommandTimeout: there was no acknowledgement.
@@ -1861,12 +1876,12 @@ class Actuators(TwinOf["AsyncActuators"]):
         self._loop.run(self.aio.release_parachute, intent=intent)
 
     def enable_parachute(self, enabled: bool = True) -> None:
-        """Allow or forbid the release of the parachute until the next reboot; returns at the acknowledgement.
+        """Allow or forbid the release of the parachute until the next reboot (MAV_CMD_DO_PARACHUTE).
 
-        MAV_CMD_DO_PARACHUTE. ArduCopter and ArduPlane only.
+        ArduCopter and ArduPlane only. Returns at the acknowledgement.
 
         Args:
-            enabled: False forbids it, also for failsafes.
+            enabled: False forbids the release, even by a failsafe.
 
         Raises:
             NotSupported, CommandRejected, CommandTimeout: as for ``release_parachute``.
@@ -1877,19 +1892,19 @@ class Actuators(TwinOf["AsyncActuators"]):
 class Gripper(TwinOf["AsyncGripper"]):
     """One gripper: ``vehicle.gripper()`` (MAV_CMD_DO_GRIPPER).
 
-    PX4 acknowledges when the gripper has moved (PD_GRIPPER_EN). ArduPilot acknowledges at once and reports the end by
-    status text (GRIP_ENABLE); an electro-permanent gripper reports only its beginning, and the call returns three
-    seconds later. Orders are sent once. After a cancellation the gripper may have moved.
+    PX4 acknowledges when the gripper has moved (PD_GRIPPER_EN). ArduPilot (GRIP_ENABLE) acknowledges at once and
+    reports the end by a status text. For an electro-permanent gripper it reports only the start, and the call returns
+    three seconds later. Orders are sent once. The gripper may have moved after a cancelled call.
     """
 
     def grab(self) -> None:
         """Close the gripper, and return when it has closed.
 
         Raises:
-            CommandRejected: there is no gripper, or it refused.
+            CommandRejected: the vehicle has no gripper, or refused.
             CommandTimeout: there was no acknowledgement.
-            OperationRejected: a newer order for this gripper was given.
-            OperationTimeout: the end was not reported within ten seconds.
+            OperationRejected: your program gave a newer order for this gripper.
+            OperationTimeout: the vehicle did not report the end within ten seconds.
         """
         self._loop.run(self.aio.grab)
 
@@ -1901,19 +1916,19 @@ class Gripper(TwinOf["AsyncGripper"]):
 class Winch(TwinOf["AsyncWinch"]):
     """One winch: ``vehicle.winch()`` (MAV_CMD_DO_WINCH).
 
-    ArduCopter has :meth:`relax`, :meth:`pay_out` and :meth:`set_rate`; the other orders are for winches that are
-    MAVLink components: ``vehicle.winch(component_id=169)``. PX4 has none of them and forwards the command to such a
-    component. An order that may pay out line twice is sent once. A newer order ends the wait for the previous one.
-    A cancelled call does not stop the winch: call ``set_rate(0)``.
+    ArduCopter supports :meth:`relax`, :meth:`pay_out` and :meth:`set_rate`. The other orders are for winches that are
+    MAVLink components: ``vehicle.winch(component_id=169)``. PX4 drives no winch itself and forwards the command to such
+    a component. An order that could pay out line twice is sent once. A newer order for the winch ends the call that
+    waits for the previous one. A cancelled call does not stop the winch: call ``set_rate(0)``.
     """
 
     @cached_property
     def status(self) -> StateCell[WinchStatus]:
-        """Length, speed, tension and state of the autopilot's winch (WINCH_STATUS); ``vehicle.winch_status``."""
+        """Length, speed, tension and state of the autopilot's winch (WINCH_STATUS): ``vehicle.winch_status``."""
         return StateCell(self._loop, self.aio.status)
 
     def relax(self) -> None:
-        """Let the line run freely; returns at the acknowledgement, which is all that ArduCopter reports.
+        """Let the line run freely. Returns at the acknowledgement, because ArduCopter reports nothing else.
 
         Raises:
             NotSupported: the autopilot has no such order. Nothing was sent.
@@ -1925,30 +1940,31 @@ class Winch(TwinOf["AsyncWinch"]):
     def pay_out(self, length_m: float, *, rate_m_s: float = 0.5, timeout: float = ACTION_TIMEOUT_S) -> None:
         """Pay out a length of line, and return when WINCH_STATUS reports it within 0.1 m.
 
-        Without WINCH_STATUS it returns at the acknowledgement. Sent once, because a copy would pay out more.
+        Returns at the acknowledgement if the winch sends no WINCH_STATUS. The command is sent once, because a copy
+        would pay out more line.
 
         Args:
-            length_m: metres, −1000 to 1000; negative values wind it up.
+            length_m: metres, −1000 to 1000; negative values wind the line up.
             rate_m_s: speed, above 0, at most 20 m/s; ArduCopter uses WINCH_MAX_RATE instead.
-            timeout: seconds until the length is out.
+            timeout: seconds until WINCH_STATUS reports the length.
 
         Raises:
             InvalidArgument: a value is out of range. Nothing was sent.
             NotSupported: the autopilot has no such order. Nothing was sent.
             CommandRejected: there is no winch (WINCH_TYPE).
             CommandTimeout: there was no acknowledgement; the winch may run.
-            OperationRejected: a newer order for this winch was given.
+            OperationRejected: your program gave a newer order for this winch.
             HeartbeatTimeout: the vehicle was silent for ten seconds.
-            OperationTimeout: the length was not reported in time.
+            OperationTimeout: WINCH_STATUS did not report the length in time.
         """
         self._loop.run(self.aio.pay_out, length_m, rate_m_s=rate_m_s, timeout=timeout)
 
     def set_rate(self, rate_m_s: float) -> None:
-        """Pay out line at this speed until the next order, and return when WINCH_STATUS reports the speed.
+        """Pay out line at this speed until the next order. Returns when WINCH_STATUS reports the speed.
 
         Args:
-            rate_m_s: −20 to 20 m/s; negative values wind it up, 0 stops. ArduCopter limits it to WINCH_MAX_RATE, and
-                this call then times out.
+            rate_m_s: −20 to 20 m/s; negative values wind the line up, 0 stops. ArduCopter limits the speed to
+                WINCH_MAX_RATE; a call with a higher speed times out.
 
         Raises:
             InvalidArgument, NotSupported, CommandRejected, CommandTimeout, OperationRejected, OperationTimeout: as for
@@ -1961,14 +1977,14 @@ class Winch(TwinOf["AsyncWinch"]):
         self._loop.run(self.aio.lock)
 
     def deliver(self) -> None:
-        """Start the winch's own delivery: lower, release, retract. Returns at the acknowledgement.
+        """Start the winch's automatic delivery: lower, release, retract. Returns at the acknowledgement.
 
         Raises as :meth:`relax`.
         """
         self._loop.run(self.aio.deliver)
 
     def hold(self) -> None:
-        """Hold the line by the motor, without the brake. Returns at the acknowledgement. Raises as :meth:`relax`."""
+        """Hold the line by the motor instead of the brake. Returns at the acknowledgement. Raises as :meth:`relax`."""
         self._loop.run(self.aio.hold)
 
     def retract(self, *, timeout: float = ACTION_TIMEOUT_S) -> None:
@@ -1988,39 +2004,39 @@ class Winch(TwinOf["AsyncWinch"]):
         self._loop.run(self.aio.retract, timeout=timeout)
 
     def load_line(self) -> None:
-        """Load new line: the motor turns slowly. Returns when WINCH_STATUS reports it. Raises as :meth:`retract`."""
+        """Turn slowly to load new line. Returns when WINCH_STATUS reports this state. Raises as :meth:`retract`."""
         self._loop.run(self.aio.load_line)
 
     def abandon_line(self) -> None:
-        """Spool out all line and release it. Returns when WINCH_STATUS reports it. Raises as :meth:`retract`."""
+        """Spool out all line and drop it. Returns when WINCH_STATUS reports this state. Raises as :meth:`retract`."""
         self._loop.run(self.aio.abandon_line)
 
     def load_payload(self) -> None:
-        """Run slowly until a payload is attached. Returns when WINCH_STATUS reports it. Raises as :meth:`retract`."""
+        """Run slowly to attach a payload. Returns when WINCH_STATUS reports this state. Raises as :meth:`retract`."""
         self._loop.run(self.aio.load_payload)
 
 
 class Shell(BlockTwin["AsyncShell"]):
     """PX4's system shell, open for the duration of an ``async with`` block: ``vehicle.shell()`` (SERIAL_CONTROL).
 
-    PX4 has one shell for each of its ports, which all stations on that port share. aerokit sends each line once, and
-    does not know what it does: a command of the shell is no order. The messages have neither numbers nor answers, so a
-    bad link loses parts of the text.
+    PX4 has one shell for each of its ports, and all stations on that port share it. aerokit sends each line once. It
+    does not know what a shell command does, so the rules for orders do not apply to it. SERIAL_CONTROL has neither
+    sequence numbers nor acknowledgements, so parts of the text may be lost.
 
     Entering raises:
-        NotSupported: ArduPilot, which has no shell. Nothing was sent.
+        NotSupported: the vehicle runs ArduPilot, which has no shell. Nothing was sent.
         BusyError: this shell was entered before; call ``vehicle.shell()`` again.
         OperationTimeout: there was no prompt within five seconds.
     """
 
     def write(self, line: str) -> None:
-        """Send one line without waiting for its output; :meth:`read` returns that.
+        """Send one line without waiting for its output, which :meth:`read` returns.
 
         Args:
             line: at most 1000 bytes, without a line break.
 
         Raises:
-            InvalidArgument: it is too long or has a line break, or the block is not open. Nothing was sent.
+            InvalidArgument: the line is too long or has a line break, or the block is not open. Nothing was sent.
         """
         self._loop.call(self.aio.write, line)
 
@@ -2037,9 +2053,9 @@ class Shell(BlockTwin["AsyncShell"]):
         return self._loop.run(self.aio.read, timeout=timeout)
 
     def run(self, command: str, *, timeout: float = 10.0) -> str:
-        """Run a command and return its output, when the shell shows its prompt again.
+        """Run a command, wait until the shell shows its prompt again, and return the output.
 
-        A cancelled or timed out call does not end the command. Output that was not read before is discarded.
+        A cancellation or time-out does not end the command. Output that arrived before the call is discarded.
 
         Args:
             command: at most 1000 bytes, without a line break.
@@ -2047,13 +2063,13 @@ class Shell(BlockTwin["AsyncShell"]):
 
         Raises:
             InvalidArgument: as for :meth:`write`.
-            OperationTimeout: there was no prompt in time; the text has the output so far.
+            OperationTimeout: there was no prompt in time; the error text has the output so far.
         """
         return self._loop.run(self.aio.run, command, timeout=timeout)
 
 
 class TemporaryParameters(TemporarilyTwin):
-    """Other values for the duration of a block, which yields the results; see :meth:`Parameters.temporarily`."""
+    """Sets other values for the duration of a block; see :meth:`Parameters.temporarily`."""
 
 
 class Transaction(TransactionTwin):
@@ -2097,9 +2113,9 @@ class Parameters(TwinOf["AsyncParameters"]):
     method accepts the old and the new name with either firmware, and converts the value; an old name that the vehicle
     no longer has causes an :class:`aerokit.errors.ParameterRenamedWarning` with the new one.
 
-    ArduPilot handles parameters a few times a second. While more than five are read, or if it has not answered within
-    half a second whether it has a parameter, aerokit raises that rate by SET_MESSAGE_INTERVAL of PARAM_VALUE, and
-    restores it at the end.
+    ArduPilot handles parameters a few times a second. aerokit raises this rate by SET_MESSAGE_INTERVAL of PARAM_VALUE
+    while it reads more than five parameters, or if there is no answer within half a second, and restores the rate at
+    the end.
 
     All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
     total; then OperationTimeout). You can cancel any call.
@@ -2149,18 +2165,19 @@ class Parameters(TwinOf["AsyncParameters"]):
         """Return all parameters; immediately if they were downloaded since the vehicle started.
 
         Args:
-            method: ``"ftp"`` reads one small file with the defaults (``@PARAM/param.pck``), ``"list"`` requests one
-                message for each parameter; ``"auto"`` uses the file if there is one.
+            method: ``"ftp"`` reads one small file that also has the defaults (``@PARAM/param.pck``), ``"list"``
+                requests one message for each parameter, ``"auto"`` uses the file if there is one.
             refresh: download again, even if the parameters are known or cached.
             cache: keep the list on disk, and use it while the vehicle's parameter hash is unchanged: the second connect
-                takes one request. True means the user's cache directory; or pass a path. Only PX4 has a hash; it does
-                not cover parameters that PX4 changes by itself, so they may be outdated. Off by default.
+                takes one request. True means the user's cache directory; or pass a path. Only PX4 has a hash. It does
+                not cover parameters that PX4 changes by itself, so these may be outdated. Off by default.
             idle_timeout_s: fail after this many seconds without progress.
             timeout: seconds in total.
             on_progress: called with the number of parameters, or bytes of the file, so far and in total.
 
         Raises:
-            ParameterTimeout: the list is incomplete; ``missing`` has the indices, ``table`` what has arrived.
+            ParameterTimeout: the list is incomplete; ``missing`` has the missing indices, ``table`` the parameters that
+                have arrived.
             FileError, FileTimeout, RemoteProtocolError: with ``method="ftp"`` only.
         """
         return self._loop.run(
@@ -2182,7 +2199,7 @@ class Parameters(TwinOf["AsyncParameters"]):
 
         Raises:
             InvalidArgument: the name is empty, or longer than 16 characters.
-            ParameterRejected: the vehicle reports that it has no such parameter, or answers only requests for others.
+            ParameterRejected: the vehicle reports that it has no such parameter, or answers only for other parameters.
             ParameterTimeout: there was no answer.
         """
         return self._loop.run(self.aio.read, name, idle_timeout_s=idle_timeout_s, timeout=timeout)
@@ -2259,9 +2276,9 @@ class Parameters(TwinOf["AsyncParameters"]):
 
         ``method="ftp"`` writes one file (``@PARAM/param.pck``) and reads the values back, ``"set"`` sets them one by
         one, ``"auto"`` uses the file if the vehicle supports it and there are many changes. Results are as for
-        :meth:`set_many`; parameters that the vehicle does not have end as ``"failed"`` with ParameterRejected, and
-        the others are set. If two names mean the same parameter, the vehicle's current name counts, and the other one
-        gets no result.
+        :meth:`set_many`; parameters that the vehicle does not have end as ``"failed"`` with ParameterRejected, and the
+        others are set. If two names mean the same parameter, the value under the vehicle's current name is used, and
+        the other name gets no result.
 
         Raises:
             InvalidArgument, FileFormatError: a name, a value or the file is invalid. Nothing was set.
@@ -2337,7 +2354,7 @@ class Parameters(TwinOf["AsyncParameters"]):
         """Return the parameters that differ from their default, according to MAVFTP or the metadata.
 
         Raises:
-            NotSupported: neither of them has defaults.
+            NotSupported: the defaults are unknown, because neither of the two is available.
         """
         return self._loop.run(
             self.aio.changed_from_default,
@@ -2350,30 +2367,31 @@ class Parameters(TwinOf["AsyncParameters"]):
 class Calibration(CalibrationTwin):
     """The steps of a calibration: iterate with ``async for``. The last step has the ``result``.
 
-    The calibration starts with the first step. Leaving the loop, in any way, cancels it on the vehicle, as does the end
-    of the vehicle's block. ArduPilot cannot cancel ``accelerometer``; a warning says so. Others that no vehicle cancels
-    (level, barometer, ArduPilot's gyroscope and airspeed, PX4's ESCs) end in seconds.
+    The calibration starts with the first step. Leaving the loop in any way, or leaving the vehicle's block, cancels the
+    calibration on the vehicle. ArduPilot cannot cancel ``accelerometer``, and aerokit then logs a warning. The other
+    calibrations that a vehicle cannot cancel (level, barometer, ArduPilot's gyroscope and airspeed, PX4's ESCs) end in
+    seconds.
 
     Iterating raises:
-        OperationRejected: the calibration failed, or was cancelled by another party, with the vehicle's texts as
-            reasons; or the vehicle is armed, or not known to be disarmed.
+        OperationRejected: the calibration failed, or another party cancelled it (``reasons`` has the vehicle's status
+            texts); or the vehicle is armed, or not known to be disarmed.
         NotSupported: the vehicle has no such sensor or calibration. Nothing was sent.
         CommandRejected: the vehicle refused to start.
         CommandTimeout: the vehicle did not answer.
-        OperationTimeout: the vehicle reported nothing for two minutes, or its result was lost.
+        OperationTimeout: the vehicle reported nothing for two minutes, or the text with the result was lost.
         HeartbeatTimeout: the vehicle was silent for 10 s.
         BusyError: another calibration of this vehicle is in progress. Nothing was sent.
         ConnectionClosed, LinkLost: the connection has ended.
     """
 
     def cancel(self) -> None:
-        """Cancel the calibration; returns when the vehicle has confirmed it.
+        """Cancel the calibration, and return when the vehicle has confirmed that it has ended.
 
         Does nothing if the calibration has not started or has ended.
 
         Raises:
-            NotSupported: the vehicle cannot cancel it.
-            OperationTimeout: the vehicle did not confirm it.
+            NotSupported: the vehicle cannot cancel this calibration.
+            OperationTimeout: the vehicle did not confirm the end.
         """
         self._loop.run(self.aio.cancel)
 
@@ -2381,23 +2399,24 @@ class Calibration(CalibrationTwin):
 class CalibrationControl(TwinOf["AsyncCalibrationControl"]):
     """Calibrates the vehicle's sensors: ``async for step in vehicle.calibrate.compass(): …``.
 
-    Each method returns the steps. Print ``step.instruction``, show ``step.pose``; where ``step.needs_confirmation`` is
-    true, the calibration waits until the loop continues. See docs/how-to/calibration.md. Only one calibration runs at a
-    time, on a disarmed vehicle.
+    Each method returns an iterator over the steps. Show ``step.instruction`` and ``step.pose`` to the person at the
+    vehicle. If ``step.needs_confirmation`` is true, the calibration waits until your loop asks for the next step. The
+    vehicle must be disarmed, and only one calibration runs at a time. See docs/how-to/calibration.md.
     """
 
     def compass(self) -> Calibration:
-        """Calibrate all compasses, while the vehicle is turned about all axes.
+        """Calibrate all compasses, while a person turns the vehicle about all its axes.
 
-        ArduPilot reports progress and fitness of each compass, and must reboot afterwards. PX4 wants up to six poses,
-        turned about the vertical in each.
+        ArduPilot reports progress and fitness of each compass, and must reboot afterwards. PX4 asks for up to six
+        poses, and for a turn about the vertical axis in each.
         """
         return Calibration(self._loop, self._loop.call(self.aio.compass))
 
     def accelerometer(self) -> Calibration:
         """Calibrate the accelerometers in six poses.
 
-        ArduPilot waits for a confirmation in each pose, and must reboot afterwards. PX4 detects poses, in any order.
+        ArduPilot waits for a confirmation in each pose, and must reboot afterwards. PX4 detects the poses itself, in
+        any order.
         """
         return Calibration(self._loop, self._loop.call(self.aio.accelerometer))
 
@@ -2406,28 +2425,30 @@ class CalibrationControl(TwinOf["AsyncCalibrationControl"]):
         return Calibration(self._loop, self._loop.call(self.aio.gyroscope))
 
     def level(self) -> Calibration:
-        """Calibrate which attitude is level, while the vehicle stands level and still."""
+        """Calibrate the level attitude, while the vehicle stands level and still."""
         return Calibration(self._loop, self._loop.call(self.aio.level))
 
     def barometer(self) -> Calibration:
-        """Calibrate the barometer: ArduPilot by the present pressure, PX4 by the altitude of the GPS."""
+        """Calibrate the barometer: ArduPilot takes the present pressure as the ground's, PX4 uses the GPS altitude."""
         return Calibration(self._loop, self._loop.call(self.aio.barometer))
 
     def airspeed(self) -> Calibration:
-        """Calibrate the airspeed sensors: sheltered from wind first; on PX4, blow into the front afterwards."""
+        """Calibrate the airspeed sensors, first sheltered from wind; PX4 then asks a person to blow into the tube."""
         return Calibration(self._loop, self._loop.call(self.aio.airspeed))
 
     def radio(self) -> Calibration:
-        """Calibrate the remote control: writes RCn_MIN, RCn_MAX and RCn_TRIM of each channel that was moved.
+        """Calibrate the remote control: write RCn_MIN, RCn_MAX and RCn_TRIM of each channel that was moved.
 
-        Both confirmations are needed: when all sticks and switches were at their ends, and when the sticks are centred.
+        Two steps need a confirmation: after all sticks and switches were moved to their ends, and after the sticks were
+        centred.
         """
         return Calibration(self._loop, self._loop.call(self.aio.radio))
 
     def escs(self, *, intent: EscIntent) -> Calibration:
         """Calibrate the ESCs. **Remove the propellers**, because the motors get full throttle.
 
-        PX4 does it at once, while you connect the battery. ArduCopter does it at the next boot: the last step says so.
+        PX4 calibrates at once, while a person connects the battery. ArduCopter calibrates at the next boot, as the last
+        step says.
 
         Args:
             intent: ``"propellers are removed"``.
@@ -2462,9 +2483,10 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         Args:
             plan: checked before anything is sent.
             method: ``"ftp"`` (ArduPilot's ``@MISSION/…`` files), ``"items"`` (the mission protocol), or ``"auto"``.
-            only_changes: if the vehicle's plan is known from an earlier transfer, and the vehicle confirms it, send
-                nothing if it is equal, and only the items that differ if the vehicle supports that.
-            verify: read the plan back and compare, or compare PX4's checksum where that is faster. Files are always
+            only_changes: compare with the vehicle's plan, if it is known from an earlier transfer and the vehicle
+                confirms it. Send nothing if both are equal, and only the items that differ if the vehicle supports
+                that.
+            verify: read the plan back and compare it, or compare PX4's checksum if that is faster. Files are always
                 read back.
             max_distance_m: refuse a plan with a position farther than this from the vehicle, if its position is
                 known.
@@ -2482,7 +2504,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
             MissionTimeout: the vehicle stopped answering; ``missing`` has the items that it did not confirm.
             VerificationFailed: the vehicle confirmed the plan, but has different items.
             NotSupported: ``"ftp"`` was requested, but the vehicle does not support it.
-            FileError, FileTimeout: the vehicle refused or did not answer an operation on a file, with ``"ftp"``.
+            FileError, FileTimeout: with ``"ftp"``: the vehicle refused an operation on a file, or did not answer.
             OperationTimeout: not done within ``timeout``.
         """
         self._loop.run(
@@ -2510,7 +2532,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
             MissionRejected: the vehicle refused.
-            MissionTimeout: items are missing; ``missing`` has them.
+            MissionTimeout: items did not arrive; ``missing`` has their numbers.
             RemoteProtocolError: the received items are not a valid plan.
             NotSupported, FileError, FileTimeout: as for :meth:`upload`, with ``"ftp"``.
             OperationTimeout: not done within ``timeout``.
@@ -2524,7 +2546,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         )
 
     def clear(self, *, idle_timeout_s: float = 10.0, timeout: float | None = None) -> None:
-        """Clear the plan on the vehicle, and verify that. ArduPilot refuses to clear a mission that it is flying.
+        """Clear the plan on the vehicle, and verify that it is empty. ArduPilot refuses to clear a mission in flight.
 
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
@@ -2573,7 +2595,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         """Fly the mission from ``item`` on; returns when HEARTBEAT reports the mission mode.
 
         The vehicle must be armed: **it takes off** if the mission begins with a take-off. A copter on the ground needs
-        a take-off item first. If you cancel the call, aerokit orders the vehicle to hold.
+        a take-off as the first item. If you cancel the call, aerokit orders the vehicle to hold.
 
         Sends MISSION_START to ArduPilot, which then takes off from the ground. Other autopilots get a mode change.
 
@@ -2594,7 +2616,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         self._loop.run(self.aio.pause)
 
     def resume(self, *, timeout: float = 10.0) -> None:
-        """Continue the mission from the current item; also after a pilot or another order has interrupted it.
+        """Continue the mission from the current item, even after a pilot or another order has interrupted it.
 
         ArduPilot starts again from the first item if its parameter MIS_RESTART is 1. Raises as :meth:`start`.
         """
@@ -2612,10 +2634,10 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
 
         Raises:
             OperationRejected: the vehicle no longer flies the mission: a pilot, a failsafe or another order changed the
-                mode, or it disarmed on the way. ``reasons`` has what the vehicle reported.
-            OperationTimeout: not finished in time; or the armed vehicle has not moved for 12 s after a descent at more
-                than 3 m/s that ended on the ground; or it has not moved for 60 s at a take-off or at a waypoint without
-                a hold, which requires that the items were uploaded or downloaded.
+                mode, it disarmed on the way, or it fell. ``reasons`` has the vehicle's status texts.
+            OperationTimeout: the mission was not finished in time; or the armed vehicle has not moved for 12 s after a
+                descent at more than 3 m/s that ended on the ground; or it has not moved for 60 s at a take-off or at a
+                waypoint without a hold (only if the items are known from an upload or a download).
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
         """
         self._loop.run(self.aio.wait_finished, timeout=timeout, max_silence_s=max_silence_s)
@@ -2624,7 +2646,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
     def explains_mode(self) -> bool:
         """True if the vehicle holds, returns or lands because its mission has ended.
 
-        This requires that the mission was the last order, and is complete or at its last item.
+        The mission must be the last order, and must be complete or at its last item.
         """
         return self.aio.explains_mode
 
@@ -2653,9 +2675,10 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
         Args:
             plan: checked before anything is sent.
             method: ``"ftp"`` (ArduPilot's ``@MISSION/…`` files), ``"items"`` (the mission protocol), or ``"auto"``.
-            only_changes: if the vehicle's plan is known from an earlier transfer, and the vehicle confirms it, send
-                nothing if it is equal, and only the items that differ if the vehicle supports that.
-            verify: read the plan back and compare, or compare PX4's checksum where that is faster. Files are always
+            only_changes: compare with the vehicle's plan, if it is known from an earlier transfer and the vehicle
+                confirms it. Send nothing if both are equal, and only the items that differ if the vehicle supports
+                that.
+            verify: read the plan back and compare it, or compare PX4's checksum if that is faster. Files are always
                 read back.
             max_distance_m: refuse a plan with a position farther than this from the vehicle, if its position is
                 known.
@@ -2673,7 +2696,7 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
             MissionTimeout: the vehicle stopped answering; ``missing`` has the items that it did not confirm.
             VerificationFailed: the vehicle confirmed the plan, but has different items.
             NotSupported: ``"ftp"`` was requested, but the vehicle does not support it.
-            FileError, FileTimeout: the vehicle refused or did not answer an operation on a file, with ``"ftp"``.
+            FileError, FileTimeout: with ``"ftp"``: the vehicle refused an operation on a file, or did not answer.
             OperationTimeout: not done within ``timeout``.
         """
         self._loop.run(
@@ -2701,7 +2724,7 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
             MissionRejected: the vehicle refused.
-            MissionTimeout: items are missing; ``missing`` has them.
+            MissionTimeout: items did not arrive; ``missing`` has their numbers.
             RemoteProtocolError: the received items are not a valid plan.
             NotSupported, FileError, FileTimeout: as for :meth:`upload`, with ``"ftp"``.
             OperationTimeout: not done within ``timeout``.
@@ -2715,7 +2738,7 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
         )
 
     def clear(self, *, idle_timeout_s: float = 10.0, timeout: float | None = None) -> None:
-        """Clear the plan on the vehicle, and verify that. ArduPilot refuses to clear a mission that it is flying.
+        """Clear the plan on the vehicle, and verify that it is empty. ArduPilot refuses to clear a mission in flight.
 
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
@@ -2739,7 +2762,7 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
 
 
 class RallyControl(TwinOf["AsyncRallyControl"]):
-    """Rally points, alternatives to home for a return: ``await vehicle.rally.upload(RallyPoints([...]))``.
+    """Rally points, where a vehicle may return instead of home: ``await vehicle.rally.upload(RallyPoints([...]))``.
 
     PX4 calls them safe points, and uses them if RTL_TYPE is set accordingly.
     """
@@ -2761,9 +2784,10 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
         Args:
             plan: checked before anything is sent.
             method: ``"ftp"`` (ArduPilot's ``@MISSION/…`` files), ``"items"`` (the mission protocol), or ``"auto"``.
-            only_changes: if the vehicle's plan is known from an earlier transfer, and the vehicle confirms it, send
-                nothing if it is equal, and only the items that differ if the vehicle supports that.
-            verify: read the plan back and compare, or compare PX4's checksum where that is faster. Files are always
+            only_changes: compare with the vehicle's plan, if it is known from an earlier transfer and the vehicle
+                confirms it. Send nothing if both are equal, and only the items that differ if the vehicle supports
+                that.
+            verify: read the plan back and compare it, or compare PX4's checksum if that is faster. Files are always
                 read back.
             max_distance_m: refuse a plan with a position farther than this from the vehicle, if its position is
                 known.
@@ -2781,7 +2805,7 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
             MissionTimeout: the vehicle stopped answering; ``missing`` has the items that it did not confirm.
             VerificationFailed: the vehicle confirmed the plan, but has different items.
             NotSupported: ``"ftp"`` was requested, but the vehicle does not support it.
-            FileError, FileTimeout: the vehicle refused or did not answer an operation on a file, with ``"ftp"``.
+            FileError, FileTimeout: with ``"ftp"``: the vehicle refused an operation on a file, or did not answer.
             OperationTimeout: not done within ``timeout``.
         """
         self._loop.run(
@@ -2809,7 +2833,7 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
             MissionRejected: the vehicle refused.
-            MissionTimeout: items are missing; ``missing`` has them.
+            MissionTimeout: items did not arrive; ``missing`` has their numbers.
             RemoteProtocolError: the received items are not a valid plan.
             NotSupported, FileError, FileTimeout: as for :meth:`upload`, with ``"ftp"``.
             OperationTimeout: not done within ``timeout``.
@@ -2823,7 +2847,7 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
         )
 
     def clear(self, *, idle_timeout_s: float = 10.0, timeout: float | None = None) -> None:
-        """Clear the plan on the vehicle, and verify that. ArduPilot refuses to clear a mission that it is flying.
+        """Clear the plan on the vehicle, and verify that it is empty. ArduPilot refuses to clear a mission in flight.
 
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
@@ -2838,15 +2862,16 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
 class NtripClient(BlockTwin["AsyncNtripClient"]):
     """Fetches corrections from an NTRIP caster while its ``async with`` block runs, and sends them to the vehicle.
 
-    Entering returns when the caster has accepted the request. A connection that ends, or is silent for 30 s, is opened
-    again, after 1 to 30 s, as often as necessary; the logger ``aerokit`` reports it. Messages that GPS_RTCM_DATA cannot
-    carry (above 720 bytes) are left out. Leaving the block closes the connection.
+    Entering returns when the caster has accepted the request. If the connection ends or is silent for 30 s, the client
+    reconnects after 1 to 30 s, as often as necessary, and logs it (logger ``aerokit``). Messages of more than 720
+    bytes, which GPS_RTCM_DATA cannot carry, are dropped. Leaving the block closes the connection.
 
     Entering raises:
-        OperationRejected: the caster refused: user or password, or no such mount point (the text lists others).
+        OperationRejected: the caster refused the user or the password, or has no such mount point (the text lists its
+            mount points).
         LinkOpenError: the caster could not be reached.
         OperationTimeout: the caster did not answer in time.
-        BusyError: the client was entered before.
+        BusyError: the client was entered before; call ``ntrip()`` again.
     """
 
     @property
@@ -2856,17 +2881,17 @@ class NtripClient(BlockTwin["AsyncNtripClient"]):
 
     @property
     def problem(self) -> str:
-        """Why the caster is not connected now; empty while it is."""
+        """Reason why the client is not connected; empty while it is connected."""
         return self.aio.problem
 
     @property
     def reconnects(self) -> int:
-        """How often the connection was opened again."""
+        """Number of times that the client has reconnected."""
         return self.aio.reconnects
 
     @property
     def oversized(self) -> int:
-        """Number of messages that were left out because they have more than 720 bytes."""
+        """Number of messages that were dropped because they have more than 720 bytes."""
         return self.aio.oversized
 
 
@@ -2878,21 +2903,21 @@ class Rtk(TwinOf["AsyncRtk"]):
 
     @cached_property
     def corrections(self) -> StateCell[Corrections]:
-        """Number, bytes and bandwidth of the corrections; its age is that of the last one."""
+        """Number, bytes and bandwidth of the corrections. The age of this cell is the age of the last message."""
         return StateCell(self._loop, self.aio.corrections)
 
     def send(self, rtcm: bytes) -> None:
         """Send RTCM 3 messages to the vehicle; never blocks.
 
-        Each message is split as GPS_RTCM_DATA requires. That message has no target, so it is sent once on each link,
-        even if several vehicles of the connection send the same message within 0.9 s. There is no acknowledgement:
-        ``vehicle.gps`` shows whether the receiver uses the corrections.
+        aerokit splits each message into GPS_RTCM_DATA. GPS_RTCM_DATA has no target and reaches all vehicles of the
+        connection. If several vehicles send the same message within 0.9 s, it is therefore transmitted once. There is
+        no acknowledgement: ``vehicle.gps`` shows whether the receiver uses the corrections.
 
         Args:
-            rtcm: one or more whole messages, each of 720 bytes at most.
+            rtcm: one or more complete messages of at most 720 bytes each.
 
         Raises:
-            InvalidArgument: ``rtcm`` is empty, or a message is incomplete, damaged or longer. Nothing was sent.
+            InvalidArgument: ``rtcm`` is empty, or a message is incomplete, damaged or too long. Nothing was sent.
             ConnectionClosed, LinkLost: the connection has ended, or the block of this vehicle was left.
         """
         self._loop.call(self.aio.send, rtcm)
@@ -2903,8 +2928,8 @@ class Rtk(TwinOf["AsyncRtk"]):
         Args:
             url: ``"ntrip://user:password@host:2101/MOUNT"``; ``ntrips://`` for TLS. Characters such as ``@`` in the
                 password are written as ``%40``. The password appears in no log, error or repr.
-            send_position: send the vehicle's position to the caster (GGA, every 10 s), which a virtual reference
-                station needs. None: if the caster's source table asks for it.
+            send_position: send the vehicle's position to the caster every 10 s (GGA), as a virtual reference station
+                needs. None: only if the caster's source table asks for it.
             timeout: seconds to wait for the caster's answer.
 
         Raises:
@@ -2920,7 +2945,7 @@ class CameraBlock(BlockTwin["AsyncCameraBlock"]):
     """An operation of a camera for the duration of an ``async with`` block.
 
     The command to stop is sent at once when the block exits, also under cancellation, and retried until it is
-    acknowledged. If the vehicle's block exits first, the command is sent then. It does not undo a newer order.
+    acknowledged. If the vehicle's block exits first, the command is sent then. The command does not undo a newer order.
     """
 
 
@@ -2940,9 +2965,9 @@ class PhotoInterval(PhotoIntervalTwin):
 class Camera(TwinOf["AsyncCamera"]):
     """One camera: photos, video, lens, tracking, storage, streams (https://mavlink.io/en/services/camera.html).
 
-    ``vehicle.camera`` is the first camera; ``vehicle.camera_at(number)`` is any camera: one with its own component id
-    (100 to 105), or one attached to the autopilot (1 to 6), e.g. ArduPilot's drivers and PX4's trigger. Calls outside
-    the camera's reported capabilities are refused before anything is sent. Cells are polled only while your program
+    ``vehicle.camera`` is the first camera, ``vehicle.camera_at(number)`` any other. A camera has its own component id
+    (100 to 105), or is attached to the autopilot (1 to 6) by ArduPilot's drivers or PX4's trigger. A call that the
+    camera's reported capabilities exclude is refused before anything is sent. Cells are polled only while your program
     uses them.
     """
 
@@ -3043,7 +3068,7 @@ class Camera(TwinOf["AsyncCamera"]):
         Args:
             x: 0 (left) to 1 (right).
             y: 0 (top) to 1 (bottom).
-            radius: part of the image width, 0 (one pixel) to 1.
+            radius: radius of the object as a fraction of the image width, 0 (one pixel) to 1.
             status_hz: rate of ``camera.tracking``, above 0 to 50.
 
         Raises:
@@ -3094,7 +3119,7 @@ class Camera(TwinOf["AsyncCamera"]):
         self._loop.run(self.aio.zoom_step, steps)
 
     def zoom_to(self, percent: float) -> None:
-        """Zoom to a part of the range: 0 (widest) to 100 %; errors as for :meth:`zoom_step`."""
+        """Zoom to a percentage of the range, 0 (widest) to 100; errors as for :meth:`zoom_step`."""
         self._loop.run(self.aio.zoom_to, percent)
 
     def zoom_to_focal_length(self, millimetres: float) -> None:
@@ -3125,7 +3150,7 @@ class Camera(TwinOf["AsyncCamera"]):
         self._loop.run(self.aio.focus_step, steps)
 
     def focus_to(self, percent: float) -> None:
-        """Focus to a part of the range: 0 (nearest) to 100 %; errors as for :meth:`focus_step`."""
+        """Focus to a percentage of the range, 0 (nearest) to 100; errors as for :meth:`focus_step`."""
         self._loop.run(self.aio.focus_to, percent)
 
     def focus_at(self, metres: float) -> None:
@@ -3357,8 +3382,8 @@ class Settings(TwinOf["AsyncSettings"]):
     from a local file. From then on you can use the names of options, and values that are out of range or excluded by
     other settings are refused before anything is sent. Without a definition, values are sent unchanged.
 
-    All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
-    total; then OperationTimeout), if they send anything. You can cancel any call.
+    Methods that send something take ``idle_timeout_s`` (they fail after this many seconds without progress) and
+    ``timeout`` (seconds in total; then they raise OperationTimeout). You can cancel any call.
     """
 
     @property
@@ -3431,7 +3456,7 @@ class Settings(TwinOf["AsyncSettings"]):
         )
 
     def options(self, name: str) -> Mapping[str, SettingValue]:
-        """Return the options of a setting, name → value, as far as the known other settings allow them.
+        """Return the options of a setting that the known other settings allow, as a mapping of names to values.
 
         Empty without a definition, and for settings without options.
         """
@@ -3491,8 +3516,8 @@ class Settings(TwinOf["AsyncSettings"]):
         afterwards, and unknown settings that restrict it are read before.
 
         Raises:
-            InvalidArgument: an invalid name or value; with a definition: an option or value that is not allowed, or a
-                setting that is read-only or excluded now. Nothing was set.
+            InvalidArgument: the name or value is invalid; or, with a definition, the value is not allowed, or the
+                setting is read-only or excluded now. Nothing was set.
             ParameterRejected: the component has no such setting, or refused; ``code`` is its PARAM_ACK.
             ParameterTimeout: not confirmed, but it may have been set.
         """
@@ -3906,10 +3931,10 @@ class Vehicle(VehicleTwin):
         return self._part("actuators", Actuators)
 
     def gripper(self, number: int = 1) -> Gripper:
-        """Return a gripper: ``await vehicle.gripper().release()``.
+        """Return one gripper of the vehicle: ``await vehicle.gripper().release()``.
 
         Args:
-            number: 1 to 8; ArduPilot and PX4 have one, and ignore the number.
+            number: 1 to 8. ArduPilot and PX4 support one gripper and ignore the number.
 
         Raises:
             InvalidArgument: the number is out of range.
@@ -3917,12 +3942,12 @@ class Vehicle(VehicleTwin):
         return Gripper(self._loop, self._loop.call(self.aio.gripper, number))
 
     def winch(self, number: int = 1, *, component_id: int | None = None) -> Winch:
-        """Return a winch: ``await vehicle.winch().pay_out(5)``.
+        """Return one winch of the vehicle: ``await vehicle.winch().pay_out(5)``.
 
         Args:
-            number: 1 to 255; ArduCopter has one, and ignores the number.
-            component_id: a winch that is a MAVLink component, 1 to 255 (MAV_COMP_ID_WINCH is 169); None: the
-                autopilot's.
+            number: 1 to 255. ArduCopter supports one winch and ignores the number.
+            component_id: component id of a winch that is a MAVLink component, 1 to 255 (MAV_COMP_ID_WINCH is 169).
+                None: the autopilot's own winch.
 
         Raises:
             InvalidArgument: a number is out of range.
@@ -3934,7 +3959,7 @@ class Vehicle(VehicleTwin):
         return Shell(self._loop, self._loop.call(self.aio.shell))
 
     def play_tune(self, tune: str) -> None:
-        """Play a tune on the vehicle's buzzer, such as ``"T200 L8 CEGO5C"`` (PLAY_TUNE); returns at once.
+        """Play a tune on the vehicle's buzzer (PLAY_TUNE), for example ``"T200 L8 CEGO5C"``; returns at once.
 
         The message has no acknowledgement, and vehicles without a buzzer ignore it.
 
@@ -3943,19 +3968,19 @@ class Vehicle(VehicleTwin):
                 A to G notes, P pause.
 
         Raises:
-            InvalidArgument: it is empty, too long, or has other characters. Nothing was sent.
+            InvalidArgument: the tune is empty, too long, or contains other characters. Nothing was sent.
         """
         self._loop.call(self.aio.play_tune, tune)
 
     def send_status_text(self, text: str, *, severity: Severity = "info") -> None:
         """Send a status text of your program to the vehicle and to other stations (STATUSTEXT); returns at once.
 
-        ArduPilot writes it to its flight log; it has no acknowledgement. A text of more than 50 bytes is sent in
-        chunks. ``connection.send`` of a message without ``vehicle`` reaches stations only.
+        There is no acknowledgement. ArduPilot writes the text to its flight log. A text of more than 50 bytes is sent
+        in chunks. To reach ground stations but not the vehicle, send a ``Statustext`` by ``connection.send``.
 
         Args:
             text: 1 to 1000 bytes in UTF-8.
-            severity: name of a MAV_SEVERITY.
+            severity: name of a MAV_SEVERITY in lower case.
 
         Raises:
             InvalidArgument: the text is empty or too long, or the severity is unknown. Nothing was sent.
@@ -3965,21 +3990,22 @@ class Vehicle(VehicleTwin):
     def inject_failure(self, unit: FailingUnit, kind: FailureKind, *, instance: int = 0, intent: FailureIntent) -> None:
         """Make a part of the vehicle fail, to test how the vehicle reacts (MAV_CMD_INJECT_FAILURE).
 
-        PX4 only, if SYS_FAILURE_EN is 1. Returns when PX4 has acknowledged; it reports the failure by status texts and
-        by the health of its sensors. **The vehicle may crash.** ``kind="ok"`` ends the failure. Sent once.
+        **The vehicle may crash.** Only PX4 supports this, and only if SYS_FAILURE_EN is 1. Returns when PX4 has
+        acknowledged. PX4 then reports the failure by status texts and by the health of its sensors. ``kind="ok"`` ends
+        the failure. The command is sent once.
 
         Args:
-            unit: the part that fails, as FAILURE_UNIT.
-            kind: how it fails, as FAILURE_TYPE.
+            unit: the part that fails (FAILURE_UNIT).
+            kind: how it fails (FAILURE_TYPE).
             instance: number of the part from 1 to 16; 0 for all.
             intent: must be ``"inject failure"``, so that no other call can be mistaken for it.
 
         Raises:
             InvalidArgument: an argument is not allowed. Nothing was sent.
-            NotSupported: ArduPilot, whose simulation has SIM_ parameters instead. Nothing was sent.
+            NotSupported: the vehicle runs ArduPilot, whose simulation has SIM_ parameters instead. Nothing was sent.
             CommandRejected: SYS_FAILURE_EN is 0, or PX4 cannot let this part fail in this way.
-            CommandTimeout: there was no acknowledgement. PX4 sends none for a part that nothing there can let fail; the
-                part may have failed nevertheless.
+            CommandTimeout: there was no acknowledgement. PX4 sends none if it cannot make this part fail. If an
+                acknowledgement was lost, the part may have failed.
         """
         self._loop.run(self.aio.inject_failure, unit, kind, instance=instance, intent=intent)
 
@@ -4002,12 +4028,13 @@ class Vehicle(VehicleTwin):
             params: param1 to param7; missing ones are 0, or NaN where the command allows it.
             component_id: the target component instead of the autopilot; 0: all components, and the autopilot's ack
                 counts.
-            retries: how often it is sent again without an ack, from 0; ``confirmation`` increments each time. A
-                command that changes something is sent again only right after a HEARTBEAT that shows no other mode, no
-                failsafe, and no newer order (docs/reliability.md). None: 3 for a request that changes nothing but
-                streams, 0 for all others, because they would be executed twice if only the ack was lost.
-            attempt_timeout: seconds to wait for an ack after each transmission, above 0, and at least two measured
-                round trips; None: 1, or 4 if it is sent once.
+            retries: maximum number of retransmissions without an ack, from 0; ``confirmation`` increments each time. A
+                command that changes something is sent again only right after a HEARTBEAT, and only if the mode has not
+                changed, no failsafe is active and there is no newer order (docs/reliability.md). None: 3 for a request
+                that changes nothing but streams, 0 for all other commands, because a lost ack would cause a second
+                execution.
+            attempt_timeout: seconds to wait for an ack after each transmission, above 0. aerokit waits for at least two
+                measured round trips. None: 1, or 4 if the command is sent only once.
             progress_timeout: seconds to wait for the next ack after each IN_PROGRESS; calibrations can take long.
             on_progress: called with 0–100, or None, for each IN_PROGRESS.
 
@@ -4044,9 +4071,9 @@ class Vehicle(VehicleTwin):
     ) -> CommandAck:
         """Send any MAV_CMD as COMMAND_INT: param1 to param4, ``x``, ``y``, ``z`` in ``frame`` (MAV_FRAME).
 
-        ``x`` and ``y`` are latitude and longitude in 1e-7 degrees, or 1e-4 m in local frames; ``z`` is in metres.
-        With ``or_long``, firmware that does not support the command as COMMAND_INT gets a COMMAND_LONG with degrees;
-        this requires frame 0. All else as for :meth:`command`.
+        ``x`` and ``y`` are latitude and longitude in 1e-7 degrees, or 1e-4 m in local frames; ``z`` is in metres. With
+        ``or_long``, firmware that does not support the command as COMMAND_INT gets a COMMAND_LONG with degrees; this
+        requires frame 0. Other arguments and errors are those of :meth:`command`.
         """
         return self._loop.run(
             self.aio.command_int,
@@ -4067,8 +4094,8 @@ class Vehicle(VehicleTwin):
     def send(self, message: Message) -> None:
         """Send one message unchanged, once; never blocks. The caller sets its ``target_system``.
 
-        A steering command and SET_MODE are orders and end the action in progress, as with :meth:`command`. A set-point
-        supersedes :meth:`posted` orders about motion. Messages to another system do neither.
+        A steering command or SET_MODE is an order, and ends the action in progress, as with :meth:`command`. A
+        set-point supersedes :meth:`posted` orders about motion. A message to another system has neither effect.
 
         Raises:
             InvalidArgument: a field is out of range; nothing was sent.
@@ -4077,9 +4104,7 @@ class Vehicle(VehicleTwin):
         self._loop.call(self.aio.send, message)
 
     def note_sent(self, message: Message) -> None:
-        """Register a message that the program sent to the vehicle by ``connection.send``; it counts as sent by
-        :meth:`send`.
-        """
+        """Register a message that the program sent by ``connection.send``, as if it had called :meth:`send`."""
         self._loop.call(self.aio.note_sent, message)
 
     def posted(
@@ -4090,16 +4115,18 @@ class Vehicle(VehicleTwin):
     ) -> AbstractContextManager[PostedOrder]:
         """Open an order without waiting for its effect, so that mode, arming and take-off can be sent in one go.
 
-        Within the block its commands are sent again right after a HEARTBEAT until they are acknowledged or their
-        effect is reported. Retries end with a newer order about the same subject, with a mode that neither this order
-        nor an order of the last ten seconds explains and, for orders about motion, with disarming. An abandoned order
-        does not make the vehicle hold, and late arming is not monitored; use the actions for that.
+        Within the block, the order's commands are sent again right after a HEARTBEAT, until they are acknowledged or
+        their effect is reported. Retries end with a newer order about the same subject; with a mode that neither this
+        order nor another order of the last ten seconds explains; and, for orders about motion, with disarming. An
+        abandoned posted order does not make the vehicle hold, and late arming is not monitored; use the actions for
+        that.
 
         Args:
-            subjects: ``"mode"``, ``"motion"`` or ``"arm"``; the first one is what the order is about, and it also
-                ends orders about the others. An order about mode or motion ends the action in progress.
-            modes: the modes that it brings about.
-            armed: True if it arms, False if it disarms; required for ``"arm"``.
+            subjects: ``"mode"``, ``"motion"`` or ``"arm"``. A newer order about the first subject ends this order; this
+                order ends earlier ones about any of its subjects. An order about mode or motion also ends the action in
+                progress.
+            modes: the modes that the order leads to.
+            armed: True if the order arms the vehicle, False if it disarms it; required for ``"arm"``.
 
         Raises:
             InvalidArgument: no subject, or ``"arm"`` without ``armed``. Nothing was sent.
@@ -4115,10 +4142,10 @@ class Vehicle(VehicleTwin):
     ) -> Subscription[ItemT]:
         """Return a stream of messages or events of this vehicle, for use in a ``with`` block.
 
-        ``capacity=1`` keeps the latest only; ``missed`` counts the others. Subscribing also requests the rate: while
-        the block lasts, the autopilot is asked to send these messages at ``rate_hz`` (above 0, at most 1000), or
-        faster if another subscriber needs it. None requests the default rate of streamed messages; messages sent on
-        demand (HEARTBEAT, STATUSTEXT, acks) are not requested. For a camera or another component use
+        ``capacity=1`` keeps only the latest message; ``missed`` counts the dropped ones. For the duration of the block,
+        aerokit requests these messages from the autopilot at ``rate_hz`` (above 0, at most 1000), or faster if another
+        subscriber needs it. None requests the default rate of streamed messages; messages sent on demand (HEARTBEAT,
+        STATUSTEXT, acks) are not requested. For a camera or another component use
         ``vehicle.component(100).subscribe(...)``.
 
         Raises:
@@ -4210,22 +4237,22 @@ class Vehicle(VehicleTwin):
         return self._loop.call(self.aio.texts_since, at)
 
     def autotune(self, *, timeout: float = 120.0, on_progress: Callable[[int], object] | None = None) -> None:
-        """Let PX4 tune its controllers (MAV_CMD_DO_AUTOTUNE_ENABLE): **the vehicle shakes about each axis**.
+        """Let PX4 tune its controllers in flight (MAV_CMD_DO_AUTOTUNE_ENABLE): **the vehicle shakes about each axis**.
 
-        Call it while the vehicle hovers, or circles on its wings. Returns when PX4 has finished: with MC_AT_APPLY 1 it
-        saves the new gains when it is disarmed. PX4 aborts if the mode changes or the sticks are moved. After a
-        cancellation it goes on tuning; change the mode to stop it.
+        Call this while a multicopter hovers or a fixed wing circles. Returns when PX4 has finished. With MC_AT_APPLY 1,
+        PX4 saves the new gains when it is disarmed. PX4 aborts if the mode changes or the sticks are moved. A cancelled
+        call does not stop the tuning; change the mode for that.
 
         Args:
-            timeout: seconds for all axes; PX4 needs about forty.
-            on_progress: called with each new percentage.
+            timeout: seconds for all axes; PX4 needs about 40.
+            on_progress: called with the progress in percent when it changes.
 
         Raises:
-            NotSupported: this firmware tunes by a pilot's sticks, in its mode AUTOTUNE. Nothing was sent.
+            NotSupported: the firmware is ArduPilot, whose mode AUTOTUNE a pilot controls. Nothing was sent.
             OperationRejected: the mode changed, or another party disarmed the vehicle.
-            CommandRejected: PX4 has no such module, or the tuning failed.
+            CommandRejected: PX4 was built without the autotune module, or the tuning failed.
             CommandTimeout: an answer is missing, or the program has paused; PX4 may go on tuning.
-            OperationTimeout: it was not done in time; PX4 may go on tuning.
+            OperationTimeout: the tuning was not done in time; PX4 may go on tuning.
         """
         self._loop.run(self.aio.autotune, timeout=timeout, on_progress=on_progress)
 
@@ -4233,40 +4260,41 @@ class Vehicle(VehicleTwin):
         """Terminate the flight (MAV_CMD_DO_FLIGHTTERMINATION): **the motors stop, and the vehicle falls**.
 
         Returns when HEARTBEAT reports disarmed, PX4's mode TERMINATION, or MAV_STATE_FLIGHT_TERMINATION. The command is
-        sent at once, also to a silent vehicle, and only once: it is neither repeated nor sent later. A cancelled call
-        may have terminated the flight. PX4 releases its parachute if it has one, and needs a restart afterwards.
-        ArduPlane and Rover refuse it unless AFS_ENABLE is 1 and AFS_TERM_ACTION is 42.
+        sent once and immediately, even to a silent vehicle. It is neither repeated nor sent later. A cancelled call may
+        have terminated the flight. PX4 releases its parachute if it has one, and needs a restart afterwards. ArduPlane
+        and Rover refuse the command unless AFS_ENABLE is 1 and AFS_TERM_ACTION is 42.
 
         Args:
             intent: must be ``"terminate flight"``.
             timeout: seconds for HEARTBEAT to report the termination after the command was accepted.
 
         Raises:
-            InvalidArgument: the intent is another one. Nothing was sent.
+            InvalidArgument: the intent is another text. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts. PX4 refuses while it is disarmed.
             CommandTimeout: there was no acknowledgement; the flight may have been terminated nevertheless.
             HeartbeatTimeout: the vehicle was silent for ten seconds after its acknowledgement.
-            OperationTimeout: it accepted the command, and HEARTBEAT does not report the termination.
+            OperationTimeout: the vehicle accepted the command, but HEARTBEAT does not report the termination.
         """
         self._loop.run(self.aio.terminate, intent=intent, timeout=timeout)
 
     def shutdown(self, *, intent: ShutdownIntent, timeout: float = 15.0) -> None:
-        """Switch the autopilot off (MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN) and wait until its HEARTBEATs end.
+        """Switch the autopilot off, and wait until its HEARTBEATs end (MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN).
 
-        HEARTBEAT counts as ended after 3.5 s, or when the link goes down after the acknowledgement. The command is sent
-        only once. Only a person at the vehicle can switch it on again. A cancelled call may have switched it off.
+        Only a person at the vehicle can switch it on again. HEARTBEATs count as ended after 3.5 s without one, or when
+        the link goes down after the acknowledgement. The command is sent once. A cancelled call may have switched the
+        autopilot off.
 
         Args:
             intent: must be ``"shut down"``.
-            timeout: seconds until it is silent.
+            timeout: seconds until the vehicle is silent.
 
         Raises:
-            InvalidArgument: the intent is another one. Nothing was sent.
+            InvalidArgument: the intent is another text. Nothing was sent.
             NotSupported: this firmware cannot be switched off (ArduPilot). Nothing was sent.
-            OperationRejected: it is armed, or not known to be disarmed. Nothing was sent.
-            CommandRejected: it refused; PX4 does on boards that cannot switch their power off.
-            CommandTimeout: there was no acknowledgement; it may have switched off nevertheless.
-            OperationTimeout: it accepted the command and still sends HEARTBEATs.
+            OperationRejected: the vehicle is armed, or not known to be disarmed. Nothing was sent.
+            CommandRejected: the vehicle refused, as PX4 does on boards that cannot switch their power off.
+            CommandTimeout: there was no acknowledgement; the autopilot may have switched off nevertheless.
+            OperationTimeout: the autopilot accepted the command, but still sends HEARTBEATs.
         """
         self._loop.run(self.aio.shutdown, intent=intent, timeout=timeout)
 
@@ -4320,9 +4348,10 @@ class Vehicle(VehicleTwin):
     def taken_over(self) -> str:
         """The takeover that ended the program's last action, as a clause; empty if there was none.
 
-        "the mode changed to LOITER": by a pilot, a failsafe or another program, which HEARTBEAT does not distinguish;
-        or "a failsafe became active (MAV_STATE_CRITICAL)", which may be reported seconds before the mode changes.
-        Disarming alone, as after a landing, is no takeover. The program's next action resets it.
+        ``"the mode changed to LOITER"`` may be the work of a pilot, a failsafe or another program, because HEARTBEAT
+        does not distinguish them. ``"a failsafe became active (MAV_STATE_CRITICAL)"`` may be reported seconds before
+        the mode changes. Disarming alone, as after a landing, is not a takeover. The program's next action resets this
+        text.
         """
         return self.aio.taken_over
 
@@ -4373,9 +4402,9 @@ class Vehicle(VehicleTwin):
             mode: the mode to arm in. None: the present mode, or one that ``take_off`` starts in if the present mode
                 does not allow arming.
             force: skip the vehicle's own arming checks. Dangerous.
-            reason: why your program arms, at most 50 bytes. Logger "aerokit" reports it at INFO, and a STATUSTEXT takes
-                it to the vehicle right before the command, where ArduPilot writes it into its flight log. PX4 logs only
-                texts that have the vehicle's own system id.
+            reason: why your program arms, at most 50 bytes. Logger "aerokit" reports it at INFO. A STATUSTEXT also
+                sends it to the vehicle right before the command, and ArduPilot writes it into its flight log. PX4 logs
+                only texts that have the vehicle's own system id.
             timeout: seconds for HEARTBEAT to report armed after the command was accepted.
             max_silence_s: raise when no heartbeat was received for this long; None: wait until ``timeout``.
 
@@ -4383,7 +4412,7 @@ class Vehicle(VehicleTwin):
             InvalidArgument: there is no such mode, it does not allow arming, or the reason is too long. Nothing was
                 sent.
             CommandRejected: the vehicle refused; ``reasons`` has its pre-arm texts, failing sensors and missing
-                estimates. Where the vehicle can run its checks on request, they are run again for this.
+                estimates. A vehicle that can run its checks on request runs them again for this.
             CommandTimeout: there was no acknowledgement, and the vehicle did not arm; the text says whether it may
                 still arm.
             OperationRejected: the vehicle is armed already in a mode other than ``mode`` (nothing was sent), or another
@@ -4432,14 +4461,14 @@ class Vehicle(VehicleTwin):
         Raises:
             OperationRejected: the vehicle is armed, or not known to be disarmed. Nothing was sent.
             CommandRejected: the vehicle refused.
-            CommandTimeout: there was no acknowledgement, and it did not reboot.
+            CommandTimeout: there was no acknowledgement, and the vehicle did not reboot.
             LinkLost: the link went down with the vehicle (USB, TCP); connect again.
             OperationTimeout: the vehicle did not restart in time.
         """
         self._loop.run(self.aio.reboot, force=force, timeout=timeout)
 
     def look_at(self, target: Position | Home) -> None:
-        """Point nose or gimbal at a place until :meth:`stop_looking`; without an altitude, at the vehicle's altitude.
+        """Point nose or gimbal at a place until :meth:`stop_looking`; a place without altitude is at the vehicle's own.
 
         Sends MAV_CMD_DO_SET_ROI_LOCATION (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_ROI_LOCATION), or
         MAV_CMD_DO_SET_ROI to old firmware.
@@ -4475,32 +4504,33 @@ class Vehicle(VehicleTwin):
         timeout: float | None = None,
         max_silence_s: float | None = MAX_SILENCE_S,
     ) -> None:
-        """Fly around a place; returns when the reported positions have gone around it ``turns`` times.
+        """Fly circles around a place; returns when the vehicle's reported positions have circled it ``turns`` times.
 
-        Then a multicopter holds, and a fixed wing goes on circling. After a cancellation or a time-out, aerokit orders
-        the vehicle to hold.
+        Afterwards a multicopter holds, and a fixed wing goes on circling. After a cancellation or a time-out, aerokit
+        orders the vehicle to hold.
 
-        PX4 flies the circle itself (MAV_CMD_DO_ORBIT). ArduCopter has no such command, and its mode CIRCLE follows the
-        throttle stick, so aerokit streams set-points with velocity and acceleration in GUIDED; if your program dies,
-        the vehicle stops. ArduPlane circles a place in GUIDED (MAV_CMD_DO_REPOSITION).
+        PX4 flies the circle itself (MAV_CMD_DO_ORBIT). ArduPlane circles a place in GUIDED (MAV_CMD_DO_REPOSITION).
+        ArduCopter has no such command, and its mode CIRCLE follows the throttle stick; aerokit therefore streams
+        set-points in GUIDED, and the vehicle stops if your program dies.
 
         Args:
-            center: the middle of the circle; its altitude is that of the circle, without one, or for home, the
-                vehicle's own.
+            center: the middle of the circle, at the altitude of the circle. For home, or a position without altitude,
+                the vehicle keeps its own altitude.
             radius_m: above 0, at most 10,000. PX4's multicopters refuse more than MC_ORBIT_RAD_MAX.
             speed_m_s: ground speed, above 0, at most 50. A fixed wing ignores it.
-            turns: number of turns, above 0, at most 1000; None: until the call is cancelled, or another order is given.
+            turns: number of turns, above 0, at most 1000. None: circle until the call is cancelled or another order is
+                given.
             clockwise: direction, as seen from above.
-            facing: direction of the nose: to the center, ahead, as at the beginning, or left to the autopilot. A fixed
-                wing ignores it.
+            facing: direction of the nose: towards the center, ahead, as it was at the beginning, or free for the
+                autopilot to choose. A fixed wing ignores it.
             max_distance_m: a center farther away than this many metres is refused.
             timeout: seconds; None: no limit while heartbeats arrive, the mode stays and the vehicle moves.
             max_silence_s: raise when no heartbeat was received for this long; None: no limit.
 
         Raises:
-            NotSupported: this type of vehicle has no way to do it. Nothing was sent.
+            NotSupported: this type of vehicle cannot circle a place. Nothing was sent.
 
-        Otherwise raises as :meth:`go_to`.
+        Other errors are those of :meth:`go_to`.
         """
         self._loop.run(
             self.aio.orbit,
@@ -4529,19 +4559,21 @@ class Vehicle(VehicleTwin):
         timeout: float | None = None,
         max_silence_s: float | None = MAX_SILENCE_S,
     ) -> None:
-        """Fly an eight around a place; returns when the reported positions were ``rounds`` times in both lobes.
+        """Fly a figure eight; returns when the vehicle's reported positions have passed both lobes ``rounds`` times.
 
-        PX4's fixed wings fly it themselves (MAV_CMD_DO_FIGURE_EIGHT: two circles and straight lines between them, and
-        on until another order). For ArduCopter and PX4's multicopters aerokit streams the set-points of a lemniscate;
-        they hold at its center. All else is as for :meth:`orbit`.
+        A PX4 fixed wing flies the figure itself (MAV_CMD_DO_FIGURE_EIGHT), as two circles and straight lines between
+        them, and goes on until another order. For ArduCopter and PX4's multicopters, aerokit streams the set-points of
+        a lemniscate, and they hold at its center at the end. Errors, cancellation and time-out are as for
+        :meth:`orbit`.
 
         Args:
-            center: where the lines cross; its altitude is that of the figure, without one the vehicle's own.
+            center: the point where the lines cross, at the altitude of the figure. Without altitude, the vehicle keeps
+                its own.
             major_radius_m: half the length of the figure, above 0, at most 10,000.
-            minor_radius_m: half its width, above 0, at most the half of ``major_radius_m``.
-            axis_deg: direction of its long axis, 0–360 clockwise from north; the first lobe is there.
+            minor_radius_m: half the width of the figure, above 0, at most half of ``major_radius_m``.
+            axis_deg: direction from the center to the first lobe, 0–360 clockwise from north.
             speed_m_s: ground speed, above 0, at most 50. A fixed wing ignores it.
-            rounds: number of figures, a multiple of a half, above 0, at most 1000; None: until the call is cancelled.
+            rounds: number of figures, a multiple of 0.5, above 0, at most 1000. None: fly until the call is cancelled.
             clockwise: direction in the first lobe, as seen from above.
             max_distance_m: a center farther away than this many metres is refused.
             timeout: seconds; None: no limit while heartbeats arrive, the mode stays and the vehicle moves.
@@ -4573,16 +4605,19 @@ class Vehicle(VehicleTwin):
         timeout: float | None = None,
         max_silence_s: float | None = MAX_SILENCE_S,
     ) -> None:
-        """Go to a place and stay: a fixed wing circles there, a multicopter hovers.
+        """Go to a place and stay there: a fixed wing circles, a multicopter hovers.
 
-        Returns when it is there, or after ``turns`` or ``duration_s`` more. The vehicle stays until another order.
-        After a cancellation or a time-out, aerokit orders it to hold where it is. Sends MAV_CMD_DO_REPOSITION
-        (ArduPilot in GUIDED, PX4 in LOITER), or MAV_CMD_DO_ORBIT for the radius of a PX4 fixed wing.
+        Returns when the vehicle has arrived and has then flown ``turns`` turns or waited ``duration_s`` seconds, if one
+        of these is given. The vehicle stays until another order. After a cancellation or a time-out, aerokit orders it
+        to hold where it is.
+
+        Sends MAV_CMD_DO_REPOSITION (ArduPilot in GUIDED, PX4 in LOITER). For a PX4 fixed wing with ``radius_m``, sends
+        MAV_CMD_DO_ORBIT.
 
         Args:
-            target: the place, as for ``go_to``; None: where the vehicle is.
-            radius_m: radius of the circle of a fixed wing, above 0, at most 10,000; None: its own (WP_LOITER_RAD,
-                NAV_LOITER_RAD).
+            target: the place, as for ``go_to``. None: the vehicle's present position.
+            radius_m: radius of a fixed wing's circle, above 0, at most 10,000. None: the vehicle's parameter
+                (WP_LOITER_RAD, NAV_LOITER_RAD).
             clockwise: direction of the circle, as seen from above; only with ``radius_m``.
             turns: return after this many turns, above 0, at most 1000; only with ``radius_m``.
             duration_s: return this many seconds after the arrival.
@@ -4590,8 +4625,11 @@ class Vehicle(VehicleTwin):
             timeout: seconds in total; None: no limit while heartbeats arrive, the mode stays and the vehicle moves.
             max_silence_s: raise when no heartbeat was received for this long; None: no limit.
 
-        All else is as for :meth:`orbit`. NotSupported is raised for a radius if the vehicle hovers, InvalidArgument for
-        ``turns`` without one.
+        Raises:
+            InvalidArgument: a value is out of range, or ``turns`` was given without ``radius_m``. Nothing was sent.
+            NotSupported: ``radius_m`` was given, but the vehicle hovers. Nothing was sent.
+
+        Other errors are those of :meth:`go_to`.
         """
         self._loop.run(
             self.aio.loiter,
@@ -4619,26 +4657,28 @@ class Vehicle(VehicleTwin):
     ) -> FollowStream:
         """Follow a moving target: ``async with vehicle.follow(leader) as following: await following.fly(60)``.
 
-        aerokit computes the place beside the target and streams it with the target's velocity, at 10 Hz
-        (SET_POSITION_TARGET_GLOBAL_INT). The modes FOLLOW of ArduCopter and FOLLOWME of PX4 are not used: they need
-        parameters that stay, and differ in what they keep.
+        aerokit computes the vehicle's place relative to the target, and streams it with the target's velocity at 10 Hz
+        (SET_POSITION_TARGET_GLOBAL_INT). It does not use ArduCopter's mode FOLLOW and PX4's FOLLOWME, which depend on
+        stored parameters and behave differently.
 
         Args:
-            target: another vehicle, of this connection or of any other; an asynchronous iterable of positions; or a
-                function that returns the latest position, or None, called on the event loop ten times a second. The
-                velocity of positions is computed from two different ones; above 100 m/s it is a jump, and counts as 0.
+            target: another vehicle, of any connection; an asynchronous iterable of positions; or a function that
+                returns the latest position or None. aerokit calls the function on the event loop ten times a second.
+                The velocity is computed from two different positions; a speed above 100 m/s counts as a jump, with
+                velocity 0.
             distance_m: distance along the ground to keep, 0 to 1000.
-            bearing_deg: direction from the target in which to stay, 0–360 clockwise from north; None: where the vehicle
-                is when it begins.
-            from_course: count ``bearing_deg`` from the direction in which the target moves: 180 is behind it.
-            height_m: height above the target, −1000 to 1000; None: the vehicle keeps its own altitude.
+            bearing_deg: direction from the target to the vehicle, 0–360 clockwise from north. None: the direction at
+                the beginning.
+            from_course: measure ``bearing_deg`` from the target's direction of movement instead: 180 is behind it.
+            height_m: height above the target, −1000 to 1000. None: the vehicle keeps its own altitude.
             face_target: turn the nose to the target.
-            valid_for_s: without a new position of the target for this long, the vehicle holds.
-            max_distance_m: if the target is farther away than this many metres, the vehicle holds.
+            valid_for_s: seconds without a new position of the target after which the vehicle holds.
+            max_distance_m: distance to the target in metres above which the vehicle holds.
 
         Raises:
             InvalidArgument: an argument is out of range, or the target is the vehicle itself.
-            NotSupported: this type of vehicle takes no position set-points, or it flies on its wings.
+            NotSupported: this type of vehicle has no position set-points, or it is a fixed wing, or a VTOL in forward
+                flight.
         """
         return FollowStream(
             self._loop,
@@ -4656,47 +4696,47 @@ class Vehicle(VehicleTwin):
         )
 
     def transition_to(self, state: FlightState, *, timeout: float = 60.0) -> None:
-        """Change a VTOL between hovering and flying on its wings (MAV_CMD_DO_VTOL_TRANSITION).
+        """Change a VTOL between hover and forward flight (MAV_CMD_DO_VTOL_TRANSITION).
 
-        Returns when EXTENDED_SYS_STATE reports the state; at once if it is reported already. ArduPilot does it only in
-        AUTO. After a cancellation the vehicle goes on with its transition.
+        Returns when EXTENDED_SYS_STATE reports the state, which may be at once. ArduPilot accepts the command only in
+        AUTO. A cancelled call does not stop the transition.
 
         Args:
             state: ``"fixed_wing"`` or ``"multicopter"``.
-            timeout: seconds until it is in that state.
+            timeout: seconds until the vehicle reports the state.
 
         Raises:
             InvalidArgument: there is no such state. Nothing was sent.
-            NotSupported: it is no VTOL. Nothing was sent.
-            OperationRejected: the mode changed or it disarmed meanwhile.
+            NotSupported: the vehicle is not a VTOL. Nothing was sent.
+            OperationRejected: the mode changed, or the vehicle disarmed, during the transition.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement.
             HeartbeatTimeout: the vehicle was silent for ten seconds.
-            OperationTimeout: it did not reach the state in time.
+            OperationTimeout: the vehicle did not report the state in time.
         """
         self._loop.run(self.aio.transition_to, state, timeout=timeout)
 
     def set_airspeed(self, airspeed_m_s: float) -> None:
         """Change the airspeed of a fixed wing in m/s, above 0 (MAV_CMD_DO_CHANGE_SPEED, SPEED_TYPE_AIRSPEED).
 
-        Returns at the acknowledgement, because no message reports the setting; VFR_HUD has what the vehicle measures.
-        ArduPlane applies it in GUIDED and AUTO, within AIRSPEED_MIN and AIRSPEED_MAX, and refuses it otherwise. PX4
-        applies it in modes that navigate, and accepts it always. ``set_speed`` changes the ground speed.
+        Returns at the acknowledgement, because no message reports the setting. VFR_HUD reports the measured airspeed.
+        ArduPlane accepts the command in GUIDED and AUTO, for airspeeds from AIRSPEED_MIN to AIRSPEED_MAX. PX4 always
+        accepts it, but applies it only in modes that navigate. ``set_speed`` changes the ground speed.
 
         Raises:
-            InvalidArgument: out of range. Nothing was sent.
-            NotSupported: this firmware cannot change this speed, or has no wings. Nothing was sent.
+            InvalidArgument: the airspeed is out of range. Nothing was sent.
+            NotSupported: this firmware cannot change the airspeed, or the vehicle has no wings. Nothing was sent.
             CommandRejected: the vehicle refused.
             CommandTimeout: there was no acknowledgement.
         """
         self._loop.run(self.aio.set_airspeed, airspeed_m_s)
 
     def set_climb_speed(self, climb_m_s: float) -> None:
-        """Change the speed of climbs in m/s, above 0 (MAV_CMD_DO_CHANGE_SPEED, SPEED_TYPE_CLIMB_SPEED).
+        """Change the climb speed in m/s, above 0 (MAV_CMD_DO_CHANGE_SPEED, SPEED_TYPE_CLIMB_SPEED).
 
-        Returns at the acknowledgement, because no message reports the setting. ArduCopter applies it in GUIDED, AUTO
-        and RTL until the mode changes, and refuses it otherwise. PX4 would take it for the cruise speed. Raises as
-        :meth:`set_airspeed`.
+        Returns at the acknowledgement, because no message reports the setting. ArduCopter accepts the command in
+        GUIDED, AUTO and RTL, and applies it until the mode changes. PX4 is not supported, because it would change the
+        cruise speed instead. Raises as :meth:`set_airspeed`.
         """
         self._loop.run(self.aio.set_climb_speed, climb_m_s)
 
@@ -4714,14 +4754,14 @@ class Vehicle(VehicleTwin):
         """Fly to a place and return on arrival.
 
         After a cancellation, a time-out or a silence, aerokit orders the vehicle to hold where it is, unless another
-        order was given meanwhile or another party changed the mode. After a silence it waits for the next heartbeat,
-        and orders the hold if the vehicle is still on its way. Sends MAV_CMD_DO_REPOSITION
+        order was given meanwhile or another party changed the mode. After a silence, aerokit waits for the next
+        heartbeat, and orders the hold if the vehicle is still on its way. Sends MAV_CMD_DO_REPOSITION
         (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_REPOSITION), or SET_POSITION_TARGET_GLOBAL_INT to a
         vehicle that does not support it.
 
         Args:
-            target: latitude and longitude, and an altitude above home or above mean sea level; without an altitude
-                the present one is kept, also for ``vehicle.home.value``.
+            target: latitude and longitude, and an altitude above home or above mean sea level. Without an altitude, and
+                for ``vehicle.home.value``, the vehicle keeps its present altitude.
             speed_m_s: ground speed from now on, above 0; None keeps the present one.
             heading_deg: heading on arrival, 0–360 clockwise from north; None leaves it to the autopilot.
             tolerance_m: arrival radius in metres; None: the default of the type of vehicle.
@@ -4732,7 +4772,7 @@ class Vehicle(VehicleTwin):
         Raises:
             InvalidArgument: the target is not on earth or too far away, or another argument is out of range. Nothing
                 was sent.
-            ValueUnknownError: position or home is needed here and not known.
+            ValueUnknownError: the vehicle's position or home is needed, and is not known.
             CommandRejected: the vehicle refused (outside its fence, no position, …).
             OperationRejected: the mode changed (a pilot, a failsafe) or the vehicle disarmed on the way.
             CommandTimeout: there was no acknowledgement.
@@ -4753,7 +4793,8 @@ class Vehicle(VehicleTwin):
     def set_speed(self, speed_m_s: float) -> None:
         """Change the ground speed in m/s, above 0 (MAV_CMD_DO_CHANGE_SPEED).
 
-        ArduPilot applies it only on the way in GUIDED or AUTO; ``go_to(speed_m_s=...)`` waits for that.
+        ArduPilot applies it only while the vehicle is on its way in GUIDED or AUTO; ``go_to(speed_m_s=...)`` waits for
+        that.
 
         Raises:
             InvalidArgument: out of range. Nothing was sent.
@@ -4779,7 +4820,7 @@ class Vehicle(VehicleTwin):
         Args:
             heading_deg: −360 to 360, clockwise from north; with ``relative`` an angle to turn by, negative to the
                 left.
-            relative: count from the present heading.
+            relative: True to turn by an angle from the present heading.
             rate_deg_s: turn rate in degrees per second; 0 leaves it to the autopilot. PX4 ignores it.
             tolerance_deg: accepted deviation in degrees.
             timeout: seconds until it has the heading.
@@ -4788,7 +4829,7 @@ class Vehicle(VehicleTwin):
         Raises:
             InvalidArgument: out of range. Nothing was sent.
             CommandRejected: the vehicle refused.
-            OperationRejected: the mode changed or it disarmed meanwhile.
+            OperationRejected: the mode changed or the vehicle disarmed meanwhile.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the vehicle did not reach the heading in time.
         """
@@ -4870,7 +4911,7 @@ class Vehicle(VehicleTwin):
             NotSupported: this type of vehicle has no landing mode. Nothing was sent.
             CommandRejected: the vehicle refused the mode.
             CommandTimeout: there was no acknowledgement.
-            OperationRejected: the mode changed meanwhile.
+            OperationRejected: the mode changed meanwhile, or the vehicle fell.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the vehicle was not on the ground in time.
         """
@@ -4943,15 +4984,15 @@ class Vehicle(VehicleTwin):
         valid_for_s: float = 0.5,
         max_lag_s: float = 0.5,
     ) -> StickStream:
-        """Fly by stick positions of your program (MANUAL_CONTROL): ``async with vehicle.sticks() as sticks: …``.
+        """Fly by stick positions from your program (MANUAL_CONTROL): ``async with vehicle.sticks() as sticks: …``.
 
         Args:
             initial: positions while the mode is entered; None centres all sticks.
             mode: the piloted mode. By default LOITER (ArduCopter), FBWA or QLOITER (ArduPlane), MANUAL (ArduPilot
                 Rover), ALT_HOLD (ArduSub), POSCTL (PX4).
             rate_hz: transmission rate of the latest positions, 2 to 400.
-            valid_for_s: seconds for which they may be repeated without new ones.
-            max_lag_s: how late the event loop may be.
+            valid_for_s: seconds for which the latest positions are repeated; the stream stops after that.
+            max_lag_s: maximum delay of the event loop in seconds; the stream stops above it.
 
         Raises:
             InvalidArgument: a rate or a time is out of range, or the autopilot has no such mode.
@@ -4970,7 +5011,7 @@ class Vehicle(VehicleTwin):
 
     @property
     def external(self) -> External:
-        """Measurements that your program supplies: odometry, vision, GPS, obstacles, ranges; the origin; the wind."""
+        """Measurements from your program for the estimator: odometry, vision, GPS, obstacles, ranges, origin, wind."""
         return self._part("external", External)
 
     def land_on(
@@ -4984,18 +5025,17 @@ class Vehicle(VehicleTwin):
     ) -> LandingReport:
         """Land on a target that your program sees; returns on the ground, disarmed, with a report of the landing.
 
-        Streams LANDING_TARGET and uses the autopilot's own precision landing: LAND with PLND_ENABLED on ArduCopter,
-        PRECLAND on PX4. If the target is lost, the autopilot decides: ArduCopter retries or lands where it is
-        (PLND_STRICT, PLND_RET_MAX); PX4 climbs to PLD_SRCH_ALT, searches for PLD_SRCH_TOUT and then lands where it
-        is. The report says for how long the target was lost. After a cancellation the vehicle continues to land,
-        without new targets.
+        aerokit streams LANDING_TARGET, and the autopilot's own mode lands: LAND with PLND_ENABLED on ArduCopter,
+        PRECLAND on PX4. If the target is lost, the autopilot decides. ArduCopter retries, or lands where it is
+        (PLND_STRICT, PLND_RET_MAX). PX4 climbs to PLD_SRCH_ALT, searches for PLD_SRCH_TOUT, and then lands where it is.
+        The report says for how long the target was lost. After a cancellation the vehicle continues to land, without
+        new targets.
 
         Args:
-            target: a function, also a coroutine function, that returns a
-                :class:`aerokit.TargetMeasurement`, or None while the target is not visible;
-                or an asynchronous iterable of them.
+            target: a function or coroutine function that returns a :class:`aerokit.TargetMeasurement`, or None while
+                the target is not visible; or an asynchronous iterable of these.
             rate_hz: rate at which the function is called, and the highest rate of LANDING_TARGET.
-            acquire_timeout: seconds until the target must be seen first; the landing is ordered after that.
+            acquire_timeout: seconds to wait until the target is visible. The landing is ordered only then.
             timeout: seconds until the vehicle is on the ground and disarmed; None: no limit.
             max_silence_s: raise when no heartbeat was received for this long; None: no limit.
 
@@ -5004,12 +5044,12 @@ class Vehicle(VehicleTwin):
             NotSupported: this type of vehicle has no precision landing. Nothing was sent.
             CommandRejected: the vehicle refused the mode.
             CommandTimeout: there was no acknowledgement.
-            OperationRejected: a parameter makes the vehicle ignore the target (nothing else was sent), or the mode
-                changed or another order was given meanwhile.
+            OperationRejected: a parameter makes the vehicle ignore the target (nothing else was sent); or, after the
+                start, the mode changed, another order was given, or the vehicle fell.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
-            OperationTimeout: the target was not seen in time (the landing was not ordered), or the vehicle was not
-                down in time.
-            ParameterTimeout: the vehicle did not report these parameters.
+            OperationTimeout: the target was not visible in time (the landing was not ordered), or the vehicle was not
+                on the ground in time.
+            ParameterTimeout: the vehicle did not report the parameters that decide about this.
         """
         return self._loop.run(
             self.aio.land_on,
@@ -5073,9 +5113,9 @@ class Vehicle(VehicleTwin):
     def return_altitude(self) -> float:
         """Return the altitude above home, in metres, at which the vehicle returns to launch.
 
-        Reads RTL_ALT_M (ArduCopter 4.7; before: RTL_ALT, in centimetres), RTL_ALTITUDE (ArduPlane; ALT_HOLD_RTL before
-        4.5), Q_RTL_ALT (ArduPilot's VTOL planes, which return in QRTL) or RTL_RETURN_ALT (PX4). ArduPlane reports −1 if
-        it keeps the present altitude, ArduCopter 0.
+        Reads RTL_ALT_M (ArduCopter 4.7; before that RTL_ALT, in centimetres), RTL_ALTITUDE (ArduPlane; before 4.5
+        ALT_HOLD_RTL), Q_RTL_ALT (ArduPilot's VTOL planes, which return in QRTL) or RTL_RETURN_ALT (PX4). A vehicle that
+        returns at its present altitude reports −1 (ArduPlane) or 0 (ArduCopter).
 
         Raises:
             NotSupported: this type of vehicle does not climb for a return. Nothing was sent.
@@ -5087,8 +5127,8 @@ class Vehicle(VehicleTwin):
     def set_return_altitude(self, altitude_m: float) -> None:
         """Set the altitude of returns to launch; returns when the vehicle has confirmed the value.
 
-        Writes the parameter that :meth:`return_altitude` reads, so the value survives a reboot. A vehicle that is
-        higher than that does not descend for its return.
+        Writes the parameter that :meth:`return_altitude` reads, so the value survives a reboot. A vehicle that is above
+        this altitude returns at its own altitude.
 
         Args:
             altitude_m: metres above home, above 0, at most 3,000. Q_RTL_ALT holds whole metres only.
@@ -5216,12 +5256,12 @@ def connect(
     running asyncio loop: nothing outlives the block, and exceptions raised in the block propagate unchanged.
 
     Args:
-        address: ``"udpin:0.0.0.0:14550"``, ``"tcp:127.0.0.1:5760"``, ``"/dev/ttyACM0,57600"``, a ``.tlog`` file …; a
-            link; several of these that lead to the same vehicle (docs/how-to/several-links.md); or an open
-                connection, to use several vehicles on one link. For an open connection, pass the arguments after
-                ``rates`` to ``open_connection`` instead.
-        system_id: the vehicle's MAVLink system id, 1–255; None takes the first autopilot found.
-        timeout: seconds to wait for its first heartbeat, above 0.
+        address: ``"udpin:0.0.0.0:14550"``, ``"tcp:127.0.0.1:5760"``, ``"/dev/ttyACM0,57600"``, a ``.tlog`` file …, or a
+            link; a list of these, if several links lead to the same vehicle (docs/how-to/several-links.md); or an open
+            connection, to use several vehicles on one link. The arguments after ``rates`` are not allowed with an open
+            connection; pass them to ``open_connection``.
+        system_id: the vehicle's MAVLink system id, 1–255; None means the first autopilot found.
+        timeout: seconds to wait for the vehicle's first heartbeat, above 0.
         rates: message class → Hz (above 0, at most 1000), requested instead of the default rates; ``{}`` requests
             nothing.
         source_system: our own system id.
@@ -5249,7 +5289,7 @@ def connect(
         BusyError: this connection already has a vehicle object for this system.
         LinkOpenError: the link, a shared link or the recording could not be opened.
         LinkLost, ConnectionClosed: the link failed while waiting, or the connection was closed.
-        ConnectFailed: no heartbeat of such a vehicle arrived in time; the text says what was received instead.
+        ConnectFailed: no heartbeat of such a vehicle arrived in time; the error text says what was received instead.
     """
     return opened(
         Vehicle,

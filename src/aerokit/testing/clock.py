@@ -62,7 +62,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         self._now = 0.0
         self._outside_calls = 0
         self._deadlock_timeout_s = deadlock_timeout_s
-        self._own_sources: int | None = None  # Size of the selector map when only the loop's self-pipe is registered.
+        self._own_sources: int | None = None  # Size of the selector map while only the loop's self-pipe is registered.
         super().__init__(_JumpingSelector(self))
         self._own_sources = len(self._selector_map())
         self._clock_resolution = 1e-9  # A rounding error in now + (when - now) must not miss a timer.

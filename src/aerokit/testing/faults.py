@@ -25,7 +25,7 @@ class FaultInjector:
     Raises InvalidArgument for times and shares out of range.
     """
 
-    # An attribute of `Faults`, set here by mistake, raises AttributeError.
+    # With slots, setting an attribute of `Faults` on this object by mistake raises AttributeError.
     __slots__ = ("_schedule_with", "_vehicle")
 
     def __init__(self, vehicle: Any, schedule_with: ScheduleWith) -> None:

@@ -6,7 +6,7 @@
 - ``dronekit_address``, ``dronekit``: on a socket, and `aerokit.dronekit` under DroneKit's name
 - ``@pytest.mark.simulated("plane", seed=3)``: selects the simulated vehicle
 
-It does not affect, or import aerokit for, tests that use none of them.
+Tests that use none of them are not affected, and do not import aerokit.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ def dronekit_address(served_flight: ServedFlight) -> str:
 
 @pytest.fixture
 def dronekit() -> Iterator[ModuleType]:
-    """`aerokit.dronekit`. During the test, ``import dronekit`` imports it, unless DroneKit was imported before."""
+    """`aerokit.dronekit`, which ``import dronekit`` imports during the test unless DroneKit was imported before."""
     import sys
 
     import aerokit.dronekit as package

@@ -49,7 +49,7 @@ class RecordedParameters:
         return name in self.names or (name == HASH_NAME and self._hash)
 
     def value_message(self, name: str, index: int | None = None) -> m.ParamValue:
-        """Return the PARAM_VALUE as last written or recorded; before its first record, return that record."""
+        """Return the latest PARAM_VALUE, written or recorded; before the first recorded one, return that."""
         position, recorded = self._vehicle.position_s, None
         for time, value in self._vehicle.recording.parameters:
             if value.param_id == name and (recorded is None or time <= position):

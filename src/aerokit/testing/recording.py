@@ -17,7 +17,7 @@ from aerokit.mavlink.message import Message
 from aerokit.mavlink.tlog import read_tlog
 
 MAX_GAP_S = 60.0
-"""Longer gaps are shortened to this: during them the recording was paused, or the clock was set."""
+"""Longer gaps are shortened to this time, because the recording was paused or the clock was set."""
 
 _ITEMS = (m.MissionItemInt, m.MissionItem)
 _COMMANDS = (m.CommandLong, m.CommandInt)
@@ -72,7 +72,7 @@ class RecordedFlight:
         self.stream: list[tuple[float, Frame]] = []
         """Frames sent without a request, in order."""
         self.answers: dict[int, list[RecordedAnswer]] = {}
-        """MAV_CMD → recorded answers, in order."""
+        """Recorded answers by MAV_CMD, in order."""
         self.parameters: list[tuple[float, m.ParamValue]] = []
         """All parameter values with their times."""
         self.has_parameter_errors: bool = False
@@ -81,9 +81,9 @@ class RecordedFlight:
         """Names of parameters that were set successfully."""
         self.plans: list[RecordedPlan] = []
         self.uploads: dict[int, list[int]] = {}
-        """MAV_MISSION_TYPE → MAV_MISSION_RESULTs of uploads."""
+        """MAV_MISSION_RESULTs of uploads, by MAV_MISSION_TYPE."""
         self.clears: dict[int, list[int]] = {}
-        """MAV_MISSION_TYPE → MAV_MISSION_RESULTs of MISSION_CLEAR_ALL."""
+        """MAV_MISSION_RESULTs of MISSION_CLEAR_ALL, by MAV_MISSION_TYPE."""
         self.uses_int: bool = True
         """True if the vehicle requests items by MISSION_REQUEST_INT, False by MISSION_REQUEST."""
         self.duration_s: float = 0.0

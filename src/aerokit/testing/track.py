@@ -171,7 +171,7 @@ class Track(Sequence[TrackPoint]):
         )
 
     def assert_stayed_within(self, radius_m: float, *, of: Position | None = None) -> None:
-        """Assert that the vehicle was never farther than this from home, or from a position, along the ground."""
+        """Assert that the horizontal distance from home, or from the position ``of``, was never above ``radius_m``."""
         __tracebackhide__ = True
         centre = self.home if of is None else of
         distance, point = self._farthest(centre)

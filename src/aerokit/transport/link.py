@@ -57,7 +57,7 @@ class OrderRefusalListener(Receiver, Protocol):
 
 @runtime_checkable
 class PeerKeeper(Receiver, Protocol):
-    """A receiver that decides by `Link.keep_peer` which peers a link remembers, so that it forgets senders of noise.
+    """A receiver that decides by `Link.keep_peer` which peers a link remembers; the link forgets senders of noise.
 
     A link that wraps another one forwards `Link.keep_peer`, `Link.forget_peer` and `Link.host_of`.
     """
@@ -247,7 +247,7 @@ class BaseLink(Link):
         self.dropped_writes += writes
 
     def _report_stalled(self, is_stalled: bool) -> None:
-        """Notify the receiver when a first transport of this link stalls, and when the last one has recovered."""
+        """Notify the receiver when the first transport of this link stalls, and when all have recovered."""
         if is_stalled == (self._stalled_at is not None):
             return
         now, since = asyncio.get_running_loop().time(), self._stalled_at
@@ -326,7 +326,7 @@ def import_optional(address: str, module: str, package: str, extra: str) -> Any:
 
 
 def memory_link_pair(*, latency_s: float = 0.0) -> tuple[MemoryLink, MemoryLink]:
-    """Return two links, each the other's only peer. Open both on the same event loop.
+    """Return two links that are connected to each other. Open both on the same event loop.
 
     Each write arrives unsplit and in order, ``latency_s`` seconds later, but never before `Link.write` returns. Data
     for an end that is not open is dropped, as with UDP. When one end closes, the other receives the data written

@@ -39,7 +39,7 @@ class MemberLinkListener(Receiver, Protocol):
         """Called when data written to a link has stopped leaving, or leaves again."""
 
     def member_link_open_failed(self, link: int, error: LinkOpenError) -> None:
-        """Called when the first two attempts to open a link have failed. It is retried. Called once per link."""
+        """Called once per link, when the first two attempts to open it have failed; further attempts follow."""
 
 
 class MultiLink(Link):

@@ -47,7 +47,7 @@ class Outbox:
         self._waiting: deque[tuple[float, bytes]] = deque()  # (deadline, frame)
         self._waiting_bytes = 0
         self._forwarded = 0  # bytes written to the transport
-        self._left = 0  # bytes accepted by the system that had left it at the last poll
+        self._left = 0  # bytes that had left this machine at the last poll
         self._progress_at = 0.0  # last progress, or start of waiting
         self._is_full = False  # between pause() and resume()
         self._is_stalled = self._is_closed = False

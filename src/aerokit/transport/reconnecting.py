@@ -69,7 +69,7 @@ class ReconnectingLink(Link):
 
     The first opening is not retried. ``link_lost`` is called only at the end of a recording, and if ``make_link``
     raises. Data written while the link is lost is dropped and counted in `dropped_writes`. Loss and recovery are logged
-    once each (WARNING, INFO). A server that closes connections just after accepting them counts as lost.
+    once each (WARNING, INFO). A link also counts as lost if the server closes each connection just after accepting it.
 
     ``make_link`` is called at once and for each attempt, and must return a new link each time.
     """

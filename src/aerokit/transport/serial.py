@@ -49,7 +49,8 @@ class SerialLink(BaseLink):
     """A serial port, 8N1, opened exclusively. Unplugging it is a lost link.
 
     ``baud`` is in bits per second. It matters for UARTs, not for USB ports such as /dev/ttyACM0. ``rtscts`` enables
-    hardware flow control. The write buffer holds about two seconds of data, at least 4096 bytes, for at most a second.
+    hardware flow control. The write buffer holds about two seconds of data (at least 4096 bytes), and drops data after
+    a second.
     """
 
     def __init__(self, device: str, baud: int = 57600, *, rtscts: bool = False) -> None:
@@ -85,7 +86,7 @@ class SerialLink(BaseLink):
         self._drop(taken > 0)
 
     async def _connect(self) -> None:
-        """Open the port. It contains no await, so it cannot be cancelled halfway."""
+        """Open the port. This method contains no await, so that it cannot be cancelled halfway."""
         self._loop = asyncio.get_running_loop()
         self._port = port = self._open_port()
         self._released.clear()

@@ -66,7 +66,7 @@ def bind_to(address: SocketAddress, kind: socket.SocketKind) -> socket.socket:
         sock.setblocking(False)
         if address.family == socket.AF_INET6:
             sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
-        if kind is socket.SOCK_STREAM and hasattr(socket, "AF_UNIX"):  # on Windows this would share the port
+        if kind is socket.SOCK_STREAM and hasattr(socket, "AF_UNIX"):  # on Windows this option would share the port
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         sock.bind(address.address)
     except BaseException:

@@ -35,7 +35,7 @@ SEND_BUFFER = 16 * 1024
 NOT_SENT_LOW_WATER = 1024
 """Limit of unsent data in the kernel (TCP_NOTSENT_LOWAT, where available)."""
 
-# Loop iterations from accepting a client to `connection_made`. Before that, closing the link misses the client.
+# Loop iterations from accepting a client to `connection_made`. A link that is closed in between misses the client.
 ACCEPT_ITERATIONS = 5
 
 MAX_CLIENTS = 64

@@ -289,7 +289,7 @@ class _DatagramProtocol(asyncio.DatagramProtocol):
     def __init__(self, link: _UdpLink) -> None:
         self._link = link
 
-    def connection_made(self, transport: Any) -> None:  # not every loop's transport inherits from it
+    def connection_made(self, transport: Any) -> None:  # not every loop's transport inherits from DatagramTransport
         self._link._transport_opened(transport)
 
     def datagram_received(self, data: bytes, addr: Any) -> None:

@@ -1,1 +1,1 @@
-"""Vehicles as programs see them: connecting, state, actions, guided set-points, health."""
+"""Vehicles: connecting, state, actions, guided set-points, health."""

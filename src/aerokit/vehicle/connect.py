@@ -78,12 +78,12 @@ async def connect(
     running asyncio loop: nothing outlives the block, and exceptions raised in the block propagate unchanged.
 
     Args:
-        address: ``"udpin:0.0.0.0:14550"``, ``"tcp:127.0.0.1:5760"``, ``"/dev/ttyACM0,57600"``, a ``.tlog`` file …; a
-            link; several of these that lead to the same vehicle (docs/how-to/several-links.md); or an open
-                connection, to use several vehicles on one link. For an open connection, pass the arguments after
-                ``rates`` to ``open_connection`` instead.
-        system_id: the vehicle's MAVLink system id, 1–255; None takes the first autopilot found.
-        timeout: seconds to wait for its first heartbeat, above 0.
+        address: ``"udpin:0.0.0.0:14550"``, ``"tcp:127.0.0.1:5760"``, ``"/dev/ttyACM0,57600"``, a ``.tlog`` file …, or a
+            link; a list of these, if several links lead to the same vehicle (docs/how-to/several-links.md); or an open
+            connection, to use several vehicles on one link. The arguments after ``rates`` are not allowed with an open
+            connection; pass them to ``open_connection``.
+        system_id: the vehicle's MAVLink system id, 1–255; None means the first autopilot found.
+        timeout: seconds to wait for the vehicle's first heartbeat, above 0.
         rates: message class → Hz (above 0, at most 1000), requested instead of the default rates; ``{}`` requests
             nothing.
         source_system: our own system id.
@@ -111,7 +111,7 @@ async def connect(
         BusyError: this connection already has a vehicle object for this system.
         LinkOpenError: the link, a shared link or the recording could not be opened.
         LinkLost, ConnectionClosed: the link failed while waiting, or the connection was closed.
-        ConnectFailed: no heartbeat of such a vehicle arrived in time; the text says what was received instead.
+        ConnectFailed: no heartbeat of such a vehicle arrived in time; the error text says what was received instead.
     """
     _check(system_id, timeout, rates, address.bus.dialect if isinstance(address, Connection) else dialect)
     if isinstance(address, Connection):
@@ -221,7 +221,7 @@ async def _attached(
 
 
 def warn_if_left_flying(vehicle: Vehicle) -> None:
-    """Log a warning if the block is left while the vehicle executes this program's orders."""
+    """Log a warning if your program leaves the block while the vehicle executes its orders."""
     if vehicle._arbiter.may_be_executing and not vehicle.is_confirmed_disarmed:
         logger.warning("the block of vehicle %d was left: %s", vehicle.system_id, vehicle.describe_now())
 

@@ -159,15 +159,15 @@ class Vehicle(
         valid_for_s: float = 0.5,
         max_lag_s: float = 0.5,
     ) -> StickStream:
-        """Fly by stick positions of your program (MANUAL_CONTROL): ``async with vehicle.sticks() as sticks: …``.
+        """Fly by stick positions from your program (MANUAL_CONTROL): ``async with vehicle.sticks() as sticks: …``.
 
         Args:
             initial: positions while the mode is entered; None centres all sticks.
             mode: the piloted mode. By default LOITER (ArduCopter), FBWA or QLOITER (ArduPlane), MANUAL (ArduPilot
                 Rover), ALT_HOLD (ArduSub), POSCTL (PX4).
             rate_hz: transmission rate of the latest positions, 2 to 400.
-            valid_for_s: seconds for which they may be repeated without new ones.
-            max_lag_s: how late the event loop may be.
+            valid_for_s: seconds for which the latest positions are repeated; the stream stops after that.
+            max_lag_s: maximum delay of the event loop in seconds; the stream stops above it.
 
         Raises:
             InvalidArgument: a rate or a time is out of range, or the autopilot has no such mode.
@@ -179,7 +179,7 @@ class Vehicle(
 
     @cached_property
     def external(self) -> External:
-        """Measurements that your program supplies: odometry, vision, GPS, obstacles, ranges; the origin; the wind."""
+        """Measurements from your program for the estimator: odometry, vision, GPS, obstacles, ranges, origin, wind."""
         from aerokit.vehicle.external.external import External
 
         return External(self._context, self.parameters.probe)
@@ -195,18 +195,17 @@ class Vehicle(
     ) -> LandingReport:
         """Land on a target that your program sees; returns on the ground, disarmed, with a report of the landing.
 
-        Streams LANDING_TARGET and uses the autopilot's own precision landing: LAND with PLND_ENABLED on ArduCopter,
-        PRECLAND on PX4. If the target is lost, the autopilot decides: ArduCopter retries or lands where it is
-        (PLND_STRICT, PLND_RET_MAX); PX4 climbs to PLD_SRCH_ALT, searches for PLD_SRCH_TOUT and then lands where it
-        is. The report says for how long the target was lost. After a cancellation the vehicle continues to land,
-        without new targets.
+        aerokit streams LANDING_TARGET, and the autopilot's own mode lands: LAND with PLND_ENABLED on ArduCopter,
+        PRECLAND on PX4. If the target is lost, the autopilot decides. ArduCopter retries, or lands where it is
+        (PLND_STRICT, PLND_RET_MAX). PX4 climbs to PLD_SRCH_ALT, searches for PLD_SRCH_TOUT, and then lands where it is.
+        The report says for how long the target was lost. After a cancellation the vehicle continues to land, without
+        new targets.
 
         Args:
-            target: a function, also a coroutine function, that returns a
-                :class:`aerokit.TargetMeasurement`, or None while the target is not visible;
-                or an asynchronous iterable of them.
+            target: a function or coroutine function that returns a :class:`aerokit.TargetMeasurement`, or None while
+                the target is not visible; or an asynchronous iterable of these.
             rate_hz: rate at which the function is called, and the highest rate of LANDING_TARGET.
-            acquire_timeout: seconds until the target must be seen first; the landing is ordered after that.
+            acquire_timeout: seconds to wait until the target is visible. The landing is ordered only then.
             timeout: seconds until the vehicle is on the ground and disarmed; None: no limit.
             max_silence_s: raise when no heartbeat was received for this long; None: no limit.
 
@@ -215,12 +214,12 @@ class Vehicle(
             NotSupported: this type of vehicle has no precision landing. Nothing was sent.
             CommandRejected: the vehicle refused the mode.
             CommandTimeout: there was no acknowledgement.
-            OperationRejected: a parameter makes the vehicle ignore the target (nothing else was sent), or the mode
-                changed or another order was given meanwhile.
+            OperationRejected: a parameter makes the vehicle ignore the target (nothing else was sent); or, after the
+                start, the mode changed, another order was given, or the vehicle fell.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
-            OperationTimeout: the target was not seen in time (the landing was not ordered), or the vehicle was not
-                down in time.
-            ParameterTimeout: the vehicle did not report these parameters.
+            OperationTimeout: the target was not visible in time (the landing was not ordered), or the vehicle was not
+                on the ground in time.
+            ParameterTimeout: the vehicle did not report the parameters that decide about this.
         """
         from aerokit.vehicle.external.landing import land_on
 
@@ -297,9 +296,9 @@ class Vehicle(
     async def return_altitude(self) -> float:
         """Return the altitude above home, in metres, at which the vehicle returns to launch.
 
-        Reads RTL_ALT_M (ArduCopter 4.7; before: RTL_ALT, in centimetres), RTL_ALTITUDE (ArduPlane; ALT_HOLD_RTL before
-        4.5), Q_RTL_ALT (ArduPilot's VTOL planes, which return in QRTL) or RTL_RETURN_ALT (PX4). ArduPlane reports −1 if
-        it keeps the present altitude, ArduCopter 0.
+        Reads RTL_ALT_M (ArduCopter 4.7; before that RTL_ALT, in centimetres), RTL_ALTITUDE (ArduPlane; before 4.5
+        ALT_HOLD_RTL), Q_RTL_ALT (ArduPilot's VTOL planes, which return in QRTL) or RTL_RETURN_ALT (PX4). A vehicle that
+        returns at its present altitude reports −1 (ArduPlane) or 0 (ArduCopter).
 
         Raises:
             NotSupported: this type of vehicle does not climb for a return. Nothing was sent.
@@ -313,8 +312,8 @@ class Vehicle(
     async def set_return_altitude(self, altitude_m: float) -> None:
         """Set the altitude of returns to launch; returns when the vehicle has confirmed the value.
 
-        Writes the parameter that :meth:`return_altitude` reads, so the value survives a reboot. A vehicle that is
-        higher than that does not descend for its return.
+        Writes the parameter that :meth:`return_altitude` reads, so the value survives a reboot. A vehicle that is above
+        this altitude returns at its own altitude.
 
         Args:
             altitude_m: metres above home, above 0, at most 3,000. Q_RTL_ALT holds whole metres only.
@@ -355,7 +354,7 @@ class Vehicle(
 
 
 def overview(vehicle: Vehicle) -> dict[str, Any]:
-    """Return a summary of the vehicle's state as to_jsonable values, for display and for other programs. Sends nothing.
+    """Return a summary of the vehicle's state that can be written as JSON. Sends nothing.
 
     Returns:
         ``system_id``, ``autopilot`` and ``firmware`` (names), ``vehicle_type`` (MAV_TYPE), ``link`` (``state`` as of

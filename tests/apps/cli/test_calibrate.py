@@ -31,7 +31,7 @@ def run(vehicle: SimulatedVehicle, *arguments: str, interrupt_after_s: float | N
 
 @pytest.fixture
 def entered(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
-    """Answers to the question whether the pose is reached; True for all after the last one."""
+    """Replace the question whether the pose is reached by these answers, then by True."""
     answers: list[bool] = []
 
     async def press_enter() -> bool:

@@ -43,6 +43,7 @@ def pair() -> list[SimulatedCopter]:
     return [SimulatedCopter(system_id=number, boot_time_s=0.0, home=HOME) for number in (1, 2)]
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("command", CHANGING, ids=lambda command: " ".join(command[:2]))
 def test_changing_command_with_two_vehicles_sends_nothing(
     pair: list[SimulatedCopter], command: tuple[str, ...], capsys: pytest.CaptureFixture[str]

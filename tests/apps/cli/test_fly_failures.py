@@ -134,7 +134,7 @@ def test_fly_fall_ends_with_error_and_sends_nothing(
 
     assert run_virtual(scenario()) == 4
     out, err = capsys.readouterr()
-    assert "it accepted the order and has not moved for 12 s, after it descended" in err
+    assert "the vehicle accepted the order and has not moved for 12 s, after it descended" in err
     assert "failed: mission.wait_finished" in out
 
 

@@ -168,6 +168,7 @@ def is_running(simulated: Any) -> bool:
     return bool(simulated.calibrations.compasses.is_running)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("kind", [SimulatedCopter, SimulatedPx4])
 @pytest.mark.parametrize("how", ["break", "exception", "cancellation", "cancel"])
 async def test_leaving_loop_cancels_on_vehicle(kind: type[Any], how: str) -> None:
@@ -246,7 +247,7 @@ async def test_accelerometer_left_says_what_remains(caplog: pytest.LogCaptureFix
             await calibration.cancel()
         assert "waits for the next pose" in caplog.text
         assert copter.calibrations.accelerometers.is_waiting
-        steps = await steps_of(vehicle.calibrate.accelerometer())  # It continues.
+        steps = await steps_of(vehicle.calibrate.accelerometer())  # The first calibration continues.
         assert steps[-1].result is not None
 
 
@@ -331,7 +332,7 @@ async def test_px4_failure_raises_with_its_texts() -> None:
 
 async def test_lost_result_of_px4_is_reported_as_unknown() -> None:
     async with stage(SimulatedPx4) as (px4, vehicle, _):
-        with pytest.raises(OperationTimeout, match="the text with its result was lost"):
+        with pytest.raises(OperationTimeout, match="its status text with the result was lost"):
             async for step in vehicle.calibrate.gyroscope():
                 if step.progress:
                     px4.send_text = lambda *_: None

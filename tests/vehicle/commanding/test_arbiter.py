@@ -128,7 +128,7 @@ def test_disarming_or_reboot_ends_order() -> None:
     assert order.end == "the vehicle disarmed"
     order = stage.arbiter.order(GUIDED)
     stage.report(LOITER, armed=False)
-    assert order.end == ""  # it was so before
+    assert order.end == ""  # the vehicle was disarmed before
     stage.arbiter.on_reboot()
     assert order.end == "the vehicle rebooted"
 
@@ -413,7 +413,7 @@ def test_vehicle_armed_by_pilot_is_not_flown_by_program() -> None:
     stage = Stage(armed=False)
     arm(stage)
     for _ in range(4):
-        stage.report(LOITER, False)  # he disarmed it at once
+        stage.report(LOITER, False)  # the pilot disarms at once
     stage.report(LOITER, True)
     assert not stage.arbiter.is_flown_by_program
 
@@ -460,7 +460,7 @@ def test_posted_mode_after_order_is_no_takeover() -> None:
 
 
 def test_device_order_withdrawn_is_not_the_newest() -> None:
-    """The one before counts again, and only that one."""
+    """Then only the previous order is the newest again."""
     arbiter = Stage().arbiter
     first = arbiter.of_device("video", may_be_withdrawn=True)
     second = arbiter.of_device("video", may_be_withdrawn=True)

@@ -72,7 +72,7 @@ async def test_raw_arm_after_abandoned_arm_stays_armed() -> None:
         with pytest.raises(CommandTimeout):
             await flight.vehicle.arm()
         flight.px4.faults.commands.clear()
-        with suppress(CommandTimeout):  # its answer is taken for one to the orders before
+        with suppress(CommandTimeout):  # its answer is taken for an answer to an earlier order
             await flight.vehicle.command(MavCmd.COMPONENT_ARM_DISARM, 1)
         await anyio.sleep(5.0)
         assert true_point(flight.px4).armed

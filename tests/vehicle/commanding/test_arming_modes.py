@@ -6,8 +6,8 @@ import anyio
 import pytest
 from flight_harness import in_the_air, open_flight, open_px4
 
-from aerokit import connect
-from aerokit.errors import InvalidArgument, LinkLost, OperationRejected, OperationTimeout
+from aerokit import connect, missions
+from aerokit.errors import CommandRejected, InvalidArgument, LinkLost, OperationRejected, OperationTimeout
 from aerokit.mavlink.enums import CopterMode, MavCmd, PlaneMode
 from aerokit.sim import SimulatedPlane, simulated_link
 from aerokit.sim.px4.modes import OFFBOARD
@@ -67,6 +67,31 @@ async def test_why_not_armable_names_mode_and_alternatives() -> None:
         (reason,) = await flight.vehicle.why_not_armable()
         assert reason.startswith("ArduCopter cannot arm in RTL, only in ACRO")
         assert reason.endswith("arm() changes to GUIDED first")
+
+
+async def test_mission_is_flown_twice() -> None:
+    """After a mission ArduCopter is in AUTO, where it refuses to arm unless AUTO_OPTIONS allows it."""
+    async with open_flight() as flight:
+        await flight.vehicle.wait_ready()
+        place = flight.vehicle.position.value.offset(north_m=10)
+        items = [
+            missions.take_off(10),
+            missions.waypoint(place.latitude_deg, place.longitude_deg, altitude_relative_m=10),
+            missions.land(place.latitude_deg, place.longitude_deg),
+        ]
+        await flight.vehicle.mission.upload(missions.Mission(items))
+        for _ in range(2):
+            await flight.vehicle.arm()
+            await flight.vehicle.mission.start()
+            await flight.vehicle.mission.wait_finished(timeout=120)
+            await flight.vehicle.armed.wait_until(lambda armed: not armed, timeout=30)
+        assert flight.vehicle.mode_name == "AUTO"
+        (reason,) = await flight.vehicle.why_not_armable()
+        assert reason == "ArduCopter cannot arm in AUTO unless AUTO_OPTIONS allows it; arm() changes to GUIDED first"
+        flight.wire.clear()
+        with pytest.raises(CommandRejected, match="AUTO mode not armable"):
+            await flight.vehicle.arm(mode="AUTO")
+        assert not flight.wire.mode_orders()
 
 
 async def test_px4_left_in_offboard_arms() -> None:

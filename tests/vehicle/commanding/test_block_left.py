@@ -147,7 +147,7 @@ async def test_vehicle_block_leaves_nothing_on_connection() -> None:
 
 
 async def test_block_left_with_stream_in_other_task_holds() -> None:
-    """The stream ends with a reason, and the vehicle holds; its task gets the error."""
+    """The stream ends with a reason, the vehicle holds, and the task of the stream gets the error."""
     copter = SimulatedCopter(boot_time_s=0.0)
     async with simulated_link(copter) as link:
         async with aerokit.connect(link) as vehicle:

@@ -1,12 +1,13 @@
-"""Taking off, going somewhere, coming back: each action ends when the vehicle has done it."""
+"""Taking off, going somewhere, coming back: each call returns when the vehicle has completed the action."""
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import anyio
 import pytest
-from flight_harness import Flight, in_the_air, now, open_flight, speed_of
+from flight_harness import Flight, in_the_air, now, open_flight, open_px4, speed_of
 
 from aerokit import Position
 from aerokit import messages as m
@@ -97,7 +98,7 @@ async def test_take_off_in_the_air_sends_nothing(flying: Flight) -> None:
 
 
 async def test_take_off_while_landing_is_rejected(flying: Flight) -> None:
-    """The take-off would be refused in the air; the mode before it would not, and the vehicle would hover."""
+    """In the air the vehicle would refuse the take-off but accept the change to GUIDED, and would hover."""
     vehicle = flying.vehicle
     await vehicle.set_mode("LAND")
     await vehicle.landed_state.wait_until(lambda state: state == MavLandedState.LANDING, timeout=10)
@@ -159,7 +160,7 @@ async def test_take_off_refused_says_why(grounded: Flight) -> None:
 
 
 async def test_take_off_state_of_last_flight_is_no_effect(grounded: Flight) -> None:
-    """TAKING_OFF was its last report before the stream ended."""
+    """TAKING_OFF was the last landed state before the stream of states ended."""
     await grounded.vehicle.wait_ready()
     await grounded.vehicle.set_mode("GUIDED")
     await grounded.vehicle.arm()
@@ -170,7 +171,7 @@ async def test_take_off_state_of_last_flight_is_no_effect(grounded: Flight) -> N
 
 
 async def test_take_off_climb_is_effect(grounded: Flight, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without a landed state: repeated while it is on the ground, confirmed once it has climbed."""
+    """Without a landed state, the command is repeated while the vehicle stands, and confirmed by its climb."""
     vehicle = grounded.vehicle
     await vehicle.wait_ready()
     await vehicle.set_mode("GUIDED")
@@ -183,7 +184,7 @@ async def test_take_off_climb_is_effect(grounded: Flight, monkeypatch: pytest.Mo
 
 
 async def test_take_off_stale_landed_state_is_ignored(grounded: Flight) -> None:
-    """Its landing was not received, nor any state since."""
+    """Neither the landing nor a later landed state was received."""
     vehicle = grounded.vehicle
     await vehicle.wait_ready()
     await vehicle.set_mode("GUIDED")
@@ -219,7 +220,7 @@ async def test_take_off_ends_when_a_pilot_takes_over(grounded: Flight) -> None:
         with pytest.raises(OperationRejected, match="mode changed to LOITER"):
             await grounded.vehicle.take_off(30.0)
     await anyio.sleep(3.0)
-    assert grounded.copter.mode.number == LOITER  # it is the pilot's now
+    assert grounded.copter.mode.number == LOITER  # the pilot's mode
 
 
 async def test_take_off_not_executed_times_out(grounded: Flight) -> None:
@@ -227,7 +228,7 @@ async def test_take_off_not_executed_times_out(grounded: Flight) -> None:
     await grounded.vehicle.set_mode("GUIDED")
     await grounded.vehicle.arm()
     started = now()
-    with pytest.raises(OperationTimeout, match=r"take_off\(10 m\): not done within 8 s; it is at -?0\.0 m"):
+    with pytest.raises(OperationTimeout, match=r"take_off\(10 m\): not done within 8 s; the vehicle is at -?0\.0 m"):
         await grounded.vehicle.take_off(10.0, timeout=8.0)
     assert 8.0 <= now() - started < 10.0
 
@@ -507,7 +508,7 @@ async def test_go_to_silent_vehicle_raises(flying: Flight) -> None:
 
 
 async def test_go_to_times_out_and_says_how_far_it_is(flying: Flight) -> None:
-    with pytest.raises(OperationTimeout, match=r"not done within 5 s; it is 1\d\d\.\d m away"):
+    with pytest.raises(OperationTimeout, match=r"not done within 5 s; the vehicle is 1\d\d\.\d m away"):
         await flying.vehicle.go_to(north_of_home(flying, 200.0), timeout=5.0)
 
 
@@ -529,6 +530,46 @@ async def test_land_returns_on_the_ground(flying: Flight) -> None:
     await flying.vehicle.land()
     assert flying.copter.is_landed
     await flying.vehicle.armed.wait_until(lambda armed: not armed, timeout=5.0)
+
+
+@pytest.mark.parametrize("is_px4", [False, True])
+async def test_land_of_vehicle_disarmed_in_the_air_is_rejected(is_px4: bool) -> None:
+    """The firmware reports disarmed and ON_GROUND while it falls."""
+    opened: Any = open_px4() if is_px4 else open_flight()
+    async with opened as flight, anyio.create_task_group() as group:
+        await flight.take_off(60.0)
+        group.start_soon(disarm_later, flight, 3.0)
+        with pytest.raises(OperationRejected, match=r"land: the vehicle was disarmed in the air and sinks at \d"):
+            await flight.vehicle.land()
+
+
+@pytest.mark.parametrize("name", ["land", "return_to_launch"])
+async def test_fall_on_the_way_to_the_ground_is_rejected(name: str) -> None:
+    async with in_the_air(30.0) as flight, anyio.create_task_group() as group:
+        await flight.vehicle.go_to(north_of_home(flight, 40.0, 30.0))
+
+        async def fail() -> None:
+            await anyio.sleep(4.0)
+            flight.copter.faults.motor_failed = True
+
+        group.start_soon(fail)
+        with pytest.raises(OperationRejected, match=rf"{name}: the vehicle hit the ground at \d+\.\d m/s"):
+            await getattr(flight.vehicle, name)()
+
+
+async def test_fast_descent_before_landing_is_no_fall() -> None:
+    copter = SimulatedCopter(boot_time_s=0.0, parameters={"LAND_SPEED_HIGH": 500.0, "LAND_SPEED": 200.0})
+    async with open_flight(copter) as flight:
+        await flight.take_off(60.0)
+        await flight.vehicle.land()
+
+
+async def disarm_later(flight: Any, seconds: float) -> None:
+    await anyio.sleep(seconds)
+    if isinstance(flight, Flight):
+        flight.copter.arming.disarm(force=True)
+    else:
+        flight.px4.arming.disarm("test", force=True)
 
 
 async def test_land_ends_when_a_pilot_takes_over(flying: Flight) -> None:
@@ -558,7 +599,7 @@ async def test_return_to_launch_ends_on_the_ground_at_home(flying: Flight) -> No
 
 async def test_return_to_launch_times_out(flying: Flight) -> None:
     await flying.vehicle.go_to(north_of_home(flying, 50.0))
-    with pytest.raises(OperationTimeout, match="return_to_launch: not done within 3 s; it is at"):
+    with pytest.raises(OperationTimeout, match="return_to_launch: not done within 3 s; the vehicle is at"):
         await flying.vehicle.return_to_launch(timeout=3.0)
     assert flying.copter.mode.number == RTL
 
@@ -615,14 +656,14 @@ async def test_set_heading_absolute_and_relative(flying: Flight) -> None:
     assert (absolute.param1, absolute.param3, absolute.param4) == (90.0, 0.0, 0.0)
     assert left.param1 == pytest.approx(60.0, abs=1.5)
     assert (left.param3, left.param4) == (-1.0, 0.0)
-    assert right.param1 == pytest.approx(100.0, abs=3.0)  # a goal: sent again, it does not turn further
+    assert right.param1 == pytest.approx(100.0, abs=3.0)  # absolute: a repetition does not turn the vehicle further
     assert (right.param2, right.param3, right.param4) == (20.0, 1.0, 0.0)
 
 
 async def test_set_heading_not_reached_times_out(flying: Flight) -> None:
     flying.copter.faults.lose_ack(MavCmd.CONDITION_YAW)
     flying.copter.yaw.fixed = lambda *_, **__: None  # type: ignore[method-assign]
-    with pytest.raises(OperationTimeout, match=r"set_heading\(90°\): not done within 3 s; it is \d+° off"):
+    with pytest.raises(OperationTimeout, match=r"set_heading\(90°\): not done within 3 s; the heading is \d+° off"):
         await flying.vehicle.set_heading(90.0, timeout=3.0)
 
 
@@ -665,7 +706,7 @@ async def test_take_off_refused_in_air_says_so(flying: Flight) -> None:
     """The vehicle answers only FAILED; the landed state was unknown when the order was given."""
     flying.vehicle.telemetry.landed_state.forget()
     with pytest.raises(
-        CommandRejected, match=r"it is in the air, 10\.\d m above home and can only take off from the ground"
+        CommandRejected, match=r"the vehicle is in the air, 10\.\d m above home and can only take off from the ground"
     ):
         await flying.vehicle.take_off(20)
 
@@ -674,7 +715,8 @@ async def test_take_off_refused_height_shows_flight(flying: Flight, monkeypatch:
     monkeypatch.setattr(flight, "IN_THE_AIR", {})
     flying.vehicle.telemetry.landed_state.forget()
     with pytest.raises(
-        CommandRejected, match=r"it is probably in the air, 10\.\d m above home and can only take off from the ground"
+        CommandRejected,
+        match=r"the vehicle is probably in the air, 10\.\d m above home and can only take off from the ground",
     ):
         await flying.vehicle.take_off(20)
 

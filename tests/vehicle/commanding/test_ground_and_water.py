@@ -66,7 +66,9 @@ async def test_sub_land_ends_at_surface() -> None:
         await vehicle.go_to(Position(here.latitude_deg, here.longitude_deg, altitude_relative_m=-5), timeout=120)
         await vehicle.land(timeout=120)
         assert vehicle.mode_name == "ALT_HOLD"
-        assert abs(vehicle.position.value.altitude_relative_m or 9.0) < 1.5
+        height_m = vehicle.position.value.altitude_relative_m
+        assert height_m is not None
+        assert abs(height_m) < 1.5
         assert vehicle.is_armed
 
 
@@ -79,7 +81,7 @@ async def test_sub_land_at_surface_returns_immediately() -> None:
 
 
 async def test_sub_land_takeover_at_depth_raises() -> None:
-    """SURFACE ends in the mode that a pilot may also choose on the way."""
+    """SURFACE ends in ALT_HOLD, a mode that a pilot may also choose during the ascent."""
     sub = SimulatedSub(boot_time_s=1.0)
     async with guided(sub) as vehicle, anyio.create_task_group() as tasks:
         here = vehicle.position.value
@@ -106,7 +108,7 @@ async def test_sub_land_accepted_not_executed_raises_after_three_seconds() -> No
 
 @pytest.mark.parametrize("kind", ["local", "global"])
 async def test_sub_position_stream_arrives(kind: str) -> None:
-    """Each such set-point restarts the path, so the same one is not sent ten times a second."""
+    """Each position set-point restarts the path, so the same set-point is not sent ten times a second."""
     async with guided(SimulatedSub(boot_time_s=1.0)) as vehicle:
         here = vehicle.position.value
         await vehicle.local_position.wait_until(lambda _: True)
@@ -162,7 +164,7 @@ async def fall(copter: SimulatedCopter, begin: Callable[[], None]) -> None:
 
 async def test_go_to_vehicle_fell_error_names_descent() -> None:
     copter = SimulatedCopter(boot_time_s=1.0)
-    descent = r"not moved for 1[23] s, after it descended (19|20)\.\d m at up to 1\d\.\d m/s; it is"
+    descent = r"not moved for 1[23] s, after it descended (19|20)\.\d m at up to 1\d\.\d m/s; the vehicle is"
     with pytest.raises(OperationTimeout, match=descent):
         await fall(copter, lambda: setattr(copter.faults, "motor_failed", True))
 
@@ -174,7 +176,7 @@ async def test_go_to_vehicle_disarmed_in_air_error_names_height() -> None:
 
 
 async def test_rover_return_to_launch_ends_at_home() -> None:
-    """It does not land there, and stays armed."""
+    """A rover stays armed at home."""
     rover = SimulatedRover(boot_time_s=1.0)
     async with guided(rover) as vehicle:
         home = vehicle.home.value.position
@@ -184,7 +186,7 @@ async def test_rover_return_to_launch_ends_at_home() -> None:
         assert vehicle.is_armed
         await vehicle.set_mode("GUIDED")
         await vehicle.go_to(vehicle.position.value.offset(north_m=30), timeout=60)
-        with pytest.raises(OperationTimeout, match=r"return_to_launch: .*; it is \d+\.\d m from home"):
+        with pytest.raises(OperationTimeout, match=r"return_to_launch: .*; the vehicle is \d+\.\d m from home"):
             await vehicle.return_to_launch(timeout=2)
 
 
@@ -200,7 +202,7 @@ async def test_rover_mission_with_return_ends_at_home() -> None:
 
 
 async def test_px4_plane_mission_with_return_ends_above_home() -> None:
-    await anyio.sleep(1000.0)  # a loop's clock begins anywhere
+    await anyio.sleep(1000.0)  # a loop's clock may start at any value
     async with simulated_link(SimulatedPx4Plane()) as link, connect(link) as vehicle:
         await vehicle.wait_ready()
         await vehicle.parameters.set("MIS_TKO_LAND_REQ", 0)
@@ -219,7 +221,7 @@ async def test_px4_plane_mission_with_return_ends_above_home() -> None:
 
 
 async def test_arduplane_mission_with_return_ends_above_home() -> None:
-    """Its mission does not complete: it changes to RTL, and the mission has stopped."""
+    """The mission does not complete: the plane changes to RTL, which stops the mission."""
     async with simulated_link(SimulatedPlane(boot_time_s=1.0)) as link, connect(link) as vehicle:
         await vehicle.wait_ready()
         home = vehicle.position.value

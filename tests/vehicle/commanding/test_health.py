@@ -66,7 +66,7 @@ async def test_arm_refused_has_status_texts(grounded: Flight) -> None:
     assert "Arm: Compass not healthy" in caught.value.reasons
     assert "Arm: Gyros inconsistent" in caught.value.reasons
     assert "\n  - Arm: Compass not healthy" in str(caught.value)
-    assert not grounded.wire.commands(MavCmd.RUN_PREARM_CHECKS)  # It has sent a status text already.
+    assert not grounded.wire.commands(MavCmd.RUN_PREARM_CHECKS)  # The vehicle has sent a status text already.
 
 
 async def test_arm_refused_without_text_requests_checks(grounded: Flight) -> None:
@@ -315,3 +315,25 @@ async def test_px4_mode_with_sticks_names_missing_rc_receiver() -> None:
         flight.px4.switch_to(POSITION)
         await anyio.sleep(2.0)
         assert "RC receiver (missing) is not healthy (SYS_STATUS)" in await flight.vehicle.why_not_armable()
+
+
+async def test_lost_gps_is_named_where_it_prevents_arming() -> None:
+    async with open_flight() as flight:
+        await flight.vehicle.wait_ready()
+        flight.copter.faults.gps_lost = True
+        await anyio.sleep(20)
+        assert "no GPS receiver has a 3D fix (GPS_RAW_INT)" in flight.vehicle.missing_for_flight()
+        assert await flight.vehicle.why_not_armable() == []
+        await flight.vehicle.arm()  # in STABILIZE
+        await flight.vehicle.disarm()
+
+
+async def test_lost_gps_prevents_arming_in_guided() -> None:
+    async with open_flight() as flight:
+        await flight.vehicle.wait_ready()
+        await flight.vehicle.set_mode("GUIDED")
+        flight.copter.faults.gps_lost = True
+        await anyio.sleep(20)
+        assert "no GPS receiver has a 3D fix (GPS_RAW_INT)" in await flight.vehicle.why_not_armable()
+        with pytest.raises(CommandRejected, match="no GPS receiver has a 3D fix"):
+            await flight.vehicle.arm()

@@ -17,7 +17,7 @@ BRAKE = CopterMode.BRAKE
 
 
 async def give_up(flight: Flight) -> None:
-    """A long way, cancelled after two seconds."""
+    """Start a long flight, and cancel it after two seconds."""
     with anyio.move_on_after(2.0) as scope:
         await flight.vehicle.go_to(flight.vehicle.position.value.offset(north_m=500))
     assert scope.cancelled_caught
@@ -91,7 +91,7 @@ async def test_refused_hold_warns_once(caplog: pytest.LogCaptureFixture) -> None
 
 
 async def test_pending_hold_is_dropped_after_takeover() -> None:
-    """Abandoned in a silence; when the vehicle is received again, its mode is a pilot's."""
+    """The flight is abandoned during a silence; afterwards the vehicle reports a pilot's mode."""
     async with in_the_air() as flight:
         asyncio.get_running_loop().call_later(1.5, setattr, flight.copter.faults, "silent", True)
         with anyio.move_on_after(6.0):

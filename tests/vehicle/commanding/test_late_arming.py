@@ -52,7 +52,7 @@ async def test_late_arming_counts_only_later_reports(grounded: Flight) -> None:
 
 @pytest.mark.parametrize("ends", ["cancelled", "unanswered"])
 async def test_vehicle_armed_before_order_stays_armed(flying: Flight, ends: str) -> None:
-    """It is flying, so this order has not armed it."""
+    """A flying vehicle was not armed by this order."""
     if ends == "cancelled":
         with anyio.move_on_after(0.0):
             await flying.vehicle.arm()
@@ -65,7 +65,7 @@ async def test_vehicle_armed_before_order_stays_armed(flying: Flight, ends: str)
 
 
 async def test_late_disarm_continues_after_watch_time(grounded: Flight) -> None:
-    """It armed at the last moment, and the first disarm command is lost."""
+    """The vehicle arms at the last moment, and the first disarm command is lost."""
     await grounded.vehicle.set_mode("GUIDED")
     grounded.copter.faults.ignore(ARM)
     reported_at = grounded.vehicle.armed.updated_at
@@ -101,7 +101,7 @@ async def test_failed_late_disarm_logs_error(grounded: Flight, caplog: pytest.Lo
 
 
 async def test_pilot_arming_after_mode_change_stays_armed(grounded: Flight, caplog: pytest.LogCaptureFixture) -> None:
-    """His mode change has ended the call, whose order was lost."""
+    """The pilot's mode change has ended the call, and the arm command was lost."""
     grounded.copter.parameters["DISARM_DELAY"] = 0.0
     await grounded.vehicle.set_mode("GUIDED")
     grounded.copter.faults.ignore(ARM)
@@ -130,7 +130,7 @@ async def test_pilot_arming_later_by_sticks_stays_armed(grounded: Flight) -> Non
 
 
 async def test_late_accepted_arm_is_undone(grounded: Flight) -> None:
-    """The ack shows whose order it was, although it arrives seconds later."""
+    """The late ack shows that this program armed the vehicle."""
     await grounded.vehicle.set_mode("GUIDED")
     grounded.copter.faults.ignore(ARM)
     with anyio.move_on_after(0.1):
@@ -169,7 +169,7 @@ def disarm(simulated: SimulatedCopter | SimulatedPx4) -> None:
 
 
 async def test_pilot_disarming_and_arming_later_stays_armed(grounded: Flight) -> None:
-    """Our command was accepted and armed it; no HEARTBEAT reported that before the pilot disarmed."""
+    """Our command armed the vehicle, but the pilot disarmed it before a HEARTBEAT reported that."""
     await grounded.vehicle.set_mode("STABILIZE")
     grounded.copter.parameters["DISARM_DELAY"] = 0.0
     reported_at = grounded.vehicle.armed.updated_at

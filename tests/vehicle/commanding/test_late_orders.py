@@ -61,7 +61,7 @@ async def test_autotune_is_not_started_again_after_pause() -> None:
 
 
 async def test_follow_slow_function_gives_no_velocity_peaks() -> None:
-    """A function that returns the latest of positions which arrive once a second."""
+    """The function returns the latest position; a new one arrives once a second."""
     async with in_the_air() as flight:
         here = flight.vehicle.position.value
         began = anyio.current_time()

@@ -174,7 +174,7 @@ async def test_orbit_of_copter_faces_as_ordered(facing: Any) -> None:
         center = vehicle.position.value.offset(north_m=12)
         await vehicle.orbit(center, radius_m=12, speed_m_s=4, turns=0.25, facing=facing)
         yaw = math.degrees(wire.all(m.SetPositionTargetLocalNed)[-20].yaw) % 360
-        wanted = {"center": 90, "ahead": 0, "initial": 0}[facing]  # It ends west of the center.
+        wanted = {"center": 90, "ahead": 0, "initial": 0}[facing]  # The orbit ends west of the center.
         assert abs(math.remainder(yaw - wanted, 360)) < 20
 
 
@@ -199,7 +199,7 @@ async def test_orbit_px4_flying_another_circle_is_held() -> None:
     async with hovering(simulated) as (vehicle, _):
         plan = simulated.flight.orbit.plan
         simulated.flight.orbit.plan = lambda _, *others: plan(20.0, *others)  # type: ignore[method-assign]
-        with pytest.raises(OperationRejected, match=r"it flies a circle of 20\.0 m instead of 500 m"):
+        with pytest.raises(OperationRejected, match=r"the vehicle flies a circle of 20\.0 m instead of 500 m"):
             await vehicle.orbit(vehicle.position.value, radius_m=500)
         await vehicle.mode.wait_until(lambda mode: mode.name == "LOITER", timeout=5)
 
@@ -331,7 +331,7 @@ async def test_follow_without_own_altitude_holds() -> None:
 
 
 async def test_follow_takes_altitude_above_sea_level_of_positions() -> None:
-    """The altitude above home of a position is that of its own vehicle, whose home may be lower."""
+    """The leader's altitude above home refers to the leader's home, which may be lower."""
     async with in_the_air() as flight:
         here = flight.vehicle.position.value
         assert here.altitude_amsl_m is not None
@@ -361,9 +361,9 @@ async def test_transition_returns_in_its_state() -> None:
 
 
 async def test_transition_of_copter_is_not_supported() -> None:
-    """ArduCopter reports MAV_VTOL_STATE_MC, and is no VTOL."""
+    """ArduCopter reports MAV_VTOL_STATE_MC, and is not a VTOL."""
     async with in_the_air() as flight:
-        with pytest.raises(NotSupported, match="is no VTOL"):
+        with pytest.raises(NotSupported, match="is not a VTOL"):
             await flight.vehicle.transition_to("fixed_wing")
         assert flight.wire.commands(MavCmd.DO_VTOL_TRANSITION) == []
 
@@ -388,7 +388,7 @@ async def test_autotune_reports_its_progress() -> None:
 
 
 async def test_autotune_is_not_asked_again_after_a_lost_answer() -> None:
-    """PX4 takes the question for another start, once it has finished."""
+    """After the end of the tuning, PX4 takes the command that asks for the progress for another start."""
     simulated = SimulatedPx4(boot_time_s=0.0)
     async with hovering(simulated) as (vehicle, wire):
         asyncio.get_running_loop().call_later(3.5, simulated.faults.ignore, MavCmd.DO_AUTOTUNE_ENABLE)
@@ -401,6 +401,6 @@ async def test_autotune_is_not_asked_again_after_a_lost_answer() -> None:
 
 async def test_autotune_of_copter_is_not_supported() -> None:
     async with in_the_air() as flight:
-        with pytest.raises(NotSupported, match="pilot's sticks"):
+        with pytest.raises(NotSupported, match="needs a pilot"):
             await flight.vehicle.autotune()
         assert flight.wire.commands(MavCmd.DO_AUTOTUNE_ENABLE) == []

@@ -92,7 +92,7 @@ async def test_order_does_not_wait_for_superseded_one() -> None:
 
 
 async def test_takeover_while_order_waits_keeps_vehicle() -> None:
-    """Both commands are the program's own, so that the second waits for the answer to the first."""
+    """The program sends both commands, so the second waits for the answer to the first."""
     async with _copter(flies=True) as (copter, vehicle, path):
         _prepare(path, Disturbances(command=MavCmd.DO_CHANGE_SPEED, lost_acks=9))
         async with anyio.create_task_group() as tasks:
@@ -135,7 +135,7 @@ async def test_arm_and_disarm_commands_supersede_each_other() -> None:
 async def test_legacy_set_mode_is_not_sent_for_ended_order(
     legacy: MavCmd,
 ) -> None:
-    """It would be sent 0.3 s after the refusal, because the refusal waits for its reasons."""
+    """SET_MODE would be sent 0.3 s after the refusal, because aerokit waits that long for the reasons."""
     async with _copter(flies=True) as (copter, vehicle, path):
         copter.faults.refuse(legacy, MavResult.UNSUPPORTED)
         there = vehicle.position.value.offset(north_m=8)

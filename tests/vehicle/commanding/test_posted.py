@@ -1,4 +1,4 @@
-"""Orders that others may follow before they are answered: when they are sent again, and what ends what."""
+"""Orders that return before they are answered: when they are repeated, and which orders end them."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ COPTER = autopilot_for(Heartbeat(2, 3, 81, 0, 4, 3))
 
 
 class Stage:
-    """An arbiter, heartbeats at the test's word, and orders that stay posted."""
+    """An arbiter, heartbeats on demand, and orders that stay posted."""
 
     def __init__(self, mode: Mode = STABILIZE, armed: bool = False) -> None:
         self.now, self._open = 0.0, ExitStack()
@@ -71,7 +71,7 @@ class Stage:
 
 
 def end_of(order: Order) -> str:
-    """Why nothing of it is sent again."""
+    """Return the reason why nothing of an order is sent again."""
     if order.is_confirmed:
         return TOLD
     return TAKEN if order.takeover_reason.startswith(TAKEN) else order.end
@@ -111,7 +111,7 @@ def test_effect_requires_change() -> None:
 
 
 def test_posted_mode_reported_keeps_late_mode_of_previous_order() -> None:
-    """In GUIDED, LOITER and GUIDED are posted: LOITER is reported late, and GUIDED is still to be repeated."""
+    """In GUIDED, the program posts LOITER, then GUIDED: LOITER is reported late, and GUIDED must still be repeated."""
     stage = Stage(GUIDED, True)
     stage.post("mode", "motion", mode=LOITER)
     again = stage.post("mode", "motion", mode=GUIDED)
@@ -296,7 +296,7 @@ async def test_set_mode_without_custom_flag_has_no_modes(flying: Flight) -> None
     vehicle.send(m.SetMode(vehicle.system_id, 0, CopterMode.LOITER))
     flying.copter.set_mode(CopterMode.LOITER)
     await vehicle.mode.wait_until(lambda mode: mode.name == "LOITER", timeout=5)
-    assert vehicle.taken_over == ""  # it may be the effect
+    assert vehicle.taken_over == ""  # the mode may be the effect of the order
     await anyio.sleep(MODE_GRACE_S)
     flying.copter.set_mode(CopterMode.ALT_HOLD)
     await vehicle.mode.wait_until(lambda mode: mode.name == "ALT_HOLD", timeout=5)
@@ -386,7 +386,7 @@ async def test_posted_order_errors_say_why(grounded: Flight) -> None:
         grounded.copter.send(m.CommandAck(ARM, MavResult.DENIED, 0, 0, 255, vehicle.connection.source_component))
         with pytest.raises(CommandRejected, match="DENIED"):  # taken back
             await order.wait_confirmed(2)
-    with pytest.raises(InvalidArgument, match="no subject is given"), vehicle.posted():
+    with pytest.raises(InvalidArgument, match="subjects are missing"), vehicle.posted():
         pass
     grounded.wire.clear()
     with pytest.raises(InvalidArgument, match="requires armed=True or armed=False"), vehicle.posted("arm"):
@@ -412,7 +412,7 @@ async def test_command_int_unsupported_falls_back_to_command_long(flying: Flight
 
 @pytest.mark.anyio
 async def test_posted_arming_is_not_undone_by_abandoned_arm(grounded: Flight) -> None:
-    """`arm()` is monitored for 15 s after it was abandoned: a later posted arming is intended."""
+    """An abandoned `arm()` is monitored for 15 s; an arming posted in this time is intended."""
     vehicle, faults = grounded.vehicle, grounded.copter.faults
     await vehicle.set_mode("GUIDED")
     faults.ignore(ARM, times=1)
@@ -472,7 +472,7 @@ async def test_classic_arming_a_pilot_ends_says_it_may_still_come(grounded: Flig
 
 @pytest.mark.anyio
 async def test_set_heading_after_refused_mode_returns_to_guided() -> None:
-    """RTL is active and not reported yet, LAND is refused: the last report of GUIDED does not suffice."""
+    """RTL is active but not reported yet, and LAND is refused: the last report, GUIDED, is outdated."""
     async with in_the_air(latency_s=0.1) as flight:
         vehicle, faults, armed = flight.vehicle, flight.copter.faults, flight.vehicle.telemetry.armed
         reported_at = armed.updated_at

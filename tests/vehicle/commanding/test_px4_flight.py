@@ -56,7 +56,7 @@ async def test_px4_take_off_uses_amsl_altitude_and_ends_in_loiter() -> None:
 async def test_take_off_is_not_repeated_after_mode_report(
     monkeypatch: pytest.MonkeyPatch, tells_landed_state: bool
 ) -> None:
-    """It starts and ends in LOITER, and stays on the ground for a second while the motors spin up."""
+    """A take-off starts and ends in LOITER, and the vehicle stays on the ground while the motors spin up."""
     async with open_px4() as flight:
         await flight.vehicle.wait_ready()
         await flight.vehicle.set_mode("LOITER")
@@ -64,7 +64,7 @@ async def test_take_off_is_not_repeated_after_mode_report(
         if not tells_landed_state:
             cell = StateCell[int]("landed_state", now, "nothing")
             monkeypatch.setattr(flight.vehicle.telemetry, "landed_state", cell)
-        flight.px4.faults.motor_failed = True  # it does not rise
+        flight.px4.faults.motor_failed = True  # the vehicle does not climb
         flight.px4.faults.lose_ack(MavCmd.NAV_TAKEOFF, times=9)
         with pytest.raises(OperationTimeout):
             await flight.vehicle.take_off(10.0, timeout=8.0)
@@ -192,7 +192,7 @@ async def test_land(flying: Px4Flight) -> None:
 async def test_land_current_mode_before_heartbeat_ends_landing(
     flying: Px4Flight, monkeypatch: pytest.MonkeyPatch, is_taken: bool
 ) -> None:
-    """It leaves LAND when it disarms; CURRENT_MODE arrives up to a second before the HEARTBEAT."""
+    """The vehicle leaves LAND when it disarms; CURRENT_MODE arrives up to a second before the HEARTBEAT."""
     reported: list[str] = []
 
     def look() -> None:

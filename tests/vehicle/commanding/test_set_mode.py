@@ -91,7 +91,7 @@ async def test_set_mode_unknown_number_is_sent(grounded: Flight) -> None:
 
 
 class CopterWithAScript(SimulatedCopter):
-    """Reports one more mode than the tables contain, as a Lua script may add one."""
+    """Reports a mode that the tables lack, such as one that a Lua script has added."""
 
     def available_modes(self) -> list[m.AvailableModes]:
         return [*super().available_modes(), m.AvailableModes(12, 12, 0, 118, 0, "Follow Boat")]

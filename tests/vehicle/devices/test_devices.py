@@ -157,7 +157,7 @@ async def test_shell_output_of_other_station_is_ignored() -> None:
 async def test_shell_without_answer_times_out_and_is_closed() -> None:
     async with on_px4() as flight:
         flight.px4.handlers[m.SerialControl.ID] = lambda *_: None
-        with pytest.raises(OperationTimeout, match="was not done within 5 s"):
+        with pytest.raises(OperationTimeout, match="has not ended within 5 s"):
             async with flight.vehicle.shell():
                 raise AssertionError
         assert flight.wire.last(m.SerialControl).flags == 0

@@ -1,4 +1,4 @@
-"""Orders to devices that wait before they are sent, or that end while they are on their way."""
+"""Orders to devices that wait before they are sent, or that are cancelled while they are being delivered."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Measurements of a program: what is sent, when it is dropped, what the vehicle needs, and flights by them."""
+"""Measurements of a program: their messages, when they are dropped, required parameters, and flights without GPS."""
 
 from __future__ import annotations
 
@@ -174,7 +174,7 @@ def test_target_of_camera_angles_is_at_its_height() -> None:
 
 
 async def test_landing_target_needs_recent_local_position() -> None:
-    """With an old one the target would move along with a vehicle that has moved since."""
+    """With an old position, the target would seem to have moved with the vehicle."""
     async with open_px4(px4()) as flight:
         await flight.take_off()
         async with flight.vehicle.external.landing_target() as stream:
@@ -409,7 +409,7 @@ def pose_of(motion: Any, place: Callable[[], tuple[float, float, float]]) -> v.O
 
 
 async def feed(stream: MeasurementStream[v.OdometryMeasurement], motion: Any) -> None:
-    """A tracking system: send the true pose thirty times a second."""
+    """Act as a tracking system: send the true pose thirty times a second."""
     while True:
         if stream.is_open:
             stream.send(pose_of(motion, lambda: motion.place))

@@ -150,6 +150,20 @@ async def test_exception_of_source_is_raised() -> None:
             await flight.vehicle.land_on(lambda: 5)  # type: ignore[arg-type,return-value]
 
 
+async def test_disarming_in_the_air_is_no_precision_landing() -> None:
+    simulated = copter()
+    async with open_flight(simulated) as flight, anyio.create_task_group() as group:
+        await flight.take_off(60.0)
+
+        async def disarm() -> None:
+            await anyio.sleep(3.0)
+            simulated.arming.disarm(force=True)
+
+        group.start_soon(disarm)
+        with pytest.raises(OperationRejected, match="land_on: the vehicle was disarmed in the air"):
+            await flight.vehicle.land_on(camera(simulated.motion))
+
+
 async def test_pilot_ends_precision_landing() -> None:
     simulated = copter()
     async with open_flight(simulated) as flight:

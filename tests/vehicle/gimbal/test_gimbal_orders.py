@@ -109,7 +109,7 @@ async def test_gimbal_without_attitude_times_out() -> None:
     async with open_flight() as flight:
         for command in (PITCHYAW, MOUNT):
             flight.copter.faults.refuse(command, MavResult.ACCEPTED)
-        with pytest.raises(OperationTimeout, match="it does not report its attitude"):
+        with pytest.raises(OperationTimeout, match="the gimbal does not report its attitude"):
             await flight.vehicle.gimbal.point(-45.0, 0.0, timeout=2.0)
 
 

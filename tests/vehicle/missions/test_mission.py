@@ -128,11 +128,9 @@ async def test_wait_finished_reports_fall_of_armed_vehicle() -> None:
         flight.copter.faults.motor_failed = True
         flight.wire.clear()
         started = now()
-        with pytest.raises(
-            OperationTimeout, match=r"not moved for 12 s, after it descended \d.* at up to .*at item 1 of"
-        ):
+        with pytest.raises(OperationRejected, match=r"the vehicle hit the ground at 7\.\d m/s, at item 1 of"):
             await mission.wait_finished()
-        assert now() - started < 20
+        assert now() - started < 8
         assert flight.vehicle.is_armed
         assert not flight.wire.commands(MavCmd.COMPONENT_ARM_DISARM)
         assert not flight.wire.commands(MavCmd.DO_SET_MODE)
@@ -283,7 +281,7 @@ async def test_disarming_ends_wait_finished() -> None:
         await reaches(flight, 1)
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(lambda: flight.vehicle.disarm(force=True))
-            with pytest.raises(OperationRejected, match="not armed"):
+            with pytest.raises(OperationRejected, match="the vehicle hit the ground at"):
                 await flight.vehicle.mission.wait_finished()
 
 

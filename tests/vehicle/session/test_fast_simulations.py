@@ -52,6 +52,7 @@ async def test_rates_requested_during_reboot_are_repeated_immediately() -> None:
             await asked_meanwhile.get(timeout=2.0)
 
 
+@pytest.mark.exhaustive
 async def test_px4_fast_simulation_obeys_10_hz_setpoints() -> None:
     for is_patient in (True, False):
         px4 = SimulatedPx4(boot_time_s=1.0)

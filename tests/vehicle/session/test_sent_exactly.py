@@ -82,6 +82,7 @@ async def test_force_uses_magic_number(grounded: Flight) -> None:
 # -------------------------------------------------------------------------------- set-points
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("kind", "rate_hz"),
     [
@@ -344,11 +345,11 @@ async def test_block_left_with_answered_arm_is_silent(
     assert "order to arm" not in caplog.text
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(("order", "longest_s"), [("land", 300.0), exhaustive(pytest.param("return_to_launch", 600.0))])
 async def test_land_and_return_default_timeouts_apply(flying: Flight, order: str, longest_s: float) -> None:
     flying.copter.motion.step = lambda *_, **__: None  # type: ignore[method-assign]
     begin = now()
-    with pytest.raises(OperationTimeout, match=f"{order}: not done within {longest_s:g} s; it is at 10.0 m"):
+    with pytest.raises(OperationTimeout, match=f"{order}: not done within {longest_s:g} s; the vehicle is at 10.0 m"):
         await getattr(flying.vehicle, order)()
     assert longest_s <= now() - begin < longest_s + 3.0

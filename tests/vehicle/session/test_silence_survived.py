@@ -49,6 +49,7 @@ async def test_call_without_silence_limit_survives_silence(name: str) -> None:
     await fly(name, None)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", CALLS)
 async def test_call_silence_exceeds_limit_raises_heartbeat_timeout(name: str) -> None:
     with pytest.raises(BaseException) as caught:  # noqa: PT011 - a group on anyio's task group

@@ -29,7 +29,7 @@ ARDUPILOT, PX4 = 3, 12
 
 @pytest.mark.parametrize(("autopilot", "reported"), [(PX4, 0.25), (ARDUPILOT, 250_000.0)])
 def test_imu_field_is_in_microtesla_on_both(autopilot: int, reported: float) -> None:
-    """ArduPilot reports a million times gauss."""
+    """ArduPilot reports gauss times a million."""
     telemetry = telemetry_of(autopilot)
     telemetry.receive(m.HighresImu(0, 1.0, 2.0, -9.8, math.pi, 0, 0, reported, 0, 0, 950.0, 1.0, 500.0, 20.0, 0))
     imu = telemetry.imu.value

@@ -1,4 +1,4 @@
-"""Recognises an address or a file in the place of another argument, before anything is opened."""
+"""Recognises an address or a file given in place of another argument, before anything is opened."""
 
 from __future__ import annotations
 

@@ -80,7 +80,7 @@ def _readiness(vehicle: Vehicle, missing: Sequence[str]) -> list[str]:
         return _aligned("ready", ["no reason against arming is reported"])
     sensors = vehicle.sensors.latest
     can_arm = sensors is not None and sensors.prearm_checks_pass is True
-    is_about_estimates = all(text.startswith("the estimator has no ") for text in missing)
+    is_about_estimates = all(text.startswith(("the estimator has no ", "no GPS receiver has ")) for text in missing)
     # ArduCopter arms in STABILIZE without a position, for example.
     note = [f"for autonomous flight; {vehicle.mode_name} allows arming:"] if can_arm and is_about_estimates else []
     return _aligned("missing", [*note, *missing])
@@ -216,7 +216,7 @@ async def _missing_for_flight(vehicle: Vehicle) -> list[str]:
             try:
                 await _request(vehicle, message, cell)
             except CommandTimeout as error:
-                # A vehicle that does not answer one request would time out on the others too.
+                # A vehicle that does not answer this request would not answer the others either.
                 return [str(error), *vehicle.missing_for_flight()]
     return list(dict.fromkeys([*await vehicle.why_not_armable(), *vehicle.missing_for_flight()]))
 

@@ -243,7 +243,8 @@ Handler = Callable[["Request"], Awaitable[Response]]
 class Operation:
     """One method of one path.
 
-    ``name`` is its operationId, ``order`` the order that it gives; ``body`` an order with the same body, not given.
+    ``name`` is its operationId and ``order`` the order that it gives. An operation that gives no order may have a
+    ``body``, which is an order whose body it shares.
     """
 
     method: str

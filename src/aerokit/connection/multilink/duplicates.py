@@ -31,14 +31,14 @@ class _Seen:
 
     def __init__(self, at: float, links: int, count: int) -> None:
         self.at, self.links = at, links  # one bit for each link
-        self.count = count  # the sender's frame count at that time
+        self.count = count  # the sender's frame count when this frame arrived
         self.is_admitted = self.is_accepted = False
 
 
 class Copies:
     """Remembers which frame arrived over which link, and detects copies.
 
-    A repetition over the same link is not a copy: the sender repeated it, or its sequence numbers have wrapped.
+    An equal frame over the same link is not a copy: the sender has repeated it, or the sequence numbers have wrapped.
     """
 
     def __init__(self) -> None:
@@ -107,8 +107,8 @@ ANSWERS = frozenset(
     )
 )  # fmt: skip
 
-# PX4 sends an acknowledgement over each port on which it received us. The second copy would be taken for the answer to
-# the next command.
+# PX4 sends an acknowledgement over each port on which it received our frames. The second copy would be taken for the
+# answer to the next command.
 ACKNOWLEDGEMENTS = frozenset(message_type.ID for message_type in (m.CommandAck, m.MissionAck, m.ParamExtAck))
 
 

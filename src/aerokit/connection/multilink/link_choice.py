@@ -24,7 +24,7 @@ MAX_TIMES_WITHOUT_HARDWARE = 3
 
 MAX_HARDWARE_REQUESTS = 20
 
-# Number of frames received over both a link and the link in use that proves that both lead to the same vehicle.
+# This many frames received both over a link and over the link in use prove that both lead to the same vehicle.
 MIN_COPIES = 3
 
 
@@ -168,8 +168,8 @@ class LinkChoice:
     """The links to one system, and the one in use.
 
     Systems with an autopilot need proof (``needs_proof``) that a second link leads to the same vehicle: a matching
-    clock, or the same frames. Before that, its frames are refused and no command is sent over it. A different hardware
-    id disproves it, even if the clock matches.
+    clock, or the same frames. Without proof, the frames of the link are refused, and no command is sent over it. A link
+    with a different hardware id is refused even if the clock matches.
     """
 
     def __init__(self, *, needs_proof: bool) -> None:
@@ -184,7 +184,7 @@ class LinkChoice:
         """The link used before; it may still deliver answers."""
         self.changed_at: float = -math.inf
         self.fresh_after: float = -math.inf
-        """Telemetry received before this time is older than the last that arrived over the former link."""
+        """Telemetry received before this time is older than the last telemetry of the former link."""
         self._better: Candidate | None = None
         self._better_since = 0.0
         self._command_at = -math.inf

@@ -121,7 +121,7 @@ class LinkProbes:
         return True
 
     def _round_trip_of(self, answer: m.Timesync, system_id: int, link: int, now: float) -> float | None:
-        """Return the seconds since the probe; None if it went to another system or over another link."""
+        """Return the seconds since the probe; None if the probe went to another system or link."""
         if self._pending.get(answer.ts1, (0, 0, 0.0))[:2] != (system_id, link):
             return None
         return max(0.0, now - self._pending.pop(answer.ts1)[2])

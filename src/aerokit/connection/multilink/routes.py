@@ -195,7 +195,7 @@ class MultiLinkRoutes:
             now = self._now()
             self._choose(system_id, choice, now)
             if choice.used.is_other_hardware:
-                return ()  # the link in use leads to another vehicle, and no other link to this one is alive
+                return ()  # the link in use leads to another vehicle, and no live link leads to this one
             if message is None or message.ID in COMMANDS:
                 choice.record_command(now)
             return self._peers_on(self._link_to(choice, (system_id, component_id)), system_id, component_id)
@@ -276,7 +276,7 @@ class MultiLinkRoutes:
     # ---------------------------------------------------------------------------- internal
 
     def _link_to(self, choice: LinkChoice, source: tuple[int, int]) -> int:
-        """Return the link in use, or another link to the same system if the component is not behind it."""
+        """Return the link in use, or another link to the same system if only that one reaches the component."""
         assert choice.used is not None
         if not self._routes[choice.used.link].has_route(source):
             for link, candidate in choice.candidates.items():

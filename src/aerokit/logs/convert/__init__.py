@@ -29,7 +29,7 @@ __all__ = ["FORMATS", "Conversion", "convert"]
 
 
 LOG_READERS: dict[str, type[LogReader]] = {".tlog": TlogReader, ".bin": BinReader, ".ulg": UlogReader}
-"""Suffix of a log → its reader."""
+"""Maps the suffix of a log to its reader."""
 
 
 class _Writer(Protocol):
@@ -47,12 +47,12 @@ FORMATS: dict[str, Callable[[Path, LogReader], _Writer]] = {
     ".gpx": GpxWriter,
     ".kml": KmlWriter,
 }
-"""Suffix of a file → its writer."""
+"""Maps the suffix of a file to its writer."""
 FOLDERS: dict[str, Callable[[Path, LogReader], _Writer]] = {
     "csv": partial(MessageTablesWriter, kind=CsvTable),
     "parquet": partial(MessageTablesWriter, kind=ParquetTable),
 }
-"""Format of the tables in a folder → writer."""
+"""Maps the format of the tables in a folder to its writer."""
 
 
 class Conversion(Snapshot):
@@ -63,8 +63,8 @@ class Conversion(Snapshot):
     entries: int
     """Number of records read from the log: messages or rows."""
     written: int
-    """Number of messages, rows or points written. In an ``.mcap``, a record is one message, and each state that the
-    record changes is another. A flight table or track has rows or points for positions only.
+    """Number of messages, rows or points written. In an ``.mcap``, each record is written as one message, plus one for
+    each state that the record changes. A flight table or track has rows or points for positions only.
     """
     bytes: int
     """Total size of the written files."""

@@ -51,7 +51,7 @@ LOG_READERS: dict[str, Callable[[FlightLog, int | None, Callable[[int], object]]
     ".bin": read_bin_flight,
     ".ulg": read_ulog_flight,
 }
-"""Suffix of a log → function that reads it."""
+"""Maps the suffix of a log to the function that reads it."""
 _SAME_ALTITUDE_M = 5.0
 
 

@@ -65,7 +65,7 @@ MODE_REASONS: Mapping[int | None, tuple[str, str | None, bool | None]] = {
     54: ("automatic landing", None, True),
     55: ("fence re-enabled", None, True),
 }
-"""Number → description, kind of failsafe (if any), and True if the autopilot changed the mode itself."""
+"""By number: description, kind of failsafe (if any), and True if the autopilot changed the mode itself."""
 
 ERRORS: Mapping[int, tuple[str, str]] = {
     1: ("general", "main loop"),
@@ -97,7 +97,7 @@ ERRORS: Mapping[int, tuple[str, str]] = {
     30: ("general", "internal error"),
     31: ("estimator", "dead reckoning"),
 }
-"""Subsystem → kind of failsafe, description."""
+"""By subsystem: kind of failsafe, description."""
 
 _CODES: Mapping[tuple[int, int], str] = {
     (2, 2): "late frames",

@@ -71,7 +71,7 @@ KINDS = {
     "time": "Flight time limit",
     "general": "Failsafe",
 }
-"""Kind of failsafe → title in reports."""
+"""Maps the kind of a failsafe to its title in reports."""
 
 _NO_EVIDENCE = re.compile(
     r"clear|resolved|\boff$|prearm|pre-arm|preflight|^arm\b|(?<!dis)arming|re-?gained|recovered|restored"

@@ -51,9 +51,9 @@ class Fall(Snapshot):
 def falls(flight: FlightLog) -> list[Fall]:
     """Return the falls and hard landings of a flight, the oldest first; none without heights and sink rates.
 
-    A descent counts if the vehicle sank at more than 3 m/s, was stopped within 0.6 s, and then stayed at that height
-    until it was disarmed, or for 30 s less than 3 m above home while it remained armed, or if the autopilot reported a
-    crash; also a log that ends in such a descent near the ground.
+    A descent counts if the vehicle sank at more than 3 m/s, was stopped within 0.6 s, and one of these is true: it
+    stayed at that height until it was disarmed; it stayed less than 3 m above home for 30 s, still armed; the autopilot
+    reported a crash. A descent near the ground in which the log ends counts too.
     """
     if not flight.armed:
         return []
@@ -81,7 +81,7 @@ def _descents(flight: FlightLog) -> Iterator[tuple[float, float, float, bool]]:
 
 def _fall(flight: FlightLog, begin_s: float, end_s: float, sink_m_s: float, has_impact: bool) -> Fall | None:
     above, below = (flight.track.at("altitude_relative_m", time_s) for time_s in (begin_s, end_s))
-    if not above - below >= _MIN_HEIGHT_M:  # also if a height is unknown
+    if not above - below >= _MIN_HEIGHT_M:  # also true if a height is NaN
         return None
     reasons = _reasons(flight, begin_s, end_s)
     is_on_ground = _stays(flight, end_s, below) if has_impact else below < 2 * sink_m_s
@@ -92,7 +92,7 @@ def _fall(flight: FlightLog, begin_s: float, end_s: float, sink_m_s: float, has_
 
 
 def _stays(flight: FlightLog, time_s: float, height_m: float) -> bool:
-    """Return True if the vehicle stays at this height until it is disarmed, or near home's height while it is armed."""
+    """Return True if the vehicle stays at this height until it is disarmed, or stays armed near home's height."""
     disarmed_s = next((end for begin, end in flight.armed if begin <= time_s < end), time_s)
     until_s = min(disarmed_s, time_s + _DISARM_TIMEOUT_S)
     is_armed = until_s < disarmed_s or disarmed_s >= flight.duration_s
@@ -103,7 +103,7 @@ def _stays(flight: FlightLog, time_s: float, height_m: float) -> bool:
 
 
 def _reasons(flight: FlightLog, begin_s: float, end_s: float) -> list[str]:
-    """Return why it is a fall, by the log: disarming in the air, and texts."""
+    """Return the log's evidence of a fall: disarming in the air, and texts."""
     reasons = [
         "disarmed in the air" for begin, end in flight.armed if begin < begin_s and begin_s - 3 <= end <= end_s - 0.3
     ]

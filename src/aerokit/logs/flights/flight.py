@@ -116,7 +116,7 @@ class TangentPlane:
 
 
 def battery_name(number: int) -> str:
-    """Return the displayed name. Batteries are counted from 1, as in ArduPilot's texts and parameters."""
+    """Return the displayed name of a battery, counted from 1 as in ArduPilot's texts and parameters."""
     return f"battery {number + 1}"
 
 

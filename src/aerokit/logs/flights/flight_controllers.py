@@ -31,7 +31,7 @@ _A_YEAR_S = 365 * 86_400.0
 _MAX_UNIX_S = 4_102_444_800.0  # the year 2100; `aerokit.mavlink.tlog` has the same limit
 
 SIMULATED_LOG = b"aerokit simulator: sample log"
-"""Begin of the logs of `aerokit.sim`."""
+"""First bytes of the logs of `aerokit.sim`."""
 
 
 def opened_bin(path: Path, on_percent: Callable[[float], object] | None = None) -> Any:

@@ -43,7 +43,7 @@ def read_bin_flight(flight: FlightLog, system_id: int | None, on_bytes: Callable
     """Fill a flight from its file.
 
     Raises:
-        FileFormatError: the file is not an ArduPilot log, or one from before 2015.
+        FileFormatError: the file is not an ArduPilot log, or is from before 2015.
     """
     size = flight.path.stat().st_size
     reader = opened_bin(flight.path, lambda percent: on_bytes(round(size * _INDEXING_SHARE * percent / 100)))
@@ -81,7 +81,7 @@ class _Tables:
             yield from zip(*chunk, strict=True)
 
     def columns(self, table: str, *columns: str) -> list[list[Any]]:
-        """Return the same data as a list for each column."""
+        """Return the data of :meth:`rows` as a list for each column."""
         found: list[list[Any]] = [[] for _ in range(len(columns) + 1)]
         for chunk in self._chunks(table, columns):
             for whole, part in zip(found, chunk, strict=True):

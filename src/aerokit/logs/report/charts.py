@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 MAX_POINTS = 2000
 """Maximum number of points of a line over time."""
 MAX_TRACK_POINTS = 6000
-"""Maximum number of points of a drawn track. The line is simplified further to stay below it."""
+"""Maximum number of points of a drawn track. Longer lines are simplified further."""
 _TRACK_TOLERANCE_M = 0.1
 _ROUNDING_M = 0.01
 _MAX_FENCE_M = 1e6

@@ -67,9 +67,9 @@ class Chart:
 Summary: TypeAlias = "tuple[str, Sequence[str], Sequence[str]]"
 Part: TypeAlias = "Paragraphs | Table | Collapsed | Chart"
 MAX_OPEN_ROWS = 15
-"""Longer tables are collapsed."""
+"""Maximum rows of a table that is not collapsed."""
 MAX_PRINTED_ROWS = 60
-"""Longer tables are not printed."""
+"""Maximum rows of a table that is printed."""
 
 
 @dataclass(frozen=True)

@@ -112,7 +112,7 @@ def _failsafe(failsafe: Failsafe) -> Table:
 def _attitude(flight: FlightLog) -> Section:
     title = Section(
         "Attitude, actual and set-point",
-        explanation="Where the lines diverge for longer, the vehicle could not follow the controller.",
+        explanation="Where the lines stay apart, the vehicle could not follow the set-points.",
         missing="The log contains no attitude.",
     )
     columns = {name: f"{name}_deg" for name in ("roll", "pitch", "yaw")}
@@ -225,7 +225,7 @@ def _gps(flight: FlightLog) -> Section:
 
 def _link(flight: FlightLog) -> Section:
     counted = (
-        "Messages that the autopilot did not receive, by its own count; of several links, the busiest one."
+        "Messages that the autopilot did not receive, by its own count. With several links, those of the busiest one."
         if flight.path.suffix.lower() == ".ulg"
         else "Lost messages in each second, by gaps in the sequence numbers; 100 % during silence."
     )

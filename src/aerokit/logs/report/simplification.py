@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-# One point in this number is always kept: without a limit, the algorithm is quadratic for spirals and repeated figures.
+# At least one of this many points is kept. Without this limit, spirals and repeated figures take quadratic time.
 _MAX_SEGMENT = 1024
 MAX_COORDINATE = 1e9
 """Larger coordinates are damaged data and are ignored, because their squares could overflow."""
@@ -23,8 +23,8 @@ def simplify(
 
     Args:
         places: coordinates; NaN interrupts the line.
-        max_points: limit of the selected points, which takes precedence over ``tolerance``. Ends of gaps, the points of
-            ``keep``, and one point in about a thousand are selected regardless of it.
+        max_points: maximum number of selected points, which takes precedence over ``tolerance``. Ends of gaps, the
+            points of ``keep``, and one point in about a thousand are selected in addition.
         tolerance: distance within which points may be omitted.
         keep: indices that are always selected.
 

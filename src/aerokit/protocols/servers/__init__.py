@@ -1,5 +1,5 @@
-"""Servers of the MAVLink services, one for each protocol: messages and time in, messages out.
+"""Servers for MAVLink's protocols, without IO.
 
-A server works on a `ServerHost`: a simulated vehicle, or this program as a component (`aerokit.component`). The habits
-of single firmwares are subclasses in `aerokit.sim`.
+A server belongs to a `ServerHost`, which is a simulated vehicle or your program as a component (`aerokit.component`).
+Subclasses in `aerokit.sim` imitate the behaviour of particular firmwares.
 """

@@ -1,4 +1,4 @@
-"""Camera protocol: messages of a camera (https://mavlink.io/en/services/camera.html)."""
+"""Messages of the camera protocol (https://mavlink.io/en/services/camera.html)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ _TO_THE_END = -1
 
 
 def camera_builders(camera: CameraDevice) -> dict[int, Builder]:
-    """Return builders by message id. Param 2 of REQUEST_MESSAGE selects a storage, a stream or the first image."""
+    """Return builders by message id.
+
+    Param 2 of REQUEST_MESSAGE selects a storage, a stream or the first image.
+    """
     return {
         m.CameraInformation.ID: lambda _: [_information(camera)],
         m.CameraSettings.ID: lambda _: [camera_settings(camera)],
@@ -36,7 +39,7 @@ def camera_builders(camera: CameraDevice) -> dict[int, Builder]:
 
 
 def camera_settings(camera: CameraDevice) -> m.CameraSettings:
-    """Return CAMERA_SETTINGS; zoom and focus are NaN if the camera has none."""
+    """Return CAMERA_SETTINGS; zoom and focus are NaN if the camera does not have them."""
     return m.CameraSettings(
         time_boot_ms=camera.host.time_boot_ms,
         mode_id=camera.mode,
@@ -46,7 +49,7 @@ def camera_settings(camera: CameraDevice) -> m.CameraSettings:
 
 
 def _number(command: ReceivedCommand | None) -> int:
-    """Return param 2; 0 (all) for streamed messages."""
+    """Return param 2 of a request; 0 (all) for a message that is streamed."""
     return 0 if command is None else whole(command.param2)
 
 
@@ -70,7 +73,7 @@ def _information(camera: CameraDevice) -> m.CameraInformation:
 
 
 def _images(camera: CameraDevice, command: ReceivedCommand | None) -> Iterable[Message]:
-    """Select images: param 2 is the first index or -1 for all, param 3 the last index, 0 for one or -1 for all."""
+    """Return the images with the indexes from param 2 (-1: all) to param 3 (0: only one, -1: all)."""
     images = camera.captures.images
     if command is None:
         return images[-1:]
@@ -123,7 +126,7 @@ def _flags(camera: CameraDevice, stream: int) -> int:
 
 
 def _thermal_range(camera: CameraDevice) -> list[m.CameraThermalRange]:
-    """Return the range with the coldest point at the upper left, the hottest at the lower right."""
+    """Return CAMERA_THERMAL_RANGE with the coldest point at the upper left and the hottest at the lower right."""
     if camera.thermal_celsius is None:
         return []
     coldest, hottest = camera.thermal_celsius

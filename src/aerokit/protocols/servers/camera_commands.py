@@ -95,13 +95,13 @@ class _Pictures:
         return MavResult.ACCEPTED
 
     async def control(self, command: ReceivedCommand) -> int:
-        """DO_DIGICAM_CONTROL of the older protocol; param 5 is 1 to take an image."""
+        """Execute DO_DIGICAM_CONTROL of the older protocol; param 5 is 1 to take an image."""
         if command.x == 1:
             self._camera.captures.take()
         return MavResult.ACCEPTED
 
     async def format(self, command: ReceivedCommand) -> int:
-        """Param 2 is 1 to format, param 3 is 1 to reset the image log."""
+        """Format the storage if param 2 is 1, and reset the image log if param 3 is 1."""
         camera, captures = self._camera, self._camera.captures
         if not _is_own(command.param1):
             return MavResult.DENIED
@@ -121,7 +121,7 @@ class _Videos:
         self._camera = camera
 
     async def start(self, command: ReceivedCommand) -> int:
-        """Param 2 is the rate of CAMERA_CAPTURE_STATUS during the recording, in Hz."""
+        """Start to record; param 2 is the rate of CAMERA_CAPTURE_STATUS during the recording in Hz."""
         camera, captures = self._camera, self._camera.captures
         if not camera.can(CameraCapFlags.CAPTURE_VIDEO):
             return MavResult.UNSUPPORTED
@@ -143,7 +143,7 @@ class _Videos:
         return MavResult.ACCEPTED
 
     async def stream(self, command: ReceivedCommand, *, runs: bool) -> int:
-        """Param 1 is the stream; 0 selects all."""
+        """Start or stop the stream of param 1; 0 selects all."""
         camera, number = self._camera, whole(command.param1)
         available = range(1, len(camera.streams) + 1)
         if not available or number not in (0, *available):
@@ -214,7 +214,7 @@ class _Settings:
 
 
 def _is_own(device: float) -> bool:
-    """Return True if param 1 selects this camera: 0 (all), 1 (the only one), or NaN, which MAVSDK sends."""
+    """Return True if param 1 selects this camera: 0 (all), 1 (this camera), or NaN, which MAVSDK sends."""
     return math.isnan(device) or device in (0.0, 1.0)
 
 

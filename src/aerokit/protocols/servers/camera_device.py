@@ -1,4 +1,4 @@
-"""A camera as its protocol servers see it: the device, its images, videos and tracking."""
+"""``CameraDevice``: the interface between a camera and its protocol server, with captures and tracking."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _IDLE, _CAPTURING, _WAITING, _WAITING_AND_CAPTURING = 0, 1, 2, 3
 _UNLIMITED = -1
 
 MIN_STATUS_INTERVAL_S = 0.02
-"""Least time between two CAMERA_CAPTURE_STATUS, whatever rate a client asks for."""
+"""Minimum time between two CAMERA_CAPTURE_STATUS; a client that requests a higher rate gets this one."""
 
 # Creates CAMERA_IMAGE_CAPTURED from the keywords image_index, capture_result and file_url.
 Shot = Callable[..., CameraImageCaptured]
@@ -31,9 +31,9 @@ UNKNOWN_ATTITUDE = (math.nan, math.nan, math.nan, math.nan)
 
 
 class CameraDevice:
-    """A camera: its state, and methods that the protocol calls. Subclasses execute them.
+    """Base class of a camera: its state, and the methods that the protocol server calls.
 
-    Methods that are refused raise an error; the command is answered with it.
+    A subclass implements the methods. A method raises an exception to refuse, which becomes the result of the command.
     """
 
     vendor: str = "aerokit"
@@ -52,9 +52,9 @@ class CameraDevice:
     capabilities: int = 0
     """CAMERA_CAP_FLAGS."""
     max_images: int = 10_000
-    """Images that the image log holds."""
+    """Maximum number of images in the image log."""
     shutter_s: float = 0.0
-    """Least time between two images of a series."""
+    """Minimum time between two images of a series."""
     mode: int = CameraMode.IMAGE
     source: int = CameraSource.DEFAULT
 
@@ -64,7 +64,7 @@ class CameraDevice:
         raise NotImplementedError
 
     def set_up_captures(self) -> None:
-        """Create the parts; call it once."""
+        """Create the image log and the tracking; call this once."""
         self.captures: Captures = Captures(self)
         self.tracking: Tracking = Tracking(self)
         self.running_streams: set[int] = set()
@@ -95,7 +95,7 @@ class CameraDevice:
         return 0
 
     def expose(self, done: Callable[[Shot | None], None]) -> None:
-        """Take an image; call ``done`` when it is taken, with None if it failed."""
+        """Take an image, then call ``done`` with it, or with None after a failure."""
         raise NotImplementedError
 
     def failed_shot(self) -> Shot:
@@ -111,7 +111,7 @@ class CameraDevice:
         return ""
 
     def storage(self, number: int) -> list[m.StorageInformation]:
-        """Return STORAGE_INFORMATION of a storage, or of all for 0."""
+        """Return STORAGE_INFORMATION for one storage, or for all if ``number`` is 0."""
         return []
 
     def tracked_place(self) -> list[m.CameraTrackingGeoStatus]:
@@ -143,7 +143,7 @@ class CameraDevice:
         """Start or stop video streams."""
 
     async def track(self, place: tuple[float, ...]) -> None:
-        """Track a point (x, y, radius), a rectangle (left, top, right, bottom) or nothing (empty)."""
+        """Track a point (x, y, radius) or a rectangle (left, top, right, bottom), or stop tracking (empty tuple)."""
 
     async def format_storage(self) -> None:
         """Erase images and videos."""
@@ -153,7 +153,7 @@ class CameraDevice:
 
 
 class Captures:
-    """Series of images, videos, and the image log. An image begins when the device has finished the one before."""
+    """Series of images, videos, and the image log. An image begins when the device has finished the previous one."""
 
     def __init__(self, camera: CameraDevice) -> None:
         self._camera = camera
@@ -168,7 +168,7 @@ class Captures:
         self._recording_since = math.nan
 
     def switch_off(self) -> None:
-        """Abort everything, as a power cut does; images stay."""
+        """Abort everything, as a power failure does; the images are kept."""
         self._remaining, self._is_open, self._is_late, self._recording_since = 0, False, False, math.nan
         self._series += 1
 
@@ -185,7 +185,7 @@ class Captures:
         self.take_series(0.0, 1)
 
     def take_series(self, interval_s: float, count: int) -> None:
-        """Take an image every ``interval_s`` seconds, the first at once; ``count`` 0 continues until `stop`."""
+        """Take ``count`` images, one every ``interval_s`` seconds, the first at once; 0 means until `stop`."""
         self.interval_s = interval_s if count != 1 else 0.0
         self._remaining = count or _UNLIMITED
         self._series += 1
@@ -214,7 +214,7 @@ class Captures:
             camera.host.call_later(wait, lambda: self._open(series))
 
     def _finish(self, series: int, shot: Shot | None) -> None:
-        """Log and announce an image. ``shot`` is None if the device could not take it."""
+        """Log and announce an image. ``shot`` is None if the device failed to take it."""
         if series != self._series:
             return
         self._is_open = False
@@ -236,14 +236,14 @@ class Captures:
             self._open(series)
 
     def record(self, status_interval_s: float) -> None:
-        """Note the start of a video; sends CAMERA_CAPTURE_STATUS at this interval, or never for 0."""
+        """Register the start of a video, and send CAMERA_CAPTURE_STATUS at this interval; 0 means never."""
         self._recording_since = self._camera.host.now
         self._camera.host.send(self.status())
         if 0.0 < status_interval_s < math.inf:
             self._send_status_every(self._recording_since, max(MIN_STATUS_INTERVAL_S, status_interval_s))
 
     def stop_recording(self) -> float:
-        """Note the end of the video and return its length in seconds; 0 if there was none."""
+        """Register the end of the video and return its length in seconds; 0 if none was being recorded."""
         if not self.is_recording:
             return 0.0
         seconds = self._camera.host.now - self._recording_since
@@ -278,7 +278,7 @@ _UNKNOWN = math.nan
 
 
 class Tracking:
-    """Tracking of a point or a rectangle in the image; call ``lose()`` to lose the target."""
+    """Tracking of a point or a rectangle in the image. ``lose()`` simulates the loss of the target."""
 
     def __init__(self, camera: CameraDevice) -> None:
         self._camera = camera
@@ -287,7 +287,7 @@ class Tracking:
     def reset(self) -> None:
         self.mode: CameraTrackingMode = CameraTrackingMode.NONE
         self.place: tuple[float, ...] = ()
-        """x, y and radius of a point; or left, top, right and bottom of a rectangle; shares of the image."""
+        """x, y and radius of a point, or left, top, right and bottom of a rectangle, as fractions of the image."""
         self.is_lost: bool = False
 
     def lose(self) -> None:

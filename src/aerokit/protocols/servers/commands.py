@@ -15,7 +15,7 @@ from aerokit.protocols.servers.host import Channel, ServerHost, sender_of
 class ReceivedCommand:
     """A command received as COMMAND_LONG or COMMAND_INT.
 
-    ``x`` and ``y`` are params 5 and 6 as sent; positions are in degrees in COMMAND_LONG, in degrees times 1e7 in
+    ``x`` and ``y`` are params 5 and 6 as sent. A position is in degrees in COMMAND_LONG, and in degrees times 1e7 in
     COMMAND_INT.
     """
 
@@ -51,13 +51,13 @@ class ReceivedCommand:
 
     @property
     def altitude_frame(self) -> int:
-        """MAV_FRAME of ``z``; a COMMAND_LONG is relative to home."""
+        """MAV_FRAME of ``z``; that of a COMMAND_LONG is relative to home."""
         return MavFrame.GLOBAL_RELATIVE_ALT if self.frame is None else self.frame
 
 
 @dataclass(frozen=True)
 class CommandProgress:
-    """Answer to a command that takes time: IN_PROGRESS with each percentage, then ``result``."""
+    """Answers to a command that takes time: IN_PROGRESS with each percentage, then ``result``."""
 
     percents: tuple[int, ...]
     interval_s: float
@@ -74,7 +74,7 @@ class CommandDispatcher:
     """Dispatches commands to handlers and sends COMMAND_ACK to the sender.
 
     Messages that a handler sends precede the acknowledgement. A command without a handler is UNSUPPORTED. ``refusal``
-    returns the MAV_RESULT of a command to refuse before its handler is called, else None.
+    is called before the handler; it returns a MAV_RESULT to refuse the command, or None.
     """
 
     def __init__(
@@ -143,7 +143,7 @@ class CommandDispatcher:
 
 
 MAX_RUNNING_COMMANDS = 16
-"""Commands that a component executes at once; further ones are TEMPORARILY_REJECTED."""
+"""Maximum number of commands that a component executes at once; further ones are TEMPORARILY_REJECTED."""
 PROGRESS_DELAY_S = 0.1
 """Seconds before the first IN_PROGRESS, so that a quick command is acknowledged once."""
 PROGRESS_INTERVAL_S = 0.5
@@ -151,7 +151,7 @@ UNKNOWN_PROGRESS = 255
 
 
 RESULT_MAX_AGE_S = 5.0
-"""Seconds for which a result is sent again instead of executing a repeated command."""
+"""Seconds for which a repeated command is answered with the same result instead of being executed again."""
 
 
 class Outcome(NamedTuple):
@@ -191,7 +191,7 @@ class RunningCommands:
         return len(self._running)
 
     def start(self, command: ReceivedCommand, cancel: Callable[[], None]) -> RunningCommand | None:
-        """Register a command. None if it must not be executed; it has been answered then."""
+        """Register a command; if it must not be executed, inform the sender and return None."""
         running = self._running.get(command.command)
         if running is not None and _is_repeated(command, running.command):
             self._server.answer(command, MavResult.IN_PROGRESS, running.progress)

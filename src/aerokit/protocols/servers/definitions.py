@@ -1,4 +1,4 @@
-"""PARAM_EXT server whose settings a camera definition file defines.
+"""PARAM_EXT server for the settings in a camera definition file.
 
 https://mavlink.io/en/services/camera_def.html
 """
@@ -18,8 +18,8 @@ _ZEROS: dict[str, SettingValue] = {"bool": False, "float": 0.0, "double": 0.0, "
 class DefinedParameterServer(ExtendedParameterServer):
     """Settings that a camera definition defines.
 
-    Write-only settings are not listed. The answer to a value that the definition does not allow is VALUE_UNSUPPORTED,
-    to setting a read-only or excluded setting FAILED.
+    Write-only settings are not listed. A value that the definition does not allow is answered with VALUE_UNSUPPORTED, a
+    change of a read-only or excluded setting with FAILED.
     """
 
     def __init__(self, host: ServerHost, definition: CameraDefinition) -> None:
@@ -29,7 +29,7 @@ class DefinedParameterServer(ExtendedParameterServer):
         self.values: dict[str, SettingValue] = {}
         """Current values; assign them at any time."""
         self.slow: dict[str, float] = {}
-        """Name → seconds that setting the parameter takes; the answer is IN_PROGRESS until then."""
+        """Maps the name of a slow setting to the seconds that a change takes; the answer is IN_PROGRESS until then."""
         self._pending: set[str] = set()
         super().__init__(host, self)
         self.reset()
@@ -40,7 +40,7 @@ class DefinedParameterServer(ExtendedParameterServer):
             self.values[name] = _ZEROS.get(setting.type, 0) if setting.default is None else setting.default
 
     def refresh(self) -> None:
-        """Called before a value is sent or set; overridden to update values that the device changes."""
+        """Update values that the device changes by itself. Called before a value is sent or set."""
 
     def can_set(self, name: str) -> bool:
         """Return True if a setting can be changed now; otherwise the answer is FAILED."""
@@ -50,7 +50,7 @@ class DefinedParameterServer(ExtendedParameterServer):
         """Called when the value of a setting has changed."""
 
     def limited(self, name: str, value: SettingValue) -> SettingValue:
-        """Return the value to check and store instead of a received one."""
+        """Return the value to check and store in place of a received one."""
         return value
 
     def restart(self) -> None:

@@ -9,7 +9,7 @@ from typing import Protocol
 from typing_extensions import Self
 
 ENOENT, EEXIST, ENOTDIR, EISDIR = 2, 17, 20, 21
-# Linux's numbers, which the firmwares send on every platform.
+# Linux's error numbers, which the firmwares send on every platform.
 EINVAL, ENFILE, EFBIG, ENOSPC, EROFS, ENOTEMPTY = 22, 23, 27, 28, 30, 39
 
 # Name and size in bytes; None for a folder.
@@ -93,7 +93,11 @@ class Mount(ABC):
 
     @abstractmethod
     def size(self, path: str) -> int:
-        """Return the size reported on opening, perhaps an estimate; raises FileFault if there is no such file."""
+        """Return the size to report when a file is opened, which may be an estimate.
+
+        Raises:
+            FileFault: there is no such file.
+        """
 
     @abstractmethod
     def open(self, path: str, *, writing: bool) -> FileHandle:
@@ -179,11 +183,11 @@ class FileTree:
     def __init__(self, *, free_bytes: int | None = None) -> None:
         self.free_bytes = free_bytes
         self.mounts: dict[str, Mount] = {}
-        """Prefix such as ``"@PARAM"`` → mount."""
+        """Maps a prefix such as ``"@PARAM"`` to its mount."""
         self._root: _Folder = {}
 
     def put(self, path: str, content: bytes | Callable[[], bytes], *, size: int | None = None) -> Self:
-        """Create or replace a file, and its folders. A function creates the content when it is first read."""
+        """Create or replace a file and its folders. A function as content is called when the file is first read."""
         folder = self._root
         *above, name = _parts(path)
         for part in above:
@@ -210,7 +214,7 @@ class FileTree:
         return True
 
     def mounted(self, path: str) -> tuple[Mount, str] | None:
-        """Return the mount of a path and the rest of the path; None outside mounts."""
+        """Return the mount of a path, and the rest of the path; None if the path is in no mount."""
         bare = path[1:] if path.startswith("/") else path
         for prefix, mount in self.mounts.items():
             if bare.startswith(prefix):

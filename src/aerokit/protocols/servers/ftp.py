@@ -1,4 +1,4 @@
-"""MAVFTP: a server with sessions (https://mavlink.io/en/services/ftp.html)."""
+"""MAVFTP server with sessions (https://mavlink.io/en/services/ftp.html)."""
 
 from __future__ import annotations
 
@@ -90,9 +90,9 @@ class SessionFtpServer(FtpRequestServer[FilesT]):
     """MAVFTP server with several sessions for each client, and immediate answers.
 
     A session is closed when its client has sent nothing for ``session_timeout_s``. A burst sends ``burst`` blocks every
-    ``burst_interval_s`` seconds, and none while ``is_congested()``. It ends after 35 kB, so that the client must
-    request the next one: a stranger cannot make a server send a whole file by one request. A small reply is sent again
-    if its sequence number is repeated.
+    ``burst_interval_s`` seconds, and none while ``is_congested()``. A burst ends after 35 kB, and the client must
+    request the next one, so that a single request with a forged sender cannot cause a whole file to be sent. A reply
+    without file content is sent again if the request is repeated.
     """
 
     burst: int = _BURST_BLOCKS
@@ -122,7 +122,7 @@ class SessionFtpServer(FtpRequestServer[FilesT]):
         return sum(len(peer.sessions) for peer in self._peers.values())
 
     def restart(self) -> None:
-        """Drop all sessions without closing their files, as a power cut does."""
+        """Drop all sessions without closing their files, as a power failure does."""
         self._peers.clear()
 
     def close(self) -> None:
@@ -137,12 +137,15 @@ class SessionFtpServer(FtpRequestServer[FilesT]):
         return request.client
 
     def _is_repeated(self, request: FtpPacket, last: FtpPacket) -> bool:
-        """Return True if the last reply answers this request. MAVProxy begins each operation with number 0."""
+        """Return True if the last reply answers this request.
+
+        The sequence number is not enough, because MAVProxy starts each operation with number 0.
+        """
         same = request.client == last.client and request.opcode == last.request_opcode
         return same and request.sequence + 1 == last.sequence
 
     def _new_number(self, peer: FtpPeer, request: FtpPacket) -> int:
-        """Return the number of a new session: the one that the client wants, as MAVProxy does, or the first free."""
+        """Return the number for a new session: the one that the client requests, as MAVProxy does, or a free one."""
         if request.session and request.session not in peer.sessions:
             return request.session
         return next(number for number in range(self.max_sessions) if number not in peer.sessions)
@@ -349,7 +352,7 @@ class SessionFtpServer(FtpRequestServer[FilesT]):
         return request.acknowledge(offset=request.offset)
 
     def _crc32(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket | None:
-        """Compute a checksum in slices, so that a large file does not keep the host from its other work."""
+        """Compute a checksum in slices, so that a large file does not block the event loop."""
         path = checked_path(request.data[: request.size])
         is_repeated = peer.checksum is not None and peer.checksum.sequence == request.sequence
         if not is_repeated:

@@ -12,7 +12,10 @@ from aerokit.protocols.servers.host import sender_of
 
 
 class FtpPacket(FtpMessage):
-    """Payload of a FILE_TRANSFER_PROTOCOL message, and its client. ``data`` of a request always has 239 bytes."""
+    """Payload of a FILE_TRANSFER_PROTOCOL message, and its client.
+
+    In a request, ``data`` always has 239 bytes.
+    """
 
     client: tuple[int, int] = (0, 0)
     """System and component id of the client."""
@@ -48,7 +51,7 @@ def path_in(data: bytes) -> str:
 
 
 def crc32(data: bytes, start: int = 0) -> int:
-    """Return the checksum of CalcFileCRC32: CRC32 without the inversions before and after."""
+    """Return the checksum for CalcFileCRC32, which is CRC32 without the inversions at the start and the end."""
     return zlib.crc32(data, start ^ 0xFFFFFFFF) ^ 0xFFFFFFFF
 
 
@@ -62,7 +65,7 @@ def read_crc32(files: FileSystem, path: str, block: int) -> int:
 
 
 class ProtectedPath(Exception):
-    """A request whose path leads out of its folder."""
+    """The path of a request contains ``..``."""
 
 
 def checked_path(data: bytes) -> str:

@@ -1,4 +1,4 @@
-"""Gimbal protocol v2: a gimbal device with its manager (https://mavlink.io/en/services/gimbal_v2.html)."""
+"""Gimbal protocol v2: a gimbal device and its gimbal manager (https://mavlink.io/en/services/gimbal_v2.html)."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _NOBODY: Owner = (0, 0)
 
 
 class GimbalMount:
-    """A gimbal device with its gimbal manager: its state, and methods that the protocol calls.
+    """Base class of a gimbal device with its gimbal manager: its state, and the methods that the protocol calls.
 
     Angles are in radians: roll and pitch from the horizon, yaw from the vehicle's nose or, if locked, from north.
     """
@@ -64,7 +64,7 @@ class GimbalMount:
 
     @property
     def device_id(self) -> int:
-        """Component id of the gimbal, by which commands select it."""
+        """Component id of the gimbal, which commands use to select it."""
         raise NotImplementedError
 
     @property
@@ -102,7 +102,7 @@ class GimbalMount:
         raise NotImplementedError
 
     def follow(self, system_id: int) -> None:
-        """Point at another vehicle once its position is received."""
+        """Point at another vehicle, as soon as its position is received."""
         raise NotImplementedError
 
     def update_followed(self, system_id: int, place: Place) -> None:
@@ -217,7 +217,7 @@ class GimbalRequests:
         return MavResult.ACCEPTED if done else MavResult.DENIED
 
     def _refusal(self, device_id: float, command: ReceivedCommand) -> int | None:
-        """Return the answer to a command that the gimbal cannot or must not execute, else None."""
+        """Return the MAV_RESULT for a command that the gimbal cannot or must not execute, or None."""
         if not self._gimbal.can_point_at_positions:
             return MavResult.UNSUPPORTED
         is_allowed = self._is_mine(device_id) and self._gimbal.is_in_control(command.sender)
@@ -286,7 +286,7 @@ class GimbalRequests:
             self.apply(message.flags, (0.0, message.pitch, message.yaw), (0.0, message.pitch_rate, message.yaw_rate))
 
     def on_manual_control(self, message: m.GimbalManagerSetManualControl, _: Channel) -> None:
-        """Apply angles, or rates from -1 to 1 as shares of the slew rate."""
+        """Apply angles, or rates from -1 to 1, which are fractions of the slew rate."""
         gimbal = self._gimbal
         if self._is_mine(message.gimbal_device_id) and gimbal.is_in_control(sender_of(message)):
             rates = (0.0, message.pitch_rate * gimbal.slew_rad_s, message.yaw_rate * gimbal.slew_rad_s)
@@ -294,7 +294,7 @@ class GimbalRequests:
 
 
 def _owner(before: Owner, wanted: tuple[int, int], sender: Owner) -> Owner:
-    """Return the component in control after one pair of params; (0, 0) is none."""
+    """Return the component that is in control after a pair of params of the command; (0, 0) if none."""
     if _SENDER in wanted:
         return sender
     if _RELEASE in wanted:

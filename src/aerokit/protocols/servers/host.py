@@ -1,4 +1,4 @@
-"""``ServerHost``: the component for which a protocol server works."""
+"""``ServerHost``: interface to the component that a protocol server belongs to."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ from typing import Any, Protocol
 
 from aerokit.mavlink.message import Message
 
-# The port on which a message was received and to which its answer goes; only the host knows its type.
+# The origin of a message, to which its answer is sent. Only the host knows the type.
 Channel = Any
 Handler = Callable[[Any, Channel], None]
 
 
 class ServerHost(Protocol):
-    """Component for which protocol servers work: delivers messages, sends messages, and calls back at a time.
+    """Interface to the component: delivers messages, sends messages, and schedules calls.
 
-    Handlers get the messages that are addressed to the component, and their channel. A message that is sent with a
-    channel goes there; with None it goes to all.
+    A handler gets each message that is addressed to the component, and the channel on which it arrived. A message is
+    sent to one channel, or to all if the channel is None.
     """
 
     @property
     def now(self) -> float:
-        """Seconds; never decreases."""
+        """Time in seconds, which never decreases."""
         ...
 
     @property

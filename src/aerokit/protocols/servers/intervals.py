@@ -13,14 +13,14 @@ from aerokit.mavlink.messages import MessageInterval
 from aerokit.protocols.servers.commands import CommandHandler, ReceivedCommand, whole
 from aerokit.protocols.servers.host import Channel, ServerHost
 
-# Returns the current messages of one id; the argument is the REQUEST_MESSAGE command, None for a stream.
+# Returns the current messages with one id. The argument is the REQUEST_MESSAGE command, or None for a stream.
 Builder = Callable[["ReceivedCommand | None"], "Iterable[Message]"]
 
 
 class MessageStreams:
-    """Sends the messages that ``builders`` returns by message id, once or periodically.
+    """Sends the messages of ``builders``, by message id, on request or periodically.
 
-    A stream with an interval below ``min_interval_s`` is sent at that interval. At most ``max_streams`` run.
+    A stream with an interval below ``min_interval_s`` is sent every ``min_interval_s``. At most ``max_streams`` run.
     """
 
     def __init__(self, host: ServerHost, *, min_interval_s: float = 0.0, max_streams: int | None = None) -> None:
@@ -43,7 +43,7 @@ class MessageStreams:
         self._streams.clear()
 
     def stream(self, message_id: int, interval_s: float, channel: Channel = None) -> bool:
-        """Stream messages of this id on one channel, or on all if None; an interval of 0 stops the stream.
+        """Stream messages with this id on one channel, or on all for None; an interval of 0 stops the stream.
 
         Returns False if there are too many streams already.
         """
@@ -61,13 +61,13 @@ class MessageStreams:
         return True
 
     def _send_stream(self, key: tuple[Channel, int], stream: _Stream) -> None:
-        if self._streams.get(key) is not stream:  # Replaced by another stream, perhaps with the same interval.
+        if self._streams.get(key) is not stream:  # Another stream has replaced it.
             return
         channel, message_id = key
         try:
             for message in self.builders[message_id](None):
                 self._host.send(message, channel)
-        finally:  # an error of a builder, which the host reports, does not end the stream
+        finally:  # The host reports an exception of a builder; the stream goes on.
             self._host.call_later(stream.interval_s, lambda: self._send_stream(key, stream))
 
     def answer_with(self, message_id: int, command: ReceivedCommand) -> int:

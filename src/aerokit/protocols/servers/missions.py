@@ -1,4 +1,4 @@
-"""Missions, fences and rally points: messages of items, and a server (https://mavlink.io/en/services/mission.html)."""
+"""Server for missions, fences and rally points (https://mavlink.io/en/services/mission.html)."""
 
 from __future__ import annotations
 
@@ -47,7 +47,8 @@ MAX_ITEMS = 2000
 _TYPES = (MavMissionType.MISSION, MavMissionType.FENCE, MavMissionType.RALLY)
 _R = MavMissionResult
 
-# Decides about an uploaded list: (MAV_MISSION_TYPE, items, answer); ``answer`` takes the MAV_MISSION_RESULT.
+# Accepts or refuses an uploaded list: called with MAV_MISSION_TYPE, items, and a function that takes the
+# MAV_MISSION_RESULT.
 Judge = Callable[[int, tuple[MissionItem, ...], Callable[[int], None]], None]
 
 
@@ -61,14 +62,15 @@ class _Upload:
     items: list[MissionItem] = field(default_factory=list)
     uses_int: bool = True
     is_judged: bool = False
-    """True while ``judge`` decides."""
+    """True from the call of ``judge`` until its answer."""
 
 
 class MissionServer:
-    """Stores missions, fences and rally points; downloads need no state, and one upload runs at a time.
+    """Stores missions, fences and rally points. Downloads have no state; one upload runs at a time.
 
-    An upload replaces a list as a whole after ``judge`` has accepted it. Items are requested again every half second;
-    an upload without progress for five seconds ends with OPERATION_CANCELLED. Another client is DENIED meanwhile.
+    When ``judge`` has accepted an upload, it replaces the whole list. A missing item is requested again every half
+    second. An upload without progress for five seconds ends with OPERATION_CANCELLED. During an upload, other clients
+    are DENIED.
     """
 
     def __init__(
@@ -80,8 +82,8 @@ class MissionServer:
         capacity: int = MAX_ITEMS,
     ) -> None:
         self.lists: dict[int, tuple[MissionItem, ...]] = dict.fromkeys(_TYPES, ())
-        """MAV_MISSION_TYPE → items; call `replace` to change them."""
-        self._opaque_ids: dict[int, int] = {}  # Kept, because MISSION_CURRENT reports them at its stream rate.
+        """Maps MAV_MISSION_TYPE to items; call `replace` to change them."""
+        self._opaque_ids: dict[int, int] = {}  # Cached, because MISSION_CURRENT reports them at its stream rate.
         self.current: int = 0
         """Index of the current item of the mission."""
         self._host = host
@@ -105,7 +107,7 @@ class MissionServer:
         return self._upload is not None
 
     def opaque_id(self, mission_type: int) -> int:
-        """Return a checksum of a list; 0 if it is empty. It does not depend on the current item."""
+        """Return a checksum of a list, or 0 for an empty list. The current item does not change it."""
         items = self.lists.get(mission_type, ())
         if items and mission_type not in self._opaque_ids:
             messages = (_item_message(item, seq, (0, 0), mission_type, current=False) for seq, item in enumerate(items))
@@ -128,7 +130,7 @@ class MissionServer:
             self.current = 0
 
     def set_current(self, seq: int) -> bool:
-        """Ask the component to continue at an item, and announce it; False if it is refused."""
+        """Let the component continue at an item, and announce the item; return False if the component refuses."""
         if not 0 <= seq < len(self.lists[MavMissionType.MISSION]) or not self._on_set_current(seq):
             return False
         self.current = seq
@@ -188,7 +190,7 @@ class MissionServer:
                 self._finish(upload)
 
     def _request_item(self, upload: _Upload) -> None:
-        """Request the next item, and again until it arrives."""
+        """Request the next item until it arrives."""
         seq = len(upload.items)
         request = m.MissionRequestInt if upload.uses_int else m.MissionRequest
         self._host.send(request(*upload.client, seq, upload.mission_type), upload.channel)
@@ -208,7 +210,7 @@ class MissionServer:
         if upload is None or sender_of(message) != upload.client or upload.is_judged:
             return
         if message.mission_type != upload.mission_type or message.seq != len(upload.items):
-            return  # a late copy; the expected item is requested again
+            return  # A late copy of an earlier item; the expected item is requested again.
         upload.received_at, upload.uses_int = self._host.now, isinstance(message, m.MissionItemInt)
         upload.items.append(from_wire(message))
         if len(upload.items) < upload.count:
@@ -237,7 +239,7 @@ class MissionServer:
         self._acknowledge(upload.client, kind, result, upload.channel, opaque_id)
 
     def _on_ack(self, ack: m.MissionAck, channel: Channel) -> None:
-        """End the client's own upload; the end of a download needs nothing."""
+        """End the client's own upload. At the end of a download there is nothing to do."""
         upload = self._upload
         if upload is not None and sender_of(ack) == upload.client and not upload.is_judged and ack.type != _R.ACCEPTED:
             self._upload = None
@@ -254,7 +256,7 @@ class MissionServer:
             self._clear([kind], client, kind, channel)
 
     def _clear(self, kinds: list[int], client: tuple[int, int], answered: int, channel: Channel) -> None:
-        """Empty these lists one after the other, each with the consent of ``judge``."""
+        """Clear these lists one after the other, each if ``judge`` accepts it."""
         if not kinds:
             self._acknowledge(client, answered, _R.ACCEPTED, channel)
             return

@@ -1,4 +1,4 @@
-"""Parameters: PARAM_* and PARAM_EXT_*, served from one list.
+"""Servers for PARAM_* and PARAM_EXT_*, which share one list of parameters.
 
 https://mavlink.io/en/services/parameter.html, https://mavlink.io/en/services/parameter_ext.html
 """
@@ -16,11 +16,11 @@ from aerokit.parameters.parameter import setting_bytes, setting_value, settings_
 from aerokit.protocols.servers.host import Channel, ServerHost, sender_of
 
 MAX_LISTS = 8
-"""Lists that a component sends at once; it ignores further requests."""
+"""Maximum number of lists that a component sends at once; it ignores further requests."""
 
 
 class NamedList(Protocol):
-    """Parameters that are listed; the position of a name is its index."""
+    """Names of the parameters to list; the position of a name is its index."""
 
     @property
     def names(self) -> Sequence[str]: ...
@@ -31,7 +31,7 @@ class ParameterLists:
 
     burst: int = 5
     starts_at_once: bool = False
-    """True to send the first group at once, False to send it after the time of one group."""
+    """True to send the first group at once, False to send it after the interval between groups."""
 
     def __init__(self, host: ServerHost, parameters: NamedList, *, list_rate_hz: float) -> None:
         self.list_rate_hz = list_rate_hz
@@ -111,7 +111,7 @@ class TypedStore(NamedList, Protocol):
 
     @property
     def small_names(self) -> Sequence[str]:
-        """Names of the parameters whose type `fits_param_value`; read for every PARAM_VALUE."""
+        """Names of the parameters whose type `fits_param_value`. Read for every PARAM_VALUE, so it must be fast."""
         ...
 
     def __contains__(self, name: object) -> bool: ...
@@ -121,7 +121,7 @@ class TypedStore(NamedList, Protocol):
     def type(self, name: str) -> MavParamExtType: ...
 
     def problem(self, name: str, value: SettingValue, type: int) -> tuple[int, int] | None:  # noqa: A002
-        """Return MAV_PARAM_ERROR and PARAM_ACK for a value that must not be stored, else None."""
+        """Return MAV_PARAM_ERROR and PARAM_ACK for a value that must not be stored; None for any other."""
         ...
 
     def store(self, name: str, value: SettingValue) -> None:
@@ -130,10 +130,10 @@ class TypedStore(NamedList, Protocol):
 
 
 class TypedParameterServer(ParameterProtocolServer):
-    """PARAM server of a component with typed parameters; the value is encoded bytewise, or cast to a float.
+    """PARAM server for typed parameters, which encodes values bytewise or casts them to float.
 
-    A refused PARAM_SET is answered by PARAM_ERROR and by the value that remains (PARAM_VALUE), for clients that do not
-    know PARAM_ERROR. Parameters whose type does not fit into PARAM_VALUE are left out: texts and 64-bit numbers.
+    A refused PARAM_SET is answered with PARAM_ERROR, and with PARAM_VALUE (the unchanged value) for clients that do not
+    know PARAM_ERROR. Texts and 64-bit numbers do not fit into PARAM_VALUE, and are left out.
     """
 
     def __init__(self, host: ServerHost, store: TypedStore, *, bytewise: bool = True, list_rate_hz: float) -> None:
@@ -175,7 +175,7 @@ class TypedParameterServer(ParameterProtocolServer):
             self.send_error(sender_of(request), name, -1, MavParamError.DOES_NOT_EXIST, channel)
             return
         value = value_of(request, bytewise=self.bytewise)
-        # A cast value needs no type, and ArduPilot's clients send all values as REAL32.
+        # The type is ignored for a cast value, because ArduPilot's clients send all values as REAL32.
         problem = store.problem(name, value, request.param_type if self.bytewise else store.type(name))
         if problem is not None:
             self.send_error(sender_of(request), name, names.index(name), problem[0], channel)
@@ -193,9 +193,9 @@ def fits_param_value(type_: MavParamExtType) -> bool:
 
 
 class ExtendedParameterServer(ParameterLists):
-    """Receives PARAM_EXT_REQUEST_LIST, PARAM_EXT_REQUEST_READ and PARAM_EXT_SET; subclasses have the values.
+    """Receives PARAM_EXT_REQUEST_LIST, PARAM_EXT_REQUEST_READ and PARAM_EXT_SET; subclasses store the values.
 
-    A list is sent at a hundred parameters a second, one list at a time.
+    One list is sent at a time, with a hundred parameters a second.
     """
 
     burst: int = 1
@@ -242,7 +242,7 @@ class ExtendedParameterServer(ParameterLists):
 
 
 class TypedExtendedServer(ExtendedParameterServer):
-    """PARAM_EXT server of a component with typed parameters, texts included."""
+    """PARAM_EXT server for typed parameters, including texts."""
 
     def __init__(self, host: ServerHost, store: TypedStore) -> None:
         super().__init__(host, store)

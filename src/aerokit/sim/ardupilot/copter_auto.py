@@ -33,7 +33,7 @@ class _Leg(Protocol):
 
 
 class _FlyLeg:
-    """Straight flight to a place. It is complete within WPNAV_RADIUS, with ``stops`` at the place itself."""
+    """Straight flight to a place. It ends within WPNAV_RADIUS of the place; with ``stops``, at the place itself."""
 
     def __init__(self, auto: CopterAuto, destination: Ned, *, stops: bool) -> None:
         self._copter, self._auto = auto.vehicle, auto
@@ -103,7 +103,7 @@ class _CircleLeg:
 
 
 class _ClimbLeg:
-    """Take-off, which waits on the ground for MISSION_START or a raised throttle unless AUTO_OPTIONS skips that."""
+    """Take-off, which waits on the ground for MISSION_START or a raised throttle; AUTO_OPTIONS can skip the wait."""
 
     def __init__(self, auto: CopterAuto, altitude_m: float) -> None:
         self._copter, self._auto = auto.vehicle, auto

@@ -53,7 +53,7 @@ _FIXED_ANGLE_MODES = frozenset({MavMountMode.RETRACT, MavMountMode.NEUTRAL})
 
 @dataclass(frozen=True)
 class MountTarget:
-    """Target angles in degrees, which ``rates`` (degrees per second) change from the time ``since`` on."""
+    """Target angles in degrees at the time ``since``; later, ``rates`` (degrees per second) change them."""
 
     roll: float = 0.0
     pitch: float = 0.0
@@ -223,7 +223,7 @@ class ArduPilotGimbal:
         return MavResult.ACCEPTED
 
     def warn(self) -> None:
-        """Send the text about invalid angles. A client that sends hundredths of a degree causes it."""
+        """Send the text about invalid angles. A client that sends hundredths of a degree causes this text."""
         self._vehicle.send_text(MavSeverity.WARNING, "Mount: invalid angle targets")
 
     def attitude_status(self) -> m.GimbalDeviceAttitudeStatus | None:

@@ -250,7 +250,7 @@ class PlaneGuided(PlaneNavigatingMode):
         self._course = course
 
     def set_attitude(self, message: m.SetAttitudeTarget) -> None:
-        """Follow those of bank, pitch and throttle that the mask selects. An angle is selected by its rate's bit."""
+        """Follow bank, pitch and throttle if the mask selects them. The bit of a rate selects its angle."""
         ignored, now = message.type_mask, self.vehicle.now
         roll, pitch, _ = euler_from_quaternion(*message.q)
         whole = not ignored & Mask.ATTITUDE_IGNORE and ignored & _RATES == _RATES

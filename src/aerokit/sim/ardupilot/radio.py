@@ -89,7 +89,7 @@ class ArduPilotRadio:
         return math.inf if seconds < 0 else seconds
 
     def _on_override(self, override: m.RcChannelsOverride, _: Channel) -> None:
-        """Apply overrides of the ground station MAV_GCS_SYSID. 0 releases a channel only from 1 to 8."""
+        """Apply overrides of the ground station MAV_GCS_SYSID. 0 releases channels 1 to 8 only."""
         vehicle = self._vehicle
         if sender_of(override)[0] != vehicle.parameters["MAV_GCS_SYSID"]:
             return

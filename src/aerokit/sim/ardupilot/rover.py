@@ -92,8 +92,8 @@ _DRIVES_ITSELF = frozenset(
 class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
     """Failsafes. FS_ACTION is executed FS_TIMEOUT after radio or ground station are lost, except in RTL and HOLD.
 
-    It is also executed on a disarmed rover. The firmware treats both links as one failsafe and names it after the link
-    that it checks first: if it checks the radio too, it reports a lost ground station as "Radio Failsafe".
+    It is also executed on a disarmed rover. The firmware treats both links as one failsafe. If the check of the radio
+    is enabled, it reports a lost ground station as "Radio Failsafe" too.
     """
 
     BATTERY_PRIORITIES: ClassVar[tuple[int, ...]] = (
@@ -205,7 +205,7 @@ _HOLD_BEYOND_M = 100.0
 
 
 class RoverFence(ArduPilotFence[RoverHost]):
-    """Fence. FENCE_ACTION has the actions of FS_ACTION; more than 100 m outside the rover changes to HOLD.
+    """Fence. FENCE_ACTION has the actions of FS_ACTION. A rover more than 100 m outside changes to HOLD.
 
     It has no altitude limits and sends no texts.
     """

@@ -395,4 +395,4 @@ BUILDERS_OF_KIND: dict[Kind, Builders] = {
         m.ExtendedSysState.ID: lambda _: m.ExtendedSysState(0, 0),
     },
 }
-"""Firmware → message id → function that builds the message. Other messages are not sent."""
+"""Functions that build messages, by firmware and message id. Other messages are not sent."""

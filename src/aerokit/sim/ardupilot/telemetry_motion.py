@@ -301,4 +301,4 @@ MOTION_BUILDERS: dict[int, Callable[[ArduPilotVehicle], Message | None]] = {
     m.Rangefinder.ID: _rangefinder,
     m.DistanceSensor.ID: _distance_sensor,
 }
-"""Message id → function that builds the message, or None if there is nothing to send."""
+"""Functions that build messages, by message id; a function returns None if there is nothing to send."""

@@ -70,7 +70,7 @@ def _format(camera: CameraBody, command: ReceivedCommand) -> int | CommandProgre
 
 
 def _at_once(handler: AsyncHandler) -> CommandHandler:
-    """Execute a handler of which the simulated camera completes every step at once."""
+    """Execute a handler in one call, because a simulated camera completes every step at once."""
 
     def execute(command: ReceivedCommand) -> int:
         try:

@@ -27,7 +27,7 @@ _PERCENT_PER_SIDE = 17
 
 
 def _side_texts(sensor: str, count: int) -> list[str]:
-    """Return the texts about the next side after ``count`` sides, until its measurement (calibration_routines.cpp)."""
+    """Return the texts before the measurement of the next side, after ``count`` sides (calibration_routines.cpp)."""
     side = _SIDES[-1 - count]
     return [
         f"pending: {' '.join(_SIDES[: len(_SIDES) - count])}",
@@ -42,8 +42,8 @@ def _side_texts(sensor: str, count: int) -> list[str]:
 class Px4Calibration:
     """Sensor calibration on the ground; one calibration runs at a time.
 
-    ``side_s``: seconds until the vehicle has been measured in one of six poses, and is placed in the next. With
-    infinity, as in SIH, the first pose is never completed.
+    ``side_s``: seconds in each of six poses, until the vehicle is measured and placed in the next. With infinity, as in
+    SIH, the first pose is never completed.
     """
 
     def __init__(self, px4: Px4Host) -> None:

@@ -60,7 +60,7 @@ def other_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
     return handlers
 
 
-# What of SIH can fail: the motors (FailureInjector.cpp) and the battery (BatterySimulator.cpp).
+# Parts of SIH that can fail: the motors (FailureInjector.cpp) and the battery (BatterySimulator.cpp).
 _FAILURES = {
     FailureUnit.SYSTEM_MOTOR: (FailureType.OK, FailureType.OFF, FailureType.STUCK, FailureType.WRONG),
     FailureUnit.SYSTEM_BATTERY: (FailureType.OK, FailureType.OFF),
@@ -68,7 +68,7 @@ _FAILURES = {
 
 
 def _inject_failure(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
-    """Let a part fail; as in SIH, only the motors and the battery answer, and the failure has no effect."""
+    """Acknowledge a failure of the motors or the battery, as SIH does; the failure has no effect."""
     if not px4.parameters.get("SYS_FAILURE_EN", 0):
         return MavResult.DENIED
     unit, kind = whole(command.param1), whole(command.param2)
@@ -233,7 +233,7 @@ class _Flight:
         return result
 
     def reposition(self, command: ReceivedCommand) -> int:
-        """Go to a position. NaN or INT32_MAX as latitude or longitude keep the place, NaN as altitude the height."""
+        """Go to a position. Latitude or longitude NaN or INT32_MAX keeps the place, altitude NaN keeps the height."""
         if whole(command.param2) != 1:
             return MavResult.UNSUPPORTED
         result = self._change(modes.HOLD)
@@ -278,7 +278,7 @@ class _Flight:
         return self._change(modes.ORBIT)
 
     def tune(self, command: ReceivedCommand) -> int | None:
-        """Start tuning, or report its progress. It then waits for disarming, as with MC_AT_APPLY 1."""
+        """Start tuning, or report its progress. Complete tuning waits for disarming, as with MC_AT_APPLY 1."""
         px4 = self._px4
         if command.param1 != 1.0 or command.param2 != 0.0:
             return MavResult.DENIED
@@ -293,7 +293,7 @@ class _Flight:
         return None
 
     def transition(self, command: ReceivedCommand) -> int | None:
-        """Report a transition, then the state of param 1. Not answered by a vehicle that is no VTOL."""
+        """Report a transition, then the state of param 1. A vehicle that is not a VTOL does not answer."""
         px4, wanted = self._px4, whole(command.param1)
         if not px4.vtol_state:
             return None

@@ -48,7 +48,7 @@ class Px4Shell:
 
 
 class Px4LogStream:
-    """Streams a log: definitions that must be acknowledged one by one, then data that is not."""
+    """Streams a log: first the definitions, each of which must be acknowledged, then data without acknowledgements."""
 
     def __init__(self, px4: SimulatedVehicle) -> None:
         self._px4 = px4

@@ -267,7 +267,7 @@ class Px4Failsafes:
         return bool(round(values["COM_RC_OVERRIDE"]) & bit) and moved * 100 >= values["COM_RC_STICK_OV"]
 
     def _is_excepted(self, parameter: str) -> bool:
-        """Return True if the parameter excepts the mode: bit 1 MISSION, 2 other automatic modes, 4 OFFBOARD."""
+        """Return True if the parameter excludes this mode: bit 1 MISSION, 2 other automatic modes, 4 OFFBOARD."""
         mode = self._px4.intended_mode
         bit = {MISSION: 1, OFFBOARD: 4}.get(mode, 2 if mode[0] == 4 else 0)
         return bool(round(self._px4.parameters[parameter]) & bit)

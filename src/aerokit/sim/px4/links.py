@@ -205,7 +205,7 @@ def _interval_us(rate_hz: float) -> int:
 
 @lru_cache(maxsize=1)
 def _table() -> dict[str, dict[int, float]]:
-    """Return link mode → message id → rate in Hz; messages with rate 0 are sent only on request."""
+    """Return the rates in Hz by link mode and message id; messages with rate 0 are sent only on request."""
     data = pkgutil.get_data(__name__, "stream_rates.csv")
     assert data is not None
     rows = list(csv.DictReader(data.decode().splitlines()))

@@ -124,9 +124,9 @@ class Px4MissionLink:
     def on_request_list(self, request: m.MissionRequestList) -> None:
         """Start or restart a download.
 
-        A download of which all items were sent counts as complete. The firmware misjudges an upload in the same way,
-        once as many items have arrived as are stored: it ends that upload, but refuses other uploads until a download
-        times out.
+        A download of which all items were sent counts as complete. The firmware treats an upload in the same way once
+        as many items have arrived as are stored: it ends that upload, but refuses other uploads until a download times
+        out.
         """
         if self._seq == self._server.count(self._type):
             self._state = TransferState.IDLE

@@ -92,7 +92,7 @@ STANDARD_MODES: Final[dict[int, Px4Mode]] = {
     7: LAND,
     8: TAKEOFF,
 }
-"""MAV_STANDARD_MODE → mode, for DO_SET_STANDARD_MODE."""
+"""Maps MAV_STANDARD_MODE to the mode, for DO_SET_STANDARD_MODE."""
 
 
 def custom_mode(mode: Px4Mode) -> int:

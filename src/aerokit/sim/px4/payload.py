@@ -28,7 +28,7 @@ _FITTED_BY = frozenset({0, 4})
 _DEVICE_ID = 1
 _LIMITS = ((-45.0, 45.0), (-45.0, 45.0), (-180.0, 180.0))
 _TAU_S, _STEP_S = 0.3, 0.0187
-# PX4 filters the integrated angle, so that it turns more slowly than commanded.
+# PX4 filters the integrated angle, so that the gimbal turns more slowly than commanded.
 _RATE_FACTOR = _STEP_S / (_TAU_S + _STEP_S)
 _RATE_TIMEOUT_S = 2.0
 _POLL_INTERVAL_S = 0.25

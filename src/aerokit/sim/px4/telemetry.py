@@ -328,4 +328,4 @@ BUILDERS: dict[int, Callable[[Px4Vehicle], Message | None]] = {
     m.GimbalManagerInformation.ID: lambda px4: px4.gimbal.manager_information(),
     m.GimbalManagerStatus.ID: lambda px4: px4.gimbal.manager_status(),
 }
-"""Message id → builder; a builder returns None if there is nothing to send."""
+"""Builders by message id; a builder returns None if there is nothing to send."""

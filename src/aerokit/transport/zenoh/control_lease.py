@@ -188,7 +188,7 @@ class ClientFilter:
         return False
 
     def refuse_late(self, data: bytes, now: float) -> list[RefusalNotice]:
-        """Refuse an outdated datagram. Return notices of its commands.
+        """Refuse an outdated datagram. Return notices about its commands.
 
         The notices have no answer, because the client may have repeated the command already.
         """

@@ -1,4 +1,4 @@
-"""``CalibrationControl``: the calibrations of a vehicle, and ``Calibration``: the steps of one."""
+"""``CalibrationControl``: starts the calibrations of a vehicle. ``Calibration``: iterates over the steps of one."""
 
 from __future__ import annotations
 
@@ -30,17 +30,18 @@ EscIntent = Literal["propellers are removed"]
 class Calibration(AsyncIterator["CalibrationStep"]):
     """The steps of a calibration: iterate with ``async for``. The last step has the ``result``.
 
-    The calibration starts with the first step. Leaving the loop, in any way, cancels it on the vehicle, as does the end
-    of the vehicle's block. ArduPilot cannot cancel ``accelerometer``; a warning says so. Others that no vehicle cancels
-    (level, barometer, ArduPilot's gyroscope and airspeed, PX4's ESCs) end in seconds.
+    The calibration starts with the first step. Leaving the loop in any way, or leaving the vehicle's block, cancels the
+    calibration on the vehicle. ArduPilot cannot cancel ``accelerometer``, and aerokit then logs a warning. The other
+    calibrations that a vehicle cannot cancel (level, barometer, ArduPilot's gyroscope and airspeed, PX4's ESCs) end in
+    seconds.
 
     Iterating raises:
-        OperationRejected: the calibration failed, or was cancelled by another party, with the vehicle's texts as
-            reasons; or the vehicle is armed, or not known to be disarmed.
+        OperationRejected: the calibration failed, or another party cancelled it (``reasons`` has the vehicle's status
+            texts); or the vehicle is armed, or not known to be disarmed.
         NotSupported: the vehicle has no such sensor or calibration. Nothing was sent.
         CommandRejected: the vehicle refused to start.
         CommandTimeout: the vehicle did not answer.
-        OperationTimeout: the vehicle reported nothing for two minutes, or its result was lost.
+        OperationTimeout: the vehicle reported nothing for two minutes, or the text with the result was lost.
         HeartbeatTimeout: the vehicle was silent for 10 s.
         BusyError: another calibration of this vehicle is in progress. Nothing was sent.
         ConnectionClosed, LinkLost: the connection has ended.
@@ -66,13 +67,13 @@ class Calibration(AsyncIterator["CalibrationStep"]):
             raise
 
     async def cancel(self) -> None:
-        """Cancel the calibration; returns when the vehicle has confirmed it.
+        """Cancel the calibration, and return when the vehicle has confirmed that it has ended.
 
         Does nothing if the calibration has not started or has ended.
 
         Raises:
-            NotSupported: the vehicle cannot cancel it.
-            OperationTimeout: the vehicle did not confirm it.
+            NotSupported: the vehicle cannot cancel this calibration.
+            OperationTimeout: the vehicle did not confirm the end.
         """
         self._is_over = True
         await self._steps.aclose()
@@ -81,7 +82,7 @@ class Calibration(AsyncIterator["CalibrationStep"]):
             await self._run.wait_cancelled()
 
     def __del__(self) -> None:
-        # ``break`` leaves a loop without telling the iterator. The blocking twin drops it on another thread.
+        # A loop that is left by ``break`` does not call the iterator. The blocking twin may drop it on another thread.
         if getattr(self, "_loop", None) is not None and not self._is_over:
             with suppress(RuntimeError):  # the loop is closed
                 self._loop.call_soon_threadsafe(_abandon, self._run, self._steps)  # type: ignore[union-attr]
@@ -96,9 +97,9 @@ def _abandon(run: CalibrationRun, steps: AsyncGenerator[CalibrationStep, None]) 
 class CalibrationControl:
     """Calibrates the vehicle's sensors: ``async for step in vehicle.calibrate.compass(): …``.
 
-    Each method returns the steps. Print ``step.instruction``, show ``step.pose``; where ``step.needs_confirmation`` is
-    true, the calibration waits until the loop continues. See docs/how-to/calibration.md. Only one calibration runs at a
-    time, on a disarmed vehicle.
+    Each method returns an iterator over the steps. Show ``step.instruction`` and ``step.pose`` to the person at the
+    vehicle. If ``step.needs_confirmation`` is true, the calibration waits until your loop asks for the next step. The
+    vehicle must be disarmed, and only one calibration runs at a time. See docs/how-to/calibration.md.
     """
 
     def __init__(self, context: VehicleContext, parameters: Callable[[], Parameters]) -> None:
@@ -106,17 +107,18 @@ class CalibrationControl:
         self._runs: list[CalibrationRun] = []
 
     def compass(self) -> Calibration:
-        """Calibrate all compasses, while the vehicle is turned about all axes.
+        """Calibrate all compasses, while a person turns the vehicle about all its axes.
 
-        ArduPilot reports progress and fitness of each compass, and must reboot afterwards. PX4 wants up to six poses,
-        turned about the vertical in each.
+        ArduPilot reports progress and fitness of each compass, and must reboot afterwards. PX4 asks for up to six
+        poses, and for a turn about the vertical axis in each.
         """
         return self._start("compass", procedures.ardupilot_compass, 0, 1)
 
     def accelerometer(self) -> Calibration:
         """Calibrate the accelerometers in six poses.
 
-        ArduPilot waits for a confirmation in each pose, and must reboot afterwards. PX4 detects poses, in any order.
+        ArduPilot waits for a confirmation in each pose, and must reboot afterwards. PX4 detects the poses itself, in
+        any order.
         """
         return self._start("accelerometer", procedures.ardupilot_accelerometer, 0, 0, 0, 0, 1)
 
@@ -125,28 +127,30 @@ class CalibrationControl:
         return self._start("gyroscope", _acknowledged("keep the vehicle still"), 1)
 
     def level(self) -> Calibration:
-        """Calibrate which attitude is level, while the vehicle stands level and still."""
+        """Calibrate the level attitude, while the vehicle stands level and still."""
         return self._start("level", _acknowledged("place the vehicle level and keep it still"), 0, 0, 0, 0, 2)
 
     def barometer(self) -> Calibration:
-        """Calibrate the barometer: ArduPilot by the present pressure, PX4 by the altitude of the GPS."""
+        """Calibrate the barometer: ArduPilot takes the present pressure as the ground's, PX4 uses the GPS altitude."""
         return self._start("barometer", _acknowledged("shelter the vehicle from wind"), 0, 0, 1)
 
     def airspeed(self) -> Calibration:
-        """Calibrate the airspeed sensors: sheltered from wind first; on PX4, blow into the front afterwards."""
+        """Calibrate the airspeed sensors, first sheltered from wind; PX4 then asks a person to blow into the tube."""
         return self._start("airspeed", procedures.ardupilot_airspeed, 0, 0, 0, 0, 0, 2)
 
     def radio(self) -> Calibration:
-        """Calibrate the remote control: writes RCn_MIN, RCn_MAX and RCn_TRIM of each channel that was moved.
+        """Calibrate the remote control: write RCn_MIN, RCn_MAX and RCn_TRIM of each channel that was moved.
 
-        Both confirmations are needed: when all sticks and switches were at their ends, and when the sticks are centred.
+        Two steps need a confirmation: after all sticks and switches were moved to their ends, and after the sticks were
+        centred.
         """
         return self._start("radio", procedures.radio_by_channels, px4=procedures.radio_by_channels)
 
     def escs(self, *, intent: EscIntent) -> Calibration:
         """Calibrate the ESCs. **Remove the propellers**, because the motors get full throttle.
 
-        PX4 does it at once, while you connect the battery. ArduCopter does it at the next boot: the last step says so.
+        PX4 calibrates at once, while a person connects the battery. ArduCopter calibrates at the next boot, as the last
+        step says.
 
         Args:
             intent: ``"propellers are removed"``.
@@ -159,7 +163,7 @@ class CalibrationControl:
     def _start(
         self, sensor: str, ardupilot: Procedure, *params: float, px4: Procedure = procedures.by_texts
     ) -> Calibration:
-        """Prepare a calibration. PX4 gets ``params`` in its command, as does ArduPilot in its simplest procedures."""
+        """Prepare a calibration. ``params`` are those of the start command; some ArduPilot procedures ignore them."""
         run = CalibrationRun(self._context, sensor, self._runs, self._parameters)
         is_px4 = self._context.session.autopilot.calibration_protocol == "texts"
         return Calibration(run, (px4 if is_px4 else ardupilot)(run, *params))

@@ -27,7 +27,8 @@ REPORT_HZ = 4.0
 END_GRACE_S = 3.0
 # A cancelled call ends within two seconds.
 RESTORE_TIMEOUT_S = 1.5
-# ArduPilot repeats its request every second; one that arrives sooner after a confirmation was sent before it.
+# ArduPilot repeats its request every second. If a request arrives this soon after our confirmation, ArduPilot sent it
+# before the confirmation arrived.
 POSE_REPEAT_S = 2.0
 POSES = {
     AccelcalVehiclePos.LEVEL: CalibrationPose.LEVEL,
@@ -41,7 +42,7 @@ IS_NOT_CANCELLED = "ArduPilot cannot cancel it: it waits for the next pose, and 
 
 
 async def by_texts(run: CalibrationRun, *params: float) -> AsyncGenerator[CalibrationStep, None]:
-    """PX4: the vehicle detects the poses itself and reports by ``[cal]`` texts."""
+    """PX4: detect the poses on the vehicle; the reports are ``[cal]`` status texts."""
     await run.begin(CANCEL_ALL)
     telemetry, now = run.session.telemetry, run.session.connection.now
     reports: deque[CalibrationReport] = deque()
@@ -68,7 +69,7 @@ async def by_texts(run: CalibrationRun, *params: float) -> AsyncGenerator[Calibr
             if not reports:
                 run.finish()
                 raise OperationTimeout(
-                    f"{run.what}: the vehicle has ended the calibration, but the text with its result was lost;"
+                    f"{run.what}: the vehicle has ended the calibration, but its status text with the result was lost;"
                     f" {run.session.describe_link()}"
                 )
             report = reports.popleft()
@@ -100,7 +101,7 @@ def _after(step: CalibrationStep, report: CalibrationReport) -> CalibrationStep:
 
 
 async def acknowledged(run: CalibrationRun, *params: float, instruction: str) -> AsyncGenerator[CalibrationStep, None]:
-    """ArduPilot: the acknowledgement is the result."""
+    """ArduPilot: send one command, whose acknowledgement is the result."""
     run.check_ready()
     yield run.step(None, instruction)
     await run.begin(None)
@@ -109,7 +110,7 @@ async def acknowledged(run: CalibrationRun, *params: float, instruction: str) ->
 
 
 async def ardupilot_airspeed(run: CalibrationRun, *_: float) -> AsyncGenerator[CalibrationStep, None]:
-    """ArduPilot calibrates airspeed sensors with the barometer, if there are any."""
+    """ArduPilot: calibrate the airspeed sensors and the barometer by one command."""
     run.check_ready()
     if await _parameter(run, "ARSPD_TYPE") == 0:
         raise run.failure("no airspeed sensor is enabled (ARSPD_TYPE is 0); nothing was sent")
@@ -118,7 +119,7 @@ async def ardupilot_airspeed(run: CalibrationRun, *_: float) -> AsyncGenerator[C
 
 
 async def ardupilot_escs(run: CalibrationRun, *_: float) -> AsyncGenerator[CalibrationStep, None]:
-    """ArduCopter calibrates ESCs while it boots, if ESC_CALIBRATION is 3."""
+    """ArduCopter: set ESC_CALIBRATION to 3, so that it calibrates the ESCs while it boots."""
     run.check_ready()
     before = await _parameter(run, "ESC_CALIBRATION")
     yield run.step(None, "remove the propellers, then continue", needs_confirmation=True)
@@ -136,13 +137,13 @@ async def ardupilot_escs(run: CalibrationRun, *_: float) -> AsyncGenerator[Calib
 
 
 async def _restore(run: CalibrationRun, name: str, value: float) -> None:
-    """Write back a parameter that makes the motors turn at the next boot; log a warning if that is not confirmed."""
+    """Restore a parameter that makes the motors turn at the next boot; log a warning if that is not confirmed."""
     with anyio.CancelScope(shield=True), anyio.move_on_after(RESTORE_TIMEOUT_S), suppress(AerokitError):
         if run.context.arbiter.is_known:
             await run.parameters().set(name, value)
             return
     logger.warning(
-        "%s was left: %s may not be %g again; set it, or the motors get full throttle at the next boot",
+        "%s was left early; perhaps %s was not restored to %g: set it, or the motors get full throttle at boot",
         *(run.what, name, value),
     )
 
@@ -152,11 +153,11 @@ async def _parameter(run: CalibrationRun, name: str) -> float:
         return (await run.parameters().read(name)).value
     except ParameterRejected:
         firmware = run.session.autopilot.firmware
-        raise NotSupported(f"{run.what}: {firmware} has no parameter {name} on this vehicle") from None
+        raise NotSupported(f"{run.what}: this {firmware} vehicle has no parameter {name}") from None
 
 
 async def ardupilot_compass(run: CalibrationRun, *_: float) -> AsyncGenerator[CalibrationStep, None]:
-    """ArduPilot: progress and reports of each compass; the result is accepted if all have succeeded."""
+    """ArduPilot: yield the progress of all compasses, and accept the result if all have succeeded."""
     await run.begin((MavCmd.DO_CANCEL_MAG_CAL, 0))
     percents: dict[int, int] = {}
     reports: dict[int, MagCalReport] = {}
@@ -208,7 +209,7 @@ def _status_name(status: int) -> str:
 
 
 async def ardupilot_accelerometer(run: CalibrationRun, *params: float) -> AsyncGenerator[CalibrationStep, None]:
-    """ArduPilot: requests six poses one after the other, each of which is confirmed."""
+    """ArduPilot: yield the six poses that the vehicle requests one after the other, and confirm each."""
     await run.begin(None, IS_NOT_CANCELLED)
     requests: deque[int] = deque()
     confirmed, confirmed_at = 0, -math.inf
@@ -221,7 +222,7 @@ async def ardupilot_accelerometer(run: CalibrationRun, *params: float) -> AsyncG
 
     with ExitStack() as ends:
         await run.start(*params)
-        # The result of an earlier calibration is broadcast until this one starts, so it is attached now.
+        # Attach only now: until this calibration starts, ArduPilot broadcasts the result of an earlier one.
         ends.callback(run.session.connection.bus.attach(CommandLong, on_request, system_id=run.session.system_id))
         while True:
             await run.wait(lambda: requests)
@@ -245,13 +246,15 @@ async def ardupilot_accelerometer(run: CalibrationRun, *params: float) -> AsyncG
 
 MIN_CHANNELS, MIN_TRAVEL_US = 4, 300
 CHANNELS_TIMEOUT_S = 5.0
-# Ranges of RCn_MIN, RCn_MAX on both firmwares (RC_Channel.cpp, PX4 rc_params).
+# RCn_MIN and RCn_MAX have these ranges on both firmwares (RC_Channel.cpp, PX4 rc_params).
 LOWEST_US, MIDDLE_US, HIGHEST_US = 800, 1500, 2200
-ENDED_RC = (MavResult.UNSUPPORTED,)  # ArduPilot prevents arming while it calibrates, and answers UNSUPPORTED.
+ENDED_RC = (
+    MavResult.UNSUPPORTED,
+)  # ArduPilot executes the command (it prevents arming meanwhile) and answers UNSUPPORTED.
 
 
 async def radio_by_channels(run: CalibrationRun, *_: float) -> AsyncGenerator[CalibrationStep, None]:
-    """Both: the travel of each channel of RC_CHANNELS becomes RCn_MIN, RCn_MAX and RCn_TRIM."""
+    """ArduPilot and PX4: measure the travel of each channel in RC_CHANNELS, and write RCn_MIN, RCn_MAX and RCn_TRIM."""
     run.check_ready()
     cell = run.session.telemetry.cells["rc_channels"]
     lows: dict[int, int] = {}
@@ -259,7 +262,9 @@ async def radio_by_channels(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
     with ExitStack() as ends:
         ends.enter_context(run.session.streaming("rc_channels"))
         seen = cell.updated_at
-        await run.wait(lambda: cell.updated_at > seen, CHANNELS_TIMEOUT_S, "no RC_CHANNELS: is there a receiver?")
+        await run.wait(
+            lambda: cell.updated_at > seen, CHANNELS_TIMEOUT_S, "no RC_CHANNELS was received: is a receiver connected?"
+        )
         if not _pulses(cell.latest):
             raise run.failure("the receiver reports no channels: is the transmitter on? nothing was sent")
         await run.begin(CANCEL_ALL)
@@ -283,7 +288,7 @@ async def radio_by_channels(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
     for number in moved:
         low, high, trim = lows[number], highs[number], trims.get(number, 0)
         if not LOWEST_US <= low <= trim <= high <= HIGHEST_US or not low < MIDDLE_US < high:
-            raise run.failure(f"channel {number} has {low} to {high} µs, centre {trim}; nothing was written")
+            raise run.failure(f"channel {number} ranges from {low} to {high} µs, centre {trim}; nothing was written")
         values |= {f"RC{number}_MIN": low, f"RC{number}_MAX": high, f"RC{number}_TRIM": trim}
     async with run.parameters().transaction() as transaction:
         await transaction.set_many(values)

@@ -39,14 +39,14 @@ logger: logging.Logger = logging.getLogger("aerokit")
 REPORT_TIMEOUT_S = 120.0
 """Seconds to wait for the vehicle's next report. PX4 waits up to two minutes for a pose (calibration_routines.cpp)."""
 START_TIMEOUT_S = 40.0
-"""Seconds to wait for the acknowledgement: ArduPilot sends it when its gyroscopes are calibrated, within 30 s."""
-# Longer than two intervals of HEARTBEAT, which shows that PX4 has ended the calibration.
+"""Seconds to wait for the acknowledgement. ArduPilot calibrates its gyroscopes first, for at most 30 s."""
+# The interval is longer than two HEARTBEATs, because only HEARTBEAT shows that PX4 has ended the calibration.
 MAX_CANCEL_ATTEMPTS, CANCEL_INTERVAL_S = 6, 2.5
 CONFIRM_POLL_INTERVAL_S = 0.1
 
 
 class CalibrationRun:
-    """One calibration. It may run on the vehicle from the first transmission until ``finish`` or a confirmed cancel."""
+    """One calibration, which counts as running from the first transmission until ``finish`` or a confirmed cancel."""
 
     def __init__(
         self, context: VehicleContext, sensor: str, runs: list[CalibrationRun], parameters: Callable[[], Parameters]
@@ -56,7 +56,7 @@ class CalibrationRun:
         self.sensor: str = sensor
         self.parameters: Callable[[], Parameters] = parameters
         self.what: str = f"calibrate.{sensor}"
-        self._runs = runs  # those of the vehicle that may be running
+        self._runs = runs  # the runs of this vehicle that may be in progress
         self.step: partial[CalibrationStep] = partial(CalibrationStep, sensor)
         self._cancel: tuple[float, ...] | None = None
         self._why_not_cancelled = ""
@@ -73,18 +73,22 @@ class CalibrationRun:
         """Raise OperationRejected unless the vehicle is known to be disarmed, NotSupported for an unknown firmware."""
         autopilot = self.session.autopilot
         if not autopilot.calibration_protocol:
-            raise NotSupported(f"{self.what}: calibrations of {autopilot.firmware} are not known; nothing was sent")
+            raise NotSupported(
+                f"{self.what}: aerokit does not know how to calibrate {autopilot.firmware}; nothing was sent"
+            )
         self.session.check_disarmed(self.what, is_current=self.context.arbiter.is_known)
 
     async def begin(self, cancel: tuple[float, ...] | None, why_not_cancelled: str = "") -> None:
-        """Claim the vehicle. A calibration that is being cancelled is waited for.
+        """Wait for the end of a calibration that is being cancelled, then register this one as running.
 
         Args:
-            cancel: the command that cancels the calibration on the vehicle, with its parameters; None: there is none.
-            why_not_cancelled: what remains on the vehicle, if there is none.
+            cancel: the command that cancels the calibration, with its parameters; None if there is no such command.
+            why_not_cancelled: text for the user about a calibration that cannot be cancelled.
         """
         self.check_ready()
-        await anyio.lowlevel.checkpoint()  # An abandoned iterator reports itself in the next iteration of the loop.
+        await (
+            anyio.lowlevel.checkpoint()
+        )  # A dropped iterator abandons its run in the next iteration of the event loop.
         for run in tuple(self._runs):
             if not run._is_abandoned:
                 raise BusyError(f"{self.what}: {run.what} is in progress; nothing was sent")
@@ -97,7 +101,7 @@ class CalibrationRun:
         self.session.on_reboot.append(self._on_reboot)
 
     async def command(self, command: int, *params: float, accepts: Collection[int] = ()) -> None:
-        """Send a command of the calibration and wait for its answer. ``accepts``: results that are no error."""
+        """Send a command of the calibration and wait for its answer. The results in ``accepts`` raise no error."""
         attempt_timeout = START_TIMEOUT_S if command == MavCmd.PREFLIGHT_CALIBRATION else None
         try:
             await self.context.sender.auxiliary_command(command, *params, attempt_timeout=attempt_timeout)
@@ -106,7 +110,7 @@ class CalibrationRun:
                 raise
 
     async def start(self, *params: float, command: int = MavCmd.PREFLIGHT_CALIBRATION) -> None:
-        """Send the command that starts the calibration; a refusal means that it does not run."""
+        """Send the command that starts the calibration. After a refusal, the calibration is not running."""
         try:
             await self.command(command, *params)
         except CommandRejected:
@@ -139,12 +143,12 @@ class CalibrationRun:
             return
         self._is_abandoned = True
         if self._why_not_cancelled:
-            logger.warning("%s was left: %s", self.what, self._why_not_cancelled)
+            logger.warning("%s was left early: %s", self.what, self._why_not_cancelled)
         if self._cancel is None or self._has_rebooted or self.session.is_closed:
             self.finish()
             return
         arbiter = self.context.arbiter
-        # Notices another party, after which the cancel is not repeated.
+        # The arbiter ends this order when another party takes over; the cancel command is not repeated then.
         self._sent = self._watch.enter_context(arbiter.sending(self._watch.enter_context(arbiter.auxiliary_order())))
         if self.session.connection.is_open and arbiter.is_known:
             self._send_cancel(*self._cancel)
@@ -154,8 +158,8 @@ class CalibrationRun:
         """Wait until the vehicle has confirmed that the calibration was cancelled.
 
         Raises:
-            NotSupported: the vehicle cannot cancel it.
-            OperationTimeout: it was not confirmed in time.
+            NotSupported: the vehicle cannot cancel this calibration.
+            OperationTimeout: the vehicle did not confirm the cancellation in time.
         """
         with anyio.move_on_after(MAX_CANCEL_ATTEMPTS * CANCEL_INTERVAL_S):
             await self._ended.wait()
@@ -167,12 +171,12 @@ class CalibrationRun:
             )
 
     def _send_cancel(self, command: float, *params: float) -> None:
-        # Not into a silence; repeating it has no further effect. See docs/reliability.md.
+        # Callers send it only while the vehicle's state is known. A repeated cancel has no further effect.
         self._cancelled_at = self.session.connection.now()
         self.session.commands.send_unconfirmed(int(command), *params)
 
     async def _confirm_cancel(self) -> None:
-        """Send the cancel, if that was not possible before, and repeat it as docs/reliability.md says."""
+        """Send the cancel command, if it was not sent yet, and repeat it until the vehicle confirms it."""
         assert self._cancel is not None
         try:
             for _ in range(MAX_CANCEL_ATTEMPTS):
@@ -193,7 +197,10 @@ class CalibrationRun:
             self.finish()
 
     def _is_cancelled(self, command: float) -> bool:
-        """ArduPilot acknowledges; PX4 acknowledges twice with different results, so its HEARTBEAT counts."""
+        """Return True if the vehicle has confirmed: ArduPilot by COMMAND_ACK, PX4 by HEARTBEAT.
+
+        PX4 sends two acknowledgements with different results.
+        """
         if self._has_rebooted:
             return True
         assert self._cancelled_at is not None
@@ -228,7 +235,7 @@ class CalibrationRun:
     def result(
         self, instruction: str = "done", *, reboot_due: bool = False, compasses: tuple[CompassFit, ...] = ()
     ) -> CalibrationStep:
-        """Register the end, and return the last step."""
+        """Register the end of the calibration, and return the last step."""
         self.finish()
         found = CalibrationResult(compasses, reboot_due, self.session.texts_since(self._started_at))
         return self.step(1.0, instruction, result=found)

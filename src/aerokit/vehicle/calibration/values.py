@@ -11,7 +11,7 @@ __all__ = ["CalibrationPose", "CalibrationReport", "CalibrationResult", "Calibra
 
 
 class CalibrationPose(Enum):
-    """How the vehicle has to be placed."""
+    """Pose in which a person has to place the vehicle."""
 
     LEVEL = "level"
     LEFT = "on its left side"
@@ -22,10 +22,10 @@ class CalibrationPose(Enum):
 
 
 class CompassFit(Snapshot):
-    """How well the calibration of one compass fits its samples.
+    """Quality of the calibration of one compass.
 
-    ``fitness_mgauss`` is the root mean square of the residuals; smaller is better. ``offsets_mgauss`` are the offsets
-    along x, y and z.
+    ``fitness_mgauss`` is the root mean square of the residuals of the samples; smaller is better. ``offsets_mgauss``
+    are the offsets along x, y and z.
     """
 
     compass: int
@@ -36,8 +36,8 @@ class CompassFit(Snapshot):
 class CalibrationResult(Snapshot):
     """The result of a successful calibration.
 
-    ``compasses`` is empty if the vehicle reports no fitness. ``reboot_due``: the vehicle uses the result, or can be
-    armed, only after a reboot. ``texts`` are the vehicle's status texts since the start.
+    ``compasses`` is empty if the vehicle reports no fitness. If ``reboot_due`` is true, the vehicle must reboot before
+    it uses the result or can be armed. ``texts`` are the vehicle's status texts since the start.
     """
 
     compasses: tuple[CompassFit, ...] = ()
@@ -49,14 +49,14 @@ class CalibrationStep(Snapshot):
     """The state of a calibration, for the person at the vehicle.
 
     Attributes:
-        sensor: name of the method: ``"compass"`` …
+        sensor: name of the method of ``vehicle.calibrate``, such as ``"compass"``.
         progress: 0 to 1; None if the vehicle reports none.
         instruction: what to do now.
-        pose: the pose that is wanted now; None if none is.
-        remaining: the poses that are still wanted, in any order, including ``pose``.
+        pose: the pose to take now; None if no pose is needed.
+        remaining: the poses that are still needed, including ``pose``; their order does not matter.
         needs_confirmation: the calibration waits until your program continues its loop, which confirms that the
             instruction was followed.
-        result: of the last step; None before.
+        result: the result of the calibration in the last step; None in all others.
     """
 
     sensor: str
@@ -68,7 +68,8 @@ class CalibrationStep(Snapshot):
     result: CalibrationResult | None = None
 
 
-# PX4 names the side that points down, except "up" and "down": calibration_routines.cpp, detect_orientation_str.
+# PX4's name is the side that points down, except for "up" and "down" (calibration_routines.cpp,
+# detect_orientation_str).
 SIDES = {
     "back": CalibrationPose.NOSE_UP,
     "front": CalibrationPose.NOSE_DOWN,
@@ -94,7 +95,7 @@ _FORMATS = {
 
 
 class CalibrationReport(Snapshot):
-    """One ``[cal]`` text of PX4. ``kind`` is ``"text"`` for instructions, whose ``text`` has no prefix."""
+    """One ``[cal]`` text of PX4. ``kind`` is a key of the formats, or ``"text"``; ``text`` has no prefix."""
 
     kind: str
     text: str
@@ -103,7 +104,7 @@ class CalibrationReport(Snapshot):
 
 
 def parse_report(status_text: str) -> CalibrationReport | None:
-    """Parse a status text of PX4; None if it is not about a calibration."""
+    """Parse a status text of PX4; return None if it is not about a calibration."""
     if not status_text.startswith("[cal] "):
         return None
     text = status_text[len("[cal] ") :].strip()

@@ -36,9 +36,9 @@ MAVFTP = re.compile(r"(?:mftp|mavlinkftp)://.|/.", re.IGNORECASE)
 class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
     """One camera: photos, video, lens, tracking, storage, streams (https://mavlink.io/en/services/camera.html).
 
-    ``vehicle.camera`` is the first camera; ``vehicle.camera_at(number)`` is any camera: one with its own component id
-    (100 to 105), or one attached to the autopilot (1 to 6), e.g. ArduPilot's drivers and PX4's trigger. Calls outside
-    the camera's reported capabilities are refused before anything is sent. Cells are polled only while your program
+    ``vehicle.camera`` is the first camera, ``vehicle.camera_at(number)`` any other. A camera has its own component id
+    (100 to 105), or is attached to the autopilot (1 to 6) by ArduPilot's drivers or PX4's trigger. A call that the
+    camera's reported capabilities exclude is refused before anything is sent. Cells are polled only while your program
     uses them.
     """
 
@@ -184,7 +184,7 @@ class Cameras:
         self._early: list[tuple[int, Any]] = []
         self._first_link = CameraLink(context, components.component, None, on_bound=self._on_first_bound)
         self._first = Camera(self._first_link)
-        # Once `first` has returned `_first`, it always returns the same object.
+        # True once `first` has returned `_first`, which it then always returns.
         self._is_first_in_use = False
         session.keep(self.cell)
         bus = session.connection.bus
@@ -211,7 +211,7 @@ class Cameras:
         return self._first
 
     def at(self, number: int) -> Camera:
-        """Return the camera of this number, always the same object, whether or not it has been discovered."""
+        """Return the camera with this number, always the same object, even before the camera is discovered."""
         if number not in AUTOPILOT_CAMERA_IDS and not 7 <= number <= 255:
             raise InvalidArgument(
                 f"number = {number} is not allowed: 1 to 6 if attached to the autopilot, or a component id up to 255"
@@ -257,7 +257,7 @@ class Cameras:
             self.at(number)._log.record(message)
 
     def _record(self, message: Any, device: int) -> int:
-        """Add the sender to the cell and return its number, or 0. ``device`` counts only if the autopilot sent it."""
+        """Add the sender to the cell and return its number, or 0. Only the autopilot's ``device`` is used."""
         frame = message.received_frame
         if frame is None:
             return 0

@@ -1,4 +1,4 @@
-"""``Capture``: one picture, decoded from any of three messages; CSV export and geotagging.
+"""``Capture``: one picture, decoded from one of three messages; CSV export and geotagging.
 
 Pillow (``pip install aerokit-mavlink[pictures]``) writes the EXIF; the image data of the JPEG stays unchanged.
 """
@@ -36,7 +36,7 @@ Quaternion = tuple[float, float, float, float]
 # Time stamps below this (the year 1990) are not UTC: they count from the boot of the vehicle.
 SECONDS_IN_1990 = 631_152_000
 
-# End of the year 9999, the largest that datetime can represent.
+# End of the year 9999, the last one that datetime can represent.
 MAX_UTC_S = 253_402_300_799
 
 # CAMERA_FEEDBACK counts pictures in 16 bits.

@@ -1,4 +1,4 @@
-"""``CaptureLog``: the captures that one camera has reported; it requests those whose message was lost."""
+"""``CaptureLog``: stores the captures that one camera has reported, and requests lost ones."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ TRIGGER_GRACE_S = 0.3
 DUPLICATE_WINDOW_S = 10.0
 # A status that is older than the newest by less than this arrived out of order; an older one means a restart.
 REORDER_WINDOW_MS = 5000
-# The index may exceed the reported count by this much. The count of a camera beyond that is not the standard's.
+# Maximum difference between an index and the reported count. Above it, the camera does not count as the standard says.
 MAX_COUNT_LEAD = 100
-# A jump over more indices than this is an outlier until a second picture confirms it.
+# A larger jump of the index counts as corrupt until a second picture confirms it.
 MAX_INDEX_GAP = 1000
-# CAMERA_FEEDBACK counts in 16 bits: the index has wrapped around if it is lower by more than half the range.
+# An index that is lower by more than half the range has wrapped around, because CAMERA_FEEDBACK counts in 16 bits.
 HALF_RANGE = FEEDBACK_INDEX_RANGE // 2
 
 
@@ -120,7 +120,7 @@ class CaptureLog:
         return None if found is None else found.capture
 
     async def _request(self, index: int) -> bool:
-        """Request it once; True if the camera says that it has no such picture, or has only a newer one."""
+        """Request the capture once; return True if the camera answers that it does not have it, or only newer ones."""
         request = self._link.requests.request
         try:
             if not self._link.is_autopilot_attached:

@@ -69,7 +69,7 @@ class LensMixin(CameraMixin):
         await self._set("zoom_step", HAS_ZOOM, ZOOM, CameraZoomType.STEP, steps, attempts=1)
 
     async def zoom_to(self, percent: float) -> None:
-        """Zoom to a part of the range: 0 (widest) to 100 %; errors as for :meth:`zoom_step`."""
+        """Zoom to a percentage of the range, 0 (widest) to 100; errors as for :meth:`zoom_step`."""
         check_range("percent", percent, 0, 100)
         await self._set("zoom_to", HAS_ZOOM, ZOOM, CameraZoomType.RANGE, percent)
 
@@ -104,7 +104,7 @@ class LensMixin(CameraMixin):
         await self._set("focus_step", HAS_FOCUS, FOCUS, SetFocusType.STEP, steps, attempts=1)
 
     async def focus_to(self, percent: float) -> None:
-        """Focus to a part of the range: 0 (nearest) to 100 %; errors as for :meth:`focus_step`."""
+        """Focus to a percentage of the range, 0 (nearest) to 100; errors as for :meth:`focus_step`."""
         check_range("percent", percent, 0, 100)
         await self._set("focus_to", HAS_FOCUS, FOCUS, SetFocusType.RANGE, percent)
 
@@ -185,7 +185,7 @@ class TrackingMixin(CameraMixin):
         Args:
             x: 0 (left) to 1 (right).
             y: 0 (top) to 1 (bottom).
-            radius: part of the image width, 0 (one pixel) to 1.
+            radius: radius of the object as a fraction of the image width, 0 (one pixel) to 1.
             status_hz: rate of ``camera.tracking``, above 0 to 50.
 
         Raises:

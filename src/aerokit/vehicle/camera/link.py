@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 # A camera with a component id sends a HEARTBEAT within this time.
 DISCOVERY_TIMEOUT_S = 2.5
 
-# After a longer gap between heartbeats, which come every second, the camera may be another one.
+# After a longer gap between heartbeats, another camera may use the id.
 MAX_SILENCE_S = 5.0
 
 
@@ -53,7 +53,7 @@ class CameraLink(CameraOrders):
     ) -> None:
         self._context, self._session = context, context.session
         self._component_of, self._on_bound = component_of, on_bound
-        # Another object publishes the events of this camera.
+        # True if another object publishes the events of this camera.
         self.is_muted = False
         self._component: Component | None = None
         self.number = None
@@ -232,7 +232,7 @@ class CameraLink(CameraOrders):
             self._session.at_close(bus.attach(message_type, filtered, system_id=self._session.system_id))
 
     def _is_for_this_camera(self, message: Any) -> bool:
-        # Firmware that does not set the field leaves 0 in it, and means its first camera.
+        # Firmware that does not set this field sends 0, which means its first camera.
         if not self.is_autopilot_attached:
             return True
         device = getattr(message, "camera_device_id", 0) or getattr(message, "camera_id", 0)
@@ -283,7 +283,7 @@ class ActiveOperation:
         link.on_finish.append(self._finish)
 
     def commit(self, error: BaseException | None = None) -> bool:
-        """Record the result of starting; return True if it failed, but may have started and must be stopped."""
+        """Record the result of the start; return True if it failed but the operation may run, and must be stopped."""
         if error is not None and (not self.order.may_move or isinstance(error, CommandRejected)):
             self.order.withdraw()
             self.discard()
@@ -298,7 +298,7 @@ class ActiveOperation:
             self._link.on_finish.remove(self._finish)
 
     async def stop(self, *, is_awaited: bool) -> None:
-        """Stop it, once. Does nothing if a newer order was given."""
+        """Stop the operation, once. Does nothing if a newer order was given."""
         if not self._is_over:
             self.discard()
             command, *params = self._stop()
@@ -316,7 +316,7 @@ class CameraBlock:
     """An operation of a camera for the duration of an ``async with`` block.
 
     The command to stop is sent at once when the block exits, also under cancellation, and retried until it is
-    acknowledged. If the vehicle's block exits first, the command is sent then. It does not undo a newer order.
+    acknowledged. If the vehicle's block exits first, the command is sent then. The command does not undo a newer order.
     """
 
     def __init__(

@@ -29,15 +29,16 @@ MessageT = TypeVar("MessageT", bound=Message)
 # Camera device ids of cameras that are attached to the autopilot and have no component id of their own.
 AUTOPILOT_CAMERA_IDS = range(1, 7)
 
-# Maximum transmissions of an order that must not be executed twice; each requires that the previous one was lost.
+# Maximum transmissions of an order that must not be executed twice. It is sent again only if the camera reports that
+# the previous transmission had no effect.
 MAX_ORDER_ATTEMPTS = 8
 
 
 class _ResendGuard:
     """Decides whether a command to a camera may be sent again.
 
-    A camera with its own component id must have sent a message since the command. The HEARTBEAT of the autopilot does
-    not show that the camera is there.
+    A camera with its own component id must have sent a message since the command, because the autopilot's HEARTBEAT
+    does not show that the camera is present.
     """
 
     def __init__(self, link: CameraOrders, sent: SentCommand) -> None:
@@ -141,7 +142,7 @@ class CameraOrders:
     ) -> None:
         """Send an order that must not be executed twice; retry only if the camera reports that it had no effect.
 
-        ``is_confirmed`` asks the camera; None means that it did not answer. A newer order ends the retries.
+        ``is_confirmed`` asks the camera, and returns None if it does not answer. A newer order ends the retries.
         """
         for attempt in range(1, MAX_ORDER_ATTEMPTS + 1):
             try:
@@ -237,7 +238,7 @@ class _PolledCell:
 
     @property
     def pending(self) -> bool:
-        # The cell asks this on every read.
+        # The cell reads this property on every access.
         self.read_at = self._now()
         return False
 

@@ -24,13 +24,13 @@ if TYPE_CHECKING:
 START, STOP = MavCmd.IMAGE_START_CAPTURE, MavCmd.IMAGE_STOP_CAPTURE
 CONTROL, TRIGGER = MavCmd.DO_DIGICAM_CONTROL, MavCmd.DO_TRIGGER_CONTROL
 TRIGGER_INTERVAL = MavCmd.DO_SET_CAM_TRIGG_INTERVAL
-# A series is checked after this long without a capture.
+# Seconds without a capture after which a series is checked, and seconds to wait for the status.
 CHECK_INTERVAL_S, STATUS_TIMEOUT_S = 1.0, 2.0
-# Number of status requests before an order: to a camera that has answered one before, and to any other camera.
+# Number of status requests before an order: to a camera that has answered before, and to any other camera.
 STATUS_ATTEMPTS, FIRST_STATUS_ATTEMPTS = 8, 3
 # Maximum number of checks without a result, after which a silent series has failed.
 MAX_SILENT_CHECKS = 6
-# A series may be ahead of its newest capture by twice the number that its interval allows, plus this many.
+# The camera may have taken twice as many pictures since the newest capture as its interval allows, plus this many.
 MAX_EXTRA_CAPTURES = 10
 # After this many unanswered requests in a row, the remaining gap is skipped.
 MAX_UNANSWERED = 3
@@ -55,7 +55,8 @@ class Shutter:
         return None if message is None else status_of(message)
 
     async def baseline_status(self) -> CameraStatus | None:
-        # The status before an order shows later whether it was executed, so it is requested more often.
+        # The status before an order is needed to see later whether the order was executed, so it is requested more
+        # often.
         first_attempts = 1 if self._has_no_status else FIRST_STATUS_ATTEMPTS
         for _ in range(STATUS_ATTEMPTS if self._reports_status else first_attempts):
             status = await self.status(STATUS_TIMEOUT_S)
@@ -85,7 +86,7 @@ class Shutter:
                     if now is None:
                         continue
                     if before is None:
-                        # An accepted order has made the newest picture.
+                        # The order was accepted, so the newest picture is the ordered one.
                         newest = now.image_count - 1
                         is_missed = error is None and not now.is_capturing and newest >= 0 and newest not in known
                         missed = await self.log.fetch(newest) if is_missed else None

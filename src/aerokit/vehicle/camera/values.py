@@ -76,7 +76,7 @@ class CameraInformation(Snapshot):
 class CameraStatus(Snapshot):
     """Activity of a camera (CAMERA_CAPTURE_STATUS).
 
-    ``is_capturing``: it is taking a picture; ``is_in_series``: it takes one every ``interval_s`` seconds.
+    ``is_capturing``: the camera is taking a picture; ``is_in_series``: it takes one every ``interval_s`` seconds.
     ``recording_s`` is the duration of the video so far, None if unknown. ``image_count`` counts pictures until the
     camera's log is cleared. ``available_mib`` is the free storage, None if unknown.
     """

@@ -218,7 +218,7 @@ class VideoMixin(CameraMixin):
             await self._link.command(*command, order=order)
 
     def _on_stream(self, message: m.VideoStreamInformation) -> None:
-        if message.stream_id or message.uri:  # ArduPilot also sends an empty one.
+        if message.stream_id or message.uri:  # ArduPilot also sends an empty message.
             stream = stream_of(message)
             self._streams[stream.number] = stream
             self._publish_streams(message)

@@ -1,1 +1,1 @@
-"""Orders to a vehicle: their validity, their retries, and every action that moves or stops the vehicle."""
+"""Orders to a vehicle: their validity and retries, and the actions that move or stop the vehicle."""

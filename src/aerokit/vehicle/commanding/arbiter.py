@@ -23,20 +23,20 @@ MODE_GRACE_S = 3.0
 ARM_HEARTBEAT_DELAY_S = 1.5
 """Seconds after an accepted arm command in which a HEARTBEAT (1 Hz) may still report the previous state."""
 MODE_MAX_AGE_S = 2.5
-"""Maximum age in seconds of a HEARTBEAT that describes the vehicle's present state; two may be lost. The
+"""Maximum age in seconds of a HEARTBEAT that counts as the vehicle's present state, so that two may be lost. The
 ground-station failsafes of ArduPilot and PX4 act later (FS_GCS_TIMEOUT 5 s, COM_DL_LOSS_T 10 s).
 """
 OWN_MODES_MAX_AGE_S = 10.0
 """Seconds in which a mode that the program ordered may still appear without counting as a takeover."""
 
 STEERING, ACTION = "steering", "action"
-"""STEERING is the topic of all steering orders; ACTION is the topic of those given by actions and raw commands."""
+"""Topics: STEERING of all steering orders, ACTION of steering orders that actions and raw commands give."""
 
 
 def was_armed_by_order(disarmed_at: float, accepted_at: float) -> bool:
-    """Return True if the vehicle was armed by the order that it accepted at this time.
+    """Return True if the vehicle was armed by the order that it accepted at ``accepted_at``.
 
-    A vehicle that reported being disarmed after the ack was armed by another party.
+    If the vehicle reported disarmed after that, another party armed it.
     """
     return disarmed_at <= accepted_at + ARM_HEARTBEAT_DELAY_S
 
@@ -108,10 +108,10 @@ class CommandArbiter:
     # ------------------------------------------------------------------------------- steering
 
     def order(self, *modes: Mode, subjects: Iterable[Subject] = ("mode", "motion"), ends_flight: bool = False) -> Order:
-        """Create a steering order that may bring about these modes.
+        """Create a steering order that may lead to these modes.
 
-        It supersedes the previous one and posted orders about these subjects. A failsafe does not end one that ends the
-        flight.
+        It supersedes the previous steering order, and posted orders about these subjects. A failsafe does not end an
+        order with ``ends_flight``.
         """
         self._notify_steering()
         self._modes_ordered.extend((self._now(), mode.custom_mode) for mode in modes)
@@ -152,7 +152,7 @@ class CommandArbiter:
 
     @contextmanager
     def auxiliary_order(self, of: Order | None = None, *, ends_flight: bool = False) -> Iterator[Order]:
-        """Create an order that does not steer (speed, home, arming …), or one command ``of`` an order to a device.
+        """Create an order that does not steer (speed, home, arming …), or a further one ``of`` an order to a device.
 
         Raises:
             OperationRejected: a newer order to the device was given.
@@ -171,9 +171,10 @@ class CommandArbiter:
     def post(
         self, subjects: Sequence[Subject], *, modes: Collection[Mode] = (), armed: bool | None = None
     ) -> Iterator[Order]:
-        """Create a posted order, valid for the duration of the block. Its main subject is the first one: a newer
-        order about it ends this order. The new order ends earlier posted orders about any of its subjects and, if it
-        steers, the action in progress.
+        """Create a posted order, valid for the duration of the block.
+
+        A newer order about the first subject ends it. The posted order itself ends earlier posted orders about any of
+        its subjects and, if it steers, the action in progress.
         """
         is_steering = "arm" not in subjects[:1]
         if is_steering:
@@ -254,8 +255,8 @@ class CommandArbiter:
     def is_flown_by_program(self) -> bool:
         """True while the vehicle is armed and executes orders of this program.
 
-        The program armed it, or has given a steering order since another party armed it, and there was no takeover
-        since.
+        The program armed the vehicle, or has given a steering order since another party armed it; and there was no
+        takeover since.
         """
         order = self.current
         if order is not None and order.was_refused:
@@ -278,7 +279,8 @@ class CommandArbiter:
     def may_be_executing(self) -> bool:
         """True while the vehicle may still execute an order of the program.
 
-        The program armed it and it was not disarmed since, or it steers and there was no takeover.
+        The program armed the vehicle, which was not disarmed since; or the program steers it, and there was no
+        takeover.
         """
         order, about = self.newest, self._ordered_since_disarmed
         # The effect of an order without modes, such as a raw command, is unknown.
@@ -354,7 +356,7 @@ class CommandArbiter:
         return bool(modes) and {mode.custom_mode for mode in modes} <= numbers
 
     def _posted_modes(self) -> tuple[Mode, ...]:
-        """Modes that posted orders may still bring about, including superseded ones."""
+        """Modes that posted orders may still lead to, including superseded orders."""
         return tuple(mode for order in self._posted if not order.is_confirmed for mode in order.modes)
 
     def _steers(self) -> bool:

@@ -111,9 +111,9 @@ class ArmingActions(VehicleBase):
             mode: the mode to arm in. None: the present mode, or one that ``take_off`` starts in if the present mode
                 does not allow arming.
             force: skip the vehicle's own arming checks. Dangerous.
-            reason: why your program arms, at most 50 bytes. Logger "aerokit" reports it at INFO, and a STATUSTEXT takes
-                it to the vehicle right before the command, where ArduPilot writes it into its flight log. PX4 logs only
-                texts that have the vehicle's own system id.
+            reason: why your program arms, at most 50 bytes. Logger "aerokit" reports it at INFO. A STATUSTEXT also
+                sends it to the vehicle right before the command, and ArduPilot writes it into its flight log. PX4 logs
+                only texts that have the vehicle's own system id.
             timeout: seconds for HEARTBEAT to report armed after the command was accepted.
             max_silence_s: raise when no heartbeat was received for this long; None: wait until ``timeout``.
 
@@ -121,7 +121,7 @@ class ArmingActions(VehicleBase):
             InvalidArgument: there is no such mode, it does not allow arming, or the reason is too long. Nothing was
                 sent.
             CommandRejected: the vehicle refused; ``reasons`` has its pre-arm texts, failing sensors and missing
-                estimates. Where the vehicle can run its checks on request, they are run again for this.
+                estimates. A vehicle that can run its checks on request runs them again for this.
             CommandTimeout: there was no acknowledgement, and the vehicle did not arm; the text says whether it may
                 still arm.
             OperationRejected: the vehicle is armed already in a mode other than ``mode`` (nothing was sent), or another
@@ -184,7 +184,7 @@ class ArmingActions(VehicleBase):
             await self._await_armed(False, order, started, timeout, max_silence_s)
 
     def _in_flight(self) -> tuple[str, ...]:
-        """Return the landed state as a reason, if it is one of flight."""
+        """Return the landed state as a reason, if it shows that the vehicle is flying."""
         landed = self.telemetry.landed_state.latest
         if landed not in (MavLandedState.IN_AIR, MavLandedState.TAKEOFF, MavLandedState.LANDING):
             return ()
@@ -263,7 +263,7 @@ class ArmingActions(VehicleBase):
         Raises:
             OperationRejected: the vehicle is armed, or not known to be disarmed. Nothing was sent.
             CommandRejected: the vehicle refused.
-            CommandTimeout: there was no acknowledgement, and it did not reboot.
+            CommandTimeout: there was no acknowledgement, and the vehicle did not reboot.
             LinkLost: the link went down with the vehicle (USB, TCP); connect again.
             OperationTimeout: the vehicle did not restart in time.
         """

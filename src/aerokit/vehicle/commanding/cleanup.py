@@ -1,4 +1,4 @@
-"""Work that remains after an order was abandoned: hold the vehicle (`FlightCleanup`), disarm it (`ArmCleanup`)."""
+"""Cleanup after an abandoned order: hold the vehicle (`FlightCleanup`) or disarm it (`ArmCleanup`)."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class BackgroundTask:
 
     @contextmanager
     def spared(self) -> Iterator[None]:
-        """Make ``drop`` ineffective within the block, for orders that the task itself gives."""
+        """Ignore ``drop`` within the block, for orders that the task itself gives."""
         scope, self._scope = self._scope, None
         try:
             yield
@@ -95,7 +95,7 @@ HOLD_CLOSE_TIMEOUT_S = 1.5
 # Number of attempts to hold a vehicle that was silent, counted from when it is received again.
 MAX_HOLD_ATTEMPTS = 3
 
-# Seconds to wait for the acknowledgement of a hold sent without waiting, and number of attempts.
+# Seconds to wait for the acknowledgement of a hold that was sent without waiting, and number of attempts.
 HOLD_ACK_TIMEOUT_S, MAX_HOLD_RESENDS = 0.5, 10
 
 # NaN means the present position, and leaves room for braking.
@@ -103,7 +103,7 @@ STOP_HERE = (MavCmd.DO_REPOSITION, -1, MavDoRepositionFlags.CHANGE_MODE, 0, *(ma
 
 
 class FlightCleanup:
-    """Makes the vehicle hold, as an order of the program or after an order was abandoned.
+    """Makes the vehicle hold, when the program orders it or after an order was abandoned.
 
     ``stop_stream`` stops the active set-point stream, with a reason.
     """
@@ -148,10 +148,10 @@ class FlightCleanup:
     def hold_in_background(self, order: Order) -> bool:
         """Hold after an order was abandoned, without waiting: for the ends of blocks and cancelled calls.
 
-        One command is sent at once if a recent HEARTBEAT describes the vehicle's state, otherwise after the next one,
-        unless a failsafe or a pilot has taken over. A background task waits for the confirmation, as long as the
-        connection is open. Nothing is sent if the order has ended, if nothing of it was sent to a vehicle that another
-        party flies, or if the vehicle is disarmed. Returns True if the command was sent, or may be sent later.
+        One command is sent at once if the last HEARTBEAT is recent, otherwise after the next HEARTBEAT, unless a
+        failsafe or a pilot has taken over by then. A background task waits for the confirmation while the connection is
+        open. Nothing is sent if the order has ended, if the vehicle is disarmed, or if another party flies the vehicle
+        and no command of the order was sent. Returns True if the command was sent, or may be sent later.
         """
         if not order.may_move:
             return False
@@ -256,7 +256,7 @@ class FlightCleanup:
 
 
 ARM_WATCH_S = 15.0
-"""Seconds for which the vehicle is monitored after an arm order was abandoned, and disarmed if that order arms it."""
+"""Seconds for which aerokit monitors the vehicle after an abandoned arm order, to disarm it if that order arms it."""
 
 ACK_S = 3.0
 """Seconds after a HEARTBEAT that reports armed in which the COMMAND_ACK of the order may arrive."""
@@ -332,8 +332,8 @@ class ArmCleanup:
     async def _has_armed(self, order: Order, disarmed_at: float) -> bool:
         """Return True if this order armed the vehicle, and not a pilot.
 
-        It did so if the vehicle accepted it and has not reported being disarmed since. Without an acknowledgement, it
-        did so if the next HEARTBEAT reports armed and there was no takeover.
+        True if the vehicle accepted the order and has not reported disarmed since. Without an acknowledgement, true if
+        the next HEARTBEAT reports armed and there was no takeover.
         """
         reported_after_s = self._session.telemetry.armed.updated_at - order.given_at
         if not order.end and reported_after_s <= ARM_HEARTBEAT_DELAY_S:

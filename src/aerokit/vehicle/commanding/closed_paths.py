@@ -1,4 +1,4 @@
-"""Closed paths in a plane, set-points along them, and the count of rounds from reported positions. No I/O."""
+"""Closed paths in a plane, set-points along them, and counters of rounds by reported positions. No I/O."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 ACCELERATION_M_S2 = 1.0
-"""Acceleration along the path, when it begins and where it ends."""
+"""Acceleration along the path, at its start and at its end."""
 MIN_SPEED_M_S = 0.1
-"""Speed to which a vehicle slows down, so that it arrives."""
+"""Minimum speed while slowing down, so that the set-point arrives."""
 
 MIN_TOLERANCE_M, TOLERANCE_SHARE = 5.0, 0.3
-"""A vehicle is on its circle within this part of the radius, and at least within this many metres."""
+"""Tolerance to count a vehicle as on its circle: this fraction of the radius, and at least this many metres."""
 
 Vector = tuple[float, float]
 """Metres north and east."""
 
 
 class ClosedPath:
-    """A closed curve around a centre. ``at(phase)`` has its place and its first two derivatives; a round is 2π."""
+    """A closed curve around a centre. ``at(phase)`` returns a place and its first two derivatives; a round is 2π."""
 
     first_phase: float = 0.0
 
@@ -64,10 +64,10 @@ class Eight(ClosedPath):
 
 
 class PathFlight:
-    """Moves a set-point: straight to the beginning of a path, there to a stop, then along it, to a stop at its end.
+    """Moves a set-point straight to the start of a path, stops it there, and moves it along the path to a stop.
 
-    ``start`` is the vehicle's place relative to the centre of the path (north, east, down), ``centre`` that of the
-    path in the local frame.
+    ``start`` is the vehicle's position relative to the centre of the path (north, east, down). ``centre`` is the
+    position of the centre in the local frame.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class PathFlight:
         return self._phase >= self._last_phase
 
     def advance(self, seconds: float) -> TrajectorySetpoint:
-        """Return the set-point after these seconds."""
+        """Move the set-point on by this time, and return it."""
         return self._advance_on_path(seconds) if self.is_on_path else self._advance_to_path(seconds)
 
     def _advance_to_path(self, seconds: float) -> TrajectorySetpoint:
@@ -134,7 +134,7 @@ class PathFlight:
 
 
 class TurnCounter:
-    """Counts turns around a centre, while the vehicle is reported near the circle and flies it in the right sense."""
+    """Counts turns around a centre, while the vehicle is near the circle and flies in the right direction."""
 
     def __init__(self, radius_m: float, *, clockwise: bool) -> None:
         self._radius_m, self._way = radius_m, 1 if clockwise else -1
@@ -142,7 +142,7 @@ class TurnCounter:
         self._bearing: float | None = None
         self.rounds: float = 0.0
         self.is_there: bool = False
-        """True while it is near the circle."""
+        """True while the vehicle is near the circle."""
 
     def add(self, north_m: float, east_m: float) -> None:
         """Process a place relative to the centre."""
@@ -153,14 +153,14 @@ class TurnCounter:
 
 
 class LobeCounter:
-    """Counts figures: both lobes of an eight, one after the other."""
+    """Counts figure eights: two different lobes in a row are one figure."""
 
     def __init__(self, major_m: float, axis_deg: float) -> None:
         self._half_m, self._axis = major_m / 2, math.radians(axis_deg)
         self._lobe = 0
         self.rounds: float = 0.0
         self.is_there: bool = False
-        """True while it is in one of the lobes."""
+        """True while the vehicle is in one of the lobes."""
 
     def add(self, north_m: float, east_m: float) -> None:
         """Process a place relative to the centre."""

@@ -13,6 +13,7 @@ from aerokit.mavlink.enums import MavLandedState
 from aerokit.position import Position
 from aerokit.vehicle.commanding.arbiter import MODE_GRACE_S
 from aerokit.vehicle.commanding.context import VehicleBase
+from aerokit.vehicle.commanding.ground import GroundCheck
 from aerokit.vehicle.commanding.progress import (
     MAX_SILENCE_S,
     POSITION_MAX_AGE_S,
@@ -36,7 +37,7 @@ IN_THE_AIR: dict[int | None, str] = {
 # Height above home from which a vehicle that sends no landed state is considered flying.
 MIN_FLYING_HEIGHT_M = 2.0
 
-# Climb that shows that a take-off command is being executed.
+# Metres of climb that show that the vehicle executes a take-off command.
 CLIMB_DETECTED_M = 0.5
 
 MODE_TIMEOUT_S = 6.0
@@ -112,7 +113,10 @@ class FlightActions(VehicleBase):
         if state is None and not altitude > MIN_FLYING_HEIGHT_M:
             return error
         height = f", {altitude:.1f} m above home" if altitude > -math.inf else ""
-        why = f"it is {state or 'probably in the air'}{height} and can only take off from the ground; go_to() climbs"
+        why = (
+            f"the vehicle is {state or 'probably in the air'}{height} and can only take off from the ground;"
+            " go_to() climbs"
+        )
         explained = CommandRejected(f"{error}", command=error.command, result=error.result, reasons=(why,))
         explained.reasons = (*error.reasons, why)
         return explained
@@ -133,7 +137,7 @@ class FlightActions(VehicleBase):
                 await self._sender.send_long(order, plan.command, *plan.params, modes=order.modes, is_done=is_rising)
 
     def _rises_from_here(self) -> Callable[[], bool]:
-        """Return a function that is true once new messages show a climb; earlier ones may describe the last flight."""
+        """Return a predicate for a climb in new messages; earlier messages may describe the previous flight."""
         here, landed = self.telemetry.position.latest, self.telemetry.landed_state
         begins_at = math.nan if here is None else self._position.altitude_relative()
         state_before = landed.latest
@@ -150,7 +154,7 @@ class FlightActions(VehicleBase):
     async def _await_altitude(
         self, altitude_m: float, timeout: float, max_silence_s: float | None, order: Order
     ) -> None:
-        """Wait for the altitude. Only the take-off's own mode and the one after it are expected."""
+        """Wait for the altitude, as long as the vehicle is in the take-off's mode or in the mode after it."""
         enough_m = altitude_m - max(0.5, 0.05 * altitude_m)
         started = self.connection.now()
 
@@ -164,7 +168,7 @@ class FlightActions(VehicleBase):
                 f"take_off({altitude_m:g} m)",
                 is_done=is_up,
                 trouble=self._sender.stays_in(order, *order.modes),
-                describe=lambda: f"it is at {self._position.altitude_relative():.1f} m",
+                describe=lambda: f"the vehicle is at {self._position.altitude_relative():.1f} m",
                 timeout=timeout,
                 max_silence_s=max_silence_s,
                 stillness=StallDetector(self._session),
@@ -183,7 +187,7 @@ class FlightActions(VehicleBase):
             NotSupported: this type of vehicle has no landing mode. Nothing was sent.
             CommandRejected: the vehicle refused the mode.
             CommandTimeout: there was no acknowledgement.
-            OperationRejected: the mode changed meanwhile.
+            OperationRejected: the mode changed meanwhile, or the vehicle fell.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the vehicle was not on the ground in time.
         """
@@ -214,14 +218,14 @@ class FlightActions(VehicleBase):
             await self._await_home(order, timeout, max_silence_s)
 
     async def _await_ground(self, what: str, order: Order, timeout: float | None, max_silence_s: float | None) -> None:
-        """Wait until messages received after the order report the ground; older ones would end the wait in the air."""
+        """Wait until messages received after the order report the ground; older messages may be wrong by now."""
         armed, landed, mode = self.telemetry.armed, self.telemetry.landed_state, self.telemetry.mode
         accepted_at = self.connection.now()
 
         def is_down() -> bool:
             is_disarmed = self.telemetry.is_confirmed_disarmed and armed.updated_at > order.given_at
             is_landed = landed.latest == MavLandedState.ON_GROUND and landed.updated_at > order.given_at
-            return is_disarmed or is_landed or (is_over() and not is_deep())
+            return ground.confirms(is_disarmed or is_landed or (is_over() and not is_deep()))
 
         def is_over() -> bool:
             return self.telemetry.mode_name == self.autopilot.mode_when_landed and mode.updated_at > accepted_at
@@ -232,21 +236,20 @@ class FlightActions(VehicleBase):
                 and self._position.altitude_relative() < -MAX_SURFACE_DEPTH_M
             )
 
-        stays = self._sender.stays_until_disarmed(order)
+        stays, ground = self._sender.stays_until_disarmed(order), GroundCheck(self._session)
 
         def trouble() -> str | None:
             if is_over() and is_deep() and self.connection.now() > accepted_at + MODE_GRACE_S:
                 return f"the mode changed to {self.telemetry.mode_name} at {self._position.altitude_relative():.1f} m"
-            return stays()
+            return ground.trouble(stays)
 
-        depth = () if self.autopilot.mode_when_landed is None else ("position",)
-        with self._session.streaming("landed_state", *depth):
+        with self._session.streaming("landed_state", "position"):
             await await_progress(
                 self._session,
                 what,
                 is_done=is_down,
                 trouble=trouble,
-                describe=lambda: f"it is at {self._position.altitude_relative():.1f} m",
+                describe=lambda: f"the vehicle is at {self._position.altitude_relative():.1f} m",
                 timeout=timeout,
                 max_silence_s=max_silence_s,
             )
@@ -267,7 +270,7 @@ class FlightActions(VehicleBase):
                 "return_to_launch",
                 is_done=is_back,
                 trouble=self._sender.stays_in(order, *order.modes),
-                describe=lambda: f"it is {self._position.distance_to(place):.1f} m from home",
+                describe=lambda: f"the vehicle is {self._position.distance_to(place):.1f} m from home",
                 timeout=timeout,
                 max_silence_s=max_silence_s,
             )
@@ -328,9 +331,10 @@ class ModeActions(VehicleBase):
     def taken_over(self) -> str:
         """The takeover that ended the program's last action, as a clause; empty if there was none.
 
-        "the mode changed to LOITER": by a pilot, a failsafe or another program, which HEARTBEAT does not distinguish;
-        or "a failsafe became active (MAV_STATE_CRITICAL)", which may be reported seconds before the mode changes.
-        Disarming alone, as after a landing, is no takeover. The program's next action resets it.
+        ``"the mode changed to LOITER"`` may be the work of a pilot, a failsafe or another program, because HEARTBEAT
+        does not distinguish them. ``"a failsafe became active (MAV_STATE_CRITICAL)"`` may be reported seconds before
+        the mode changes. Disarming alone, as after a landing, is not a takeover. The program's next action resets this
+        text.
         """
         order = self._arbiter.current or self._arbiter.newest
         if order is None or not order.has_lost_mode:

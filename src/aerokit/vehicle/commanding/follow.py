@@ -1,4 +1,4 @@
-"""`FollowStream`: keeps a vehicle at its place relative to a moving target."""
+"""`FollowStream`: keeps a vehicle at a fixed offset from a moving target."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ __all__ = ["FollowStream"]
 RATE_HZ, MAX_LAG_S = 10.0, 1.0
 MAX_DISTANCE_M = 1000.0
 MIN_COURSE_SPEED_M_S = 0.5
-"""Ground speed from which a movement has a direction."""
+"""Minimum ground speed at which the course of the target is used."""
 MIN_INTERVAL_S = 0.05
-"""Seconds between two positions from which a velocity can be computed."""
+"""Minimum seconds between two positions to compute a velocity from them."""
 OVERDUE = 1.5
-"""Part of the last interval after which a target without another position has stopped."""
+"""Multiple of the last interval between positions after which a target without a new position counts as stopped."""
 MAX_TARGET_SPEED_M_S = 100.0
-"""A greater speed between two positions is a jump of the target's position."""
+"""A higher speed between two positions counts as a jump of the target's position."""
 POLL_INTERVAL_S = 0.1
 
 
 class FollowPlace(Snapshot):
-    """The place of the follower relative to its target; see :meth:`aerokit.Vehicle.follow`."""
+    """The follower's place relative to its target; see :meth:`aerokit.Vehicle.follow`."""
 
     distance_m: float
     bearing_deg: float | None
@@ -62,7 +62,7 @@ class FollowPlace(Snapshot):
 class TargetState(Snapshot):
     """Position of the target with its velocity (north, east, down in m/s).
 
-    ``at`` is when it was last known to be there, ``since`` when it was there first.
+    ``since`` is the time at which this position was first reported, ``at`` the time of its last report.
     """
 
     position: Position
@@ -72,7 +72,7 @@ class TargetState(Snapshot):
 
 
 class FollowedTarget:
-    """The latest position of the target, and its velocity: reported by a vehicle, or computed from two positions."""
+    """Latest position and velocity of the target, reported by a vehicle or computed from two positions."""
 
     def __init__(self, target: FollowTarget, now: Callable[[], float]) -> None:
         self._target, self._now = target, now
@@ -80,7 +80,7 @@ class FollowedTarget:
         self._interval_s = 0.0
 
     def read(self) -> TargetState | None:
-        """Read a vehicle or call the function; return the latest state."""
+        """Return the latest state of the target, after reading the vehicle or calling the function."""
         if isinstance(self._target, HasTelemetry):
             self._read_vehicle(self._target.telemetry)
         elif not isinstance(self._target, AsyncIterable) and (position := self._target()) is not None:
@@ -96,13 +96,13 @@ class FollowedTarget:
         self.latest = TargetState(position.latest.replace(altitude_relative_m=None), speeds, at, at)
 
     def add(self, position: object) -> None:
-        """Process a position that the program supplied. An unchanged one counts as new.
+        """Process a position that the program supplied. An unchanged position counts as a new report.
 
-        The velocity is that between two different positions, because a program may be asked more often than its target
-        reports. It becomes zero when the next position is overdue, and if the target has jumped.
+        The velocity is computed from two different positions, because a program may be asked more often than its target
+        moves. It becomes zero when the next different position is overdue, and after a jump.
 
         Raises:
-            InvalidArgument: it is no position.
+            InvalidArgument: the object is not a `Position`.
         """
         if not isinstance(position, Position):
             raise InvalidArgument(f"position = {short_repr(position)} is not allowed: a Position")
@@ -130,15 +130,17 @@ class FollowStream(SteeringStream[TargetState]):
     """Follows a target while its ``async with`` block runs; opened by :meth:`aerokit.Vehicle.follow`.
 
     Entering the block waits for the first position of the target, and changes the mode: to GUIDED on ArduPilot, to
-    OFFBOARD on PX4. Leaving it in any way makes the vehicle hold. It stops by itself, and the vehicle holds, when no
-    new position of the target arrives for ``valid_for_s``, when the target's positions end or raise, when it is farther
-    away than ``max_distance_m``, and for the reasons of set-point streams. After a pilot or a failsafe has changed the
-    mode, nothing more is sent. ``fly`` and leaving the block then raise :class:`SetpointStreamStopped`.
+    OFFBOARD on PX4. Leaving the block in any way makes the vehicle hold.
+
+    The stream stops by itself, and the vehicle holds, when no new position of the target arrives for ``valid_for_s``,
+    when the source of positions ends or raises, when the target is farther away than ``max_distance_m``, and for the
+    same reasons as a set-point stream. If a pilot or a failsafe changes the mode, the stream stops and sends nothing
+    more. ``fly`` and leaving the block then raise :class:`SetpointStreamStopped`.
 
     Entering raises:
-        OperationRejected: the vehicle is not flying (nothing was sent), or its altitude is unknown (it holds).
+        OperationRejected: the vehicle is not flying (nothing was sent), or its altitude is unknown (the vehicle holds).
         OperationTimeout: no position of the target was known within ``valid_for_s``. The vehicle holds.
-        InvalidArgument: a height is wanted, and the target has no altitude. The vehicle holds.
+        InvalidArgument: ``height_m`` was given, but the target has no altitude. The vehicle holds.
     """
 
     _NAME, _VALUE = "following", "position of the target"
@@ -154,7 +156,7 @@ class FollowStream(SteeringStream[TargetState]):
         check_range("max_distance_m", max_distance_m, place.distance_m, math.inf)
         autopilot = context.session.autopilot
         if getattr(target, "telemetry", None) is context.session.telemetry:
-            raise InvalidArgument("target is not allowed: the vehicle itself, which would flee from itself")
+            raise InvalidArgument("target is not allowed: a vehicle cannot follow itself")
         if not (autopilot.setpoints.global_position and autopilot.setpoints.velocity):
             raise NotSupported(f"follow: {autopilot.firmware} does not support position set-points; nothing was sent")
         nowhere = TargetState(Position(0.0, 0.0), ZERO, -math.inf, -math.inf)
@@ -178,10 +180,10 @@ class FollowStream(SteeringStream[TargetState]):
         return math.inf if here is None or target is None else here.distance_to(target)
 
     async def fly(self, duration_s: float | None = None) -> None:
-        """Follow for ``duration_s`` seconds; None: until it stops by itself.
+        """Follow the target for ``duration_s`` seconds; None: until the stream stops by itself.
 
         Raises:
-            SetpointStreamStopped: it has stopped; the text has the reason.
+            SetpointStreamStopped: the stream has stopped; the error text has the reason.
         """
         until = math.inf if duration_s is None else self._now() + duration_s
         while (left := until - self._now()) > 0:
@@ -200,7 +202,7 @@ class FollowStream(SteeringStream[TargetState]):
             with self._context.flight_cleanup.preparing(mode) as self._prepared_order:
                 self._value = await self._first_state()
                 self._choose_place(self._value.position)
-                self._take(self._value)  # Raises for an invalid place; an earlier flight of the program then holds.
+                self._take(self._value)  # Raises for an invalid place, before the mode changes.
             return await super().__aenter__()
         except BaseException:
             self._stop_reading()
@@ -241,7 +243,7 @@ class FollowStream(SteeringStream[TargetState]):
         return state
 
     def _choose_place(self, target: Position) -> None:
-        """Choose what was left open: the present bearing from the target, and the present altitude."""
+        """Choose the values that were not given: the present bearing from the target, and the present altitude."""
         here = self._session.telemetry.position.fresh(POSITION_MAX_AGE_S)
         self._bearing_deg = target.bearing_to(here) if self._place.bearing_deg is None else self._place.bearing_deg
         self._course_deg = here.bearing_to(target)
@@ -263,7 +265,7 @@ class FollowStream(SteeringStream[TargetState]):
             if state is not None:
                 self._take(state)
                 self._set_at = state.at
-        # CancelledError: of a task whose result the function returns.
+        # The function raises CancelledError if it returns the result of a cancelled task.
         except (Exception, asyncio.CancelledError) as error:
             self._end_reason = f"the position of the target raised {error!r}"
         super()._tick(due)
@@ -276,7 +278,7 @@ class FollowStream(SteeringStream[TargetState]):
         return super()._why_stop(lag)
 
     def _encode_place(self, state: TargetState) -> Message:
-        """Return the place at this moment: the target moves on between two of its positions."""
+        """Return the set-point for this moment, assuming that the target keeps its velocity between two positions."""
         seconds = max(0.0, min(self._now() - state.since, self._valid_for_s))
         north_m_s, east_m_s, down_m_s = state.velocity
         if math.hypot(north_m_s, east_m_s) >= MIN_COURSE_SPEED_M_S:
@@ -291,7 +293,7 @@ class FollowStream(SteeringStream[TargetState]):
         if self._place.height_m is None:
             place = place.replace(altitude_amsl_m=self._own_altitude_m, altitude_relative_m=None)
             down_m_s = 0.0
-        elif place.altitude_amsl_m is not None:  # The altitude above home may be above another vehicle's home.
+        elif place.altitude_amsl_m is not None:  # The target's relative altitude may refer to another home.
             place = place.replace(altitude_relative_m=None)
         yaw_deg = math.degrees(math.remainder(bearing + math.pi, 2 * math.pi)) if self._place.face_target else None
         return self._encode_position(PositionSetpoint(place, yaw_deg), (north_m_s, east_m_s, down_m_s))

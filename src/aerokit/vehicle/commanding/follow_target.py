@@ -10,7 +10,7 @@ from aerokit.position import Position
 
 @runtime_checkable
 class HasTelemetry(Protocol):
-    """A vehicle, asynchronous or blocking."""
+    """A vehicle of the asynchronous or the blocking API."""
 
     @property
     def telemetry(self) -> Any: ...

@@ -1,9 +1,9 @@
 """Guided set-points, streamed at a fixed rate while a program supplies them.
 
-An autopilot stops by itself when set-points stop arriving (ArduCopter after 3 s, PX4 after 0.5 s). Resending the last
-set-point without limit would defeat that. Here the stream ends, and aerokit orders the vehicle to hold, when the code
-that supplies set-points ends, raises, is cancelled, stops supplying them or blocks the event loop, and when the vehicle
-falls silent.
+An autopilot stops by itself when set-points stop arriving (ArduCopter after 3 s, PX4 after 0.5 s). A library that
+resends the last set-point without limit defeats that. In aerokit, the stream ends and the vehicle is ordered to hold
+when the code that supplies set-points ends, raises, is cancelled, stops supplying them or blocks the event loop, and
+when the vehicle falls silent.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ __all__ = ["Guided", "SetpointStream"]
 
 SetpointT = TypeVar("SetpointT")
 
-# A position set-point that restarts the path is sent this many times at once, in case one is lost, then at this
+# If a position set-point restarts the path, it is sent this many times at once (one may be lost), then at this
 # interval.
 INITIAL_REPEATS, REPEAT_INTERVAL_S = 3, 5.0
 
@@ -49,10 +49,10 @@ INITIAL_REPEATS, REPEAT_INTERVAL_S = 3, 5.0
 class Guided:
     """Opens set-point streams: ``async with vehicle.guided.velocity() as stream: stream.set(...)``.
 
-    Every stream takes ``rate_hz`` (transmission rate of the latest set-point, 2 to 400), ``valid_for_s`` (how long a
-    set-point may be resent without a new one) and ``max_lag_s`` (how late the event loop may be). NotSupported is
-    raised for a kind that this type of vehicle does not support. Rates and seconds are in real time: a simulation at
-    ten times the speed needs ten times the rate.
+    All streams have the same arguments. ``rate_hz`` (2 to 400) is the transmission rate of the latest set-point. The
+    stream stops if it gets no new set-point for ``valid_for_s`` seconds, or if the event loop is late by ``max_lag_s``
+    seconds. NotSupported is raised for a kind of set-point that this type of vehicle does not support. Rates and
+    seconds are in real time: a simulation at ten times the speed needs ten times the rate.
     """
 
     def __init__(self, context: VehicleContext) -> None:
@@ -135,8 +135,8 @@ class Guided:
     ) -> SetpointStream[AttitudeRateSetpoint]:
         """Stream body rates with thrust (SET_ATTITUDE_TARGET without an attitude).
 
-        ArduCopter and PX4 obey them. Nothing levels the vehicle: it keeps turning until the next set-point, or until it
-        holds, which is ordered after ``valid_for_s`` without one.
+        ArduCopter and PX4 execute them. The autopilot does not level the vehicle: it keeps turning until the next
+        set-point, or until aerokit orders a hold, after ``valid_for_s`` without a new one.
         """
         return self._stream("attitude rate", self._encode.attitude_rate, initial, rate_hz, valid_for_s, max_lag_s)
 
@@ -161,18 +161,18 @@ class Guided:
     ) -> SetpointStream[ActuatorSetpoint]:
         """Stream actuator controls (SET_ACTUATOR_CONTROL_TARGET).
 
-        PX4 obeys them up to version 1.13; newer ones, and ArduPilot, ignore the message.
+        PX4 executes them up to version 1.13; newer versions, and ArduPilot, ignore the message.
 
         Raises:
-            NotSupported: this firmware does not obey them, or its version is not known yet. Nothing was sent.
+            NotSupported: this firmware ignores the message, or its version is not known yet. Nothing was sent.
         """
         session = self._context.session
         until, version = session.autopilot.actuators_until, session.telemetry.version.latest
         if until is None or version is None or version.number[:2] >= until:
             known = "of unknown version" if version is None else str(version.firmware)
             raise NotSupported(
-                f"{session.autopilot.firmware} {known} does not obey SET_ACTUATOR_CONTROL_TARGET; only PX4 before 1.14"
-                " does. Use vehicle.guided.attitude_rate()"
+                f"{session.autopilot.firmware} {known} ignores SET_ACTUATOR_CONTROL_TARGET; only PX4 before 1.14"
+                " executes it. Use vehicle.guided.attitude_rate()"
             )
         return SetpointStream(self._context, self._encode.actuators, initial, rate_hz, valid_for_s, max_lag_s)
 
@@ -190,11 +190,13 @@ class Guided:
 class SetpointStream(SteeringStream[SetpointT]):
     """Sends the latest set-point at a fixed rate while the ``async with`` block supplies set-points.
 
-    Entering the block changes to the set-point mode (GUIDED, OFFBOARD) with the initial set-point. Leaving it in any
-    way makes the vehicle hold. The stream stops by itself without a new set-point for ``valid_for_s``, if the event
-    loop is late by ``max_lag_s``, if the vehicle leaves the mode, disarms or falls silent, and if it should move but
-    stays in place for twelve seconds. Then ``set`` and leaving the block raise :class:`SetpointStreamStopped`. After a
-    pilot or a failsafe has changed the mode, nothing more is sent to the vehicle.
+    Entering the block changes to the set-point mode (GUIDED, OFFBOARD) with the initial set-point. Leaving the block in
+    any way makes the vehicle hold.
+
+    The stream stops by itself if there is no new set-point for ``valid_for_s``, if the event loop is late by
+    ``max_lag_s``, if the vehicle leaves the mode, disarms or falls silent, and if the vehicle should move but stays in
+    place for twelve seconds. ``set`` and leaving the block then raise :class:`SetpointStreamStopped`. If a pilot or a
+    failsafe changed the mode, nothing more is sent to the vehicle.
     """
 
     _NAME, _VALUE = "set-point stream", "set-point"

@@ -79,21 +79,31 @@ class Health:
             if not self.arming_texts(since) and self._autopilot.runs_prearm_checks:
                 await self._run_prearm_checks()
             await self._refresh()
-        found = (self.arming_texts(since), self.unarmable_mode(), self._out_of_date(), self._failing())
+        mode = self._telemetry.mode.latest
+        needs_position = mode is None or mode.name not in self._autopilot.modes_without_position
+        failing = self._failing() if needs_position else self._failing_sensors()
+        found = (self.arming_texts(since), self.unarmable_mode(), self._out_of_date(), failing)
         return self._session.deduplicate_reasons(*(reason for reasons in found for reason in reasons))
 
     def unarmable_mode(self) -> list[str]:
-        """Return a text if the present mode does not allow arming, else nothing."""
+        """Return a list with a text if the present mode does not allow arming, otherwise an empty list."""
         mode = self._telemetry.mode.latest
-        is_unarmable = mode is not None and mode.name in self._autopilot.unarmable_modes
-        return [self.unarmable_text(mode)] if mode is not None and is_unarmable else []
+        return [self.unarmable_text(mode)] if mode is not None and mode.name in self._left_modes() else []
 
     def unarmable_text(self, mode: Mode) -> str:
         """Return a sentence that names the modes that allow arming."""
-        others = sorted({*self._autopilot.modes.names} - self._autopilot.unarmable_modes)
-        text = f"{self._autopilot.firmware} cannot arm in {mode.name}, only in {', '.join(others)}"
+        option = self._autopilot.armable_by_option.get(mode.name)
+        others = ", ".join(sorted({*self._autopilot.modes.names} - self._left_modes()))
+        if option is None:
+            text = f"{self._autopilot.firmware} cannot arm in {mode.name}, only in {others}"
+        else:
+            text = f"{self._autopilot.firmware} cannot arm in {mode.name} unless {option} allows it"
         better = self._autopilot.mode_to_arm_in()
         return text if better is None else f"{text}; arm() changes to {better.name} first"
+
+    def _left_modes(self) -> frozenset[str]:
+        """Return the modes that `arm` leaves."""
+        return self._autopilot.unarmable_modes.union(self._autopilot.armable_by_option)
 
     async def _refresh(self) -> None:
         """Wait briefly for states that are missing or too old."""
@@ -113,21 +123,30 @@ class Health:
         return [text for text in self._session.texts_since(since) if self._autopilot.arming_reason(text) is not None]
 
     def _failing(self) -> list[str]:
-        """Return failing sensors, failing pre-arm checks and missing estimates.
+        """Return failing sensors, failing pre-arm checks, missing estimates, and a missing GPS fix as their cause."""
+        failing, estimator = self._failing_sensors(), self._telemetry.estimator.latest
+        if estimator is None or not estimator.missing:
+            return failing
+        failing += [f"the estimator has no {name} ({estimator.message})" for name in estimator.missing]
+        receivers = self._telemetry.gps.latest or ()
+        if receivers and not any(receiver.has_3d_fix for receiver in receivers):
+            failing.append("no GPS receiver has a 3D fix (GPS_RAW_INT)")
+        return failing
 
-        If the vehicle reports that it can be armed, a failing sensor is not required (PX4: no RC receiver). In a mode
-        that does not allow arming, PX4 evaluates the requirements of that mode, which say nothing about arming. PX4
-        also reports the receiver as failing in modes that do not require it.
+    def _failing_sensors(self) -> list[str]:
+        """Return failing sensors and failing pre-arm checks.
+
+        If the vehicle reports that it can be armed, failing sensors are left out, because they are not required (PX4
+        without an RC receiver). In a mode that does not allow arming, PX4 evaluates the requirements of that mode,
+        which say nothing about arming. PX4 reports a missing receiver as failing even in modes that do not require it.
         """
         failing: list[str] = []
-        sensors, estimator = self._telemetry.sensors.latest, self._telemetry.estimator.latest
+        sensors = self._telemetry.sensors.latest
         says_nothing = self._autopilot.prearm_depends_on_mode and self.unarmable_mode()
         if sensors is not None and sensors.prearm_checks_pass is not True and not says_nothing:
             failing += [f"{name} is not healthy (SYS_STATUS)" for name in sensors.failing if self._is_required(name)]
             if sensors.prearm_checks_pass is False:
                 failing.append("the vehicle's pre-arm checks do not pass (SYS_STATUS)")
-        if estimator is not None:
-            failing += [f"the estimator has no {name} ({estimator.message})" for name in estimator.missing]
         return failing
 
     def _is_required(self, sensor: str) -> bool:

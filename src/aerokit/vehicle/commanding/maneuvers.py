@@ -50,32 +50,33 @@ class ManeuverActions(VehicleBase):
         timeout: float | None = None,
         max_silence_s: float | None = MAX_SILENCE_S,
     ) -> None:
-        """Fly around a place; returns when the reported positions have gone around it ``turns`` times.
+        """Fly circles around a place; returns when the vehicle's reported positions have circled it ``turns`` times.
 
-        Then a multicopter holds, and a fixed wing goes on circling. After a cancellation or a time-out, aerokit orders
-        the vehicle to hold.
+        Afterwards a multicopter holds, and a fixed wing goes on circling. After a cancellation or a time-out, aerokit
+        orders the vehicle to hold.
 
-        PX4 flies the circle itself (MAV_CMD_DO_ORBIT). ArduCopter has no such command, and its mode CIRCLE follows the
-        throttle stick, so aerokit streams set-points with velocity and acceleration in GUIDED; if your program dies,
-        the vehicle stops. ArduPlane circles a place in GUIDED (MAV_CMD_DO_REPOSITION).
+        PX4 flies the circle itself (MAV_CMD_DO_ORBIT). ArduPlane circles a place in GUIDED (MAV_CMD_DO_REPOSITION).
+        ArduCopter has no such command, and its mode CIRCLE follows the throttle stick; aerokit therefore streams
+        set-points in GUIDED, and the vehicle stops if your program dies.
 
         Args:
-            center: the middle of the circle; its altitude is that of the circle, without one, or for home, the
-                vehicle's own.
+            center: the middle of the circle, at the altitude of the circle. For home, or a position without altitude,
+                the vehicle keeps its own altitude.
             radius_m: above 0, at most 10,000. PX4's multicopters refuse more than MC_ORBIT_RAD_MAX.
             speed_m_s: ground speed, above 0, at most 50. A fixed wing ignores it.
-            turns: number of turns, above 0, at most 1000; None: until the call is cancelled, or another order is given.
+            turns: number of turns, above 0, at most 1000. None: circle until the call is cancelled or another order is
+                given.
             clockwise: direction, as seen from above.
-            facing: direction of the nose: to the center, ahead, as at the beginning, or left to the autopilot. A fixed
-                wing ignores it.
+            facing: direction of the nose: towards the center, ahead, as it was at the beginning, or free for the
+                autopilot to choose. A fixed wing ignores it.
             max_distance_m: a center farther away than this many metres is refused.
             timeout: seconds; None: no limit while heartbeats arrive, the mode stays and the vehicle moves.
             max_silence_s: raise when no heartbeat was received for this long; None: no limit.
 
         Raises:
-            NotSupported: this type of vehicle has no way to do it. Nothing was sent.
+            NotSupported: this type of vehicle cannot circle a place. Nothing was sent.
 
-        Otherwise raises as :meth:`go_to`.
+        Other errors are those of :meth:`go_to`.
         """
         from aerokit.vehicle.commanding.closed_paths import Circle, TurnCounter
         from aerokit.vehicle.commanding.rounds import RoundFlight
@@ -109,19 +110,21 @@ class ManeuverActions(VehicleBase):
         timeout: float | None = None,
         max_silence_s: float | None = MAX_SILENCE_S,
     ) -> None:
-        """Fly an eight around a place; returns when the reported positions were ``rounds`` times in both lobes.
+        """Fly a figure eight; returns when the vehicle's reported positions have passed both lobes ``rounds`` times.
 
-        PX4's fixed wings fly it themselves (MAV_CMD_DO_FIGURE_EIGHT: two circles and straight lines between them, and
-        on until another order). For ArduCopter and PX4's multicopters aerokit streams the set-points of a lemniscate;
-        they hold at its center. All else is as for :meth:`orbit`.
+        A PX4 fixed wing flies the figure itself (MAV_CMD_DO_FIGURE_EIGHT), as two circles and straight lines between
+        them, and goes on until another order. For ArduCopter and PX4's multicopters, aerokit streams the set-points of
+        a lemniscate, and they hold at its center at the end. Errors, cancellation and time-out are as for
+        :meth:`orbit`.
 
         Args:
-            center: where the lines cross; its altitude is that of the figure, without one the vehicle's own.
+            center: the point where the lines cross, at the altitude of the figure. Without altitude, the vehicle keeps
+                its own.
             major_radius_m: half the length of the figure, above 0, at most 10,000.
-            minor_radius_m: half its width, above 0, at most the half of ``major_radius_m``.
-            axis_deg: direction of its long axis, 0–360 clockwise from north; the first lobe is there.
+            minor_radius_m: half the width of the figure, above 0, at most half of ``major_radius_m``.
+            axis_deg: direction from the center to the first lobe, 0–360 clockwise from north.
             speed_m_s: ground speed, above 0, at most 50. A fixed wing ignores it.
-            rounds: number of figures, a multiple of a half, above 0, at most 1000; None: until the call is cancelled.
+            rounds: number of figures, a multiple of 0.5, above 0, at most 1000. None: fly until the call is cancelled.
             clockwise: direction in the first lobe, as seen from above.
             max_distance_m: a center farther away than this many metres is refused.
             timeout: seconds; None: no limit while heartbeats arrive, the mode stays and the vehicle moves.
@@ -137,7 +140,7 @@ class ManeuverActions(VehicleBase):
         if rounds is not None:
             check_range("rounds", rounds, 0, MAX_ROUNDS, above=True)
             if rounds * 2 != int(rounds * 2):
-                raise InvalidArgument(f"rounds = {rounds!r} is not allowed: a multiple of a half")
+                raise InvalidArgument(f"rounds = {rounds!r} is not allowed: a multiple of 0.5")
         is_flown_by_px4 = self._is_on_wings and self.autopilot.circles_by == "orbit"
         if not is_flown_by_px4 and (self._is_on_wings or not self.autopilot.setpoints.trajectory):
             raise NotSupported(f"figure_eight: {self.autopilot.firmware} has no such manoeuvre; nothing was sent")
@@ -164,16 +167,19 @@ class ManeuverActions(VehicleBase):
         timeout: float | None = None,
         max_silence_s: float | None = MAX_SILENCE_S,
     ) -> None:
-        """Go to a place and stay: a fixed wing circles there, a multicopter hovers.
+        """Go to a place and stay there: a fixed wing circles, a multicopter hovers.
 
-        Returns when it is there, or after ``turns`` or ``duration_s`` more. The vehicle stays until another order.
-        After a cancellation or a time-out, aerokit orders it to hold where it is. Sends MAV_CMD_DO_REPOSITION
-        (ArduPilot in GUIDED, PX4 in LOITER), or MAV_CMD_DO_ORBIT for the radius of a PX4 fixed wing.
+        Returns when the vehicle has arrived and has then flown ``turns`` turns or waited ``duration_s`` seconds, if one
+        of these is given. The vehicle stays until another order. After a cancellation or a time-out, aerokit orders it
+        to hold where it is.
+
+        Sends MAV_CMD_DO_REPOSITION (ArduPilot in GUIDED, PX4 in LOITER). For a PX4 fixed wing with ``radius_m``, sends
+        MAV_CMD_DO_ORBIT.
 
         Args:
-            target: the place, as for ``go_to``; None: where the vehicle is.
-            radius_m: radius of the circle of a fixed wing, above 0, at most 10,000; None: its own (WP_LOITER_RAD,
-                NAV_LOITER_RAD).
+            target: the place, as for ``go_to``. None: the vehicle's present position.
+            radius_m: radius of a fixed wing's circle, above 0, at most 10,000. None: the vehicle's parameter
+                (WP_LOITER_RAD, NAV_LOITER_RAD).
             clockwise: direction of the circle, as seen from above; only with ``radius_m``.
             turns: return after this many turns, above 0, at most 1000; only with ``radius_m``.
             duration_s: return this many seconds after the arrival.
@@ -181,8 +187,11 @@ class ManeuverActions(VehicleBase):
             timeout: seconds in total; None: no limit while heartbeats arrive, the mode stays and the vehicle moves.
             max_silence_s: raise when no heartbeat was received for this long; None: no limit.
 
-        All else is as for :meth:`orbit`. NotSupported is raised for a radius if the vehicle hovers, InvalidArgument for
-        ``turns`` without one.
+        Raises:
+            InvalidArgument: a value is out of range, or ``turns`` was given without ``radius_m``. Nothing was sent.
+            NotSupported: ``radius_m`` was given, but the vehicle hovers. Nothing was sent.
+
+        Other errors are those of :meth:`go_to`.
         """
         from aerokit.vehicle.commanding.closed_paths import TurnCounter
         from aerokit.vehicle.commanding.rounds import RoundFlight
@@ -193,7 +202,7 @@ class ManeuverActions(VehicleBase):
             check_range("radius_m", radius_m, 0, MAX_RADIUS_M, above=True)
             if not self._is_on_wings:
                 raise NotSupported(
-                    f"loiter: this {self.autopilot.firmware} vehicle hovers and takes no radius: use orbit()"
+                    f"loiter: this {self.autopilot.firmware} vehicle hovers, so radius_m is not supported: use orbit()"
                 )
         elif turns is not None:
             raise InvalidArgument(f"turns = {turns!r} is not allowed without radius_m")
@@ -224,31 +233,33 @@ class ManeuverActions(VehicleBase):
     ) -> FollowStream:
         """Follow a moving target: ``async with vehicle.follow(leader) as following: await following.fly(60)``.
 
-        aerokit computes the place beside the target and streams it with the target's velocity, at 10 Hz
-        (SET_POSITION_TARGET_GLOBAL_INT). The modes FOLLOW of ArduCopter and FOLLOWME of PX4 are not used: they need
-        parameters that stay, and differ in what they keep.
+        aerokit computes the vehicle's place relative to the target, and streams it with the target's velocity at 10 Hz
+        (SET_POSITION_TARGET_GLOBAL_INT). It does not use ArduCopter's mode FOLLOW and PX4's FOLLOWME, which depend on
+        stored parameters and behave differently.
 
         Args:
-            target: another vehicle, of this connection or of any other; an asynchronous iterable of positions; or a
-                function that returns the latest position, or None, called on the event loop ten times a second. The
-                velocity of positions is computed from two different ones; above 100 m/s it is a jump, and counts as 0.
+            target: another vehicle, of any connection; an asynchronous iterable of positions; or a function that
+                returns the latest position or None. aerokit calls the function on the event loop ten times a second.
+                The velocity is computed from two different positions; a speed above 100 m/s counts as a jump, with
+                velocity 0.
             distance_m: distance along the ground to keep, 0 to 1000.
-            bearing_deg: direction from the target in which to stay, 0–360 clockwise from north; None: where the vehicle
-                is when it begins.
-            from_course: count ``bearing_deg`` from the direction in which the target moves: 180 is behind it.
-            height_m: height above the target, −1000 to 1000; None: the vehicle keeps its own altitude.
+            bearing_deg: direction from the target to the vehicle, 0–360 clockwise from north. None: the direction at
+                the beginning.
+            from_course: measure ``bearing_deg`` from the target's direction of movement instead: 180 is behind it.
+            height_m: height above the target, −1000 to 1000. None: the vehicle keeps its own altitude.
             face_target: turn the nose to the target.
-            valid_for_s: without a new position of the target for this long, the vehicle holds.
-            max_distance_m: if the target is farther away than this many metres, the vehicle holds.
+            valid_for_s: seconds without a new position of the target after which the vehicle holds.
+            max_distance_m: distance to the target in metres above which the vehicle holds.
 
         Raises:
             InvalidArgument: an argument is out of range, or the target is the vehicle itself.
-            NotSupported: this type of vehicle takes no position set-points, or it flies on its wings.
+            NotSupported: this type of vehicle has no position set-points, or it is a fixed wing, or a VTOL in forward
+                flight.
         """
         from aerokit.vehicle.commanding.follow import FollowPlace, FollowStream
 
         if self._is_on_wings:
-            raise NotSupported("follow: the vehicle flies on its wings, and cannot fly as slowly as its target")
+            raise NotSupported("follow: the vehicle flies on its wings, and cannot slow down or stop with its target")
         place = FollowPlace(distance_m, bearing_deg, from_course, height_m, face_target)
         return FollowStream(self._context, target, place, valid_for_s, max_distance_m)
 
@@ -269,31 +280,31 @@ class ManeuverActions(VehicleBase):
 
     @property
     def _is_on_wings(self) -> bool:
-        """True if it flies on its wings now, and so cannot stop."""
+        """True for a fixed wing and for a VTOL in forward flight, which cannot stop."""
         state = self.telemetry.vtol_state.latest
         return state == MavVtolState.FW if state else self.vehicle_type == MavType.FIXED_WING
 
     async def transition_to(self, state: FlightState, *, timeout: float = 60.0) -> None:
-        """Change a VTOL between hovering and flying on its wings (MAV_CMD_DO_VTOL_TRANSITION).
+        """Change a VTOL between hover and forward flight (MAV_CMD_DO_VTOL_TRANSITION).
 
-        Returns when EXTENDED_SYS_STATE reports the state; at once if it is reported already. ArduPilot does it only in
-        AUTO. After a cancellation the vehicle goes on with its transition.
+        Returns when EXTENDED_SYS_STATE reports the state, which may be at once. ArduPilot accepts the command only in
+        AUTO. A cancelled call does not stop the transition.
 
         Args:
             state: ``"fixed_wing"`` or ``"multicopter"``.
-            timeout: seconds until it is in that state.
+            timeout: seconds until the vehicle reports the state.
 
         Raises:
             InvalidArgument: there is no such state. Nothing was sent.
-            NotSupported: it is no VTOL. Nothing was sent.
-            OperationRejected: the mode changed or it disarmed meanwhile.
+            NotSupported: the vehicle is not a VTOL. Nothing was sent.
+            OperationRejected: the mode changed, or the vehicle disarmed, during the transition.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement.
             HeartbeatTimeout: the vehicle was silent for ten seconds.
-            OperationTimeout: it did not reach the state in time.
+            OperationTimeout: the vehicle did not report the state in time.
         """
         if MavCmd.DO_VTOL_TRANSITION in self.autopilot.unsupported_commands or not self.telemetry.is_vtol:
-            raise NotSupported(f"transition_to: this {self.autopilot.firmware} vehicle is no VTOL; nothing was sent")
+            raise NotSupported(f"transition_to: this {self.autopilot.firmware} vehicle is not a VTOL; nothing was sent")
         wanted, cell = VTOL_STATES[state], self.telemetry.vtol_state
         with self._arbiter.auxiliary_order() as order:
             started = self.connection.now()
@@ -311,24 +322,24 @@ class ManeuverActions(VehicleBase):
     async def set_airspeed(self, airspeed_m_s: float) -> None:
         """Change the airspeed of a fixed wing in m/s, above 0 (MAV_CMD_DO_CHANGE_SPEED, SPEED_TYPE_AIRSPEED).
 
-        Returns at the acknowledgement, because no message reports the setting; VFR_HUD has what the vehicle measures.
-        ArduPlane applies it in GUIDED and AUTO, within AIRSPEED_MIN and AIRSPEED_MAX, and refuses it otherwise. PX4
-        applies it in modes that navigate, and accepts it always. ``set_speed`` changes the ground speed.
+        Returns at the acknowledgement, because no message reports the setting. VFR_HUD reports the measured airspeed.
+        ArduPlane accepts the command in GUIDED and AUTO, for airspeeds from AIRSPEED_MIN to AIRSPEED_MAX. PX4 always
+        accepts it, but applies it only in modes that navigate. ``set_speed`` changes the ground speed.
 
         Raises:
-            InvalidArgument: out of range. Nothing was sent.
-            NotSupported: this firmware cannot change this speed, or has no wings. Nothing was sent.
+            InvalidArgument: the airspeed is out of range. Nothing was sent.
+            NotSupported: this firmware cannot change the airspeed, or the vehicle has no wings. Nothing was sent.
             CommandRejected: the vehicle refused.
             CommandTimeout: there was no acknowledgement.
         """
         await self._set_speed("set_airspeed", SpeedType.AIRSPEED, airspeed_m_s)
 
     async def set_climb_speed(self, climb_m_s: float) -> None:
-        """Change the speed of climbs in m/s, above 0 (MAV_CMD_DO_CHANGE_SPEED, SPEED_TYPE_CLIMB_SPEED).
+        """Change the climb speed in m/s, above 0 (MAV_CMD_DO_CHANGE_SPEED, SPEED_TYPE_CLIMB_SPEED).
 
-        Returns at the acknowledgement, because no message reports the setting. ArduCopter applies it in GUIDED, AUTO
-        and RTL until the mode changes, and refuses it otherwise. PX4 would take it for the cruise speed. Raises as
-        :meth:`set_airspeed`.
+        Returns at the acknowledgement, because no message reports the setting. ArduCopter accepts the command in
+        GUIDED, AUTO and RTL, and applies it until the mode changes. PX4 is not supported, because it would change the
+        cruise speed instead. Raises as :meth:`set_airspeed`.
         """
         await self._set_speed("set_climb_speed", SpeedType.CLIMB_SPEED, climb_m_s)
 

@@ -1,4 +1,4 @@
-"""Commands, messages and subscriptions beyond the vehicle's actions, and the quality of its link."""
+"""Raw commands, messages and subscriptions, and the quality of the vehicle's link."""
 
 from __future__ import annotations
 
@@ -157,12 +157,13 @@ class MessagingActions(VehicleBase):
             params: param1 to param7; missing ones are 0, or NaN where the command allows it.
             component_id: the target component instead of the autopilot; 0: all components, and the autopilot's ack
                 counts.
-            retries: how often it is sent again without an ack, from 0; ``confirmation`` increments each time. A
-                command that changes something is sent again only right after a HEARTBEAT that shows no other mode, no
-                failsafe, and no newer order (docs/reliability.md). None: 3 for a request that changes nothing but
-                streams, 0 for all others, because they would be executed twice if only the ack was lost.
-            attempt_timeout: seconds to wait for an ack after each transmission, above 0, and at least two measured
-                round trips; None: 1, or 4 if it is sent once.
+            retries: maximum number of retransmissions without an ack, from 0; ``confirmation`` increments each time. A
+                command that changes something is sent again only right after a HEARTBEAT, and only if the mode has not
+                changed, no failsafe is active and there is no newer order (docs/reliability.md). None: 3 for a request
+                that changes nothing but streams, 0 for all other commands, because a lost ack would cause a second
+                execution.
+            attempt_timeout: seconds to wait for an ack after each transmission, above 0. aerokit waits for at least two
+                measured round trips. None: 1, or 4 if the command is sent only once.
             progress_timeout: seconds to wait for the next ack after each IN_PROGRESS; calibrations can take long.
             on_progress: called with 0–100, or None, for each IN_PROGRESS.
 
@@ -199,9 +200,9 @@ class MessagingActions(VehicleBase):
     ) -> CommandAck:
         """Send any MAV_CMD as COMMAND_INT: param1 to param4, ``x``, ``y``, ``z`` in ``frame`` (MAV_FRAME).
 
-        ``x`` and ``y`` are latitude and longitude in 1e-7 degrees, or 1e-4 m in local frames; ``z`` is in metres.
-        With ``or_long``, firmware that does not support the command as COMMAND_INT gets a COMMAND_LONG with degrees;
-        this requires frame 0. All else as for :meth:`command`.
+        ``x`` and ``y`` are latitude and longitude in 1e-7 degrees, or 1e-4 m in local frames; ``z`` is in metres. With
+        ``or_long``, firmware that does not support the command as COMMAND_INT gets a COMMAND_LONG with degrees; this
+        requires frame 0. Other arguments and errors are those of :meth:`command`.
         """
         if or_long and frame != MavFrame.GLOBAL:
             raise InvalidArgument(f"frame = {frame} is not allowed with or_long: MAV_FRAME_GLOBAL (0)")
@@ -224,8 +225,8 @@ class MessagingActions(VehicleBase):
     def send(self, message: Message) -> None:
         """Send one message unchanged, once; never blocks. The caller sets its ``target_system``.
 
-        A steering command and SET_MODE are orders and end the action in progress, as with :meth:`command`. A set-point
-        supersedes :meth:`posted` orders about motion. Messages to another system do neither.
+        A steering command or SET_MODE is an order, and ends the action in progress, as with :meth:`command`. A
+        set-point supersedes :meth:`posted` orders about motion. A message to another system has neither effect.
 
         Raises:
             InvalidArgument: a field is out of range; nothing was sent.
@@ -235,9 +236,7 @@ class MessagingActions(VehicleBase):
         self.note_sent(message)
 
     def note_sent(self, message: Message) -> None:
-        """Register a message that the program sent to the vehicle by ``connection.send``; it counts as sent by
-        :meth:`send`.
-        """
+        """Register a message that the program sent by ``connection.send``, as if it had called :meth:`send`."""
         target = getattr(message, "target_system", self.system_id)
         subjects = subjects_of(message) if target in (ALL_SYSTEMS, self.system_id) else ()
         if subjects == ARM_ALONE and isinstance(message, (CommandInt, CommandLong)):
@@ -260,22 +259,24 @@ class MessagingActions(VehicleBase):
     ) -> Iterator[PostedOrder]:
         """Open an order without waiting for its effect, so that mode, arming and take-off can be sent in one go.
 
-        Within the block its commands are sent again right after a HEARTBEAT until they are acknowledged or their
-        effect is reported. Retries end with a newer order about the same subject, with a mode that neither this order
-        nor an order of the last ten seconds explains and, for orders about motion, with disarming. An abandoned order
-        does not make the vehicle hold, and late arming is not monitored; use the actions for that.
+        Within the block, the order's commands are sent again right after a HEARTBEAT, until they are acknowledged or
+        their effect is reported. Retries end with a newer order about the same subject; with a mode that neither this
+        order nor another order of the last ten seconds explains; and, for orders about motion, with disarming. An
+        abandoned posted order does not make the vehicle hold, and late arming is not monitored; use the actions for
+        that.
 
         Args:
-            subjects: ``"mode"``, ``"motion"`` or ``"arm"``; the first one is what the order is about, and it also
-                ends orders about the others. An order about mode or motion ends the action in progress.
-            modes: the modes that it brings about.
-            armed: True if it arms, False if it disarms; required for ``"arm"``.
+            subjects: ``"mode"``, ``"motion"`` or ``"arm"``. A newer order about the first subject ends this order; this
+                order ends earlier ones about any of its subjects. An order about mode or motion also ends the action in
+                progress.
+            modes: the modes that the order leads to.
+            armed: True if the order arms the vehicle, False if it disarms it; required for ``"arm"``.
 
         Raises:
             InvalidArgument: no subject, or ``"arm"`` without ``armed``. Nothing was sent.
         """
         if not subjects:
-            raise InvalidArgument("posted: no subject is given: mode, motion or arm")
+            raise InvalidArgument("posted: subjects are missing: pass 'mode', 'motion' or 'arm'")
         if "arm" in subjects and armed is None:
             raise InvalidArgument("posted: subject 'arm' requires armed=True or armed=False")
         with (
@@ -295,10 +296,10 @@ class MessagingActions(VehicleBase):
     ) -> Subscription[ItemT]:
         """Return a stream of messages or events of this vehicle, for use in a ``with`` block.
 
-        ``capacity=1`` keeps the latest only; ``missed`` counts the others. Subscribing also requests the rate: while
-        the block lasts, the autopilot is asked to send these messages at ``rate_hz`` (above 0, at most 1000), or
-        faster if another subscriber needs it. None requests the default rate of streamed messages; messages sent on
-        demand (HEARTBEAT, STATUSTEXT, acks) are not requested. For a camera or another component use
+        ``capacity=1`` keeps only the latest message; ``missed`` counts the dropped ones. For the duration of the block,
+        aerokit requests these messages from the autopilot at ``rate_hz`` (above 0, at most 1000), or faster if another
+        subscriber needs it. None requests the default rate of streamed messages; messages sent on demand (HEARTBEAT,
+        STATUSTEXT, acks) are not requested. For a camera or another component use
         ``vehicle.component(100).subscribe(...)``.
 
         Raises:

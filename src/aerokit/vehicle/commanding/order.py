@@ -51,7 +51,7 @@ CHANGED_BY_COMMAND: Mapping[int, tuple[Subject, ...]] = {
     MavCmd.DO_PAUSE_CONTINUE: _MOTION,
     MavCmd.COMPONENT_ARM_DISARM: ARM_ALONE,
 }
-"""MAV_CMD → the subjects that a command sent by the program itself changes. It supersedes actions about them."""
+"""Maps MAV_CMD to the subjects that it changes. A raw command supersedes actions about these subjects."""
 CHANGED_BY_MESSAGE: Mapping[str, tuple[Subject, ...]] = {
     "SET_MODE": _MODE,
     "SET_ATTITUDE_TARGET": _MOTION,
@@ -63,7 +63,7 @@ FAILSAFE_STATES = (MavState.CRITICAL, MavState.EMERGENCY, MavState.FLIGHT_TERMIN
 """HEARTBEAT.system_status values while a failsafe is active. PX4 reports them seconds before the failsafe changes the
 mode (COM_FAIL_ACT_T), and an order that arrives in that time cancels the failsafe.
 """
-# MISSION_ITEM.current of an item that the vehicle flies to at once.
+# Values of MISSION_ITEM.current for an item that the vehicle flies to at once.
 GUIDED_ITEM = (2, 3)
 REQUEST_COMMANDS = frozenset(
     (
@@ -80,7 +80,7 @@ REQUEST_COMMANDS = frozenset(
         MavCmd.REQUEST_FLIGHT_INFORMATION,
     )
 )
-"""MAV_CMDs that only request data. They change nothing but streams, so they are sent again until acknowledged."""
+"""MAV_CMDs that only request data. They change nothing but streams, so they may be repeated until acknowledged."""
 
 
 def subjects_of(message: Message) -> tuple[Subject, ...]:
@@ -94,7 +94,7 @@ def subjects_of(message: Message) -> tuple[Subject, ...]:
 
 
 def is_worse(state: int, before: int | None) -> bool:
-    """Return True if this MAV_STATE reports a failsafe that the previous one did not, or a more severe one."""
+    """Return True if this MAV_STATE reports a failsafe, and the previous one reported none or a less severe one."""
     is_first = before is None or before not in FAILSAFE_STATES
     return state in FAILSAFE_STATES and (is_first or state > (before or 0))
 
@@ -108,15 +108,19 @@ def failsafe_text(state: int) -> str:
 class Order:
     """One order of this program, from its creation until it is done, superseded or taken over.
 
-    A newer order about any topic in ``ended_by`` supersedes it. An order that the arbiter updates with the vehicle's
-    HEARTBEATs also ends when another party acts: an unexpected mode, a failsafe, disarming, a reboot. It does not
-    become valid again, even if the mode comes back.
+    A newer order about any topic in ``ended_by`` supersedes this one. The arbiter updates the order with each
+    HEARTBEAT; an unexpected mode, a failsafe, disarming or a reboot ends it. It does not become valid again, even if
+    the mode comes back.
 
-    Modes are classified as follows. ``mode_before`` was active when the order was given, ``modes`` are the order's
-    own, ``expected`` modes may still appear because the program ordered them shortly before, in any sequence until
-    ``settles_at``. Until ``any_until`` every mode is accepted, because the program sent a raw command with an unknown
-    effect. Any other mode is attributed to the pilot or a failsafe. Expected modes are no longer accepted once an own
-    mode is reported; with ``requires_mode_change`` only after a change to it, not if the vehicle was in it already.
+    Modes are classified as follows:
+
+    - ``mode_before`` was active when the order was given.
+    - ``modes`` are the order's own modes.
+    - ``expected`` modes may appear, in any sequence until ``settles_at``, because the program ordered them shortly
+      before. After a report of an own mode they are no longer accepted; with ``requires_mode_change``, that report must
+      differ from the previous mode.
+    - Until ``any_until`` every mode is accepted, because the program sent a raw command with an unknown effect.
+    - Any other mode is attributed to the pilot or a failsafe.
     """
 
     def __init__(
@@ -144,22 +148,22 @@ class Order:
         self.ended_by: tuple[Topic, ...] = tuple(ended_by)
         self.modes: tuple[Mode, ...] = tuple(modes)
         self.armed = armed
-        """True if it arms, False if it disarms, None if it does neither."""
+        """True if the order arms the vehicle, False if it disarms it, None if it does neither."""
         self.may_move = False
-        """True once the vehicle may move because of it, or because of an earlier order: if abandoned, the vehicle
-        must hold.
+        """True once the vehicle may move because of this order or an earlier one, so that it must hold if the order is
+        abandoned.
         """
         self.was_refused: bool = False
-        """True if the vehicle refused it, and therefore continues its previous task."""
+        """True if the vehicle refused the order, and therefore continues its previous task."""
         self.was_flown_before: bool = False
         """True if the vehicle was executing an order of this program before this one."""
         self.before: Order | None = None
         """The previous order about the same device, which becomes valid again if this one is withdrawn."""
         self.is_withdrawn: bool = False
         self.takeover_reason: str = ""
-        """The action of another party that ended it, as a clause; empty if there was none."""
+        """The action of another party that ended the order, as a clause; empty if there was none."""
         self.failsafe: str = ""
-        """The failsafe that became active since, as a clause; empty if none did."""
+        """The failsafe that became active after the order, as a clause; empty if there was none."""
         self.unexplained: str = ""
         """A mode change that may be the effect of a raw command or a pilot's action, as a clause; empty if there was
         none.
@@ -167,9 +171,9 @@ class Order:
         self.has_lost_mode: bool = False
         """True if the mode was changed to one that the order does not explain."""
         self.mode_lost_at: float = -math.inf
-        """Time of that change. CURRENT_MODE reports it before the HEARTBEAT that may also report disarming."""
+        """Time of that change, which CURRENT_MODE reports before a HEARTBEAT does, which may also report disarming."""
         self.is_confirmed: bool = False
-        """True once a change to one of its modes, or to its armed state, was reported."""
+        """True once a change to one of the order's modes, or to its armed state, was reported."""
         self._before = set() if mode_before is None else {mode_before.custom_mode} - set(expected)
         self._mode_now = None if mode_before is None else mode_before.custom_mode
         self._expected = set(expected)
@@ -184,7 +188,7 @@ class Order:
 
     @property
     def is_newest(self) -> bool:
-        """Return True while no newer order supersedes it."""
+        """Return True while no newer order supersedes this one."""
         return self._is_newest(self)
 
     @property
@@ -221,7 +225,7 @@ class Order:
     # -------------------------------------------------------------------- vehicle reports
 
     def on_mode(self, mode: Mode, at: float) -> None:
-        """Process the mode reported at this time. Once in an own mode, a return to the previous mode is a takeover."""
+        """Process the mode reported at this time. After an own mode, a return to the previous mode is a takeover."""
         number, is_known = mode.custom_mode, self._mode_now is not None
         is_change = is_known and number != self._mode_now
         self.is_confirmed = self.is_confirmed or (is_change and number in self._own)
@@ -264,10 +268,10 @@ class Order:
 
 
 class SentCommand:
-    """One command of an order after its first transmission. Decides whether it may be sent again.
+    """One command of an order after its first transmission, which decides about retransmissions.
 
-    It may be sent again while the vehicle has reported neither its effect nor an action of another party. A change to
-    one of ``modes``, or to ``armed``, is an effect; ``is_done`` reports any other effect.
+    The command may be sent again while the vehicle has reported neither the command's effect nor an action of another
+    party. A change to one of ``modes``, or to ``armed``, is the effect; ``is_done`` reports any other effect.
     """
 
     def __init__(
@@ -288,13 +292,13 @@ class SentCommand:
         self._modes = {mode.custom_mode for mode in modes}
         self._armed_now = armed_now
         self.arms = armed
-        """True if it arms, False if it disarms, None if it does neither."""
+        """True if the command arms the vehicle, False if it disarms it, None if it does neither."""
         self._is_overruled = False
         self._is_done = is_done
 
     @property
     def is_confirmed(self) -> bool:
-        """True once its effect was reported."""
+        """True once the command's effect was reported."""
         self._is_reported = self._is_reported or self._is_done()
         return self._is_reported
 

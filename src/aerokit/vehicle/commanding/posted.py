@@ -1,4 +1,4 @@
-"""`PostedOrder`: an order that does not delay the next one, because its effect need not be awaited."""
+"""`PostedOrder`: an order whose effect need not be awaited, so that the next one can be given at once."""
 
 from __future__ import annotations
 
@@ -54,9 +54,10 @@ class PostedOrder:
         return "its effect was reported" if self._order.is_confirmed else self._order.end or self._order.unexplained
 
     async def command(self, command: int, *params: float, component_id: int | None = None) -> None:
-        """Send a COMMAND_LONG of this order; returns when it is acknowledged or the order's effect is reported.
+        """Send a COMMAND_LONG of this order; returns at the acknowledgement, or when the order's effect is reported.
 
-        It is not sent again after a newer order about the same subject, or after another party changed the mode.
+        The command is not sent again after a newer order about the same subject, or after another party changed the
+        mode.
 
         Args:
             command: the MAV_CMD.
@@ -138,10 +139,10 @@ class PostedOrder:
         return False
 
     async def wait_confirmed(self, timeout: float) -> None:
-        """Wait until HEARTBEAT reports the order's effect; returns at once if it was in effect already.
+        """Wait until HEARTBEAT reports the order's effect, which may be at once.
 
         Raises:
-            CommandRejected: the vehicle accepted first and refused then, as PX4 may do.
+            CommandRejected: the vehicle first accepted and then refused, as PX4 may do.
             OperationTimeout: the effect was not reported within ``timeout`` seconds.
         """
         await self._sender.await_effect(

@@ -30,7 +30,10 @@ POSITION_MAX_AGE_S = 2.0
 STALL_TIMEOUT_S, STALL_DISTANCE_M = 12.0, 0.3
 
 FALL_SINK_M_S = 3.0
-"""A faster descent is mentioned when the vehicle does not move any more; autopilots descend at 1.5 m/s by default."""
+"""Speed from which a descent is considered a fall; autopilots descend at 1.5 m/s by default."""
+
+FALL_EVIDENT_S = 0.5
+"""After falling for this time, a vehicle sinks faster than ``FALL_SINK_M_S``, even with air resistance."""
 
 FALL_STOP_S = 1.5
 """A fast descent that ends within this time is a fall, if the vehicle then stands still on the ground."""
@@ -52,10 +55,10 @@ async def await_progress(
     changes.
 
     Raises:
-        OperationRejected: ``trouble()`` returned a reason why it cannot succeed.
+        OperationRejected: ``trouble()`` returned a reason why the operation cannot succeed.
         HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds (None: silence is ignored).
-        OperationTimeout: ``timeout`` seconds have passed, or ``stillness()`` reports that it does not move; the text
-            includes ``describe()``.
+        OperationTimeout: ``timeout`` seconds have passed, or ``stillness()`` reports that the vehicle does not move;
+            the error text includes ``describe()``.
         ConnectionClosed, LinkLost: the connection ended.
     """
     started = reasons_from = session.connection.now()
@@ -84,7 +87,7 @@ async def await_progress(
 
 
 def _height_when_disarmed(session: VehicleSession) -> str:
-    """Return the height of a vehicle that is disarmed in the air, as a clause, else an empty string."""
+    """Return the height of a vehicle that is disarmed in the air, as a clause; empty otherwise."""
     here = session.telemetry.position.latest
     height_m = None if here is None else here.altitude_relative_m
     is_falling = session.telemetry.is_confirmed_disarmed and height_m is not None and height_m > 1.0
@@ -121,7 +124,7 @@ class ChangeSignal:
 
 
 class StallDetector:
-    """Detects a vehicle that has accepted an order to move and does not move.
+    """Detects that a vehicle does not move although it has accepted an order to move.
 
     It reports nothing without positions, nor before ``STALL_TIMEOUT_S`` seconds, because a vehicle may turn or spool
     up.
@@ -151,7 +154,7 @@ class StallDetector:
             self._from, self._since = here, now
             self._record_descent(here)
         elif now - self._since >= timeout_s:
-            return f"it accepted the order and has not moved for {now - self._since:.0f} s{self._reason(here)}"
+            return f"the vehicle accepted the order and has not moved for {now - self._since:.0f} s{self._reason(here)}"
         return None
 
     def _record_descent(self, here: Position) -> None:
@@ -183,7 +186,7 @@ MAX_DISTANCE_M = 100_000.0
 
 
 CIRCLE_MARGIN = 1.3
-"""Part of its radius within which a vehicle flies a circle."""
+"""Multiple of the ordered radius within which the vehicle counts as on its circle."""
 
 
 class VehiclePosition:
@@ -277,7 +280,7 @@ class VehiclePosition:
 
         The frame is MAV_FRAME_GLOBAL_RELATIVE_ALT_INT or MAV_FRAME_GLOBAL_INT.
 
-        PX4 takes altitudes above mean sea level only, so an altitude relative to home requires a known home.
+        PX4 accepts only altitudes above mean sea level, so an altitude relative to home requires a known home.
         """
         relative, amsl = target.altitude_relative_m, target.altitude_amsl_m
         if relative is None and amsl is None:

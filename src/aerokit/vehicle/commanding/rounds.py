@@ -1,4 +1,4 @@
-"""`RoundFlight`: flies around a place, by a command of the firmware or by set-points, and counts the rounds."""
+"""`RoundFlight`: flies around a place, by a firmware command or by set-points, and counts the rounds."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ if TYPE_CHECKING:
 
 SETPOINT_INTERVAL_S, SETPOINT_RATE_HZ, VALID_FOR_S = 0.1, 20.0, 1.0
 RADIUS_ERROR_M, CIRCLE_REPORT_S = 0.5, 2.0
-"""Deviation that is another radius, and seconds in which PX4 may still report the previous circle."""
+"""Deviation from which the radius counts as wrong, and seconds for which PX4 may still report the previous circle."""
 LAG_ROUNDS = 0.02
-"""Part of a round by which a vehicle at the end of its path may have been counted too little."""
+"""Fraction of a round that the count may lack although the vehicle is at the end of its path."""
 END_TIMEOUT_S = 15.0
 """Seconds to reach the end of a path after its last set-point."""
 FRAME_TIMEOUT_S = 5.0
-"""Seconds to wait for the local position, which set-points are relative to."""
+"""Seconds to wait for the local position, because set-points are in the local frame."""
 
 
 class RoundFlight:
-    """One flight around a place, or to it if there is no ``counter``; ``rounds`` None means until it is cancelled.
+    """One flight around a place, or to it if there is no ``counter``. Without ``rounds`` it goes on until cancelled.
 
-    ``limits``: max_distance_m, timeout and max_silence_s. The constructor raises if the vehicle cannot fly there.
+    ``limits`` are max_distance_m, timeout and max_silence_s. The constructor raises if the vehicle cannot fly there.
     """
 
     def __init__(
@@ -79,9 +79,9 @@ class RoundFlight:
         stay_s: float = 0.0,
         circle_m: float = 0.0,
     ) -> None:
-        """Send the command and wait until the rounds are flown and ``stay_s`` seconds have passed.
+        """Send the command, and wait until the rounds are flown and another ``stay_s`` seconds have passed.
 
-        Then hold if ``is_held``, or go on with a circle of this radius.
+        At the end, the vehicle holds if ``is_held``, or goes on with a circle of radius ``circle_m``.
         """
         context, cleanup = self._context, self._context.flight_cleanup
         hold = context.sender.mode_for(self._what, "hold")
@@ -110,10 +110,12 @@ class RoundFlight:
         stall, stays = StallDetector(session), self._context.sender.stays_in(order, mode)
 
         def on_status(status: OrbitExecutionStatus) -> None:
-            """Recognise that PX4 flies another radius: it accepts one that it does not allow."""
+            """Recognise a wrong radius: PX4 accepts a radius above its limit, but flies another one."""
             flown_m = abs(status.radius)
             is_wrong = circle_m and abs(flown_m - circle_m) > RADIUS_ERROR_M
-            self._wrong_circle = f"it flies a circle of {flown_m:.1f} m instead of {circle_m:g} m" if is_wrong else ""
+            self._wrong_circle = (
+                f"the vehicle flies a circle of {flown_m:.1f} m instead of {circle_m:g} m" if is_wrong else ""
+            )
 
         def trouble() -> str | None:
             refusals = filter(session.autopilot.is_refusal, session.texts_since(order.given_at))
@@ -159,7 +161,7 @@ class RoundFlight:
     def _describe(self) -> str:
         away_m = self._context.vehicle_position.remaining_distance(self._center)
         done = "" if self._counter is None else f"{self._counter.rounds:.2f} of {self._rounds:g} rounds were flown, "
-        return f"{done}it is {away_m:.1f} m from the place"
+        return f"{done}the vehicle is {away_m:.1f} m from the place"
 
     def _offset(self, place: Position) -> Vector:
         center = self._center
@@ -182,7 +184,7 @@ class RoundFlight:
             raise OperationTimeout(f"{self._what}: not done within {self._timeout:g} s; {self._describe()}")
 
     async def _path_flight(self, path: ClosedPath, speed_m_s: float, facing: str) -> PathFlight:
-        """Convert the center to the vehicle's local frame, by its present position in both."""
+        """Convert the center to the local frame, by the vehicle's present position in both frames."""
         local, since = self._telemetry.local_position, self._session.connection.now()
         place = await local.wait_until(lambda _: local.updated_at >= since, timeout=FRAME_TIMEOUT_S)
         here = self._telemetry.position.fresh(POSITION_MAX_AGE_S)

@@ -1,4 +1,4 @@
-"""`OrderSender`: the command sequences of all orders: single commands, mode changes, arming."""
+"""`OrderSender`: sends the commands of orders: single commands, mode changes, arming."""
 
 from __future__ import annotations
 
@@ -167,7 +167,7 @@ class OrderSender:
         ``refusals``.
 
         Raises:
-            CommandRejected: the vehicle accepted first and refused then.
+            CommandRejected: the vehicle first accepted and then refused.
             OperationRejected: ``trouble()`` returned a reason.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the effect was not reported within ``timeout`` seconds.
@@ -206,8 +206,8 @@ class OrderSender:
         return mode
 
     def stays_in(self, order: Order, *modes: Mode) -> Callable[[], str | None]:
-        """Return a function that reports why the order cannot succeed: superseded, disarmed, or in a mode not listed
-        here.
+        """Return a function that reports why the order cannot succeed: it was superseded, or the vehicle is disarmed or
+        in another mode.
         """
         grace_until, settles_at = self._session.connection.now() + MODE_GRACE_S, self._arbiter.mode_settles_at
         arrived = False
@@ -229,7 +229,7 @@ class OrderSender:
         return trouble
 
     def stays_until_disarmed(self, order: Order) -> Callable[[], str | None]:
-        """Like :meth:`stays_in` the modes of the order, for one that ends by disarming, which may change the mode."""
+        """Like :meth:`stays_in` with the order's modes, for an order that ends by disarming."""
         stays, armed = self.stays_in(order, *order.modes), self._session.telemetry.armed
 
         def trouble() -> str | None:
@@ -278,7 +278,7 @@ class OrderSender:
 
     @contextmanager
     def _own_order(self, command: int, modes: Collection[Mode]) -> Iterator[Order]:
-        """Register a raw command as an order: it supersedes those of actions if it steers."""
+        """Register a raw command as an order, which supersedes actions if it steers."""
         if CHANGED_BY_COMMAND.get(command, ARM_ALONE) != ARM_ALONE:
             yield self._arbiter.raw_order(CHANGED_BY_COMMAND[command], modes=modes)
         else:

@@ -46,11 +46,11 @@ VECTORS = {
     IGNORE_VELOCITY: ("north_m_s", "east_m_s", "down_m_s"),
     IGNORE_ACCELERATION: ("north_m_s2", "east_m_s2", "down_m_s2"),
 }
-"""Fields of the vectors in SET_POSITION_TARGET_LOCAL_NED, by the bits that ignore them."""
+"""Maps the bits that ignore a vector in SET_POSITION_TARGET_LOCAL_NED to its fields."""
 ZERO = (0.0, 0.0, 0.0)
 IGNORE_BODY_RATES, IGNORE_ATTITUDE = 0x07, 0x80
 ACTUATORS_PER_GROUP, MAX_BODY_RATE_DEG_S = 8, 3600.0
-# Below this speed, or within this many arrival radii, a vehicle that obeys may stand still.
+# Below this speed, or within this many arrival radii, a vehicle that follows its set-point may stand still.
 SLOW_M_S, MAX_RESTING_RADII = 0.3, 2.0
 
 
@@ -157,7 +157,7 @@ LocalSetpoint = VelocitySetpoint | AccelerationSetpoint | LocalPositionSetpoint 
 
 
 def wants_motion(setpoint: object, context: VehicleContext) -> bool:
-    """Return True if a vehicle that obeys this set-point must move now; False if unknown."""
+    """Return True if a vehicle that follows this set-point must move now; False if unknown."""
     if isinstance(setpoint, (VelocitySetpoint, TrajectorySetpoint)):
         return math.hypot(setpoint.north_m_s, setpoint.east_m_s, setpoint.down_m_s) >= SLOW_M_S
     if isinstance(setpoint, BodyVelocitySetpoint):
@@ -195,9 +195,8 @@ class SetpointEncoder:
     def body_velocity(self, s: BodyVelocitySetpoint) -> Message:
         """Return SET_POSITION_TARGET_LOCAL_NED with a velocity in MAV_FRAME_BODY_NED.
 
-        With a heading for ArduPilot it is converted to MAV_FRAME_LOCAL_NED by the present heading: in
-        MAV_FRAME_BODY_NED ArduPilot adds each yaw to the previous target, and correcting that by telemetry
-        oscillates.
+        For ArduPilot, a set-point with a heading is converted to MAV_FRAME_LOCAL_NED by the present heading: in
+        MAV_FRAME_BODY_NED, ArduPilot adds each yaw to the previous target, and a correction by telemetry oscillates.
         """
         forward, right, frame = s.forward_m_s, s.right_m_s, MavFrame.BODY_NED
         if s.yaw_deg is not None and self._session.autopilot.setpoints.body_yaw_is_relative:
@@ -211,7 +210,7 @@ class SetpointEncoder:
     def position(self, s: PositionSetpoint, velocity: tuple[float, float, float] | None = None) -> Message:
         """Return SET_POSITION_TARGET_GLOBAL_INT, relative to home or above mean sea level.
 
-        ``velocity`` is that of the place, in m/s north, east, down.
+        ``velocity`` is the velocity of the position itself, in m/s north, east, down.
         """
         mask, yaw, yaw_rate = _yaw(s.yaw_deg, s.yaw_rate_deg_s)
         mask |= IGNORE_ACCELERATION | (IGNORE_VELOCITY if velocity is None else 0)

@@ -1,8 +1,9 @@
-"""``SimpleOrder``: an order that is one command, declared as one table row.
+"""``SimpleOrder``: an order that consists of one command, declared as a row of a table.
 
-A row has the command, its parameters with units and ranges, and the message that reports its effect. Whether a firmware
-has the command is in `aerokit.autopilots` (``unsupported_commands``), and whether it may be repeated in
-`aerokit.protocols.command`. A method that gives the order documents its arguments, as in ``devices/actuators.py``.
+A row has the command, its parameters with units and ranges, and the message that reports its effect.
+`aerokit.autopilots` lists the commands that a firmware does not support (``unsupported_commands``), and
+`aerokit.protocols.command` those that may be repeated. The method that gives the order documents its arguments, as in
+``devices/actuators.py``.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ EFFECT_POLL_S = 0.4
 class Argument(Snapshot):
     """One parameter of a command that the caller chooses.
 
-    ``name`` has the unit, as the argument of the public method. With ``above``, ``minimum`` itself is invalid.
+    ``name`` is the argument of the public method, with its unit. With ``above``, ``minimum`` itself is invalid.
     """
 
     name: str
@@ -63,9 +64,9 @@ class Effect(Snapshot):
 class SimpleOrder(Snapshot):
     """One command with its parameters and its effect.
 
-    ``name`` is that of the public method, for error texts. In ``params``, an `Argument` takes the next value that
-    ``send`` is called with; a number is sent as it is. Without ``effect``, the acknowledgement ends the order, because
-    no message reports its effect.
+    ``name`` is the public method, for error texts. In ``params``, a number is sent unchanged, and an `Argument` stands
+    for the next value that is passed to ``send``. Without ``effect``, the acknowledgement ends the order, because no
+    message reports its effect.
     """
 
     name: str
@@ -99,9 +100,9 @@ class SimpleOrder(Snapshot):
 
         Args:
             context: the vehicle.
-            values: one for each `Argument`, in order. `Effect.is_reported` gets them, too.
-            of: the order to a device of which this is a further command.
-            topic: the device that the command is for. A newer order with the same topic ends the wait for this one.
+            values: one for each `Argument`, in order; they are also passed to `Effect.is_reported`.
+            of: an earlier order to the device, if this is a further command of it.
+            topic: key of the device that the command is for. A newer order with the same topic ends this call.
             component_id: the target component; None: the autopilot.
             timeout: seconds after the acknowledgement until a message must report the effect.
 
@@ -111,7 +112,7 @@ class SimpleOrder(Snapshot):
             CommandRejected: the vehicle refused.
             CommandTimeout: there was no acknowledgement.
             OperationRejected: a newer order for the same device was given.
-            HeartbeatTimeout: the vehicle was silent for ten seconds while its effect was awaited.
+            HeartbeatTimeout: the vehicle was silent for ten seconds after the acknowledgement.
             OperationTimeout: the effect was not reported in time.
         """
         params = self.wire_params(*values)
@@ -171,7 +172,7 @@ class SimpleOrder(Snapshot):
         target: int,
         timeout: float,
     ) -> None:
-        """Request the message until it reports the effect. The ack must do if the vehicle does not have the message."""
+        """Request the message until it reports the effect; return if the vehicle does not have this message."""
         session, message_type = context.session, getattr(m, effect.message)
         reports: list[Message] = []
         is_reported = False
@@ -211,8 +212,8 @@ def _superseded(order: Order | None) -> str | None:
 
 
 async def _has_message(context: VehicleContext, message_id: int, component_id: int) -> bool:
-    """Request a message; return False if the vehicle refuses, because it does not have it."""
-    with suppress(CommandTimeout):  # It may have the message nevertheless.
+    """Request a message; return False if the vehicle refuses, which means that it does not have the message."""
+    with suppress(CommandTimeout):  # The vehicle may have the message nevertheless.
         try:
             await context.session.commands.send_long(
                 MavCmd.REQUEST_MESSAGE, message_id, component_id=component_id, attempts=2, attempt_timeout=1.0

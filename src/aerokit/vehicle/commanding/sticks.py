@@ -1,7 +1,7 @@
-"""`StickStream`: flies the vehicle by the sticks of your program, as a pilot does by those of a transmitter.
+"""`StickStream`: sends stick positions from your program, as a pilot's transmitter does.
 
-MAVLink's MANUAL_CONTROL (https://mavlink.io/en/services/manual_control.html). ArduPilot treats it as an override of
-the transmitter's channels, PX4 as a second source of manual control.
+The stream sends MANUAL_CONTROL (https://mavlink.io/en/services/manual_control.html). ArduPilot treats this message as
+an override of the transmitter's channels, PX4 as a second source of manual control.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
 __all__ = ["StickInput", "StickStream"]
 
-# An axis without a value: ArduPilot releases its channel (GCS_Common.cpp, manual_override).
+# Value of an axis that has none: ArduPilot releases the axis's channel (GCS_Common.cpp, manual_override).
 NO_VALUE = 0x7FFF
-# RC_CHANNELS_OVERRIDE: release a channel (1 to 8, and 9 to 18), or leave it as it is.
+# Values of RC_CHANNELS_OVERRIDE: release a channel (1 to 8), release a channel (9 to 18), leave it unchanged.
 RELEASED, RELEASED_UPPER, UNCHANGED = 0, 0xFFFE, 0xFFFF
 # Channels that MANUAL_CONTROL overrides on ArduSub, from 1 (joystick.cpp).
 SUB_CHANNELS = 11
@@ -40,9 +40,9 @@ IGNORE_OVERRIDES = 1 << 1
 class StickInput(Snapshot):
     """Stick positions from −1 to 1; 0 is the centre.
 
-    ``forward`` is the pitch stick, ``right`` the roll stick, ``yaw`` turns clockwise. ``throttle`` −1 is the lowest
-    position: a multicopter that holds its altitude descends, a plane has no thrust; a rover reverses. ``buttons`` is a
-    bit mask (ArduSub has functions for them).
+    ``forward`` is the pitch stick, ``right`` the roll stick; positive ``yaw`` turns clockwise. ``throttle`` −1 is the
+    lowest position: a multicopter in a mode that holds altitude descends, a plane has no thrust, a rover reverses.
+    ``buttons`` is a bit mask; ArduSub has functions for the buttons.
     """
 
     forward: float = 0.0
@@ -56,21 +56,23 @@ class StickInput(Snapshot):
 class StickStream(SteeringStream[StickInput]):
     """Sends the latest stick positions at a fixed rate while the ``async with`` block supplies them.
 
-    Entering the block sends the initial positions for a second and then changes to the mode. Leaving it in any way
-    orders the vehicle to hold and releases the sticks. If the stream stops by itself (no new positions, a blocked event
-    loop, a silent vehicle), ``set`` and leaving the block raise :class:`SetpointStreamStopped`. If a pilot or a
+    Entering the block sends the initial positions for a second and then changes to the mode. Leaving the block in any
+    way orders the vehicle to hold and releases the sticks. If the stream stops by itself (no new positions, a blocked
+    event loop, a silent vehicle), ``set`` and leaving the block raise :class:`SetpointStreamStopped`. If a pilot or a
     failsafe changes the mode, the sticks are released at once and no hold is ordered.
 
     If the program is killed, ArduPilot returns to the transmitter after RC_OVERRIDE_TIME (3 s), and PX4 treats the
-    sticks as lost after COM_RC_LOSS_T (0.5 s). PX4 has no release, so every end of a stream is such a loss: without
-    another source of manual control it acts as NAV_RCL_ACT says (return by default), also in its hold mode unless
-    COM_RCL_EXCEPT has bit 1. ArduCopter without a transmitter acts on the loss as FS_THR_ENABLE says.
+    sticks as lost after COM_RC_LOSS_T (0.5 s). PX4 has no message that releases the sticks, so it treats every end of a
+    stream as a loss. Without another source of manual control, it then acts as NAV_RCL_ACT says (return by default),
+    even in its hold mode unless bit 1 of COM_RCL_EXCEPT is set. ArduCopter without a transmitter acts as FS_THR_ENABLE
+    says.
 
     Entering raises:
         InvalidArgument: a position is out of range. Nothing was sent.
         NotSupported: this type of vehicle has no sticks. Nothing was sent.
-        OperationRejected: a parameter makes the vehicle ignore the sticks, or keep them for ever; the text names it.
-        ParameterTimeout: the vehicle did not report these parameters. Nothing else was sent.
+        OperationRejected: a parameter makes the vehicle ignore the sticks, or never release them; the error text names
+            it.
+        ParameterTimeout: the vehicle did not report the parameters that decide about this. Nothing else was sent.
         CommandRejected: the vehicle refused the mode.
         BusyError: another set-point stream is open.
     """
@@ -94,10 +96,10 @@ class StickStream(SteeringStream[StickInput]):
         self._given_mode = None if mode is None else self._session.autopilot.find_mode(mode, telemetry.mode_names)
 
     def set(self, sticks: StickInput) -> None:
-        """Move the sticks; the positions are sent at the next tick and repeated until ``valid_for_s`` has passed.
+        """Set the stick positions, which are sent at the next tick and repeated until ``valid_for_s`` has passed.
 
         Raises:
-            InvalidArgument: a position is out of range; the previous ones remain in force until they expire.
+            InvalidArgument: a position is out of range; the previous positions stay in force until they expire.
             SetpointStreamStopped: the stream has ended by itself, or the block was left.
         """
         check_kind("sticks", sticks, StickInput)
@@ -110,7 +112,7 @@ class StickStream(SteeringStream[StickInput]):
 
     @property
     def _is_stream_before_mode(self) -> bool:
-        return True  # otherwise the mode would begin with the transmitter's throttle
+        return True  # Otherwise the mode would start with the transmitter's throttle.
 
     def _wanted_mode(self) -> Mode:
         if self._rules is None:
@@ -131,11 +133,11 @@ class StickStream(SteeringStream[StickInput]):
         ground_station = values.get("MAV_GCS_SYSID", values.get("SYSID_MYGCS", own_id))
         if ground_station != own_id:
             raise OperationRejected(
-                f"sticks: ArduPilot accepts them from system {ground_station:g} only (MAV_GCS_SYSID), and this program"
-                f" is system {own_id}: connect with source_system={ground_station:g}"
+                f"sticks: ArduPilot accepts stick positions only from system {ground_station:g} (MAV_GCS_SYSID), and"
+                f" this program is system {own_id}: connect with source_system={ground_station:g}"
             )
         if (seconds := values.get("RC_OVERRIDE_TIME", 3.0)) <= 0:
-            why = "keeps the last position for ever if this program dies" if seconds < 0 else "ignores them"
+            why = "never releases the sticks if this program dies" if seconds < 0 else "ignores stick positions"
             raise OperationRejected(f"sticks: with RC_OVERRIDE_TIME = {seconds:g} ArduPilot {why}; set it to 3")
         if int(values.get("RC_OPTIONS", 0)) & IGNORE_OVERRIDES:
             raise OperationRejected("sticks: bit 1 of RC_OPTIONS makes ArduPilot ignore overrides; clear it")
@@ -154,7 +156,7 @@ class StickStream(SteeringStream[StickInput]):
         self._has_sent = True
 
     def _release(self) -> None:
-        """Return the channels to the transmitter; PX4 has no message for that."""
+        """Release the channels to the transmitter; does nothing for PX4, which has no message for that."""
         if not self._has_sent or self._rules is None or not self._session.connection.is_open:
             return
         self._has_sent = False

@@ -1,6 +1,6 @@
 """`ValueStream`: sends the latest value that the program supplies at a fixed rate, and stops with the program.
 
-`SteeringStream` adds what a stream needs that flies the vehicle: its mode, takeovers, and a hold at the end.
+`SteeringStream` is the base class of streams that fly the vehicle: it adds the mode, takeovers, and a hold at the end.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.commanding.order import Order
 
     Probe = Callable[..., Awaitable[Mapping[str, object]]]
-    """``Parameters.probe``, which is in a room above this one."""
+    """``Parameters.probe``, which this package must not import."""
 
 __all__ = ["MAX_RATE_HZ", "SteeringStream", "TakeoverCheck", "ValueStream", "known_values"]
 
@@ -48,10 +48,12 @@ LEAD_TIME_S = 1.0
 
 @checks_arguments
 class ValueStream(Generic[ValueT]):
-    """Sends the latest value at a fixed rate. It stops when the program no longer supplies values, blocks the event
-    loop, or leaves the block, and when the vehicle falls silent.
+    """Sends the latest value at a fixed rate.
 
-    A subclass enters and leaves the block, and decides what happens when the stream stops by itself.
+    The stream stops when the program no longer supplies values, blocks the event loop, or leaves the block, and
+    when the vehicle falls silent.
+
+    Subclasses implement entering and leaving the block, and what happens when the stream stops by itself.
     """
 
     _NAME, _VALUE = "stream", "value"  # nouns for error texts
@@ -143,7 +145,7 @@ class ValueStream(Generic[ValueT]):
             return f"the event loop was blocked for {lag:.1f} s"
         if age > self._valid_for_s:
             return f"no new {self._VALUE} was supplied for {age:.1f} s (valid_for_s = {self._valid_for_s:g})"
-        # On a connection that has ended, sending raises the reason.
+        # If the connection has ended, the next transmission raises its error.
         if self._session.watch.is_silent and self._session.connection.is_open:
             return f"the vehicle has been silent for {self._session.heartbeat_age:.1f} s"
         return None
@@ -162,7 +164,7 @@ class ValueStream(Generic[ValueT]):
         return False
 
     def _release(self) -> None:
-        """End the effect of the last value, where the vehicle would continue it."""
+        """End the effect of the last value, if the vehicle would keep it."""
 
     def _end(self) -> None:
         """Stop sending."""
@@ -297,8 +299,8 @@ class SteeringStream(ValueStream[ValueT]):
 
 
 class TakeoverCheck:
-    """Refuses to order a mode if another party has changed the mode since an earlier moment of the same call, or the
-    program has given a newer order.
+    """Refuses to order a mode if, since its creation, another party has changed the mode or the program has given
+    another order.
     """
 
     def __init__(self, context: VehicleContext, wanted: Mode) -> None:
@@ -310,7 +312,7 @@ class TakeoverCheck:
         self._take_off, self._hold = (session.autopilot.mode_for(p, is_vtol=is_vtol) for p in ("take_off", "hold"))
 
     def raise_if_changed(self, what: str) -> None:
-        """Raise OperationRejected if the mode has changed, except by the end of a take-off, or an order was given."""
+        """Raise OperationRejected if an order was given, or the mode has changed except by the end of a take-off."""
         if self._arbiter.latest(STEERING) is not self._order:
             raise OperationRejected(f"{what}: {SUPERSEDED} before anything was ordered")
         before, mode = self._before, self._telemetry.mode.latest
@@ -320,7 +322,7 @@ class TakeoverCheck:
 
 
 async def known_values(probe: Probe, *names: str) -> dict[str, float]:
-    """Return the values of those parameters that the vehicle has; raise ParameterTimeout if it did not answer."""
+    """Return the values of the parameters that the vehicle has; raise ParameterTimeout if it does not answer."""
     answers = await probe(*names)
     for answer in answers.values():
         if isinstance(answer, ParameterTimeout):

@@ -1,4 +1,4 @@
-"""Orders that end a flight or the vehicle's operation for good: flight termination and shutdown."""
+"""Flight termination, and shutdown of the autopilot."""
 
 from __future__ import annotations
 
@@ -22,26 +22,26 @@ ONCE: dict[str, Any] = {"attempts": 1, "attempt_timeout": ANSWER_TIMEOUT_S}
 
 @checks_arguments
 class TerminationActions(VehicleBase):
-    """Flight termination and shutdown. Each call names its intent, so that no other call can be mistaken for it."""
+    """Flight termination and shutdown. Each call has to state its intent, to prevent calls by mistake."""
 
     async def terminate(self, *, intent: TerminationIntent, timeout: float = 10.0) -> None:
         """Terminate the flight (MAV_CMD_DO_FLIGHTTERMINATION): **the motors stop, and the vehicle falls**.
 
         Returns when HEARTBEAT reports disarmed, PX4's mode TERMINATION, or MAV_STATE_FLIGHT_TERMINATION. The command is
-        sent at once, also to a silent vehicle, and only once: it is neither repeated nor sent later. A cancelled call
-        may have terminated the flight. PX4 releases its parachute if it has one, and needs a restart afterwards.
-        ArduPlane and Rover refuse it unless AFS_ENABLE is 1 and AFS_TERM_ACTION is 42.
+        sent once and immediately, even to a silent vehicle. It is neither repeated nor sent later. A cancelled call may
+        have terminated the flight. PX4 releases its parachute if it has one, and needs a restart afterwards. ArduPlane
+        and Rover refuse the command unless AFS_ENABLE is 1 and AFS_TERM_ACTION is 42.
 
         Args:
             intent: must be ``"terminate flight"``.
             timeout: seconds for HEARTBEAT to report the termination after the command was accepted.
 
         Raises:
-            InvalidArgument: the intent is another one. Nothing was sent.
+            InvalidArgument: the intent is another text. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts. PX4 refuses while it is disarmed.
             CommandTimeout: there was no acknowledgement; the flight may have been terminated nevertheless.
             HeartbeatTimeout: the vehicle was silent for ten seconds after its acknowledgement.
-            OperationTimeout: it accepted the command, and HEARTBEAT does not report the termination.
+            OperationTimeout: the vehicle accepted the command, but HEARTBEAT does not report the termination.
         """
         modes = self.autopilot.modes_of_command(MavCmd.DO_FLIGHTTERMINATION, (1.0,))
         self._arm_cleanup.stop()
@@ -67,22 +67,23 @@ class TerminationActions(VehicleBase):
         )
 
     async def shutdown(self, *, intent: ShutdownIntent, timeout: float = 15.0) -> None:
-        """Switch the autopilot off (MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN) and wait until its HEARTBEATs end.
+        """Switch the autopilot off, and wait until its HEARTBEATs end (MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN).
 
-        HEARTBEAT counts as ended after 3.5 s, or when the link goes down after the acknowledgement. The command is sent
-        only once. Only a person at the vehicle can switch it on again. A cancelled call may have switched it off.
+        Only a person at the vehicle can switch it on again. HEARTBEATs count as ended after 3.5 s without one, or when
+        the link goes down after the acknowledgement. The command is sent once. A cancelled call may have switched the
+        autopilot off.
 
         Args:
             intent: must be ``"shut down"``.
-            timeout: seconds until it is silent.
+            timeout: seconds until the vehicle is silent.
 
         Raises:
-            InvalidArgument: the intent is another one. Nothing was sent.
+            InvalidArgument: the intent is another text. Nothing was sent.
             NotSupported: this firmware cannot be switched off (ArduPilot). Nothing was sent.
-            OperationRejected: it is armed, or not known to be disarmed. Nothing was sent.
-            CommandRejected: it refused; PX4 does on boards that cannot switch their power off.
-            CommandTimeout: there was no acknowledgement; it may have switched off nevertheless.
-            OperationTimeout: it accepted the command and still sends HEARTBEATs.
+            OperationRejected: the vehicle is armed, or not known to be disarmed. Nothing was sent.
+            CommandRejected: the vehicle refused, as PX4 does on boards that cannot switch their power off.
+            CommandTimeout: there was no acknowledgement; the autopilot may have switched off nevertheless.
+            OperationTimeout: the autopilot accepted the command, but still sends HEARTBEATs.
         """
         if not self.autopilot.can_shut_down:
             raise NotSupported(f"shutdown: {self.autopilot.firmware} cannot be switched off; nothing was sent")
@@ -90,14 +91,14 @@ class TerminationActions(VehicleBase):
         try:
             await self._sender.auxiliary_command(MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, SHUTDOWN, **ONCE)
         except CommandTimeout as error:
-            raise CommandTimeout(f"{error}; it may have switched off nevertheless") from None
+            raise CommandTimeout(f"{error}; the autopilot may have switched off nevertheless") from None
         with suppress(LinkLost):
             await await_progress(
                 self._session,
                 "shutdown",
                 is_done=lambda: self._session.watch.is_silent,
                 trouble=lambda: None,
-                describe=lambda: "it still sends HEARTBEATs",
+                describe=lambda: "the autopilot still sends HEARTBEATs",
                 timeout=timeout,
                 max_silence_s=None,
             )

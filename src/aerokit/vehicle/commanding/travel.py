@@ -53,14 +53,14 @@ class TravelActions(VehicleBase):
         """Fly to a place and return on arrival.
 
         After a cancellation, a time-out or a silence, aerokit orders the vehicle to hold where it is, unless another
-        order was given meanwhile or another party changed the mode. After a silence it waits for the next heartbeat,
-        and orders the hold if the vehicle is still on its way. Sends MAV_CMD_DO_REPOSITION
+        order was given meanwhile or another party changed the mode. After a silence, aerokit waits for the next
+        heartbeat, and orders the hold if the vehicle is still on its way. Sends MAV_CMD_DO_REPOSITION
         (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_REPOSITION), or SET_POSITION_TARGET_GLOBAL_INT to a
         vehicle that does not support it.
 
         Args:
-            target: latitude and longitude, and an altitude above home or above mean sea level; without an altitude
-                the present one is kept, also for ``vehicle.home.value``.
+            target: latitude and longitude, and an altitude above home or above mean sea level. Without an altitude, and
+                for ``vehicle.home.value``, the vehicle keeps its present altitude.
             speed_m_s: ground speed from now on, above 0; None keeps the present one.
             heading_deg: heading on arrival, 0–360 clockwise from north; None leaves it to the autopilot.
             tolerance_m: arrival radius in metres; None: the default of the type of vehicle.
@@ -71,7 +71,7 @@ class TravelActions(VehicleBase):
         Raises:
             InvalidArgument: the target is not on earth or too far away, or another argument is out of range. Nothing
                 was sent.
-            ValueUnknownError: position or home is needed here and not known.
+            ValueUnknownError: the vehicle's position or home is needed, and is not known.
             CommandRejected: the vehicle refused (outside its fence, no position, …).
             OperationRejected: the mode changed (a pilot, a failsafe) or the vehicle disarmed on the way.
             CommandTimeout: there was no acknowledgement.
@@ -140,7 +140,7 @@ class TravelActions(VehicleBase):
         mode: Mode,
         resend: SetPositionTargetGlobalInt | None,
     ) -> None:
-        """Wait for the arrival. The older message has no acknowledgement, so it is repeated meanwhile."""
+        """Wait for the arrival, and meanwhile repeat the order if its message has no acknowledgement."""
         started = sent_at = self.connection.now()
 
         def is_there() -> bool:
@@ -158,7 +158,7 @@ class TravelActions(VehicleBase):
                 f"go_to({target.latitude_deg:.7f}, {target.longitude_deg:.7f})",
                 is_done=is_there,
                 trouble=self._sender.stays_in(order, mode),
-                describe=lambda: f"it is {self._position.remaining_distance(target):.1f} m away",
+                describe=lambda: f"the vehicle is {self._position.remaining_distance(target):.1f} m away",
                 timeout=timeout,
                 max_silence_s=max_silence_s,
                 held_for=0.5,
@@ -168,7 +168,8 @@ class TravelActions(VehicleBase):
     async def set_speed(self, speed_m_s: float) -> None:
         """Change the ground speed in m/s, above 0 (MAV_CMD_DO_CHANGE_SPEED).
 
-        ArduPilot applies it only on the way in GUIDED or AUTO; ``go_to(speed_m_s=...)`` waits for that.
+        ArduPilot applies it only while the vehicle is on its way in GUIDED or AUTO; ``go_to(speed_m_s=...)`` waits for
+        that.
 
         Raises:
             InvalidArgument: out of range. Nothing was sent.
@@ -195,7 +196,7 @@ class TravelActions(VehicleBase):
         Args:
             heading_deg: −360 to 360, clockwise from north; with ``relative`` an angle to turn by, negative to the
                 left.
-            relative: count from the present heading.
+            relative: True to turn by an angle from the present heading.
             rate_deg_s: turn rate in degrees per second; 0 leaves it to the autopilot. PX4 ignores it.
             tolerance_deg: accepted deviation in degrees.
             timeout: seconds until it has the heading.
@@ -204,7 +205,7 @@ class TravelActions(VehicleBase):
         Raises:
             InvalidArgument: out of range. Nothing was sent.
             CommandRejected: the vehicle refused.
-            OperationRejected: the mode changed or it disarmed meanwhile.
+            OperationRejected: the mode changed or the vehicle disarmed meanwhile.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the vehicle did not reach the heading in time.
         """
@@ -221,7 +222,7 @@ class TravelActions(VehicleBase):
             await self._sender.send_long(order, MavCmd.DO_REPOSITION, *params, modes=(mode,))
         else:
             await self._sender.ensure_mode(mode, order)
-            # An absolute heading, not an angle: a repetition does not turn it further.
+            # An absolute heading is sent instead of an angle, so that a repetition does not turn the vehicle further.
             direction = (1 if heading_deg >= 0 else -1) if relative else 0
             await self._sender.send_long(order, MavCmd.CONDITION_YAW, goal, rate_deg_s, direction, 0)
         await self._await_heading(goal, tolerance_deg, timeout, max_silence_s, order, mode)
@@ -247,7 +248,7 @@ class TravelActions(VehicleBase):
                 f"set_heading({goal:g}°)",
                 is_done=lambda: heading.updated_at >= started and off() <= tolerance_deg and not order.end,
                 trouble=self._sender.stays_in(order, mode),
-                describe=lambda: f"it is {off():.0f}° off",
+                describe=lambda: f"the heading is {off():.0f}° off",
                 timeout=timeout,
                 max_silence_s=max_silence_s,
             )
@@ -329,7 +330,7 @@ class LookActions(VehicleBase):
     """Pointing the nose or the gimbal at a place. A new order replaces the previous one."""
 
     async def look_at(self, target: Position | Home) -> None:
-        """Point nose or gimbal at a place until :meth:`stop_looking`; without an altitude, at the vehicle's altitude.
+        """Point nose or gimbal at a place until :meth:`stop_looking`; a place without altitude is at the vehicle's own.
 
         Sends MAV_CMD_DO_SET_ROI_LOCATION (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_ROI_LOCATION), or
         MAV_CMD_DO_SET_ROI to old firmware.
@@ -376,7 +377,7 @@ class LookActions(VehicleBase):
 
     @staticmethod
     def _raise_if_superseded(order: Order) -> None:
-        """Raise if the order was superseded. A mode change by the program does not count: a ROI applies in any mode."""
+        """Raise if the order was superseded. The program may change the mode, because a ROI applies in any mode."""
         if order.end and not order.takeover_reason:
             raise OperationRejected(f"{order.end}; the rest of the order was not sent")
 

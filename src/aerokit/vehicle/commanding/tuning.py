@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 POLL_INTERVAL_S, ANSWER_TIMEOUT_S = 1.0, 1.0
-"""PX4 reports the result for two seconds; the command would start another tuning after that."""
+"""PX4 reports the result for two seconds after the end. Polling later would start another tuning."""
 MAX_ANSWER_AGE_S = 1.5
-"""An older answer does not show that PX4 is still tuning: the program, or its event loop, has paused."""
+"""Maximum age of an answer. If the program or its event loop paused for longer, the tuning may have ended."""
 TUNED_PERCENT = 95
-"""Progress from which PX4 waits for disarming, to save its new gains."""
+"""Progress in percent at which PX4 has finished, and waits for disarming to save its new gains."""
 
 
 @checks_arguments
@@ -30,25 +30,27 @@ class TuningActions(VehicleBase):
     """Automatic tuning."""
 
     async def autotune(self, *, timeout: float = 120.0, on_progress: Callable[[int], object] | None = None) -> None:
-        """Let PX4 tune its controllers (MAV_CMD_DO_AUTOTUNE_ENABLE): **the vehicle shakes about each axis**.
+        """Let PX4 tune its controllers in flight (MAV_CMD_DO_AUTOTUNE_ENABLE): **the vehicle shakes about each axis**.
 
-        Call it while the vehicle hovers, or circles on its wings. Returns when PX4 has finished: with MC_AT_APPLY 1 it
-        saves the new gains when it is disarmed. PX4 aborts if the mode changes or the sticks are moved. After a
-        cancellation it goes on tuning; change the mode to stop it.
+        Call this while a multicopter hovers or a fixed wing circles. Returns when PX4 has finished. With MC_AT_APPLY 1,
+        PX4 saves the new gains when it is disarmed. PX4 aborts if the mode changes or the sticks are moved. A cancelled
+        call does not stop the tuning; change the mode for that.
 
         Args:
-            timeout: seconds for all axes; PX4 needs about forty.
-            on_progress: called with each new percentage.
+            timeout: seconds for all axes; PX4 needs about 40.
+            on_progress: called with the progress in percent when it changes.
 
         Raises:
-            NotSupported: this firmware tunes by a pilot's sticks, in its mode AUTOTUNE. Nothing was sent.
+            NotSupported: the firmware is ArduPilot, whose mode AUTOTUNE a pilot controls. Nothing was sent.
             OperationRejected: the mode changed, or another party disarmed the vehicle.
-            CommandRejected: PX4 has no such module, or the tuning failed.
+            CommandRejected: PX4 was built without the autotune module, or the tuning failed.
             CommandTimeout: an answer is missing, or the program has paused; PX4 may go on tuning.
-            OperationTimeout: it was not done in time; PX4 may go on tuning.
+            OperationTimeout: the tuning was not done in time; PX4 may go on tuning.
         """
         if not self.autopilot.tunes_by_command:
-            raise NotSupported(f"autotune: {self.autopilot.firmware} tunes by a pilot's sticks; nothing was sent")
+            raise NotSupported(
+                f"autotune: {self.autopilot.firmware} needs a pilot for its mode AUTOTUNE; nothing was sent"
+            )
         started, percent = self.connection.now(), -1
         answers: list[CommandAck] = []
         detach = self.connection.bus.attach(CommandAck, answers.append, system_id=self.system_id)
@@ -56,7 +58,9 @@ class TuningActions(VehicleBase):
             with self._arbiter.auxiliary_order() as order:
                 while percent < TUNED_PERCENT:
                     if self.connection.now() - started > timeout:
-                        raise OperationTimeout(f"autotune: {percent} % within {timeout:g} s; PX4 may go on tuning")
+                        raise OperationTimeout(
+                            f"autotune: not done within {timeout:g} s ({percent} %); PX4 may go on tuning"
+                        )
                     answer = await self._ask(answers)
                     if answer.result not in (MavResult.IN_PROGRESS, MavResult.ACCEPTED):
                         raise rejection(MavCmd.DO_AUTOTUNE_ENABLE, answer.result)
@@ -66,12 +70,14 @@ class TuningActions(VehicleBase):
                     await anyio.sleep(POLL_INTERVAL_S if percent < TUNED_PERCENT else 0)
                     self._sender.raise_if_ended(order)
                     if percent < TUNED_PERCENT and self.connection.now() - _received_at(answer) > MAX_ANSWER_AGE_S:
-                        raise CommandTimeout("autotune: the program has paused; PX4 may go on tuning")
+                        raise CommandTimeout(
+                            "autotune: this program was blocked too long to poll PX4; PX4 may go on tuning"
+                        )
         finally:
             detach()
 
     async def _ask(self, answers: list[CommandAck]) -> CommandAck:
-        """Send the command once and return its answer."""
+        """Poll PX4 by sending the command once; return the answer."""
         answers.clear()
         self._session.commands.send_unconfirmed(MavCmd.DO_AUTOTUNE_ENABLE, 1)
         until = self.connection.now() + ANSWER_TIMEOUT_S

@@ -47,8 +47,8 @@ class Settings:
     from a local file. From then on you can use the names of options, and values that are out of range or excluded by
     other settings are refused before anything is sent. Without a definition, values are sent unchanged.
 
-    All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
-    total; then OperationTimeout), if they send anything. You can cancel any call.
+    Methods that send something take ``idle_timeout_s`` (they fail after this many seconds without progress) and
+    ``timeout`` (seconds in total; then they raise OperationTimeout). You can cancel any call.
     """
 
     def __init__(
@@ -149,7 +149,7 @@ class Settings:
             return self.load(parse_definition(data, uri), locale=locale)
 
     def options(self, name: str) -> Mapping[str, SettingValue]:
-        """Return the options of a setting, name → value, as far as the known other settings allow them.
+        """Return the options of a setting that the known other settings allow, as a mapping of names to values.
 
         Empty without a definition, and for settings without options.
         """
@@ -225,8 +225,8 @@ class Settings:
         afterwards, and unknown settings that restrict it are read before.
 
         Raises:
-            InvalidArgument: an invalid name or value; with a definition: an option or value that is not allowed, or a
-                setting that is read-only or excluded now. Nothing was set.
+            InvalidArgument: the name or value is invalid; or, with a definition, the value is not allowed, or the
+                setting is read-only or excluded now. Nothing was set.
             ParameterRejected: the component has no such setting, or refused; ``code`` is its PARAM_ACK.
             ParameterTimeout: not confirmed, but it may have been set.
         """

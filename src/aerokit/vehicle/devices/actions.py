@@ -55,10 +55,10 @@ class DeviceActions(VehicleBase):
         return Actuators(self._context)
 
     def gripper(self, number: int = 1) -> Gripper:
-        """Return a gripper: ``await vehicle.gripper().release()``.
+        """Return one gripper of the vehicle: ``await vehicle.gripper().release()``.
 
         Args:
-            number: 1 to 8; ArduPilot and PX4 have one, and ignore the number.
+            number: 1 to 8. ArduPilot and PX4 support one gripper and ignore the number.
 
         Raises:
             InvalidArgument: the number is out of range.
@@ -69,12 +69,12 @@ class DeviceActions(VehicleBase):
         return Gripper(self._context, number)
 
     def winch(self, number: int = 1, *, component_id: int | None = None) -> Winch:
-        """Return a winch: ``await vehicle.winch().pay_out(5)``.
+        """Return one winch of the vehicle: ``await vehicle.winch().pay_out(5)``.
 
         Args:
-            number: 1 to 255; ArduCopter has one, and ignores the number.
-            component_id: a winch that is a MAVLink component, 1 to 255 (MAV_COMP_ID_WINCH is 169); None: the
-                autopilot's.
+            number: 1 to 255. ArduCopter supports one winch and ignores the number.
+            component_id: component id of a winch that is a MAVLink component, 1 to 255 (MAV_COMP_ID_WINCH is 169).
+                None: the autopilot's own winch.
 
         Raises:
             InvalidArgument: a number is out of range.
@@ -93,7 +93,7 @@ class DeviceActions(VehicleBase):
         return Shell(self._session)
 
     def play_tune(self, tune: str) -> None:
-        """Play a tune on the vehicle's buzzer, such as ``"T200 L8 CEGO5C"`` (PLAY_TUNE); returns at once.
+        """Play a tune on the vehicle's buzzer (PLAY_TUNE), for example ``"T200 L8 CEGO5C"``; returns at once.
 
         The message has no acknowledgement, and vehicles without a buzzer ignore it.
 
@@ -102,7 +102,7 @@ class DeviceActions(VehicleBase):
                 A to G notes, P pause.
 
         Raises:
-            InvalidArgument: it is empty, too long, or has other characters. Nothing was sent.
+            InvalidArgument: the tune is empty, too long, or contains other characters. Nothing was sent.
         """
         if not 1 <= len(tune) <= MAX_TUNE or not TUNE.fullmatch(tune):
             raise InvalidArgument(
@@ -114,12 +114,12 @@ class DeviceActions(VehicleBase):
     def send_status_text(self, text: str, *, severity: Severity = "info") -> None:
         """Send a status text of your program to the vehicle and to other stations (STATUSTEXT); returns at once.
 
-        ArduPilot writes it to its flight log; it has no acknowledgement. A text of more than 50 bytes is sent in
-        chunks. ``connection.send`` of a message without ``vehicle`` reaches stations only.
+        There is no acknowledgement. ArduPilot writes the text to its flight log. A text of more than 50 bytes is sent
+        in chunks. To reach ground stations but not the vehicle, send a ``Statustext`` by ``connection.send``.
 
         Args:
             text: 1 to 1000 bytes in UTF-8.
-            severity: name of a MAV_SEVERITY.
+            severity: name of a MAV_SEVERITY in lower case.
 
         Raises:
             InvalidArgument: the text is empty or too long, or the severity is unknown. Nothing was sent.
@@ -140,30 +140,31 @@ class DeviceActions(VehicleBase):
     ) -> None:
         """Make a part of the vehicle fail, to test how the vehicle reacts (MAV_CMD_INJECT_FAILURE).
 
-        PX4 only, if SYS_FAILURE_EN is 1. Returns when PX4 has acknowledged; it reports the failure by status texts and
-        by the health of its sensors. **The vehicle may crash.** ``kind="ok"`` ends the failure. Sent once.
+        **The vehicle may crash.** Only PX4 supports this, and only if SYS_FAILURE_EN is 1. Returns when PX4 has
+        acknowledged. PX4 then reports the failure by status texts and by the health of its sensors. ``kind="ok"`` ends
+        the failure. The command is sent once.
 
         Args:
-            unit: the part that fails, as FAILURE_UNIT.
-            kind: how it fails, as FAILURE_TYPE.
+            unit: the part that fails (FAILURE_UNIT).
+            kind: how it fails (FAILURE_TYPE).
             instance: number of the part from 1 to 16; 0 for all.
             intent: must be ``"inject failure"``, so that no other call can be mistaken for it.
 
         Raises:
             InvalidArgument: an argument is not allowed. Nothing was sent.
-            NotSupported: ArduPilot, whose simulation has SIM_ parameters instead. Nothing was sent.
+            NotSupported: the vehicle runs ArduPilot, whose simulation has SIM_ parameters instead. Nothing was sent.
             CommandRejected: SYS_FAILURE_EN is 0, or PX4 cannot let this part fail in this way.
-            CommandTimeout: there was no acknowledgement. PX4 sends none for a part that nothing there can let fail; the
-                part may have failed nevertheless.
+            CommandTimeout: there was no acknowledgement. PX4 sends none if it cannot make this part fail. If an
+                acknowledgement was lost, the part may have failed.
         """
         await INJECT_FAILURE.send(self._context, UNITS[unit], FailureType[kind.upper()], instance)
 
 
 def _chunks(text: str) -> list[str]:
-    """Split a text into chunks of at most 50 bytes, at whole characters; a full last chunk is followed by an empty one.
+    """Split a text into chunks of at most 50 bytes, between characters; an empty chunk follows a full last one.
 
-    The receiver takes a chunk that is not full as the end, so a chunk ends early only before a character that does not
-    fit; it is padded with a space then.
+    A receiver treats a chunk of less than 50 bytes as the last one. A chunk that cannot hold the next character is
+    therefore padded with spaces.
     """
     chunks = [""]
     for character in text:

@@ -24,7 +24,7 @@ SpinIntent = Literal["spin motor"]
 ReleaseIntent = Literal["release parachute"]
 
 MAX_MOTOR_TEST_S = 3.0
-"""PX4 ends a test after 3 s at the latest (Commander.cpp, handleCommandActuatorTest)."""
+"""PX4 ends a motor test after at most 3 s (Commander.cpp, handleCommandActuatorTest)."""
 TEST_END_TIMEOUT_S = 4.0
 PARACHUTE_TIMEOUT_S = 3.0
 ACTUATORS = 6
@@ -63,10 +63,10 @@ PERCENT = MotorTestThrottleType.THROTTLE_PERCENT
 
 @checks_arguments
 class Actuators(ReadOnly):
-    """Outputs of the vehicle besides its flight controls: ``vehicle.actuators``.
+    """Outputs of the vehicle other than its flight controls: ``vehicle.actuators``.
 
-    ArduPilot has servos, relays, landing gear and a parachute; PX4 has actuators. After a cancellation the vehicle may
-    have executed the order.
+    ArduPilot has servos, relays, landing gear and a parachute; PX4 has actuators. The vehicle may have executed the
+    order of a cancelled call.
     """
 
     def __init__(self, context: VehicleContext) -> None:
@@ -75,7 +75,7 @@ class Actuators(ReadOnly):
     async def set_servo(self, number: int, pulse_us: int) -> None:
         """Set the pulse width of a servo output, and return when SERVO_OUTPUT_RAW reports it (MAV_CMD_DO_SET_SERVO).
 
-        ArduPilot only. The output must have no function, or follow a stick (SERVOn_FUNCTION 0, 1, 51 to 66).
+        ArduPilot only. The output must have no function, or pass a stick through (SERVOn_FUNCTION 0, 1, 51 to 66).
 
         Args:
             number: output, 1 to 32.
@@ -86,16 +86,17 @@ class Actuators(ReadOnly):
             NotSupported: the firmware does not have the command. Nothing was sent.
             CommandRejected: the vehicle refused, for example because the output has another function.
             CommandTimeout: there was no acknowledgement.
-            OperationRejected: a newer order for this output was given.
-            OperationTimeout: the vehicle reports another state.
+            OperationRejected: your program gave a newer order for this output.
+            OperationTimeout: SERVO_OUTPUT_RAW still reports another pulse width.
         """
         await SET_SERVO.send(self._context, number, pulse_us, topic=("servo", number))
 
     async def repeat_servo(self, number: int, pulse_us: int, *, count: int, period_s: float) -> None:
         """Move a servo ``count`` times to a pulse width and back to its trim (MAV_CMD_DO_REPEAT_SERVO).
 
-        Returns when ArduPilot has acknowledged and begins; no message reports the end. It has one cycle at a time: the
-        next order of this kind replaces it. Never sent twice, because each copy starts a new cycle. ArduPilot only.
+        ArduPilot only. Returns when ArduPilot has acknowledged and begins, because no message reports the end.
+        ArduPilot repeats one output at a time: the next order of this kind replaces the previous one. The command is
+        never sent twice, because each copy starts again.
 
         Args:
             number: output, 1 to 32, as for :meth:`set_servo`.
@@ -111,8 +112,8 @@ class Actuators(ReadOnly):
     async def set_relay(self, number: int, on: bool) -> None:
         """Switch a relay, and return when RELAY_STATUS reports it (MAV_CMD_DO_SET_RELAY).
 
-        Firmware without RELAY_STATUS (before ArduPilot 4.5) only acknowledges. ArduPilot only; it refuses a relay
-        without a pin. Raises as :meth:`set_servo`.
+        ArduPilot only; it refuses a relay without a pin. With firmware before 4.5, which has no RELAY_STATUS, the call
+        returns at the acknowledgement. Raises as :meth:`set_servo`.
 
         Args:
             number: relay from 0 (RELAY1_PIN) to 15.
@@ -121,10 +122,10 @@ class Actuators(ReadOnly):
         await SET_RELAY.send(self._context, number, on, topic=("relay", number))
 
     async def repeat_relay(self, number: int, *, count: int, period_s: float) -> None:
-        """Switch a relay over and back ``count`` times (MAV_CMD_DO_REPEAT_RELAY).
+        """Toggle a relay and toggle it back, ``count`` times (MAV_CMD_DO_REPEAT_RELAY).
 
-        Returns when ArduPilot has acknowledged and begins. Never sent twice. ArduPilot only.
-        Raises as :meth:`repeat_servo`.
+        ArduPilot only. Returns when ArduPilot has acknowledged and begins. The command is never sent twice. Raises as
+        :meth:`repeat_servo`.
 
         Args:
             number: relay from 0 to 15.
@@ -139,10 +140,11 @@ class Actuators(ReadOnly):
         await self.set_actuators(*(value if index == number else None for index in range(1, ACTUATORS + 1)))
 
     async def set_actuators(self, *values: float | None) -> None:
-        """Set actuators by number: the first value is for "Peripheral via Actuator Set 1" (MAV_CMD_DO_SET_ACTUATOR).
+        """Set up to six actuators: the first value is for "Peripheral via Actuator Set 1" (MAV_CMD_DO_SET_ACTUATOR).
 
-        Returns when PX4 has acknowledged, because no message reports the values. It acknowledges also if no output has
-        this function (PWM_MAIN_FUNCn 301 to 306). PX4 only; ArduPilot has servos. Raises as :meth:`repeat_servo`.
+        PX4 only; for ArduPilot use ``set_servo``. Returns when PX4 has acknowledged, because no message reports the
+        values. PX4 acknowledges even if no output has this function (PWM_MAIN_FUNCn 301 to 306). Raises as
+        :meth:`repeat_servo`.
 
         Args:
             values: one to six values, −1 to 1; None leaves an actuator as it is.
@@ -161,18 +163,18 @@ class Actuators(ReadOnly):
     async def raise_landing_gear(self) -> None:
         """Retract the landing gear (MAV_CMD_AIRFRAME_CONFIGURATION); returns at the acknowledgement.
 
-        ArduCopter and ArduPlane only. They report the gear by no message, and accept the order also if there is no
-        landing gear (LGR_ENABLE), or while they stand on it.
+        ArduCopter and ArduPlane only. No message reports the position of the gear. Both accept the order even if there
+        is no landing gear (LGR_ENABLE), and even while the vehicle stands on it.
 
         Raises:
-            NotSupported: PX4, Rover and Sub. Nothing was sent.
+            NotSupported: the firmware (PX4, Rover or Sub) does not have the command. Nothing was sent.
             OperationRejected: the vehicle is disarmed, or on the ground. Nothing was sent.
             CommandRejected: the vehicle refused.
             CommandTimeout: there was no acknowledgement.
         """
         LANDING_GEAR.check_supported(self._context)
         telemetry = self._context.session.telemetry
-        # The last report counts, however old: it stands on its gear until another one was received.
+        # An old report counts too: a vehicle on the ground stands on its gear until it reports a take-off.
         if telemetry.landed_state.latest == MavLandedState.ON_GROUND or telemetry.is_confirmed_disarmed:
             raise OperationRejected("raise_landing_gear: the vehicle is disarmed or on the ground; nothing was sent")
         await LANDING_GEAR.send(self._context, 1, topic="landing gear")
@@ -188,36 +190,38 @@ class Actuators(ReadOnly):
     async def set_lights(self, on: bool, *, component_id: int = MavComponent.ILLUMINATOR) -> None:
         """Switch an illuminator, and return when ILLUMINATOR_STATUS reports it (MAV_CMD_ILLUMINATOR_ON_OFF).
 
-        For lights that are a MAVLink component. ArduPilot and PX4 do not have the command; lights on an output of
-        ArduPilot are servos or relays. Raises as :meth:`set_servo`.
+        Only for lights that are MAVLink components, because ArduPilot and PX4 do not have the command. Switch lights on
+        an output of ArduPilot by ``set_servo`` or ``set_relay``. Raises as :meth:`set_servo`.
 
         Args:
             on: the new state.
-            component_id: the light, 1 to 255; MAV_COMP_ID_ILLUMINATOR is 243.
+            component_id: component id of the light, 1 to 255; MAV_COMP_ID_ILLUMINATOR is 243.
         """
         check_range("component_id", component_id, 1, 255)
         await LIGHTS.send(self._context, on, topic=("lights", component_id), component_id=component_id)
 
     async def test_motor(self, number: int, *, throttle_percent: float, duration_s: float, intent: SpinIntent) -> None:
-        """Spin one motor of a disarmed vehicle, and return when it has stopped; remove the propellers.
+        """Spin one motor of a disarmed vehicle, and return when it has stopped; remove the propellers first.
 
-        Sent once: a copy would spin it again. If the call is cancelled or fails, aerokit orders the motor to stop at
-        once; without that, it stops after ``duration_s``. ArduCopter reports armed during the test, and the call
-        returns when it reports disarmed. PX4 acknowledges only, so the call returns after ``duration_s``.
+        ArduPilot: MAV_CMD_DO_MOTOR_TEST. PX4: MAV_CMD_ACTUATOR_TEST, if COM_MOT_TEST_EN is 1. The command is sent once,
+        because a copy would spin the motor again.
 
-        ArduPilot: MAV_CMD_DO_MOTOR_TEST. PX4: MAV_CMD_ACTUATOR_TEST, if COM_MOT_TEST_EN is 1.
+        The motor stops after ``duration_s``. If the call is cancelled or fails while the motor may turn, aerokit orders
+        the motor to stop at once. ArduCopter reports armed during the test, and the call returns when it reports
+        disarmed. PX4 reports nothing about the test, so the call returns after ``duration_s``.
 
         Args:
-            number: 1 to 12. ArduCopter counts clockwise from the front, PX4 by output function (Motor 1).
+            number: 1 to 12. ArduCopter counts motors clockwise from the front; PX4 uses the number of the output
+                function (Motor 1).
             throttle_percent: 0 to 100.
             duration_s: seconds, above 0, at most 3.
             intent: must be ``"spin motor"``, so that no other call can be mistaken for it.
 
         Raises:
             InvalidArgument: a value is out of range, or the intent is another one. Nothing was sent.
-            OperationRejected: the vehicle is armed, or not known to be disarmed: nothing was sent. Or a newer order
-                for its motors was given.
-            CommandRejected: it refused (not landed, safety switch, COM_MOT_TEST_EN).
+            OperationRejected: the vehicle is armed, or not known to be disarmed (nothing was sent); or your program
+                started another motor test.
+            CommandRejected: the vehicle refused (not landed, safety switch, COM_MOT_TEST_EN).
             CommandTimeout: there was no acknowledgement; the motor may have turned.
             OperationTimeout: the vehicle still reports armed four seconds after the end.
         """
@@ -227,7 +231,7 @@ class Actuators(ReadOnly):
         session, arbiter = self._context.session, self._context.arbiter
         start: tuple[float, ...]
         stop: tuple[float, ...]
-        # Throttle 0 for 0 s ends a test on ArduPilot; PX4 releases the output after 0 s.
+        # A test with throttle 0 for 0 s ends a running test on ArduPilot; on PX4 a test of 0 s releases the output.
         if MavCmd.DO_MOTOR_TEST in session.autopilot.unsupported_commands:
             command, start = MavCmd.ACTUATOR_TEST, (throttle_percent / 100, duration_s, 0, 0, number)
             stop = (math.nan, 0, 0, 0, number)
@@ -235,7 +239,8 @@ class Actuators(ReadOnly):
             command, start = MavCmd.DO_MOTOR_TEST, (number, PERCENT, throttle_percent, duration_s, 1)
             stop = (number, PERCENT, 0, 0, 1)
         session.check_disarmed("test_motor", is_current=arbiter.is_known)
-        order, spins_until = arbiter.of_device("motor test"), math.inf
+        order = arbiter.of_device("motor test")
+        spins_until = order.given_at + duration_s
         try:
             await SimpleOrder("test_motor", command, start).send(self._context, of=order)
             spins_until = session.connection.now() + duration_s
@@ -252,24 +257,24 @@ class Actuators(ReadOnly):
         except CommandRejected:
             raise
         except BaseException:
-            # After its end, the stop would be another test, which arms the motors.
+            # After the end of the test, the stop command would start another test, which arms the motors.
             is_spinning = session.connection.now() < spins_until
             if is_spinning and order.is_newest and arbiter.is_known and session.connection.is_open:
                 session.commands.send_unconfirmed(command, *stop)
             raise
 
     async def release_parachute(self, *, intent: ReleaseIntent) -> None:
-        """Release the parachute and stop the motors; return when ArduPilot reports that it was released.
+        """Release the parachute and stop the motors; return when ArduPilot reports the release (MAV_CMD_DO_PARACHUTE).
 
-        MAV_CMD_DO_PARACHUTE. ArduPilot accepts the command also where it then refuses to release: on the ground, below
-        CHUTE_ALT_MIN, or if the parachute is disabled. ArduCopter and ArduPlane only. **The vehicle falls.**
+        **The vehicle falls.** ArduCopter and ArduPlane only. ArduPilot accepts the command and then refuses the release
+        by a status text if the vehicle is on the ground or below CHUTE_ALT_MIN, or if the parachute is disabled.
 
         Args:
             intent: must be ``"release parachute"``, so that no other call can be mistaken for it.
 
         Raises:
             InvalidArgument: the intent is another one. Nothing was sent.
-            NotSupported: PX4, Rover and Sub. Nothing was sent.
+            NotSupported: the firmware (PX4, Rover or Sub) does not have the command. Nothing was sent.
             OperationRejected: the vehicle refused after the acknowledgement; ``reasons`` has its status texts.
             CommandRejected: the vehicle refused.
             CommandTimeout: there was no acknowledgement.
@@ -285,12 +290,12 @@ class Actuators(ReadOnly):
         )
 
     async def enable_parachute(self, enabled: bool = True) -> None:
-        """Allow or forbid the release of the parachute until the next reboot; returns at the acknowledgement.
+        """Allow or forbid the release of the parachute until the next reboot (MAV_CMD_DO_PARACHUTE).
 
-        MAV_CMD_DO_PARACHUTE. ArduCopter and ArduPlane only.
+        ArduCopter and ArduPlane only. Returns at the acknowledgement.
 
         Args:
-            enabled: False forbids it, also for failsafes.
+            enabled: False forbids the release, even by a failsafe.
 
         Raises:
             NotSupported, CommandRejected, CommandTimeout: as for ``release_parachute``.

@@ -17,7 +17,7 @@ __all__ = ["Gripper"]
 NUMBER = Argument("number", 1, 8)
 GRIP_TIMEOUT_S = 10.0
 EPM_WAIT_S = 3.0
-"""An electro-permanent gripper reports only that it begins; a servo reports its end 0.5 s later."""
+"""Seconds until an electro-permanent gripper has moved: it reports the begin, but not the end as a servo does."""
 BEGINS = {GripperActions.GRAB: "Gripper load grabbing", GripperActions.RELEASE: "Gripper load releasing"}
 ENDS = {GripperActions.GRAB: "Gripper load grabbed", GripperActions.RELEASE: "Gripper load released"}
 
@@ -26,9 +26,9 @@ ENDS = {GripperActions.GRAB: "Gripper load grabbed", GripperActions.RELEASE: "Gr
 class Gripper(ReadOnly):
     """One gripper: ``vehicle.gripper()`` (MAV_CMD_DO_GRIPPER).
 
-    PX4 acknowledges when the gripper has moved (PD_GRIPPER_EN). ArduPilot acknowledges at once and reports the end by
-    status text (GRIP_ENABLE); an electro-permanent gripper reports only its beginning, and the call returns three
-    seconds later. Orders are sent once. After a cancellation the gripper may have moved.
+    PX4 acknowledges when the gripper has moved (PD_GRIPPER_EN). ArduPilot (GRIP_ENABLE) acknowledges at once and
+    reports the end by a status text. For an electro-permanent gripper it reports only the start, and the call returns
+    three seconds later. Orders are sent once. The gripper may have moved after a cancelled call.
     """
 
     def __init__(self, context: VehicleContext, number: int) -> None:
@@ -38,10 +38,10 @@ class Gripper(ReadOnly):
         """Close the gripper, and return when it has closed.
 
         Raises:
-            CommandRejected: there is no gripper, or it refused.
+            CommandRejected: the vehicle has no gripper, or refused.
             CommandTimeout: there was no acknowledgement.
-            OperationRejected: a newer order for this gripper was given.
-            OperationTimeout: the end was not reported within ten seconds.
+            OperationRejected: your program gave a newer order for this gripper.
+            OperationTimeout: the vehicle did not report the end within ten seconds.
         """
         await self._move(GripperActions.GRAB)
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 __all__ = ["Shell"]
 
 PROMPTS = ("pxh> ", "nsh> ")
-"""Prompts of PX4 in simulation and on NuttX, after each command."""
+"""PX4's prompts, in simulation and on NuttX. The shell shows one when a command has ended."""
 DATA_BYTES, MAX_LINE, MAX_WAITING, OPEN_TIMEOUT_S = 70, 1000, 4096, 5.0
 _RESPOND, _REPLY = SerialControlFlag.RESPOND, SerialControlFlag.REPLY
 
@@ -28,12 +28,12 @@ _RESPOND, _REPLY = SerialControlFlag.RESPOND, SerialControlFlag.REPLY
 class Shell(ReadOnly):
     """PX4's system shell, open for the duration of an ``async with`` block: ``vehicle.shell()`` (SERIAL_CONTROL).
 
-    PX4 has one shell for each of its ports, which all stations on that port share. aerokit sends each line once, and
-    does not know what it does: a command of the shell is no order. The messages have neither numbers nor answers, so a
-    bad link loses parts of the text.
+    PX4 has one shell for each of its ports, and all stations on that port share it. aerokit sends each line once. It
+    does not know what a shell command does, so the rules for orders do not apply to it. SERIAL_CONTROL has neither
+    sequence numbers nor acknowledgements, so parts of the text may be lost.
 
     Entering raises:
-        NotSupported: ArduPilot, which has no shell. Nothing was sent.
+        NotSupported: the vehicle runs ArduPilot, which has no shell. Nothing was sent.
         BusyError: this shell was entered before; call ``vehicle.shell()`` again.
         OperationTimeout: there was no prompt within five seconds.
     """
@@ -69,17 +69,19 @@ class Shell(ReadOnly):
         self._is_open = False
 
     def write(self, line: str) -> None:
-        """Send one line without waiting for its output; :meth:`read` returns that.
+        """Send one line without waiting for its output, which :meth:`read` returns.
 
         Args:
             line: at most 1000 bytes, without a line break.
 
         Raises:
-            InvalidArgument: it is too long or has a line break, or the block is not open. Nothing was sent.
+            InvalidArgument: the line is too long or has a line break, or the block is not open. Nothing was sent.
         """
         data = line.encode()
         if len(data) > MAX_LINE or "\n" in line or "\r" in line:
-            raise InvalidArgument(f"line is not allowed: at most {MAX_LINE} bytes in one line, got {len(data)} bytes")
+            raise InvalidArgument(
+                f"line of {len(data)} bytes is not allowed: at most {MAX_LINE} bytes, without a line break"
+            )
         if not self._is_open:
             raise InvalidArgument("the shell is not open: write to it inside its `async with` block")
         data += b"\n"
@@ -111,9 +113,9 @@ class Shell(ReadOnly):
                 return bytes(message.data[: message.count]).decode(errors="replace")
 
     async def run(self, command: str, *, timeout: float = 10.0) -> str:
-        """Run a command and return its output, when the shell shows its prompt again.
+        """Run a command, wait until the shell shows its prompt again, and return the output.
 
-        A cancelled or timed out call does not end the command. Output that was not read before is discarded.
+        A cancellation or time-out does not end the command. Output that arrived before the call is discarded.
 
         Args:
             command: at most 1000 bytes, without a line break.
@@ -121,7 +123,7 @@ class Shell(ReadOnly):
 
         Raises:
             InvalidArgument: as for :meth:`write`.
-            OperationTimeout: there was no prompt in time; the text has the output so far.
+            OperationTimeout: there was no prompt in time; the error text has the output so far.
         """
         check_range("timeout", timeout, 0, 1e6, above=True)
         while self._output.get_nowait() is not None:
@@ -135,7 +137,7 @@ class Shell(ReadOnly):
         except OperationTimeout:
             link = self._session.describe_link()
             raise OperationTimeout(
-                f"shell: {command!r} was not done within {timeout:g} s; output: {text!r}; {link}"
+                f"shell: {command!r} has not ended within {timeout:g} s; output: {text!r}; {link}"
             ) from None
         text = text.removeprefix(command).removeprefix("\n")
         return text.rpartition("\n")[0] if "\n" in text else ""

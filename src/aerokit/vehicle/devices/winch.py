@@ -32,10 +32,10 @@ MAX_LENGTH_M, MAX_RATE_M_S = 1000.0, 20.0
 class Winch(ReadOnly):
     """One winch: ``vehicle.winch()`` (MAV_CMD_DO_WINCH).
 
-    ArduCopter has :meth:`relax`, :meth:`pay_out` and :meth:`set_rate`; the other orders are for winches that are
-    MAVLink components: ``vehicle.winch(component_id=169)``. PX4 has none of them and forwards the command to such a
-    component. An order that may pay out line twice is sent once. A newer order ends the wait for the previous one.
-    A cancelled call does not stop the winch: call ``set_rate(0)``.
+    ArduCopter supports :meth:`relax`, :meth:`pay_out` and :meth:`set_rate`. The other orders are for winches that are
+    MAVLink components: ``vehicle.winch(component_id=169)``. PX4 drives no winch itself and forwards the command to such
+    a component. An order that could pay out line twice is sent once. A newer order for the winch ends the call that
+    waits for the previous one. A cancelled call does not stop the winch: call ``set_rate(0)``.
     """
 
     def __init__(self, context: VehicleContext, number: int, component_id: int | None) -> None:
@@ -47,12 +47,12 @@ class Winch(ReadOnly):
 
     @property
     def status(self) -> StateCell[WinchStatus]:
-        """Length, speed, tension and state of the autopilot's winch (WINCH_STATUS); ``vehicle.winch_status``."""
+        """Length, speed, tension and state of the autopilot's winch (WINCH_STATUS): ``vehicle.winch_status``."""
         cell: StateCell[WinchStatus] = self._context.session.telemetry.cells["winch_status"]
         return cell
 
     async def relax(self) -> None:
-        """Let the line run freely; returns at the acknowledgement, which is all that ArduCopter reports.
+        """Let the line run freely. Returns at the acknowledgement, because ArduCopter reports nothing else.
 
         Raises:
             NotSupported: the autopilot has no such order. Nothing was sent.
@@ -64,26 +64,29 @@ class Winch(ReadOnly):
     async def pay_out(self, length_m: float, *, rate_m_s: float = 0.5, timeout: float = ACTION_TIMEOUT_S) -> None:
         """Pay out a length of line, and return when WINCH_STATUS reports it within 0.1 m.
 
-        Without WINCH_STATUS it returns at the acknowledgement. Sent once, because a copy would pay out more.
+        Returns at the acknowledgement if the winch sends no WINCH_STATUS. The command is sent once, because a copy
+        would pay out more line.
 
         Args:
-            length_m: metres, −1000 to 1000; negative values wind it up.
+            length_m: metres, −1000 to 1000; negative values wind the line up.
             rate_m_s: speed, above 0, at most 20 m/s; ArduCopter uses WINCH_MAX_RATE instead.
-            timeout: seconds until the length is out.
+            timeout: seconds until WINCH_STATUS reports the length.
 
         Raises:
             InvalidArgument: a value is out of range. Nothing was sent.
             NotSupported: the autopilot has no such order. Nothing was sent.
             CommandRejected: there is no winch (WINCH_TYPE).
             CommandTimeout: there was no acknowledgement; the winch may run.
-            OperationRejected: a newer order for this winch was given.
+            OperationRejected: your program gave a newer order for this winch.
             HeartbeatTimeout: the vehicle was silent for ten seconds.
-            OperationTimeout: the length was not reported in time.
+            OperationTimeout: WINCH_STATUS did not report the length in time.
         """
         check_range("length_m", length_m, -MAX_LENGTH_M, MAX_LENGTH_M)
         check_range("rate_m_s", rate_m_s, 0, MAX_RATE_M_S, above=True)
         self._check_supported(_A.RELATIVE_LENGTH_CONTROL)
-        order = self._context.arbiter.of_device(self._topic)  # A newer order during the question ends this one.
+        order = self._context.arbiter.of_device(
+            self._topic
+        )  # The next line waits; a newer order given meanwhile ends this one.
         start = await receive_once(self._context, m.WinchStatus, self._component_id)
         goal_m = None if start is None else start.line_length + length_m
         await self._send(
@@ -96,11 +99,11 @@ class Winch(ReadOnly):
         )
 
     async def set_rate(self, rate_m_s: float) -> None:
-        """Pay out line at this speed until the next order, and return when WINCH_STATUS reports the speed.
+        """Pay out line at this speed until the next order. Returns when WINCH_STATUS reports the speed.
 
         Args:
-            rate_m_s: −20 to 20 m/s; negative values wind it up, 0 stops. ArduCopter limits it to WINCH_MAX_RATE, and
-                this call then times out.
+            rate_m_s: −20 to 20 m/s; negative values wind the line up, 0 stops. ArduCopter limits the speed to
+                WINCH_MAX_RATE; a call with a higher speed times out.
 
         Raises:
             InvalidArgument, NotSupported, CommandRejected, CommandTimeout, OperationRejected, OperationTimeout: as for
@@ -116,14 +119,14 @@ class Winch(ReadOnly):
         await self._send_until(_F.LOCKED, _A.LOCK)
 
     async def deliver(self) -> None:
-        """Start the winch's own delivery: lower, release, retract. Returns at the acknowledgement.
+        """Start the winch's automatic delivery: lower, release, retract. Returns at the acknowledgement.
 
         Raises as :meth:`relax`.
         """
         await self._send(_A.DELIVER)
 
     async def hold(self) -> None:
-        """Hold the line by the motor, without the brake. Returns at the acknowledgement. Raises as :meth:`relax`."""
+        """Hold the line by the motor instead of the brake. Returns at the acknowledgement. Raises as :meth:`relax`."""
         await self._send(_A.HOLD)
 
     async def retract(self, *, timeout: float = ACTION_TIMEOUT_S) -> None:
@@ -143,15 +146,15 @@ class Winch(ReadOnly):
         await self._send_until(_F.FULLY_RETRACTED, _A.RETRACT, timeout)
 
     async def load_line(self) -> None:
-        """Load new line: the motor turns slowly. Returns when WINCH_STATUS reports it. Raises as :meth:`retract`."""
+        """Turn slowly to load new line. Returns when WINCH_STATUS reports this state. Raises as :meth:`retract`."""
         await self._send_until(_F.LOAD_LINE, _A.LOAD_LINE)
 
     async def abandon_line(self) -> None:
-        """Spool out all line and release it. Returns when WINCH_STATUS reports it. Raises as :meth:`retract`."""
+        """Spool out all line and drop it. Returns when WINCH_STATUS reports this state. Raises as :meth:`retract`."""
         await self._send_until(_F.ABANDON_LINE, _A.ABANDON_LINE)
 
     async def load_payload(self) -> None:
-        """Run slowly until a payload is attached. Returns when WINCH_STATUS reports it. Raises as :meth:`retract`."""
+        """Run slowly to attach a payload. Returns when WINCH_STATUS reports this state. Raises as :meth:`retract`."""
         await self._send_until(_F.LOAD_PAYLOAD, _A.LOAD_PAYLOAD)
 
     async def _send_until(

@@ -1,4 +1,4 @@
-"""Encoding of measurements as the messages that an autopilot reads; invalid ones raise InvalidArgument."""
+"""``MeasurementEncoder``: encodes measurements as the messages that the autopilot reads."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ __all__ = ["MeasurementEncoder"]
 
 NAN = math.nan
 UNKNOWN_VECTOR: Vector = (NAN, NAN, NAN)
-# Places of the diagonal in the upper triangle of a 6x6 covariance matrix.
+# Indexes of the diagonal in the upper triangle of a 6x6 covariance matrix, row by row.
 POSITION_DIAGONAL, ORIENTATION_DIAGONAL, TRIANGLE_SIZE = (0, 6, 11), (15, 18, 20), 21
 MAX_SECTORS, UNKNOWN_DISTANCE = 72, 0xFFFF
 MAX_CENTIMETRES = 0xFFFE
@@ -31,7 +31,7 @@ GPS_EPOCH_S, LEAP_SECONDS, SECONDS_PER_WEEK = 315_964_800, 18, 604_800
 GPS_NUMBERS = ("hdop", "vdop", "horizontal_accuracy_m", "vertical_accuracy_m", "speed_accuracy_m_s", "yaw_deg")
 # MAV_SENSOR_ORIENTATION.
 ORIENTATIONS: dict[RangeDirection, int] = {"forward": 0, "right": 2, "back": 4, "left": 6, "up": 24, "down": 25}
-# MAV_ESTIMATOR_TYPE, and the MAV_DISTANCE_SENSOR and its covariance for "unknown".
+# MAV_ESTIMATOR_TYPE, MAV_DISTANCE_SENSOR, and the covariance of DISTANCE_SENSOR that means "unknown".
 VISION, LASER, NO_COVARIANCE = 2, 0, 255
 # Rotations between the axes of ROS (east, north, up; forward, left, up) and those of MAVLink.
 HALF = math.sqrt(0.5)
@@ -40,16 +40,17 @@ FLU_TO_FRD: Quaternion = (0.0, 1.0, 0.0, 0.0)
 
 
 class MeasurementEncoder:
-    """Encodes measurements for one vehicle. Each method returns the messages of one measurement.
+    """Encodes measurements for one vehicle: each method returns the messages of one measurement.
 
-    Time stamps are in the clock of the event loop; `TimesyncAnswers` lets PX4 convert them to its own.
+    A measurement that is out of range raises InvalidArgument. Time stamps are those of the event loop's clock; by
+    `TimesyncAnswers` PX4 can convert them to its own clock.
     """
 
     def __init__(self, session: VehicleSession) -> None:
         self._session = session
 
     def odometry(self, value: v.OdometryMeasurement) -> tuple[Message, ...]:
-        """Return ODOMETRY in the frames that the autopilot reads."""
+        """Return ODOMETRY in a frame that the autopilot reads."""
         check_range("quality", value.quality, -1, 100)
         given = value.orientation
         q = given.quaternion if isinstance(given, Attitude) else given
@@ -90,7 +91,7 @@ class MeasurementEncoder:
         return (m.VisionPositionEstimate(time, *place, roll, pitch, yaw, covariance, count),)
 
     def motion_capture(self, value: v.PoseMeasurement) -> tuple[Message, ...]:
-        """Return ATT_POS_MOCAP, or VISION_POSITION_ESTIMATE for an estimator that does not read it."""
+        """Return ATT_POS_MOCAP, or VISION_POSITION_ESTIMATE for an autopilot that does not read ATT_POS_MOCAP."""
         if not self._session.autopilot.external.has_mocap:
             return self.vision_position(value)
         time, place, covariance = self._pose(value)
@@ -105,7 +106,7 @@ class MeasurementEncoder:
         return self._time_us(value.measured_at), place, covariance
 
     def vision_speed(self, value: v.SpeedMeasurement) -> tuple[Message, ...]:
-        """Return VISION_SPEED_ESTIMATE, or ODOMETRY without a pose."""
+        """Return VISION_SPEED_ESTIMATE, or ODOMETRY without a pose for an autopilot that does not read it."""
         speeds = (value.north_m_s, value.east_m_s, value.down_m_s)
         check_finite("velocity", *speeds)
         time, count = self._time_us(value.measured_at), _reset_counter(value.reset_counter)
@@ -164,7 +165,7 @@ class MeasurementEncoder:
         )
 
     def obstacles(self, value: v.ObstacleSectors) -> tuple[Message, ...]:
-        """Return OBSTACLE_DISTANCE around the body axes."""
+        """Return OBSTACLE_DISTANCE with angles from the vehicle's nose."""
         check_range("step_deg", value.step_deg, 0, 360, above=True)
         check_range("first_deg", value.first_deg, -360, 360)
         count = len(value.distances_m)
@@ -180,7 +181,7 @@ class MeasurementEncoder:
         return (m.ObstacleDistance(time, LASER, distances, 0, low, high, step, value.first_deg, MavFrame.BODY_FRD),)
 
     def obstacle_points(self, value: v.ObstaclePoints) -> tuple[Message, ...]:
-        """Return OBSTACLE_DISTANCE_3D for each point, with the same time stamp."""
+        """Return one OBSTACLE_DISTANCE_3D for each point, all with the same time stamp."""
         check_range("min_m", value.min_m, 0, 1e5)
         check_range("max_m", value.max_m, 0, 1e5, above=True)
         time = self._time_us(value.measured_at) // 1000 & 0xFFFFFFFF
@@ -208,13 +209,13 @@ class MeasurementEncoder:
         return (m.DistanceSensor(time, low, high, distance, LASER, 0, *place, signal_quality=value.quality or 0),)
 
     def landing_target(self, value: v.TargetMeasurement) -> tuple[Message, ...]:
-        """Return LANDING_TARGET relative to the vehicle, or in the local frame by its attitude and position."""
+        """Return LANDING_TARGET relative to the vehicle, or converted to the local frame for PX4."""
         offset = (value.forward_m, value.right_m, value.down_m)
         check_finite("target", *offset)
         check_range("number", value.number, 0, 255)
         distance = math.hypot(*offset)
         if not distance > 0:
-            raise InvalidArgument("the target is at the vehicle itself: its distance must be above 0")
+            raise InvalidArgument("the distance of the target is 0; it must be above 0")
         frame = MavFrame.LOCAL_FRD if value.is_level else MavFrame.BODY_FRD
         if self._session.autopilot.external.target_is_local:
             frame, offset = MavFrame.LOCAL_NED, self._in_local_frame(offset, is_level=value.is_level)
@@ -224,7 +225,7 @@ class MeasurementEncoder:
         return (m.LandingTarget(time, value.number, frame, *angles, distance, *no_size, *offset, q, 2, 1),)
 
     def optical_flow(self, value: v.FlowMeasurement) -> tuple[Message, ...]:
-        """Return OPTICAL_FLOW_RAD, or OPTICAL_FLOW with rates in whole radians per interval, as ArduPilot reads it."""
+        """Return OPTICAL_FLOW_RAD for PX4, or OPTICAL_FLOW scaled as ArduPilot reads it."""
         check_finite("flow", value.x_rad, value.y_rad, *(value.gyro_rad or ()))
         check_range("interval_s", value.interval_s, 0, 10, above=True)
         check_range("quality", value.quality, 0, 255)
@@ -236,7 +237,7 @@ class MeasurementEncoder:
             interval_us = round(value.interval_s * 1e6)
             flow = (value.x_rad, value.y_rad, *gyro)
             return (m.OpticalFlowRad(time, 0, interval_us, *flow, 0, value.quality, 0, distance),)
-        # AP_OpticalFlow_MAV.cpp: rate in rad/s = flow_x times the interval between messages.
+        # ArduPilot multiplies flow_x by the interval between messages to get rad/s (AP_OpticalFlow_MAV.cpp).
         x, y = (round(angle / value.interval_s**2) for angle in (value.x_rad, value.y_rad))
         for name, count in (("x_rad", x), ("y_rad", y)):
             check_range(name, count, -0x8000, 0x7FFF)
@@ -287,10 +288,10 @@ def _normalized(q: Quaternion) -> Quaternion:
 
 
 def _triangle(first: float | None, second: float | None) -> list[float]:
-    """Return the upper triangle of a covariance matrix with two variances; its first element is NaN for "unknown".
+    """Return the upper triangle of a 6x6 covariance matrix with two variances, each three times on its diagonal.
 
-    An unknown second one is 0, because ArduPilot and PX4 then apply the minimum of their parameters; ArduPilot does
-    not accept NaN there.
+    An unknown first variance is sent as NaN. An unknown second variance is sent as 0: both autopilots then use the
+    minimum in their parameters, and ArduPilot does not accept NaN there.
     """
     _check_variance(first)
     _check_variance(second)

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 __all__ = ["External"]
 
-# The origin is stored in centimetres by ArduPilot; PX4 reports it as 32-bit degrees.
+# ArduPilot stores the origin in centimetres; PX4 reports degrees of 32 bits.
 ORIGIN_TOLERANCE_M = 1.0
 POLL_INTERVAL_S = 0.5
 
@@ -43,9 +43,9 @@ POLL_INTERVAL_S = 0.5
 class External:
     """Supplies the vehicle with measurements: ``async with vehicle.external.odometry() as stream: stream.send(…)``.
 
-    ``rate_hz`` (above 0, to 400) is the highest rate at which measurements are sent, ``valid_for_s`` the age at which
-    one is dropped. Time stamps are those of the event loop's clock, and aerokit answers the vehicle's TIMESYNC
-    requests with it meanwhile.
+    ``rate_hz`` (above 0, at most 400) is the maximum rate at which measurements are sent. A measurement older than
+    ``valid_for_s`` is dropped. Time stamps are those of the event loop's clock. While a stream is open, aerokit answers
+    the vehicle's TIMESYNC requests with this clock.
     """
 
     def __init__(self, context: VehicleContext, probe: Probe) -> None:
@@ -62,11 +62,11 @@ class External:
         return self._stream("vision_position", PoseMeasurement, self._encode.vision_position, rate_hz, valid_for_s)
 
     def vision_speed(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[SpeedMeasurement]:
-        """Supply a velocity (VISION_SPEED_ESTIMATE; ODOMETRY without a pose to PX4)."""
+        """Supply a velocity (VISION_SPEED_ESTIMATE; for PX4 ODOMETRY without a pose)."""
         return self._stream("vision_speed", SpeedMeasurement, self._encode.vision_speed, rate_hz, valid_for_s)
 
     def motion_capture(self, *, rate_hz: float = 50.0, valid_for_s: float = 0.2) -> MeasurementStream[PoseMeasurement]:
-        """Supply a pose by motion capture (ATT_POS_MOCAP; VISION_POSITION_ESTIMATE to PX4)."""
+        """Supply a pose from motion capture (ATT_POS_MOCAP; for PX4 VISION_POSITION_ESTIMATE)."""
         return self._stream("motion_capture", PoseMeasurement, self._encode.motion_capture, rate_hz, valid_for_s)
 
     def gps(self, *, rate_hz: float = 5.0, valid_for_s: float = 0.5) -> MeasurementStream[GpsMeasurement]:
@@ -81,24 +81,24 @@ class External:
         return self._stream("obstacles", ObstacleSectors, self._encode.obstacles, rate_hz, valid_for_s)
 
     def obstacle_points(self, *, rate_hz: float = 10.0, valid_for_s: float = 0.5) -> MeasurementStream[ObstaclePoints]:
-        """Supply places of obstacles (OBSTACLE_DISTANCE_3D). ArduPilot needs PRX1_TYPE 2; PX4 does not read them."""
+        """Supply positions of obstacles (OBSTACLE_DISTANCE_3D). ArduPilot needs PRX1_TYPE 2; PX4 does not read them."""
         return self._stream("obstacle_points", ObstaclePoints, self._encode.obstacle_points, rate_hz, valid_for_s)
 
     def range_finder(self, *, rate_hz: float = 20.0, valid_for_s: float = 0.2) -> MeasurementStream[RangeMeasurement]:
-        """Supply a distance (DISTANCE_SENSOR). ArduPilot needs RNGFND1_TYPE 10 and its orientation."""
+        """Supply a distance (DISTANCE_SENSOR). ArduPilot needs RNGFND1_TYPE 10 and RNGFND1_ORIENT."""
         return self._stream("range_finder", RangeMeasurement, self._encode.range_finder, rate_hz, valid_for_s)
 
     def landing_target(
         self, *, rate_hz: float = 20.0, valid_for_s: float = 0.3
     ) -> MeasurementStream[TargetMeasurement]:
-        """Supply the place of a landing target (LANDING_TARGET). ArduPilot needs PLND_ENABLED and PLND_TYPE 1.
+        """Supply the position of a landing target (LANDING_TARGET). ArduPilot needs PLND_ENABLED and PLND_TYPE 1.
 
-        ``vehicle.land_on`` does this and lands.
+        ``vehicle.land_on`` opens this stream itself and lands the vehicle.
         """
         return self._stream("landing_target", TargetMeasurement, self._encode.landing_target, rate_hz, valid_for_s)
 
     def optical_flow(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[FlowMeasurement]:
-        """Supply optical flow (OPTICAL_FLOW; OPTICAL_FLOW_RAD to PX4).
+        """Supply optical flow (OPTICAL_FLOW; for PX4 OPTICAL_FLOW_RAD).
 
         ArduPilot needs FLOW_TYPE 5, PX4 EKF2_OF_CTRL.
         """
@@ -112,19 +112,19 @@ class External:
         speed_accuracy_m_s: float = 1.0,
         direction_accuracy_deg: float = 15.0,
     ) -> None:
-        """Supply an estimate of the wind (MAV_CMD_EXTERNAL_WIND_ESTIMATE); returns when it is acknowledged.
+        """Supply an estimate of the wind (MAV_CMD_EXTERNAL_WIND_ESTIMATE); returns at the acknowledgement.
 
-        No message reports the effect. ArduPilot applies it to its simpler estimator (DCM), PX4 to EKF2.
+        No message reports the effect. ArduPilot uses the estimate in its simpler estimator (DCM), PX4 in EKF2.
 
         Args:
             speed_m_s: horizontal speed, 0 to 100.
-            direction_deg: direction that it comes from, 0 to 360.
+            direction_deg: direction that the wind comes from, 0 to 360 clockwise from north.
             speed_accuracy_m_s: one standard deviation, 0 to 100.
             direction_accuracy_deg: one standard deviation, 0 to 180.
 
         Raises:
             InvalidArgument: a value is out of range. Nothing was sent.
-            CommandRejected: the vehicle refused, or does not support it.
+            CommandRejected: the vehicle refused, or does not support the command.
             CommandTimeout: there was no acknowledgement.
         """
         check_range("speed_m_s", speed_m_s, 0, 100)
@@ -137,18 +137,18 @@ class External:
     async def set_origin(self, origin: Position, *, timeout: float = 10.0) -> None:
         """Set the origin of the estimator's local frame, and wait until GPS_GLOBAL_ORIGIN reports it.
 
-        A vehicle without GPS needs it for global positions. SET_GPS_GLOBAL_ORIGIN is sent once; it has no
-        acknowledgement. Returns at once if the vehicle has this origin already. After a cancellation the vehicle may
-        have accepted it.
+        A vehicle without GPS needs the origin to compute global positions. SET_GPS_GLOBAL_ORIGIN is sent once, because
+        it has no acknowledgement. Returns at once if the vehicle has this origin already. The vehicle may have accepted
+        the origin of a cancelled call.
 
         Args:
             origin: latitude, longitude and altitude above mean sea level.
             timeout: seconds until the vehicle reports it.
 
         Raises:
-            InvalidArgument: the place has no altitude above mean sea level. Nothing was sent.
+            InvalidArgument: the origin has no altitude above mean sea level. Nothing was sent.
             OperationRejected: ArduPilot has another origin and keeps it until a reboot. Nothing was sent.
-            OperationTimeout: the vehicle did not report it.
+            OperationTimeout: the vehicle did not report the origin in time.
         """
         if origin.altitude_amsl_m is None:
             raise InvalidArgument("origin has no altitude_amsl_m, which the local frame requires")

@@ -1,4 +1,4 @@
-"""Precision landing: a stream of target positions, the autopilot's landing mode, and a report of what was seen."""
+"""Precision landing: streams target positions, changes to the landing mode, and reports how it went."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import anyio
 from aerokit._internal.arguments import check_kind, check_range
 from aerokit._internal.values import Snapshot
 from aerokit.errors import OperationTimeout, ValueUnknownError
+from aerokit.vehicle.commanding.ground import GroundCheck
 from aerokit.vehicle.commanding.progress import await_progress
 from aerokit.vehicle.commanding.streams import TakeoverCheck
 from aerokit.vehicle.external.values import TargetMeasurement
@@ -30,28 +31,32 @@ TargetSource: TypeAlias = (
     Callable[[], "TargetMeasurement | Awaitable[TargetMeasurement | None] | None"]
     | AsyncIterable["TargetMeasurement | None"]
 )
-"""Function that is called at the rate of the stream, or asynchronous iterable; None while the target is not visible."""
+"""A function, called at the rate of the stream, or an asynchronous iterable; None means that no target is visible."""
 
-# A target that was not seen for this long counts as lost. ArduPilot's estimator keeps it for 2 s (AC_PrecLand.cpp).
+# A target counts as lost after this time without a measurement. ArduPilot's estimator keeps it for 2 s
+# (AC_PrecLand.cpp).
 LOST_AFTER_S = 1.0
 POLL_INTERVAL_S = 0.2
 
 
 class TargetLoss(Snapshot):
-    """Time for which the target was not visible; ``height_m`` above home when it was last seen (None: unknown)."""
+    """One time during which the target was not visible.
+
+    ``height_m`` is the vehicle's height above home at the start of this time; None if unknown.
+    """
 
     seconds: float
     height_m: float | None
 
 
 class LandingReport(Snapshot):
-    """Course of a precision landing that has ended on the ground, disarmed.
+    """Report of a precision landing, made when the vehicle is on the ground and disarmed.
 
-    ``last_target`` is the last measurement, ``unseen_s`` its age at the end; a camera rarely sees the target from close
-    by. ``losses`` are the times of more than a second without the target before that. ``climbed_m`` is how far the
-    vehicle climbed in between: a retry of ArduPilot, a search of PX4. ``used_target`` is False if no measurement was
-    sent during the descent, so that the vehicle landed wherever its firmware chose. ``texts`` are the vehicle's status
-    texts.
+    ``last_target`` is the last measurement, and ``unseen_s`` its age at the end: a camera rarely sees the target from
+    close by. ``losses`` are the earlier times of more than a second without the target. ``climbed_m`` is how far the
+    vehicle climbed during the landing, in a retry of ArduPilot or a search of PX4. ``used_target`` is False if no
+    measurement was sent during the descent; the vehicle then landed where its firmware chose. ``texts`` are the
+    vehicle's status texts since the order.
     """
 
     last_target: TargetMeasurement | None
@@ -95,7 +100,7 @@ async def land_on(
 
 
 class TargetLanding:
-    """Reads the source of targets, gives each one to the stream, and keeps what the report needs."""
+    """Passes the targets from their source to the stream, and collects the data of the report."""
 
     def __init__(self, context: VehicleContext, stream: MeasurementStream[TargetMeasurement]) -> None:
         self._context, self._session, self._stream = context, context.session, stream
@@ -107,7 +112,7 @@ class TargetLanding:
         self._error: Exception | None = None
 
     async def read(self, source: TargetSource, period_s: float) -> None:
-        """Read the source until it ends or fails; the waiting methods then raise its exception."""
+        """Read the source until it ends or fails. ``acquire`` and ``await_disarmed`` raise its exception."""
         try:
             if isinstance(source, AsyncIterable):
                 async for target in source:
@@ -121,7 +126,7 @@ class TargetLanding:
             self._error = error
 
     async def acquire(self, reader: asyncio.Task[None], timeout: float) -> None:
-        """Wait for the first sight of the target, before anything is ordered."""
+        """Wait until the target is visible for the first time, before the landing is ordered."""
         started = self._now()
         while self._last is None:
             self._raise_error()
@@ -132,7 +137,8 @@ class TargetLanding:
 
     async def await_disarmed(self, order: Order, timeout: float | None, max_silence_s: float | None) -> None:
         """Wait until the vehicle is on the ground and disarmed."""
-        telemetry = self._session.telemetry
+        telemetry, ground = self._session.telemetry, GroundCheck(self._session)
+        stays = self._context.sender.stays_until_disarmed(order)
 
         def is_down() -> bool:
             height = self._height_m()
@@ -140,25 +146,25 @@ class TargetLanding:
                 self._lowest_m = min(self._lowest_m, height)
                 self._climbed_m = max(self._climbed_m, height - self._lowest_m)
             self._raise_error()
-            return telemetry.is_confirmed_disarmed and telemetry.armed.updated_at > order.given_at
+            return ground.confirms(telemetry.is_confirmed_disarmed and telemetry.armed.updated_at > order.given_at)
 
         def describe() -> str:
             height = self._height_m()
             where = "at an unknown height" if height is None else f"at {height:.1f} m"
-            return f"it is {where}; the target was last seen {self._now() - self._seen_at:.1f} s ago"
+            return f"the vehicle is {where}; the target was last seen {self._now() - self._seen_at:.1f} s ago"
 
         await await_progress(
             self._session,
             "land_on",
             is_done=is_down,
-            trouble=self._context.sender.stays_until_disarmed(order),
+            trouble=lambda: ground.trouble(stays),
             describe=describe,
             timeout=timeout,
             max_silence_s=max_silence_s,
         )
 
     def report(self, *, is_used: bool, texts: tuple[str, ...]) -> LandingReport:
-        """Return the report of the landing, which is over."""
+        """Return the report after the end of the landing."""
         unseen_s = self._now() - self._seen_at
         return LandingReport(self._last, unseen_s, tuple(self._losses), self._climbed_m, is_used, texts)
 
@@ -177,7 +183,7 @@ class TargetLanding:
         if target is None:
             return
         check_kind("target", target, TargetMeasurement)
-        with contextlib.suppress(ValueUnknownError):  # PX4's position was not received yet.
+        with contextlib.suppress(ValueUnknownError):  # PX4's attitude or local position is unknown.
             self._stream.send(target)
             gap = self._now() - self._seen_at
             if LOST_AFTER_S < gap < math.inf:

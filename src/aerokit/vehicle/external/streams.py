@@ -1,4 +1,4 @@
-"""`MeasurementStream`: sends each measurement of a program once, as long as it is recent."""
+"""`MeasurementStream`: sends measurements of your program to the vehicle, each once and only while it is recent."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ ESTIMATOR_MAX_AGE_S = 2.5
 class TimesyncAnswers:
     """Answers the vehicle's TIMESYNC requests with the clock of the event loop while a stream is open.
 
-    PX4 needs the answers to convert the time stamps of measurements to its own clock (Timesync.cpp, sync_stamp); until
-    they have converged it uses the times of arrival, as ArduPilot does always.
+    PX4 needs the answers to convert the time stamps of measurements to its own clock (Timesync.cpp, sync_stamp). Before
+    its offset has converged, PX4 uses the time of arrival, as ArduPilot always does.
     """
 
     def __init__(self, session: VehicleSession) -> None:
@@ -46,14 +46,14 @@ class TimesyncAnswers:
         self._detach: Detach | None = None
 
     def open(self) -> None:
-        """Begin to answer; each call needs a call of `close`."""
+        """Start to answer. Each call must be paired with a call of `close`."""
         self._users += 1
         if self._users == 1:
             bus = self._session.connection.bus
             self._detach = bus.attach(Timesync, self._on_timesync, system_id=self._session.system_id)
 
     def close(self) -> None:
-        """Stop answering after the last stream."""
+        """Stop to answer when the last stream has closed."""
         self._users -= 1
         if self._users == 0 and self._detach is not None:
             self._detach()
@@ -69,17 +69,19 @@ class TimesyncAnswers:
 
 @checks_arguments
 class MeasurementStream(Generic[MeasurementT]):
-    """Sends the measurements that you give to ``send``, each once, at most ``rate_hz`` times a second.
+    """Sends each measurement passed to ``send`` once, at most ``rate_hz`` measurements a second.
 
-    A measurement is never repeated: without new ones nothing is sent, and the vehicle acts as without its sensor. Of
-    several measurements within one period only the newest is sent. One that is older than ``valid_for_s`` when it
-    could be sent is dropped, after a blocked event loop for example; while the vehicle is silent all are dropped.
-    ``sent`` and ``dropped`` count them. The stream does not end by itself; it ends with the block.
+    A measurement is never repeated: if your program supplies no new one, nothing is sent, and the vehicle acts as if
+    its sensor had failed. Of several measurements within one period, only the newest is sent. A measurement is dropped
+    if it is older than ``valid_for_s`` when its turn comes, for example after the event loop was blocked. While the
+    vehicle is silent, all measurements are dropped. ``sent`` and ``dropped`` count them. The stream ends only with the
+    block.
 
     Entering raises:
         NotSupported: this firmware does not read such measurements. Nothing was sent.
-        OperationRejected: a parameter makes the vehicle ignore them; the text names it. Nothing else was sent.
-        ParameterTimeout: the vehicle did not report these parameters.
+        OperationRejected: a parameter makes the vehicle ignore such measurements; the error text names it. No
+            measurement was sent.
+        ParameterTimeout: the vehicle did not report the parameters that decide about this.
     """
 
     def __init__(
@@ -113,7 +115,7 @@ class MeasurementStream(Generic[MeasurementT]):
 
     @property
     def dropped(self) -> int:
-        """Number of measurements that were not sent: replaced by a newer one, too old, or during a silence."""
+        """Number of measurements that were not sent: replaced, too old, or given while the vehicle was silent."""
         return self._dropped
 
     @property
@@ -123,12 +125,12 @@ class MeasurementStream(Generic[MeasurementT]):
 
     @property
     def estimator_use(self) -> EstimatorUse:
-        """Use of these measurements by the vehicle's estimator.
+        """Use of these measurements by the vehicle's estimator: ``"used"``, ``"not used"`` or ``"unknown"``.
 
-        No message reports this. It is derived from EKF_STATUS_REPORT or ESTIMATOR_STATUS and from the parameters at
-        the beginning of the block. "used": the estimator has a position or velocity, and its parameters allow no other
-        source. "not used": it has none. "unknown" in all other cases, such as with a GPS beside, for sensors that are
-        not a position, or without a recent report.
+        No message reports this, so aerokit derives it from EKF_STATUS_REPORT or ESTIMATOR_STATUS and from the
+        parameters at the beginning of the block. ``"used"``: the estimator has a position, and its parameters allow no
+        other source of it. ``"not used"``: the estimator has no position. ``"unknown"``: all other cases, for example
+        if the vehicle also has a GPS, for sensors that supply no position, or without a recent report.
         """
         rule = self._session.autopilot.external.kinds.get(self._kind)
         estimator = self._session.telemetry.estimator
@@ -138,7 +140,7 @@ class MeasurementStream(Generic[MeasurementT]):
         if estimator.age > ESTIMATOR_MAX_AGE_S or not self._sent:
             return "unknown"
         has_position = health.has_relative_position or health.has_absolute_position
-        # PX4 sets the flag also for a vehicle at rest.
+        # PX4 also sets the flag while the vehicle is at rest.
         is_resting = self._session.telemetry.landed_state.latest == MavLandedState.ON_GROUND
         is_constant = health.flags & CONSTANT_POSITION and not (
             is_resting and self._session.autopilot.external.constant_position_at_rest
@@ -150,12 +152,12 @@ class MeasurementStream(Generic[MeasurementT]):
         return "used" if is_alone else "unknown"
 
     def send(self, measurement: MeasurementT) -> None:
-        """Send a measurement now, or at the end of the period if one was sent within it.
+        """Send a measurement now, or at the end of the period if another one was already sent in this period.
 
         Raises:
             InvalidArgument: a value is out of range; nothing was sent.
             SetpointStreamStopped: the block was left or not entered.
-            ValueUnknownError: a landing target for PX4, whose attitude or local position is unknown.
+            ValueUnknownError: PX4's attitude or local position is unknown, which a landing target requires.
             ConnectionClosed: the connection has ended.
         """
         check_kind("measurement", measurement, self._value_type)
@@ -166,7 +168,7 @@ class MeasurementStream(Generic[MeasurementT]):
             message.encode()
         connection = self._session.connection
         if not connection.is_open:
-            connection.send(messages[0])  # Raises the reason of the end.
+            connection.send(messages[0])  # Raises the error that ended the connection.
         now = connection.now()
         given: float | None = getattr(measurement, "measured_at", None)
         if self._waiting is not None:
@@ -212,7 +214,7 @@ class MeasurementStream(Generic[MeasurementT]):
         self._answers.close()
 
     async def _check_support(self) -> dict[str, float]:
-        """Raise unless the vehicle reads these measurements; return the parameters that decide about them."""
+        """Raise an error unless the vehicle uses these measurements; return the parameters that decide about it."""
         firmware, rule = self._session.autopilot.firmware, self._session.autopilot.external.kinds.get(self._kind)
         what = self._kind.replace("_", " ")
         if rule is None:

@@ -1,8 +1,8 @@
 """Measurements that a program supplies to a vehicle, in SI units and degrees.
 
 ``measured_at`` is the time of the measurement on the clock of the event loop (``vehicle.connection.now()``); None means
-the time at which it is given to the stream. ``variance`` fields are squares of one standard deviation; None is unknown,
-and the autopilot then uses its parameters (VISO_POS_M_NSE …, EKF2_EVP_NOISE …).
+the time of the call of ``send``. ``variance`` fields are squared standard deviations. If one is None, the autopilot
+uses its parameters instead (VISO_POS_M_NSE …, EKF2_EVP_NOISE …).
 """
 
 from __future__ import annotations
@@ -32,17 +32,21 @@ __all__ = [
 Vector: TypeAlias = tuple[float, float, float]
 Quaternion: TypeAlias = tuple[float, float, float, float]
 LocalFrame: TypeAlias = Literal["ned", "frd", "enu", "flu"]
-"""Axes of a local frame: north-east-down; forward-right-down at the start; and both as in ROS, with the body axes
-forward, left, up (REP 103)."""
+"""Axes of a local frame.
+
+``ned``: north, east, down. ``frd``: forward, right, down of the vehicle at its start. ``enu``: east, north, up, and
+``flu``: forward, left, up, as in ROS (REP 103); the body axes are then forward, left, up too.
+"""
 RangeDirection: TypeAlias = Literal["down", "up", "forward", "back", "left", "right"]
 
 
 class OdometryMeasurement(Snapshot):
     """Pose and velocity of the vehicle (ODOMETRY).
 
-    ``position_m`` and ``orientation`` are in ``frame``, the orientation from body axes to the frame as a quaternion
-    (w, x, y, z) or an :class:`Attitude`; ``velocity_m_s`` is along the body axes. ``quality`` is from 0 to 100 percent,
-    or −1 for a failed measurement. Increase ``reset_counter`` (0 to 255) when the estimate jumps.
+    ``position_m`` and ``orientation`` are in ``frame``. ``orientation`` is the rotation from the body axes to the
+    frame, as a quaternion (w, x, y, z) or an :class:`Attitude`. ``velocity_m_s`` is along the body axes. ``quality`` is
+    from 0 to 100 percent, or −1 for a failed measurement. Increase ``reset_counter`` (0 to 255) when the estimate
+    jumps.
     """
 
     position_m: Vector
@@ -58,7 +62,7 @@ class OdometryMeasurement(Snapshot):
 
 
 class PoseMeasurement(Snapshot):
-    """Pose of the vehicle by vision or motion capture: metres north, east, down, and attitude in degrees."""
+    """Pose of the vehicle from vision or motion capture: metres north, east and down of the origin, and attitude."""
 
     north_m: float
     east_m: float
@@ -71,7 +75,7 @@ class PoseMeasurement(Snapshot):
 
 
 class SpeedMeasurement(Snapshot):
-    """Velocity of the vehicle by vision in m/s north, east, down."""
+    """Velocity of the vehicle from vision, in m/s north, east and down."""
 
     north_m_s: float
     east_m_s: float
@@ -84,8 +88,9 @@ class SpeedMeasurement(Snapshot):
 class GpsMeasurement(Snapshot):
     """Position of a satellite receiver (GPS_INPUT).
 
-    ``fix`` is GPS_FIX_TYPE (3 is a 3D fix), ``yaw_deg`` the heading of a receiver with two antennas, ``unix_time_s``
-    the time of the fix in seconds since 1970 (UTC). ``instance`` is the number of the receiver, from 0.
+    ``velocity_m_s`` is north, east, down. ``fix`` is a GPS_FIX_TYPE (3 is a 3D fix). ``yaw_deg`` is the heading from a
+    receiver with two antennas. ``unix_time_s`` is the time of the fix in seconds since 1970 (UTC). ``instance`` is the
+    number of the receiver, from 0.
     """
 
     latitude_deg: float
@@ -106,10 +111,10 @@ class GpsMeasurement(Snapshot):
 
 
 class ObstacleSectors(Snapshot):
-    """Distances to obstacles around the vehicle (OBSTACLE_DISTANCE), at most 72.
+    """Distances in metres to obstacles around the vehicle, in at most 72 sectors (OBSTACLE_DISTANCE).
 
-    The first sector is centred on ``first_deg`` clockwise from the nose, each next one ``step_deg`` further. A distance
-    in metres of None is unknown, and infinity means that nothing is within ``max_m``.
+    The first sector is centred on ``first_deg`` clockwise from the nose, each next one ``step_deg`` further. None means
+    that the distance is unknown; infinity means that there is no obstacle within ``max_m``.
     """
 
     distances_m: tuple[float | None, ...]
@@ -121,7 +126,7 @@ class ObstacleSectors(Snapshot):
 
 
 class ObstaclePoints(Snapshot):
-    """Places of obstacles in metres forward, right and down of the vehicle (OBSTACLE_DISTANCE_3D)."""
+    """Positions of obstacles in metres forward, right and down of the vehicle (OBSTACLE_DISTANCE_3D)."""
 
     points_m: tuple[Vector, ...]
     min_m: float
@@ -130,7 +135,7 @@ class ObstaclePoints(Snapshot):
 
 
 class RangeMeasurement(Snapshot):
-    """Distance in metres by a range finder (DISTANCE_SENSOR). ``quality`` is from 1 to 100 percent."""
+    """Distance measured by a range finder, in metres (DISTANCE_SENSOR). ``quality`` is from 1 to 100 percent."""
 
     distance_m: float
     min_m: float
@@ -142,9 +147,10 @@ class RangeMeasurement(Snapshot):
 
 
 class TargetMeasurement(Snapshot):
-    """Place of a landing target relative to the vehicle in metres forward, right and down.
+    """Position of a landing target relative to the vehicle in metres forward, right and down.
 
-    With ``is_level`` the axes are level (of a stabilised camera), otherwise those of the body, which tilts.
+    The axes are those of the body, which tilts with the vehicle. With ``is_level`` they are level, as for a stabilised
+    camera.
     """
 
     forward_m: float
@@ -158,21 +164,22 @@ class TargetMeasurement(Snapshot):
     def from_angles(
         cls, forward_deg: float, right_deg: float, height_m: float, *, is_level: bool = False
     ) -> TargetMeasurement:
-        """Return the target that a camera sees at these angles from straight down, ``height_m`` below it."""
+        """Return the target ``height_m`` below a camera that sees it at these angles from straight down."""
         forward, right = (math.tan(math.radians(angle)) * height_m for angle in (forward_deg, right_deg))
         return cls(forward, right, height_m, is_level)
 
     @property
     def horizontal_m(self) -> float:
-        """Horizontal distance, if the axes are level."""
+        """Horizontal distance in metres, if the axes are level."""
         return math.hypot(self.forward_m, self.right_m)
 
 
 class FlowMeasurement(Snapshot):
     """Optical flow of a camera that looks down (OPTICAL_FLOW, OPTICAL_FLOW_RAD).
 
-    ``x_rad`` and ``y_rad`` are the angles of the motion of the ground about the body's forward and right axes within
-    ``interval_s``; ``gyro_rad`` are those of the camera itself, about all axes. ``quality`` is from 0 to 255.
+    ``x_rad`` and ``y_rad`` are the angles by which the ground moved about the body's forward and right axes within
+    ``interval_s``. ``gyro_rad`` are the angles by which the camera itself turned about all three axes. ``quality`` is
+    from 0 to 255.
     """
 
     x_rad: float

@@ -41,7 +41,7 @@ class RemoteFile(NamedTuple):
 
 
 class FileChannel:
-    """MAVFTP requests in order. Files that were read, or abandoned, are closed in the background."""
+    """Sends MAVFTP requests one at a time. Files that were read or abandoned are closed in the background."""
 
     def __init__(self, transfers: Transfers) -> None:
         connection = transfers.connection
@@ -134,10 +134,10 @@ class FileChannel:
                 else:
                     await self._close(file.session, path, idle_timeout_s)
                 return result
-        raise AssertionError("a loop that returns or raises")
+        raise AssertionError("the loop returns or raises")
 
     async def _open(self, opcode: MavFtpOpcode, path: str, idle_timeout_s: float) -> RemoteFile:
-        """Open a file. If another session blocks it, wait once until the vehicle has timed that session out."""
+        """Open a file. If another session is in the way, wait once until the vehicle times that session out."""
         may_wait, may_be_ours = True, True
         while True:
             request = self._request(opcode, path, self.client.next_session(), idle_timeout_s)
@@ -221,7 +221,7 @@ class _Closing:
 
 
 class LogChannel:
-    """LOG_* messages of one vehicle, one operation at a time; an interrupted one is ended in the background."""
+    """Runs LOG_* operations one at a time; an interrupted operation is ended in the background."""
 
     def __init__(self, transfers: Transfers) -> None:
         self._transfers = transfers

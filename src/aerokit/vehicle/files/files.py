@@ -30,7 +30,7 @@ CAPABILITY_FTP = 0x20
 CRC_UNSUPPORTED = (MavFtpErr.FAIL, MavFtpErr.UNKNOWNCOMMAND)
 MAX_FILE_SIZE = 0xFFFFFFFF
 BLOCK_SIZE = 1 << 16
-# A directory listing is taken as endless after this many replies in a row without new entries, or this many entries.
+# A directory listing counts as endless after this many consecutive replies without entries, or this many entries.
 MAX_EMPTY_REPLIES, MAX_ENTRIES = 50, 1_000_000
 
 
@@ -54,7 +54,7 @@ class Files:
     Every method raises:
         InvalidArgument: a path is empty, contains NUL, cannot be encoded, or has more than 238 bytes. Nothing was sent.
         FileError: the vehicle refused; see ``code`` and ``errno``.
-        FileTimeout: it did not finish; ``missing`` has the missing ranges.
+        FileTimeout: the operation did not finish; ``missing`` has the missing ranges.
 
     :meth:`is_supported` raises none of them.
     """
@@ -64,7 +64,7 @@ class Files:
         self._channel = FileChannel(transfers)
 
     async def is_supported(self) -> bool:
-        """Return True if the vehicle reports MAVFTP; False also if it does not answer within three seconds."""
+        """Return True if the vehicle reports MAVFTP; False if it does not, or does not answer within three seconds."""
         capabilities = await self._transfers.capabilities()
         return capabilities is not None and bool(capabilities & CAPABILITY_FTP)
 
@@ -163,7 +163,7 @@ class Files:
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> None:
-        """Write a file. An existing file is replaced; its content is lost with the first message.
+        """Write a file. An existing file is replaced; its old content is lost as soon as the write begins.
 
         ``verify`` compares the CRC-32 afterwards, if the vehicle can compute it. It cannot for files whose names
         begin with ``@``: the vehicle evaluates them when they are closed, and does not report the result.

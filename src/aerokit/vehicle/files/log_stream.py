@@ -29,9 +29,9 @@ DROPOUT = b"\x02\x00O"
 
 
 class UlogAssembler:
-    """Joins the messages of a log stream to a valid ULog file: whole ULog messages, and a mark where some are missing.
+    """Assembles the messages of a log stream into a valid ULog file, with marks where messages are missing.
 
-    A gap in the numbers discards what is left of the current ULog message, up to the next one that begins.
+    After a gap in the sequence numbers, the rest of the current ULog message is discarded, up to the start of the next.
     """
 
     def __init__(self) -> None:
@@ -45,7 +45,7 @@ class UlogAssembler:
     def add(self, message: LoggingData | LoggingDataAcked, now: float) -> bytes:
         """Take the next message and return the complete ULog messages."""
         gap = 0 if self._next is None else (message.sequence - self._next) % 0x10000
-        if gap >= 0x8000:  # A repetition, because the acknowledgement was lost.
+        if gap >= 0x8000:  # A repetition of an earlier message, whose acknowledgement was lost.
             return b""
         data, first = bytes(message.data[: message.length]), message.first_message_offset
         marks = b""
@@ -82,15 +82,15 @@ class UlogAssembler:
 
 @checks_arguments
 class LogStream(ReadOnly):
-    """The flight log that PX4 sends while its ``async with`` block runs (LOGGING_DATA): an async iterator over bytes.
+    """PX4's flight log, received while PX4 writes it (LOGGING_DATA): an async iterator over bytes.
 
-    Written to a file one after the other, the bytes are a valid ULog file at any time. Lost messages are marked there
-    as dropouts; ``lost`` counts them. The iterator ends with the connection. PX4 sends one such log at a time.
+    If you append all bytes to a file, it is a valid ULog file at any time. Lost messages are marked in it as dropouts;
+    ``lost`` counts them. The iterator ends with the connection. PX4 sends one such log at a time.
 
     Entering raises:
-        NotSupported: ArduPilot. Nothing was sent.
+        NotSupported: the vehicle runs ArduPilot. Nothing was sent.
         CommandRejected: PX4 streams to another station, or the port is too slow (below 5 kB/s).
-        CommandTimeout: there was no acknowledgement; the stream that may have begun is stopped.
+        CommandTimeout: there was no acknowledgement; aerokit stops the stream, which may have begun.
     """
 
     def __init__(self, context: VehicleContext, idle_timeout_s: float) -> None:
@@ -103,7 +103,7 @@ class LogStream(ReadOnly):
 
     @property
     def lost(self) -> int:
-        """Number of LOGGING_DATA messages that were not received, or that the reader was too slow for."""
+        """Number of LOGGING_DATA messages that were lost, or dropped because your program read too slowly."""
         return self._assembler.lost
 
     async def __aenter__(self) -> Self:
@@ -132,7 +132,7 @@ class LogStream(ReadOnly):
     async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         is_stopped = False
         try:
-            if error is None:  # PX4 acknowledges when its last message was acknowledged (logger.cpp, stop_log_mavlink).
+            if error is None:  # PX4 answers when its last message is acknowledged (logger.cpp)
                 await STOP.send(self._context)
                 is_stopped = True
         finally:

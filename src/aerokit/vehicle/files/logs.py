@@ -39,7 +39,7 @@ MAX_UNANSWERED_REQUESTS = 4
 MAX_LOG_ID = 0xFFFF
 ERASE_RETRY_INTERVAL_S = 1.0
 ERASE_PATIENCE_S = 60.0
-# The time of a log is the vehicle's clock while it is written, and the time of the file afterwards.
+# While a log is written, its time is the vehicle's clock; afterwards it is the time of the file.
 MAX_CLOCK_DIFFERENCE = timedelta(days=1)
 ARDUPILOT_NAME = re.compile(r"(\d{8})\.BIN", re.IGNORECASE)
 PX4_LIST = "logdata.txt"
@@ -59,7 +59,7 @@ class LogEntry(Snapshot):
 
 
 class GrowthReporter:
-    """Forwards progress, and reports in the log if there was more data than in the entry."""
+    """Forwards progress, and logs a message if the log was larger than its entry says."""
 
     def __init__(self, entry: LogEntry, on_progress: OnProgress | None) -> None:
         self._entry, self._on_progress = entry, on_progress
@@ -73,7 +73,7 @@ class GrowthReporter:
     def log_growth(self) -> None:
         if self._size > self._entry.size:
             logger.info(
-                "log %d was still being written: listed with %d bytes, downloaded with %d",
+                "flight log %d was still being written: listed with %d bytes, downloaded with %d",
                 self._entry.id,
                 self._entry.size,
                 self._size,
@@ -124,7 +124,8 @@ class Logs:
     ) -> None:
         """Copy a log to this computer. A log that is still being written is read up to its current end.
 
-        Until it is complete it is ``<to>.part`` by MAVFTP, ``<to>.log<id>-<time>.part`` by the LOG_* messages.
+        Until the download is complete, the local file is named ``<to>.part`` (MAVFTP) or ``<to>.log<id>-<time>.part``
+        (LOG_*).
 
         Args:
             log: an entry of :meth:`list`, or its id.
@@ -140,7 +141,7 @@ class Logs:
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
             FileError: there is no such log, or it was requested by MAVFTP and cannot be identified.
-            FileTimeout: it did not arrive; ``missing`` has the missing ranges.
+            FileTimeout: the log did not arrive completely; ``missing`` has the missing ranges.
             OSError: the local file cannot be written.
         """
         _check(log)
@@ -211,7 +212,7 @@ class Logs:
                     raise FileTimeout(f"erase logs: {len(before)} logs still exist after {idle_timeout_s:g} s")
 
     def stream(self, *, idle_timeout_s: float = IDLE_TIMEOUT_S) -> LogStream:
-        """Receive the log that PX4 writes, for the duration of an ``async with`` block (MAV_CMD_LOGGING_START).
+        """Receive the flight log while PX4 writes it, during an ``async with`` block (MAV_CMD_LOGGING_START).
 
         ``async with vehicle.logs.stream() as stream: async for data in stream: file.write(data)``
 
@@ -256,7 +257,7 @@ class Logs:
     async def _entry(
         self, log: LogEntry | int, idle_timeout_s: float, timeout: float | None, *, may_be_silent: bool
     ) -> LogEntry:
-        """Return the current entry. If asked for an unknown id, ArduPilot lists nonexistent logs without end."""
+        """Return the current entry. Unknown ids are not requested: ArduPilot then lists nonexistent logs for ever."""
         log_id, only = (log, None) if isinstance(log, int) else (log.id, log.id)
         async with self._channel.operation(f"log {log_id}", timeout):
             entries = await self._entries(idle_timeout_s, only, MAX_UNANSWERED_REQUESTS if may_be_silent else None)

@@ -36,11 +36,11 @@ RELEASE_ATTEMPTS, ATTEMPT_TIMEOUT_S = 10, 0.5
 
 
 class ReleaseCommand:
-    """The last command of a block, which stops or releases a gimbal. Sent at once, retried in the background.
+    """The last command of a block, which stops or releases a gimbal. It is sent at once and retried in the background.
 
     While the vehicle is silent, it is sent at the next HEARTBEAT. ``is_meant`` is checked before each attempt, so that
-    it does not undo a newer order or the control of another station. To a manager that has fallen silent it is sent
-    once more at the manager's next HEARTBEAT.
+    the command does not undo a newer order or the control of another station. If the manager has fallen silent, the
+    command is sent once more at the manager's next HEARTBEAT.
     """
 
     def __init__(
@@ -125,7 +125,7 @@ class ReleaseCommand:
             detach()
 
 
-# Seconds in which the manager may confirm our control unrequested, and seconds in all, after a request as well.
+# Seconds in which the manager may confirm our control without a request, and seconds in total including a request.
 STATUS_TIMEOUT_S, CONFIRM_TIMEOUT_S = 0.5, 3.0
 
 STATUS_HZ = 1.0
@@ -146,7 +146,7 @@ class GimbalControl:
         BusyError: your program already has this control in another block. Nothing was sent.
         CommandRejected: the manager refused.
         CommandTimeout: there was no answer.
-        OperationTimeout: it was accepted, but the manager does not confirm that you are in control.
+        OperationTimeout: the manager accepted the command, but does not confirm that you are in control.
     """
 
     def __init__(self, orders: GimbalOrders, is_primary: bool) -> None:

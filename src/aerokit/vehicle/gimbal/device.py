@@ -96,7 +96,7 @@ def information_of(
     manager: GimbalManagerInformation | None,
     device: GimbalDeviceInformation | None,
 ) -> GimbalInformation:
-    """Combine both messages; the manager's capabilities and limits take precedence over the device's."""
+    """Combine the messages of manager and device; the manager's capabilities and limits take precedence."""
     source = manager or device
     assert source is not None
     capabilities = manager.cap_flags if manager is not None else source.cap_flags

@@ -120,7 +120,7 @@ class GimbalRegistry:
         self._received_at[frame.component_id] = self._session.connection.now()
 
     def _device_of(self, message: Message, device_id: int) -> GimbalDevice | None:
-        """Sender of a device message: id 0 is the component itself, 1 to 6 attached to it; other ids are invalid."""
+        """Return the device of a message: the component itself (id 0), or one attached to it (1 to 6); else None."""
         self._record_received(message)
         frame = message.received_frame
         component_id = self._session.component_id if frame is None else frame.component_id

@@ -92,7 +92,7 @@ class RoiMixin(GimbalMixin):
 
         Raises:
             InvalidArgument: the tolerance is out of range. Nothing was sent.
-            NotSupported: the manager supports it for its first gimbal only. Nothing was sent.
+            NotSupported: the manager supports regions of interest for its first gimbal only. Nothing was sent.
             ValueUnknownError: the target needs home or the vehicle's altitude, which is unknown. Nothing was sent.
 
         Otherwise raises as :meth:`neutral`.
@@ -167,7 +167,7 @@ class RoiMixin(GimbalMixin):
         await orders.send_roi(orders.begin_order(), MavCmd.DO_SET_ROI_NONE, orders.roi_parameter)
 
 
-# Time for information to arrive after it was promised.
+# Seconds in which information must arrive after the manager accepted the request.
 INFORMATION_TIMEOUT_S = 2.0
 
 
@@ -242,7 +242,7 @@ class Gimbal(ReadOnly, PointingMixin, RoiMixin):
         Args:
             pitch_deg_s: the first rate in degrees per second, −720 to 720; positive is up.
             yaw_deg_s: the first rate in degrees per second, −720 to 720; positive is to the right.
-            frame: whether the yaw keeps to north (``"earth"``) or turns with the vehicle (``"vehicle"``).
+            frame: ``"earth"`` if the yaw is held relative to north, ``"vehicle"`` if it turns with the vehicle.
             rate_hz: how often the latest rates are sent, 2 to 100.
             valid_for_s: stop if no new rates are set for this time.
             max_lag_s: stop if the event loop is blocked for this time.

@@ -62,7 +62,7 @@ class GimbalOrders:
 
     @property
     def attitude_source(self) -> GimbalDevice:
-        """The device that reports the attitude: the placeholder while only an old mount reports one."""
+        """The device that reports the attitude; the placeholder if only an old mount (MOUNT_STATUS) reports it."""
         is_mount = self._device is None and self.registry.reporting is None
         return self.registry.placeholder if is_mount else self.device
 
@@ -173,7 +173,7 @@ class GimbalOrders:
         return False
 
     async def send_mount_angles(self, order: Order, pitch: float, roll: float, yaw: float, *, from_nose: bool) -> None:
-        """Send mount angles. The mount's yaw is relative to the nose, so it is right only at the time of sending."""
+        """Send mount angles. The mount's yaw is relative to the nose, so a yaw from north is right only now."""
         heading = self.session.telemetry.attitude.latest
         nose = 0.0 if heading is None else heading.yaw_deg
         turned = yaw if from_nose else math.remainder(yaw - nose, 360.0)
@@ -216,7 +216,7 @@ class GimbalOrders:
             detach()
 
     async def find_manager(self) -> int:
-        """Return the manager, after asking the device whether it manages itself if no manager is known."""
+        """Return the manager. If none is known, first ask the device whether it manages itself."""
         device = self.device
         if device.manager_id is None and device.component_id:
             with suppress(CommandRejected, CommandTimeout):

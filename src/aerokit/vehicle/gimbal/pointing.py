@@ -34,7 +34,7 @@ Angles = tuple[float | None, float | None, float | None, float | None]
 
 
 class AngleTarget:
-    """Angles to reach within a tolerance. ``wanted`` returns the angles at each call, None while they are unknown."""
+    """Angles to reach within a tolerance. ``wanted`` returns them, or None while they are unknown."""
 
     def __init__(self, wanted: Callable[[], Angles | None], tolerance_deg: float, unknown: str = "") -> None:
         self._wanted, self._tolerance_deg, self._unknown = wanted, tolerance_deg, unknown
@@ -130,7 +130,7 @@ def _position(orders: GimbalOrders, since: float) -> str:
     source, device = orders.attitude_source, orders.device
     cell = source.attitude
     if not cell.is_known:
-        return f"it does not report its attitude (no {cell.waits_for})"
+        return f"the gimbal does not report its attitude (no {cell.waits_for})"
     attitude = cell.value
     angles = (attitude.pitch_deg, attitude.roll_deg, attitude.yaw_deg, attitude.yaw_from_nose_deg)
     text = f"it points to {_angles(angles)}"
@@ -216,8 +216,8 @@ class PointingMixin(GimbalMixin):
         Args:
             pitch_deg: from the horizon, −360 to 360: 0 is level, −90 straight down.
             yaw_deg: −360 to 360, clockwise from north (``frame="earth"``) or from the nose (``"vehicle"``).
-            roll_deg: from the horizon, −360 to 360. Other values than 0 need the mount command, which turns the camera
-                with the vehicle: a yaw from north is right only at the time of the order.
+            roll_deg: from the horizon, −360 to 360. A roll other than 0 needs the mount command, whose yaw turns with
+                the vehicle: a yaw from north is right only at the time of the order.
             frame: reference of the yaw, which the gimbal keeps afterwards.
             wait: False: return when the manager has accepted the order.
             tolerance_deg: accepted deviation in each axis, above 0 to 45.
@@ -275,7 +275,7 @@ class PointingMixin(GimbalMixin):
         await self._rest("neutral", NEUTRAL, MavMountMode.NEUTRAL, wait=wait, timeout=timeout)
 
     async def retract(self, *, wait: bool = True, timeout: float = 10.0) -> None:
-        """Retract the gimbal; returns when it rests there.
+        """Retract the gimbal; returns when it rests in the retracted position.
 
         Args:
             wait: False: return when the manager has accepted the order.

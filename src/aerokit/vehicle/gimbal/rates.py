@@ -35,7 +35,8 @@ class GimbalRates(ValueStream[tuple[float, float]]):
     (GIMBAL_MANAGER_SET_PITCHYAW, or GIMBAL_MANAGER_SET_ATTITUDE to PX4). Leaving, in any way, orders a rate of zero:
     the gimbal keeps its direction. The stream stops by itself, with a rate of zero, if no new rates are set for
     ``valid_for_s``, the event loop is blocked for ``max_lag_s``, or the vehicle is silent. It stops without sending a
-    rate of zero if another order is given to the gimbal, or control is lost. Then ``set`` and leaving the block raise.
+    rate of zero if another order is given to the gimbal, or control is lost. ``set`` and leaving the block then raise
+    :class:`SetpointStreamStopped` or :class:`GimbalTaken`.
 
     Entering raises:
         InvalidArgument: a rate is out of range. Nothing was sent.

@@ -36,7 +36,7 @@ DUPLICATE_WINDOW_S = 0.3
 
 REPEAT_AFTER_S = 1.0
 
-# A vehicle that has landed may report another item than the last one this long before it disarms.
+# After a landing, a vehicle may report another item than the last one for this long before it disarms.
 FINAL_ITEM_MAX_AGE_S = 3.0
 
 # A vehicle that starts its mission again may report for this long that it is complete.
@@ -86,7 +86,7 @@ class PlanContext:
         return self.session.connection.now()
 
     def offset_of(self, mission_type: int) -> int:
-        """Offset of the vehicle's item numbers: 1 if its item 0 is home, else 0."""
+        """Offset of the vehicle's item numbers: 1 if the vehicle's item 0 is home, otherwise 0."""
         return int(mission_type == 0 and self.autopilot.home_is_item_0)
 
     @property
@@ -131,9 +131,9 @@ class PlanContext:
 class MissionTracker:
     """Cells and events for mission progress. Item numbers do not count home.
 
-    An ArduCopter that lands at the end disarms and returns to its first item, without reporting that the mission is
-    complete. PX4 reports completion until the next mission has started, reports an active mission also in its landing
-    mode, and sends each reached item ten times.
+    If ArduCopter lands at the end, it disarms and returns to its first item, without reporting that the mission is
+    complete. PX4 reports completion until the next mission has started, reports an active mission even in its landing
+    mode, and sends each MISSION_ITEM_REACHED ten times.
     """
 
     def __init__(self, session: VehicleSession) -> None:

@@ -11,6 +11,7 @@ from aerokit.errors import CommandRejected, InvalidArgument, OperationRejected, 
 from aerokit.mavlink.enums import MavCmd, MavLandedState, MavResult, MissionState
 from aerokit.position import Position
 from aerokit.vehicle.commanding.arbiter import MODE_GRACE_S
+from aerokit.vehicle.commanding.ground import ImpactDetector
 from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, await_progress
 from aerokit.vehicle.missions.plans import VehiclePlan
 from aerokit.vehicle.missions.stalling import MissionStallDetector
@@ -42,10 +43,10 @@ RETURN_TIMEOUT_S = 300.0
 class MissionEndDetector:
     """Detects the end of a mission.
 
-    A mission ends when the vehicle reports that it is complete, or has landed and disarmed at its last item. A mission
-    that ends with a landing, or with a return that ends in one, has ended only once the vehicle is on the ground: PX4
-    reports completion when the return starts, and flies it in another mode. A return without a landing ends at home.
-    Vehicles that do not report a mission state must have reached the last item.
+    A mission has ended when the vehicle reports that it is complete, or has landed and disarmed at its last item. If
+    the mission ends with a landing, or with a return that includes a landing, the vehicle must also be on the ground,
+    because PX4 reports completion when the return starts, and returns in another mode. A return without a landing ends
+    at home. A vehicle that reports no mission state must have reached the last item.
     """
 
     def __init__(
@@ -65,8 +66,12 @@ class MissionEndDetector:
         self._grace_until = session.connection.now() + MODE_GRACE_S
         self._was_in_mode = False
         self._left_at: float | None = None
+        self._impact = ImpactDetector(session)
 
     def has_ended(self) -> bool:
+        self._impact.update()
+        if self._impact.text() and self._is_on_ground:
+            return False
         if self._tracker.is_complete:
             at_home = self._ends_in_air and (self._session.autopilot.mission_completes_at_home or self._is_home)
             return not self._ends_by_landing or self._is_on_ground or at_home
@@ -86,6 +91,8 @@ class MissionEndDetector:
         session, now = self._session, self._session.connection.now()
         if self._vehicle_context.arbiter.newest not in (self._order, order):
             return "another order was given"
+        if self._is_on_ground and (impact := self._impact.text()):
+            return f"{impact}, {self.describe()}"
         is_in_mode = session.telemetry.is_in(self._mode)
         self._was_in_mode = self._was_in_mode or is_in_mode
         if not session.telemetry.is_confirmed_disarmed and (
@@ -93,7 +100,7 @@ class MissionEndDetector:
         ):
             self._left_at = None
             return None
-        if self._left_at is None:  # The report of the end may come after the change of mode that it causes.
+        if self._left_at is None:  # The end of the mission may be reported after the mode change that it causes.
             self._left_at = now
         if now - self._left_at < END_GRACE_S or now < self._grace_until:
             return None
@@ -192,7 +199,7 @@ class MissionControl(VehiclePlan["Mission"]):
         """Fly the mission from ``item`` on; returns when HEARTBEAT reports the mission mode.
 
         The vehicle must be armed: **it takes off** if the mission begins with a take-off. A copter on the ground needs
-        a take-off item first. If you cancel the call, aerokit orders the vehicle to hold.
+        a take-off as the first item. If you cancel the call, aerokit orders the vehicle to hold.
 
         Sends MISSION_START to ArduPilot, which then takes off from the ground. Other autopilots get a mode change.
 
@@ -238,7 +245,7 @@ class MissionControl(VehiclePlan["Mission"]):
         await vehicle_context.flight_cleanup.stop_in(mode, self._order)
 
     async def resume(self, *, timeout: float = 10.0) -> None:
-        """Continue the mission from the current item; also after a pilot or another order has interrupted it.
+        """Continue the mission from the current item, even after a pilot or another order has interrupted it.
 
         ArduPilot starts again from the first item if its parameter MIS_RESTART is 1. Raises as :meth:`start`.
         """
@@ -267,17 +274,17 @@ class MissionControl(VehiclePlan["Mission"]):
 
         Raises:
             OperationRejected: the vehicle no longer flies the mission: a pilot, a failsafe or another order changed the
-                mode, or it disarmed on the way. ``reasons`` has what the vehicle reported.
-            OperationTimeout: not finished in time; or the armed vehicle has not moved for 12 s after a descent at more
-                than 3 m/s that ended on the ground; or it has not moved for 60 s at a take-off or at a waypoint without
-                a hold, which requires that the items were uploaded or downloaded.
+                mode, it disarmed on the way, or it fell. ``reasons`` has the vehicle's status texts.
+            OperationTimeout: the mission was not finished in time; or the armed vehicle has not moved for 12 s after a
+                descent at more than 3 m/s that ended on the ground; or it has not moved for 60 s at a take-off or at a
+                waypoint without a hold (only if the items are known from an upload or a download).
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
         """
         vehicle_context, session = self._vehicle_context, self._session
         mode = vehicle_context.sender.mode_for("mission.wait_finished", "mission")
         items = (self._context.caches[0].items or ())[self._context.offset_of(0) :]
         end = MissionEndDetector(vehicle_context, self._tracker, mode, items)
-        with session.streaming("mission_current", "landed_state"):
+        with session.streaming("mission_current", "landed_state", "position"):
             await await_progress(
                 session,
                 "mission.wait_finished",
@@ -293,7 +300,7 @@ class MissionControl(VehiclePlan["Mission"]):
     def explains_mode(self) -> bool:
         """True if the vehicle holds, returns or lands because its mission has ended.
 
-        This requires that the mission was the last order, and is complete or at its last item.
+        The mission must be the last order, and must be complete or at its last item.
         """
         session = self._vehicle_context.session
         if self._order is None or self._vehicle_context.arbiter.newest is not self._order:
@@ -321,7 +328,7 @@ class MissionControl(VehiclePlan["Mission"]):
             raise InvalidArgument(f"item = {item!r} is not allowed: 0 to {last}")
 
     async def _set_current(self, item: int, timeout: float, order: Order, *, keeps_jump_counts: bool = True) -> None:
-        """Set the current item. ArduPilot's item 0 resets its jump counts, unless ``keeps_jump_counts``."""
+        """Set the current item. Item 0 also resets ArduPilot's jump counts, unless ``keeps_jump_counts``."""
         vehicle_context, session = self._vehicle_context, self._session
         seq = item + self._context.offset_of(0)
         if session.autopilot.sets_current_by_command:

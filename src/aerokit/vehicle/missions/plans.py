@@ -53,9 +53,10 @@ class VehiclePlan(ReadOnly, Generic[PlanT]):
         Args:
             plan: checked before anything is sent.
             method: ``"ftp"`` (ArduPilot's ``@MISSION/…`` files), ``"items"`` (the mission protocol), or ``"auto"``.
-            only_changes: if the vehicle's plan is known from an earlier transfer, and the vehicle confirms it, send
-                nothing if it is equal, and only the items that differ if the vehicle supports that.
-            verify: read the plan back and compare, or compare PX4's checksum where that is faster. Files are always
+            only_changes: compare with the vehicle's plan, if it is known from an earlier transfer and the vehicle
+                confirms it. Send nothing if both are equal, and only the items that differ if the vehicle supports
+                that.
+            verify: read the plan back and compare it, or compare PX4's checksum if that is faster. Files are always
                 read back.
             max_distance_m: refuse a plan with a position farther than this from the vehicle, if its position is
                 known.
@@ -73,7 +74,7 @@ class VehiclePlan(ReadOnly, Generic[PlanT]):
             MissionTimeout: the vehicle stopped answering; ``missing`` has the items that it did not confirm.
             VerificationFailed: the vehicle confirmed the plan, but has different items.
             NotSupported: ``"ftp"`` was requested, but the vehicle does not support it.
-            FileError, FileTimeout: the vehicle refused or did not answer an operation on a file, with ``"ftp"``.
+            FileError, FileTimeout: with ``"ftp"``: the vehicle refused an operation on a file, or did not answer.
             OperationTimeout: not done within ``timeout``.
         """
         plan = self._checked(plan)
@@ -97,7 +98,7 @@ class VehiclePlan(ReadOnly, Generic[PlanT]):
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
             MissionRejected: the vehicle refused.
-            MissionTimeout: items are missing; ``missing`` has them.
+            MissionTimeout: items did not arrive; ``missing`` has their numbers.
             RemoteProtocolError: the received items are not a valid plan.
             NotSupported, FileError, FileTimeout: as for :meth:`upload`, with ``"ftp"``.
             OperationTimeout: not done within ``timeout``.
@@ -108,7 +109,7 @@ class VehiclePlan(ReadOnly, Generic[PlanT]):
             return plan
 
     async def clear(self, *, idle_timeout_s: float = 10.0, timeout: float | None = None) -> None:
-        """Clear the plan on the vehicle, and verify that. ArduPilot refuses to clear a mission that it is flying.
+        """Clear the plan on the vehicle, and verify that it is empty. ArduPilot refuses to clear a mission in flight.
 
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
@@ -173,7 +174,7 @@ class FenceControl(VehiclePlan["Fence"]):
 
 
 class RallyControl(VehiclePlan["RallyPoints"]):
-    """Rally points, alternatives to home for a return: ``await vehicle.rally.upload(RallyPoints([...]))``.
+    """Rally points, where a vehicle may return instead of home: ``await vehicle.rally.upload(RallyPoints([...]))``.
 
     PX4 calls them safe points, and uses them if RTL_TYPE is set accordingly.
     """

@@ -19,18 +19,19 @@ MISSION_STALL_TIMEOUT_S = 60.0
 """Longer than ``STALL_TIMEOUT_S``, because obstacle avoidance and strong wind may stop a vehicle between waypoints."""
 
 GROUND_HEIGHT_M = 3.0
-"""Below this height above home, a vehicle that stands still after a fast descent counts as fallen."""
+"""Height above home below which a vehicle that stands still after a fast descent counts as fallen."""
 
 _TAKEOFFS = (MavCmd.NAV_TAKEOFF, MavCmd.NAV_VTOL_TAKEOFF)
 _WAYPOINTS = (MavCmd.NAV_WAYPOINT, MavCmd.NAV_SPLINE_WAYPOINT)
 
 
 class MissionStallDetector:
-    """Reports a fall, and an item at which the vehicle should move and does not.
+    """Reports a fall, and a vehicle that does not move although its item requires it.
 
     A fall is a standstill of 12 s right after a fast descent, on the ground or at an item without a hold. Without a
-    descent, only an item without a hold counts, after ``MISSION_STALL_TIMEOUT_S``, while the vehicle is in its mission
-    mode and not paused. Items are known after an upload or a download. A disarmed vehicle is never reported.
+    fast descent, a standstill is reported after ``MISSION_STALL_TIMEOUT_S`` at an item without a hold, while the
+    vehicle is in its mission mode and not paused. Items are known after an upload or a download. A disarmed vehicle is
+    never reported.
     """
 
     def __init__(

@@ -98,7 +98,7 @@ class PlanChannel:
         return await self._has(MavProtocolCapability.FTP, by_default=False)
 
     async def write_file(self, items: Sequence[MissionItem]) -> None:
-        """Write the file. ArduPilot evaluates it when it is closed, without reporting the result."""
+        """Write the file. ArduPilot evaluates the file when it is closed, and does not report the result."""
         await self._context.files().write(self._path, pack_items(items, self.mission_type), **self._options)
         self._has_changed = True
 
@@ -153,7 +153,7 @@ class PlanChannel:
         connection = self._context.transfers.connection
         if self.mission_type != MavMissionType.MISSION and connection.mavlink_version == 1:
             raise NotSupported(
-                "MAVLink 1 can transfer missions only: the vehicle would take this as its mission; nothing was sent"
+                "MAVLink 1 can transfer only missions: the vehicle would use this plan as its mission; nothing was sent"
             )
         started = connection.now()
         try:
@@ -195,7 +195,7 @@ PLAN_NAMES = ("mission", "fence", "rally points")
 # MISSION_CURRENT, which has the checksum, is sent at 1 Hz.
 CHECKSUM_INTERVAL_S = 1.0
 
-# A partial upload costs about as many extra messages as this number of items.
+# The extra messages of a partial upload cost about as much as this many items.
 PART_OVERHEAD_ITEMS = 4
 
 
@@ -285,7 +285,7 @@ class PlanTransfer(Generic[PlanT]):
         return has_ftp and self._cache.has_file is not False and not is_flying
 
     def _on_file_error(self, error: Exception, method: str) -> None:
-        """Use items from now on; raise the error if files were requested or have worked before."""
+        """Transfer no files from now on; raise the error if the caller chose files, or if they have worked before."""
         if method == "ftp" or (self._cache.has_file and not isinstance(error, FileError)):
             raise error
         self._cache.has_file = False
@@ -320,7 +320,7 @@ class PlanTransfer(Generic[PlanT]):
             except VerificationFailed:
                 if method == "ftp":
                     raise
-        # There is no such file, or an item was refused: the mission protocol reports which one and why.
+        # There is no such file, or an item was refused. The mission protocol then reports which item and why.
         await self._send_items(items, method, verify=True)
 
     async def _send_changes(self, items: Sequence[MissionItem], method: str, *, verify: bool) -> bool:

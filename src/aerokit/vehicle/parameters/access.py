@@ -33,7 +33,7 @@ UploadMethod = Literal["auto", "ftp", "set"]
 CacheChoice = bool | str | os.PathLike[str]
 """False: no cache; True: the user's cache directory; or the path of another directory."""
 
-# MAVFTP counts as unsupported after this time, or this many attempts, without an answer, even if it is advertised.
+# Seconds and attempts without an answer after which MAVFTP counts as unsupported, even if the vehicle advertises it.
 FTP_PROBE_TIMEOUT_S, FTP_PROBE_ATTEMPTS = 2.0, 3
 ANSWER_DELAY_S = 0.1
 # SET_MESSAGE_INTERVAL: the default rate of the autopilot.
@@ -42,9 +42,9 @@ DEFAULT_INTERVAL = 0
 ECHO_WINDOW_S = 3.0
 # ArduPilot answers this many reads at once; more wait for its next turn.
 MAX_READS_UNBOOSTED = 5
-# Finding out whether a parameter exists takes several requests, so the rate is raised after this time.
+# A missing parameter is recognised only after several requests, so the rate is raised after this time.
 BOOST_DELAY_S = 0.5
-# Fewer changes are set one by one, which is as fast, and confirmed by the vehicle.
+# Fewer changes than this are set one by one, which is as fast, and which the vehicle confirms.
 MIN_PACK_SIZE = 10
 # More values than this are read back by a download.
 MAX_READ_BACK = 100
@@ -123,7 +123,7 @@ class ParameterAccess:
 
     @contextmanager
     def _ftp_probe(self) -> Iterator[None]:
-        """Raise FileTimeout early if MAVFTP is not answered: some relays drop it, and the list needs no MAVFTP."""
+        """Raise FileTimeout early if MAVFTP is not answered, because some relays drop it, and not the list."""
         connection, round_trip = self._transfers.connection, self._transfers.round_trip
         timeout_s = max(FTP_PROBE_TIMEOUT_S, FTP_PROBE_ATTEMPTS * round_trip.timeout_s())
         answers: list[object] = []
@@ -194,7 +194,7 @@ class ParameterAccess:
     async def read(
         self, names: Iterable[str], idle_timeout_s: float, *, probe: bool = False
     ) -> dict[str, ParameterAnswer]:
-        """Read parameters; ``probe``: the vehicle may not have them."""
+        """Read parameters; with ``probe``, ones that the vehicle may not have."""
         names = tuple(names)
         if not names:
             return {}
@@ -221,7 +221,8 @@ class ParameterAccess:
     def _boosted(self, *, after_s: float = 0.0) -> Iterator[None]:
         """Raise the rate at which ArduPilot handles parameters, by SET_MESSAGE_INTERVAL of PARAM_VALUE.
 
-        Sent after ``after_s`` seconds, if the block lasts that long, and restored at its end.
+        The rate is raised after ``after_s`` seconds, if the block lasts that long, and restored at the end of the
+        block.
         """
         interval_s = self._transfers.autopilot.parameter_interval_s
         if interval_s is None or after_s == math.inf:
@@ -339,7 +340,7 @@ class ParameterAccess:
         return {name: table[name] for name in _names(wanted) if name in table}
 
     def _was_applied(self, wanted: Parameter, answer: ParameterAnswer | None) -> bool:
-        """Compare; a value that was read as a float lacks its last bits."""
+        """Return True if the vehicle has the value; a value that was read as a float lacks its last bits."""
         if not isinstance(answer, Parameter):
             return False
         if self.store.bytewise:

@@ -49,9 +49,9 @@ class Parameters(ReadOnly):
     method accepts the old and the new name with either firmware, and converts the value; an old name that the vehicle
     no longer has causes an :class:`aerokit.errors.ParameterRenamedWarning` with the new one.
 
-    ArduPilot handles parameters a few times a second. While more than five are read, or if it has not answered within
-    half a second whether it has a parameter, aerokit raises that rate by SET_MESSAGE_INTERVAL of PARAM_VALUE, and
-    restores it at the end.
+    ArduPilot handles parameters a few times a second. aerokit raises this rate by SET_MESSAGE_INTERVAL of PARAM_VALUE
+    while it reads more than five parameters, or if there is no answer within half a second, and restores the rate at
+    the end.
 
     All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
     total; then OperationTimeout). You can cancel any call.
@@ -114,18 +114,19 @@ class Parameters(ReadOnly):
         """Return all parameters; immediately if they were downloaded since the vehicle started.
 
         Args:
-            method: ``"ftp"`` reads one small file with the defaults (``@PARAM/param.pck``), ``"list"`` requests one
-                message for each parameter; ``"auto"`` uses the file if there is one.
+            method: ``"ftp"`` reads one small file that also has the defaults (``@PARAM/param.pck``), ``"list"``
+                requests one message for each parameter, ``"auto"`` uses the file if there is one.
             refresh: download again, even if the parameters are known or cached.
             cache: keep the list on disk, and use it while the vehicle's parameter hash is unchanged: the second connect
-                takes one request. True means the user's cache directory; or pass a path. Only PX4 has a hash; it does
-                not cover parameters that PX4 changes by itself, so they may be outdated. Off by default.
+                takes one request. True means the user's cache directory; or pass a path. Only PX4 has a hash. It does
+                not cover parameters that PX4 changes by itself, so these may be outdated. Off by default.
             idle_timeout_s: fail after this many seconds without progress.
             timeout: seconds in total.
             on_progress: called with the number of parameters, or bytes of the file, so far and in total.
 
         Raises:
-            ParameterTimeout: the list is incomplete; ``missing`` has the indices, ``table`` what has arrived.
+            ParameterTimeout: the list is incomplete; ``missing`` has the missing indices, ``table`` the parameters that
+                have arrived.
             FileError, FileTimeout, RemoteProtocolError: with ``method="ftp"`` only.
         """
         with self._transfers.limit(timeout):
@@ -146,7 +147,7 @@ class Parameters(ReadOnly):
 
         Raises:
             InvalidArgument: the name is empty, or longer than 16 characters.
-            ParameterRejected: the vehicle reports that it has no such parameter, or answers only requests for others.
+            ParameterRejected: the vehicle reports that it has no such parameter, or answers only for other parameters.
             ParameterTimeout: there was no answer.
         """
         with self._transfers.limit(timeout):
@@ -220,9 +221,9 @@ class Parameters(ReadOnly):
 
         ``method="ftp"`` writes one file (``@PARAM/param.pck``) and reads the values back, ``"set"`` sets them one by
         one, ``"auto"`` uses the file if the vehicle supports it and there are many changes. Results are as for
-        :meth:`set_many`; parameters that the vehicle does not have end as ``"failed"`` with ParameterRejected, and
-        the others are set. If two names mean the same parameter, the vehicle's current name counts, and the other one
-        gets no result.
+        :meth:`set_many`; parameters that the vehicle does not have end as ``"failed"`` with ParameterRejected, and the
+        others are set. If two names mean the same parameter, the value under the vehicle's current name is used, and
+        the other name gets no result.
 
         Raises:
             InvalidArgument, FileFormatError: a name, a value or the file is invalid. Nothing was set.
@@ -294,7 +295,7 @@ class Parameters(ReadOnly):
         """Return the parameters that differ from their default, according to MAVFTP or the metadata.
 
         Raises:
-            NotSupported: neither of them has defaults.
+            NotSupported: the defaults are unknown, because neither of the two is available.
         """
         table = await self.download(idle_timeout_s=idle_timeout_s, timeout=timeout, on_progress=on_progress)
         if not any(parameter.default is not None for parameter in table.values()):

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from aerokit.connection.bus import Detach
     from aerokit.vehicle.session.transfers import Transfers
 
-# Messages with a replaced value may arrive for this long.
+# Messages with the previous value may still arrive for this long.
 IN_FLIGHT_S = 1.0
 
 

@@ -128,7 +128,7 @@ class _Block:
 
 
 class TemporaryParameters(_Block):
-    """Other values for the duration of a block, which yields the results; see :meth:`Parameters.temporarily`."""
+    """Sets other values for the duration of a block; see :meth:`Parameters.temporarily`."""
 
     def __init__(
         self,

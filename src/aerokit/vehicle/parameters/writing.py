@@ -29,7 +29,7 @@ ParameterFailure = ParameterRejected | ParameterTimeout
 
 
 class ResolvedParameter(Snapshot):
-    """A parameter of the vehicle, under the name ``requested`` by the program; ``is_fresh``: it was just read."""
+    """A parameter of the vehicle, and the name ``requested`` by the program. ``is_fresh`` if it was just read."""
 
     requested: str
     parameter: Parameter
@@ -107,7 +107,7 @@ class NameResolver:
         return name.upper() if self._access.has_upper_case_names else name
 
     def _unknown_names(self, names: Iterable[str]) -> dict[str, None]:
-        """Return all possible names of those parameters that are not known under any of them."""
+        """Return all possible names of the parameters that are known under none of their names."""
         from aerokit.parameters.renames import other_names, resolve_rename
 
         store = self._access.store
@@ -160,10 +160,16 @@ MAX_RELATIVE_ROUNDING = 1e-3
 class ParameterWrite(Snapshot):
     """Result of writing one parameter, in the name and unit that the program used.
 
-    ``outcome`` is ``"set"``: the vehicle confirmed the value and its type; ``"unchanged"``: it had this value before;
-    ``"rounded"``: it set a value near the ``requested`` one; ``"clamped"``: it set another value; ``"failed"``: see
-    ``error``, and ``value`` is the last known one, or NaN. ``note`` has further information: another name on this
-    vehicle, a documented range that the value is outside of, a reboot that is needed.
+    ``outcome`` is one of:
+
+    - ``"set"``: the vehicle confirmed the value and its type.
+    - ``"unchanged"``: the vehicle had this value before.
+    - ``"rounded"``: the vehicle set a value near the ``requested`` one.
+    - ``"clamped"``: the vehicle set another value.
+    - ``"failed"``: see ``error``; ``value`` is the last known value, or NaN.
+
+    ``note`` has further information: another name on this vehicle, a value outside its documented range, a reboot that
+    is needed.
     """
 
     name: str
@@ -189,7 +195,7 @@ def outcome_of(wanted: Parameter, before: Parameter | None, answer: ParameterAns
         text = f"{wanted.name} = {wanted.value:g} was refused: the vehicle keeps {answer.value:g}"
         return ParameterRejected(text, name=wanted.name)
     if same_value(float(answer.value), float(wanted.value)):
-        return "rounded"  # an integer that a float cannot represent exactly
+        return "rounded"  # The value is an integer that a float cannot represent exactly.
     distance = abs(answer.value - wanted.value)
     near = (
         distance < MAX_INTEGER_ROUNDING
@@ -199,7 +205,7 @@ def outcome_of(wanted: Parameter, before: Parameter | None, answer: ParameterAns
     return "rounded" if near else "clamped"
 
 
-# Parameters that appear only after others were set are looked up this often.
+# Number of times that parameters are looked up that appear only after others were set.
 MAX_ROUNDS = 3
 
 NoteOf = Callable[[str, float], str]
@@ -308,7 +314,7 @@ def _check_same(one: _PlannedWrite, other: _PlannedWrite) -> None:
     if not same_value(one.wanted.value, other.wanted.value):
         raise InvalidArgument(
             f"{one.found.requested} = {one.requested:g} and {other.found.requested} = {other.requested:g} contradict:"
-            f" both are {one.wanted.name} on this vehicle"
+            f" both names mean {one.wanted.name} on this vehicle"
         )
 
 

@@ -43,7 +43,7 @@ logger: logging.Logger = logging.getLogger("aerokit")
 DEFAULT_PORT = 2101
 MIN_RETRY_S, MAX_RETRY_S = 1.0, 30.0
 MAX_SILENCE_S = 30.0
-"""Seconds without data after which the caster is connected to again; base stations send every second or two."""
+"""Seconds without data after which the client reconnects. Base stations send every second or two."""
 POSITION_INTERVAL_S = 10.0
 POSITION_POLL_INTERVAL_S = 1.0
 POSITION_MAX_AGE_S = 10.0
@@ -54,7 +54,7 @@ CLOSE_TIMEOUT_S = 1.0
 
 
 class Caster:
-    """Address of a mount point, with the credentials. Its repr and texts do not contain the password."""
+    """Address and credentials of an NTRIP mount point. Its repr does not contain the password."""
 
     def __init__(self, host: str, port: int, mount: str, credentials: str, is_encrypted: bool) -> None:
         self.host: str = host
@@ -65,7 +65,7 @@ class Caster:
 
     @classmethod
     def parse(cls, url: str) -> Caster:
-        """Parse ``ntrip://user:password@host:port/MOUNT``; the text of an error does not contain the URL."""
+        """Parse ``ntrip://user:password@host:port/MOUNT``. Error texts do not contain the URL, but its format."""
         try:
             parts = urlsplit(url)
             host, port = parts.hostname, parts.port
@@ -102,7 +102,7 @@ class Caster:
 
 
 class _Response:
-    """The answer of a caster: status line, and the body without its chunks."""
+    """Response of a caster: its status line, and its body without the chunk headers."""
 
     def __init__(self, reader: asyncio.StreamReader, status: str, headers: dict[str, str]) -> None:
         self._reader, self.status, self._headers = reader, status, headers
@@ -115,7 +115,7 @@ class _Response:
     async def read(cls, reader: asyncio.StreamReader) -> _Response:
         status = (await reader.readline()).decode("latin-1").strip()
         headers: dict[str, str] = {}
-        # The data of NTRIP 1 follow "ICY 200 OK" at once, or after an empty line, which is no RTCM and is skipped.
+        # In NTRIP 1, the data follow "ICY 200 OK" at once or after an empty line. RtcmReader skips that line.
         if not status.startswith(("ICY", "ERROR")):
             for _ in range(MAX_HEADER_LINES):
                 name, _, value = (await reader.readline()).decode("latin-1").strip().partition(":")
@@ -141,15 +141,16 @@ class _Response:
 class NtripClient:
     """Fetches corrections from an NTRIP caster while its ``async with`` block runs, and sends them to the vehicle.
 
-    Entering returns when the caster has accepted the request. A connection that ends, or is silent for 30 s, is opened
-    again, after 1 to 30 s, as often as necessary; the logger ``aerokit`` reports it. Messages that GPS_RTCM_DATA cannot
-    carry (above 720 bytes) are left out. Leaving the block closes the connection.
+    Entering returns when the caster has accepted the request. If the connection ends or is silent for 30 s, the client
+    reconnects after 1 to 30 s, as often as necessary, and logs it (logger ``aerokit``). Messages of more than 720
+    bytes, which GPS_RTCM_DATA cannot carry, are dropped. Leaving the block closes the connection.
 
     Entering raises:
-        OperationRejected: the caster refused: user or password, or no such mount point (the text lists others).
+        OperationRejected: the caster refused the user or the password, or has no such mount point (the text lists its
+            mount points).
         LinkOpenError: the caster could not be reached.
         OperationTimeout: the caster did not answer in time.
-        BusyError: the client was entered before.
+        BusyError: the client was entered before; call ``ntrip()`` again.
     """
 
     def __init__(
@@ -176,17 +177,17 @@ class NtripClient:
 
     @property
     def problem(self) -> str:
-        """Why the caster is not connected now; empty while it is."""
+        """Reason why the client is not connected; empty while it is connected."""
         return "" if self.is_connected else self._problem
 
     @property
     def reconnects(self) -> int:
-        """How often the connection was opened again."""
+        """Number of times that the client has reconnected."""
         return self._reconnects
 
     @property
     def oversized(self) -> int:
-        """Number of messages that were left out because they have more than 720 bytes."""
+        """Number of messages that were dropped because they have more than 720 bytes."""
         return self._oversized
 
     def __repr__(self) -> str:
@@ -194,7 +195,7 @@ class NtripClient:
 
     async def __aenter__(self) -> Self:
         if self._was_entered:
-            raise BusyError("NtripClient can be entered only once: call ntrip() again")
+            raise BusyError("this NtripClient was entered before: call ntrip() again")
         self._was_entered = True
         try:
             if self._sends_position is None:
@@ -221,7 +222,7 @@ class NtripClient:
                     await writer.wait_closed()
 
     async def _run(self, response: _Response) -> None:
-        """Forward corrections, and connect again, until the block ends."""
+        """Forward corrections, and reconnect when necessary, until the block ends."""
         try:
             with self._work:
                 await self._forward(response)
@@ -231,7 +232,8 @@ class NtripClient:
                     pause_s = min(2 * pause_s, MAX_RETRY_S)
                     try:
                         response = await self._open(self._caster.mount)
-                    # A refusal may pass too: casters limit the connections of a user, and the old one may linger.
+                    # Retry after a refusal too: casters limit the connections of a user, and may still count the old
+                    # one.
                     except (OperationRejected, OperationTimeout, LinkOpenError) as error:
                         self._report(str(error))
                         continue
@@ -246,7 +248,7 @@ class NtripClient:
             self._ended.set()
 
     async def _forward(self, response: _Response) -> int:
-        """Send the corrections of one connection to the vehicle; return their number."""
+        """Send the corrections from one connection to the vehicle; return the number of messages."""
         reader, count = RtcmReader(), 0
         reason = "the caster closed the connection"
         reports = asyncio.ensure_future(self._report_position()) if self._sends_position else None
@@ -281,7 +283,7 @@ class NtripClient:
     # -------------------------------------------------------------------------------------- caster
 
     async def _open(self, mount: str) -> _Response:
-        """Request a mount point; the connection stays open in ``_writer``."""
+        """Request a mount point, and keep the connection open in ``_writer``."""
         response = await self._request(mount)
         if response.is_stream:
             return response
@@ -318,7 +320,7 @@ class NtripClient:
             raise LinkOpenError(f"{self._name}: the caster could not be reached: {reason}") from None
 
     async def _asks_for_position(self) -> bool:
-        """Return True if the source table says that the mount point needs GGA; False if it does not say."""
+        """Return True if the source table says that the mount point needs the position (GGA)."""
         try:
             response = await self._request("")
             return (await self._table(response)).get(self._caster.mount, False)
@@ -326,7 +328,7 @@ class NtripClient:
             self._close()
 
     async def _table(self, response: _Response) -> dict[str, bool]:
-        """Read a source table: mount point → whether it needs the position (the field ``nmea``)."""
+        """Read a source table: return its mount points, and whether each needs the position (field ``nmea``)."""
         text = b""
         with suppress(OSError, ValueError, EOFError, asyncio.TimeoutError):
             async for data in response.body():

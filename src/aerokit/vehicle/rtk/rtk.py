@@ -20,28 +20,28 @@ if TYPE_CHECKING:
 __all__ = ["Corrections", "Rtk"]
 
 BANDWIDTH_WINDOW_S = 10.0
-# Vehicles that use the same corrections pass the same message within this time. A base station repeats equal messages
-# (1005, its position) after a second at the earliest.
+# If several vehicles use the same corrections, all of them pass each message here within this time. A base station
+# repeats an equal message (1005, its position) after at least a second.
 REPEAT_WINDOW_S = 0.9
 MAX_RECENT = 64
 
 
 class _SentMessages:
-    """RTCM messages that were sent on one connection, however many vehicles use it."""
+    """RTCM messages that were sent on one connection, by all its vehicles."""
 
     def __init__(self) -> None:
         self.sequence = 0
         self.recent: dict[bytes, tuple[float, set[int]]] = {}
-        """Message → time of the transmission, and the senders that have passed it."""
+        """Maps each message to the time of its transmission and the ids of the senders that passed it here."""
 
 
 _SENT: WeakKeyDictionary[Connection, _SentMessages] = WeakKeyDictionary()
 
 
 def send_rtcm(connection: Connection, message: bytes, sender: object) -> int:
-    """Send one RTCM message as GPS_RTCM_DATA, which has no target and so reaches every vehicle of the connection.
+    """Send one RTCM message as GPS_RTCM_DATA, which reaches every vehicle of the connection.
 
-    Sends nothing if another sender has just sent it. Returns the number of MAVLink messages.
+    Sends nothing if another sender has just sent the same message. Returns the number of MAVLink messages sent.
     """
     sent = _SENT.setdefault(connection, _SentMessages())
     now, (at, senders) = connection.now(), sent.recent.get(message, (0.0, {id(sender)}))
@@ -60,10 +60,11 @@ def send_rtcm(connection: Connection, message: bytes, sender: object) -> int:
 
 
 class Corrections(Snapshot):
-    """The corrections sent to the vehicle so far. The age of the cell is the age of the last one.
+    """Statistics of the corrections that were sent to the vehicle.
 
-    ``message_number`` is the RTCM number of the last message (1005, 1077 …), None if it was empty.
-    ``bandwidth_bytes_s`` is the mean of RTCM bytes per second over the last ten seconds.
+    ``message_number`` is the RTCM number of the last message (1005, 1077 …), None if that message was empty.
+    ``messages`` and ``bytes_sent`` count all messages. ``bandwidth_bytes_s`` is the mean rate over the last ten
+    seconds.
     """
 
     message_number: int | None
@@ -90,21 +91,21 @@ class Rtk:
 
     @property
     def corrections(self) -> StateCell[Corrections]:
-        """Number, bytes and bandwidth of the corrections; its age is that of the last one."""
+        """Number, bytes and bandwidth of the corrections. The age of this cell is the age of the last message."""
         return self._corrections
 
     def send(self, rtcm: bytes) -> None:
         """Send RTCM 3 messages to the vehicle; never blocks.
 
-        Each message is split as GPS_RTCM_DATA requires. That message has no target, so it is sent once on each link,
-        even if several vehicles of the connection send the same message within 0.9 s. There is no acknowledgement:
-        ``vehicle.gps`` shows whether the receiver uses the corrections.
+        aerokit splits each message into GPS_RTCM_DATA. GPS_RTCM_DATA has no target and reaches all vehicles of the
+        connection. If several vehicles send the same message within 0.9 s, it is therefore transmitted once. There is
+        no acknowledgement: ``vehicle.gps`` shows whether the receiver uses the corrections.
 
         Args:
-            rtcm: one or more whole messages, each of 720 bytes at most.
+            rtcm: one or more complete messages of at most 720 bytes each.
 
         Raises:
-            InvalidArgument: ``rtcm`` is empty, or a message is incomplete, damaged or longer. Nothing was sent.
+            InvalidArgument: ``rtcm`` is empty, or a message is incomplete, damaged or too long. Nothing was sent.
             ConnectionClosed, LinkLost: the connection has ended, or the block of this vehicle was left.
         """
         for message in rtcm_messages(rtcm):
@@ -116,8 +117,8 @@ class Rtk:
         Args:
             url: ``"ntrip://user:password@host:2101/MOUNT"``; ``ntrips://`` for TLS. Characters such as ``@`` in the
                 password are written as ``%40``. The password appears in no log, error or repr.
-            send_position: send the vehicle's position to the caster (GGA, every 10 s), which a virtual reference
-                station needs. None: if the caster's source table asks for it.
+            send_position: send the vehicle's position to the caster every 10 s (GGA), as a virtual reference station
+                needs. None: only if the caster's source table asks for it.
             timeout: seconds to wait for the caster's answer.
 
         Raises:

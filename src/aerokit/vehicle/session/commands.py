@@ -1,4 +1,4 @@
-"""Sends any MAV_CMD to one vehicle and awaits its result; equal commands are sent one at a time."""
+"""Sends any MAV_CMD to one vehicle and awaits its result. Equal commands are sent one at a time."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from aerokit.protocols.command import OrderStatus
 
 UNKNOWN = (MavResult.UNSUPPORTED, MavResult.COMMAND_LONG_ONLY, MavResult.COMMAND_UNSUPPORTED_MAV_FRAME)
-"""MAV_RESULTs of firmware that does not support a command, or not in this form."""
-# Nothing is sent again before this many measured round trips, because the answer may still arrive.
+"""MAV_RESULTs that mean that the firmware does not support a command, or not as this message."""
+# Nothing is repeated until this many measured round trips have passed, because the answer may still arrive.
 ROUND_TRIPS = 2
 MAX_ATTEMPT_TIMEOUT_S = 5.0
 PENDING_ACK_TIMEOUT_S = 2.0
@@ -34,9 +34,9 @@ _Key = tuple[int, int]
 class CommandSender:
     """The command protocol with one vehicle (https://mavlink.io/en/services/command.html).
 
-    COMMAND_ACK carries no request id, so equal commands to one component are serialized; different commands never
-    wait for each other. If an order ends, its command in progress is aborted, and its waiting command is not sent.
-    Acks of cancelled and unconfirmed commands are not mistaken for the ack of the next one.
+    COMMAND_ACK has no request id, so equal commands to one component are serialized; different commands never wait for
+    each other. If an order ends, its running command is aborted, and its waiting command is not sent. Late acks of
+    cancelled or unconfirmed commands are not taken for the ack of the next command.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class CommandSender:
         self._acks_per_command = acks_per_command
         self._locks: defaultdict[_Key, asyncio.Lock] = defaultdict(asyncio.Lock)
         self._runs: dict[_Key, ExchangeRun[CommandAck]] = {}
-        # Guards of the running commands.
+        # Maps a running command to the status of its order.
         self._standings: dict[_Key, OrderStatus | None] = {}
         self._under_way: dict[_Key, list[float]] = {}
         self._results: dict[_Key, int] = {}
@@ -153,11 +153,11 @@ class CommandSender:
         return self._results.get((self._component_id if component_id is None else component_id, command))
 
     def is_unknown(self, command: int, component_id: int | None = None) -> bool:
-        """Return True if the vehicle answered that it does not support the command, or not in this form."""
+        """Return True if the vehicle answered that it does not support the command, or not as this message."""
         return self.last_result(command, component_id) in UNKNOWN
 
     def accepted_at(self, command: int) -> float:
-        """Return the time of the last ACCEPTED ack that was addressed to us, by the autopilot; −inf without one."""
+        """Return the time of the autopilot's last ACCEPTED ack that was addressed to us; −inf without one."""
         return self._accepted_at.get((self._component_id, command), -math.inf)
 
     def forget_result(self, command: int, component_id: int | None = None) -> None:
@@ -221,15 +221,15 @@ class CommandSender:
                 self._expect_answers(key, exchange.pending_answers, earlier[exchange.answers :])
 
     def _make_way(self, key: _Key) -> None:
-        """Abort a running command whose order has ended, so that the newer command need not wait."""
+        """Abort a running command whose order has ended, so that a newer command need not wait."""
         order_status = self._standings.get(key)
         if order_status is not None and order_status.end:
             text = f"no COMMAND_ACK for {command_name(key[1])} yet; not sent again: {order_status.end}"
             self._runs[key].abort(CommandTimeout(text))
 
     def _answers_within_s(self) -> float:
-        """Return the minimum time to wait for an ack. Limited, because the round trip includes the time of a stalled
-        link.
+        """Return the minimum time to wait for an ack, limited because a stalled link makes the measured round trip too
+        long.
         """
         return min(ROUND_TRIPS * (self._round_trip_s() or 0.0), MAX_ATTEMPT_TIMEOUT_S)
 
@@ -237,7 +237,7 @@ class CommandSender:
         return self._acks_per_command.get(command, 1)
 
     def _expect_answers(self, key: _Key, count: int, earlier: Sequence[float] = ()) -> None:
-        """Record acks that may still arrive, so that the next command of this key ignores them."""
+        """Record acks that may still arrive, so that the next command with this key ignores them."""
         if expected := [*earlier, *[self._connection.now()] * count]:
             self._under_way.setdefault(key, []).extend(expected)
 
@@ -250,7 +250,7 @@ class CommandSender:
             run.abort(error)
 
     def _on_ack(self, ack: CommandAck) -> None:
-        """Deliver an ack to the running exchange; without one, count it as an expected late ack."""
+        """Deliver an ack to the running exchange, or count it as an expected late ack."""
         frame = ack.received_frame
         key = (0 if frame is None else frame.component_id, ack.command)
         run = self._runs.get(key)

@@ -45,7 +45,7 @@ MAX_RETRY_INTERVAL_S = 60.0
 AUTOPILOT_DEFAULT = 0.0
 
 SUBSCRIPTION_HZ = 4.0
-"""Rate in Hz of a streamed message without a default rate, for subscriptions that name none."""
+"""Rate in Hz for subscriptions that name no rate, to a streamed message without a default rate."""
 
 
 def subscription_rate_hz(message_type: type[Message]) -> float | None:
@@ -103,8 +103,8 @@ class MessageRates:
     """Keeps one component sending the requested messages, each at the highest requested rate.
 
     Uses MAV_CMD_SET_MESSAGE_INTERVAL, or REQUEST_DATA_STREAM if the vehicle does not support that command
-    (https://mavlink.io/en/mavgen_python/howto_requestmessages.html). A stream that does not arrive, also after a
-    reboot, is requested again; one that is too slow is reported as :class:`StreamSlow`.
+    (https://mavlink.io/en/mavgen_python/howto_requestmessages.html). A stream that does not arrive, for example after a
+    reboot, is requested again. A stream that is too slow is reported as :class:`StreamSlow`.
     """
 
     def __init__(
@@ -244,7 +244,7 @@ class MessageRates:
                 wanted[group] = self._fastest_of(group)
             stream.mark_requested(self._connection.now(), stream.needed_hz)
         for group, hz in wanted.items():
-            if hz > 0:  # A group that no subscriber needs may have been started by another ground station.
+            if hz > 0:  # Another ground station may have started a group that no subscriber here needs.
                 rate = math.ceil(hz)
                 self._connection.send(RequestDataStream(self._system_id, self._component_id, group, rate, 1))
 
@@ -398,7 +398,7 @@ class ComponentSubscriber:
         return cell
 
     def _only(self, sink: Callable[..., object]) -> Sink:
-        """Pass only messages of this component, and events about it or about no component."""
+        """Pass messages of this component, events about it, and events about no particular component."""
 
         def filtered(item: Any) -> None:
             frame = getattr(item, "received_frame", None)
@@ -410,7 +410,7 @@ class ComponentSubscriber:
 
 
 class WatchedStream:
-    """Feed of a cell whose message is requested only while your program waits for the cell or follows it.
+    """Feed of a cell that requests its message only while the program waits for the cell or follows it.
 
     ``request`` returns None if the message need not be requested now.
     """

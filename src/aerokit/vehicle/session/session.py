@@ -230,14 +230,14 @@ class VehicleSession:
     def check_disarmed(self, action: str, *, is_current: bool = True) -> None:
         """Raise OperationRejected unless the vehicle is known to be disarmed.
 
-        ``is_current`` False: its last HEARTBEAT is too old for that.
+        If ``is_current`` is False, the last HEARTBEAT is too old to know that.
         """
         if not self.telemetry.is_confirmed_disarmed or not is_current:
             state = "armed" if self.telemetry.is_armed else "not known to be disarmed"
             raise OperationRejected(f"{action}: the vehicle is {state}; nothing was sent")
 
     async def wait_for_heartbeat(self, since: float | None = None) -> None:
-        """Wait for a HEARTBEAT after ``since`` (None: the next one), which describes the vehicle's state."""
+        """Wait for a HEARTBEAT that was received after ``since`` (None: the next one)."""
         armed, after = self.telemetry.armed, self.connection.now() if since is None else since
         await armed.wait_until(lambda _: armed.updated_at > after, description="the next HEARTBEAT")
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.session.session import VehicleSession
 
 
-# A heartbeat arrives each second and shows whether the key was accepted.
+# The retry interval is that of HEARTBEAT, whose signature shows whether the key was accepted.
 RETRY_INTERVAL_S = 1.0
 
 

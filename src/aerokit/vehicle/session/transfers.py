@@ -137,8 +137,8 @@ class Transfers:
         return None if version is None else version.capabilities
 
     async def capabilities(self) -> int | None:
-        """Return the MAV_PROTOCOL_CAPABILITY bits of the autopilot; None if it does not send them within a few
-        seconds. A component that does not send them is requested once.
+        """Return the MAV_PROTOCOL_CAPABILITY bits of the autopilot; None if it does not send them within a few seconds.
+        A component that does not answer is not asked again.
         """
         if not self._version.is_known and not self._is_version_unavailable:
             with anyio.move_on_after(VERSION_TIMEOUT_S), suppress(CommandRejected, CommandTimeout):

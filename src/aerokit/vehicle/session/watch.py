@@ -31,12 +31,12 @@ if TYPE_CHECKING:
     from aerokit.events import LinkState
     from aerokit.mavlink.frame import Frame
 
-# A reboot decreases the time since boot by more than this, unless the boot before was very recent. Reordered messages
-# decrease it by less.
+# A decrease of the time since boot above this limit is a reboot. Reordered messages cause a smaller decrease, and so
+# does a reboot soon after another one.
 REBOOT_STEP_MS = 3000
 # The decreased time must persist for this long and in at least two messages, because one message may be late.
 REBOOT_CONFIRM_S = 0.2
-# Limit after an accepted reboot command: booting takes longer than this, and no message is delayed by as much.
+# The limit after an accepted reboot command. A boot takes longer than this, and messages are delayed by less than this.
 MIN_REBOOT_STEP_MS = 2000
 CLOCK_SPAN_S = 5.0
 REPORT_PERIOD_S = 1.0
@@ -95,8 +95,8 @@ class VehicleWatch:
     def silent_for_s(self) -> float:
         """Seconds since a heartbeat was processed.
 
-        :attr:`last_heartbeat_at` may be older if the event loop was blocked: a pause of this program does not count
-        as silence.
+        A pause of this program does not count as silence: after a blocked event loop, :attr:`last_heartbeat_at` may be
+        older.
         """
         return self._connection.now() - self._heartbeat_read_at
 
@@ -135,8 +135,8 @@ class VehicleWatch:
     def on_time_answer(self, requested_at: float, milliseconds: int) -> None:
         """Process the time since boot from an answer to our TIMESYNC request.
 
-        An answer to a request that was sent after the previous answer has an earlier time only after a reboot. No
-        confirmation is needed, however fast a simulation runs.
+        If the request was sent after the previous answer had arrived, only a reboot explains an earlier time. It needs
+        no confirmation, even in a fast simulation.
         """
         before_at, before = self._last_answer
         if requested_at <= before_at:
@@ -180,7 +180,7 @@ class VehicleWatch:
             self._note_time(frame, "time_boot_ms", int.from_bytes(frame.body[17:21], "little"))
 
     def _on_timesync(self, message: Timesync) -> None:
-        """Process answers to our requests; a vehicle without streams sends them, too."""
+        """Process answers to our TIMESYNC requests, which a vehicle without streams sends too."""
         frame = message.received_frame
         if message.tc1 != 0 and frame is not None and frame.component_id == self._component_id:
             self._note_time(frame, "TIMESYNC", message.tc1 // 1_000_000)
@@ -188,7 +188,7 @@ class VehicleWatch:
     def _note_time(self, frame: Frame, clock: str, milliseconds: int) -> None:
         now = self._now()
         before, then = self._times.get(clock, (milliseconds, now))
-        # A lower bound, because the earlier message may have been delayed as well.
+        # This is a lower bound, because the earlier message may have been delayed as well.
         late = 1000 * (frame.received_at - then) - (milliseconds - before)
         if self._expects_reboot and late > MIN_REBOOT_STEP_MS:
             self._has_rebooted(clock, milliseconds)

@@ -53,7 +53,7 @@ LOOKING_DOWN = 25
 
 GPS_FIX_TYPE_3D = 3
 
-# Largest value of one cell. The voltage of a pack above 65.5 V is the sum of several "cells", all but the last at it.
+# Largest value of one cell. A pack above 65.5 V is reported as several "cells", all but the last with this value.
 FULL_CELL = 0xFFFE
 
 INVALID_QUALITY = 1

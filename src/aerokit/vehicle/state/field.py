@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 MESSAGE_IDS = {row[0]: message_id for message_id, row in messages.INDEX.items()}
-"""Name of a message class → message id, without importing the class."""
+"""Maps the name of a message class to the message id, without importing the class."""
 
 
 def message_type(class_name: str) -> type[Message]:
@@ -38,7 +38,8 @@ class MessageSource(Generic[T]):
 
     Args:
         message: name of its class, so that not all messages are imported.
-        decode: returns the value, or None if the message has no value. None: the telemetry handles the message itself.
+        decode: function that returns the value, or None if the message has none. Without a function, `Telemetry`
+            handles the message.
         needs_context: ``decode`` takes a :class:`Context` as well.
         hz: the default rate to request, in Hz.
         fallback: the message is used only while no better message has reported the state recently.
@@ -160,8 +161,8 @@ def scaled(value: int, unknown: int, divisor: int) -> float | None:
     return None if value == unknown else value / divisor
 
 
-# Maximum delay in seconds of decoding a frame whose value is not read. A later frame may lack a value that this one
-# has, such as a position without a fix.
+# Maximum delay in seconds of decoding a frame whose value is not read. A later frame may lack a value that this frame
+# has: without a fix, the position is missing.
 MAX_DECODE_DELAY_S = 5.0
 
 _HEADER_LENGTH = 9
@@ -207,7 +208,7 @@ class StreamedMessage:
             return
         if self._is_watched or frame.received_at >= self._look_at:
             self._look_at = frame.received_at + MAX_DECODE_DELAY_S
-            # Observers must be called in the loop's thread, so the decoding is not left to another one.
+            # Observers must be called in the loop's thread, so another thread must not decode the frame.
             with self._lock:
                 if self.pending:
                     self.catch_up()

@@ -25,8 +25,8 @@ _F = AdsbFlags
 class Imu(Snapshot):
     """One inertial sensor, in body axes: x forward, y right, z down.
 
-    Accelerations in m/s², rates in degrees per second, magnetic field in microtesla (1 gauss is 100 µT). Pressures in
-    Pa and metres, None if the message has none.
+    Accelerations in m/s², rates in degrees per second, magnetic field in microtesla (1 gauss is 100 µT). Pressures are
+    in Pa, the pressure altitude in metres; None if the message does not contain them.
     """
 
     acceleration_m_s2: tuple[float, float, float]
@@ -39,7 +39,7 @@ class Imu(Snapshot):
 
 
 class RawImu(Snapshot):
-    """Readings of one inertial sensor without a unit, as its driver gives them: x, y, z of the body axes."""
+    """Raw readings of one inertial sensor, without a unit: x, y, z of the body axes."""
 
     acceleration: tuple[int, int, int]
     rate: tuple[int, int, int]
@@ -118,7 +118,7 @@ class Aircraft(Snapshot):
 class WinchStatus(Snapshot):
     """Line and motor of a winch; unknown values are None. ``flags`` are MAV_WINCH_STATUS_FLAG bits.
 
-    ``speed_m_s`` is positive while the line runs out. ArduCopter reports the ordered speed and the length that follows
+    ``speed_m_s`` is positive while the line runs out. ArduCopter reports the ordered speed, and a length calculated
     from it.
     """
 
@@ -200,13 +200,13 @@ def air_pressure(message: messages.ScaledPressure) -> AirPressure:
 
 
 def ground_truth(message: messages.HilStateQuaternion) -> Position | None:
-    """Return the position in HIL_STATE_QUATERNION, the truth of PX4's simulation; None if it is not a place."""
+    """Return the position in HIL_STATE_QUATERNION, the truth of PX4's simulation; None if it is invalid."""
     where = place(message.lat, message.lon)
     return where and Position(*where, message.alt / 1000)
 
 
 def simulation_state(message: messages.SimState) -> Position | None:
-    """Return the position in SIM_STATE, the truth of ArduPilot's simulation; None if it is not a place."""
+    """Return the position in SIM_STATE, the truth of ArduPilot's simulation; None if it is invalid."""
     latitude, longitude = message.lat_int, message.lon_int
     if not (latitude or longitude) and abs(message.lat) <= 90 and abs(message.lon) <= 180:
         latitude, longitude = round(message.lat * 1e7), round(message.lon * 1e7)

@@ -253,7 +253,7 @@ class States:
 STATES: Mapping[str, StateField[Any]] = {
     name: value for name, value in vars(States).items() if isinstance(value, StateField)
 }
-"""Name → declaration."""
+"""Declarations by name."""
 
 
 def _by_message() -> dict[str, list[tuple[StateField[Any], MessageSource[Any]]]]:
@@ -265,7 +265,7 @@ def _by_message() -> dict[str, list[tuple[StateField[Any], MessageSource[Any]]]]
 
 
 SOURCES: Mapping[str, list[tuple[StateField[Any], MessageSource[Any]]]] = _by_message()
-"""Name of a message class → the states that it reports, and how."""
+"""The states that a message reports, and how, by name of the message class."""
 
 LAZY = tuple(name for name, rows in SOURCES.items() if not any(field.eager for field, _ in rows))
 """Messages that are decoded on access to one of their states."""
@@ -275,4 +275,4 @@ DEFAULT_RATES_HZ: Mapping[str, float] = {
     for name, rows in SOURCES.items()
     if any(source.hz is not None for _, source in rows)
 }
-"""Name of a message class → default rate in Hz."""
+"""Default rates in Hz by name of the message class."""

@@ -50,7 +50,7 @@ class StatusTextAssembler:
         return late + texts
 
     def expire(self, now: float) -> list[StatusText]:
-        """Return the texts whose next chunk has not arrived for two seconds, as they are."""
+        """Return the incomplete texts whose next chunk has not arrived for two seconds."""
         late = [key for key, text in self._open.items() if now - text.touched_at > CHUNK_TIMEOUT_S]
         texts = [self._open.pop(key).cut(now) for key in late]
         self._recent.extend(texts)

@@ -28,7 +28,7 @@ watched": only while your program waits for the state or follows its changes; re
 
 
 def documentation() -> dict[str, tuple[str, str]]:
-    """Return name → type and documentation of each state, from the source."""
+    """Return type and documentation of each state by name, from the source."""
     (body,) = (
         node.body
         for node in ast.parse(Path(states.__file__).read_text(encoding="utf-8")).body

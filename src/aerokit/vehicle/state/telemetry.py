@@ -73,12 +73,12 @@ class Telemetry(States):
 
     @property
     def handles(self) -> Mapping[int, Callable[[Any], None]]:
-        """Message id → handler of the message."""
+        """Message handlers by message id."""
         return self._handlers
 
     @property
     def streams(self) -> Mapping[int, StreamedMessage]:
-        """Message id → handler of frames, which are decoded on access to their cells."""
+        """Handlers of frames, which are decoded on access to their cells, by message id."""
         return self._streams
 
     def accepts(self, frame: Frame) -> bool:
@@ -111,17 +111,17 @@ class Telemetry(States):
 
     @property
     def cells(self) -> Mapping[str, StateCell[Any]]:
-        """Name → cell."""
+        """Cells by name."""
         return self._cells
 
     @property
     def mode_names(self) -> Mapping[int, str]:
-        """custom_mode → name of modes from AVAILABLE_MODES that no table contains."""
+        """Names of modes from AVAILABLE_MODES that no table contains, by custom_mode."""
         return self._mode_names
 
     @property
     def default_rates(self) -> Mapping[type[Message], float]:
-        """Message class → default rate in Hz."""
+        """Default rates in Hz by message class."""
         known = {message_type(name): hz for name, hz in DEFAULT_RATES_HZ.items()}
         return {message: hz for message, hz in known.items() if self.autopilot.sends(message)}
 
@@ -158,7 +158,7 @@ class Telemetry(States):
         return latest is not None and latest.custom_mode == mode.custom_mode
 
     def texts_since(self, at: float) -> tuple[StatusText, ...]:
-        """Return the status texts received since then (64 at most), oldest first."""
+        """Return the status texts received at or after this time (64 at most), oldest first."""
         return self._texts.recent(at)
 
     # -------------------------------------------------------------------------- the machinery

@@ -74,8 +74,8 @@ def random_case(row: Row, autopilot: str, seed: int) -> Case:
 
 
 def random_case_over_two(row: Row, autopilot: str, seed: int) -> Case:
-    """The same over two links: the one in use falls silent before, with or after the order; answers come over the other
-    one, or are lost on both. None of them delivers late: what a network keeps cannot be taken back.
+    """The same over two links: the link in use falls silent before, with or after the order. Answers come over the
+    other link, or are lost on both. No link delivers late, because a program cannot take back what a network stores.
     """
     case = random_case(row, autopilot, seed)
     dice = random.Random(f"two links {row.name} {row.command} {autopilot} {seed}")
@@ -87,8 +87,8 @@ def random_case_over_two(row: Row, autopilot: str, seed: int) -> Case:
 
 
 def random_case_through_hub(row: Row, autopilot: str, seed: int) -> Case:
-    """The same through a hub, with disturbances on either side, where the hub's endpoint may be full, or go away and
-    come back; or there are two ways between the hub and one of them.
+    """The same through a hub, with disturbances on either side. The hub's endpoint may be full, or disappear and
+    return, or two links connect the hub with program or vehicle.
     """
     case = random_case(row, autopilot, seed)
     dice = random.Random(f"a hub {row.name} {row.command} {autopilot} {seed}")

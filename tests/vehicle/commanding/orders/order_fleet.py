@@ -84,7 +84,7 @@ def _row(action: str, autopilot: str) -> Row:
 
 
 def faults_of(case: FleetCase) -> list[str]:
-    """Fly it on virtual time: every rule that was broken, with the member's name."""
+    """Fly the case on virtual time; return every rule that was broken, with the member's name."""
     return run_virtual(_fly(case))
 
 
@@ -109,7 +109,7 @@ async def _fly(case: FleetCase) -> list[str]:
             continue
         one.fresh_at = tuple(order_set.at for order_set in ordered if f"{name}/1" in order_set.orders)
         if one.fresh_at and case.policy != "hold_others":
-            # It continues, also when cancelled.
+            # The policy's order continues, also when its call is cancelled.
             one.error = AerokitError("the policy had another order for it")
         found += [f"{name}: {fault}" for fault in faults(one)]
     return found
@@ -177,7 +177,7 @@ async def _give(
 
 async def fly_by_another_station(vehicle: Simulated, path: DisturbedLink) -> None:
     """Arm, take off and fly manually by another station; this program has given no order."""
-    station, seconds = FrameEncoder(200, 190), 40.0  # it boots, and gets its position
+    station, seconds = FrameEncoder(200, 190), 40.0  # the vehicle boots, and gets its position
     is_px4 = isinstance(vehicle, SimulatedPx4)
     if is_px4:
         vehicle.parameters["MIS_TAKEOFF_ALT"] = 10.0
@@ -194,7 +194,7 @@ async def fly_by_another_station(vehicle: Simulated, path: DisturbedLink) -> Non
 
 
 def _not_compared(acted: list[tuple[float, str]]) -> BaseException | None:
-    """Return members that are not compared: another party may have taken one over before the others were done."""
+    """Return an error if another party has acted; the results of the members are not compared then."""
     return AerokitError("another party has acted") if acted else None
 
 

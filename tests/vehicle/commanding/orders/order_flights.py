@@ -56,12 +56,12 @@ class Flown:
 
 
 def mode_of(vehicle: Simulated) -> str:
-    """The mode that it is truly in, as programs spell it."""
+    """The true mode of the vehicle, as programs spell it."""
     return true_point(vehicle).mode
 
 
 def fly(case: Case) -> Flown:
-    """Fly it on virtual time."""
+    """Fly the case on virtual time."""
     return run_virtual(_fly(replace(case, disturbances=replace(case.disturbances))))
 
 
@@ -85,7 +85,7 @@ async def go_to_place(place: str, vehicle: Simulated, program: aerokit.Vehicle) 
 
 
 def take_over(vehicle: Simulated) -> None:
-    """The pilot turns the mode switch, the sticks in the middle."""
+    """Turn the pilot's mode switch, with centred sticks."""
     if isinstance(vehicle, SimulatedCopter):
         vehicle.rc[2] = 1500
     turn_switch(vehicle)
@@ -151,7 +151,7 @@ def set_up(case: Case) -> Simulated:
     if case.autopilot == "px4":
         px4 = SimulatedPx4(boot_time_s=1.0)
         px4.parameters["NAV_DLL_ACT"] = 2.0 * case.station_failsafe
-        px4.parameters["COM_DISARM_PRFLT"] = 0.0  # what stays armed is seen
+        px4.parameters["COM_DISARM_PRFLT"] = 0.0  # a vehicle that stays armed must be noticed
         return px4
     copter = SimulatedCopter(boot_time_s=0.0)
     copter.parameters["FS_GCS_ENABLE"] = 1.0 * case.station_failsafe

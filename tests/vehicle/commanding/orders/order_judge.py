@@ -36,7 +36,7 @@ INITIAL_SEND_S = 0.01
 
 
 def faults(flown: Flown) -> list[str]:
-    """Every rule that was broken, in words."""
+    """Return a description of every rule that was broken."""
     return [
         *_sent_again(flown),
         *_sent_into_silence(flown),
@@ -91,8 +91,8 @@ def _key(message: Message) -> object:
 
 
 def _sent_again(flown: Flown) -> Iterator[str]:
-    """A repetition needs a HEARTBEAT since, and all HEARTBEATs since the first transmission report the previous
-    state.
+    """A repetition needs a HEARTBEAT after the last transmission; all HEARTBEATs since the first one report the
+    previous state.
     """
     first: dict[object, int] = {}
     last: dict[object, int] = {}
@@ -110,8 +110,8 @@ def _sent_again(flown: Flown) -> Iterator[str]:
 
 
 def _may_report_effect(flown: Flown, message: Message, state: State) -> bool:
-    """Return True if the effect may already be reported. An abandoned order may take effect late, and is held again
-    then; a PX4 stopped by DO_REPOSITION may be in its hold mode all the time, which is not the effect.
+    """Return True if the effect may already be reported. An abandoned order may take effect late; then aerokit orders
+    another hold. A PX4 that DO_REPOSITION stops may be in its hold mode all the time, which is not the effect.
     """
     if not isinstance(message, CommandLong):
         return False
@@ -204,7 +204,7 @@ def _armed_late(flown: Flown) -> Iterator[str]:
 
 
 def _abandoned_flight_not_held(flown: Flown) -> Iterator[str]:
-    """An abandoned flight without a takeover holds, also if it was silent then."""
+    """An abandoned flight without a takeover ends in a hold, also if the vehicle was silent at that time."""
     row, is_abandoned = flown.case.row, isinstance(flown.error, (asyncio.CancelledError, OperationTimeout))
     was_reachable = flown.given_at + flown.case.quiet_until < flown.ended_at + WATCH_S - OUTAGE_RECOVERY_S
     if (

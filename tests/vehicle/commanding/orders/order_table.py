@@ -22,6 +22,17 @@ async def _fly_setpoints(vehicle: aerokit.Vehicle) -> None:
         await stream.fly(aerokit.VelocitySetpoint(north_m_s=1.0), 6.0)
 
 
+async def _fly_body_rates(vehicle: aerokit.Vehicle) -> None:
+    async with vehicle.guided.attitude_rate() as stream:
+        await stream.fly(aerokit.AttitudeRateSetpoint(), 6.0)
+
+
+async def _fly_trajectory(vehicle: aerokit.Vehicle) -> None:
+    place = aerokit.TrajectorySetpoint(5.0, 0.0, -10.0, north_m_s=0.5)
+    async with vehicle.guided.trajectory(place) as stream:
+        await stream.fly(place, 6.0)
+
+
 async def _follow(vehicle: aerokit.Vehicle) -> None:
     target = north(vehicle, 12.0)
     async with vehicle.follow(lambda: target, distance_m=4) as following:
@@ -70,10 +81,10 @@ def _set(name: tuple[str, str]) -> Give:
     return give
 
 
-def _calibrate(name: str) -> Give:
+def _calibrate(name: str, **options: Any) -> Give:
     async def give(vehicle: aerokit.Vehicle) -> None:
-        with anyio.move_on_after(40.0):  # nobody turns the simulated PX4
-            async for _ in getattr(vehicle.calibrate, name)():
+        with anyio.move_on_after(40.0):  # nobody turns the simulated vehicle
+            async for _ in getattr(vehicle.calibrate, name)(**options):
                 pass
 
     return give
@@ -107,7 +118,19 @@ ROWS = (
         ends_later=True,
         on=("px4",),
     ),
-    Row("calibrate.gyroscope", _calibrate("gyroscope"), CALIBRATION, place="ground", steers=False, ends_later=True),
+    *(
+        Row(f"calibrate.{name}", _calibrate(name), CALIBRATION, place="ground", steers=False, ends_later=True)
+        for name in ("accelerometer", "barometer", "gyroscope", "level")
+    ),
+    Row(
+        "calibrate.escs",
+        _calibrate("escs", intent="propellers are removed"),
+        CALIBRATION,
+        place="ground",
+        steers=False,
+        ends_later=True,
+        on=("px4",),
+    ),
     Row(
         "set_mode",
         lambda v: v.set_mode("LOITER"),
@@ -181,6 +204,20 @@ ROWS = (
     Row(
         "guided.velocity",
         _fly_setpoints,
+        SET_MODE,
+        modes=(("GUIDED", "BRAKE"), ("OFFBOARD", "LOITER")),
+        holds=True,
+    ),
+    Row(
+        "guided.attitude_rate",
+        _fly_body_rates,
+        SET_MODE,
+        modes=(("GUIDED", "BRAKE"), ("OFFBOARD", "LOITER")),
+        holds=True,
+    ),
+    Row(
+        "guided.trajectory",
+        _fly_trajectory,
         SET_MODE,
         modes=(("GUIDED", "BRAKE"), ("OFFBOARD", "LOITER")),
         holds=True,

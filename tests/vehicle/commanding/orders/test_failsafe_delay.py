@@ -1,4 +1,4 @@
-"""A failsafe that is active and has not acted yet: PX4 holds for COM_FAIL_ACT_T first, and any order ends it."""
+"""A failsafe before its action: PX4 first holds for COM_FAIL_ACT_T, and any order ends the failsafe."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FAILSAFE_DELAY_S = 5.0
 
 
 async def _in_the_delay(flight: Flight | Px4Flight) -> None:
-    """Return a flight whose battery is low, and HEARTBEAT has reported it."""
+    """Return a flight whose HEARTBEAT has reported the failsafe of a low battery."""
     run_the_battery_down(flight.px4 if isinstance(flight, Px4Flight) else flight.copter)
     await flight.vehicle.system_status.wait_until(lambda state: state == MavState.CRITICAL, timeout=3)
     flight.wire.clear()

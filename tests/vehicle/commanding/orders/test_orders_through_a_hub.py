@@ -1,4 +1,4 @@
-"""The order table through a hub, with bad links on either side; and dangers that only a hub has.
+"""The order table through a hub, with bad links on either side, and failures that only a hub can have.
 
 `nox -s orders -- SEEDS` flies every row with many seeds.
 """
@@ -17,7 +17,7 @@ ROWS, SEEDS_EACH = (ALL_ROWS, SEEDS) if IS_SESSION else (ALL_ROWS[::3], 1)
 """Few of them in the tests, all of them in the session."""
 
 
-@pytest.mark.sampled(8)
+@pytest.mark.sampled(12)
 @pytest.mark.parametrize("seed", range(SEEDS_EACH))
 @pytest.mark.parametrize(("row", "autopilot"), ROWS)
 def test_order_table_no_rule_is_broken(row: Row, autopilot: str, seed: int) -> None:

@@ -81,5 +81,5 @@ def test_blocked_program_keeps_failsafe(cases: list[tuple[str, str]]) -> None:
         where = f"{what} over {scheme}: {flown[scheme, what]}"
         assert error is not None, where
         assert len(sent) == (what != "stream"), where  # Sent before the pause.
-        assert oldest_s > PAUSE_S - 1.5, where  # HEARTBEATs that waited are called as old as they are
+        assert oldest_s > PAUSE_S - 1.5, where  # the age of queued HEARTBEATs includes the pause
         assert reported == mode == RTL, where

@@ -1,4 +1,4 @@
-"""Several orders at once, some cancelled, on a bad link, and a pilot: only the newest is sent, nothing against him."""
+"""Several orders at once, some cancelled, on a bad link: only the newest is sent, and none after a pilot's takeover."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def kind_of(message: Message) -> Hashable:
 
 @dataclass(frozen=True)
 class Choice:
-    """One order of a program, and its messages on ArduCopter and on PX4; empty: it does not steer."""
+    """An order of a program, and its messages on ArduCopter and on PX4; no messages mean that it does not steer."""
 
     name: str
     give: Callable[[aerokit.Vehicle], Awaitable[object]]
@@ -174,7 +174,7 @@ def _judge(
     assert kind == "set-point" or not is_against_the_pilot, f"after the pilot had taken over: {about}"
 
 
-@pytest.mark.sampled(15)
+@pytest.mark.sampled(30)
 @pytest.mark.parametrize("is_px4", [False, True], ids=["ardupilot", "px4"])
 @pytest.mark.parametrize("seed", range(4 * SEEDS))
 def test_posted_orders_only_newest_is_sent(seed: int, is_px4: bool) -> None:
