@@ -9,7 +9,8 @@ from datetime import datetime, timezone
 from functools import lru_cache
 from importlib import import_module
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any, TextIO
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
 
 from aerokit.logs.flights.records import TableColumn
 
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
     from aerokit.logs.flights.records import LogReader, LogRecord
 
-_ROWS = 1 << 15
+_ROWS, _LINES = 1 << 15, 1 << 8
 _SENDER = (
     TableColumn("time_utc", "", "time"),
     TableColumn("system_id", "", "int"),
@@ -52,16 +53,6 @@ FLIGHT = (
 """Columns of the flight table after time and system id. Each row has the newest values at one position."""
 
 
-class _UnixLines:
-    """Converts the line ends of rows from CR LF to LF."""
-
-    def __init__(self, file: TextIO) -> None:
-        self._file = file
-
-    def write(self, row: str) -> None:
-        self._file.write(row[:-2] + "\n")
-
-
 # Places in a text where spreadsheets recognise a formula (owasp.org/www-community/attacks/CSV_Injection): at the
 # beginning, even after white space, and after the separators of other locales, which quotes do not protect.
 _FORMULA = re.compile(r"(^|[;\t])(?=[\s\0]*[=+\-@\uff1d\uff0b\uff0d\uff20])|^(?=[\t\r\n\0])")
@@ -86,19 +77,28 @@ class CsvTable:
 
     def __init__(self, path: Path, columns: Sequence[TableColumn]) -> None:
         self._file = path.open("w", encoding="utf-8", newline="")
+        self._lines: list[str] = []
         # The csv module quotes values with "\r" and "\n" only if the line terminator contains both.
-        self._writer = csv.writer(_UnixLines(self._file), lineterminator="\r\n")
+        self._writer = csv.writer(SimpleNamespace(write=self._lines.append), lineterminator="\r\n")
         self._writer.writerow([_csv_cell(column.name) for column in columns])
 
     def add(self, unix_s: float, values: Sequence[Any]) -> None:
         """Add a row; the time is ISO 8601 in UTC with microseconds."""
         shown = [value if type(value) in _NUMBERS and value == value else _csv_cell(value) for value in values]
         self._writer.writerow([_iso_time(unix_s), *shown])
+        if len(self._lines) >= _LINES:
+            self._flush()
 
     def close(self) -> None:
+        self._flush()
         self._file.close()
 
-    discard = close
+    def discard(self) -> None:
+        self._file.close()
+
+    def _flush(self) -> None:
+        self._file.write("".join([line[:-2] + "\n" for line in self._lines]))
+        self._lines.clear()
 
 
 class ParquetTable:
