@@ -79,7 +79,8 @@ class CsvTable:
         self._file = path.open("w", encoding="utf-8", newline="")
         self._lines: list[str] = []
         # The csv module quotes values with "\r" and "\n" only if the line terminator contains both.
-        self._writer = csv.writer(SimpleNamespace(write=self._lines.append), lineterminator="\r\n")
+        lines: Any = SimpleNamespace(write=self._lines.append)
+        self._writer = csv.writer(lines, lineterminator="\r\n")
         self._writer.writerow([_csv_cell(column.name) for column in columns])
 
     def add(self, unix_s: float, values: Sequence[Any]) -> None:
