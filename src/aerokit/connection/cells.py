@@ -294,6 +294,11 @@ class StateCell(Generic[T]):
                 raise AttributeError(f"{self.name} is a StateCell: did you mean .value.{name}?")
             raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
 
+        def __getitem__(self, key: object) -> NoReturn:
+            """Suggest ``.value[…]``; iteration also ends here."""
+            camera = ", or camera_at(number) for a camera" if self.name == "cameras" else ""
+            raise TypeError(f"{self.name} is a StateCell, not its value: use {self.name}.value[…]{camera}")
+
     def __bool__(self) -> NoReturn:
         """Raise TypeError, because ``if vehicle.armed:`` would always be true."""
         raise TypeError(f"a StateCell has no truth value: use {self.name}.value or {self.name}.latest")

@@ -271,7 +271,7 @@ def test_unknown_log_or_format_raises(log: Path, tmp_path: Path) -> None:
 def test_convert_command_prints_result(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["convert", str(log), str(tmp_path / "out.gpx")]) == 0
     assert "2023-11-14 22:13:20" in capsys.readouterr().out
-    assert main(["convert", str(log), str(tmp_path / "out.gpx")]) == 2
+    assert main(["convert", str(log), str(tmp_path / "out.gpx")]) == 6
     assert "--force" in capsys.readouterr().err
 
 
