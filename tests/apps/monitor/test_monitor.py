@@ -236,6 +236,12 @@ async def test_wide_terminal_shows_more_and_puts_texts_below_map() -> None:
     assert empty < len(lines) / 3
 
 
+async def test_vehicle_without_mission_shows_no_item() -> None:
+    async with stage(1, size=(200, 50)) as it:
+        await it.wait_drawn("mission")
+        assert "No mission" in it.screen()
+
+
 async def test_slow_streams_are_one_line_with_count() -> None:
     async with stage(1) as it:
         bus, texts = it.app._model.connection.bus, it.app.query_one("#texts", RichLog)

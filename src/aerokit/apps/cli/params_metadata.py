@@ -15,12 +15,14 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from aerokit.parameters import Metadata, Parameter, ParameterMetadata
+    from aerokit.vehicle.parameters.parameters import ParameterWrite
     from aerokit.vehicle.vehicle import Vehicle
 
 # ArduPilot uses a new system id at once (GCS_Common.cpp, update_send), PX4 and old ArduPilots after a reboot.
 _SYSTEM_ID_NAMES = ("SYSID_THISMAV", "MAV_SYSID", "MAV_SYS_ID")
 # Limits the time that reading the metadata from the vehicle takes; over a slow radio it takes longer.
 _FETCH_TIMEOUT_S = 10.0
+RANGES_NOT_CHECKED = "ranges not checked (--metadata FILE checks them)"
 
 
 def add_metadata(command: argparse.ArgumentParser, *, checks: bool = False) -> None:
@@ -96,6 +98,17 @@ def _entry(metadata: Metadata, name: str) -> tuple[ParameterMetadata | None, Any
             return metadata[spelled], lambda value: value
     renamed = resolve_rename(name.upper(), metadata)
     return (None, lambda value: value) if renamed is None else (metadata[renamed.name], renamed.to_vehicle)
+
+
+def with_range_note(metadata: Metadata | None, result: ParameterWrite) -> str:
+    """Return the note of a result; if the value was set without a check of its range, the note says so."""
+    text = ""
+    if metadata is None:
+        text = RANGES_NOT_CHECKED.replace("ranges", "range").replace("them", "it")
+    elif _entry(metadata, result.name)[0] is None:
+        text = "range not checked (the metadata does not have this parameter)"
+    is_set = result.error is None and result.outcome != "unchanged"
+    return "; ".join(filter(None, (result.note, text if is_set else "")))
 
 
 def reboot_note(metadata: Metadata | None, name: str, value: float) -> str:
