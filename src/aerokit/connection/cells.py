@@ -111,7 +111,9 @@ class StateCell(Generic[T]):
     @property
     def latest(self) -> T | None:
         """The latest value, or None before the first."""
-        self._catch_up()
+        for feed in self._feeds:  # `_catch_up`, without the call
+            if feed.pending:
+                feed.catch_up()
         return self._latest if self._known else None
 
     @property

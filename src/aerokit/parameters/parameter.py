@@ -49,7 +49,8 @@ class ParameterType(IntEnum):
 
         REAL32 for unknown numbers, because every value is sent as a float.
         """
-        return cls(number) if 1 <= number <= 10 else cls.REAL32
+        found: ParameterType = cls._value2member_map_.get(number, cls.REAL32)  # type: ignore[assignment]
+        return found
 
     @property
     def is_integer(self) -> bool:

@@ -18,6 +18,7 @@ from aerokit import messages as m
 from aerokit.apps.cli import main
 from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.logs.convert import convert
+from aerokit.logs.convert.tables import CsvTable
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.frame import Frame
@@ -149,6 +150,15 @@ def test_folder_has_table_per_message_type(tmp_path: Path, kind: str) -> None:
         assert int(row["vx_cm_s"]) == position.vx
         assert int(row["time_boot_ms"]) == position.time_boot_ms
         assert int(row["system_id"]) == 1
+
+
+@pytest.mark.parametrize("unix_s", [0.0, 1.0000005, 1764115200.9999998, 1764115200.25, -1.25])
+def test_csv_times_have_rounded_microseconds(unix_s: float, tmp_path: Path) -> None:
+    table = CsvTable(tmp_path / "times.csv", [])
+    table.add(unix_s, [])
+    table.close()
+    expected = datetime.fromtimestamp(unix_s, timezone.utc).isoformat(timespec="microseconds")
+    assert (tmp_path / "times.csv").read_text().splitlines()[1] == expected
 
 
 def test_gpx_has_times_elevations_and_mission(log: Path, tmp_path: Path) -> None:
