@@ -45,10 +45,11 @@ _Entry = tuple[int, Callable[..., None]]
 
 MESSAGE, FRAME, BOTH = range(3)
 
-# (True if any of the sinks needs the decoded message, all sinks).
-_DeliveryPlan = tuple[bool, tuple[_Entry, ...]]
+# (what all of the sinks take, all sinks).
+_DeliveryPlan = tuple[int, tuple[Callable[..., None], ...]]
 
 EVERY_SYSTEM = 0
+_HEARTBEAT_ID = 0
 
 
 class Bus:
@@ -60,6 +61,8 @@ class Bus:
 
     def __init__(self, dialect: Dialect = STANDARD) -> None:
         self.dialect = dialect
+        self.one_at_a_time = False
+        """True to end :meth:`deliver_all` after the current frame."""
         self.wanted: dict[int, int] = {}  # message id → number of sinks
         self._sinks: dict[tuple[int, int], tuple[_Entry, ...]] = {}
         self._plans: dict[int, _DeliveryPlan] = {}  # cache, by system and message id
@@ -97,10 +100,10 @@ class Bus:
         """
 
         def first(frame: Frame) -> None:
-            before = self._plan(frame)[1]
+            before = self._entries(frame)
             create()
             detach_all()
-            for entry in self._plan(frame)[1]:
+            for entry in self._entries(frame):
                 if entry not in before:
                     kind, sink = entry
                     sink(self.dialect.decode(frame) if kind == MESSAGE else frame)
@@ -120,19 +123,41 @@ class Bus:
 
     def deliver(self, frame: Frame) -> None:
         """Deliver a frame, decoded if needed. Exceptions of sinks are logged; the other sinks still get it."""
-        try:
-            is_decoded, entries = self._plans[frame.system_id << 24 | frame.message_id]
-        except KeyError:
-            is_decoded, entries = self._plan(frame)
-        if not is_decoded:  # the common case: FRAME and BOTH sinks take the frame alone
-            for _, sink in entries:
-                try:
-                    sink(frame)
-                except Exception:
-                    _report(sink)
-            return
+        self.deliver_all((frame,), _ignore)
+
+    def deliver_all(
+        self, frames: Iterable[Frame], before_heartbeat: Callable[..., None], *context: object
+    ) -> Frame | None:
+        """Deliver the frames in order, like :meth:`deliver`, and return None.
+
+        Calls ``before_heartbeat(frame, *context)`` with each HEARTBEAT before it is delivered. If a sink sets
+        :attr:`one_at_a_time`, the frame that it got is returned; those behind it are not delivered.
+        """
+        plans, decode = self._plans, self.dialect.decode
+        for frame in frames:
+            message_id = frame.message_id
+            if message_id == _HEARTBEAT_ID:
+                before_heartbeat(frame, *context)
+            try:
+                kind, sinks = plans[frame.system_id << 24 | message_id]
+            except KeyError:
+                kind, sinks = self._plan(frame)
+            if kind == BOTH:
+                self._deliver_both(frame)
+            else:
+                item = frame if kind == FRAME else decode(frame)
+                for sink in sinks:
+                    try:
+                        sink(item)
+                    except Exception:
+                        _report(sink)
+            if self.one_at_a_time:
+                return frame
+        return None
+
+    def _deliver_both(self, frame: Frame) -> None:
         message = self.dialect.decode(frame)
-        for kind, sink in entries:
+        for kind, sink in self._entries(frame):
             try:
                 if kind == MESSAGE:
                     sink(message)
@@ -161,14 +186,19 @@ class Bus:
 
     def _plan(self, frame: Frame) -> _DeliveryPlan:
         """Return the sinks for the frame's system, then the sinks for all systems. Empty if the message is unknown."""
-        system_id, message_id = frame.system_id, frame.message_id
-        sinks = self._sinks.get((system_id, message_id), ()) if system_id != EVERY_SYSTEM else ()
-        sinks += self._sinks.get((EVERY_SYSTEM, message_id), ())
-        if not sinks or self.dialect.get(message_id) is None:
-            return False, ()
-        plan = any(kind == MESSAGE for kind, _ in sinks), sinks
-        self._plans[system_id << 24 | message_id] = plan
+        entries = self._entries(frame)
+        if not entries or self.dialect.get(frame.message_id) is None:
+            return FRAME, ()
+        kinds = {kind for kind, _ in entries}
+        # Without a sink that needs the message, FRAME and BOTH sinks take the frame alone.
+        kind = FRAME if MESSAGE not in kinds else MESSAGE if kinds == {MESSAGE} else BOTH
+        plan = self._plans[frame.system_id << 24 | frame.message_id] = kind, tuple(sink for _, sink in entries)
         return plan
+
+    def _entries(self, frame: Frame) -> tuple[_Entry, ...]:
+        system_id, message_id = frame.system_id, frame.message_id
+        own = self._sinks.get((system_id, message_id), ()) if system_id != EVERY_SYSTEM else ()
+        return own + self._sinks.get((EVERY_SYSTEM, message_id), ())
 
     def _detach(self, key: tuple[int, int], entry: _Entry) -> None:
         _drop(self._sinks, key, entry)
@@ -204,7 +234,7 @@ def once(action: Callable[[], None]) -> Detach:
     return detach
 
 
-def _ignore(message: object) -> None:
+def _ignore(item: object) -> None:
     pass
 
 
@@ -301,7 +331,8 @@ class Subscription(Generic[ItemT]):
         self._detach: list[Detach] = []
         self._capacity, self._overflow = capacity, overflow
         self._queue: deque[ItemT] = deque()
-        self._waiter: asyncio.Future[None] | None = None
+        self._has_reader = False
+        self._waiter: asyncio.Future[None] | None = None  # until it is woken
         self._error: Exception | None = None
         self._closed = False
 
@@ -380,14 +411,15 @@ class Subscription(Generic[ItemT]):
             self.close(SubscriptionOverflow(f"the reader was too slow: {self._capacity} items are already queued"))
 
     async def _wait(self) -> None:
-        if self._waiter is not None:
+        if self._has_reader:
             raise InvalidArgument("a subscription has one reader; open a second subscription for a second reader")
-        self._waiter = asyncio.get_running_loop().create_future()
+        self._has_reader, self._waiter = True, asyncio.get_running_loop().create_future()
         try:
             await self._waiter
         finally:
-            self._waiter = None
+            self._has_reader, self._waiter = False, None
 
     def _wake(self) -> None:
-        if self._waiter is not None and not self._waiter.done():
-            self._waiter.set_result(None)
+        waiter, self._waiter = self._waiter, None
+        if waiter is not None and not waiter.done():
+            waiter.set_result(None)

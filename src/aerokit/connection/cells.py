@@ -111,7 +111,9 @@ class StateCell(Generic[T]):
     @property
     def latest(self) -> T | None:
         """The latest value, or None before the first."""
-        self._catch_up()
+        for feed in self._feeds:  # `_catch_up`, without the call
+            if feed.pending:
+                feed.catch_up()
         return self._latest if self._known else None
 
     @property
@@ -292,6 +294,11 @@ class StateCell(Generic[T]):
             if not name.startswith("_") and hasattr(self.latest, name):
                 raise AttributeError(f"{self.name} is a StateCell: did you mean .value.{name}?")
             raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
+
+        def __getitem__(self, key: object) -> NoReturn:
+            """Suggest ``.value[…]``; iteration also ends here."""
+            camera = ", or camera_at(number) for a camera" if self.name == "cameras" else ""
+            raise TypeError(f"{self.name} is a StateCell, not its value: use {self.name}.value[…]{camera}")
 
     def __bool__(self) -> NoReturn:
         """Raise TypeError, because ``if vehicle.armed:`` would always be true."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import logging
 import math
 import time
@@ -23,6 +22,7 @@ from aerokit.connection.heartbeats import (
     OwnHeartbeat,
     discovery_event,
 )
+from aerokit.connection.loop_watch import loop_clock
 from aerokit.connection.routes import MAX_ROUTES, Routes
 from aerokit.connection.signatures import SignatureGate, check_signing
 from aerokit.connection.tasks import BackgroundTasks, Deadlines
@@ -110,7 +110,7 @@ class Connection:
         self.link_state: StateCell[LinkState] = StateCell("link_state", self.now, "frame")
         """State of the link, from frames of any sender; ``vehicle.link_state`` is about one vehicle."""
         self.deadlines: Deadlines = Deadlines()
-        self._clock = asyncio.get_running_loop().time
+        self._clock = loop_clock()
         self._unix_epoch_s = time.time() - self._clock()
         self._encoder = FrameEncoder(source_system, source_component, version=mavlink_version)
         self._gate = SignatureGate(self._encoder, self.unix_time, self.bus.publish)
@@ -345,7 +345,7 @@ class Connection:
     @checked
     def new_cell(self, name: str, waits_for: str) -> StateCell[Any]:
         """Make a cell whose values are time-stamped with the receive time of their message; see :class:`StateCell`."""
-        return StateCell(name, self.now, waits_for, stamp=self.arrived_at)
+        return StateCell(name, self.now, waits_for, stamp=self._receiver.arrived_at)
 
     def arrived_at(self) -> float:
         """Return the receive time of the message being delivered, on the clock of :meth:`now`.

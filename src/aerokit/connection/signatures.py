@@ -43,6 +43,8 @@ class SignatureGate:
         self._keep_error: OSError | None = None
         self.is_open: bool = True
         """True while all frames are admitted without a check."""
+        self.on_change: Callable[[], object] = bool
+        """Called when :attr:`is_open` may have changed."""
 
     def use(self, signing: Signing | None) -> None:
         """Sign and verify with this key from now on (None: neither). Raises InvalidArgument with MAVLink 1."""
@@ -76,6 +78,7 @@ class SignatureGate:
 
     def _update(self) -> None:
         self.is_open = self._encoder.signing is None and self._handover is None
+        self.on_change()
 
     def admits(self, frame: Frame, *, may_hand_over: bool = True) -> bool:
         """Return True if a frame is admitted.

@@ -1,7 +1,7 @@
 """Missions, fences and rally points of a simulated vehicle: conversions and the ``@MISSION`` files.
 
-The servers of the mission protocol are separate, because the autopilots differ too much
-(`sim.ardupilot.mission_server`, `sim.px4.mission_server`). https://mavlink.io/en/services/mission.html
+`sim.ardupilot.mission_server` and `sim.px4.mission_server` add the habits of the autopilots to the server of
+`protocols.servers.missions`. https://mavlink.io/en/services/mission.html
 """
 
 from __future__ import annotations

@@ -4564,8 +4564,8 @@ class Vehicle(VehicleTwin):
 
         A PX4 fixed wing flies the figure itself (MAV_CMD_DO_FIGURE_EIGHT), as two circles and straight lines between
         them, and goes on until another order. For ArduCopter and PX4's multicopters, aerokit streams the set-points of
-        a lemniscate, and they hold at its center at the end. Errors, cancellation and time-out are as for
-        :meth:`orbit`.
+        a lemniscate, and they hold at its center at the end. Time-out, cancellation and
+        errors are those of :meth:`orbit`.
 
         Args:
             center: the point where the lines cross, at the altitude of the figure. Without altitude, the vehicle keeps

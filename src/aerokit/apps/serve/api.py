@@ -20,6 +20,7 @@ from aerokit.apps.serve.orders import (
     OrderRecord,
     OrderRunner,
     OrderType,
+    check_parameter,
     parse_plan_body,
 )
 from aerokit.apps.serve.requests import (
@@ -416,6 +417,7 @@ class HttpApi:
         kind.check(arguments)
         if kind is SET_PARAMETER:
             arguments["name"] = request.path_params["name"]
+            check_parameter(vehicle.parameters.metadata or self._metadata, arguments)
         key = request.headers.get("idempotency-key", "").strip().strip('"')
         record = self._orders.submit(vehicle, kind, arguments, key, seen_at(request))
         await _wait_ended(record, None if waits else _REFUSAL_TIMEOUT_S)
@@ -457,6 +459,7 @@ def _parameter(parameter: Parameter, metadata: Metadata | None) -> dict[str, Any
     default = known.default if parameter.default is None else parameter.default
     about = {name: to_jsonable(getattr(known, name)) for name in _METADATA}
     about |= {"default": to_jsonable(default), "meaning": known.describe(parameter.value)}
+    about |= {"values": {str(value): text for value, text in known.values.items()}, "has_bits": bool(known.bitmask)}
     return {**fields, **about}
 
 

@@ -248,6 +248,7 @@ class CopterAuto(MissionMode):
             if self._has_changed() and isinstance(self._leg, _FlyLeg):
                 self._restart_command()
             self.vehicle.mission.update()
+            self._has_changed()
         if self.vehicle.mode is not self:
             return
         is_stopped = self.is_paused and isinstance(self._leg, _FlyLeg)
