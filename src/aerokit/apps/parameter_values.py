@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 def check_values(metadata: Metadata | None, values: Mapping[str, float], force: str) -> None:
     """Raise InvalidArgument with all values that the metadata does not allow. Unknown names are accepted.
 
-    ``force`` is what the user adds to set such values too, for the error text.
+    ``force`` is the option with which the user can set such values, too; it appears in the error text.
     """
     if metadata is None:
         return
@@ -26,7 +26,7 @@ def check_values(metadata: Metadata | None, values: Mapping[str, float], force: 
 
 
 def _problem(metadata: Metadata, name: str, value: float) -> str | None:
-    """Return why the value is not allowed, in the name and unit of the user."""
+    """Return the reason why the value is not allowed, with the name and unit that the user gave; None if it is."""
     entry, convert = metadata_entry(metadata, name)
     problem = None if entry is None else entry.problem(convert(value))
     if problem is None or entry is None or entry.name == name:

@@ -45,7 +45,7 @@ _Entry = tuple[int, Callable[..., None]]
 
 MESSAGE, FRAME, BOTH = range(3)
 
-# (what all of the sinks take, all sinks).
+# (what the sinks take: FRAME, MESSAGE, or BOTH if they differ; all sinks).
 _DeliveryPlan = tuple[int, tuple[Callable[..., None], ...]]
 
 EVERY_SYSTEM = 0
@@ -131,7 +131,8 @@ class Bus:
         """Deliver the frames in order, like :meth:`deliver`, and return None.
 
         Calls ``before_heartbeat(frame, *context)`` with each HEARTBEAT before it is delivered. If a sink sets
-        :attr:`one_at_a_time`, the frame that it got is returned; those behind it are not delivered.
+        :attr:`one_at_a_time`, the method returns the frame that this sink got, and does not deliver the frames after
+        it.
         """
         plans, decode = self._plans, self.dialect.decode
         for frame in frames:
@@ -332,7 +333,7 @@ class Subscription(Generic[ItemT]):
         self._capacity, self._overflow = capacity, overflow
         self._queue: deque[ItemT] = deque()
         self._has_reader = False
-        self._waiter: asyncio.Future[None] | None = None  # until it is woken
+        self._waiter: asyncio.Future[None] | None = None  # set while a reader waits
         self._error: Exception | None = None
         self._closed = False
 

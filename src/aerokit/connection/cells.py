@@ -111,7 +111,7 @@ class StateCell(Generic[T]):
     @property
     def latest(self) -> T | None:
         """The latest value, or None before the first."""
-        for feed in self._feeds:  # `_catch_up`, without the call
+        for feed in self._feeds:  # inlined `_catch_up`, to save the call
             if feed.pending:
                 feed.catch_up()
         return self._latest if self._known else None
@@ -296,7 +296,7 @@ class StateCell(Generic[T]):
             raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
 
         def __getitem__(self, key: object) -> NoReturn:
-            """Suggest ``.value[…]``; iteration also ends here."""
+            """Suggest ``.value[…]``. Iteration over a cell also calls this method."""
             camera = ", or camera_at(number) for a camera" if self.name == "cameras" else ""
             raise TypeError(f"{self.name} is a StateCell, not its value: use {self.name}.value[…]{camera}")
 

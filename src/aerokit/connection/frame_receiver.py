@@ -246,7 +246,7 @@ class FrameReceiver:
         self._bus.publish(ComputerSlept(self._clock(), 0, seconds))
 
     def _update_checks(self) -> None:
-        """Determine whether each frame must be checked for its route and signature, recorded or observed."""
+        """Determine whether frames need work besides delivery: checks of route or signature, or observers."""
         self._bus.one_at_a_time = (
             self._is_closed
             or self._multilink is not None

@@ -96,7 +96,7 @@ class Streams:
         self.next_due: float = math.inf
         """Time of the next message; infinity when nothing is streamed."""
         self._intervals: dict[int, tuple[float, int]] = {}
-        # Due time, token, message id; time of the first message, number of messages since then.
+        # (due time, token, message id, time of the first message, number of messages since then)
         self._heap: list[tuple[float, int, int, float, int]] = []
         self._token = 0
 

@@ -1,7 +1,7 @@
 """Missions, fences and rally points of a simulated vehicle: conversions and the ``@MISSION`` files.
 
-`sim.ardupilot.mission_server` and `sim.px4.mission_server` add the habits of the autopilots to the server of
-`protocols.servers.missions`. https://mavlink.io/en/services/mission.html
+`sim.ardupilot.mission_server` and `sim.px4.mission_server` extend the server of `protocols.servers.missions` with the
+behaviour of the autopilots. https://mavlink.io/en/services/mission.html
 """
 
 from __future__ import annotations

@@ -81,8 +81,9 @@ _LEAN_KEPT_PER_S = (1.0 - 0.02 / 0.15) ** 50  # A time constant of 0.15 s.
 _TURN_GAIN_PER_S = 2.0
 _TERMINAL_SPEED_M_S = 25.0
 _APPROACH_PER_S, _MAX_APPROACH_M_S = 0.8, 1.5
-# Limits of steady motion, in which steps of 0.1 s do. A constant jerk of 4 m/s³ moves the position by jerk · 0.1³ / 6,
-# which is less than 1 mm, in a step. Touchdown is not steady, so that its time and speed are those of short steps.
+# Limits of steady motion, for which steps of 0.1 s suffice. In such a step, a constant jerk of 4 m/s³ changes the
+# position by jerk · 0.1³ / 6, which is less than 1 mm. Touchdown does not count as steady, so its time and speed come
+# from short steps.
 _STEADY_JERK_M_S3 = 4.0
 _STEADY_LEAN_RATE_RAD_S = 0.6
 _STEADY_ABOVE_GROUND_S = 0.3

@@ -64,7 +64,7 @@ class SimulatorServer:
         self._numbers = {id(vehicle): number for number, vehicle in enumerate(self.vehicles)}
         self._min_wait_s = _MIN_WAIT_S if speedup != 1.0 or len(self.vehicles) > _BATCH_THRESHOLD else 0.0
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._end_source: Callable[[], None] | None = None  # On a `VirtualClockLoop`, in place of timers.
+        self._end_source: Callable[[], None] | None = None  # used instead of timers on a `VirtualClockLoop`
         self._started_at = 0.0
         self._now_at_start = max((vehicle.now for vehicle in self.vehicles), default=0.0)
         self._ports: list[_Port] = []
@@ -238,7 +238,7 @@ class SimulatorServer:
         self._timer = loop.call_at(when, self._on_due)
 
     def _skip_lateness(self) -> None:
-        """Except in real time, skip the lateness of the timer beyond ``_MAX_CATCH_UP_S``."""
+        """If the timer is late by more than ``_MAX_CATCH_UP_S``, skip the excess, except in real time."""
         if self._loop is None or self._speedup == 1.0 or (self._timer is None and self._end_source is None):
             return
         due_at = self._next_loop_time() if self._timer is None else self._timer_at

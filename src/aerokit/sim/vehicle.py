@@ -23,7 +23,7 @@ from aerokit.sim.channel import Channel
 from aerokit.sim.faults import Faults
 
 TICK_S = 0.02
-"""Interval of motion and modes (50 Hz) while the vehicle moves; in steady flight several make one long tick."""
+"""Interval of motion and modes (50 Hz) while the vehicle moves. In steady flight, several make one long tick."""
 
 _STEADY_TICKS = 5
 
@@ -228,10 +228,10 @@ class SimulatedVehicle:
 
     @property
     def is_steady(self) -> bool:
-        """True if a long tick does as well as several short ones.
+        """True if a long tick gives the same result as several short ticks.
 
-        It lasts at most 0.1 s. It ends before anything is received, streamed or due, so that samples are as recent as
-        with short ticks.
+        A long tick lasts at most 0.1 s. It ends before anything is received, streamed or due, so that samples are as
+        recent as with short ticks.
         """
         return False
 
@@ -267,11 +267,11 @@ class SimulatedVehicle:
         self._plan_tick(1)
 
     def _plan_tick(self, ticks: int) -> None:
-        """Tick after this many intervals at the latest."""
+        """Schedule the next tick after this many intervals; it may come earlier."""
         self._next_tick = self._ticks_from + (self._ticks_done + ticks) * TICK_S
 
     def _tick_until(self, now: float) -> None:
-        """Make up for the ticks up to ``now`` by one tick."""
+        """Advance to ``now`` by a single tick that stands for all ticks since the last one."""
         done = self._ticks_done
         while self._ticks_from + (self._ticks_done + 1) * TICK_S <= now:
             self._ticks_done += 1

@@ -46,7 +46,7 @@ import anyio
 T = TypeVar("T")
 
 _POLL_EVERY = 64
-# As in asyncio, which then discards the cancelled timers.
+# With more timers than this, mostly cancelled ones, asyncio's own iteration discards the cancelled timers.
 _MANY_TIMERS = 100
 
 DEADLOCK_TIMEOUT_S = 10.0
@@ -71,7 +71,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         super().__init__(_JumpingSelector(self))
         selector: selectors.BaseSelector = self._selector  # type: ignore[attr-defined]
         self._selected: Mapping[Any, Any] = selector.get_map()
-        self._own_selected = len(self._selected)  # The loop's self-pipe.
+        self._own_selected = len(self._selected)  # just the loop's self-pipe
         self._clock_resolution = 1e-9  # A rounding error in now + (when - now) must not miss a timer.
 
     def time(self) -> float:
@@ -81,16 +81,16 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
     def add_event_source(self, next_due: Callable[[], float], run: Callable[[], None]) -> Callable[[], None]:
         """Call ``run`` whenever the clock would pass ``next_due()``; return a function that ends this.
 
-        It does the same as a timer, in a fraction of the time: it takes neither timers nor iterations of the loop.
-        ``next_due`` returns seconds of this clock, infinity for never, and later ones after each ``run``. It comes
-        before the timers of the same instant.
+        An event source does the same as a timer in a fraction of the time, because it needs neither timers nor
+        iterations of the loop. ``next_due`` returns seconds on this clock, or infinity for never. After each ``run``,
+        it must return a later time. Event sources run before timers of the same instant.
         """
         source = (next_due, asyncio.Handle(run, (), self))
         self._sources.append(source)
         return lambda: self._sources.remove(source) if source in self._sources else None
 
     def _run_once(self) -> None:
-        """Run an iteration like asyncio's. Without sockets it does not poll, except now and then for signals."""
+        """Run one iteration of the loop. Without sockets, poll only now and then, for signals."""
         self._turns += 1
         ready, timers = self._ready, self._scheduled  # type: ignore[attr-defined]
         if (
@@ -117,12 +117,12 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
 
     @property
     def _is_alone(self) -> bool:
-        """True if no socket, no thread and no debugging needs asyncio's own iteration."""
+        """True if neither sockets nor threads nor the debug mode need asyncio's own iteration."""
         is_watched = self._outside_calls or self._stopping or self._debug  # type: ignore[attr-defined]
         return not is_watched and len(self._selected) == self._own_selected
 
     def _next_timer(self) -> float:
-        """Return the time of the first timer, infinity without one; discards cancelled ones before it."""
+        """Return the time of the first timer, infinity without timers. Discard cancelled timers before it."""
         timers: list[Any] = self._scheduled  # type: ignore[attr-defined]
         while timers and timers[0]._cancelled:
             self._timer_cancelled_count -= 1  # type: ignore[attr-defined]
@@ -130,7 +130,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         return timers[0]._when if timers else math.inf
 
     def _run_sources(self) -> bool:
-        """Run events before the instant of the next timer, until a callback is ready; return True if any ran."""
+        """Run event sources that are due before the next timer, until a callback is ready. Return True if any ran."""
         sources, ready, has_run = self._sources, self._ready, False  # type: ignore[attr-defined]
         is_alone = self._is_alone
         while sources and not ready:

@@ -58,7 +58,7 @@ class RecordedParameters(ParameterProtocolServer):
         self._hash = is_whole and HASH_NAME in uncounted
 
     def value_message(self, name: str, index: int) -> m.ParamValue:
-        """Return the latest PARAM_VALUE, written or recorded; before the first recorded one, return that."""
+        """Return the latest PARAM_VALUE, written or recorded. Before the first recorded value, return that value."""
         position, recorded = self._vehicle.position_s, self._recorded[name]
         latest = next((value for time, value in reversed(recorded) if time <= position), recorded[0][1])
         written = self._written.get(name, latest.param_value)
@@ -158,10 +158,10 @@ class RecordedMissions(MissionServer):
         self._acknowledge(sender_of(request), kind, result, channel)
 
     def _on_set_current(self, request: m.MissionSetCurrent, channel: Channel) -> None:
-        """The recording decides which item is current."""
+        """Do nothing: the recording decides which item is current."""
 
     def _recorded_result(self, what: str, results: list[int], mission_type: int) -> int:
-        """Return the recorded results in order; the last one is repeated."""
+        """Return the next of the recorded results; the last result is repeated."""
         number = self._done.get((what, mission_type), 0)
         self._done[what, mission_type] = number + 1
         return results[min(number, len(results) - 1)]

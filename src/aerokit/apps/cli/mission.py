@@ -223,7 +223,7 @@ async def _check(options: argparse.Namespace) -> int:
     plan = read_plan(options.file)
     for part in PARTS:
         items = getattr(plan, part).to_items()
-        if items or options.json:  # "fence: 0 items" would look like a fence that the upload clears
+        if items or options.json:  # "fence: 0 items" would look as if the upload cleared the fence
             emit_items(options, part, items, "in the file")
     if not any(getattr(plan, part).to_items() for part in PARTS) and not options.json:
         print(f"{options.file} has no items")

@@ -84,7 +84,7 @@ def _text(error: BaseException) -> str:
     return plain_text(error) or type(error).__name__
 
 
-# Calls of the library whose names begin error texts, and what a command prints instead.
+# Maps names of calls with which error texts of the library begin to the words that a command prints instead.
 _PLAIN_NAMES = {
     "arm": "arming",
     "disarm": "disarming",
@@ -102,7 +102,7 @@ _CALL = re.compile(rf"({'|'.join(map(re.escape, _PLAIN_NAMES))})(?:\(([^()]*)\))
 
 
 def plain_text(error: BaseException) -> str:
-    """Return the text of an error without the name of the call that raised it, which users of a command do not know.
+    """Return the text of an error. The name of the call that raised it is replaced, because users do not know the call.
 
     ``mission.wait_finished: the mode changed to RTL`` becomes ``flying the mission: the mode changed to RTL``.
     """

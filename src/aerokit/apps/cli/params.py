@@ -205,8 +205,8 @@ def _emit_results(
 ) -> int:
     """Print a line for each result, and return the exit code.
 
-    It is that of the first error, as for ``get``; otherwise FAILED if a value differs from the requested one by more
-    than rounding.
+    The exit code is that of the first error, as for ``get``. Without an error, it is FAILED if a value differs from the
+    requested value by more than rounding.
     """
     code = DONE
     for result in results:

@@ -78,7 +78,7 @@ def check_given(metadata: Metadata | None, values: Mapping[str, float]) -> None:
 
 
 def with_range_note(metadata: Metadata | None, result: ParameterWrite) -> str:
-    """Return the note of a result; if the value was set without a check of its range, the note says so."""
+    """Return the note of a result, which says whether the value was set without a check of its range."""
     text = ""
     if metadata is None:
         text = RANGES_NOT_CHECKED.replace("ranges", "range").replace("them", "it")

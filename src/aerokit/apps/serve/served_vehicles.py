@@ -227,13 +227,13 @@ def _failing_checks(vehicle: Vehicle) -> tuple[str, ...] | None:
 
 
 def _is_flying_mission(vehicle: Vehicle) -> bool:
-    """Return True while the vehicle is armed in its mission mode, like ``mission.pause``."""
+    """Return True while the vehicle is armed in its mission mode, the condition of ``mission.pause``."""
     mode = vehicle.autopilot.mode_for("mission", is_vtol=vehicle.telemetry.is_vtol)
     return mode is not None and vehicle.telemetry.is_in(mode) and not vehicle.telemetry.is_confirmed_disarmed
 
 
 def _unarmable_mode(vehicle: Vehicle) -> dict[str, str | None] | None:
-    """Return the mode if ``arm`` leaves it, the mode in which ``arm`` arms, and the parameter that allows the mode."""
+    """Return the current mode if ``arm`` would leave it, the mode to arm in, and the parameter that permits arming."""
     autopilot, mode = vehicle.autopilot, vehicle.mode.latest
     if mode is None or mode.name not in autopilot.unarmable_modes.union(autopilot.armable_by_option):
         return None

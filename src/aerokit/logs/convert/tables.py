@@ -226,7 +226,7 @@ def _row_of(columns: Sequence[TableColumn], record: LogRecord) -> Callable[[LogR
         names = [column.field for column in columns]
         return lambda record: [_cell(record.fields.get(name)) for name in names]
     parts = [column.field.partition(".") for column in columns]
-    fields = attrgetter("NAME", *(name for name, _, _ in parts))  # of at least two names, so that it returns a tuple
+    fields = attrgetter("NAME", *(name for name, _, _ in parts))  # a tuple, due to the additional name
     elements = [(place, int(index)) for place, (_, _, index) in enumerate(parts) if index]
     texts = [place for place, column in enumerate(columns) if column.kind == "str"]
 

@@ -54,7 +54,7 @@ class LogReader:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.needs_states: bool = True
-        """False to leave out the states of a ``.tlog``'s records, which take most of the time."""
+        """False to leave out the states of records of a ``.tlog``. Decoding them takes most of the time."""
         self.notes: list[str] = []
 
     def entries(self, on_bytes: Callable[[int], object]) -> Iterator[LogRecord]:

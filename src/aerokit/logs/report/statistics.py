@@ -26,7 +26,7 @@ _A_YEAR_S = 365 * 86_400.0
 _MAX_LISTED = 5
 # A hovering multicopter needs 20 to 60 % throttle.
 _HIGH_THROTTLE_PERCENT, _HIGH_ATTITUDE_ERROR_DEG = 90.0, 20.0
-# Current in a descent below this share of the one before it: the motors take less power than for a controlled descent.
+# Below this share of the current before a descent, the motors take less power than a controlled descent needs.
 _LESS_CURRENT = 0.5
 _BEFORE_FALL_S = 5.0
 
@@ -182,7 +182,7 @@ def findings(flight: FlightLog) -> list[str]:
 def fall_measurements(flight: FlightLog, fall: Fall) -> list[str]:
     """Return throttle, tilt, attitude error and battery current in the descent, where the log has them.
 
-    An unusual value is followed by what to look at.
+    An unusual value is followed by advice on what to look at.
     """
     span_s = fall.begins_s, fall.time_s - 0.2  # without the impact
     found = []
@@ -206,7 +206,7 @@ def fall_measurements(flight: FlightLog, fall: Fall) -> list[str]:
 
 
 class _SpanAndBefore(Snapshot):
-    """Lowest and highest value of a descent, and the median of the seconds before it; NaN if unknown."""
+    """Lowest and highest value in a descent, and the median of the seconds before the descent; NaN if unknown."""
 
     low: float
     high: float
@@ -219,7 +219,7 @@ class _SpanAndBefore(Snapshot):
 
 
 def _span_and_before(series: TimeSeries, name: str, begin_s: float, end_s: float) -> _SpanAndBefore | None:
-    """Return None if the series has no known value in the span."""
+    """Return the values of a span and before it; None if the series has no known value in the span."""
     values = series.between(name, begin_s, end_s)
     before = series.between(name, begin_s - _BEFORE_FALL_S, begin_s)
     return _SpanAndBefore(min(values), max(values), median(before) if before else math.nan) if values else None

@@ -193,7 +193,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         block = request.acknowledge(data, offset=offset)
         block = block.replace(sequence=sequence, burst_complete=is_short or is_last)
         self._reply(peer, block)
-        # The firmware has advanced its last reply when it repeats it or refuses to read on.
+        # The firmware has already advanced its last reply when it repeats this reply or refuses to read on.
         after = offset + len(data) if is_short else offset
         peer.reply = block.replace(sequence=sequence + 1 & 0xFFFF, offset=after)
         following = self._end_burst if is_last else partial(self._send_next, peer, session, request, number + 1)

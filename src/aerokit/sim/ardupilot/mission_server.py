@@ -96,7 +96,7 @@ class ArduPilotMissionServer(MissionServer):
         self._vehicle.send_text(MavSeverity.WARNING, text)
 
     def _warn_once(self, message: AnyItem | m.MissionRequest, text: str) -> None:
-        """Warn of a kind of message, once for each upload of this type."""
+        """Send a warning about a kind of message, once for each upload of this type."""
         warning = (type(message), message.mission_type)
         if warning not in self._warnings:
             self._warnings.add(warning)
@@ -213,7 +213,7 @@ class ArduPilotMissionServer(MissionServer):
         self._end(upload, result)
 
     def _on_ack(self, ack: m.MissionAck, channel: Channel) -> None:
-        """ArduPilot ignores this message."""
+        """Do nothing: ArduPilot ignores this message."""
 
     def _on_clear(self, request: m.MissionClearAll, channel: Channel) -> None:
         kind, to = request.mission_type, sender_of(request)

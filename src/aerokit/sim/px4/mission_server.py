@@ -45,7 +45,7 @@ class TransferState(Enum):
 
 @dataclass(eq=False)
 class _Link(ListUpload):
-    """The latest transfer of a link, an upload or a download; the firmware reads it even after its end."""
+    """The latest upload or download of a link. The firmware uses this state even after the transfer has ended."""
 
     state: TransferState = TransferState.IDLE
     opaque_id: int = 0
@@ -135,7 +135,7 @@ class Px4MissionServer(MissionServer):
         self._acknowledge(to or link.client, link.mission_type, result, link.channel)
 
     def _begin_transfer(self, state: TransferState, message: AnyListMessage, channel: Channel, count: int) -> _Link:
-        """Start a transfer in place of the latest one, whose retries end."""
+        """Start a transfer. It replaces the latest transfer of the link, which is then no longer retried."""
         client, kind, now = sender_of(message), message.mission_type, self._px4.now
         link = replace(
             self._link(channel), state=state, client=client, mission_type=kind, next=0, end=count, received_at=now
@@ -190,9 +190,9 @@ class Px4MissionServer(MissionServer):
     def _on_request_list(self, request: m.MissionRequestList, channel: Channel) -> None:
         """Start or restart a download.
 
-        A download of which all items were sent counts as complete. The firmware treats an upload in the same way once
-        as many items have arrived as are stored: it ends that upload, but refuses other uploads until a download times
-        out.
+        A download counts as complete once all items were sent. The firmware applies this rule to an upload, too, once
+        the number of received items equals the number of stored items. This upload then ends, but other uploads are
+        refused until a download times out.
         """
         link = self._link(channel)
         if link.next == self.count(link.mission_type):
@@ -315,7 +315,7 @@ class Px4MissionServer(MissionServer):
         self._end(link, _R.ACCEPTED)
 
     def _on_clear(self, request: m.MissionClearAll, channel: Channel) -> None:
-        """Clear a list, or all lists for MAV_MISSION_TYPE_ALL; during a transfer only send a text."""
+        """Clear a list, or all lists for MAV_MISSION_TYPE_ALL. During a transfer, only send a text."""
         link = self._link(channel)
         if link.state is not TransferState.IDLE:
             self._warn("WPM: IGN CLEAR CMD: Busy")
