@@ -47,7 +47,7 @@ class ListenerThread:
             self._calls.put((function, args))
 
     def offer(self, function: Callable[..., object], *args: Any) -> None:
-        """Like :meth:`post`, but drop the call while 10,000 calls are queued. For values that repeat."""
+        """Like :meth:`post`, but drop the call while 10,000 calls are queued. Used for values that repeat."""
         if self._calls.qsize() < MAX_QUEUED_CALLS:
             self.post(function, *args)
             return

@@ -308,7 +308,7 @@ class TimestampFile:
         self._write(self.timestamp)
 
     def reserve(self, timestamp: int, ahead: int) -> None:
-        """Ensure that the file has a later timestamp than this: if needed, write ``timestamp + ahead``."""
+        """Ensure that the stored timestamp is later than ``timestamp``: if needed, write ``timestamp + ahead``."""
         if timestamp < self.timestamp:
             return
         self.timestamp = min(timestamp + ahead, self._maximum)

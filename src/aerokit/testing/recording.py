@@ -49,7 +49,7 @@ class RecordedAnswer:
 
 @dataclass(frozen=True)
 class RecordedPlan:
-    """A plan on the vehicle since a point in time."""
+    """A plan that the vehicle had from a point in time on."""
 
     since: float
     mission_type: int

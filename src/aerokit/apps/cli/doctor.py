@@ -103,7 +103,7 @@ def _users_of(device: str) -> list[str]:
     """Return the names of other programs that have the port open. Linux shows programs of other users only to root."""
     users: list[str] = []
     if sys.platform != "linux" or os.path.realpath(device).startswith("/dev/pts/"):
-        return users  # ignore the creator of a pseudo-terminal, which keeps it open
+        return users  # no users, because the creator of a pseudo-terminal keeps it open
     for process in glob("/proc/[0-9]*"):
         number = int(process.rpartition("/")[2])
         if number == os.getpid():

@@ -73,7 +73,7 @@ class BatteryFailsafe:
         return level if charge or 0 < timer < low_for else _OK
 
     def _is_below(self, level: int) -> tuple[bool, bool]:
-        """Return two values: True if the voltage is below the limit of the level, and True if the charge is."""
+        """Return two values: True if the voltage, and True if the charge, is below the limit of the level."""
         parameters, name = self._vehicle.parameters, _NAMES[level]
         volts, charge = parameters[f"BATT_{name}_VOLT"], parameters[f"BATT_{name}_MAH"]
         is_charge_low = charge > 0 and self._remaining_mah() < charge

@@ -345,7 +345,7 @@ def horizontal_distance(vehicle: ArduPilotHost, place: Ned | None) -> float:
 
 
 def set_home_from(vehicle: ArduPilotHost, item: MissionItem) -> None:
-    """Execute DO_SET_HOME of a mission: set home to the item's position; without one, to that of the vehicle."""
+    """Execute DO_SET_HOME of a mission: set home to the item's position, or else to the vehicle's position."""
     point: Ned | None = vehicle.motion.place
     if item.param1 != 1 and (item.x, item.y, item.z) != (0, 0, 0):
         point = vehicle.point(int(item.x), int(item.y), item.z, item.frame)
