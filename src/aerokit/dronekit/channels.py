@@ -65,9 +65,9 @@ def _unsupported(name: str) -> Any:
 class Channels(_ChannelDict):
     """RC input of the autopilot, overrides included: microseconds by number (``'1'`` or 1). Read only.
 
-    From RC_CHANNELS and RC_CHANNELS_RAW; each message changes all values at once. A channel is None if it does not
-    exist or was not received. There are eight channels, or 16 after an RC_CHANNELS_RAW with more than eight. Setting
-    :attr:`count` changes the number. :attr:`overrides` changes channels.
+    The values come from RC_CHANNELS and RC_CHANNELS_RAW. Each message changes all values at once. A channel is None if
+    it does not exist or was not received. There are eight channels, or 16 after an RC_CHANNELS_RAW with more than
+    eight. Setting :attr:`count` changes the number. :attr:`overrides` changes channels.
     """
 
     def __init__(self, vehicle: VehicleCore, count: int) -> None:

@@ -121,7 +121,8 @@ class FlightMethods(VehicleAttributes):
     # -------------------------------------------------------------------------------- flying
 
     def simple_takeoff(self, alt: float | None = None) -> None:
-        """Take off and climb to ``alt`` metres above home; returns immediately. For armed copters in GUIDED mode.
+        """Take off and climb to ``alt`` metres above home; returns immediately. The copter must be armed in GUIDED
+        mode.
 
         Without an altitude, nothing is sent. Raises ValueError if the altitude is not a finite number.
         """

@@ -66,7 +66,7 @@ class Master:
 
     @property
     def port(self) -> Master:
-        """This object itself, because programs call ``port.close()``. Not a socket or serial port."""
+        """This object itself, because programs call ``port.close()``. It is not a socket or serial port."""
         return self
 
     @property

@@ -182,7 +182,7 @@ class ParameterValues:
 async def set_parameter(aio: AsyncVehicle, name: str, value: float, retries: int) -> AerokitError | None:
     """Set a parameter; return None when confirmed, otherwise the error.
 
-    Fractions for integer parameters are cut off, as ArduPilot does. PARAM_SET is sent once; without an answer the value
+    Fractions for integer parameters are cut off, as in ArduPilot. PARAM_SET is sent once; without an answer the value
     is requested, for ``retries`` + 1 attempts in total.
     """
     idle_timeout_s = (retries + LAST_ATTEMPT_SHARE) * _try_s(aio)

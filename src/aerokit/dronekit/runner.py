@@ -39,7 +39,7 @@ def install() -> None:
     """Make ``import dronekit`` and ``from dronekit.lib import …`` import :mod:`aerokit.dronekit`.
 
     ``import dronekit_sitl`` imports :mod:`aerokit.dronekit.sitl`, unless another ``dronekit_sitl`` was imported before.
-    Takes precedence over an installed DroneKit. Idempotent. For test runners (in ``conftest.py``) and embedding
+    Takes precedence over an installed DroneKit. Idempotent. Use it in test runners (in ``conftest.py``) and embedding
     programs.
 
     Raises:

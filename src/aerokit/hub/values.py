@@ -49,7 +49,7 @@ class Endpoint(Snapshot):
     baud: int = 57600
     """Bits per second of a serial link whose address does not give them."""
     retry_open: bool = False
-    """True to start the hub even if this endpoint cannot be opened, and to retry. For servers that start later."""
+    """True to start the hub even if this endpoint cannot be opened yet (a server that starts later), and to retry."""
 
     def _check(self) -> None:
         if not isinstance(self.address, (str, Link)):

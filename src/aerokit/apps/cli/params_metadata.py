@@ -89,7 +89,7 @@ def with_range_note(metadata: Metadata | None, result: ParameterWrite) -> str:
 
 
 def reboot_note(metadata: Metadata | None, name: str, value: float) -> str:
-    """Return what is still to do until the new value takes effect; empty if nothing is known."""
+    """Return a note on the steps until the new value takes effect, e.g. a reboot; empty if none is known."""
     if name.upper() in _SYSTEM_ID_NAMES:
         return f"the system id changes at the next reboot at the latest; then connect with --system-id {value:g}"
     entry = None if metadata is None else metadata_entry(metadata, name)[0]

@@ -134,7 +134,7 @@ class MergedStreams:
     """Accepts each frame once, whichever copy arrives first.
 
     If two links carry separate streams (each port of an autopilot has its own sequence numbers), only frames of the
-    link in use are accepted, because those of the other link may be older. ``choices`` has the links to each system.
+    link in use are accepted, because frames of the other link may be older. ``choices`` has the links to each system.
     """
 
     def __init__(self, links: int, choices: Mapping[int, LinkChoice]) -> None:

@@ -1,6 +1,6 @@
 """Meanings of numbers in ArduPilot logs: mode reasons, and errors of subsystems.
 
-From ``ModeReason.h`` and ``AP_Logger.h`` of ArduPilot 4.7.
+The meanings are from ``ModeReason.h`` and ``AP_Logger.h`` of ArduPilot 4.7.
 """
 
 from __future__ import annotations

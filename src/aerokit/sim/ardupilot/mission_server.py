@@ -103,7 +103,7 @@ class ArduPilotMissionServer(MissionServer):
             self._warn(text)
 
     def capacity(self, mission_type: int) -> int:
-        """Return the capacity; that of the mission is 0 until the vehicle is initialised."""
+        """Return the capacity of a list. The capacity of the mission is 0 until the vehicle is initialised."""
         is_late = mission_type == MavMissionType.MISSION and not self._vehicle.is_initialised
         return 0 if is_late else self._lists[mission_type].capacity
 
