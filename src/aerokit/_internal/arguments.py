@@ -233,7 +233,7 @@ def _are_items(is_item: Check, value: object) -> bool:
 
 
 def check_kind(name: str, value: object, kind: type) -> None:
-    """Raise InvalidArgument unless ``value`` is an instance of ``kind``. Used where the annotation is a type variable."""
+    """Raise InvalidArgument unless ``value`` is an instance of ``kind``. Used if the annotation is a type variable."""
     if not isinstance(value, kind):
         raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: {with_article(kind.__name__)}")
 

@@ -121,10 +121,10 @@ class FlightMethods(VehicleAttributes):
     # -------------------------------------------------------------------------------- flying
 
     def simple_takeoff(self, alt: float | None = None) -> None:
-        """Take off and climb to ``alt`` metres above home; returns immediately. The copter must be armed in GUIDED
-        mode.
+        """Take off and climb to ``alt`` metres above home; returns immediately.
 
-        Without an altitude, nothing is sent. Raises ValueError if the altitude is not a finite number.
+        The copter must be armed in GUIDED mode. Without an altitude, nothing is sent. Raises ValueError if the
+        altitude is not a finite number.
         """
         if alt is not None:
             self._dk_take_off(float(alt))
