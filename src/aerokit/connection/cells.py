@@ -82,7 +82,7 @@ class StateCell(Generic[T]):
         self.name: str = name
         """Name of the value, for error texts."""
         self._clock = clock
-        self._stamp = clock if stamp is None else stamp  # receive time of a value that is set now
+        self._stamp = clock if stamp is None else stamp  # returns the receive time for a value that is set now
         self.waits_for: str = waits_for
         """Names of the messages that carry the value."""
         # Returns the reason why no values arrive, for time-out errors; "" if unknown.

@@ -355,7 +355,7 @@ class _Stream(asyncio.Protocol):
         return self._transport.get_write_buffer_size() + kernel_unsent_bytes(self._fd)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._fd = -1  # the number may be reused
+        self._fd = -1  # the system may reuse the number
         if self._outbox is not None:
             self._outbox.discard()
             self._outbox.close()

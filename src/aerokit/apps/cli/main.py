@@ -250,7 +250,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with plain_warnings():
             code: int = asyncio.run(options.run(options))
     except BrokenPipeError:
-        # Otherwise the interpreter reports another BrokenPipeError when it flushes stdout at exit.
+        # Without this, the interpreter would report another BrokenPipeError when it flushes stdout at exit.
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115
         return FAILED
     except KeyboardInterrupt:
