@@ -26,6 +26,7 @@ from pymavlink import mavutil
 from table import Row, row
 
 import aerokit
+from aerokit import wire_implementation
 from aerokit.mavlink import STANDARD, Frame
 from aerokit.transport.link import BaseLink
 
@@ -33,6 +34,7 @@ __all__ = ["FedLink", "rows"]
 
 AUTOPILOT = (1, 1)
 FLIGHT = next(iter(decode.RECORDINGS))
+TELEMETRY_AIM, READ_AIM = (12.0, 10.0) if wire_implementation == "c" else (2.0, 2.0)
 
 
 def rows(rounds: int = 7, recording: str = FLIGHT) -> list[Row]:
@@ -43,7 +45,9 @@ def rows(rounds: int = 7, recording: str = FLIGHT) -> list[Row]:
     telemetry, peer = anyio.run(_in_turns, _telemetry, frames, frames, rounds)
     read, peer_of_read = anyio.run(_in_turns, _async_for, frames, pieces, rounds)
     return [
-        row("deliver_telemetry", telemetry, peer, peer_name, unit="frames/s", ratio=telemetry / peer, aim=2.0),
+        row(
+            "deliver_telemetry", telemetry, peer, peer_name, unit="frames/s", ratio=telemetry / peer, aim=TELEMETRY_AIM
+        ),
         row(
             "deliver_async_for",
             read,
@@ -51,7 +55,7 @@ def rows(rounds: int = 7, recording: str = FLIGHT) -> list[Row]:
             peer_name,
             unit="frames/s",
             ratio=read / peer_of_read,
-            aim=2.0,
+            aim=READ_AIM,
         ),
     ]
 

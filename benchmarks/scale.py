@@ -113,9 +113,9 @@ class _MeasuredServer(SimulatorServer):
 
     spent_s = 0.0
 
-    def _run_ahead(self, now: float) -> None:
+    def _run(self, now: float) -> None:
         started = time.thread_time()
-        super()._run_ahead(now)
+        super()._run(now)
         self.spent_s += time.thread_time() - started
 
     def on_bytes(self, data: bytes, peer: Any, port: Any) -> None:

@@ -21,6 +21,8 @@ if sys.dont_write_bytecode:  # else each worker and each child process would com
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a background job of a script: some tests interrupt themselves
     signal.signal(signal.SIGINT, signal.default_int_handler)
+if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:  # nohup: programs inherit it
+    signal.signal(signal.SIGHUP, lambda *_: None)
 gc.disable()  # until all tests are collected: nothing of them is garbage, and each worker collects all
 settings.register_profile("aerokit", deadline=None, max_examples=40, derandomize=True)
 settings.load_profile("aerokit")

@@ -66,6 +66,10 @@ def source_strings() -> str:
     return "\n".join(sorted(found))
 
 
+VEHICLE_TEXTS = ("mode not armable",)
+"""Texts that the autopilot itself prints (AP_Arming_Copter.cpp)."""
+
+
 @functools.cache
 def python_texts() -> tuple[str, ...]:
     """Return the texts of Python and of the system that the page quotes."""
@@ -82,7 +86,7 @@ def python_texts() -> tuple[str, ...]:
         warnings.simplefilter("always")
         _ = arm()
         del _
-    return *texts, *(str(warning.message) for warning in caught)
+    return *texts, *VEHICLE_TEXTS, *(str(warning.message) for warning in caught)
 
 
 def is_printed(piece: str) -> bool:

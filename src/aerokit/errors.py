@@ -62,7 +62,7 @@ class LinkLost(LinkError):
 
 
 class RecordingEnded(LinkLost):
-    """The recording being replayed has ended, or its next part cannot be read."""
+    """The recording being replayed has ended, or the rest of the file cannot be read."""
 
 
 class ConnectionClosed(AerokitError):
@@ -91,7 +91,7 @@ class ConnectFailed(HeartbeatTimeout):
 class ParameterTimeout(OperationTimeout):
     """Parameters were not received or not confirmed in time.
 
-    ``missing`` holds their names, or the indices of those whose names are unknown.
+    ``missing`` holds the names of these parameters, or their indices where the names are unknown.
     """
 
     def __init__(self, message: str, *, missing: tuple[str | int, ...] = ()) -> None:
@@ -102,7 +102,7 @@ class ParameterTimeout(OperationTimeout):
 class MissionTimeout(OperationTimeout):
     """A mission transfer did not complete in time.
 
-    ``missing`` holds the indices of the items that were not transferred, counted from 0 without home.
+    ``missing`` holds the indices of the items that were not transferred. The first item after home has index 0.
     """
 
     def __init__(self, message: str, *, missing: tuple[int, ...] = ()) -> None:
@@ -124,7 +124,7 @@ class FileTimeout(OperationTimeout):
 class OperationRejected(AerokitError):
     """The vehicle refused an operation, or accepted it and then did something else.
 
-    ``reasons`` holds the explanations of the vehicle: status texts, failing health bits, estimator flags.
+    ``reasons`` holds the vehicle's explanations: status texts, failing health bits, estimator flags.
     """
 
     def __init__(self, message: str, *, reasons: tuple[str, ...] = ()) -> None:
@@ -158,7 +158,7 @@ class ParameterRejected(OperationRejected):
 
 
 class RollbackFailed(OperationRejected):
-    """Parameters could not be restored. ``not_restored`` maps their names to the values they should have."""
+    """Parameters could not be restored. ``not_restored`` maps their names to their original values."""
 
     def __init__(self, message: str, *, not_restored: dict[str, float]) -> None:
         super().__init__(message)
@@ -166,10 +166,11 @@ class RollbackFailed(OperationRejected):
 
 
 class MissionRejected(OperationRejected):
-    """The vehicle refused a mission, a fence or rally points. The text says whether it kept the previous ones.
+    """The vehicle refused a mission, a fence or rally points.
 
-    ``result`` is the MAV_MISSION_RESULT (https://mavlink.io/en/messages/common.html#MAV_MISSION_RESULT); ``item`` is
-    the index of the refused item, or None if unknown.
+    The text says whether the vehicle kept the previous items. ``result`` is the MAV_MISSION_RESULT
+    (https://mavlink.io/en/messages/common.html#MAV_MISSION_RESULT); ``item`` is the index of the refused item, or None
+    if unknown.
     """
 
     def __init__(self, message: str, *, result: int, item: int | None = None, reasons: tuple[str, ...] = ()) -> None:
@@ -179,7 +180,7 @@ class MissionRejected(OperationRejected):
 
 
 class VerificationFailed(OperationRejected):
-    """The vehicle confirmed a change but reads back different values. ``differences`` lists them as texts."""
+    """The vehicle confirmed a change but reads back different values. ``differences`` describes each of them."""
 
     def __init__(self, message: str, *, differences: tuple[str, ...]) -> None:
         super().__init__(message, reasons=differences)
@@ -232,7 +233,7 @@ class InvalidArgument(AerokitError, ValueError):
 
 
 class FileFormatError(AerokitError, ValueError):
-    """A file is damaged or has another format. The text names the file, the position and what was expected."""
+    """A file is damaged or not in the expected format. The text names the file, the position and what was expected."""
 
 
 class RemoteProtocolError(AerokitError):
@@ -248,11 +249,14 @@ class StaleValueError(ValueUnknownError):
 
 
 class SubscriptionOverflow(AerokitError):
-    """A subscription with the policy ``error`` overflowed, because the program did not read it fast enough."""
+    """A subscription with the policy ``error`` overflowed, because the program read too slowly."""
 
 
 class SetpointStreamStopped(AerokitError):
-    """A set-point stream stopped: stale set-points, blocked loop, lost link or mode change. The text says which."""
+    """A set-point stream stopped. The text names the cause.
+
+    Causes are stale set-points, a blocked event loop, a lost link and a mode change.
+    """
 
 
 class BusyError(AerokitError):

@@ -71,9 +71,9 @@ class Event(Snapshot):
 
 
 class VehicleFound(Event):
-    """The first heartbeat of an autopilot arrived on the connection, even if no `Vehicle` is connected to it.
+    """The first heartbeat of an autopilot arrived on the connection, even if no `Vehicle` is connected.
 
-    ``vehicle_type`` is its MAV_TYPE, ``autopilot`` its MAV_AUTOPILOT.
+    ``vehicle_type`` is the MAV_TYPE, ``autopilot`` the MAV_AUTOPILOT in the heartbeat.
     """
 
     component_id: int
@@ -129,7 +129,7 @@ class RouteChanged(Event):
 class RouteChangeRefused(Event):
     """Frames of a silent component arrive from ``peer``, but are ignored: their sequence numbers do not continue.
 
-    The sender may be another vehicle, or the same one with a new IP address after a reboot; ``may_move=True``
+    The sender may be another vehicle, or the same vehicle with a new IP address after a reboot. ``may_move=True``
     accepts both.
     """
 
@@ -138,8 +138,9 @@ class RouteChangeRefused(Event):
 
 
 class FrameRefused(Event):
-    """A frame was dropped because it has no valid signature of our key. Published once for each reason.
-    ``connection.signing.refused`` counts all refused frames.
+    """A frame was dropped because it has no valid signature made with our key.
+
+    Published once for each reason. ``connection.signing.refused`` counts all refused frames.
     """
 
     component_id: int
@@ -150,7 +151,8 @@ class OrderRefused(Event):
     """The program that serves the vehicle on the network did not forward a message of this program (docs/network.md).
 
     ``message`` is the name of the MAVLink message, and ``reason`` a clause that explains the refusal. ``lease_holder``
-    is the client that controls the vehicle, if that is the reason. Published at most twice a second for each name.
+    is the client that controls the vehicle, if its control is the reason. Published at most twice a second for each
+    message name.
     """
 
     message: str
@@ -159,7 +161,7 @@ class OrderRefused(Event):
 
 
 class ModeChanged(Event):
-    """The flight mode reported by HEARTBEAT changed. Names are those of ``vehicle.mode``."""
+    """The flight mode reported by HEARTBEAT changed. The names are the same as in ``vehicle.mode``."""
 
     before: str | None
     after: str
@@ -179,7 +181,7 @@ class LandedStateChanged(Event):
 
 
 class MissionItemReached(Event):
-    """The vehicle reached mission item ``item``, counted from 0 without home.
+    """The vehicle reached mission item ``item``. The first item after home is 0.
 
     Some autopilots do not report items that they pass without stopping.
     """
@@ -188,7 +190,7 @@ class MissionItemReached(Event):
 
 
 class MissionCurrentChanged(Event):
-    """The current mission item changed; None before the mission has started, and without a mission."""
+    """The current mission item changed. An item is None before the mission has started, or if there is no mission."""
 
     before: int | None
     after: int | None
@@ -212,7 +214,10 @@ class GimbalControlLost(Event):
 
 
 class StatusTextReceived(Event):
-    """The vehicle sent a STATUSTEXT; chunks are joined. ``severity`` is a MAV_SEVERITY: 0 emergency to 7 debug."""
+    """The vehicle sent a STATUSTEXT. The chunks of a long text are joined.
+
+    ``severity`` is a MAV_SEVERITY: 0 emergency to 7 debug.
+    """
 
     severity: int
     text: str
@@ -236,7 +241,7 @@ class StreamUnavailable(Event):
 
 
 class ParameterChanged(Event):
-    """A known parameter of this component has a new value, regardless of who changed it."""
+    """A parameter whose value aerokit had already read has a new value, regardless of who changed it."""
 
     name: str
     before: int | float
@@ -245,7 +250,7 @@ class ParameterChanged(Event):
 
 
 class SettingChanged(Event):
-    """A known setting (PARAM_EXT) of this component has a new value, regardless of who changed it."""
+    """A setting (PARAM_EXT) whose value aerokit had already read has a new value, regardless of who changed it."""
 
     name: str
     before: bool | int | float | str | bytes
@@ -289,7 +294,10 @@ class LoopBlocked(Event):
 
 
 class ComputerSlept(Event):
-    """The computer was suspended for ``seconds``. The event loop's clock stood still, so values are that much older."""
+    """The computer was suspended for ``seconds``.
+
+    The event loop's clock stood still meanwhile. aerokit adds this time to the age of every value of a vehicle.
+    """
 
     seconds: float
 
@@ -340,10 +348,10 @@ class LinkDrained(Event):
 class LinkSelected(Event):
     """The traffic to this system now uses ``link`` (its address), one of several links.
 
-    ``before`` is the previous link, None for the first one. ``reason`` is "first heard" for the first link; "silent",
-    "stalled" or "lost" if the previous link became so; "better" or "cheaper" if the new link is; or "another vehicle"
-    if AUTOPILOT_VERSION showed that the previous link leads to another vehicle. aerokit requests message rates again,
-    because autopilots keep separate rates for each link.
+    ``before`` is the previous link; None if there was none. ``reason`` is "first heard" for the first link. It is
+    "silent", "stalled" or "lost" if that happened to the previous link, "better" or "cheaper" if that is true of the
+    new link, and "another vehicle" if AUTOPILOT_VERSION showed that the previous link leads to another vehicle. aerokit
+    requests message rates again, because autopilots keep separate rates for each link.
     """
 
     link: str
@@ -371,7 +379,7 @@ class MemberLinkOpenFailed(Event):
 
 
 class LinkStateChanged(Event):
-    """CONNECTED, SILENT or LOST: the state of one vehicle, or of the link as a whole (``system_id`` 0), changed."""
+    """The state of one vehicle, or of the whole link (``system_id`` 0), changed to CONNECTED, SILENT or LOST."""
 
     before: LinkState
     after: LinkState
@@ -384,7 +392,7 @@ class LinkClosed(Event):
 
 
 SILENT_AFTER_S = 3.5
-"""Seconds without a heartbeat before a vehicle counts as silent: three and a half intervals."""
+"""Seconds without a heartbeat before a vehicle counts as silent: 3.5 heartbeat intervals."""
 
 
 class LinkState(enum.Enum):
@@ -393,7 +401,8 @@ class LinkState(enum.Enum):
     CONNECTED = "connected"
     """The vehicle sent a heartbeat, or the link delivered any frame, within the last 3.5 seconds."""
     SILENT = "silent"
-    """The link is open, but no such frame arrived within the last 3.5 seconds."""
+    """The link is open, but silent for more than 3.5 seconds: no heartbeat of the vehicle, or no frame at all.
+    """
     LOST = "lost"
     """The link failed or the connection was closed. With ``reconnect=True`` the state may become CONNECTED again."""
 
@@ -404,7 +413,7 @@ class LinkStatus(Snapshot):
     link: str
     """Address of the link."""
     state: LinkState
-    """SILENT: no vehicle was received for a second or two. LOST: closed; aerokit reopens it if possible."""
+    """SILENT: no vehicle was received for a second or two. LOST: the link is closed; aerokit reopens it if possible."""
     is_costly: bool
     """True if the link is used only when all others fail (``costly=1``)."""
     systems: tuple[int, ...]
@@ -412,6 +421,6 @@ class LinkStatus(Snapshot):
     used_for: tuple[int, ...]
     """Ids of the systems whose traffic uses this link."""
     loss_percent: float | None
-    """Frame loss of the last seconds, by sequence numbers, for the system with the highest loss; None until known."""
+    """Loss in the last seconds, from sequence numbers, of the system that loses most frames; None until known."""
     round_trip_s: float | None
     """Round-trip time (TIMESYNC) of the slowest system; None before the first answer."""

@@ -55,9 +55,10 @@ class Position(Snapshot):
 
 
 class Home(Snapshot):
-    """The home position (HOME_POSITION); ``north_m`` … are from the local origin, None if not reported.
+    """The home position (HOME_POSITION).
 
-    Calls that take a Position also take a Home. ``go_to`` then keeps the vehicle's present altitude.
+    ``north_m``, ``east_m`` and the like are metres from the local origin; None if not reported. Calls that take a
+    Position also take a Home. With a Home, ``go_to`` keeps the vehicle's present altitude.
     """
 
     latitude_deg: float
@@ -74,12 +75,12 @@ class Home(Snapshot):
 
 
 def point_at(place: Position | Home) -> Position:
-    """Return the position of a place. That of home has an altitude above mean sea level."""
+    """Return a place as a Position. A Home is converted with its altitude above mean sea level."""
     return place.position.replace(altitude_amsl_m=place.altitude_amsl_m) if isinstance(place, Home) else place
 
 
 def travel_target(place: Position | Home) -> Position:
-    """Return the position to fly to. That of home has no altitude, so that the vehicle keeps its present one."""
+    """Return the position to fly to. A Home gets no altitude, so that the vehicle keeps its present one."""
     return place.position if isinstance(place, Home) else place
 
 

@@ -31,7 +31,7 @@ __all__ = ["VideoFrame", "VideoStream", "open_video"]
 # FFmpeg options for live streams: no buffering. https://ffmpeg.org/ffmpeg-protocols.html
 LIVE_OPTIONS = {"rtsp_transport": "tcp", "fflags": "nobuffer", "flags": "low_delay", "probesize": "500000"}
 
-# How long the end of a block waits for the thread, which FFmpeg blocks until the next frame or its timeout.
+# Maximum wait for the decoding thread at the end of a block. FFmpeg blocks the thread until the next frame or timeout.
 JOIN_TIMEOUT_S = 1.0
 
 
@@ -39,8 +39,9 @@ class VideoFrame(Snapshot):
     """One video frame.
 
     - ``picture``: a PyAV frame: ``picture.to_ndarray(format="rgb24")`` (height, width, 3), ``picture.to_image()``
-    - ``received_at``: time of decoding on the loop's clock; ``stream_s``: time in the stream, None if it has none
-    - ``position``, ``attitude``: the latest of the vehicle at that time; None without a vehicle, or while unknown
+    - ``received_at``: time of decoding on the loop's clock; ``stream_s``: time in the stream, None if the frame has
+      none
+    - ``position``, ``attitude``: the vehicle's latest at ``received_at``; None without a vehicle, or while unknown
     """
 
     picture: Any
@@ -62,7 +63,7 @@ async def open_video(
     """Open a video stream for the duration of an ``async with`` block. A slow reader gets the latest frame.
 
     ``async with open_video(stream.uri, vehicle) as video: async for frame in video: …``. A thread decodes the stream.
-    The thread ends with the block; if no frame arrives at that time, it ends at its next timeout.
+    The thread ends with the block or, if it waits for a frame then, at its next timeout.
 
     Args:
         uri: anything that FFmpeg reads: ``rtsp://…``, ``udp://0.0.0.0:5600``, the path of a file.
@@ -100,7 +101,7 @@ async def open_video(
 class VideoStream:
     """Asynchronous iterator over the frames of a stream, for a single reader. Created by :func:`open_video`.
 
-    The iteration ends at the end of a file, and raises LinkLost if a stream fails.
+    The iteration ends at the end of a file. If a stream fails, the iteration raises LinkLost.
     """
 
     def __init__(self, uri: str, vehicle: Vehicle | None) -> None:

@@ -1,141 +1,28 @@
-"""The page of ``aerokit serve`` in headless Chromium (`nox -s browser`); skipped where one is missing.
-
-With AEROKIT_SCREENSHOTS=DIRECTORY it leaves pictures of the page there.
-"""
+"""The page of ``aerokit serve`` in headless Chromium (`nox -s browser`); skipped where one is missing."""
 
 from __future__ import annotations
 
-import contextlib
-import json
-import os
 import re
-import shutil
-import subprocess
-import sys
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
-from anyio.from_thread import start_blocking_portal
-from served_copter import served
-
-import aerokit
-from aerokit.missions import (
-    Fence,
-    FencePolygon,
-    Mission,
-    Plan,
-    format_plan,
-    format_waypoints,
-    return_to_launch,
-    take_off,
-    waypoint,
+from page_stage import (
+    CHROMIUM,
+    assert_toasts_beside_orders,
+    boxes_of_orders,
+    check_contrast,
+    opened,
+    order,
+    picture,
+    serving,
+    wait_done,
 )
+
 from aerokit.sim import SimulatedCopter
-from aerokit.sim.motion import GlobalPoint, LocalFrame
 from aerokit.testing.track import true_point
 
-playwright = pytest.importorskip("playwright.sync_api", reason="playwright is installed by `nox -s browser`")
-axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe is installed by `nox -s browser`")
-CHROMIUM = os.environ.get("AEROKIT_CHROMIUM") or shutil.which("chromium")
-pytestmark = [
-    pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium"),
-    pytest.mark.timeout(300),
-]
-
-HOME = (-35.363261, 149.165230, 584.0)
+pytestmark = [pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium"), pytest.mark.timeout(300)]
 HOSTILE = "<img src=x onerror=alert(1)>"
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    quiet = [
-        "--no-first-run",
-        "--disable-background-networking",
-        "--disable-component-update",
-        "--disable-sync",
-    ]
-    with playwright.sync_playwright() as driver:
-        chromium = driver.chromium.launch(
-            executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu", "--disable-quic", *quiet]
-        )
-        yield chromium
-        chromium.close()
-
-
-@contextlib.contextmanager
-def serving(*arguments: str) -> Iterator[dict[str, Any]]:
-    command = [sys.executable, "-m", "aerokit", "serve", *arguments, "--port", "0", "--json"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stdout is not None
-            yield json.loads(process.stdout.readline())
-        finally:
-            process.terminate()
-            assert process.wait(10) == 0
-
-
-@pytest.fixture(scope="module")
-def copters() -> Iterator[tuple[list[SimulatedCopter], str]]:
-    frame = LocalFrame(GlobalPoint(round(HOME[0] * 1e7), round(HOME[1] * 1e7), HOME[2]))
-    made = []
-    for number in (1, 2):
-        place = frame.to_global(0.0, 25.0 * (number - 1), 0.0)
-        made.append(
-            SimulatedCopter(
-                system_id=number,
-                home=(place.latitude_e7 / 1e7, place.longitude_e7 / 1e7, HOME[2]),
-                boot_time_s=0.0,
-            )
-        )
-    with served(made, speedup=4.0) as address:
-        with start_blocking_portal() as portal:  # this thread has playwright's loop
-            portal.call(upload, address)
-        yield made, address
-
-
-async def upload(address: str) -> None:
-    async with aerokit.connect(address, system_id=1) as vehicle:
-        await vehicle.wait_ready()
-        here = vehicle.position.value
-        corners = [here.offset(north_m=n, east_m=e) for n, e in ((70, -20), (80, 60), (30, 95), (-15, 50))]
-        items = [waypoint(at.latitude_deg, at.longitude_deg, altitude_relative_m=20) for at in corners]
-        await vehicle.mission.upload(Mission([take_off(altitude_relative_m=20), *items, return_to_launch()]))
-
-
-@contextlib.contextmanager
-def opened(browser: Any, url: str, wide: int = 1360, high: int = 820, scheme: str = "dark") -> Iterator[Any]:
-    """A page, which at the end must have had no mistake, no foreign request and nothing refused by its policy."""
-    mistakes: list[str] = []
-    context = browser.new_context(viewport={"width": wide, "height": high}, color_scheme=scheme)
-    page = context.new_page()
-    page.set_default_timeout(10_000)
-    page.on("pageerror", lambda error: mistakes.append(str(error)))
-    page.on("console", lambda each: mistakes.append(each.text) if each.type == "error" else None)
-    page.on("dialog", lambda each: mistakes.append(each.message))
-    page.on("request", lambda each: mistakes.append(each.url) if "//127.0.0.1:" not in each.url else None)
-    page.goto(url)
-    page.wait_for_selector(".vehicle[aria-pressed=true]")
-    yield page
-    assert [each for each in mistakes if "Failed to load resource" not in each] == []  # refused orders
-    context.close()
-
-
-def picture(page: Any, name: str) -> None:
-    if directory := os.environ.get("AEROKIT_SCREENSHOTS"):
-        page.screenshot(path=str(Path(directory) / f"{name}.png"))
-
-
-def order(page: Any, name: str, fields: dict[str, str] | None = None) -> None:
-    page.click(f"button[data-order='{name}']")
-    for field, value in (fields or {}).items():
-        page.fill(f"dialog input[name={field}]", value)
-    page.click("dialog .yes")
-
-
-def wait_done(page: Any, text: str) -> None:
-    page.locator(".toast.done", has_text=text).first.wait_for(timeout=60_000)
 
 
 def test_page_commands_flight(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
@@ -146,6 +33,7 @@ def test_page_commands_flight(browser: Any, copters: tuple[list[SimulatedCopter]
         page.locator("#panel tr").nth(5).wait_for()
         assert page.locator("#tiles-of-state dd > span").first.inner_text() == "STABILIZE"
 
+        places = boxes_of_orders(page)
         take_off = page.locator("button[data-order='take_off']")
         assert (take_off.is_disabled(), take_off.locator("small").inner_text()) == (True, "Arm first")
         page.click("button[data-order='arm']")
@@ -166,9 +54,16 @@ def test_page_commands_flight(browser: Any, copters: tuple[list[SimulatedCopter]
                 seen.add((disarm.is_disabled(), disarm.locator("small").inner_text()))
         assert seen == {(True, "Land first")}
         wait_done(page, "Vehicle 1: take off to 20 m: done")
+        assert boxes_of_orders(page) == places
+        assert_toasts_beside_orders(page)
         values_have_units(page)
         order(page, "mission/start")
-        wait_done(page, "mission start")
+        wait_done(page, "Vehicle 1: mission started at item 0")
+        for name in ("mission/start", "mission/resume"):
+            button = page.locator(f"button[data-order='{name}'][disabled]")
+            button.wait_for()
+            assert button.locator("small").inner_text() == "Running"
+        assert page.locator("button[data-order='mission/pause']").is_enabled()
         page.locator("tr.current", has_text=re.compile("^[34]")).wait_for(timeout=90_000)
         picture(page, "mission")
         fly_to_a_click(page, first)
@@ -209,7 +104,12 @@ def fly_to_a_click(page: Any, copter: SimulatedCopter) -> None:
     page.click("button[data-order='pick']")
     box = page.locator("#map").bounding_box()
     page.mouse.click(box["x"] + box["width"] * 0.55, box["y"] + box["height"] * 0.55)
-    asked = re.search(r"(-?\d+\.\d+), (-?\d+\.\d+)", page.locator("dialog p").inner_text())
+    where = page.locator("dialog .where")
+    where.filter(has_text=re.compile(r"^\d+ m (north|east|south|west)\S* of the vehicle$")).wait_for()
+    assert page.locator("dialog").bounding_box()["x"] > box["x"] + box["width"] * 0.55  # the position stays visible
+    page.wait_for_function(TARGET_IS_DRAWN, arg=[0.55, 0.55])
+    picture(page, "go-to")
+    asked = re.search(r"(-?\d+\.\d+), (-?\d+\.\d+)", page.locator("dialog p").first.inner_text())
     assert asked is not None
     page.click("dialog .yes")
     wait_done(page, "go to")
@@ -218,21 +118,17 @@ def fly_to_a_click(page: Any, copter: SimulatedCopter) -> None:
     assert place.longitude_deg == pytest.approx(float(asked[2]), abs=3e-5)
 
 
-def test_page_sets_parameter_after_confirmation(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
-    _, address = copters
-    with serving(address) as server, opened(browser, server["page"]) as page:
-        page.locator(".vehicle", has_text="2 ArduCopter").click()
-        page.get_by_role("tab", name="Parameters").click()
-        page.fill("input[type=search]", "wpnav_speed")
-        page.locator("tr", has_text="WPNAV_SPEED_UP").wait_for()
-        page.fill("input[type=search]", "wp_spd_up")  # its other name
-        page.locator("tr", has_text="WPNAV_SPEED_UP").click()
-        page.fill("dialog input[name=value]", "321")
-        assert "Vehicle 2" in page.locator("dialog").inner_text()
-        page.click("dialog .yes")
-        wait_done(page, "WPNAV_SPEED_UP")
-        page.locator("tr", has_text="321").wait_for()
-        picture(page, "parameters")
+# Whether the mark of a target is on the map at this fraction of its width and height.
+TARGET_IS_DRAWN = """([x, y]) => {
+    const map = document.getElementById("map"), sample = document.createElement("canvas").getContext("2d");
+    sample.fillStyle = getComputedStyle(document.documentElement).getPropertyValue("--accent");
+    sample.fillRect(0, 0, 1, 1);
+    const accent = sample.getImageData(0, 0, 1, 1).data.join();
+    const pixels = map.getContext("2d").getImageData(map.width * x - 12, map.height * y - 12, 24, 24).data;
+    let count = 0;
+    for (let at = 0; at < pixels.length; at += 4) count += pixels.slice(at, at + 4).join() === accent;
+    return count > 30;
+}"""
 
 
 def test_page_escapes_texts(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
@@ -284,12 +180,6 @@ def test_page_shows_silence_with_readable_values(
         page.locator(".silence").wait_for(state="detached")
 
 
-def check_contrast(page: Any) -> None:
-    found = axe.Axe().run(page).response["violations"]
-    severe = [each for each in found if each["impact"] in ("serious", "critical")]
-    assert [(each["id"], [node["html"][:120] for node in each["nodes"]]) for each in severe] == []
-
-
 @pytest.mark.parametrize("scheme", ["dark", "light"])
 def test_page_has_accessible_contrast(browser: Any, copters: tuple[list[SimulatedCopter], str], scheme: str) -> None:
     _, address = copters
@@ -316,38 +206,6 @@ def test_page_keeps_chosen_theme(browser: Any, copters: tuple[list[SimulatedCopt
         assert page.evaluate("document.documentElement.dataset.theme") == "dark"
 
 
-def test_page_shows_why_vehicle_is_not_ready(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
-    (_, second), address = copters
-    with serving(address) as server, opened(browser, server["page"]) as page:
-        page.locator(".vehicle", has_text="2 ArduCopter").click()
-        page.locator("#readiness.good", has_text="Ready to arm").wait_for()
-        second.faults.prearm_failures = ["Compass not healthy"]
-        try:
-            page.locator("#readiness.warn li", has_text="Compass not healthy").wait_for(timeout=30_000)
-            arm = page.locator("button[data-order='arm']")
-            assert (arm.is_disabled(), arm.locator("small").inner_text()) == (True, "Not ready")
-            picture(page, "not-ready")
-        finally:
-            second.faults.prearm_failures = []
-        page.locator("#readiness.good", has_text="Ready to arm").wait_for(timeout=30_000)
-
-
-def test_disarm_needs_known_ground(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
-    expected = {"ON_GROUND": "", "TAKEOFF": "Land first", "LANDING": "Land first", "IN_AIR": "Land first"}
-    with serving(copters[1]) as server, opened(browser, server["page"]) as page:
-        obstacles = """async ([landed, age, type, link]) => {
-            const { obstacle } = await import("/static/readiness.js");
-            const states = { armed: { value: true, age_s: 0 }, landed_state: { value: landed, age_s: age } };
-            const vehicle = { states, link: { state: link }, vehicle_type: type, missing_for_flight: [] };
-            return obstacle("disarm", vehicle, { isOpen: true });
-        }"""
-        for landed, text in expected.items():
-            assert page.evaluate(obstacles, [landed, 0, 2, "connected"]) == text
-        assert page.evaluate(obstacles, ["ON_GROUND", 10, 2, "connected"]) == "Unknown if landed"
-        assert page.evaluate(obstacles, ["ON_GROUND", 0, 2, "silent"]) == "Silent"
-        assert page.evaluate(obstacles, [None, 0, 10, "connected"]) == ""  # a rover has no landed state
-
-
 def test_page_words_errors_for_people(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
     said = {
         "take_off: the vehicle is not armed: arm() comes first": "The vehicle is not armed: “Arm” comes first",
@@ -363,41 +221,6 @@ def test_page_words_errors_for_people(browser: Any, copters: tuple[list[Simulate
             return details.map((detail) => inWords({ detail }));
         }"""
         assert page.evaluate(words, [*said]) == [*said.values()]
-
-
-DROP = """([name, text]) => {
-    const data = new DataTransfer();
-    data.items.add(new File([text], name));
-    window.dispatchEvent(new DragEvent("drop", { dataTransfer: data, cancelable: true }));
-}"""
-
-
-def test_page_uploads_dropped_plan_after_confirmation(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
-    (_, second), address = copters
-    place = true_point(second)
-    here = aerokit.Position(place.latitude_deg, place.longitude_deg)
-    corners = [here.offset(north_m=n, east_m=e) for n, e in ((90, -90), (90, 90), (-90, 90), (-90, -90))]
-    leg = waypoint(corners[0].latitude_deg, corners[0].longitude_deg, altitude_relative_m=15)
-    plan = Plan(Mission([take_off(altitude_relative_m=15), leg]), Fence([FencePolygon(corners)]))
-    with serving(address) as server, opened(browser, server["page"]) as page:
-        page.locator(".vehicle", has_text="2 ArduCopter").click()
-        page.evaluate(DROP, ["notes.plan", "no JSON"])
-        page.locator(".toast.failed", has_text="notes.plan: line 1: expected 'QGC WPL 110', found 'no JSON'").wait_for()
-        page.evaluate(DROP, ["field.plan", format_plan(plan)])
-        text = page.locator("dialog[open]").inner_text()
-        assert "Vehicle 2" in text
-        assert "get 2 mission items, 1 fence area from field.plan" in text
-        page.click("dialog .yes")
-        wait_done(page, "upload field.plan (2 items)")
-        page.get_by_role("tab", name="Mission").click()
-        page.locator("#panel tr", has_text="waypoint").wait_for()
-        page.evaluate(DROP, ["field.waypoints", format_waypoints(plan.mission)])
-        assert "get 2 mission items from field.waypoints" in page.locator("dialog[open]").inner_text()
-        page.click("dialog .yes")
-        wait_done(page, "upload field.waypoints (2 items)")
-        page.evaluate(DROP, ["broken.plan", format_plan(plan).replace('"version": 2', '"version": 7')])
-        page.locator(".toast.failed", has_text="broken.plan").wait_for()
-        picture(page, "uploaded")
 
 
 def test_map_labels_do_not_overlap_on_phone(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:

@@ -12,8 +12,13 @@ from aerokit import errors
 __all__ = ["documented"]
 
 NAMES = {*errors.__all__, "OSError"}
-AS_OTHERS = re.compile(r"(?:[Rr]aises as|else as|[Ee]rrors as for|errors are those of|is as for|see) :meth:`([\w.]+)`")
-FOR_ALL = re.compile(r"(Every method raises:|All methods take|NotSupported is\s+raised for).*", re.DOTALL)
+AS_OTHERS = re.compile(
+    r"(?:[Rr]aises\s+as|else\s+as|[Ee]rrors\s+as\s+for|errors\s+are\s+those\s+of|is\s+as\s+for|see)\s+:meth:`([\w.]+)`"
+)
+FOR_ALL = re.compile(
+    r"(Every method raises:|All methods take|Methods that send something take|NotSupported is\s+raised for).*",
+    re.DOTALL,
+)
 """Errors that a class docstring documents for all its methods."""
 
 

@@ -188,6 +188,7 @@ def _table() -> Table:
         ("GimbalRates", "CommandRejected"): P(_rates(), before=refused(PITCHYAW)),
         ("GimbalRates", "CommandTimeout"): P(_rates(), grounded, ignored(PITCHYAW)),
         ("GimbalRates", "GimbalTaken"): P(_rates_after_takeover, grounded, _fitted()),
+        ("GimbalRates", "SetpointStreamStopped"): P(_rates(_setting(0.0, after_s=2.0)), before=_fitted()),
         ("GimbalRates.set", "InvalidArgument"): P(_rates(_setting(9e9)), before=_fitted()),
         ("GimbalRates.set", "SetpointStreamStopped"): P(_rates(_setting(0.0, after_s=2.0)), before=_fitted()),
         ("GimbalRates.set", "GimbalTaken"): P(lambda s: _feed_after_takeover(s, _setting(1.0)), grounded, _fitted()),

@@ -41,6 +41,15 @@ async def test_cell_as_condition_raises_type_error() -> None:
     assert str(caught.value) == "a StateCell has no truth value: use armed.value or armed.latest"
 
 
+async def test_cell_with_index_or_loop_raises_type_error() -> None:
+    cameras: Any = make_cell("cameras")
+    with pytest.raises(TypeError, match=r"^cameras is a StateCell.*: use cameras.value\[…\], or camera_at\(number\)"):
+        _ = cameras[100]
+    batteries: Any = make_cell("batteries")
+    with pytest.raises(TypeError, match=r"^batteries is a StateCell.*: use batteries.value\[…\]$"):
+        list(batteries)
+
+
 async def test_value_age_and_source() -> None:
     cell = make_cell()
     await asyncio.sleep(1.5)

@@ -179,7 +179,7 @@ def broken(*_: object, **__: object) -> Any:
 
 
 def break_bus(vehicle: Vehicle, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(vehicle.connection.bus, "deliver", broken)
+    monkeypatch.setattr(vehicle.connection.bus, "deliver_all", broken)
 
 
 def break_encoder(vehicle: Vehicle, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -552,3 +552,17 @@ def test_plan_file_of_other_version_is_not_called_incomplete() -> None:
     with pytest.raises(FileFormatError, match=r"version.*9") as caught:
         read({"fileType": "Plan", "version": 9})
     assert "required" not in str(caught.value)
+
+
+def test_mission_is_written_as_plan_without_other_parts(tmp_path: Path) -> None:
+    mission = Mission([take_off(15), return_to_launch()])
+    write_plan_file(tmp_path / "two.plan", mission)
+    assert read_plan_file(tmp_path / "two.plan") == Plan(mission)
+
+
+def test_plan_file_of_other_type_is_not_written(tmp_path: Path) -> None:
+    path = tmp_path / "two.plan"
+    items: Any = [take_off(15)]
+    with pytest.raises(InvalidArgument, match=r"^plan = .* is neither a Plan nor a Mission: pass Mission\(\[…\]\), or"):
+        write_plan_file(path, items)
+    assert not path.exists()

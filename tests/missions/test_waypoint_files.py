@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -15,6 +16,7 @@ from aerokit.mavlink.enums import MavCmd
 from aerokit.missions import (
     Mission,
     MissionItem,
+    Plan,
     format_waypoints,
     jump,
     land,
@@ -214,3 +216,11 @@ def test_waypoint_file_of_pymavlink_is_read(tmp_path: Path) -> None:
     for item, other in zip(MISSION, mission, strict=True):
         assert abs(item.x - other.x) <= 5  # six digits behind the point
         assert item.replace(x=0, y=0) == other.replace(x=0, y=0)
+
+
+@pytest.mark.parametrize("plan", [Plan(), [take_off(15)]], ids=["plan", "items"])
+def test_waypoint_file_of_other_type_is_refused(plan: Any) -> None:
+    with pytest.raises(
+        InvalidArgument, match=r"^mission = .* is not a Mission: pass Mission\(\[…\]\), or plan.mission"
+    ):
+        format_waypoints(plan)

@@ -77,6 +77,25 @@ async def test_file_is_opened_with_session_and_number_of_mavproxy(tmp_path: Path
     assert answers[1].session == 131
 
 
+async def test_checksum_of_missing_file_is_refused_each_time(tmp_path: Path) -> None:
+    """MAVProxy begins each operation with number 0."""
+    (tmp_path / "a").write_bytes(b"1")
+    async with payload_and_station() as (payload, station):
+        payload.serve_files(tmp_path)
+        codes = []
+        for number, opcode in ((0, MavFtpOpcode.CALCFILECRC), (2, MavFtpOpcode.NONE), (0, MavFtpOpcode.CALCFILECRC)):
+            request = FtpPacket(number, opcode, 0, 5, data=b"/none", client=station.target)
+            codes.append(FtpPacket.parse(await station.ask(request.message(), m.FileTransferProtocol)).data[0])
+    assert codes == [MavFtpErr.FILENOTFOUND, ord("/"), MavFtpErr.FILENOTFOUND]
+
+
+async def test_item_of_unknown_mission_type_is_unsupported() -> None:
+    async with payload_and_station() as (payload, station):
+        assert payload.missions.items() == ()
+        ack = await station.ask(m.MissionRequestInt(*station.target, 0, 7), m.MissionAck)
+    assert (ack.type, ack.mission_type) == (MavMissionResult.UNSUPPORTED, 7)
+
+
 async def test_second_upload_is_denied_and_silent_one_is_cancelled() -> None:
     async with payload_and_station() as (payload, station):
         _ = payload.missions

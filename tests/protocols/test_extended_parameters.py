@@ -217,7 +217,7 @@ def test_setting_read_of_unknown_name_is_rejected() -> None:
     channel = Channel(FakeCamera(table_of(4)))
     answers = channel.run(reads("NOPE", "CAM_001"))
     assert isinstance(answers["NOPE"], ParameterRejected)
-    assert "no setting NOPE: it answers other requests" in str(answers["NOPE"])
+    assert "no setting NOPE: it answers requests for other names" in str(answers["NOPE"])
     assert value(answers["CAM_001"]) == 0.5
     assert channel.now < 3.0
 

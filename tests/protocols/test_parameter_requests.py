@@ -98,7 +98,7 @@ def test_unanswered_name_is_rejected_by_probe() -> None:
     answer = answers["NOPE"]
     assert isinstance(answer, ParameterRejected)
     assert answer.code is None
-    assert "it answers other requests" in str(answer)
+    assert "it answers requests for other names" in str(answer)
     assert value(answers["PARAM_0004"]) == 2.0
     assert channel.now < 1.5
 

@@ -53,3 +53,16 @@ def test_streams_have_their_own_rates(requests: list[tuple[int, float]]) -> None
         sent += streams.take_due(streams.next_due)
     for message_id, interval in dict(requests).items():
         assert abs(sent.count(message_id) - 10.0 / interval) <= 1
+
+
+def test_streams_of_different_rates_share_their_instants() -> None:
+    """Sums of 0.1 and of 0.2 differ in their last bits; these do not."""
+    streams, instants, start = Streams(), 0, 12.34
+    for message_id, rate in enumerate((10.0, 5.0, 2.0, 1.0)):
+        streams.set_interval(message_id, 1.0 / rate, start)
+    while streams.next_due < start + 99.95:
+        instants += 1
+        ids = streams.take_due(streams.next_due)
+        assert (2 in ids) == ((instants - 1) % 5 == 0)
+        assert len(ids) == 4 or (instants - 1) % 10
+    assert instants == 1000

@@ -227,6 +227,8 @@ def test_cells_read_without_the_loop(vehicle: aerokit.sync.Vehicle) -> None:
     assert 0 <= cell.age < 60
     with pytest.raises(TypeError, match="has no truth value"):
         bool(cell)
+    with pytest.raises(TypeError, match=r"use position.value\[…\]"):
+        _ = cell[0]  # type: ignore[index]
     with pytest.raises(errors.ConnectionClosed):
         cell.wait_until(lambda _: False)
 

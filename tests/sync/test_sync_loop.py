@@ -267,7 +267,13 @@ def test_run_shielded_completes_wherever_ctrl_c_arrives() -> None:
 def test_ctrl_c_is_never_lost_and_leaves_no_threads() -> None:
     """Interrupt at every line that the main thread runs in aerokit and threading, but not in contextlib and pytest."""
     ours = ("loop_thread.py", "thread_future.py", "threading.py")
-    places = sorted(place for place in interrupted_at(None) if place[0].endswith(ours))
+    # CPython would keep an AttributeError that Condition.__init__ handles as the context of all later exceptions.
+    handled = ("except AttributeError:", "pass")
+    places = sorted(
+        place
+        for place in interrupted_at(None)
+        if place[0].endswith(ours) and linecache.getline(*place).strip() not in handled
+    )
     assert len(places) > 80
     lost = []
     for place in places:

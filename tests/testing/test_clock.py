@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import asyncio
+import os
+import signal
 import socket
 import threading
 import time
@@ -153,65 +155,120 @@ def test_errors_and_executor_shutdown() -> None:
         run_virtual(fail())
 
 
-async def _jumps(prepare: Callable[[VirtualClockLoop], object] = lambda _: None) -> bool:
-    """Return True if a jump of one second succeeds inside a callback; the clock has advanced only then."""
-    loop = asyncio.get_running_loop()
-    assert isinstance(loop, VirtualClockLoop)
-    found: asyncio.Future[bool] = loop.create_future()
+class Metronome:
+    """Event source that is due every half second; it notes times and calls a function."""
 
-    def jump() -> None:
-        kept = prepare(loop)
-        before = loop.time()
-        has_jumped = loop.jump(before + 1.0)
-        assert loop.time() - before == pytest.approx(1.0 if has_jumped else 0.0)
-        del kept
-        found.set_result(has_jumped)
+    def __init__(self, action: Callable[[], object] = lambda: None) -> None:
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, VirtualClockLoop)
+        self.loop, self.action, self.start = loop, action, loop.time()
+        self.ran: list[float] = []
+        self.end = loop.add_event_source(lambda: self.start + 0.5 * (len(self.ran) + 1), self._run)
 
-    loop.call_soon(jump)
-    return await found
+    def _run(self) -> None:
+        self.ran.append(self.loop.time() - self.start)
+        self.action()
 
 
 @pytest.mark.anyio
-async def test_callback_may_jump_while_idle() -> None:
-    assert await _jumps()
-    assert await _jumps(lambda loop: loop.call_later(1.5, lambda: None))
-
-
-@pytest.mark.anyio
-@pytest.mark.parametrize("delay", [0.5, 1.0], ids=["before", "at the same instant"])
-async def test_earlier_timer_prevents_jump(delay: float) -> None:
-    assert not await _jumps(lambda loop: loop.call_later(delay, lambda: None))
-
-
-@pytest.mark.anyio
-async def test_cancelled_timer_allows_jump() -> None:
-    assert await _jumps(lambda loop: loop.call_later(0.5, lambda: None).cancel())
-    assert asyncio.get_running_loop().time() == pytest.approx(1.0)
+async def test_event_sources_run_at_their_times_until_ended() -> None:
+    source = Metronome()
+    await asyncio.sleep(1.75)
+    assert source.ran == pytest.approx([0.5, 1.0, 1.5])
+    source.end()
+    source.end()
     await asyncio.sleep(1.0)
+    assert len(source.ran) == 3
 
 
 @pytest.mark.anyio
-async def test_ready_callback_prevents_jump() -> None:
-    assert not await _jumps(lambda loop: loop.call_soon(lambda: None))
+async def test_earliest_of_several_event_sources_runs_first() -> None:
+    order: list[str] = []
+    one = Metronome(lambda: order.append("one"))
+    await asyncio.sleep(0.25)
+    other = Metronome(lambda: order.append("other"))
+    await asyncio.sleep(1.1)
+    assert order == ["one", "other", "one", "other"]
+    one.end(), other.end()
 
 
 @pytest.mark.anyio
-async def test_foreign_socket_prevents_jump() -> None:
+async def test_event_source_runs_before_timer_of_same_instant() -> None:
+    order: list[str] = []
+    source = Metronome(lambda: order.append("source"))
+    source.loop.call_later(0.5, order.append, "timer")
+    await asyncio.sleep(0.6)
+    assert order == ["source", "timer"]
+    source.end()
+
+
+@pytest.mark.anyio
+async def test_ready_callbacks_run_before_the_next_event() -> None:
+    order: list[str] = []
+
+    def act() -> None:
+        order.append("source")
+        source.loop.call_soon(order.append, "callback")
+
+    source = Metronome(act)
+    await asyncio.sleep(1.1)
+    assert order == ["source", "callback"] * 2
+    source.end()
+
+
+@pytest.mark.anyio
+async def test_cancelled_timers_do_not_move_the_clock() -> None:
+    source = Metronome()
+    for _ in range(300):
+        source.loop.call_later(0.1, source.ran.clear).cancel()
+    await asyncio.sleep(0.75)
+    assert source.ran == pytest.approx([0.5])
+    source.end()
+
+
+@pytest.mark.anyio
+async def test_sockets_are_read_between_events() -> None:
     near, far = socket.socketpair()
-    loop = asyncio.get_running_loop()
+    received: list[int] = []
     with near, far:
         near.setblocking(False)
-        loop.add_reader(near, lambda: None)
-        assert not await _jumps()
-        loop.remove_reader(near)
-        assert await _jumps()
+        source = Metronome(lambda: far.send(b"x"))
+        source.loop.add_reader(near, lambda: received.append(len(near.recv(10))))
+        await asyncio.sleep(1.6)
+        source.loop.remove_reader(near)
+        source.end()
+    assert received == [1, 1, 1]
 
 
 @pytest.mark.anyio
-async def test_running_executor_prevents_jump() -> None:
-    go_on = threading.Event()
+async def test_event_sources_wait_for_a_running_executor() -> None:
+    source, go_on = Metronome(), threading.Event()
     work = asyncio.get_running_loop().run_in_executor(None, go_on.wait, 10.0)
-    assert not await _jumps()
+    for _ in range(100):
+        await asyncio.sleep(0)
+    assert not source.ran
     go_on.set()
     await work
-    assert await _jumps()
+    await asyncio.sleep(0.6)
+    assert source.ran == pytest.approx([0.5])
+    source.end()
+
+
+@pytest.mark.anyio
+async def test_error_of_an_event_source_is_reported() -> None:
+    errors: list[dict[str, object]] = []
+    source = Metronome(lambda: 1 / 0)
+    source.loop.set_exception_handler(lambda _, context: errors.append(context))
+    await asyncio.sleep(0.6)
+    source.end()
+    assert isinstance(errors[0]["exception"], ZeroDivisionError)
+
+
+@pytest.mark.anyio
+async def test_signals_arrive_while_events_run() -> None:
+    source, arrived = Metronome(lambda: source.loop.call_soon(lambda: None)), asyncio.Event()
+    source.loop.add_signal_handler(signal.SIGUSR1, arrived.set)
+    os.kill(os.getpid(), signal.SIGUSR1)
+    await asyncio.wait_for(arrived.wait(), 3600.0)
+    source.loop.remove_signal_handler(signal.SIGUSR1)
+    source.end()

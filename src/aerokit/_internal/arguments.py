@@ -28,7 +28,7 @@ from aerokit.errors import InvalidArgument, LinkOpenError
 FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
 ClassT = TypeVar("ClassT")
 
-# A check, and a check with a description of what is allowed.
+# A rule is a check with a description of the allowed values.
 Check = Callable[[Any], bool]
 Rule = tuple[Check, str]
 
@@ -183,7 +183,7 @@ def _named_rule(name: str, names: Mapping[str, Any]) -> Rule:
 
 
 def _generic_rule(name: str, inner: ast.expr, names: Mapping[str, Any]) -> Rule:
-    if name in _SIMPLE:  # Callable[[int], None], PathLike[str]
+    if name in _SIMPLE:  # e.g. Callable[[int], None] or PathLike[str]
         return _SIMPLE[name]
     parts = inner.elts if isinstance(inner, ast.Tuple) else [inner]
     rules = [_rule(part, names) for part in parts]
@@ -233,7 +233,7 @@ def _are_items(is_item: Check, value: object) -> bool:
 
 
 def check_kind(name: str, value: object, kind: type) -> None:
-    """Raise InvalidArgument unless ``value`` is an instance of ``kind``. For annotations that are type variables."""
+    """Raise InvalidArgument unless ``value`` is an instance of ``kind``. Used if the annotation is a type variable."""
     if not isinstance(value, kind):
         raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: {with_article(kind.__name__)}")
 

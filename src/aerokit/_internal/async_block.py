@@ -40,7 +40,7 @@ class _Block(AbstractAsyncContextManager[T]):
     async def __aenter__(self) -> T:
         try:
             asyncio.get_running_loop()
-        except RuntimeError:  # trio.run, for example
+        except RuntimeError:  # there is no asyncio loop, e.g. in trio.run
             raise InvalidArgument(
                 f"{self._name}(…) requires asyncio, and no asyncio event loop is running here: start the program with"
                 " asyncio.run(…), or, on trio, use aerokit.sync in a thread (trio.to_thread.run_sync)"
@@ -81,7 +81,7 @@ class _Block(AbstractAsyncContextManager[T]):
         )
 
 
-# Attribute → the call that changes the value it reports.
+# Maps an attribute to the call that changes the reported value.
 _SETTER_CALLS = {
     "mode": "set_mode({value})",
     "mode_name": "set_mode({value})",
@@ -106,7 +106,8 @@ class ReadOnly:
         found = inspect.getattr_static(type(self), name, None)
         is_setter = isinstance(found, property) and found.fset is not None
         is_descriptor = hasattr(type(found), "__get__")
-        # Callable: a method replaced by a mock. No descriptor: set in the constructor, or added by the program.
+        # A callable is a method that a mock replaces. Attributes without a descriptor are set in the constructor or by
+        # programs.
         if name.startswith("_") or is_setter or callable(found) or not is_descriptor:
             object.__setattr__(self, name, value)
             return

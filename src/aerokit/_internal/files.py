@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 MAX_FILE_SIZE = 16 << 20
-"""Size limit in bytes for files of parameters, metadata, plans and definitions; real ones have at most 5 MB."""
+"""Size limit in bytes for files of parameters, metadata, plans and definitions; real files have at most 5 MB."""
 
 _XZ_MAGIC = b"\xfd7zXZ\x00"
 _XZ_MEMORY_LIMIT = 128 << 20  # xz -9 needs 65 MB
@@ -29,7 +29,7 @@ def write_atomically(path: str | os.PathLike[str], text: str) -> None:
         with part.open("x", encoding="utf-8", newline="\n") as file:
             file.write(text)
             file.flush()
-            os.fsync(file.fileno())  # otherwise a power failure may leave an empty file under the new name
+            os.fsync(file.fileno())  # without fsync, a power failure may leave an empty file under the new name
         part.replace(target)
     finally:
         part.unlink(missing_ok=True)

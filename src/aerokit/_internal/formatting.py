@@ -83,7 +83,7 @@ _CREDENTIALS = re.compile(r"//([^/@:\s]*):[^\s]*@")
 
 
 def short_repr(value: object) -> str:
-    """Return ``repr(value)``, at most 100 characters, without the password of a URL; the type's name if it fails."""
+    """Return ``repr(value)``, at most 100 characters, without a URL's password; if it fails, the type's name."""
     try:
         text = repr(value)
     except Exception:  # repr fails for an int of 5000 digits, and may fail for classes of the program

@@ -25,7 +25,7 @@ def bearing_deg(latitude_deg: float, longitude_deg: float, to_latitude_deg: floa
 
 
 def offset(latitude_deg: float, longitude_deg: float, north_m: float, east_m: float) -> tuple[float, float]:
-    """Return latitude and longitude of the place ``north_m`` north and ``east_m`` east of the given one."""
+    """Return latitude and longitude of the place ``north_m`` north and ``east_m`` east of the given place."""
     distance, azimuth = math.hypot(north_m, east_m), math.degrees(math.atan2(east_m, north_m))
     line = _wgs84().Direct(latitude_deg, longitude_deg, azimuth, distance)
     return float(line["lat2"]), wrap_longitude(float(line["lon2"]))

@@ -14,8 +14,8 @@ _OTHER_PACKAGES = ("aero", "engine", "stability")
 def installation_problem(folder: str, *, is_ours: bool = True) -> str | None:
     """Describe what is wrong with the installation in ``folder`` and how to repair it; None if nothing is wrong.
 
-    PyPI has another project called aerokit, for compressible flow. It installs into the same folder, so that with both
-    installed neither may work. ``is_ours`` is True if the ``__init__.py`` there is this library's.
+    PyPI has another project called aerokit, for compressible flow. Both projects install into the same folder, so
+    neither may work if both are installed. ``is_ours`` is True if the ``__init__.py`` there is this library's.
     """
     others = [name for name in _OTHER_PACKAGES if os.path.isfile(os.path.join(folder, name, "__init__.py"))]
     if is_ours and not others:
@@ -32,8 +32,8 @@ def lazy_exports(
 ) -> tuple[Callable[[str], object], Callable[[], list[str]], list[str]]:
     """Create ``__getattr__``, ``__dir__`` and ``__all__`` of a package that imports its names on first use.
 
-    ``exports`` maps modules to names; a name that the module does not define is the module itself. For type checkers,
-    the package repeats the names as ``import name as name`` under TYPE_CHECKING.
+    ``exports`` maps modules to names; a name that the module does not define stands for the module itself. For type
+    checkers, the package repeats the names as ``import name as name`` under TYPE_CHECKING.
     """
     modules = {name: module for module, names in exports.items() for name in names}
 

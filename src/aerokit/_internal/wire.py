@@ -11,7 +11,7 @@ from importlib import import_module
 from types import MemberDescriptorType
 from typing import TYPE_CHECKING, Any
 
-_VERSION = 1  # as in _wire.c: a stale build in a clone is not used
+_VERSION = 1  # the same as in _wire.c, so that a stale build in a clone is not used
 
 
 def _load() -> Any:

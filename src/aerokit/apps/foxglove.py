@@ -191,7 +191,7 @@ class _TopicChannels:
             self._messages[frame.system_id, frame.component_id, message.ID] = message
 
     def publish(self, vehicles: Mapping[int, Vehicle]) -> None:
-        """Send all values that are newer than those already sent."""
+        """Send all values that are newer than the last values sent."""
         for system_id, vehicle in vehicles.items():
             self._publish_states(system_id, vehicle)
             self._publish_place(system_id, vehicle)
@@ -249,7 +249,7 @@ class _TopicChannels:
                 self._send(name, text.at, topics.log_entry(self._unix(text.at), system_id, text))
 
     def _needs_sending(self, name: str, at: float, topic: Callable[[], Topic]) -> bool:
-        """Return True if a viewer subscribes to the topic, and the value is newer than the last one sent.
+        """Return True if a viewer subscribes to the topic, and the value is newer than the last value sent.
 
         Creates the channel of the topic with its first value.
         """

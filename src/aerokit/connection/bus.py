@@ -36,7 +36,7 @@ Detach = Callable[[], None]
 """Ends an attachment. Calling it a second time does nothing."""
 
 Sink = Callable[[Any], None]
-"""Callback for one message, frame or event. It must return quickly; it cannot await."""
+"""Callback for one message, frame or event. The callback must return quickly and cannot await."""
 
 EventT = TypeVar("EventT", bound=Event)
 
@@ -45,20 +45,24 @@ _Entry = tuple[int, Callable[..., None]]
 
 MESSAGE, FRAME, BOTH = range(3)
 
-# (True if any of the sinks needs the decoded message, all sinks).
-_DeliveryPlan = tuple[bool, tuple[_Entry, ...]]
+# (what the sinks take: FRAME, MESSAGE, or BOTH if they differ; all sinks).
+_DeliveryPlan = tuple[int, tuple[Callable[..., None], ...]]
 
 EVERY_SYSTEM = 0
+_HEARTBEAT_ID = 0
 
 
 class Bus:
     """Delivers messages and events to the attached sinks, in the order in which they were attached.
 
-    ``wanted`` has the message ids with a sink and is updated in place: a framer that uses it skips all other frames.
+    ``wanted`` has the message ids for which a sink is attached, and is updated in place. A framer that uses this
+    mapping skips all other frames.
     """
 
     def __init__(self, dialect: Dialect = STANDARD) -> None:
         self.dialect = dialect
+        self.one_at_a_time = False
+        """True to end :meth:`deliver_all` after the current frame."""
         self.wanted: dict[int, int] = {}  # message id → number of sinks
         self._sinks: dict[tuple[int, int], tuple[_Entry, ...]] = {}
         self._plans: dict[int, _DeliveryPlan] = {}  # cache, by system and message id
@@ -84,7 +88,7 @@ class Bus:
         *,
         system_id: int = EVERY_SYSTEM,
     ) -> Detach:
-        """Like :meth:`attach_frames`, but also pass the message if it is decoded for another sink."""
+        """Like :meth:`attach_frames`, but also pass the decoded message if another sink needs it."""
         return self._attach((system_id, message_type.ID), (BOTH, sink))
 
     def create_on_first(
@@ -96,10 +100,10 @@ class Bus:
         """
 
         def first(frame: Frame) -> None:
-            before = self._plan(frame)[1]
+            before = self._entries(frame)
             create()
             detach_all()
-            for entry in self._plan(frame)[1]:
+            for entry in self._entries(frame):
                 if entry not in before:
                     kind, sink = entry
                     sink(self.dialect.decode(frame) if kind == MESSAGE else frame)
@@ -119,19 +123,42 @@ class Bus:
 
     def deliver(self, frame: Frame) -> None:
         """Deliver a frame, decoded if needed. Exceptions of sinks are logged; the other sinks still get it."""
-        try:
-            is_decoded, entries = self._plans[frame.system_id << 24 | frame.message_id]
-        except KeyError:
-            is_decoded, entries = self._plan(frame)
-        if not is_decoded:  # the common case: FRAME and BOTH sinks take the frame alone
-            for _, sink in entries:
-                try:
-                    sink(frame)
-                except Exception:
-                    _report(sink)
-            return
+        self.deliver_all((frame,), _ignore)
+
+    def deliver_all(
+        self, frames: Iterable[Frame], before_heartbeat: Callable[..., None], *context: object
+    ) -> Frame | None:
+        """Deliver the frames in order, like :meth:`deliver`, and return None.
+
+        Calls ``before_heartbeat(frame, *context)`` with each HEARTBEAT before it is delivered. If a sink sets
+        :attr:`one_at_a_time`, the method returns the frame that this sink got, and does not deliver the frames after
+        it.
+        """
+        plans, decode = self._plans, self.dialect.decode
+        for frame in frames:
+            message_id = frame.message_id
+            if message_id == _HEARTBEAT_ID:
+                before_heartbeat(frame, *context)
+            try:
+                kind, sinks = plans[frame.system_id << 24 | message_id]
+            except KeyError:
+                kind, sinks = self._plan(frame)
+            if kind == BOTH:
+                self._deliver_both(frame)
+            else:
+                item = frame if kind == FRAME else decode(frame)
+                for sink in sinks:
+                    try:
+                        sink(item)
+                    except Exception:
+                        _report(sink)
+            if self.one_at_a_time:
+                return frame
+        return None
+
+    def _deliver_both(self, frame: Frame) -> None:
         message = self.dialect.decode(frame)
-        for kind, sink in entries:
+        for kind, sink in self._entries(frame):
             try:
                 if kind == MESSAGE:
                     sink(message)
@@ -159,15 +186,20 @@ class Bus:
         return once(lambda: self._detach(key, entry))
 
     def _plan(self, frame: Frame) -> _DeliveryPlan:
-        """Return the sinks of the frame's system, then those of every system; none if the message is unknown."""
-        system_id, message_id = frame.system_id, frame.message_id
-        sinks = self._sinks.get((system_id, message_id), ()) if system_id != EVERY_SYSTEM else ()
-        sinks += self._sinks.get((EVERY_SYSTEM, message_id), ())
-        if not sinks or self.dialect.get(message_id) is None:
-            return False, ()
-        plan = any(kind == MESSAGE for kind, _ in sinks), sinks
-        self._plans[system_id << 24 | message_id] = plan
+        """Return the sinks for the frame's system, then the sinks for all systems. Empty if the message is unknown."""
+        entries = self._entries(frame)
+        if not entries or self.dialect.get(frame.message_id) is None:
+            return FRAME, ()
+        kinds = {kind for kind, _ in entries}
+        # Without a sink that needs the message, FRAME and BOTH sinks take the frame alone.
+        kind = FRAME if MESSAGE not in kinds else MESSAGE if kinds == {MESSAGE} else BOTH
+        plan = self._plans[frame.system_id << 24 | frame.message_id] = kind, tuple(sink for _, sink in entries)
         return plan
+
+    def _entries(self, frame: Frame) -> tuple[_Entry, ...]:
+        system_id, message_id = frame.system_id, frame.message_id
+        own = self._sinks.get((system_id, message_id), ()) if system_id != EVERY_SYSTEM else ()
+        return own + self._sinks.get((EVERY_SYSTEM, message_id), ())
 
     def _detach(self, key: tuple[int, int], entry: _Entry) -> None:
         _drop(self._sinks, key, entry)
@@ -183,7 +215,7 @@ class Bus:
 
 
 def _drop(table: dict[Any, tuple[Any, ...]], key: object, sink: object) -> None:
-    """Remove one occurrence of the sink by a new tuple: a delivery in progress continues with the old one."""
+    """Remove one occurrence of the sink. A delivery in progress continues with the old tuple."""
     left = list(table[key])
     left.remove(sink)
     if left:
@@ -203,7 +235,7 @@ def once(action: Callable[[], None]) -> Detach:
     return detach
 
 
-def _ignore(message: object) -> None:
+def _ignore(item: object) -> None:
     pass
 
 
@@ -222,7 +254,7 @@ def copy_exception(error: ErrorT) -> ErrorT:
     """
     try:
         fresh = copy.copy(error)
-    except Exception:  # its constructor requires more than `args`
+    except Exception:  # the constructor of the exception requires more than `args`
         return error.with_traceback(None)
     fresh.__cause__, fresh.__suppress_context__ = error.__cause__, error.__suppress_context__
     return fresh
@@ -271,14 +303,14 @@ def _nothing() -> None:
 ItemT = TypeVar("ItemT")
 
 Overflow = Literal["drop_oldest", "drop_newest", "error"]
-"""Policy for an item that arrives at a full queue: drop the oldest, drop the new one, or raise in the reader."""
+"""Policy for an item that arrives at a full queue: drop the oldest item, drop the new item, or raise in the reader."""
 
 
 class Subscription(Generic[ItemT]):
     """Asynchronous iterator over received items, for one reader. Active inside its ``with`` block.
 
     The default, ``capacity=1`` with ``drop_oldest``, always yields the latest item; ``missed`` counts the dropped
-    ones. When the connection ends, queued items can still be read; after that, reading raises the connection's error.
+    items. When the connection ends, queued items can still be read; after that, reading raises the connection's error.
     """
 
     def __init__(
@@ -292,7 +324,7 @@ class Subscription(Generic[ItemT]):
             raise InvalidArgument(f"capacity = {capacity} is not allowed: at least 1")
         if overflow not in ("drop_oldest", "drop_newest", "error"):
             raise InvalidArgument(f"overflow = {overflow!r} is not allowed: 'drop_oldest', 'drop_newest' or 'error'")
-        # Explains in a time-out error why no items arrive; "" if unknown.
+        # Returns the reason why no items arrive, for time-out errors; "" if unknown.
         self._explain_timeout: Callable[[], str] = str
         self.missed: int = 0
         """Number of items dropped because the reader was slow."""
@@ -300,7 +332,8 @@ class Subscription(Generic[ItemT]):
         self._detach: list[Detach] = []
         self._capacity, self._overflow = capacity, overflow
         self._queue: deque[ItemT] = deque()
-        self._waiter: asyncio.Future[None] | None = None
+        self._has_reader = False
+        self._waiter: asyncio.Future[None] | None = None  # set while a reader waits
         self._error: Exception | None = None
         self._closed = False
 
@@ -379,14 +412,15 @@ class Subscription(Generic[ItemT]):
             self.close(SubscriptionOverflow(f"the reader was too slow: {self._capacity} items are already queued"))
 
     async def _wait(self) -> None:
-        if self._waiter is not None:
+        if self._has_reader:
             raise InvalidArgument("a subscription has one reader; open a second subscription for a second reader")
-        self._waiter = asyncio.get_running_loop().create_future()
+        self._has_reader, self._waiter = True, asyncio.get_running_loop().create_future()
         try:
             await self._waiter
         finally:
-            self._waiter = None
+            self._has_reader, self._waiter = False, None
 
     def _wake(self) -> None:
-        if self._waiter is not None and not self._waiter.done():
-            self._waiter.set_result(None)
+        waiter, self._waiter = self._waiter, None
+        if waiter is not None and not waiter.done():
+            waiter.set_result(None)

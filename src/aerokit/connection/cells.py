@@ -82,10 +82,10 @@ class StateCell(Generic[T]):
         self.name: str = name
         """Name of the value, for error texts."""
         self._clock = clock
-        self._stamp = clock if stamp is None else stamp  # receive time of a value that is set now
+        self._stamp = clock if stamp is None else stamp  # returns the receive time for a value that is set now
         self.waits_for: str = waits_for
         """Names of the messages that carry the value."""
-        # Explains in a time-out error why no values arrive; "" if unknown.
+        # Returns the reason why no values arrive, for time-out errors; "" if unknown.
         self._explain_timeout: Callable[[], str] = str
         self._known = False
         self._latest: T | None = None
@@ -111,7 +111,9 @@ class StateCell(Generic[T]):
     @property
     def latest(self) -> T | None:
         """The latest value, or None before the first."""
-        self._catch_up()
+        for feed in self._feeds:  # inlined `_catch_up`, to save the call
+            if feed.pending:
+                feed.catch_up()
         return self._latest if self._known else None
 
     @property
@@ -171,7 +173,8 @@ class StateCell(Generic[T]):
         single message is not missed. Exceptions of the predicate are raised here.
 
         Raises:
-            OperationTimeout: not reached within ``timeout`` seconds; the text has ``description`` and the last values.
+            OperationTimeout: the condition was not met within ``timeout`` seconds; the text has ``description`` and the
+                last values.
         """
         self._raise_if_closed()
         waiter = _Waiter(self, predicate, held_for)
@@ -181,7 +184,7 @@ class StateCell(Generic[T]):
         return await waiter.wait(timeout, description)
 
     def changes(self) -> Changes[T]:
-        """Iterate over values that differ from their predecessor, starting with the current one if there is one.
+        """Iterate over values that differ from their predecessor, starting with the current value if there is one.
 
         A slow reader gets only the latest value. The loop can be left at any time.
         """
@@ -218,7 +221,7 @@ class StateCell(Generic[T]):
                 sink.receive(value)
 
     def _add_age(self, seconds: float) -> None:
-        """Add time that the clock did not count, because the computer slept, to the age of the value."""
+        """Add ``seconds`` to the age of the value, because the clock stood still while the computer slept."""
         self._catch_up()
         self._updated_at -= seconds
 
@@ -291,6 +294,11 @@ class StateCell(Generic[T]):
             if not name.startswith("_") and hasattr(self.latest, name):
                 raise AttributeError(f"{self.name} is a StateCell: did you mean .value.{name}?")
             raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
+
+        def __getitem__(self, key: object) -> NoReturn:
+            """Suggest ``.value[…]``. Iteration over a cell also calls this method."""
+            camera = ", or camera_at(number) for a camera" if self.name == "cameras" else ""
+            raise TypeError(f"{self.name} is a StateCell, not its value: use {self.name}.value[…]{camera}")
 
     def __bool__(self) -> NoReturn:
         """Raise TypeError, because ``if vehicle.armed:`` would always be true."""
@@ -463,7 +471,7 @@ class _Observer(_Sink[T]):
         if self._every_arrival or previous is None or previous != value:
             try:
                 self._callback(previous, value)
-            except Exception:  # a faulty observer must not keep the value from the others
+            except Exception:  # other observers must get the value although one is faulty
                 logger.exception("an observer of %s raised an exception", self._cell.name)
 
     def forget(self) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import logging
 import math
 import time
@@ -23,6 +22,7 @@ from aerokit.connection.heartbeats import (
     OwnHeartbeat,
     discovery_event,
 )
+from aerokit.connection.loop_watch import loop_clock
 from aerokit.connection.routes import MAX_ROUTES, Routes
 from aerokit.connection.signatures import SignatureGate, check_signing
 from aerokit.connection.tasks import BackgroundTasks, Deadlines
@@ -110,7 +110,7 @@ class Connection:
         self.link_state: StateCell[LinkState] = StateCell("link_state", self.now, "frame")
         """State of the link, from frames of any sender; ``vehicle.link_state`` is about one vehicle."""
         self.deadlines: Deadlines = Deadlines()
-        self._clock = asyncio.get_running_loop().time
+        self._clock = loop_clock()
         self._unix_epoch_s = time.time() - self._clock()
         self._encoder = FrameEncoder(source_system, source_component, version=mavlink_version)
         self._gate = SignatureGate(self._encoder, self.unix_time, self.bus.publish)
@@ -165,7 +165,7 @@ class Connection:
     def write_raw(self, data: bytes) -> None:
         """Write one complete frame of another sender unchanged, for programs that forward frames. Never blocks.
 
-        It goes to the peers that :meth:`send` would choose for its message. A signature is kept.
+        The frame goes to the peers that :meth:`send` would choose for the same message. A signature is kept.
 
         Raises:
             InvalidArgument: ``data`` is not exactly one MAVLink frame; nothing was sent.
@@ -205,7 +205,7 @@ class Connection:
 
     @property
     def unsent_bytes(self) -> int:
-        """Number of written bytes that have not left this machine, if the link can measure it.
+        """Number of written bytes that have not left this machine, if the link can measure that number.
 
         A value that stays above 0 means that the link does not drain (TCP without a network, a serial port with flow
         control asserted); see :class:`LinkStalled`. Always 0 for UDP.
@@ -215,7 +215,7 @@ class Connection:
     def discard_unsent(self) -> None:
         """Discard data that was sent but has not left this program, e.g. an outdated command.
 
-        This applies to all waiting data, for all targets. Data in the system's TCP buffer cannot be discarded and
+        The call discards all waiting data, for all targets. Data in the system's TCP buffer cannot be discarded and
         stays in :attr:`unsent_bytes`.
         """
         self.link.discard_unsent()
@@ -236,7 +236,7 @@ class Connection:
 
     @property
     def signing(self) -> Signing | None:
-        """Key that signs sent frames and verifies received ones; None: frames are neither signed nor verified.
+        """Key that signs sent frames and verifies received frames; None: frames are neither signed nor verified.
 
         ``signing.timestamp`` is the time stamp to store; ``signing.refused`` counts refused frames. May be set while
         the connection is open. Raises InvalidArgument with MAVLink 1, which has no signatures.
@@ -258,7 +258,7 @@ class Connection:
         """Return a stream of these messages or events, of one system (0: of all), for use in a ``with`` block.
 
         Raises:
-            InvalidArgument: no type is given, or the dialect does not have it.
+            InvalidArgument: no type is given, or the dialect does not have a given type.
         """
         self.check_types(types)
 
@@ -269,7 +269,7 @@ class Connection:
         return subscription
 
     async def vehicles(self) -> AsyncGenerator[VehicleFound, None]:
-        """Yield every autopilot on the link once, until the connection ends. Those already known come first.
+        """Yield every autopilot on the link once, until the connection ends. Autopilots already known come first.
 
         ``async for found in connection.vehicles(): async with aerokit.connect(connection,
         system_id=found.system_id)…``
@@ -291,7 +291,7 @@ class Connection:
         return [self._attach(item, sink, system_id) for item in types]
 
     def observe_frames(self, callback: FrameObserver) -> Detach:
-        """Call ``callback(frame, peer)`` with every received frame, after the subscribers of its message.
+        """Call ``callback(frame, peer)`` with every received frame, after the subscribers got the message.
 
         Frames with message ids outside the dialect are included, and their checksums are not checked. Frames that are
         refused because a second peer sends them under the ids of a known component are excluded. The callback must
@@ -345,12 +345,12 @@ class Connection:
     @checked
     def new_cell(self, name: str, waits_for: str) -> StateCell[Any]:
         """Make a cell whose values are time-stamped with the receive time of their message; see :class:`StateCell`."""
-        return StateCell(name, self.now, waits_for, stamp=self.arrived_at)
+        return StateCell(name, self.now, waits_for, stamp=self._receiver.arrived_at)
 
     def arrived_at(self) -> float:
         """Return the receive time of the message being delivered, on the clock of :meth:`now`.
 
-        It is earlier than now if the event loop was blocked: the message may have waited in the socket.
+        This time is earlier than now if the event loop was blocked, because the message may have waited in the socket.
         """
         return self._receiver.arrived_at()
 
@@ -377,7 +377,7 @@ class Connection:
     def close(self, error: Exception | None = None) -> None:
         """Close the link, cancel background tasks and raise ``error`` in all waiters. Never blocks; idempotent.
 
-        May be called inside the connection's block; the block continues, and its calls on the connection raise.
+        May be called inside the connection's block. The block continues, but its further calls on the connection raise.
         """
         self._end(error or ConnectionClosed("the connection was closed"))
         if self._is_on_link:
@@ -385,7 +385,7 @@ class Connection:
         self._observers.close()
 
     def fail(self, error: Exception) -> None:
-        """Close the connection because of an internal error of aerokit. Waiters get it as the cause of their error."""
+        """Close the connection because of an internal error of aerokit, which is the cause of the waiters' errors."""
         if not self.is_open and isinstance(error, AerokitError):
             return  # a background task failed because the connection was closed before
         logger.error("the connection is closed because of an internal error of aerokit", exc_info=error)
@@ -450,7 +450,7 @@ class Connection:
     def order_refused(self, message: str, reason: str, lease_holder: str | None, answers: tuple[bytes, ...]) -> None:
         """Called when the vehicle side of a zenoh network refused one of our commands."""
         self.bus.publish(OrderRefused(self._clock(), 0, message, reason, lease_holder))
-        for answer in answers:  # a framer would count them as received frames
+        for answer in answers:  # not through a framer, which would count them as received frames
             self.bus.deliver(Frame.parse(answer, self._clock()))
 
     def link_lost(self, error: LinkLost) -> None:
@@ -460,7 +460,7 @@ class Connection:
     # ------------------------------------------------------------------------------- internal
 
     async def _open_link(self) -> None:
-        """Open the link. If it is already open, it belongs to another connection and is not closed."""
+        """Open the link. A link that is already open belongs to another connection and stays open."""
         try:
             await self.link.open(self)
         except BusyError:

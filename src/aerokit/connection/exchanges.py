@@ -37,7 +37,7 @@ async def run_exchange(connection: Connection, system_id: int, exchange: Exchang
 
 
 class ExchangeRun(Generic[ResultT]):
-    """Drives one exchange: sends its messages and calls it at its deadlines.
+    """Drives one exchange: sends the messages of the exchange, and calls it at its deadlines.
 
     The owner calls :meth:`receive` with each message of the target, and :meth:`abort` when the connection ends.
     """
@@ -60,7 +60,7 @@ class ExchangeRun(Generic[ResultT]):
     def receive(self, message: Message) -> None:
         try:
             self._exchange.receive(message, self._connection.now())
-        finally:  # the bus logs exceptions of the program's callbacks; the exchange continues
+        finally:  # the exchange continues after an exception of a program's callback, which the bus logs
             self._after_step()
 
     def link_chosen(self, system_id: int, event: LinkSelected) -> None:
@@ -75,7 +75,7 @@ class ExchangeRun(Generic[ResultT]):
         self._after_step()
 
     def _expire(self) -> None:
-        # Timers may fire early by the clock's resolution; the exchange then must not wait again.
+        # A timer may fire early by the clock's resolution. The exchange must not wait again because of that.
         now = self._connection.now()
         now, self._deadline = max(now, now if self._deadline is None else self._deadline), None
         try:
@@ -89,7 +89,7 @@ class ExchangeRun(Generic[ResultT]):
         try:
             for message in exchange.take_outbox():
                 self._connection.send(message)
-        except Exception as error:  # otherwise the caller of result() would never get it
+        except Exception as error:  # passed on to the caller of result()
             exchange.abort(error)
         if exchange.done:
             self._connection.deadlines.cancel(self._expire)

@@ -36,9 +36,9 @@ class Recording:
     If no frame arrives, an existing file stays. Frames are written unchanged, signatures included; SETUP_SIGNING is
     left out because it contains the key.
 
-    ``now`` is the current time on the clock of :meth:`write`. Time stamps are the system time at the start, advanced
-    by that clock: setting the system clock in flight, as a companion computer does when it gets a network, makes no
-    jump in the recording.
+    ``now`` is the current time on the clock of :meth:`write`. Time stamps are the system time at the start, advanced by
+    that clock. The recording therefore has no jump when the system clock is set in flight, e.g. on a companion computer
+    that connects to a network.
 
     Raises:
         LinkOpenError: the file cannot be written.
@@ -48,7 +48,7 @@ class Recording:
         self._path = os.fspath(path)
         self._unix_epoch_s = time.time() - now
         self._writer: TlogWriter | None = None
-        self._waiting: deque[tuple[bytes, float]] | None = None  # sent before the first received frame
+        self._waiting: deque[tuple[bytes, float]] | None = None  # frames sent before the first received one
         try:
             if os.path.isfile(path) and os.path.getsize(path):
                 with open(path, "ab"):

@@ -30,7 +30,7 @@ MAX_PEERS = 256
 """Maximum number of peers that have sent a valid frame."""
 
 MAX_UNVERIFIED_PEERS = 32
-"""Maximum number of tracked peers without a valid frame. A new one replaces the oldest."""
+"""Maximum number of tracked peers without a valid frame. A new peer replaces the oldest peer."""
 
 MAX_SENDERS = 2048
 """Maximum number of (system id, component id) pairs, over all peers, that have their own counters."""
@@ -81,7 +81,7 @@ class PeerTable:
         return framer, frames
 
     def reset(self) -> None:
-        """Reset the framers after the link was reopened, and register the peers at the new one."""
+        """Reset the framers after the link was reopened, and register the peers at the new link."""
         for framer in self:
             framer.reset()
         for peer in self.framers:
@@ -116,7 +116,7 @@ _HEARTBEAT_ID = Heartbeat.ID
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
-# From this length on, a pause of the loop delays a heartbeat.
+# A pause of the loop of at least this length delays a heartbeat.
 BLOCKED_WARNING_S = 1.0
 
 BLOCKING_CODE_HINT = (
@@ -146,10 +146,12 @@ class FrameReceiver:
         self.framers: dict[Peer, Framer] = self._peers.framers
         self.heartbeats: dict[tuple[int, int], Heartbeat] = {}
         """Last HEARTBEAT of every (system id, component id) on the link."""
-        self.observers: FrameObservers = FrameObservers(self._update_framers)
+        self.observers: FrameObservers = FrameObservers(self._on_observers_changed)
         self._loop_watch = LoopWatch(self._on_blocked, self._on_slept)
         self._is_closed = False
-        bus.require_frames(Heartbeat)  # for routes and diagnosis
+        bus.one_at_a_time = multilink is not None
+        gate.on_change = self._update_checks
+        bus.require_frames(Heartbeat)  # routes and diagnosis need heartbeats
 
     def start(self) -> None:
         self._loop_watch.start()
@@ -158,6 +160,7 @@ class FrameReceiver:
 
     def close(self) -> None:
         self._is_closed = True
+        self._update_checks()
         self._loop_watch.close()
 
     def reset(self) -> None:
@@ -165,15 +168,28 @@ class FrameReceiver:
         self._peers.reset()
 
     def receive(self, data: bytes, peer: Peer) -> None:
-        framer, multilink, observers = self.framers.get(peer), self._multilink, self.observers
         now = self._clock()
         if now > self._loop_watch.late_after:
             now = self._loop_watch.arrival(now)
+        framer = self.framers.get(peer)
         if framer is not None:
             frames = framer.receive(data, now)
         else:
             framer, frames = self._peers.receive_unverified(peer, data, now)
-        framers, gate, deliver = self.framers, self._gate, self._bus.deliver
+            self._update_checks()
+        if not frames:
+            return
+        if self._bus.one_at_a_time or framer.late or framer.foreign:
+            self._check_and_deliver(frames, framer, peer)
+            return
+        last = self._bus.deliver_all(frames, self._record_heartbeat, framer, peer)
+        if last is not None:  # a sink has closed the connection, set a key or added an observer
+            self.observers.notify_received(last, peer)
+            self._check_and_deliver(frames[frames.index(last) + 1 :], framer, peer)
+
+    def _check_and_deliver(self, frames: Iterable[Frame], framer: Framer, peer: Peer) -> None:
+        """Deliver the frames that pass all checks, and pass them to the recording and the observers."""
+        framers, multilink, gate, observers = self.framers, self._multilink, self._gate, self.observers
         has_stale = bool(framer.late or framer.foreign)
         for frame in frames:
             if self._is_closed:  # a sink closed the receiver while processing an earlier frame
@@ -194,14 +210,15 @@ class FrameReceiver:
                     continue
                 observers.record_received(frame.raw, self._clock())
             if frame.message_id == _HEARTBEAT_ID:
-                self._record_heartbeat(framer, frame, peer)
-            deliver(frame)
+                self._record_heartbeat(frame, framer, peer)
+            self._bus.deliver(frame)
             if observers.received:
                 observers.notify_received(frame, peer)
 
     def arrived_at(self) -> float:
-        """Return the receive time of the current frame: now, or earlier if it may have waited for a blocked loop."""
-        return min(self._clock(), self._loop_watch.oldest_arrival)
+        """Return the receive time of the current frame: now, or earlier if the frame may have waited in the socket."""
+        now, oldest = self._clock(), self._loop_watch.oldest_arrival
+        return now if now < oldest else oldest
 
     def statistics(self) -> Iterator[FramerStatistics]:
         return (framer.statistics for framer in self._peers)
@@ -228,17 +245,28 @@ class FrameReceiver:
         logger.warning("the computer slept for %.0f s: all values of vehicles are now older by this time", seconds)
         self._bus.publish(ComputerSlept(self._clock(), 0, seconds))
 
-    def _update_framers(self) -> None:
+    def _update_checks(self) -> None:
+        """Determine whether frames need work besides delivery: checks of route or signature, or observers."""
+        self._bus.one_at_a_time = (
+            self._is_closed
+            or self._multilink is not None
+            or not self._gate.is_open
+            or self.observers.want_all
+            or len(self.framers) > 1
+        )
+
+    def _on_observers_changed(self) -> None:
+        self._update_checks()
         for framer in self._peers:
             self._update_framer(framer)
 
     def _update_framer(self, framer: Framer) -> None:
-        """Make the framer build all frames, unknown ones included, while there are observers."""
+        """Make the framer build all frames, including unknown messages, while there are observers."""
         framer.keep_unknown = self.observers.want_all
         framer.wanted = None if framer.keep_unknown else self._bus.wanted
 
     def _is_admitted(self, frame: Frame, is_other_peer: bool) -> bool:
-        # Only the first copy of a frame is checked: a second check would take another copy for a replay.
+        # Only the first copy of a frame is checked, because a second check would take the next copy for a replay.
         if self._multilink is not None and self._multilink.copies.was_admitted:
             return True
         is_admitted = self._gate.admits(frame, may_hand_over=not is_other_peer)
@@ -250,7 +278,7 @@ class FrameReceiver:
         return self._routes.claims_route(frame, peer, framer.counters_of(frame), self._gate.has_checked(frame))
 
     def _is_stale(self, framer: Framer, frame: Frame) -> bool:
-        """Return True if an out-of-order frame is to be dropped: sent by a second sender, or an outdated heartbeat."""
+        """Return True if an out-of-order frame is to be dropped: a second sender's frame or an outdated heartbeat."""
         is_foreign = frame in framer.foreign
         if not is_foreign and frame not in framer.late:
             return False
@@ -261,7 +289,7 @@ class FrameReceiver:
                 return True
         return frame.message_id == Heartbeat.ID and (is_foreign or self._routes.is_outdated(frame))
 
-    def _record_heartbeat(self, framer: Framer, frame: Frame, peer: Peer) -> None:
+    def _record_heartbeat(self, frame: Frame, framer: Framer, peer: Peer) -> None:
         heartbeat = self._bus.dialect.decode(frame)
         if frame.system_id == 0 or not isinstance(heartbeat, Heartbeat):
             return

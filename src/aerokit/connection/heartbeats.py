@@ -72,7 +72,7 @@ def discovery_event(
 
 
 BLOCKING_MAX_IDLE_S = 60.0
-"""Seconds without a call after which a blocking program's heartbeat pauses; longer than usual sleeps in flight."""
+"""Seconds without a call after which a blocking program's heartbeat pauses. Programs rarely sleep longer in flight."""
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
@@ -82,9 +82,9 @@ class OwnHeartbeat(Snapshot):
 
     A vehicle's ground station failsafe acts when heartbeats stop. Heartbeats therefore pause when the program hangs,
     ``fed_within_s`` seconds after its last call or ``feed()``. None means 60 seconds in :mod:`aerokit.sync` and
-    :mod:`aerokit.dronekit`, whose event loop has its own thread, and no limit in asyncio, where a blocked loop sends
-    nothing anyway. Infinity means no limit. ``type`` is a MAV_TYPE: 6 for a ground station (GCS), 18 for a companion
-    computer (ONBOARD_CONTROLLER).
+    :mod:`aerokit.dronekit`, whose event loop runs on a thread of its own. In asyncio, None means no limit, because a
+    blocked loop sends nothing anyway. Infinity means no limit. ``type`` is a MAV_TYPE: 6 for a ground station (GCS), 18
+    for a companion computer (ONBOARD_CONTROLLER).
     """
 
     type: int = MavType.GCS.value
@@ -104,7 +104,7 @@ class ActivityMonitor:
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock, self._fed_at = clock, clock()
         self.pending_calls: set[object] = set()
-        """Calls that the program is waiting for; while there are any, it is not idle."""
+        """Calls that the program is waiting for. While there are pending calls, the program is not idle."""
 
     def feed(self) -> None:
         self._fed_at = self._clock()
@@ -126,7 +126,7 @@ class HeartbeatWatchdog:
         self._paused_at: float | None = None
 
     def require(self, activity: ActivityMonitor, fed_within_s: float) -> None:
-        """Watch this activity too. ``fed_within_s`` is the limit if the settings have none."""
+        """Also watch this activity. ``fed_within_s`` is the limit if the settings have none."""
         self.activity = activity
         self._limit_s = fed_within_s if self._limit_s is None else self._limit_s
 
@@ -166,7 +166,7 @@ class LinkStateTracker:
         return self._cell.latest
 
     def record_activity(self, at: float) -> None:
-        """Record that something was received at this time: the state becomes CONNECTED."""
+        """Record that something was received at this time, which makes the state CONNECTED."""
         self._active_at = at
         if self._cell.latest is not LinkState.CONNECTED:
             self._set(LinkState.CONNECTED, at)
@@ -184,7 +184,7 @@ class LinkStateTracker:
             self._set(LinkState.SILENT, now)
 
     def mark_lost(self, now: float, *, publish: bool = True) -> None:
-        """Set LOST; without an event (``publish=False``) if the program closed the link itself."""
+        """Set LOST. ``publish=False`` publishes no event, because the program closed the link itself."""
         self._set(LinkState.LOST, now, publish=publish)
 
     def _set(self, state: LinkState, now: float, *, publish: bool = True) -> None:

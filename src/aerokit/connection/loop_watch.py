@@ -17,11 +17,11 @@ LATE_THRESHOLD_S = 0.1
 
 BLOCKED_THRESHOLD_S = 0.25
 
-# After this many loop iterations without a read, all data that waited during the pause has been read. One would not be
-# enough, because some loops run timers before sockets.
+# After this many loop iterations without a read, all data that waited during the pause has been read. One iteration
+# would not be enough, because some loops run timers before sockets.
 IDLE_ITERATIONS = 3
 
-# Platform → a clock that includes suspended time, and the loop's clock. On Windows, the loop's clock includes it too.
+# Platform → (clock that includes suspended time, clock of the loop). On Windows, the loop's clock includes that time.
 CLOCKS = {
     "linux": ("CLOCK_BOOTTIME", "CLOCK_MONOTONIC"),
     "darwin": ("CLOCK_MONOTONIC", "CLOCK_UPTIME_RAW"),
@@ -38,13 +38,19 @@ def suspended_s() -> float:
     return time.clock_gettime(total) - time.clock_gettime(awake)
 
 
+def loop_clock() -> Callable[[], float]:
+    """Return the clock of the running event loop, without the wrapper that asyncio's own loops have around it."""
+    loop = asyncio.get_running_loop()
+    return time.monotonic if type(loop).time is asyncio.BaseEventLoop.time else loop.time
+
+
 class LoopWatch:
     """Detects pauses of the event loop by a timer that fires late.
 
-    Data may have waited during a pause. Until all waiting data has been read, the time at which the loop last ran
-    before the pause is therefore the receive time of data. Pauses shorter than ``CHECK_INTERVAL_S + LATE_THRESHOLD_S``
-    are not detected; ages may be too small by this time. ``on_blocked`` gets the length of pauses above
-    ``BLOCKED_THRESHOLD_S``, ``on_slept`` the time that the computer was suspended.
+    Data may arrive during a pause and wait. Until all of this data has been read, its receive time is the time at which
+    the loop last ran before the pause. Pauses shorter than ``CHECK_INTERVAL_S + LATE_THRESHOLD_S`` are not detected, so
+    ages may be too small by up to this time. ``on_blocked`` gets the length of pauses above ``BLOCKED_THRESHOLD_S``,
+    ``on_slept`` the time that the computer was suspended.
     """
 
     def __init__(
@@ -57,10 +63,12 @@ class LoopWatch:
         self._on_blocked, self._on_slept = on_blocked, on_slept
         self._suspended, self._suspended_before = suspended, max(suspended() for _ in range(3))
         self.late_after: float = math.inf
-        """Loop time up to which data is received in time; for data read later, call :meth:`arrival`."""
+        """Data read up to this loop time has not waited. For data read later, call :meth:`arrival`."""
         self._ran_at = self._due = self._loop.time()
         self._timer: asyncio.TimerHandle | None = None
-        self._oldest: float | None = None  # set while data may have waited
+        self.oldest_arrival: float = math.inf
+        """Earliest possible receive time of data that is read now; infinite while no data can have waited."""
+        self._check_sleep_at = -math.inf
         self._has_read = False
         self._idle_iterations = 0
 
@@ -73,16 +81,16 @@ class LoopWatch:
             self._timer.cancel()
             self._timer = None
 
-    @property
-    def oldest_arrival(self) -> float:
-        """Earliest possible receive time of data that is read now; infinite while no data can have waited."""
-        return math.inf if self._oldest is None else self._oldest
-
     def arrival(self, now: float) -> float:
         """Return ``now``, or the earliest possible receive time if data that is read now may have waited."""
-        # Data that is read in time postpones the timer: waking a sleeping process costs as much as a few messages.
+        if now < self._check_sleep_at and self.oldest_arrival < math.inf:
+            self._has_read = True
+            return self.oldest_arrival
+        self._check_sleep_at = now + CHECK_INTERVAL_S / 2
+        # Data that is read in time postpones the timer, because waking a sleeping process costs as much as a few
+        # messages.
         has_slept = self._has_slept()
-        if self._oldest is None and not has_slept and now <= self._due + LATE_THRESHOLD_S:
+        if self.oldest_arrival == math.inf and not has_slept and now <= self._due + LATE_THRESHOLD_S:
             if self._timer is not None:
                 self._timer.cancel()
             self._set_timer(now)
@@ -100,7 +108,8 @@ class LoopWatch:
             self._on_blocked(late + CHECK_INTERVAL_S)
 
     def _has_slept(self) -> bool:
-        # A process that is preempted between reading the two clocks gets too small a value; the true one never shrinks.
+        # If the process is preempted between reading the two clocks, the value is too small. The true value never
+        # shrinks.
         before = self._suspended_before
         self._suspended_before = max(before, self._suspended())
         slept_s = self._suspended_before - before
@@ -112,15 +121,15 @@ class LoopWatch:
 
     def _set_timer(self, now: float) -> None:
         self._ran_at, self._due = now, now + CHECK_INTERVAL_S
-        if self._oldest is None:
+        if self.oldest_arrival == math.inf:
             self.late_after = now + CHECK_INTERVAL_S / 2
         self._timer = self._loop.call_at(self._due, self._tick)
 
     def _fall_behind(self) -> float:
-        if self._oldest is None:
-            self._oldest, self.late_after, self._idle_iterations = self._ran_at, -math.inf, 0
+        if self.oldest_arrival == math.inf:
+            self.oldest_arrival, self.late_after, self._idle_iterations = self._ran_at, -math.inf, 0
             self._loop.call_soon(self._check_idle)
-        return self._oldest
+        return self.oldest_arrival
 
     def _check_idle(self) -> None:
         self._idle_iterations = 0 if self._has_read else self._idle_iterations + 1
@@ -130,7 +139,7 @@ class LoopWatch:
         if self._idle_iterations < IDLE_ITERATIONS:
             self._loop.call_soon(self._check_idle)
         else:
-            self._oldest = None
+            self.oldest_arrival = math.inf
             self.late_after = self._ran_at + CHECK_INTERVAL_S / 2
 
 

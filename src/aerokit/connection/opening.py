@@ -31,8 +31,11 @@ if TYPE_CHECKING:
 CLOSE_TIMEOUT_S = 2.0
 
 OBSERVER_SYSTEM_ID = 254
-"""System id for tools that connect briefly while a vehicle flies. Not 255, the default of ArduPilot's MAV_GCS_SYSID:
-its failsafe (FS_GCS_ENABLE) acts five seconds after a ground station of that id has gone."""
+"""System id for tools that connect briefly while a vehicle flies.
+
+It is not 255, the default of ArduPilot's MAV_GCS_SYSID, because a failsafe (FS_GCS_ENABLE) acts five seconds after a
+ground station with that id has gone.
+"""
 
 
 @checked
@@ -59,12 +62,12 @@ async def open_connection(
 
     Args:
         address: a connection string (``"udpin:0.0.0.0:14550"``, ``"/dev/ttyACM0,57600"``, …) or an unopened link; or a
-            list of them that lead to the same vehicles (docs/how-to/several-links.md). Then each frame is processed
-            once, and commands use the best link, or the next one when it fails. ``?costly=1`` in an address marks a
-            link that is used only when the others fail. A lost link is reopened while another one works.
+            list of links to the same vehicles (docs/how-to/several-links.md). With a list, each frame is processed
+            once, and commands use the best link that works. ``?costly=1`` in an address marks a link that is used only
+            when the others fail. A lost link is reopened while another link works.
         source_system: own system id, 1–255; ground stations use 255.
         source_component: own component id, 1–255. 0 is allowed for programs that have always used it (DroneKit).
-        baud: bits per second of a serial link whose address has none, above 0.
+        baud: bits per second of a serial link whose address does not give them, above 0.
         dialect: the messages that are decoded.
         mavlink_version: version of sent messages, 1 or 2; both are received.
         signing: key that signs sent frames; received frames without its signature are refused (docs/signing.md). None:
@@ -188,7 +191,7 @@ def _check_distinct(addresses: Sequence[str | Link], targets: Sequence[Link | Li
 
 
 def _target_key(target: Link | LinkAddress) -> object:
-    """Return a key of the port or socket that an address opens; None if it opens a new one each time."""
+    """Return a key of the port or socket that an address opens; None if it opens a new socket each time."""
     if isinstance(target, Link):
         return id(target)
     is_new = (target.kind in ("udpin", "tcpin") and not target.port) or (target.kind == "pty" and not target.path)
@@ -202,7 +205,7 @@ def _identity(link: Link) -> Link:
     return link
 
 
-# Noise of this length contains about a tenth of a pattern that looks like a damaged frame.
+# In noise of this length, a pattern that looks like a damaged frame occurs with a probability of about 10 %.
 NOISE_BYTES = 500
 
 MAX_LISTED_IDS = 5
@@ -237,7 +240,7 @@ class _Diagnosis:
         return self._without_vehicle()
 
     def _without_frames(self) -> str:
-        # Noise contains a few patterns that look like frames, so each diagnosis needs most of the bytes.
+        # Noise contains a few patterns that look like frames, so a few of them justify no diagnosis.
         received = f"{self._bytes} bytes were received"
         if self._unknown and 2 * self._bad_bytes < self._bytes:
             numbers = ", ".join(map(str, sorted(self._unknown_messages)[:MAX_LISTED_IDS]))

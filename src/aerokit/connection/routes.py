@@ -28,9 +28,10 @@ CLAIM_MIN_FRAMES = 3
 
 
 class RouteClaim:
-    """A peer's claim to the route of one component, decided by its first frame after the owner's last frame.
+    """Claim of a peer to a component's route that belongs to another peer, the owner.
 
-    The decision is final until the owner sends again; otherwise a peer could try many sequence numbers.
+    The peer's first frame after the owner's last frame decides the claim. The decision is final until the owner sends
+    again, because otherwise a peer could try many sequence numbers.
     """
 
     __slots__ = (
@@ -47,7 +48,7 @@ class RouteClaim:
         self._expected: int | None = None
         self._sequence_matches: bool | None = None
         self._clock_matches: bool | None = None
-        self._frames, self._since = 0, 0.0  # since the owner's last frame
+        self._frames, self._since = 0, 0.0  # counted since the owner's last frame
         self.is_duplicate_reported: bool = False
         self.is_refusal_reported: bool = False
 
@@ -97,7 +98,7 @@ MAX_ROUTES = 1024
 """Maximum number of components with a route. Messages to other components go to every peer."""
 
 MAX_CLAIMS = 256
-"""Maximum number of remembered claims. An evicted claim is reported again when it recurs."""
+"""Maximum number of remembered claims. An evicted claim is reported again when the peer repeats it."""
 
 SWEEP_INTERVAL_S = 1.0
 
@@ -123,14 +124,14 @@ class Routes:
     The first peer that sends a HEARTBEAT under these ids owns the route; frames of other peers under the same ids are
     dropped (``DuplicateSender``). Another peer takes over the route (``RouteChanged``)
 
-    1. at once, if it is another port of the same host and continues the owner's stream: three frames that continue its
-       sequence numbers and, where known, its time since boot, while the owner is silent for the time of three frames;
+    1. at once, if it is another port of the same host and continues the owner's stream: three frames continue the
+    sequence numbers and, where known, the time since boot, while the owner is silent for the time of three frames;
     2. after 3.5 s without a heartbeat, or when a TCP client has disconnected: if it is on the same host (a reboot or
        restart, with new numbers), or continues the stream as above from any host, or signs with our key;
     3. in the same case from any host, if the system has no vehicle object or the program allows it (``may_move``).
 
-    A peer refused by rule 2 (``RouteChangeRefused``) is judged again after the owner has sent again. A system with a
-    vehicle object keeps its route however long it is silent.
+    A peer refused by rule 2 (``RouteChangeRefused``) is judged again after the owner has sent again. The route of a
+    system with a vehicle object never expires.
 
     ``attached`` has the system ids with a vehicle object. ``boot_clocks`` maps components to functions from
     ``received_at`` to their time since boot in milliseconds. ``publish`` publishes events.
@@ -198,7 +199,7 @@ class Routes:
         return route is not None and route.peer != peer
 
     def claims_route(self, frame: Frame, peer: Peer, counters: SourceStatistics | None, is_signed: bool) -> bool:
-        """Return True if ``peer``, which does not own the route, takes it over with this frame; see the class."""
+        """Return True if ``peer`` takes over a route of another peer with this frame; see the class for the rules."""
         source, now = (frame.system_id, frame.component_id), frame.received_at
         route = self._routes[source]
         is_silent = now - route.heartbeat_at > ROUTE_TIMEOUT_S or not self._link.has_peer(route.peer)
@@ -223,7 +224,7 @@ class Routes:
     def evictable_peers(self, peers: Iterable[Peer], now: float) -> list[Peer]:
         """Return the first peer without a live component (heartbeat in the last 30 s, or vehicle object), if any.
 
-        Its claims are forgotten, so they are reported again if it comes back.
+        The claims of that peer are forgotten, so they are reported again if the peer comes back.
         """
         live = {
             route.peer
@@ -256,7 +257,7 @@ class Routes:
     def _evidence(
         self, route: _Route, frame: Frame, counters: SourceStatistics | None
     ) -> tuple[int, bool | None, bool | None]:
-        """Return the owner's expected frame count, and whether number and clock continue its stream (None: unknown)."""
+        """Return the owner's expected frame count, and whether number and clock continue the stream (None: unknown)."""
         sequence_matches: bool | None = None
         silent_for = max(frame.received_at - route.heartbeat_at, 0.0)
         expected = 0
@@ -307,7 +308,7 @@ class Routes:
         return len(self._routes) < MAX_ROUTES
 
 
-_SAME_PEER = object()  # key of claims of a second sender behind the owner's own peer
+_SAME_PEER = object()  # key for claims of a second sender behind the same peer as the owner
 
 
 def _name(peer: Peer) -> str:

@@ -1,4 +1,4 @@
-"""``SignatureGate``: signs the frames of a connection and refuses received ones without a valid signature."""
+"""``SignatureGate``: signs the frames of a connection and refuses received frames without a valid signature."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
-# A vehicle that still has its key sends a signed heartbeat each second.
+# Unsigned frames prove a removed key, because a vehicle with a key sends a signed heartbeat each second.
 MIN_UNSIGNED_FRAMES = 3
 MIN_UNSIGNED_S = 2.0
 
@@ -43,6 +43,8 @@ class SignatureGate:
         self._keep_error: OSError | None = None
         self.is_open: bool = True
         """True while all frames are admitted without a check."""
+        self.on_change: Callable[[], object] = bool
+        """Called when :attr:`is_open` may have changed."""
 
     def use(self, signing: Signing | None) -> None:
         """Sign and verify with this key from now on (None: neither). Raises InvalidArgument with MAVLink 1."""
@@ -52,11 +54,11 @@ class SignatureGate:
 
     @contextmanager
     def key_handover(self, signing: Signing | None, system_id: int, component_id: int) -> Iterator[asyncio.Event]:
-        """Switch to ``signing`` when the component's frames, received during the block, show that it uses the new key.
+        """Switch to ``signing`` when frames received during the block show that the component uses the new key.
 
-        The yielded event is set at the switch; before it, the old key signs and verifies. One frame signed with the
-        new key is enough. If the key is removed, at least `MIN_UNSIGNED_FRAMES` unsigned frames over `MIN_UNSIGNED_S`
-        without a signed one are needed, because any sender could forge a few.
+        The yielded event is set at the switch. Before the switch, the old key signs and verifies. One frame signed with
+        the new key is enough. If the key is removed, at least `MIN_UNSIGNED_FRAMES` unsigned frames over
+        `MIN_UNSIGNED_S` without a signed frame are needed, because any sender could forge a few unsigned frames.
 
         Raises:
             BusyError: another handover is in progress.
@@ -76,9 +78,13 @@ class SignatureGate:
 
     def _update(self) -> None:
         self.is_open = self._encoder.signing is None and self._handover is None
+        self.on_change()
 
     def admits(self, frame: Frame, *, may_hand_over: bool = True) -> bool:
-        """Return True if a frame is admitted. With ``may_hand_over=False`` (another peer's frame), keep the key."""
+        """Return True if a frame is admitted.
+
+        ``may_hand_over=False`` is for frames of another peer, which must not complete a handover.
+        """
         handover = self._handover
         is_of_handover = handover is not None and may_hand_over and handover.concerns(frame)
         if handover is not None and is_of_handover and handover.is_shown_by(frame, self._unix_time()):
@@ -140,7 +146,7 @@ def _has_key(frame: Frame) -> bool:
 
 
 class _Handover:
-    """Handover of another key, or of none, to one component."""
+    """Change of one component to another key, or to no key."""
 
     def __init__(self, signing: Signing | None, source: tuple[int, int], taken: asyncio.Event) -> None:
         self.signing, self.taken = signing, taken
@@ -164,6 +170,6 @@ class _Handover:
 
 
 def check_signing(signing: Signing | None, mavlink_version: int) -> None:
-    """Raise InvalidArgument if this MAVLink version has no signatures."""
+    """Raise InvalidArgument if ``signing`` is given and this MAVLink version has no signatures."""
     if signing is not None and mavlink_version == 1:
         raise InvalidArgument("signing needs MAVLink 2: mavlink_version = 1 has no signatures")

@@ -133,10 +133,10 @@ class Deadlines:
         self._loop = asyncio.get_running_loop()
         self._deadlines: dict[Alarm, float] = {}
         self._timer: asyncio.TimerHandle | None = None
-        self._timer_at = 0.0  # a uvloop handle does not give its time once it is past
+        self._timer_at = 0.0  # stored here, because a uvloop handle does not give a time that has passed
 
     def set(self, alarm: Alarm, at: float) -> None:
-        """Call ``alarm`` at ``at`` (seconds, loop time); this replaces an earlier time of the same alarm."""
+        """Call ``alarm`` at ``at`` (seconds, loop time). This replaces an earlier deadline of the alarm."""
         self._deadlines[alarm] = at
         self._schedule(at)
 

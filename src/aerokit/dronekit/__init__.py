@@ -65,7 +65,7 @@ if TYPE_CHECKING:
 monotonic = time  # DroneKit exports the package `monotonic`; its only function is `monotonic`
 
 basestring: tuple[type[str], type[bytes]] = (str, bytes)
-"""For ``isinstance`` checks in programs that also ran on Python 2."""
+"""String types for ``isinstance`` checks in programs that also ran on Python 2."""
 
 __all__ = [
     "APIException",

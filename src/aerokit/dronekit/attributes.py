@@ -38,7 +38,7 @@ POS_HORIZ_ABS, CONST_POS_MODE, PRED_POS_HORIZ_ABS = (
     EkfStatusFlags.CONST_POS_MODE.value,
     EkfStatusFlags.PRED_POS_HORIZ_ABS.value,
 )
-# The flags agree with those of ESTIMATOR_STATUS.
+# ESTIMATOR_STATUS has the same flags.
 FACING_DOWN = 25
 NO_MODE = (None, "INITIALISING", "MAV")  # while booting
 GLOBAL_FRAMES = ("location.global_relative_frame", "location.global_frame")
@@ -96,7 +96,7 @@ class Locations(HasObservers, LocationPrivates):
         self._core.listeners.announce("location")
 
     def _announce(self, frame: str) -> None:
-        """Notify listeners of this object, then those of the vehicle, where the name has the prefix ``location.``."""
+        """Notify listeners of this object, then listeners of the vehicle, which use the prefix ``location.``."""
         self._dk_listeners.announce(frame)
         self._core.listeners.announce(f"location.{frame}")
 
@@ -208,7 +208,7 @@ class VehicleAttributes(VehicleCore):
     def is_armable(self) -> bool:
         """True if the vehicle has booted and has a GPS fix and a (predicted) position; on PX4, if its checks pass.
 
-        Its own arming checks may still fail: :meth:`Vehicle.arm` reports the reasons.
+        The vehicle's own arming checks may still fail. :meth:`Vehicle.arm` reports the reasons.
         """
         if self._flightmode in NO_MODE or self._dk_heartbeat is None:
             return False

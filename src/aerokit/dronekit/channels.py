@@ -65,9 +65,9 @@ def _unsupported(name: str) -> Any:
 class Channels(_ChannelDict):
     """RC input of the autopilot, overrides included: microseconds by number (``'1'`` or 1). Read only.
 
-    From RC_CHANNELS and RC_CHANNELS_RAW; each message changes all values at once. A channel is None if it does not
-    exist or was not received. There are eight channels, 16 after an RC_CHANNELS_RAW with more, or :attr:`count`.
-    :attr:`overrides` changes channels.
+    The values come from RC_CHANNELS and RC_CHANNELS_RAW. Each message changes all values at once. A channel is None if
+    it does not exist or was not received. There are eight channels, or 16 after an RC_CHANNELS_RAW with more than
+    eight. Setting :attr:`count` changes the number. :attr:`overrides` changes channels.
     """
 
     def __init__(self, vehicle: VehicleCore, count: int) -> None:
@@ -82,7 +82,7 @@ class Channels(_ChannelDict):
 
     @property
     def count(self) -> int:
-        """Number of channels. Set it to 8 to 18 (else ValueError)."""
+        """Number of channels. Can be set to 8 to 18; other values raise ValueError."""
         return self._count
 
     @count.setter
@@ -165,7 +165,7 @@ class ChannelsOverride(_ChannelDict):
         return self
 
     def update(self, *others: Any, **more: Any) -> None:
-        """Override these channels, too, with one message."""
+        """Override these channels in addition, with one message."""
         self._change(dict(*others, **more))
 
     def clear(self) -> None:

@@ -30,7 +30,7 @@ vehicle_logger: logging.Logger = logging.getLogger("dronekit")
 
 ORDERS_TIMEOUT_S = 2.0  # close() waits for the answers to recent orders
 
-SAME_KIND = {"disarm": "arm"}  # a newer order of either kind replaces the older one
+SAME_KIND = {"disarm": "arm"}  # arming and disarming orders replace each other
 
 Work = Callable[..., Awaitable[object]]
 
@@ -59,7 +59,7 @@ class ClassicConnection:
         self.supports_mavlink_2 = False
         """True once the vehicle has reported that it supports MAVLink 2, even if it still sends version 1."""
         self.note_sent: Callable[[Message], None] = lambda message: None
-        """Called on the loop with each sent message, because it may be an order that overrules earlier ones."""
+        """Called on the loop with each sent message, because it may overrule earlier orders."""
         self.vehicle: Any = None
         self._is_closed = threading.Event()
         self._closing = threading.Lock()
@@ -71,9 +71,9 @@ class ClassicConnection:
     def send(self, message: Message, *, to: int | None = None) -> None:
         """Send a message, in the order of the calls, from any thread, without blocking.
 
-        InvalidArgument: a field is out of range; APIException: the connection is closed.
+        Raises InvalidArgument if a field is out of range, and APIException if the connection is closed.
         """
-        message.encode()  # raises here, in the caller, rather than on the loop
+        message.encode()  # errors are raised here, in the caller, rather than on the loop
         with classic_errors():
             self.connection.raise_if_ended()
             self.calls.post(self._send, message, to)
@@ -161,8 +161,8 @@ class BackgroundCall(concurrent.futures.Future[None]):
 class BackgroundCalls:
     """Runs coroutine functions on the loop in the background, and logs each failure as a warning.
 
-    A newer call of a kind cancels the previous one. This class does not decide which commands may still be sent; the
-    vehicle's :class:`aerokit.vehicle.commanding.arbiter.CommandArbiter` does.
+    A newer call cancels the previous call of the same kind. This class does not decide which commands may still be
+    sent: that is the task of the vehicle's :class:`aerokit.vehicle.commanding.arbiter.CommandArbiter`.
     """
 
     def __init__(self, loop: LoopThread) -> None:
@@ -231,7 +231,7 @@ class BackgroundCalls:
             await work()
         except Exception as error:
             if not isinstance(error, ConnectionClosed):
-                text = str(error)  # the exception itself would keep frames, and so the vehicle, alive
+                text = str(error)  # the exception itself would keep stack frames, and thus the vehicle, alive
                 if isinstance(error, CommandRejected) and self.describe is not None:
                     text += f" ({self.describe()})"  # a rejection rarely names its cause
                 vehicle_logger.warning("%s: %s", order.kind, text)
@@ -265,11 +265,11 @@ RELEASE_UPPER = 0xFFFE  # releases a channel above 8, for which 0 means "ignore"
 CHANNELS_OF_MAVLINK_1 = 8
 CHANNELS = 18
 
-RELEASE_COPIES = 3  # not acknowledged, and frames get lost
+RELEASE_COPIES = 3  # the message is not acknowledged, and frames get lost
 
 
 class OverrideRelease:
-    """The channels that this connection overrides, by target; releases them when it ends.
+    """The channels that this connection overrides, by target; releases them when the connection ends.
 
     https://mavlink.io/en/messages/common.html#RC_CHANNELS_OVERRIDE
     """

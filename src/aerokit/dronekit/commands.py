@@ -109,7 +109,7 @@ class Command(_MissionItem):
 
 
 class SequenceState(Snapshot):
-    """Content of a CommandSequence. Replaced as a whole."""
+    """Content of a CommandSequence. A change replaces the whole object."""
 
     items: tuple[Command, ...] = ()
     home: Command | None = None
@@ -120,9 +120,9 @@ class SequenceState(Snapshot):
 class CommandSequence:
     """The commands of a mission, without home: ``commands[0]`` is the first to be flown and has ``seq`` 1.
 
-    It is empty before :meth:`download`, and the vehicle's mission changes only with :meth:`upload`. In between it works
-    like a list: length, indices (also negative), slices, iteration and assignment; commands can be edited in place. Can
-    be used from any thread.
+    The sequence is empty before :meth:`download`, and the vehicle's mission changes only with :meth:`upload`. The
+    sequence works like a list: length, indices (also negative), slices, iteration and assignment. Commands can be
+    edited in place. The sequence can be used from any thread.
     """
 
     def __init__(self, vehicle: VehicleAttributes) -> None:
@@ -139,8 +139,9 @@ class CommandSequence:
     def download(self) -> None:
         """Start reading the vehicle's mission; :meth:`wait_ready` waits for it.
 
-        A running download is restarted. When it is complete, the sequence is replaced, listeners of ``'commands'`` are
-        called, and ``vehicle.home_location`` is set if the mission has it. APIException: the link is down.
+        A running download is restarted. When the download is complete, the sequence is replaced, listeners of
+        ``'commands'`` are called, and ``vehicle.home_location`` is set if the mission has home. Raises APIException
+        while the link is down.
         """
         self._core.check_link()
         with self._lock:
@@ -151,7 +152,7 @@ class CommandSequence:
     def wait_ready(self, **kwargs: Any) -> bool:
         """Wait for the download; arguments, result and errors are those of :meth:`Vehicle.wait_ready`.
 
-        Raises APIException with the reason if the download fails; it can be repeated.
+        Raises APIException with the reason if the download fails. The download can then be repeated.
         """
         return self._vehicle.wait_ready("commands", **kwargs)
 
@@ -166,15 +167,15 @@ class CommandSequence:
 
         Raises:
             TimeoutError: the vehicle did not answer in time.
-            APIException: the vehicle refused; the text has the index of the command here and the reason.
-            InvalidArgument: a ValueError; a command is invalid. Nothing was sent.
+            APIException: the vehicle refused; the text has the command's index in this sequence, and the reason.
+            InvalidArgument: a command is invalid (also a ValueError). Nothing was sent.
         """
         self._require_downloaded()
         with self._lock:
             values = _values_of(self._held.items)
             if not self._held.is_changed and values == self._uploaded:
                 return
-            held = self._held = self._held.replace(is_changed=True)  # until the vehicle has confirmed it
+            held = self._held = self._held.replace(is_changed=True)  # until the vehicle has confirmed
         aio = self._core.check_link()
         # DroneKit has no such limit, and its programs must run unchanged.
         options = {"timeout": timeout, "max_distance_m": math.inf}
@@ -188,7 +189,7 @@ class CommandSequence:
     def next(self) -> int:
         """``seq`` of the current command: ``commands[commands.next - 1]``; 0 before the mission starts.
 
-        Setting it makes that command the next (0: restart) without waiting.
+        Setting the attribute selects the next command (0: restart), without waiting.
         """
         return self._current.seq
 
@@ -210,7 +211,8 @@ class CommandSequence:
         """Append a copy of a command; :meth:`upload` sends the change. Waits for a running download.
 
         ``cmd`` is a :class:`Command` or a MISSION_ITEM of pymavlink (else TypeError); its ``target_system`` is set. The
-        first row of a waypoint file, which is home, is stored separately. APIException: the last download has failed.
+        first row of a waypoint file, which is home, is stored separately. Raises APIException if the last download has
+        failed.
         """
         self._require_downloaded()
         added = _command_from(cmd)
@@ -249,7 +251,7 @@ class CommandSequence:
             self._held = self._held.replace(items=tuple(items), is_changed=True)
 
     def rows(self) -> tuple[Command, ...]:
-        """Return the rows of a waypoint file: home (zeros if unknown) and the commands; empty if all is unknown."""
+        """Return the rows of a waypoint file: home (zeros if unknown) and the commands; empty if neither is known."""
         held = self._held
         if not held.items and held.home is None:
             return ()
@@ -357,8 +359,8 @@ def _values_of(commands: Iterable[Command]) -> tuple[tuple[Any, ...], ...]:
 def _is_home_row(cmd: Command, home: LocationGlobal | None) -> bool:
     """Return True if a command is the home row of a waypoint file rather than a waypoint.
 
-    The home row is a waypoint above sea level, without parameters, that has ``current`` set, is all zeros, or is at
-    home.
+    The home row is a waypoint without parameters whose altitude is above sea level. It has ``current`` set, is all
+    zeros, or is at home.
     """
     if cmd.command != MavCmd.NAV_WAYPOINT or cmd.frame not in AMSL_FRAMES:
         return False
@@ -373,7 +375,7 @@ def _is_at(cmd: Command, home: LocationGlobal | None) -> bool:
     try:
         away = max(abs(cmd.x - home.lat), abs(cmd.y - home.lon) * math.cos(math.radians(home.lat)))
         return bool(away <= HOME_TOLERANCE_DEG and abs(cmd.z - home.alt) <= HOME_TOLERANCE_M)
-    except TypeError:  # not numbers: upload() reports it
+    except TypeError:  # upload() reports values that are not numbers
         return False
 
 

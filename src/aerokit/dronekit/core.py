@@ -37,7 +37,7 @@ MessageT = TypeVar("MessageT", bound=Message)
 
 
 class Readiness:
-    """Names of attributes that have a value, and waiting for them. Can be used from any thread."""
+    """Records which attributes have a value, and waits for missing values. Can be used from any thread."""
 
     def __init__(self) -> None:
         self.names: set[str] = set()
@@ -62,7 +62,7 @@ class Readiness:
             self.names.discard(name)
 
     def fail(self, name: str, error: APIException) -> None:
-        """Record that the attribute gets no value; programs that wait for it raise this error."""
+        """Record that the attribute gets no value. Programs that wait for the attribute raise this error."""
         with self._changed:
             self._failures[name] = error
             self._changed.notify_all()
@@ -72,7 +72,7 @@ class Readiness:
         return next(filter(None, map(self._failures.get, names)), None)
 
     def wait_for_change(self, wanted: set[str], at_most_s: float) -> None:
-        """If one of these attributes is missing, wait for a change: at most ``at_most_s``, and at most 0.2 s."""
+        """Wait for a change if one of these attributes is missing: at most ``at_most_s``, and never more than 0.2 s."""
         with self._changed:
             missing = wanted - self.names
             if missing and self.failure_of(missing) is None:
@@ -91,7 +91,7 @@ class LatestMessage(Generic[MessageT]):
         self._held: Frame | MessageT | None = None
         self._decoded: MessageT | None = None
         self.component_id = 0
-        """Component id of the autopilot; messages of others are ignored."""
+        """Component id of the autopilot; messages of other components are ignored."""
 
     @property
     def message(self) -> MessageT | None:
@@ -111,8 +111,8 @@ class LatestMessage(Generic[MessageT]):
     def add(self, handler: Callable[[MessageT], object], names: tuple[str, ...], listeners: Listeners | None) -> None:
         """Add a handler, called with each message.
 
-        With ``names`` it is called only while one of these attributes has no value yet or has listeners, here or in
-        ``listeners``.
+        With ``names``, the handler is called only while one of these attributes has no value yet, or has listeners on
+        the vehicle or in ``listeners``.
         """
         self._handlers.append(handler)
         self._names.update(names)
@@ -120,7 +120,7 @@ class LatestMessage(Generic[MessageT]):
             self._listeners.append(listeners)
 
     def take(self, frame: Frame, message: MessageT | None = None) -> None:
-        """Receive a frame of the vehicle's system, with its message if that is decoded already (loop thread)."""
+        """Receive a frame of the vehicle's system, with the message if the frame is decoded already (loop thread)."""
         if frame.component_id != self.component_id:
             return
         if self._needs_message():
@@ -201,8 +201,8 @@ class Core:
     ) -> LatestMessage[MessageT]:
         """Call a handler with messages of the autopilot (loop thread, by weak reference); return the latest message.
 
-        If the handler only announces attributes, pass their ``names``: it is then called only while they have
-        listeners, here or in ``listeners``.
+        If the handler only announces attributes, pass their ``names``. The handler is then called only while these
+        attributes have listeners on the vehicle or in ``listeners``.
         """
         if message_type not in self._latest:
             self._latest[message_type] = LatestMessage(message_type, self.ready.names, self.listeners)
@@ -223,7 +223,7 @@ class Core:
         """Start receiving once the vehicle is connected (loop thread). The loop gets weak references only."""
         self.aio_or_none, self._tasks = aio, tasks
         self.handler.target_system = aio.system_id
-        _ = aio.parameters  # created first, so that its table has a value before handlers here are called
+        _ = aio.parameters  # created first, so that the parameter table has a value before our handlers are called
         for message_type, latest in self._latest.items():
             latest.component_id = aio.component_id
             aio.connection.bus.attach_lazily(message_type, weak_callback(latest.take), system_id=aio.system_id)
@@ -237,7 +237,7 @@ class Core:
         self.listeners.notify("last_heartbeat", age)
         if (age > SILENCE_WARNING_S) != self._is_silent:
             self._is_silent = not self._is_silent
-            post = self.handler.listener_thread.post  # log handlers of the program may block
+            post = self.handler.listener_thread.post  # because log handlers of the program may block
             if self._is_silent:
                 post(self.logger.warning, "Link timeout, no heartbeat in last %d seconds", SILENCE_WARNING_S)
             else:
@@ -262,13 +262,13 @@ class Core:
             return self.handler.loop.run(function, *args, **kwargs)
 
     def order(self, kind: str, function: Work, *args: Any, **kwargs: Any) -> BackgroundCall:
-        """Start an order without waiting; a newer order of its kind replaces it."""
+        """Start an order without waiting; a newer order of the same kind replaces it."""
         self.check_link()
         with classic_errors():
             return self.handler.calls.start(kind, function, *args, **kwargs)
 
     def command(self, kind: str, command: int, *params: float, **options: Any) -> BackgroundCall:
-        """Send a command to all components without waiting; the answer of the autopilot counts."""
+        """Send a command to all components without waiting; only the autopilot's answer counts."""
         options.setdefault("retries", max_attempts(command, params) - 1)
         return self.order(kind, self.check_link().command, command, *params, component_id=0, **options)
 
@@ -317,7 +317,7 @@ class VehicleCore(HasObservers):
         still_waiting_interval: float = 1,
         **_: Any,
     ) -> bool:
-        """Wait until attributes have values; without names, or with True, for the usual five.
+        """Wait until attributes have values. Without names, or with True, wait for five default attributes.
 
         Args:
             types: names of attributes, including your own; ``wait_ready(True)`` is ``'parameters'``, ``'gps_0'``,
@@ -364,5 +364,5 @@ class VehicleCore(HasObservers):
 
 
 def core_of(vehicle: VehicleCore) -> Core:
-    """Return the core of a vehicle. Its parts take a vehicle because their constructors are DroneKit's."""
+    """Return the core of a vehicle. Parts of a vehicle are constructed with the vehicle, as in DroneKit."""
     return vehicle._dk

@@ -95,7 +95,7 @@ class FlightMethods(VehicleAttributes):
         return order is not None and order.kind == ARMING[value] and not order.done()
 
     def arm(self, wait: bool = True, timeout: float | None = None) -> None:
-        """Arm the motors: **propellers may start to turn**. With ``wait``, wait until HEARTBEAT reports armed.
+        """Arm the motors: **propellers may start to turn**. With ``wait``, wait until HEARTBEAT reports that.
 
         Raises TimeoutError after ``timeout`` seconds, or as soon as the vehicle refuses; the text has its reasons.
         """
@@ -121,9 +121,10 @@ class FlightMethods(VehicleAttributes):
     # -------------------------------------------------------------------------------- flying
 
     def simple_takeoff(self, alt: float | None = None) -> None:
-        """Take off and climb to ``alt`` metres above home; returns immediately. For armed copters in GUIDED mode.
+        """Take off and climb to ``alt`` metres above home; returns immediately.
 
-        Without an altitude nothing is sent. ValueError: the altitude is not a finite number.
+        The copter must be armed in GUIDED mode. Without an altitude, nothing is sent. Raises ValueError if the
+        altitude is not a finite number.
         """
         if alt is not None:
             self._dk_take_off(float(alt))
@@ -142,7 +143,7 @@ class FlightMethods(VehicleAttributes):
         return send((mode,), plan.command, *plan.params)
 
     def wait_simple_takeoff(self, alt: float | None = None, epsilon: float = 0.1, timeout: float | None = None) -> None:
-        """Call :meth:`simple_takeoff` and wait like :meth:`wait_for_alt`; TimeoutError as soon as it is rejected."""
+        """Call :meth:`simple_takeoff` and wait like :meth:`wait_for_alt`; TimeoutError as soon as the order fails."""
         if alt is not None:
             order = self._dk_take_off(float(alt))
             has_reached = self._dk_altitude_condition(float(alt), epsilon, is_relative=True)
@@ -197,7 +198,7 @@ class FlightMethods(VehicleAttributes):
 
     @property
     def airspeed(self) -> float | Any:
-        """Airspeed in m/s (VFR_HUD), None if unknown. Setting it works like :attr:`groundspeed`."""
+        """Airspeed in m/s (VFR_HUD), None if unknown. Setting it works like setting :attr:`groundspeed`."""
         speed = self._dk_vfr_hud.values("airspeed")[0]
         return None if speed is None or math.isnan(speed) else speed
 
@@ -242,7 +243,7 @@ class FlightMethods(VehicleAttributes):
         order.add_done_callback(self._dk_home_is_set)
 
     def _dk_home_is_set(self, order: Future[None]) -> None:
-        """Restore the reported home if the vehicle has rejected the new one."""
+        """Restore the reported home if the vehicle has rejected the new home."""
         if not order.cancelled() and isinstance(order.exception(), (CommandRejected, OperationTimeout)):
             self._home_location = self._dk_reported_home
 
@@ -269,7 +270,7 @@ class FlightMethods(VehicleAttributes):
         interval: float = 0.1,
         errmsg: str | None = None,
     ) -> None:
-        """Wait until ``condition()`` is true. It is called every ``interval`` seconds on the caller's thread.
+        """Wait until ``condition()`` is true: call it every ``interval`` seconds on the caller's thread.
 
         Raises TimeoutError with the text ``errmsg`` after ``timeout`` seconds (None: no limit).
         """

@@ -1,6 +1,6 @@
 """Orders that move a vehicle, maintenance orders, and checks of their arguments.
 
-Flight modes have the names that DroneKit programs use: pymavlink's, which are the autopilots' own.
+Flight modes have the names that DroneKit programs use: those of pymavlink, which are the autopilots' own names.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ POSITION_ONLY = 0x0DF8
 
 ARMED_TIMEOUT_S = 10.0
 
-CONFIRM_TIMEOUT_S = 1.5  # for MISSION_CURRENT after MISSION_SET_CURRENT
+CONFIRM_TIMEOUT_S = 1.5  # time to wait for MISSION_CURRENT after MISSION_SET_CURRENT
 
 MAX_SEQ = 0xFFFF
 
@@ -85,7 +85,7 @@ async def change_mode(vehicle: AsyncVehicle, wanted: Mode) -> None:
 
 
 async def change_armed(vehicle: AsyncVehicle, value: bool) -> None:
-    """Arm or disarm, and wait until HEARTBEAT reports it. Disarming ends orders about motion."""
+    """Arm or disarm, and wait until HEARTBEAT reports the change. Disarming ends orders that move the vehicle."""
     subjects: tuple[Subject, ...] = ("arm",) if value else ("arm", "motion")
     try:
         with vehicle.posted(*subjects, armed=value) as order:
@@ -106,7 +106,7 @@ async def take_off(vehicle: AsyncVehicle, modes: tuple[Mode, ...], command: int,
 async def go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: float) -> None:
     """Send DO_REPOSITION; if it is unsupported, send SET_POSITION_TARGET_GLOBAL_INT.
 
-    The altitude is above home, or above sea level if the autopilot repositions with that (PX4).
+    The altitude is above home, or above sea level if the autopilot's reposition command uses that (PX4).
     """
     is_amsl = vehicle.autopilot.repositions_amsl
     with vehicle.posted("motion", modes=reposition_modes(vehicle)[:1]) as order:
@@ -128,9 +128,10 @@ async def go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: 
 
 
 def reposition_modes(aio: AsyncVehicle) -> tuple[Mode, ...]:
-    """Return the modes in which a reposition command may be sent. The command itself sets the first of them (PX4).
+    """Return the modes in which a reposition command may be sent.
 
-    Empty if the command does not change the mode: the vehicle then refuses it in wrong modes.
+    The command itself sets the first of these modes (PX4). Empty if the command does not change the mode. The vehicle
+    then refuses the command in wrong modes.
     """
     if not aio.autopilot.repositions_amsl:
         return ()
@@ -166,13 +167,13 @@ def check_speed(name: str, speed: float | None) -> None:
 class CurrentCommand:
     """MISSION_CURRENT and MISSION_SET_CURRENT of one vehicle.
 
-    ArduPilot counts home as item 0, and is at 0 before it flies a mission. PX4 counts the first item as 0; this class
-    reports it as 1, and 0 while no mission is active.
+    ArduPilot counts home as item 0, and is at 0 before it flies a mission. PX4 counts the first item as 0. This class
+    then reports the first item as 1, and 0 while no mission is active.
     """
 
     def __init__(self, core: Core) -> None:
         self._core = core
-        self._chosen: int | None = None  # set on PX4 and not yet passed
+        self._chosen: int | None = None  # command that was chosen on PX4 and not yet passed
         self._latest = core.on(m.MissionCurrent, self._on_current)
 
     @property
@@ -188,7 +189,7 @@ class CurrentCommand:
         return int(message.seq) + 1
 
     def choose(self, seq: int) -> None:
-        """Set the next command without waiting. InvalidArgument: ``seq`` is not from 0 to 65,535."""
+        """Set the next command without waiting. Raises InvalidArgument if ``seq`` is not from 0 to 65,535."""
         if not 0 <= operator.index(seq) <= MAX_SEQ:
             raise InvalidArgument(f"next = {seq!r} is not allowed: 0 to {MAX_SEQ}")
         self._core.order("commands.next", self._choose, operator.index(seq))
@@ -202,7 +203,7 @@ class CurrentCommand:
         return has_ended and not self._core.aio.is_armed
 
     async def _choose(self, seq: int) -> None:
-        """Send MISSION_SET_CURRENT once, as DroneKit does; if it is not confirmed, send a command with retries."""
+        """Send MISSION_SET_CURRENT once, like DroneKit. Without confirmation, send a command with retries."""
         aio = self._core.aio
         if not aio.autopilot.home_is_item_0:
             await aio.mission.set_current(max(seq - 1, 0))
@@ -270,8 +271,8 @@ class Maintenance(VehicleCore):
     def play_tune(self, tune: str | bytes) -> None:
         """Play a tune on the vehicle's buzzer, such as ``"AAAA"``, in the format of the autopilot (PLAY_TUNE).
 
-        At most 230 ASCII characters (else ValueError); ArduPilot plays the first 99. APIException: the link is down, or
-        the vehicle uses MAVLink 1, which has no such message.
+        At most 230 ASCII characters (else ValueError); ArduPilot plays the first 99. Raises APIException if the link is
+        down, or if the vehicle uses MAVLink 1, which has no such message.
         """
         text = _tune_text(tune)
         if self._dk.check_link().connection.mavlink_version == 1:

@@ -19,15 +19,15 @@ if TYPE_CHECKING:
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
 HOME_TIMEOUT_S = 10.0
-MAX_ANGLE_DEG = 360.0  # limit of vehicle.aio.gimbal; larger angles, from sums, are reduced
+MAX_ANGLE_DEG = 360.0  # limit of vehicle.aio.gimbal; larger angles, which sums may yield, are reduced
 UNKNOWN_ATTITUDE = GimbalAttitude(None, None, None)
 
 
 class Gimbal(GimbalPrivates):
     """The first gimbal: its attitude, and orders to it.
 
-    :attr:`pitch`, :attr:`roll` and :attr:`yaw` are None until the vehicle reports a gimbal. Orders return immediately;
-    a newer one replaces an unanswered one, and a rejection is logged as a warning of the logger ``dronekit``. Raises
+    :attr:`pitch`, :attr:`roll` and :attr:`yaw` are None until the vehicle reports a gimbal. Orders return immediately.
+    A newer order replaces an unanswered order. A rejection is logged as a warning of the logger ``dronekit``. Raises
     ValueError for invalid numbers and locations, and APIException while the link is down.
     """
 
@@ -72,7 +72,7 @@ class Gimbal(GimbalPrivates):
         Args:
             pitch: degrees from the horizon: 0 is level, -90 straight down.
             roll: degrees from the horizon. If not 0, a command is used that stabilises yaw relative to the vehicle:
-                ``yaw`` is correct when the command is sent, and follows the vehicle afterwards.
+                the camera points at ``yaw`` at first, but then turns with the vehicle.
             yaw: degrees clockwise from north.
         """
         angles = [_checked(name, value) for name, value in (("pitch", pitch), ("yaw", yaw), ("roll", roll))]
@@ -80,7 +80,7 @@ class Gimbal(GimbalPrivates):
         self._core.order("gimbal", gimbal.point, *angles[:2], roll_deg=angles[2], wait=False)
 
     def target_location(self, roi: LocationGlobalRelative | LocationGlobal) -> None:
-        """Point the camera at a location; a copter without a gimbal turns itself. Zeros end the order."""
+        """Point the camera at a location; a copter without a gimbal turns itself. Zeros as location end the order."""
         if not isinstance(roi, (LocationGlobal, LocationGlobalRelative)):
             raise InvalidArgument("Expecting roi to be LocationGlobal or LocationGlobalRelative.")
         is_location = any(checked_location(roi))

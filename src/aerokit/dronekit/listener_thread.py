@@ -47,7 +47,7 @@ class ListenerThread:
             self._calls.put((function, args))
 
     def offer(self, function: Callable[..., object], *args: Any) -> None:
-        """Like :meth:`post`, for values that repeat: dropped while 10,000 calls are queued."""
+        """Like :meth:`post`, but drop the call while 10,000 calls are queued. Used for values that repeat."""
         if self._calls.qsize() < MAX_QUEUED_CALLS:
             self.post(function, *args)
             return
@@ -56,10 +56,10 @@ class ListenerThread:
         self.dropped += 1
 
     def call(self, function: Callable[..., object], *args: Any) -> None:
-        """Queue a call and wait for it; call directly if on this thread already, or if the thread has ended.
+        """Queue a call and wait for it. Call directly if the caller runs on this thread, or if the thread has ended.
 
-        Does not wait on threads of event loops and of other listeners, to avoid deadlocks. Waits at most two seconds
-        elsewhere, because the caller may hold a lock that a callback needs.
+        If the caller runs on the thread of an event loop or of other listeners, does not wait, to avoid deadlocks.
+        Other callers wait at most two seconds, because they may hold a lock that a callback needs.
         """
         if self.is_current or self.is_stopped:
             function(*args)
@@ -76,7 +76,7 @@ class ListenerThread:
                 called.finish()
 
         self.post(call_and_finish)
-        end = time.monotonic() + CALL_TIMEOUT_S  # short waits, for Ctrl-C on every system
+        end = time.monotonic() + CALL_TIMEOUT_S  # waits in short steps, so that Ctrl-C works on every system
         while not called.wait(0.2) and not self.is_stopped and time.monotonic() <= end:
             pass
 

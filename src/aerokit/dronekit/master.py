@@ -28,13 +28,13 @@ if TYPE_CHECKING:
     from aerokit.transport.link import Peer
 
 MAX_MESSAGES = 1000
-MESSAGE_MAX_AGE_S = 5.0  # a program that rarely reads gets recent messages
-FIRST_LOOKUP_TIMEOUT_S = 1.0  # nothing was stored before the first access
+MESSAGE_MAX_AGE_S = 5.0  # older messages are dropped, for programs that rarely read
+FIRST_LOOKUP_TIMEOUT_S = 1.0  # time to wait for a message, because none is stored before the first access
 SIGNAL_CHECK_INTERVAL_S = 0.2  # longer waits are split, so that Ctrl-C and a closed connection are noticed
 
 
 class Master:
-    """The part of pymavlink's ``mavfile`` that old programs use. New programs find all of it on the vehicle.
+    """The part of pymavlink's ``mavfile`` that old programs use. New programs use the vehicle itself.
 
     Methods that send return immediately and do not report the result.
     """
@@ -66,7 +66,7 @@ class Master:
 
     @property
     def port(self) -> Master:
-        """This object itself, because programs call ``port.close()``. Not a socket or serial port."""
+        """This object itself, because programs call ``port.close()``. It is not a socket or serial port."""
         return self
 
     @property
@@ -175,11 +175,11 @@ class Master:
         blocking: bool = False,
         timeout: float | None = None,
     ) -> Any:
-        """Return the next message of a type, of several or of any, that satisfies pymavlink's ``condition``.
+        """Return the next message of one type, several types or any type that satisfies pymavlink's ``condition``.
 
         From the first call on, the last 1,000 messages of the last five seconds are kept. Without a match, returns None
-        at once if ``blocking`` is false, otherwise after ``timeout`` seconds (None: no limit). APIException: the
-        connection was closed.
+        at once if ``blocking`` is false, otherwise after ``timeout`` seconds (None: no limit). Raises APIException if
+        the connection is closed.
         """
         names = {type} if isinstance(type, str) else None if type is None else set(type)
 
@@ -210,7 +210,7 @@ class Master:
         return value
 
     def location(self, relative_alt: bool = False) -> Any:
-        """Return ``lat``, ``lon`` (degrees), ``alt`` (metres) and ``heading`` (degrees) from messages received now.
+        """Return ``lat``, ``lon`` (degrees), ``alt`` (metres) and ``heading`` (degrees) from new messages.
 
         Waits for a 3D GPS fix. The altitude is above home (``relative_alt``) or above sea level.
         """
@@ -240,8 +240,8 @@ class Master:
 class Inbox(Mapping[str, Any]):
     """The last message of every type by name, and a queue of unread messages, as pymavlink objects.
 
-    Receives from the first access on; look-ups in the first second wait for a message. Contains messages of the
-    vehicle, of radios and of ground stations, but not of other vehicles.
+    Messages are received from the first access on. Look-ups in the first second wait for a message. Contains messages
+    of the vehicle, of radios and of ground stations, but not of other vehicles.
     """
 
     def __init__(self, connection: ClassicConnection) -> None:
@@ -302,7 +302,7 @@ class Inbox(Mapping[str, Any]):
         return is_young and self._connection.connection.is_open and not self._connection.loop.is_current
 
     def _take(self, frame: Frame, peer: Peer) -> None:
-        # On the loop's thread.
+        # Runs on the loop's thread.
         if self._connection.is_of_another_vehicle(frame.system_id):
             return
         with self._came:
@@ -311,7 +311,7 @@ class Inbox(Mapping[str, Any]):
             self._came.notify_all()
 
     def _pop(self, end: float | None) -> Frame | None:
-        """Return the oldest frame that is not too old; None when the time is over."""
+        """Return the oldest frame that is recent enough; None when the time is over."""
         now = self._connection.connection.now
         while True:
             with self._came:

@@ -150,7 +150,7 @@ class MAVConnection(ClassicConnection):
 
     @property
     def out_queue(self) -> queue.Queue[bytes]:
-        """Always empty: messages are sent immediately."""
+        """A queue that is always empty, because messages are sent immediately."""
         return queue.Queue()
 
     def _forward(self, frame: Frame, peer: Peer) -> None:

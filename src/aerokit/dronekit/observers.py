@@ -79,7 +79,7 @@ class Listeners:
         return name in self.by_name or EVERY_NAME in self.by_name
 
     def notify(self, name: str, value: Any, cache: bool = False, *, waits: bool = False) -> None:
-        """Notify listeners of a value: with ``cache``, if it changed; without ``cache``, unless the load is high.
+        """Notify listeners of a value. With ``cache``, notify only of changes; without it, skip values under high load.
 
         Returns immediately or, with ``waits``, after the listeners have run.
         """
@@ -111,7 +111,7 @@ class Listeners:
                 try:
                     listener(self._owner, attr_name, value)
                 except BaseException:
-                    # Including SystemExit, which would end the listener thread only.
+                    # This includes SystemExit, which would end the listener thread only.
                     logger.exception("Exception in %s handler for %s", self.kind, attr_name)
 
     def _keep_owner(self) -> None:
@@ -150,9 +150,9 @@ class HasObservers:
     def add_attribute_listener(self, attr_name: str, observer: AttributeListener) -> None:
         """Call ``observer(self, attr_name, value)`` when the attribute is updated, or the parameter changed.
 
-        Listeners of sensor values are called with every message, those of states (``mode``, ``armed``,
-        ``system_status``, ``ekf_ok``) on changes. ``'*'`` is every name. A registered listener is not added again.
-        Names are not checked, because programs may define more attributes.
+        Listeners of sensor values are called with every message. Listeners of states (``mode``, ``armed``,
+        ``system_status``, ``ekf_ok``) are called on changes. ``'*'`` stands for every name. A registered listener is
+        not added again. Names are not checked, because programs may define more attributes.
         """
         self._dk_listeners.add(self._dk_normalized(attr_name), observer)
 
@@ -175,7 +175,7 @@ class HasObservers:
 class MessageListeners(Listeners):
     """Message listeners of a vehicle, called on the listener thread. Imports pymavlink for the first listener.
 
-    They get messages of all components of the vehicle, and of radios, ground stations and so on, but not of other
+    Listeners get messages of all components of the vehicle, and of radios, ground stations and so on, but not of other
     vehicles on the link.
     """
 
@@ -194,7 +194,7 @@ class MessageListeners(Listeners):
         self._attach_now()
 
     def remove(self, name: str, listener: AttributeListener) -> None:
-        """Remove a listener; ignored if it is not registered."""
+        """Remove a listener; ignored if the listener is not registered."""
         with contextlib.suppress(ValueError):
             super().remove(name, listener)
         self._attach_now()
@@ -205,7 +205,7 @@ class MessageListeners(Listeners):
         self._attach()
 
     def _attach_now(self) -> None:
-        # Blocks, so that no message is missed after add() has returned.
+        # This call blocks, so that no message is missed after add() has returned.
         if not self._is_started:
             return
         if self._handler.loop.is_current:
@@ -247,7 +247,7 @@ class MessageListeners(Listeners):
 def message_of(frame: Frame) -> Any:
     """Convert a frame to a pymavlink message. Never raises.
 
-    Uses the program's dialect, ``mavutil.mavlink``, if that is one of MAVLink 2. ``_timestamp`` is the time of this
+    Uses the program's dialect, ``mavutil.mavlink``, if that is a MAVLink 2 dialect. ``_timestamp`` is the time of this
     call.
     """
     mavutil, to_pymavlink = _pymavlink()

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.parameters.writing import ResolvedParameter
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
-VERSION_TIMEOUT_S = 1.0  # for AUTOPILOT_VERSION, which shows whether the list is available as a file
+VERSION_TIMEOUT_S = 1.0  # time to wait for AUTOPILOT_VERSION, which shows whether the list is available as a file
 READ_TIMEOUT_S = 30.0
 RETRY_DELAY_S = 1.0
 
@@ -42,7 +42,7 @@ MIN_ATTEMPT_S = 1.0  # longer on slow links
 LAST_ATTEMPT_SHARE = 0.5
 ROUND_TRIPS = 3
 
-ROUNDING = 0.01  # ArduPilot adds this before it truncates a value to an integer
+ROUNDING = 0.01  # ArduPilot adds this value before it truncates a number to an integer
 
 
 class ParameterDownload:
@@ -159,12 +159,12 @@ class ParameterValues:
         return {name: float(parameter.value) for name, parameter in self._known.copy().items()}
 
     def find(self, name: str) -> ResolvedParameter | None:
-        """Look up an upper-case name, also under its other names."""
+        """Look up a parameter by an upper-case name, old or new."""
         known = self._known
         return resolve_known(name if name in known else self._spelled.get(name, name), known)
 
     def get(self, name: str) -> float | None:
-        """Return the value of an upper-case name, without renaming, or None."""
+        """Return the value of exactly this upper-case name, or None."""
         known = self._known.get(name)
         return None if known is None else float(known.value)
 
@@ -182,7 +182,7 @@ class ParameterValues:
 async def set_parameter(aio: AsyncVehicle, name: str, value: float, retries: int) -> AerokitError | None:
     """Set a parameter; return None when confirmed, otherwise the error.
 
-    Fractions for integer parameters are cut off, as ArduPilot does. PARAM_SET is sent once; without an answer the value
+    Fractions for integer parameters are cut off, as in ArduPilot. PARAM_SET is sent once; without an answer the value
     is requested, for ``retries`` + 1 attempts in total.
     """
     idle_timeout_s = (retries + LAST_ATTEMPT_SHARE) * _try_s(aio)
@@ -248,7 +248,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
     ) -> float | None:
         """Return a value, or ``default`` if the vehicle has no such parameter.
 
-        The second argument is not the default: if false, only known values count, and nothing is requested.
+        The second argument is not the default. If it is false, only known values count, and nothing is requested.
         """
         if isinstance(name, str) and (value := self._values.get(name.upper())) is not None:
             return value
@@ -306,7 +306,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
         found = self._values.find(name)
         own, converted = name if found is None else found.name, number
         if found is not None and found.renamed is not None:
-            converted = found.renamed.to_vehicle(number)  # not rounded: set_parameter converts to integers
+            converted = found.renamed.to_vehicle(number)  # not rounded here, because set_parameter converts to integers
             warn_of_rename(found.renamed)
         core = self._core
         if retries <= 0:
@@ -365,7 +365,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
         self._take(message.param_id)
 
     def _on_changed(self, event: ParameterChanged) -> None:
-        # Includes downloads that the program started with vehicle.aio.
+        # This includes downloads that the program started with vehicle.aio.
         if event.system_id == self._core.target_system:
             self._take(event.name)
 

@@ -86,7 +86,7 @@ class VehiclePrivates:
     _last_heartbeat = attribute_path("last_heartbeat")
     _heartbeat_started = OverridableProperty(lambda vehicle: vehicle.last_heartbeat is not None)
     _heartbeat_system = attribute_path("_handler.target_system")
-    # True while the link is silent: a flag, not seconds.
+    # True while the link is silent. Despite its name, the attribute is a flag.
     _heartbeat_timeout = OverridableProperty(lambda vehicle: (vehicle.last_heartbeat or 0.0) >= SILENCE_S)
     _heartbeat_lastreceived = OverridableProperty(_last_heartbeat_at)
     _params_loaded = OverridableProperty(lambda vehicle: "parameters" in vehicle._ready_attrs)

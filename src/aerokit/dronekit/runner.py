@@ -38,8 +38,9 @@ SITL_ALIAS, SITL_MODULE = "dronekit_sitl", "aerokit.dronekit.sitl"
 def install() -> None:
     """Make ``import dronekit`` and ``from dronekit.lib import …`` import :mod:`aerokit.dronekit`.
 
-    ``import dronekit_sitl`` imports :mod:`aerokit.dronekit.sitl`, unless another one was imported before. Takes
-    precedence over an installed DroneKit. Idempotent. For test runners (in ``conftest.py``) and embedding programs.
+    ``import dronekit_sitl`` imports :mod:`aerokit.dronekit.sitl`, unless another ``dronekit_sitl`` was imported before.
+    Takes precedence over an installed DroneKit. Idempotent. Use it in test runners (in ``conftest.py``) and embedding
+    programs.
 
     Raises:
         ImportError: another ``dronekit`` was imported before.
@@ -70,7 +71,7 @@ def uninstall() -> None:
 
 
 def _own_name(name: str) -> str | None:
-    """Return the name of an alias's module in aerokit, or None for other modules."""
+    """Return the name of the aerokit module for an alias such as ``dronekit.lib``, or None for other modules."""
     if name == SITL_ALIAS:
         return SITL_MODULE
     return PACKAGE + name.removeprefix(ALIAS) if name.startswith(f"{ALIAS}.") else None
@@ -109,9 +110,10 @@ RUNPY_FILES = (runpy.__file__, "<frozen runpy>")
 def run_script(path: str | os.PathLike[str], arguments: Sequence[str] = ()) -> None:
     """Run a DroneKit program in this process, and return when its main program has ended.
 
-    Its environment is that of ``python program.py arguments…``: ``sys.argv``, its folder first in ``sys.path``,
-    ``__name__ == '__main__'``. ``import dronekit`` imports :mod:`aerokit.dronekit`, also afterwards. A folder or zip
-    file with a ``__main__.py`` is a program, too. Afterwards ``sys`` is restored, and open vehicles are closed.
+    The program's environment is that of ``python program.py arguments…``: ``sys.argv``, its folder first in
+    ``sys.path``, ``__name__ == '__main__'``. ``import dronekit`` imports :mod:`aerokit.dronekit`, also afterwards. A
+    folder or zip file with a ``__main__.py`` is a program, too. Afterwards ``sys`` is restored, and open vehicles are
+    closed.
 
     Args:
         path: the program.
@@ -160,7 +162,7 @@ def main(arguments: Sequence[str], prog: str = "python -m aerokit.dronekit") -> 
         return FAILED
     sys.excepthook = _print_program_traceback
     if not getattr(sys.flags, "safe_path", False):
-        del sys.path[:1]  # the folder of this command
+        del sys.path[:1]  # remove the folder of this command
     run = _run_module if options.module else _run_file
     try:
         run(options.program, rest)
@@ -296,7 +298,7 @@ def _restored_sys() -> Iterator[None]:
 
 
 def _print_program_traceback(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
-    """Print a traceback without the frames of this module, as Python does for its own."""
+    """Print a traceback without the frames of this module, like Python for its own frames."""
     error.__traceback__ = _without_our_frames(traceback)
     sys.__excepthook__(kind, error, error.__traceback__)
 

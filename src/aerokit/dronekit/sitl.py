@@ -21,7 +21,7 @@ from aerokit.sim.server import open_simulator
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-# Vehicles of dronekit-sitl, and kinds of the simulator.
+# Maps vehicles of dronekit-sitl to kinds of the simulator.
 KINDS = {"copter": "copter", "solo": "copter", "plane": "plane", "rover": "rover", "sub": "sub"}
 START_TIMEOUT_S = 30.0
 USUAL_ADDRESSES = ("tcpin:127.0.0.1:5760", "udpout:127.0.0.1:14550")

@@ -70,9 +70,9 @@ class LocationLocal(_Value):
         self.down = down
 
     def distance_home(self) -> float | None:
-        """Distance to the origin in metres, horizontal if ``down`` is None; None if ``north`` or ``east`` is.
+        """Distance to the origin in metres, horizontal if ``down`` is None; None if ``north`` or ``east`` is None.
 
-        The origin is home unless one of them was moved.
+        The origin is at home, unless the origin or home was moved.
         """
         if self.north is None or self.east is None:
             return None
@@ -84,8 +84,8 @@ class LocationLocal(_Value):
 class GPSInfo(_Value):
     """GPS receiver: fields of GPS_RAW_INT.
 
-    ``eph`` and ``epv`` are dilutions of precision times 100 (65535: unknown), ``fix_type`` is 0 or 1 without a fix,
-    2 for 2D, 3 for 3D and higher for better fixes, ``satellites_visible`` a number (255: unknown).
+    ``eph`` and ``epv`` are dilutions of precision times 100 (65535: unknown). ``fix_type`` is 0 or 1 without a fix, 2
+    for 2D, 3 for 3D and higher for better fixes. ``satellites_visible`` is a count (255: unknown).
     """
 
     _text = "GPSInfo:fix={0.fix_type},num_sat={0.satellites_visible}"
@@ -100,8 +100,8 @@ class GPSInfo(_Value):
 class Battery(_Value):
     """The main battery: ``voltage`` in volts, ``current`` in amperes or None, ``level`` in percent or None.
 
-    The constructor takes the fields of SYS_STATUS: millivolts (65535, unknown, becomes 65.535 V), hundredths of an
-    ampere, and percent. A current or percentage of -1 is unknown.
+    The constructor takes the fields of SYS_STATUS: millivolts, hundredths of an ampere, and percent. A voltage of
+    65535, which means unknown, becomes 65.535 V. A current or percentage of -1 is unknown.
     """
 
     _text = "Battery:voltage={0.voltage},current={0.current},level={0.level}"
@@ -176,7 +176,7 @@ class Version(_Value):
 
     Args:
         raw_version: flight_sw_version of AUTOPILOT_VERSION, with one byte each for ``major``, ``minor``, ``patch`` and
-            ``release``; None if unknown, then all four are None.
+            ``release``; None if unknown; all four are then None.
         autopilot_type: MAV_AUTOPILOT of the heartbeat, or None.
         vehicle_type: MAV_TYPE of the heartbeat, or None.
     """

@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 FIRST_VALUES = ("attitude", "location.global_relative_frame", "heading", "gps_0", "battery")
 
 # Seconds to wait for the first telemetry, because DroneKit programs read attributes right after connect(). Not every
-# vehicle reports all of them: after each value, wait at most the second time for the next one.
+# vehicle reports every value, so waiting also ends if no further value arrives within the second time.
 FIRST_VALUES_TIMEOUT_S, NEXT_VALUE_TIMEOUT_S = 1.0, 0.4
 
 CONNECT_TIMEOUT_S = 30.0
@@ -65,9 +65,10 @@ LEVELS = (logging.CRITICAL,) * 3 + (logging.ERROR, logging.WARNING, logging.INFO
 class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
     """A vehicle: attributes to read and to listen to, orders, parameters, missions.
 
-    Created by :func:`connect`; ``connect(…, vehicle_class=…)`` creates a subclass, whose constructor passes its one
-    argument on and may add listeners and attributes. Can be used from any thread. Callbacks run in order on a separate
-    thread, and may use the vehicle too. A context manager; :meth:`close` closes the connection.
+    Created by :func:`connect`; ``connect(…, vehicle_class=…)`` uses a subclass, whose constructor passes its one
+    argument on and may add listeners and attributes. The vehicle can be used from any thread. Callbacks run in order on
+    a separate thread, and may use the vehicle, too. The vehicle is a context manager; :meth:`close` closes the
+    connection.
     """
 
     def __init__(self, handler: MAVConnection) -> None:
@@ -85,7 +86,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
 
     @property
     def channels(self) -> Channels:
-        """RC channels by number; ``.overrides`` overrides them."""
+        """RC channels by number; ``.overrides`` sets overrides."""
         return self._channels
 
     @property
@@ -143,7 +144,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
     def sync(self) -> sync.Vehicle:
         """The blocking API (:class:`aerokit.sync.Vehicle`) on the same connection.
 
-        Programs can move to it function by function: ``vehicle.sync.take_off(10)`` returns at altitude. Raises
+        Programs can move to this API function by function: ``vehicle.sync.take_off(10)`` returns at altitude. Raises
         APIException before the vehicle is connected.
         """
         if self._dk_held is None:
@@ -157,7 +158,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
     def run(self, function: Callable[..., Awaitable[Any]], /, *args: Any, **kwargs: Any) -> Any:
         """Await a coroutine function on the vehicle's loop: ``vehicle.run(survey, vehicle.aio)``.
 
-        Ctrl-C cancels it. Its exceptions propagate unchanged.
+        Ctrl-C cancels the coroutine. Exceptions of the coroutine propagate unchanged.
         """
         return self._handler.loop.run(function, *args, **kwargs)
 
@@ -171,7 +172,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         self._message_listeners.add(name, fn)
 
     def remove_message_listener(self, name: str, fn: AttributeListener) -> None:
-        """Remove a listener; ignored if it is not registered."""
+        """Remove a listener; ignored if the listener is not registered."""
         self._message_listeners.remove(name, fn)
 
     def on_message(self, name: str | list[str] | tuple[str, ...]) -> Callable[[AttributeListener], AttributeListener]:
@@ -281,7 +282,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         end = no_more_at = now + FIRST_VALUES_TIMEOUT_S
         missing = wanted
         while (still := wanted - ready.names) and now < min(end, no_more_at):
-            if still < missing:  # includes values that arrived before this wait
+            if still < missing:  # also true for values that arrived before this loop
                 missing, no_more_at = still, now + NEXT_VALUE_TIMEOUT_S
             ready.wait_for_change(wanted, min(end, no_more_at) - now)
             now = time.monotonic()
@@ -348,8 +349,8 @@ def connect(
     Args:
         ip: connection string: ``'127.0.0.1:14550'`` and ``'udp:…'`` listen, ``'tcp:127.0.0.1:5760'``,
             ``'/dev/ttyACM0'``, ``'com14'`` … (docs/addresses.md).
-        wait_ready: True waits for ``parameters``, ``gps_0``, ``armed``, ``mode`` and ``attitude``; a list waits for
-            these names; otherwise does not wait.
+        wait_ready: True waits for ``parameters``, ``gps_0``, ``armed``, ``mode`` and ``attitude``; a list waits for the
+            names in it. With any other value, ``connect`` does not wait.
         timeout: seconds for ``wait_ready``.
         still_waiting_callback: called with the set of missing names.
         still_waiting_interval: seconds between these calls.
@@ -412,7 +413,7 @@ def connect(
 
 
 def _print_texts(handler: MAVConnection, status_printer: Callable[[str], object]) -> None:
-    # Through the logger `autopilot`, as in DroneKit, so that its level applies.
+    # Texts go through the logger `autopilot`, as in DroneKit, so that the logger's level applies.
     logger, printer = logging.getLogger("autopilot"), ErrprinterHandler(status_printer)
     logger.addHandler(printer)
     handler.on_close(lambda: logger.removeHandler(printer))

@@ -41,11 +41,11 @@ class FleetAction:
     Args:
         context: context of the fleet.
         name: appears in results, events and errors.
-        members: members to run it on; unavailable ones are skipped.
+        members: members that run the action; unavailable members are skipped.
         execute: called with each available member.
         timeout: seconds for each member; None: no limit.
         stagger_s: delay in seconds between the starts of consecutive members.
-        is_safe: the action ends a flight (hold, land, return), so that a failure does not stop the others.
+        is_safe: the action ends a flight (hold, land, return), so a member's failure does not stop the other members.
         holds_if_cancelled: on cancellation, members that have already finished hold, too.
     """
 
@@ -111,7 +111,7 @@ class FleetAction:
 
     @property
     def orders(self) -> dict[str, str]:
-        """Orders of the policy by member name; empty if no member failed, or the others continue."""
+        """Orders of the policy by member name; empty if no member failed, or if the other members continue."""
         return dict(self._orders)
 
     @property
@@ -222,8 +222,8 @@ class FleetAction:
                     partial(self._send_order, member, self._orders[member.name]),
                     f"aerokit policy {member.name}",
                 )
-        # The policy's orders come first: they supersede those of the running actions, so that these send no hold when
-        # they are cancelled.
+        # The policy's orders come first. They supersede the orders of the running actions, so a cancelled action sends
+        # no hold.
         asyncio.get_running_loop().call_soon(self._cancel, [member for member in available if member.name in orders])
         if not self._orders:
             self._publish_completed()
@@ -301,7 +301,7 @@ class FleetContext:
         self.bus: Bus = Bus()
         self.background: BackgroundTasks = BackgroundTasks(on_error)
         self.actions: list[FleetAction] = []
-        self.missions: dict[str, Mission] = {}  # last upload, once every member has accepted its mission
+        self.missions: dict[str, Mission] = {}  # missions of the last upload, set once every member has accepted
         self.is_closed: bool = False
 
     def start(self) -> None:
@@ -357,7 +357,7 @@ ACTIONS_ON_GROUND = ("arm", "wait_ready", "upload")
 
 
 class SelectionBase:
-    """Members of a selection, and how it runs actions."""
+    """Members of a selection, and the execution of actions by them."""
 
     def __init__(self, context: FleetContext, names: tuple[str, ...] | None) -> None:
         self._context, self._names = context, names

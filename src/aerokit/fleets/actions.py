@@ -77,7 +77,7 @@ class Actions(SelectionBase):
         return await self._run("arm", lambda member: member.vehicle.arm(timeout=timeout), stagger_s=stagger_s)
 
     async def disarm(self, *, timeout: float = 10.0) -> FleetResult:
-        """Disarm; refused in the air; see :meth:`aerokit.Vehicle.disarm`.
+        """Disarm; see :meth:`aerokit.Vehicle.disarm`. Vehicles in the air refuse.
 
         Args:
             timeout: seconds for each member.
@@ -154,7 +154,7 @@ class Actions(SelectionBase):
 
         Args:
             condition: called with a member, four times a second and when its state changes.
-            timeout: seconds until it is true for all members.
+            timeout: seconds until the condition is true for all members.
             description: name of the barrier in errors.
 
         Raises:
@@ -187,7 +187,7 @@ class Actions(SelectionBase):
         Args:
             altitude_m: metres above the home of each member.
             tolerance_m: allowed difference in metres.
-            timeout: seconds until all of them are there.
+            timeout: seconds until all members are at the altitude.
 
         Raises:
             FleetError: a member did not reach the altitude in time.

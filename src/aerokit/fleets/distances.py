@@ -112,7 +112,7 @@ class DistanceMonitor:
                 self._on_too_close(self._context.members[one], self._context.members[other], distance_m)
 
     def _flying_positions(self) -> dict[str, tuple[float, float, float]]:
-        """Return latitude, longitude and altitude of all members in the air, including those that others control."""
+        """Return latitude, longitude and altitude of all members in the air, whoever controls them."""
         positions: dict[str, tuple[float, float, float]] = {}
         for member in self._context.members.values():
             vehicle = member.vehicle

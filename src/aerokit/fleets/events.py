@@ -1,4 +1,4 @@
-"""Events of a fleet and its members. Each has the member's name."""
+"""Events of a fleet and its members. Each event has the member's name."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class FleetEvent(Event):
 class MemberEvent(FleetEvent):
     """An event of one vehicle, such as ``ModeChanged``, ``StatusTextReceived`` or ``LinkReport``.
 
-    For an event of a link ``member`` is the name of the network.
+    For an event about a link, ``member`` is the name of the network.
     """
 
     event: Event
@@ -78,7 +78,7 @@ class MemberFailed(FleetEvent):
 
 
 class PolicyApplied(FleetEvent):
-    """``member`` failed in ``action``, and the policy sends ``orders`` to others.
+    """``member`` failed in ``action``, and the policy sends ``orders`` to other members.
 
     ``orders`` maps names to ``"hold"``, ``"land"`` or ``"return"``; ``skipped`` maps members without an order to the
     reason.
@@ -98,7 +98,7 @@ class PolicyCompleted(FleetEvent):
 
 
 class FollowingStopped(FleetEvent):
-    """Following the leader ``member`` ended, but its block is still running.
+    """The followers of the leader ``member`` stopped following, but the program's block is still running.
 
     ``orders`` and ``skipped`` are as in :class:`PolicyApplied`.
     """

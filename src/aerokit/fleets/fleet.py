@@ -29,9 +29,10 @@ __all__ = ["Fleet", "Selection"]
 class Selection(Actions, Missions, Formations, Shows):
     """Some members of a fleet: ``fleet.group("alpha")``, ``fleet["north/*"]``.
 
-    Every action runs on all available members at once, which are those that are not lost, taken over or released. The
-    action returns a :class:`FleetResult` when all of them are done. If a member fails, the fleet's policy sends orders
-    to the others, and the action ends when they have executed these. If the action is cancelled, all members hold.
+    Every action runs on all available members at once. A member is available unless it is lost, taken over or released.
+    The action returns a :class:`FleetResult` when all of these members are done. If a member fails, the fleet's policy
+    sends orders to the other members, and the action ends when these orders are executed. If the action is cancelled,
+    all members hold.
     """
 
     def __getitem__(self, pattern: str) -> Selection:
@@ -79,7 +80,7 @@ class Fleet(Selection):
     def reclaim(self, name: str) -> None:
         """Make members available again that were taken over or released.
 
-        Sends nothing; the next action includes them. **Ask the pilot first.**
+        Sends nothing. The next action includes these members. **Ask the pilot first.**
 
         Args:
             name: a member's name or a pattern.
@@ -91,7 +92,7 @@ class Fleet(Selection):
             self._context.members[member].reclaim()
 
     def release(self, name: str, reason: str = "released by the program") -> None:
-        """Exclude members from actions until :meth:`reclaim`. Sends nothing: they continue what they are doing.
+        """Exclude members from actions until :meth:`reclaim`. Nothing is sent, so the members continue as before.
 
         Args:
             name: a member's name or a pattern.
@@ -114,7 +115,7 @@ class Fleet(Selection):
 
         Raises:
             InvalidArgument: a message is incomplete, damaged or too long, or ``rtcm`` is empty. Nothing was sent.
-            ConnectionClosed, LinkLost: a link has ended; the links before it got the corrections.
+            ConnectionClosed, LinkLost: a link has ended; earlier links got the corrections.
         """
         messages, count = rtcm_messages(rtcm), 0
         for connection in dict.fromkeys(self._context.networks.values()):
@@ -132,10 +133,10 @@ class Fleet(Selection):
         """Subscribe to events of the fleet and its vehicles; use it in a ``with`` block.
 
         Args:
-            *types: events of the fleet (``MemberLost``, ``PolicyCompleted`` …) and of vehicles (``ModeChanged`` …). The
-                latter arrive as :class:`MemberEvent` with the member's name. None: all of both.
+            *types: events of the fleet (``MemberLost``, ``PolicyCompleted`` …) and of vehicles (``ModeChanged`` …).
+                Events of vehicles arrive as :class:`MemberEvent` with the member's name. Without arguments: all events.
             capacity: maximum number of unread events.
-            overflow: what happens to an event that exceeds the capacity; ``missed`` of the stream counts them.
+            overflow: what happens to an event that exceeds the capacity; the stream's ``missed`` counts dropped events.
 
         Raises:
             InvalidArgument: a type is not an event.
@@ -166,7 +167,8 @@ class Fleet(Selection):
             *names: names of docs/states.md: ``"position"``, ``"batteries"`` …
             every_arrival: also report values that arrive unchanged.
             capacity: maximum number of unread updates.
-            overflow: what happens to an update that exceeds the capacity; ``missed`` of the stream counts them.
+            overflow: what happens to an update that exceeds the capacity; the stream's ``missed`` counts dropped
+                updates.
 
         Raises:
             InvalidArgument: a name is unknown, or none is given.

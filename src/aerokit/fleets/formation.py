@@ -1,4 +1,4 @@
-"""Formations: positions relative to a leader, flown once (``form``) or kept while it moves (``following``)."""
+"""Formations: positions relative to a leader, flown once (``form``) or kept while the leader moves (``following``)."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Offset(Snapshot):
     up_m: float = 0.0
 
     def turned(self, heading_deg: float) -> Offset:
-        """Convert from ahead and right of a vehicle with this heading to north and east."""
+        """Convert an offset ahead and right of a vehicle with this heading to an offset north and east."""
         angle = math.radians(heading_deg)
         return Offset(
             self.north_m * math.cos(angle) - self.east_m * math.sin(angle),
@@ -122,7 +122,7 @@ def follow_velocity(
     gain: float,
     max_speed_m_s: float,
 ) -> tuple[float, float, float]:
-    """Return the velocity to reach a moving target: its velocity plus ``gain`` times the distance vector.
+    """Return the velocity to reach a moving target: the target's velocity plus ``gain`` times the distance vector.
 
     Args:
         to_go: distance vector to the target in metres.
@@ -224,8 +224,8 @@ class Following:
                 # Wait for the cancellation by `_stop_if_leader_lost`: leaving the stream then makes the vehicle hold.
                 await asyncio.Event().wait()
         finally:
-            # Deferred, because the action has yet to record the failure, but not until the end of the action: the
-            # policy may still land the others.
+            # Deferred until the action has recorded the failure. The end of the action would be too late, because the
+            # policy may land the other members first.
             asyncio.get_running_loop().call_soon(self._stop_if_no_followers)
 
     def _stop_if_no_followers(self) -> None:
@@ -335,7 +335,8 @@ class Formations(Travel):
         for follower in followers:
             offset = formation.offset_of(follower.name, heading)
             there = here.offset(north_m=offset.north_m, east_m=offset.east_m, up_m=offset.up_m)
-            # Above sea level, because the homes of the followers may be at other altitudes than the leader's.
+            # Targets are above sea level, because the homes of followers may be at other altitudes than the leader's
+            # home.
             targets[follower.name] = (
                 there
                 if there.altitude_amsl_m is None
@@ -351,7 +352,7 @@ class Formations(Travel):
         """Keep a formation while the leader moves: ``async with fleet.following(formation, leader="north/1"):``.
 
         Each follower is flown by velocity set-points. If the leader is lost or taken over, the followers hold. If a
-        follower fails, the fleet's policy decides about the others.
+        follower fails, the fleet's policy decides about the other followers.
 
         Args:
             formation: the places.

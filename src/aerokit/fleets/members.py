@@ -31,7 +31,7 @@ class MemberState(enum.Enum):
     TAKEN_OVER = "taken over"
     """A pilot, a failsafe or another program controls the member. The fleet sends it no orders until ``reclaim``."""
     FAILED = "failed"
-    """The member failed in its last action. It takes part in the next one."""
+    """The member failed in its last action. It takes part in the next action."""
     RELEASED = "released"
     """The program released the member. The fleet sends it no orders until ``reclaim``."""
 
@@ -56,7 +56,7 @@ class Member:
         """The cause of the state; empty while it is ACTIVE."""
         self._lost_at = 0.0
         self._control_when_reclaimed: tuple[object, object] | None = None
-        # MAV_STATE when the program reclaimed the member: this failsafe does not count as a takeover.
+        # MAV_STATE at the time of `reclaim`. If this is a failsafe, it does not count as a takeover.
         self._ignored_failsafe: int | None = None
         self._detach: list[Detach] = []
         self._publish: Callable[[FleetEvent], None] = lambda _: None
@@ -69,7 +69,7 @@ class Member:
 
     @property
     def is_flown_by_program(self) -> bool:
-        """True while an order of this program flies it. Only then do policies and the distance monitor stop it."""
+        """True while this program's order flies the member. Only then do policies and the distance monitor stop it."""
         return self.is_available and self.vehicle.is_flown_by_program
 
     @property
@@ -97,7 +97,7 @@ class Member:
         ]
         if vehicle.is_silent:
             self._set_lost(vehicle.describe_link())
-        self.refresh()  # another program may have flown it before
+        self.refresh()  # another program may have flown the vehicle before
 
     def stop_monitoring(self) -> None:
         """Unsubscribe."""
@@ -145,7 +145,7 @@ class Member:
 
     def _takeover_reason(self) -> str:
         vehicle = self.vehicle
-        if vehicle.is_confirmed_disarmed:  # nothing to take over on the ground
+        if vehicle.is_confirmed_disarmed:  # on the ground, there is nothing to take over
             return ""
         state = vehicle.system_status.latest
         if state not in FAILSAFE_STATES:
@@ -162,7 +162,8 @@ class Member:
         return self.vehicle._arbiter.newest, self.vehicle.mode.latest
 
     def _refresh_soon(self, *_: object) -> None:
-        # Deferred until the whole HEARTBEAT is read: after a landing it reports disarming and a mode change together.
+        # Deferred until the whole HEARTBEAT is read, because it reports disarming and a mode change together after a
+        # landing.
         asyncio.get_running_loop().call_soon(self.refresh)
 
     def _on_silent(self, event: VehicleSilent) -> None:

@@ -41,7 +41,7 @@ TooCloseAction = Literal["hold", "report"]
 """Reaction to two members that come too close to each other in flight."""
 Source = str | Link | Connection | Vehicle
 
-DISCOVERY_S = 2.5  # two heartbeats at 1 Hz
+DISCOVERY_S = 2.5  # time for two heartbeats at 1 Hz
 WAIT_WARNING_S = 5.0
 
 
@@ -66,8 +66,8 @@ async def fleet(
     system 7 of network "north". Several networks can therefore use the same system ids.
 
     Args:
-        *sources: addresses, links or open connections, on which all vehicles found become members; or vehicle objects.
-            A mapping gives names to networks or vehicles; other networks are named ``"1"``, ``"2"`` …
+        *sources: addresses, links or open connections, whose vehicles all become members; or vehicle objects. A mapping
+            gives names to networks or vehicles; other networks are named ``"1"``, ``"2"`` …
         count: number of vehicles to wait for, in total; None: at least one on each network, plus those found in the
             next 2.5 seconds.
         system_ids: use these system ids only, on all networks or by network name; None: all that are found.
@@ -78,7 +78,8 @@ async def fleet(
         min_distance_m: minimum distance between any two members in metres. Paths are compared before flight, and the
             event ``TooClose`` reports violations in flight; None: no checks.
         on_too_close: ``"hold"``: both members hold, if this program flies them; ``"report"``: event only.
-        timeout: seconds to wait for all members. After five seconds logger "aerokit" warns which are missing.
+        timeout: seconds to wait for all members. After five seconds, a warning of the logger "aerokit" lists the
+            missing members.
         rates: message class → Hz, requested from each member instead of the default rates; ``{}`` requests nothing.
 
     Raises:
@@ -86,7 +87,7 @@ async def fleet(
         BusyError: this program already has a vehicle object for one of ``system_ids`` on that connection.
         LinkOpenError: a link could not be opened.
         LinkLost, ConnectionClosed: a link closed while waiting.
-        ConnectFailed: some members were not found in time; the text lists those that were.
+        ConnectFailed: some members were not found in time; the text lists the members found.
     """
     rules = PolicyRules(on_error, on_error_by_group or {})
     if min_distance_m is not None and not 0 < min_distance_m < 10_000:
@@ -217,11 +218,11 @@ async def find_systems(
     given: int,
     timeout: float,
 ) -> dict[str, list[int]]:
-    """Return the system ids to connect to, by network: the requested ones, or all found that have no vehicle object.
+    """Return the system ids to connect to, by network: the requested ids, or all found without a vehicle object.
 
     Args:
         networks: connections by name.
-        requested: system ids by network; None: find them.
+        requested: system ids by network; None: all that are found.
         count: total number to wait for, including ``given``.
         given: number of vehicles that the program passed to ``fleet()``.
         timeout: seconds.
@@ -312,7 +313,7 @@ class MemberConnections:
         self._all_closed = asyncio.Event()
 
     async def open(self, systems: Sequence[tuple[str, Connection, int]]) -> list[tuple[str, Vehicle]]:
-        """Connect to all systems, given as network, connection and system id; keeps their order."""
+        """Connect to all systems, given as network, connection and system id. The result is in the same order."""
         for number, (network, connection, system_id) in enumerate(systems):
             self._running += 1
             self._tasks.start(partial(self._run, number, network, connection, system_id))

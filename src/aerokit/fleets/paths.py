@@ -135,7 +135,7 @@ def horizontal_distance(one: tuple[LocalPoint, LocalPoint], other: tuple[LocalPo
 
 
 def _lower_bound(one: tuple[PathPoint, PathPoint], other: tuple[PathPoint, PathPoint]) -> float:
-    """Return a lower bound of the distance between two legs: that of their midpoints minus half of both lengths."""
+    """Return a lower bound of the distance of two legs: distance of the midpoints minus half of both lengths."""
     middles = [tuple((a + b) / 2 for a, b in zip(leg[0].place, leg[1].place, strict=True)) for leg in (one, other)]
     lengths = math.dist(one[0].place, one[1].place) + math.dist(other[0].place, other[1].place)
     return math.dist(*middles) - lengths / 2
@@ -182,7 +182,7 @@ def _closest(one: tuple[PathPoint, PathPoint], other: tuple[PathPoint, PathPoint
 def _closest_inside(
     between: Sequence[float], along: Sequence[float], others: Sequence[float]
 ) -> tuple[float, float] | None:
-    """Return the closest point of two lines if it is within both legs; None also for parallel lines."""
+    """Return the closest point of two lines; None if it is outside of a leg, or the lines are parallel."""
     aa, bb, ab = _dot(along, along), _dot(others, others), _dot(along, others)
     determinant = aa * bb - ab * ab
     if determinant <= TOLERANCE * max(aa * bb, TOLERANCE):

@@ -53,7 +53,7 @@ ORDERS: Mapping[str, PolicyOrder] = {
 
 
 class PolicyRules:
-    """The policy of a fleet and those of its groups. The group of the failed member selects the policy."""
+    """The policies of a fleet and of its groups. The group of the failed member selects the policy."""
 
     def __init__(self, policy: Policy, of_groups: Mapping[str, Policy]) -> None:
         for name, candidate in (
@@ -68,10 +68,10 @@ class PolicyRules:
         self._policy, self._of_groups = policy, dict(of_groups)
 
     def decide(self, failure: MemberFailure) -> dict[str, PolicyOrder]:
-        """Return the order for each of the others; members without an order continue.
+        """Return the orders for ``failure.others``; members without an order continue.
 
         Raises:
-            InvalidArgument: the policy function returned something else, or a name that is not among the others.
+            InvalidArgument: the policy function returned something else, or a name that is not in ``others``.
         """
         policy = self._of_groups.get(failure.group, self._policy)
         decided = policy(failure) if callable(policy) else policy
@@ -113,7 +113,7 @@ class FleetResult(Mapping[str, Any]):
         self.failed: dict[str, Exception] = dict(failed)
         """Members that failed, with their errors."""
         self.stopped: dict[str, Exception] = dict(stopped)
-        """Members that the policy stopped because another one failed."""
+        """Members that the policy stopped because another member failed."""
         self.skipped: dict[str, str] = dict(skipped)
         """Members that were not ordered, with the reason (lost, taken over); they are not in the mapping."""
         self._outcomes = dict(outcomes)
@@ -124,7 +124,7 @@ class FleetResult(Mapping[str, Any]):
         return not self.failed and not self.stopped
 
     def raise_for_errors(self) -> None:
-        """Raise FleetError if a member failed or was stopped; its ``errors`` has all of them."""
+        """Raise FleetError if a member failed or was stopped; ``FleetError.errors`` has all errors."""
         errors = {**self.failed, **self.stopped}
         if errors:
             done = len(self._outcomes) - len(errors)

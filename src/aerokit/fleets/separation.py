@@ -52,7 +52,7 @@ class Deconfliction(Snapshot):
     - ``"corridors"``: each vehicle starts after its delay in ``delays_s``;
     - ``"refused"``: the conflicts cannot be resolved.
 
-    ``conflicts`` are those of the original paths. Heights are metres above sea level.
+    ``conflicts`` has the conflicts of the original paths. Heights are metres above sea level.
     """
 
     decision: Literal["clear", "layers", "corridors", "refused"]
@@ -68,7 +68,7 @@ def find_conflicts(paths: Sequence[Path], min_distance_m: float, *, slack_s: flo
 
     Args:
         paths: paths of the vehicles.
-        min_distance_m: metres.
+        min_distance_m: minimum distance in metres.
         slack_s: how early or late one vehicle may be relative to another, in seconds; infinite: ignore times.
     """
     _check_distance(min_distance_m)
@@ -188,7 +188,7 @@ def _delays(
     slack_s: float,
     max_delay_s: float,
 ) -> tuple[dict[str, float], Route | None, str]:
-    """Return the delay of each route; and, if one would exceed the maximum, this route and the name of its blocker."""
+    """Return the delay of each route. If a delay exceeds the maximum, also return its route and the blocker's name."""
     placed: list[Path] = []
     delays: dict[str, float] = {}
     for route in order:
@@ -207,7 +207,7 @@ def _delays(
 
 
 def _vertical_conflict(routes: Sequence[Route], stationary: Mapping[str, LocalPoint], min_distance_m: float) -> str:
-    """Return why the vehicles cannot climb and descend vertically; empty if they can."""
+    """Return the reason why the vehicles cannot climb and descend vertically; empty if they can."""
     for what in ("start", "target"):
         ends = {route.name: getattr(route, what) for route in routes}
         # A stationary vehicle well below an end point is not on the vertical path above it.
@@ -252,7 +252,7 @@ def _check_distance(min_distance_m: float) -> None:
 
 METRES_PER_DEGREE = 111_319.5
 
-# Half of the 26 neighbours of a cube; the other half has this cube among theirs.
+# Half of the 26 neighbours of a cube, so that each pair of neighbouring cubes is compared once.
 NEIGHBOURS = tuple(step for step in product((-1, 0, 1), repeat=3) if step > (0, 0, 0))
 
 

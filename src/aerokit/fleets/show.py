@@ -54,7 +54,7 @@ class Show(Snapshot):
         """Return all pairs of tracks that come closer than ``min_distance_m``.
 
         Args:
-            min_distance_m: metres.
+            min_distance_m: minimum distance in metres.
             slack_s: maximum time offset between two vehicles in seconds.
         """
         return find_conflicts(list(self.tracks.values()), min_distance_m, slack_s=slack_s)
@@ -90,7 +90,7 @@ class Show(Snapshot):
         """Read a CSV or JSON file; the content decides which.
 
         Raises:
-            FileFormatError: the file is neither, or damaged; the text names the line or the track.
+            FileFormatError: the file is damaged, or neither CSV nor JSON; the text names the line or the track.
             OSError: the file cannot be read.
         """
         text = read_bounded(path).decode("utf-8-sig", errors="replace")

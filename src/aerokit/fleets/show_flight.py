@@ -210,10 +210,10 @@ def _interpolate(samples: Sequence[tuple[float, LocalPoint]], at_s: float) -> Lo
 
 
 class TrackRecorder:
-    """Records each GLOBAL_POSITION_INT in its block as seconds of the show and metres from its origin.
+    """Records each GLOBAL_POSITION_INT during its block, as seconds of the show and metres from the show's origin.
 
-    Uses the vehicle's own time (``time_boot_ms``) with its measured clock, or the time of arrival if that is
-    implausible.
+    The time is the vehicle's own (``time_boot_ms``), converted by means of its measured clock. If that is implausible,
+    the time is the time of arrival.
     """
 
     def __init__(self, vehicle: Vehicle, clock: ClockOffset, origin: LocalOrigin, begin: float, base_m: float) -> None:
@@ -221,7 +221,7 @@ class TrackRecorder:
         position = origin.to_position((0.0, 0.0, base_m))
         self._latitude, self._longitude = position.latitude_deg, position.longitude_deg
         self._north_m, self._east_m = _metres_per_degree(origin, self._latitude, self._longitude)
-        self.samples: list[tuple[float, LocalPoint]] = []  # from the start of the show
+        self.samples: list[tuple[float, LocalPoint]] = []  # times count from the start of the show
         self._latest: tuple[float, LocalPoint, LocalPoint] | None = None
         self._detach: Detach | None = None
 
@@ -307,7 +307,7 @@ class Shows(Travel):
         """Fly a show: all members fly to their first points, start at the same instant, and hold at the end.
 
         The members have to be in the air. Their clocks are measured with TIMESYNC, so that delayed telemetry does not
-        count as deviation. If a member fails, the fleet's policy decides about the others, as in any action.
+        count as deviation. If a member fails, the fleet's policy decides about the other members, as in any action.
 
         Args:
             show: tracks by member's name; :meth:`Show.renamed` assigns tracks to members.

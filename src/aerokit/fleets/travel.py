@@ -63,7 +63,7 @@ class Travel(SelectionBase):
             InvalidArgument: a name is unknown, or a target is too far away. Nothing was sent.
             ValueUnknownError: the position of a member is unknown. Nothing was sent.
             OperationRejected: paths come too close and cannot be separated: nothing was sent. Or a member became
-                unavailable between two legs in layers: the others stay in their layers.
+                unavailable between two legs in layers: the other members stay in their layers.
         """
         if speed_m_s is not None:
             check_range("speed_m_s", speed_m_s, 0, 1000, above=True)
@@ -99,8 +99,8 @@ class Travel(SelectionBase):
         Args:
             targets: as for :meth:`go_to`.
             min_distance_m: minimum distance between any two members in metres; None: that of the fleet.
-            by: ``"layers"``: separate crossing paths by altitude; ``"corridors"``: by time, which needs ``speed_m_s``;
-                ``"refuse"``: refuse crossing paths.
+            by: ``"layers"`` separates crossing paths by altitude, ``"corridors"`` by time, which needs ``speed_m_s``.
+                ``"refuse"`` refuses crossing paths.
             speed_m_s: ground speed of all members.
             max_altitude_m: highest layer in metres above sea level; None: no limit.
             slack_s: for corridors: how early or late a member may be relative to another, in seconds.
@@ -223,7 +223,7 @@ class Travel(SelectionBase):
         result: FleetResult | None = None
         for leg in legs:
             missing = [name for name in leg if not self.members[name].is_available]
-            if missing:  # its position is not under control, so it may be in the path of any other member
+            if missing:  # a missing member may be in the path of any other member
                 raise OperationRejected(
                     f"{action}: {', '.join(missing)} became unavailable between two legs; the others stay in their"
                     " layers"
@@ -272,7 +272,7 @@ class Missions(SelectionBase):
         Raises:
             InvalidArgument: a name is unknown, or a mission is invalid. Nothing was sent.
             OperationRejected: a member is unavailable, or paths come too close. Nothing was sent.
-            FleetError: an upload failed; ``start_missions`` will start none of them.
+            FleetError: an upload failed; ``start_missions`` will start no mission.
         """
         if max_concurrent < 1:
             raise InvalidArgument(f"max_concurrent = {max_concurrent!r} is not allowed: at least 1")
@@ -309,7 +309,7 @@ class Missions(SelectionBase):
             stagger_s: delay in seconds between the starts of consecutive members; None: all at once.
 
         Raises:
-            OperationRejected: no upload succeeded for all members, or a member is unavailable or not armed. Nothing was
+            OperationRejected: the last upload failed for a member, or a member is unavailable or not armed. Nothing was
                 sent.
         """
         names = tuple(name for name in self._context.missions if name in self.members)
@@ -330,7 +330,7 @@ class Missions(SelectionBase):
         """Wait until each member has finished its mission; see ``vehicle.mission.wait_finished``.
 
         Args:
-            timeout: seconds until all of them have; None: no limit.
+            timeout: seconds until all members have finished; None: no limit.
         """
         names = tuple(name for name in self._context.missions if name in self.members)
         return await self._run(

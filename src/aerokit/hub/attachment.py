@@ -153,7 +153,7 @@ class Attachment:
             if frames:
                 port = self._ports.get(port_peer) or self._add_port(port_peer)
                 self._switch.take(port, framer, frames, data, now)
-                if port_peer != peer:  # the peer that answered a broadcast
+                if port_peer != peer:  # this peer has answered a broadcast
                     self.link.keep_peer(peer)
         except Exception as error:
             self._report(self, "internal_error", f"internal error of aerokit: {error!r}")

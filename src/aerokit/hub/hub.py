@@ -52,8 +52,8 @@ class Hub:
     ```
 
     Each client of a listening endpoint is routed separately. Lost links are reopened. An endpoint that fails, stalls or
-    is flooded does not affect the others: its queue is bounded, newer telemetry replaces older telemetry, and a command
-    that has waited for a second is dropped.
+    is flooded does not affect other endpoints: its queue is bounded, newer telemetry replaces older telemetry, and a
+    command that has waited for a second is dropped.
 
     A hub runs in the asyncio loop in which it is entered, and can be entered once.
     """
@@ -63,7 +63,7 @@ class Hub:
 
         Args:
             endpoints: connection strings, unopened links, or `Endpoint` with filters.
-            dialect: known messages; others are forwarded to all endpoints, unchecked.
+            dialect: known messages; unknown messages are forwarded to all endpoints, unchecked.
 
         Raises:
             InvalidArgument: an address or a message name is wrong, or two endpoints have the same name.
@@ -147,9 +147,10 @@ class Hub:
     async def share(self, connection: Connection, *, name: str = "program") -> EndpointStatistics:
         """Add an open connection of this program as an endpoint.
 
-        The connection continues as before. The other endpoints get every frame that it receives or sends. Their frames
-        for its vehicles are sent over the connection, signed if the connection signs. Other stations must not use this
-        program's ids (``source_system``, ``source_component``), because frames for these ids go to the program.
+        The connection continues as before. The other endpoints get every frame that the connection receives or sends.
+        Frames of these endpoints for the connection's vehicles are sent over the connection, signed if the connection
+        signs. Other stations must not use this program's ids (``source_system``, ``source_component``), because frames
+        for these ids go to the program.
 
         Raises:
             InvalidArgument: an endpoint has this name already.

@@ -36,7 +36,7 @@ ORDER_MAX_AGE_S = 1.0
 
 
 class Filters:
-    """Select the messages that an endpoint sends: those that match ``only`` (all if empty) and not ``block``.
+    """Selects the messages that an endpoint sends: those that match ``only`` (all if empty) and not ``block``.
 
     Patterns may contain wildcards: ``"GPS_*"``. ``rates`` maps patterns to the maximum rate per sender in Hz; the first
     matching pattern applies. Wildcards do not limit `ANSWERS`.
@@ -94,7 +94,7 @@ class MessageKind(Enum):
     """How a queued message is treated."""
 
     TELEMETRY = "telemetry"
-    """Replaced by a newer one of the same sender."""
+    """Replaced by newer telemetry of the same sender with the same message id."""
     TRANSFER = "transfer"
     """Kept in order, never replaced: part of a transfer, an answer, a text."""
     ORDER = "order"
@@ -178,7 +178,7 @@ STANDARD_OFFSETS: dict[tuple[int, int | None], tuple[int, ...]] = {
     (79, 80): (126,),
 }  # fmt: skip
 
-# An offset beyond the end of every frame: the field does not exist.
+# An offset beyond the end of every frame, for a field that does not exist.
 NO_FIELD = 1 << 16
 
 # Offsets in `Frame.body` of the target's system id and component id.

@@ -38,15 +38,15 @@ class QueuedFrame(NamedTuple):
 class FrameQueue:
     """Queue in which newer telemetry replaces older telemetry with the same message id and sender.
 
-    When the queue is full, the oldest telemetry is dropped first, then the new frame.
+    When the queue is full, the oldest telemetry is dropped. If there is none, the new frame is dropped.
     """
 
     def __init__(self) -> None:
-        # In order. Keys: sender and message for telemetry, negative numbers for all others.
+        # Frames in order. The key is sender and message for telemetry, and a negative number for other frames.
         self._frames: dict[int, QueuedFrame] = {}
         self._bytes = 0
         self._count = 0
-        self._orders = self._telemetry = 0  # counts, to skip searches
+        self._orders = self._telemetry = 0  # numbers of queued frames, so that needless searches are skipped
 
     def __len__(self) -> int:
         return len(self._frames)
@@ -114,7 +114,7 @@ def _reframed(frame: Frame, crc_extra: bytes, *, flags: int) -> bytes:
 
 
 class SigningGateway:
-    """Signs frames that leave an endpoint; verifies and removes the signatures of received ones.
+    """Signs frames that leave an endpoint; verifies and removes the signatures of received frames.
 
     ``unix_time`` is in seconds since 1970. MAVLink 1 frames are sent as MAVLink 2, and refused on reception unless
     ``allow_unsigned`` of the `Signing` accepts them. Messages outside the dialect cannot be signed, because their
@@ -157,7 +157,7 @@ class SigningGateway:
 MAX_JOINED_BYTES = 1200
 """Frames sent together are joined up to this size, so that their datagram is not fragmented."""
 UNLIMITED = 1 << 62
-_INCOMPLETE = -1 << 62  # equals no number of bytes
+_INCOMPLETE = -1 << 62  # a value that equals no number of bytes
 MAX_RATE_LIMITS = 4096
 """Maximum number of (sender, message) pairs whose rate is tracked."""
 
@@ -175,7 +175,7 @@ class Port:
     """One peer of one endpoint.
 
     While the link accepts data, frames are collected in ``batch`` until the end of the loop iteration. While more than
-    ``hold_above`` bytes are unsent (`UNLIMITED`: not checked), frames wait in a `FrameQueue`.
+    ``hold_above`` bytes are unsent, frames wait in a `FrameQueue`. `UNLIMITED` turns this check off.
 
     ``endpoint`` is the endpoint's name, ``period(message_id)`` is `Filters.period`. ``report(kind, text)`` publishes an
     event of the endpoint; ``on_drop(reason, frame)`` is called for each frame dropped from the queue.
@@ -215,7 +215,7 @@ class Port:
         self.batch: list[bytes] = []
         """Data to write: single frames, or pieces of several."""
         self.joined_frames = 0
-        """Number of frames in ``batch`` above the number of its pieces."""
+        """Number of frames in ``batch``, minus the number of its pieces."""
         self.node: RouterPort[Port] | None = None
         self._dialect = dialect
         self._hold_above, self._may_hold = hold_above, hold_above < UNLIMITED
@@ -238,7 +238,7 @@ class Port:
         return self.gateway is None and not self.writes_single_frames
 
     def is_whole(self, framer: Framer, data: bytes) -> bool:
-        """Return True if ``data``, the last that was received, consists of nothing but whole valid frames."""
+        """Return True if ``data``, the last data received, consists of whole valid frames only."""
         before = self._framed_bytes
         statistics = framer.statistics
         self._framed_bytes = _INCOMPLETE if framer.waiting else statistics.bytes - statistics.bad_bytes
@@ -307,7 +307,7 @@ class Port:
 
 
 def joined(batch: list[bytes]) -> list[bytes]:
-    """Join pieces to larger ones of at most `MAX_JOINED_BYTES`. Pieces that are larger themselves stay alone."""
+    """Join pieces to larger pieces of at most `MAX_JOINED_BYTES`. Larger pieces are not joined."""
     whole = b"".join(batch)
     if len(whole) <= MAX_JOINED_BYTES:
         return [whole] if whole else []

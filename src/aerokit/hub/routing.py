@@ -58,15 +58,17 @@ class ForwardingPlan(Generic[PortT]):
         self.target: tuple[int, int] = target
         """System id and component id; 0 means all."""
         self.outs: tuple[PortT, ...] = outs
-        """Ports that get each frame. Equal ones of one port are the same object, so that they are cheap to compare."""
+        """Ports that get each frame. Equal tuples in the plans of one port are one object, so comparing them is cheap.
+        """
         self.rate_limited: tuple[tuple[PortT, float], ...] = rate_limited
         """Ports that get at most one frame per interval, with the interval in seconds."""
         self.reason: str = reason
-        """Reason for dropping the frames, a key of `EndpointStatistics.dropped`; "" if there is only no destination."""
+        """Reason for dropping the frames, a key of `EndpointStatistics.dropped`; "" if only the destination is missing.
+        """
         self.is_plain: bool = not (rate_limited or reason)
         """True if each frame goes to `outs`, and nothing else is to be done."""
         self.sender: Sender = sender
-        """The sender, in the plans of `RouterPort.streams`."""
+        """The sender of the frames; used in the plans of `RouterPort.streams`."""
         self.identity: int = sender.source << 24
         """The sender's part of the numbers in `RecentFrames`."""
 
@@ -82,7 +84,8 @@ class RouterPort(Generic[PortT]):
         """Unique number above 0."""
         self.plans: dict[int, ForwardingPlan[PortT]] = {}
         self.streams: dict[bytes, ForwardingPlan[PortT]] = {}
-        """Sender and message, as in a frame → plan, for broadcasts of senders that are reached by this port."""
+        """Maps sender and message, as bytes of a frame, to the plan for broadcasts of senders that this port reaches.
+        """
         self.destinations: dict[tuple[PortT, ...], tuple[PortT, ...]] = {}
         self.echoes: dict[int, int] = {}
         """Maps senders to the number of returning frames minus the number of new frames at this port."""
@@ -101,15 +104,15 @@ class Router(Generic[PortT]):
     - A broadcast goes to all other ports. A broadcast command skips ports through which it would reach a vehicle twice.
     - A message for one component or system goes to the ports at which its target was received. It is dropped if the
       target is unknown. A message for an unknown component of a known system goes to the ports of the system.
-    - A vehicle that is received at several ports gets messages through the first port until that is silent for 3.5 s,
-      so that no command arrives twice. A message for a system goes to its autopilot in this way, and also to ports that
-      only reach other components of it. Ground stations that share ids all get their messages.
-    - A frame never goes back to its port, and is forwarded once. Copies at other ports within two seconds are
-      dropped, and later copies if they prove a loop. Copies do not change routes.
+    - A vehicle that is received at several ports gets messages through the first port until that port is silent for 3.5
+      s, so that no command arrives twice. A message for a system goes to the autopilot in this way, and also to ports
+      that only reach other components of the system. Ground stations that share ids all get the messages for these ids.
+    - A frame never goes back to the port at which it arrived, and is forwarded once. Copies that arrive at other ports
+      within two seconds are dropped. Later copies are dropped if they prove a loop. Copies do not change routes.
     - SETUP_SIGNING, which contains a key, is not forwarded. Status messages of telemetry radios do not go to vehicles.
 
-    At most `MAX_ROUTES` senders are remembered. A new sender replaces one without heartbeats, or one that was silent
-    for `PEER_TTL_S`. If there is neither, messages for the new sender are dropped.
+    At most `MAX_ROUTES` senders are remembered. A new sender replaces a sender without heartbeats, or a sender that was
+    silent for `PEER_TTL_S`. If there is none, messages for the new sender are dropped.
 
     ``period(port, message_id)`` returns the minimum interval of a message at a port in seconds: None if the message
     does not go there, 0 without a limit. The interval applies per sender, to broadcasts only.
@@ -157,8 +160,8 @@ class Router(Generic[PortT]):
     def route_all(
         self, node: RouterPort[PortT], frames: list[Frame], now: float, late: list[Frame]
     ) -> list[ForwardingPlan[PortT]]:
-        """Return the plans for frames received together at ``node``. ``late``: those with a number out of order."""
-        # Hot path: what :meth:`route` does for a new frame of a stream; it does the rest.
+        """Return the plans for frames received together at ``node``. ``late``: frames with a number out of order."""
+        # Hot path for new frames of known streams. :meth:`route` processes all other frames.
         recent, streams, number = self._recent, node.streams, node.number
         if late or node.echoes or now >= recent.ends_at or len(recent.newer) + len(frames) > MAX_RECENT_FRAMES:
             return [self.route(node, frame, now, frame in late) for frame in frames]
@@ -256,10 +259,10 @@ class Router(Generic[PortT]):
             self._report("route_changed", sender.source, node, before)
 
     def _is_copy(self, before: tuple[int, int, float], number: int, now: float, is_late: bool) -> bool:
-        """Return True if a frame is a copy of an earlier one, not the first frame of a restarted program.
+        """Return True if a frame is a copy of an earlier frame, not the first frame of a restarted program.
 
-        A restarted program starts its sequence numbers again. Its first command may equal an earlier one and must not
-        be lost. It arrives at a new port after the former port was removed, or at the same port after a while.
+        A restarted program starts its sequence numbers again. The first command may equal an earlier command and must
+        not be lost. It arrives at a new port after the former port was removed, or at the same port after a while.
         """
         first, count, at = before
         if first == number:
@@ -267,7 +270,7 @@ class Router(Generic[PortT]):
         return first in self._nodes and number <= count and now - at <= DUPLICATE_WINDOW_S
 
     def _is_echo(self, before: tuple[int, int, float], number: int, now: float) -> bool:
-        """Return True if an equal frame arrived at another port before: by chance, or because of a loop."""
+        """Return True if an equal frame arrived at another port before, be it by chance or because of a loop."""
         first, count, at = before
         return first != number and number <= count and now - at <= LOOP_WINDOW_S
 
@@ -351,8 +354,8 @@ class Router(Generic[PortT]):
         autopilots = [sender for sender in known if sender.is_autopilot]
         found: dict[int, None] = {}
         for sender in sorted(known, key=lambda sender: not sender.is_autopilot):
-            # A component is already reached if one of its ports is chosen. Ports at which the autopilot is received too
-            # are skipped, because it would get the command twice.
+            # A component is already reached if one of its ports is chosen. Ports at which the autopilot is received,
+            # too, are skipped, because the autopilot would get the command twice.
             is_reached = sender.is_vehicle and any(sender.is_at(number) for number in found)
             if not is_reached:
                 found.update(

@@ -31,7 +31,7 @@ It is below 256 s, after which the sequence numbers of a component that sends on
 """
 
 MIN_LOOP_FRAMES = 8
-"""Returning frames of one sender that prove a loop. Fewer may be equal by chance, if a vehicle has two radios."""
+"""Number of returning frames of one sender that proves a loop. Fewer may be equal by chance, with two radios."""
 
 MAX_RECENT_FRAMES = 1 << 15
 
@@ -66,7 +66,7 @@ class Sender:
         self.ports: dict[int, float] = {number: now}
         """Maps port numbers to the time of the last frame there; for `number`, use :attr:`received_at`."""
         self.is_vehicle: bool = False
-        """True if its HEARTBEAT is not that of a ground station. Messages for it then go to one port only."""
+        """True if its HEARTBEAT is not that of a ground station. Messages for a vehicle go to one port only."""
         self.is_autopilot: bool = False
         self.reported: set[int] = set()
         """Ports already known to lead to this autopilot."""
@@ -112,7 +112,8 @@ class RecentFrames:
     __slots__ = ("ends_at", "newer", "older")
 
     def __init__(self) -> None:
-        # Sender, sequence number and checksum as one number → port number, number of ports created so far, time.
+        # Maps sender, sequence number and checksum (as one number) to (port number, number of ports created so far,
+        # time).
         self.newer: dict[int, tuple[int, int, float]] = {}
         self.older: dict[int, tuple[int, int, float]] = {}
         self.ends_at: float = float("-inf")

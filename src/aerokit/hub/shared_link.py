@@ -53,7 +53,7 @@ class SharedLink(Link):
         ]
 
     def write(self, data: bytes, peer: Peer = None) -> None:
-        """See `Link.write`. Frames are signed if the connection signs; those for this program are dropped."""
+        """See `Link.write`. Frames are signed if the connection signs. Frames for this program are dropped."""
         if self._receiver is None:
             return
         for raw in _frames(data):
@@ -89,7 +89,7 @@ class SharedLink(Link):
         """See `Link.wait_closed`."""
 
     def _check_ids(self, frame: Frame) -> None:
-        """Report another station with our ids, because each would process the vehicle's answers to the other."""
+        """Report another station with our ids, because both stations would process the vehicle's answers to either."""
         ours = self._connection.source_system, self._connection.source_component
         if (frame.system_id, frame.component_id) == ours:
             self._is_duplicate_reported = True
@@ -112,7 +112,7 @@ class SharedLink(Link):
             self._receiver.bytes_received(unsigned, None)
 
     def _on_end(self, error: Exception) -> None:
-        # In the next loop iteration, because the connection may have ended inside a write.
+        # Report the loss in the next loop iteration, because the connection may have ended inside a write.
         self._loss_report = asyncio.get_running_loop().call_soon(self._report_loss, error)
 
     def _report_loss(self, error: Exception) -> None:

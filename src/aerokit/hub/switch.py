@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.framer import Framer
 
-# Interval at which full links are polled. It is doubled while no link accepts data.
+# Interval at which full links are polled. The interval is doubled while no link accepts data.
 MIN_POLL_INTERVAL_S = 0.01
 MAX_POLL_INTERVAL_S = 0.08
 
@@ -118,7 +118,7 @@ class Switch:
                     self._on_error(port, error)
 
     def _admitted(self, port: Port, framer: Framer, frames: list[Frame]) -> tuple[list[Frame], list[Frame]]:
-        """Return the frames that the sender may send, without signatures, and those of them that are out of order."""
+        """Return the frames that the sender may send, without signatures, and the out-of-order frames among them."""
         admitted: list[Frame] = []
         late: list[Frame] = []
         gateway, guard, peer = port.gateway, port.guard, port.peer
@@ -135,7 +135,7 @@ class Switch:
         return admitted, late
 
     def _forward_together(self, plans: list[ForwardingPlan[Port]], data: bytes) -> bool:
-        """Forward the frames of ``data`` unchanged if all go to the same ports in one datagram. Return False if not."""
+        """Forward the frames of ``data`` unchanged if all go to the same ports in one datagram. Else return False."""
         outs = plans[0].outs
         for plan in plans:
             if plan.outs is not outs or not plan.is_plain:

@@ -47,9 +47,9 @@ class Endpoint(Snapshot):
     peers: PeerFilter | None = None
     """IP addresses and networks to accept, for udpin, udpbcast and tcpin; None: all."""
     baud: int = 57600
-    """Bits per second of a serial link whose address has none."""
+    """Bits per second of a serial link whose address does not give them."""
     retry_open: bool = False
-    """True to start the hub even if this endpoint cannot be opened, and to retry. For servers that start later."""
+    """True to start the hub even if this endpoint cannot be opened yet (a server that starts later), and to retry."""
 
     def _check(self) -> None:
         if not isinstance(self.address, (str, Link)):
@@ -94,13 +94,13 @@ class EndpointStatistics(Snapshot):
     peers: int
     """Number of clients or senders."""
     frames_in: int
-    """Valid frames, including refused and duplicate ones."""
+    """Valid frames, including refused frames and duplicates."""
     bytes_in: int
     frames_out: int
     bytes_out: int
     """Bytes written; writes that the link dropped are counted in ``dropped["link"]``."""
     lost: int
-    """Frames lost before they arrived here, by sequence numbers."""
+    """Number of frames that were lost before this endpoint, by sequence numbers."""
     bad_bytes: int
     """Bytes outside valid frames."""
     waiting: int
@@ -108,10 +108,10 @@ class EndpointStatistics(Snapshot):
     dropped: Mapping[str, int]
     """Number of dropped frames by reason.
 
-    Received: ``no_route`` (unknown target), ``duplicate``, ``loop``, ``read_only``, ``refused`` (signature),
-    ``foreign`` (another peer has the ids of this autopilot), ``secret`` (SETUP_SIGNING), ``unknown`` (message outside
-    the dialect, from an unknown sender). Sent: ``late`` (commands), ``queue_full``, ``superseded``, ``rate_limited``
-    (telemetry), ``link_lost``, ``unsignable``, ``link``.
+    Reasons for received frames: ``no_route`` (unknown target), ``duplicate``, ``loop``, ``read_only``, ``refused``
+    (signature), ``foreign`` (another peer has the ids of this autopilot), ``secret`` (SETUP_SIGNING), ``unknown``
+    (message outside the dialect, from an unknown sender). Reasons for frames to send: ``late`` (commands),
+    ``queue_full``, ``superseded``, ``rate_limited`` (telemetry), ``link_lost``, ``unsignable``, ``link``.
     """
     systems: tuple[tuple[int, int], ...]
     """(system id, component id) of all senders received here."""

@@ -1,6 +1,6 @@
 """Parser of MAVLink XML, for the generator and for dialects that are loaded at run time.
 
-See https://mavlink.io/en/guide/xml_schema.html, and for the order of fields and for CRC_EXTRA
+Format: https://mavlink.io/en/guide/xml_schema.html. Field order and CRC_EXTRA:
 https://mavlink.io/en/guide/serialization.html.
 """
 
@@ -82,7 +82,7 @@ class MessageDefinition:
     fields: tuple[FieldDefinition, ...]
     description: str = ""
     origin: str = ""  # name of the XML file without suffix
-    remarks: tuple[str, ...] = ()  # deprecated, superseded, work in progress
+    remarks: tuple[str, ...] = ()  # e.g. that the message is deprecated, superseded or work in progress
 
     @property
     def class_name(self) -> str:
@@ -129,7 +129,7 @@ class EntryDefinition:
 
 @dataclass(frozen=True)
 class EnumDefinition:
-    """One enum, with the entries of one file, or of all files after `merged_enums`."""
+    """One enum. It has the entries of one file or, after `merged_enums`, of all files."""
 
     name: str
     entries: tuple[EntryDefinition, ...]
@@ -137,7 +137,7 @@ class EnumDefinition:
     description: str = ""
     origin: str = ""
     remarks: tuple[str, ...] = ()
-    own_prefix: str = ""  # see `prefix`; empty: derived from the entries
+    own_prefix: str = ""  # value of `prefix`; empty: derive the prefix from the entries
 
     @property
     def class_name(self) -> str:
@@ -168,7 +168,7 @@ class DialectDefinition:
 def cap_words(name: str) -> str:
     """Convert ``GLOBAL_POSITION_INT`` to ``GlobalPositionInt``."""
     words = "".join(part.capitalize() for part in name.split("_"))
-    return words + "_" if keyword.iskeyword(words) else words  # None, True, False
+    return words + "_" if keyword.iskeyword(words) else words  # for None, True and False
 
 
 def read_dialect(path: Path, search: Sequence[Path] = ()) -> list[DialectDefinition]:
@@ -196,7 +196,7 @@ def read_dialect(path: Path, search: Sequence[Path] = ()) -> list[DialectDefinit
 
 
 def read_xml(path: Path) -> DialectDefinition:
-    """Read one file without its includes. InvalidArgument if it is not MAVLink XML."""
+    """Read one file without its includes. Raises InvalidArgument if the file is not MAVLink XML."""
     from xml.etree.ElementTree import ParseError  # not needed for definitions from pymavlink
 
     from defusedxml import ElementTree as DefusedXml
@@ -238,7 +238,7 @@ def merged_enums(dialects: Iterable[DialectDefinition]) -> list[EnumDefinition]:
 def _find_include(include: str, file: Path, search: Sequence[Path]) -> Path:
     folders = [file.parent, *search]
     for folder in folders:
-        if os.path.isfile(folder / include):  # unlike Path.is_file, it does not raise for long names
+        if os.path.isfile(folder / include):  # unlike Path.is_file, os.path.isfile does not raise for long names
             return folder / include
     looked = ", ".join(str(folder) for folder in folders)
     raise InvalidArgument(f"{file.name} includes {include}, which is in none of: {looked}")

@@ -1,8 +1,8 @@
 """`Dialect`: maps message ids to message classes.
 
 `STANDARD` has all generated messages: minimal, standard, common and development of MAVLink, and ardupilotmega with its
-includes. Other dialects are read at run time from an XML file or a pymavlink module. Messages that they share with the
-standard have the same classes, so that ``isinstance(message, messages.Heartbeat)`` works.
+includes. Other dialects are read at run time from an XML file or a pymavlink module. Messages that another dialect
+shares with the standard have the same classes, so that ``isinstance(message, messages.Heartbeat)`` works.
 """
 
 from __future__ import annotations
@@ -114,12 +114,13 @@ class Dialect:
         return self._decoders[frame.message_id](frame.body, frame)
 
     def _decode_first(self, message_id: int, body: bytes, frame: Frame | None) -> Message:
-        # Replaces itself by the decoder of the class, so that `decode` needs no check whether the class is loaded.
+        # This function replaces itself by the decoder of the class, so that `decode` need not check if the class is
+        # loaded.
         decoder = self._decoders[message_id] = decoder_of(self[message_id])
         return decoder(body, frame)
 
     def extended_by(self, other: Dialect) -> Dialect:
-        """Return a dialect with the messages of both. InvalidArgument if they define an id differently."""
+        """Return a dialect with the messages of both dialects. InvalidArgument if an id is defined differently."""
         for message_id in self.rows.keys() & other.rows.keys():
             if self.rows[message_id] != other.rows[message_id]:
                 raise InvalidArgument(

@@ -21,7 +21,7 @@ _BYTES = tuple(bytes((number,)) for number in range(256))
 class FrameEncoder:
     """Adds ids, sequence number, checksum and signature of one component to its messages.
 
-    Use one for each link, so that the peer can detect losses.
+    Use a separate encoder for each link, so that the peer can detect losses.
     """
 
     _encode_frame: Any = None if wire is None else wire.encode_frame
@@ -71,7 +71,7 @@ class FrameEncoder:
             if compiled is not None:
                 self.sequence = (self.sequence + 1) & 0xFF
                 return compiled if signing is None else compiled + signing.sign(compiled, now)
-            layout_of(type(message))  # for its next message
+            layout_of(type(message))  # compiles the layout for the next message of this type
         payload = message.encode()
         number = message.ID
         if self._version == 2:

@@ -28,7 +28,7 @@ class Frame(FrameFields):
     """One frame with a valid checksum. Treat it as immutable, because all receivers share it."""
 
     # No constructor, for speed: the framer sets the attributes, and properties compute the rest.
-    if not TYPE_CHECKING:  # those of the base class
+    if not TYPE_CHECKING:  # type checkers see the attributes of the base class
         __slots__ = ()
 
     body: bytes
@@ -41,7 +41,7 @@ class Frame(FrameFields):
     """System id of the sender, 0..255 (0 is invalid)."""
     component_id: int
     """Component id of the sender, 0..255."""
-    _raw: bytes  # only if `raw` cannot be reconstructed: MAVLink 1, signed or parsed frames
+    _raw: bytes  # set only if `raw` cannot be reconstructed: for MAVLink 1, signed frames and parsed frames
     received_at: float
     """Time in seconds that was passed to the framer with the data."""
 

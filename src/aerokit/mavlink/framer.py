@@ -1,9 +1,13 @@
 """`Framer`: extracts frames from bytes.
 
 The input may be datagrams or a stream cut anywhere, with noise and text between frames. The framer never raises. At
-each byte that could start a frame, it applies these rules in order: a frame with a valid checksum is returned; after a
-plausible header, it waits for the rest; anything else is skipped one byte at a time, so that a valid frame after noise
-is found. https://mavlink.io/en/guide/serialization.html
+each byte that could start a frame, it applies these rules in order:
+
+- A frame with a valid checksum is returned.
+- After a plausible header, the framer waits for the rest of the frame.
+- Anything else is skipped one byte at a time, so that a valid frame after noise is found.
+
+https://mavlink.io/en/guide/serialization.html
 """
 
 from __future__ import annotations
@@ -30,13 +34,13 @@ _CHECKSUM = Struct("<H").unpack_from
 _MIN_LENGTH_V2 = 12
 _MIN_LENGTH_V1 = 8
 _MAGICS = (MAGIC_V1, MAGIC_V2)
-# Possible starts of frames; of version 2 only with known flags, or truncated before them.
+# Possible starts of frames. MAVLink 2 frames must have known flags, unless the data ends before the flags.
 _magics = re.compile(rb"\xfe|\xfd(?=\Z|.\Z|.[\x00\x01])", re.DOTALL).finditer
 
 # Verdicts about a position in the data.
 _GOOD = 0  # a whole frame with a valid checksum
 _WAIT = 1  # the beginning of a plausible frame
-_IMPLAUSIBLE = 2  # the beginning of an implausible frame: wait, but examine what follows
+_IMPLAUSIBLE = 2  # the beginning of an implausible frame: wait for the rest, but also examine the bytes that follow
 _UNKNOWN = 3  # looks like a whole frame of an unknown message
 _BAD_CRC = 4
 _NOISE = 5
@@ -45,7 +49,8 @@ _NOISE = 5
 _Found = tuple[int, int, int, int, int]
 
 # State of the data that is kept: how far it was examined, candidates (begin, verdict, size at which to examine again),
-# and positions of bad checksums. It avoids examining the same bytes again while others arrive one by one.
+# and positions of bad checksums. This state avoids examining the same bytes again while further bytes arrive one by
+# one.
 _ScanState = tuple[int, list[tuple[int, int, int]], list[int]]
 _NEW_SCAN: _ScanState = (0, [], [])
 
@@ -63,9 +68,9 @@ class PythonFramer:
         self.statistics: FramerStatistics = FramerStatistics()
         """Counters since the beginning."""
         self.late: list[Frame] = []
-        """Frames of the last `receive` that newer ones of their sender have overtaken, and repeated ones."""
+        """Frames of the last `receive` call that arrived after newer frames of their sender, and repeated frames."""
         self.foreign: list[Frame] = []
-        """Frames of the last `receive` from another sender with the same ids."""
+        """Frames of the last `receive` call that came from a second sender with the same ids."""
         self._rest = b""
         self._scan = _NEW_SCAN
         self._unknown: list[bytes] = []
@@ -86,7 +91,8 @@ class PythonFramer:
         if self.late or self.foreign:
             self.late, self.foreign = [], []
         elif size >= _MIN_LENGTH_V2 and not self._rest:
-            # Most datagrams are a single valid frame in sequence: a sixth faster than the loop below.
+            # Most datagrams are a single valid frame in sequence. For these, this path is a sixth faster than the loop
+            # below.
             magic, length, flags, sequence, key, message_id = _HEADER_V2(data)
             upto = 10 + length
             end = upto + (2 + SIGNATURE_LENGTH if flags else 2)
@@ -182,11 +188,11 @@ class PythonFramer:
         self._rest = b""
 
     def close(self) -> None:
-        """Release the framer's senders in a shared `SourceLimit`. Do not use it afterwards."""
+        """Release the framer's senders in a shared `SourceLimit`. Do not use the framer afterwards."""
         self._limit.leave(self.statistics)
 
     def counters_of(self, frame: Frame) -> SourceStatistics | None:
-        """Return the counters of a frame's sender, or None if it has no separate ones."""
+        """Return the counters of a frame's sender, or None if the sender has no counters of its own."""
         return self._sources.get(frame.component_id << 8 | frame.system_id)
 
     @property
@@ -195,7 +201,7 @@ class PythonFramer:
         return len(self._rest)
 
     def _sort_out(self, frames: list[Frame], out_of_order: list[tuple[int, int, int]]) -> None:
-        # Unwanted frames are not in the list, so the frame at that position may be another one.
+        # Unwanted frames are not in the list, so the list may have a different frame at that position.
         for place, verdict, which in out_of_order:
             if place < len(frames):
                 frame = frames[place]
@@ -205,10 +211,10 @@ class PythonFramer:
     # -------------------------------------------------------------------------------- slow path
 
     def _search(self, data: bytes, begin: int, scan: _ScanState) -> _Found | None:
-        """Find the next valid frame from ``begin`` on. Otherwise keep in ``_rest`` what may become one, return None."""
+        """Return the next valid frame from ``begin`` on, or keep possible beginnings of frames in ``_rest``."""
         size = len(data)
-        hold = -1  # data is kept from here on
-        unknown = unknown_end = -1  # a whole frame of an unknown message, unless it contains a valid one
+        hold = -1  # position from which data is kept
+        unknown = unknown_end = -1  # a whole frame of an unknown message, unless it contains a valid frame
         examined, candidates, bad_crcs = scan
         pending: list[tuple[int, int, int]] = []
         bad_crcs = list(bad_crcs)
@@ -314,7 +320,7 @@ class PythonFramer:
 
 def _earliest(hold: int, unknown: int, here: int) -> int:
     """Return the start of the data to keep: the earliest candidate for a frame, at ``here`` or before."""
-    if unknown >= 0:  # earlier than `hold`, because it is set only while `hold` is not
+    if unknown >= 0:  # `unknown` is set only while `hold` is not, so it is earlier
         return unknown
     return here if hold < 0 else hold
 
@@ -324,7 +330,7 @@ if TYPE_CHECKING or wire is None:
 else:
 
     class Framer(wire.FramerFields, PythonFramer):
-        """`PythonFramer` with a compiled `receive`, which calls these methods for what is rare."""
+        """`PythonFramer` with a compiled `receive`, which calls the methods in Python for rare cases."""
 
         def __init__(self, dialect: Dialect = STANDARD, limit: SourceLimit | None = None) -> None:
             PythonFramer.__init__(self, dialect, limit)
@@ -332,7 +338,8 @@ else:
             self._out_of_order: list[tuple[int, int, int]] = []
 
         def _find(self, data: bytes, begin: int, kept: int, now: float, frames: list[Frame]) -> int | None:
-            # `kept` is 2 if `_scan` describes the beginning of the data, 1 if that was a single plausible frame.
+            # `kept` is 2 if `_scan` describes the kept data, and 1 if the kept data is the beginning of one plausible
+            # frame.
             scan = self._scan if kept == 2 else (1, [(0, _WAIT, 0)], []) if kept else _NEW_SCAN
             found = self._search(data, begin, scan)
             if self._unknown:

@@ -1,13 +1,14 @@
 """Generates the modules of messages and enums from pymavlink's XML and additions.
 
 pymavlink contains ArduPilot's fork of the standard. The XML files in the folder ``additions`` contain the definitions
-of the standard that are missing in the fork. Where the two differ in units, enums, values or deprecation, the additions
-take precedence. Descriptions are taken from pymavlink if it has them. ArduPilot's own definitions are kept.
+of the standard that are missing in the fork. Where fork and additions differ in units, enums, values or deprecation,
+the additions take precedence. Descriptions are taken from pymavlink if it has them. ArduPilot's own definitions are
+kept.
 
     python -m aerokit.mavlink.generator            # write the modules
     python -m aerokit.mavlink.generator --check    # compare only; exit code 1 if the modules differ
 
-The check is skipped if the installed pymavlink has different XML from that of the committed modules.
+The check is skipped if the committed modules were generated from the XML of a different pymavlink.
 
 The output depends only on the XML, so a difference is a change of the standard, the additions or the generator.
 """
@@ -38,7 +39,7 @@ from aerokit.mavlink.rendering import render_enum_row, render_enum_stub, render_
 
 UNION_FOLDER = Path(__file__).parent / "additions"
 
-# The standard's files, each including the one before. Definitions in several of them belong to the first.
+# The standard's files. Each includes the previous file. A definition in several files belongs to the first of them.
 STANDARD_FILES = ("minimal", "standard", "common")
 
 DefinedT = TypeVar("DefinedT", EnumDefinition, MessageDefinition)
@@ -52,7 +53,7 @@ def read_additions() -> list[DialectDefinition]:
 def with_added_messages(
     messages: Sequence[MessageDefinition], additions: Sequence[DialectDefinition]
 ) -> list[MessageDefinition]:
-    """Return pymavlink's messages with the additions, in order, then new messages."""
+    """Return pymavlink's messages, supplemented by the additions, followed by the new messages of the additions."""
     merged = {message.id: message for message in messages}
     for added in (message for dialect in additions for message in dialect.messages):
         known = merged.get(added.id)
@@ -63,9 +64,10 @@ def with_added_messages(
 
 
 def with_added_enums(enums: Sequence[EnumDefinition], additions: Sequence[DialectDefinition]) -> list[EnumDefinition]:
-    """Return pymavlink's enums with the additions, in order, then new ones. A value's standard name comes first.
+    """Return pymavlink's enums, supplemented by the additions, followed by the new enums of the additions.
 
-    New entries do not change the Python names of the existing ones.
+    If a value has several names, the standard's name comes first. New entries do not change the Python names of
+    existing entries.
     """
     merged = {enum.name: enum for enum in enums}
     for added in (enum for dialect in additions for enum in dialect.enums):
@@ -309,7 +311,7 @@ def generate(folder: Path | None = None) -> dict[str, str]:
 
 
 def differences(folder: Path | None = None) -> list[str]:
-    """Return the committed files that differ from the generated ones."""
+    """Return the committed files that differ from the generated files."""
     files = generate(folder)
     present = {
         path.relative_to(FOLDER).as_posix()

@@ -28,8 +28,8 @@ PACK_ERRORS = (struct.error, OverflowError, TypeError, ValueError, AttributeErro
 MessageT = TypeVar("MessageT", bound="Message")
 
 _ANY_HEADER = bytes(HEADER_LENGTH)
-# Message and field of ``char`` arrays that carry bytes, a number or a text depending on another field. As strings,
-# which end at the first NUL, numbers would be truncated.
+# Message and field of ``char`` arrays that carry bytes, a number or a text, depending on another field. Decoding such
+# an array as a string, which ends at the first NUL, would truncate a number.
 BYTES_IN_CHARS = frozenset((name, "param_value") for name in ("PARAM_EXT_VALUE", "PARAM_EXT_SET", "PARAM_EXT_ACK"))
 # Fields whose values never appear in texts.
 SECRET_FIELDS = frozenset(("secret_key", "passkey", "password"))
@@ -91,7 +91,7 @@ class Field:
         carries_bytes: bool = False,
     ) -> None:
         self.name = name
-        """Name of the attribute: that in the standard, with a trailing underscore if it is a Python keyword."""
+        """Name of the attribute: the name in the standard, with a trailing underscore if that is a Python keyword."""
         self.type = type
         """Type without brackets: ``"uint16_t"``, ``"float"``, ``"char"`` …"""
         self.array_length = array_length
@@ -289,7 +289,7 @@ def pack_bytes(value: bytes, size: int) -> bytes:
 
 
 def pack_items(value: Sequence[float], size: int) -> Sequence[float]:
-    """Append zeros. If there are more than ``size`` numbers, struct raises."""
+    """Return the numbers, with zeros appended up to ``size``. If there are more numbers, struct raises."""
     missing = size - len(value)
     return (*value, *(0,) * missing) if missing else value
 
@@ -335,7 +335,8 @@ def _text_problem(value: Any, size: int) -> str | None:
 
 # ------------------------------------------------------------------------------------------ enums
 
-# The standard library's decorator for its own long enums since Python 3.11: the same enum in half the time.
+# Since Python 3.11, the standard library uses this decorator for its long enums. It makes the same enum in half the
+# time.
 _simple_enum: Any = getattr(enum, "_simple_enum", None)
 
 

@@ -27,9 +27,9 @@ else:
 class MessageFactory(_MAVLink):
     """Provides ``<message>_encode(…)``, which returns a pymavlink message, and ``<message>_send(…)`` for every message.
 
-    The messages are those of pymavlink's ardupilotmega dialect for MAVLink 2; further ones of the program's dialect
-    (``mavutil.mavlink``) are created by that. Values are only checked on sending. Strings may be ``str`` or bytes. Use
-    :func:`from_pymavlink` to convert messages, which also rounds numbers for integer fields:
+    The messages are those of pymavlink's ardupilotmega dialect for MAVLink 2. Further messages of the program's dialect
+    (``mavutil.mavlink``) are created by that dialect. Values are only checked on sending. Strings may be ``str`` or
+    bytes. Use :func:`from_pymavlink` to convert messages, which also rounds numbers for integer fields:
     ``MessageFactory(lambda message: vehicle.send(from_pymavlink(message, vehicle.system_id)), 255, 0)``.
     """
 

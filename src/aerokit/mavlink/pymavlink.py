@@ -30,9 +30,9 @@ def from_pymavlink(message: Any, target_system: int | None = None) -> Message:
     """Convert a message to one of aerokit, for ``vehicle.send``. The result is a validated copy.
 
     Args:
-        message: a pymavlink message of any dialect, for MAVLink 1 or 2; any object with ``get_type()`` and the fields
-            of a standard message as attributes; or a message of aerokit. Numbers in integer fields are rounded; strings
-            may be ``str`` (sent as UTF-8) or bytes; missing extension fields are 0.
+        message: a pymavlink message of any dialect, for MAVLink 1 or 2; or any object with ``get_type()`` and the
+            fields of a standard message as attributes; or a message of aerokit. Numbers in integer fields are rounded.
+            Strings may be ``str`` (sent as UTF-8) or bytes. Missing extension fields are 0.
         target_system: new value of the field ``target_system``, if the message has this field. It is also assigned to
             ``message`` itself, unless that is a message of aerokit. None and 0 leave the field unchanged.
             ``target_component`` is never changed.
@@ -69,7 +69,7 @@ def _class_of(message: Any) -> type[Message]:
 
 @cache
 def _counterpart(message_id: int, crc_extra: int, given: Any) -> type[Message]:
-    """Return the standard's class if it has the same wire format, else one created from pymavlink's."""
+    """Return the standard's class if it has the same wire format, else a class created from pymavlink's class."""
     if message_id < 0 or not given.ordered_fieldnames:
         raise InvalidArgument(f"{given.__name__} is not a message that can be sent")
     standard = STANDARD.get(message_id)
@@ -97,7 +97,7 @@ def _values(message_class: type[Message], message: Any) -> dict[str, Any]:
 
 
 def _has(message: Any, name: str) -> bool:
-    # Not hasattr alone, because every class of pymavlink has an attribute ``id``.
+    # hasattr alone would not do, because every class of pymavlink has an attribute ``id``.
     if name in getattr(message, "__dict__", ()):
         return True
     return hasattr(message, name) and not hasattr(type(message), "ordered_fieldnames")
@@ -189,7 +189,7 @@ class _RawText(str):
         return self._data
 
 
-# Searched for pymavlink's class of a message if the program's dialect has none. Together they cover all of STANDARD.
+# Dialects to search for pymavlink's class of a message if the program's dialect has none. They cover all of STANDARD.
 DIALECTS = ("ardupilotmega", "development")
 
 CHECKSUM_LENGTH = 2
@@ -201,7 +201,7 @@ Decoder = Callable[["Frame", float], Any]
 
 
 def to_pymavlink(frame: Frame, *, dialect: ModuleType | None = None, timestamp: float = 0.0) -> Any:
-    """Decode a frame to the pymavlink message, with the same fields, header, buffers and ``str()``. Never raises.
+    """Decode a frame to a pymavlink message, with header, buffers and ``str()`` as in pymavlink. Never raises.
 
     Args:
         frame: a received frame: ``message.received_frame``, or the argument of a frame observer.

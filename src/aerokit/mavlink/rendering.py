@@ -1,6 +1,7 @@
 """Renders definitions as Python source of message classes and enums.
 
-`generator` writes it to modules, `runtime_dialect` compiles it, so that both kinds of classes are the same.
+`generator` writes this source to modules, and `runtime_dialect` compiles it. Both kinds of classes are therefore the
+same.
 """
 
 from __future__ import annotations
@@ -14,12 +15,12 @@ from aerokit.mavlink.frame import HEADER_LENGTH
 from aerokit.mavlink.message import STRUCT_CODES
 
 _WIDTH = 110
-# Arrays up to this length are unpacked into separate names, longer ones are sliced.
+# Arrays up to this length are unpacked into separate names; longer arrays are sliced.
 _MAX_UNPACKED_LENGTH = 4
 
 
 def render_message(message: MessageDefinition, *, docs: bool = True) -> str:
-    """Render the class of one message with its Struct. ``docs=False`` omits all texts but the first line."""
+    """Render the class of one message with its Struct. ``docs=False`` keeps only the first docstring line."""
     lines = [
         f"_S{message.id} = Struct({_format(message)!r})",
         "",
@@ -195,7 +196,7 @@ def _default(f: FieldDefinition) -> str:
 
 
 def _init(message: MessageDefinition) -> list[str]:
-    # Parameters after one with a default need defaults too, so those without one become keyword-only.
+    # Parameters after a parameter with a default need a default, too. Parameters without a default become keyword-only.
     arguments: list[str] = []
     optional = False
     for f in message.fields:

@@ -72,7 +72,7 @@ def class_from_pymavlink(message_class: Any, standard: Standard) -> type[Message
 
 
 def compile_message(definition: MessageDefinition) -> type[Message]:
-    """Create a class like the generated ones. It cannot be pickled, because it is in no module."""
+    """Create a class like the generated classes. Its messages cannot be pickled, because no module has the class."""
     source = "from __future__ import annotations\n" + render_message(definition, docs=False)
     namespace: dict[str, Any] = {
         "__name__": f"{__name__}.{definition.origin}",
@@ -121,7 +121,7 @@ def _enum_type(dialect: str, enum: EnumDefinition) -> type[Any]:
 
 
 def _standard_class(definition: MessageDefinition, standard: Standard) -> type[Message] | None:
-    """Return the generated class if it has the same wire format; it may have more extension fields."""
+    """Return the generated class if the wire formats are the same. Additional extension fields are allowed."""
     row = standard.rows.get(definition.id)
     if row is None or row[:2] != (definition.crc_extra, definition.base_length):
         return None

@@ -120,10 +120,10 @@ class Refusal(Enum):
 
 
 class Signing:
-    """Signs the frames sent on one link, verifies those received on it, and counts those refused.
+    """Signs the sent frames of one link, verifies the received frames, and counts refused frames.
 
-    Each link needs a separate object, because the object stores timestamps. Create those of further links with the same
-    key by :meth:`for_link`. An object can be reused after its link is closed.
+    Each link needs a separate object, because the object stores timestamps. For further links with the same key, create
+    the objects with :meth:`for_link`. An object can be reused after its link is closed.
     """
 
     def __init__(
@@ -138,18 +138,18 @@ class Signing:
         """Create signing for one link.
 
         Args:
-            key: the key; the other side must have the same one.
+            key: the key; the other side must have the same key.
             link_id: distinguishes the links of one sender, 0–255. Programs with the same system and component id need
-                different ones.
+                different link ids.
             timestamp: the last value of :attr:`timestamp` with this key (10 µs since 2015), for computers whose clock
                 may be wrong. A later time of the clock takes precedence.
             allow_unsigned: a function that returns True for a frame to accept it without a valid signature, for example
                 from a camera without a key. Anyone can send such frames. None accepts only RADIO_STATUS, which
                 telemetry radios send.
-            keep: a file that stores the timestamp, so that frames from before a restart of the program are refused
-                after it. Each key needs a separate file, and two programs must not use one file at the same time. The
-                file is replaced atomically, at most twice a minute, because it contains a timestamp up to half a minute
-                in the future.
+            keep: a file that stores the timestamp, so that a restarted program refuses frames from before the restart.
+                Each key needs a separate file, and two programs must not use one file at the same time. The file is
+                replaced atomically, at most twice a minute, because it contains a timestamp up to half a minute in the
+                future.
 
         Raises:
             InvalidArgument: a number is out of range, or ``key`` is not a SigningKey.
@@ -166,7 +166,7 @@ class Signing:
         self.link_id: int = int(link_id)
         self.timestamp: int = int(timestamp)
         """Minimum timestamp of the next frame, in 10 µs since 2015: later than all timestamps sent, and not earlier
-        than any received. Programs on computers without a reliable clock store it across restarts."""
+        than any received. Programs on computers without a reliable clock store this value across restarts."""
         self.allow_unsigned = allow_unsigned
         self.refused: dict[Refusal, int] = dict.fromkeys(Refusal, 0)
         """Number of frames refused, for each reason."""
@@ -191,7 +191,7 @@ class Signing:
     def sign(self, frame: bytes, now: float = 0.0) -> bytes:
         """Return the 13 bytes to append to a whole MAVLink 2 frame with the `SIGNED` flag.
 
-        ``now`` is in seconds since 1970; with 0, for no clock, timestamps are incremented.
+        ``now`` is in seconds since 1970. 0 means that there is no clock; the previous timestamp is then incremented.
 
         Raises:
             InvalidArgument: no later timestamp fits into 48 bits, so another key is needed.
@@ -268,7 +268,8 @@ class Signing:
         self._advance(max(self.timestamp, stamp))
 
     def _advance(self, timestamp: int) -> None:
-        # Store the timestamp before using it, so that the next program starts with a later one even after a crash.
+        # Store the timestamp before using it, so that the next program starts with a later timestamp even after a
+        # crash.
         if self._timestamp_file is not None:
             self._timestamp_file.reserve(timestamp, ONE_MINUTE // 2)  # a sender may be a minute behind
         self.timestamp = timestamp
@@ -294,8 +295,8 @@ _MAX_LENGTH = 64
 class TimestampFile:
     """A file with a timestamp that is later than all timestamps used.
 
-    The constructor raises FileFormatError for other contents, and OSError. A later error is stored in ``error`` until
-    writing succeeds, because it must not end a flight.
+    The constructor raises OSError, or FileFormatError if the file contains anything else. A later error must not end a
+    flight, so it is stored in ``error`` until writing succeeds.
     """
 
     def __init__(self, path: str | PathLike[str], maximum: int) -> None:
@@ -307,7 +308,7 @@ class TimestampFile:
         self._write(self.timestamp)
 
     def reserve(self, timestamp: int, ahead: int) -> None:
-        """Ensure that the file has a later timestamp. If it must be written, write ``timestamp + ahead``."""
+        """Ensure that the stored timestamp is later than ``timestamp``: if needed, write ``timestamp + ahead``."""
         if timestamp < self.timestamp:
             return
         self.timestamp = min(timestamp + ahead, self._maximum)

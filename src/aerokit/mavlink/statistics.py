@@ -25,8 +25,8 @@ IN_ORDER, LATE, OTHERS = range(3)
 class SourceStatistics(SourceFields):
     """Counters of one sender (system, component): frames received and lost.
 
-    Two senders with the same ids are detected by their sequence numbers: two streams advance independently. The one
-    with more frames counts as the sender, until it has been silent for 1.5 s.
+    Two senders with the same ids are detected by their sequence numbers: two streams advance independently. The stream
+    with more frames counts as that of the sender, until it has been silent for 1.5 s.
     """
 
     expected: int
@@ -64,11 +64,11 @@ class SourceStatistics(SourceFields):
         self.system_id: int = system_id
         self.component_id: int = component_id
         self.lost: int = 0
-        """Number of lost frames. A frame that arrives late is no longer counted."""
+        """Number of lost frames. A frame that arrives late is subtracted again."""
         self.expected = sequence
-        """Sequence number of the next frame. It does not wrap at 255; its low byte is the number on the wire."""
-        # How far `expected` has advanced without a received frame. `received` is derived from the two, so that counting
-        # a frame needs a single addition.
+        """Sequence number of the next frame. Does not wrap at 255; the low byte is the number on the wire."""
+        # How far `expected` has advanced without a received frame. `received` is derived from both numbers, so that
+        # counting a frame needs a single addition.
         self._without = sequence
         self._missing = 0  # bit n is set if the frame n + 1 before `_missing_at` is missing
         self._missing_at = sequence
@@ -148,7 +148,7 @@ class SourceStatistics(SourceFields):
         return was_missing
 
     def _on_repeated(self, sequence: int, now: float) -> int:
-        # One such frame is a repetition; several in direct succession mean that the sender rebooted.
+        # A single frame like this is a repetition. Several in direct succession mean that the sender rebooted.
         follows = sequence == (self._late_sequence + 1) & 0xFF
         self._late_run = self._late_run + 1 if follows and self._late_at == self.received else 0
         is_near = (self.expected - sequence) & 0xFF <= _MAX_GAP
@@ -167,7 +167,7 @@ class SourceStatistics(SourceFields):
         self._missing, self._missing_at, self._skipped_over = 0, self.expected, 0
 
     def _continue_other(self, sequence: int, now: float) -> int:
-        # The other stream counts as the sender if it has more frames, or if the current one has timed out.
+        # The other stream counts as the sender if it has more frames, or if the current stream has timed out.
         count, was_first = self.received - self._since, self._other_count > self.received - self._since
         is_over = now - self._moved_at > _STREAM_TIMEOUT_S
         self._take_turns(now, 1)
@@ -185,7 +185,7 @@ class SourceStatistics(SourceFields):
         return LATE if was_first else OTHERS
 
     def _swap(self, sequence: int, now: float, count: int, other_count: int) -> None:
-        self.lost = max(0, self.lost - self._skipped_over)  # below 0 if skipped frames arrived late
+        self.lost = max(0, self.lost - self._skipped_over)  # the difference is below 0 if skipped frames arrived late
         self._other, self._other_count, self._other_at = self.expected & 0xFF, count, now
         self._since, self._returns = self.received - other_count, 0
         self._continue_at(sequence)
@@ -217,7 +217,7 @@ class SourceLimit:
         self._swept_at = -math.inf
 
     def join(self, statistics: FramerStatistics) -> None:
-        """Include the senders of these statistics."""
+        """Count the senders of these statistics, too."""
         self._statistics.add(statistics)
 
     def leave(self, statistics: FramerStatistics) -> None:
@@ -240,7 +240,8 @@ class SourceLimit:
 class FramerStatistics(CounterFields):
     """Counters of one framer.
 
-    Every byte is part of a valid frame or of a frame of an unknown message, bad, or still in the buffer.
+    Every byte received belongs to a valid frame or a frame of an unknown message, counts as bad, or is still in the
+    buffer.
     """
 
     unknown_ids: int
@@ -264,9 +265,9 @@ class FramerStatistics(CounterFields):
         self.bad_crcs: int = 0
         """Positions that look like a frame of a known message, with a wrong checksum."""
         self.unknown_ids = 0
-        """Frames of messages that the dialect does not have. They may be noise, because they cannot be verified."""
+        """Frames of messages that the dialect does not have. Such frames cannot be verified and may be noise."""
         self.unknown_messages: dict[int, int] = {}
-        """Number of such frames by message id, for the first 64 ids."""
+        """Number of frames of unknown messages by message id, for the first 64 ids."""
         self.sources: dict[tuple[int, int], SourceStatistics] = {}
         """Counters by (system id, component id), for the first 1024 of 65,536 possible senders."""
         self._by_key: dict[int, SourceStatistics] = {}
@@ -280,11 +281,11 @@ class FramerStatistics(CounterFields):
 
     @property
     def by_key(self) -> dict[int, SourceStatistics]:
-        """Like :attr:`sources`, by system id + 256 · component id."""
+        """Like :attr:`sources`, but the key is system id + 256 · component id."""
         return self._by_key
 
     def add_source(self, key: int, sequence: int, may_stay: bool) -> SourceStatistics:
-        """Create the counters of a new sender. With ``may_stay`` False, they are not kept, but the frame is counted."""
+        """Create the counters of a new sender. If ``may_stay`` is False, the counters are not kept."""
         source = SourceStatistics(key & 0xFF, key >> 8, sequence)
         if may_stay:
             self._by_key[key] = self.sources[source.system_id, source.component_id] = source

@@ -48,7 +48,7 @@ def _records(file: BinaryIO) -> Iterator[tuple[float, bytes]]:
     data, begin, ended, earliest = b"", 0, False, 0
     end: int | None
     while True:
-        if not ended and len(data) - begin < 2 * _MAX_RECORD:  # a record and the header of the next
+        if not ended and len(data) - begin < 2 * _MAX_RECORD:  # room for a record and the header of the next record
             block = file.read(_BLOCK)
             ended = not block
             data, begin = data[begin:] + block, 0
@@ -58,7 +58,7 @@ def _records(file: BinaryIO) -> Iterator[tuple[float, bytes]]:
             if records:
                 yield from records
                 continue
-        # Fast path for unsigned MAVLink 2: takes half the time of `_record_end`.
+        # Fast path for unsigned MAVLink 2, which takes half the time of `_record_end`.
         try:
             end = begin + 20 + data[begin + 9]
             if (
@@ -93,7 +93,7 @@ def _record_end(data: bytes, begin: int, earliest: int) -> int | None:
 
 
 def _looks_shifted(data: bytes, begin: int, end: int) -> bool:
-    """Return True if a record that begins inside this one is followed by another record, and so is the real one."""
+    """Return True if this record contains the start of the real record, which another record follows directly."""
     for inside in range(begin + 1, end):
         true_end = _frame_end(data, inside)
         if true_end is not None and true_end > end and _frame_end(data, true_end) is not None:
@@ -102,7 +102,7 @@ def _looks_shifted(data: bytes, begin: int, end: int) -> bool:
 
 
 def _frame_end(data: bytes, begin: int) -> int | None:
-    """Return the end according to the header, which may be beyond the data. None if there is no header."""
+    """Return the end of a frame according to its header, which may be beyond the data. None if there is no header."""
     at = begin + 8
     if len(data) - at < 3 or data[at] not in _MAGICS or _TIME.unpack_from(data, begin)[0] > _LAST_TIME:
         return None

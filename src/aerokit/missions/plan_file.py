@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from aerokit._internal.files import read_text, write_atomically
+from aerokit._internal.formatting import short_repr
 from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavFrame
 from aerokit.missions.item import MissionItem, canonical_frame
@@ -48,8 +49,13 @@ def read_plan_file(path: str | os.PathLike[str]) -> Plan:
     return parse_plan(read_text(path), Path(path).name)
 
 
-def write_plan_file(path: str | os.PathLike[str], plan: Plan) -> None:
-    """Write a plan to a file; see :func:`format_plan`."""
+def write_plan_file(path: str | os.PathLike[str], plan: Plan | Mission) -> None:
+    """Write a plan, or a mission as a plan without fence and rally points, to a file; see :func:`format_plan`.
+
+    Raises:
+        InvalidArgument: the plan cannot be written. No file was changed.
+        OSError: the file cannot be written.
+    """
     write_atomically(path, format_plan(plan))
 
 
@@ -71,13 +77,22 @@ def parse_plan(text: str, name: str = "plan") -> Plan:
     )
 
 
-def format_plan(plan: Plan) -> str:
-    """Format a plan as the text of a file. For a plan that was read from a file, only changes are applied to its text.
+def format_plan(plan: Plan | Mission) -> str:
+    """Format a plan or a mission as the text of a file.
+
+    For a plan that was read from a file, only changes are applied to its text.
 
     Raises:
-        InvalidArgument: a .plan file cannot store a value: rally points or a fence return point with altitudes that
-            are not relative to home, or infinite numbers.
+        InvalidArgument: ``plan`` is neither a plan nor a mission, or a .plan file cannot store a value: rally points
+            or a fence return point with altitudes that are not relative to home, or infinite numbers.
     """
+    if isinstance(plan, Mission):
+        plan = Plan(plan)
+    elif not isinstance(plan, Plan):
+        raise InvalidArgument(
+            f"plan = {short_repr(plan)} is neither a Plan nor a Mission: pass Mission([…]), or Plan(mission, fence,"
+            " rally)"
+        )
     try:
         return json.dumps(_document(plan), indent=4, allow_nan=False) + "\n"
     except RecursionError:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from aerokit._internal.files import read_text, write_atomically
+from aerokit._internal.formatting import short_repr
 from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavFrame
 from aerokit.missions.item import MissionItem, canonical_frame, xy_scale
@@ -75,8 +76,12 @@ def format_waypoints(mission: Mission, *, version: int = 110) -> str:
     """Format a mission as the text of a file, with Mission Planner's precision, or more where a number needs more.
 
     Raises:
-        InvalidArgument: a number is infinite, or the version is neither 110 nor 120.
+        InvalidArgument: ``mission`` is no mission, a number is infinite, or the version is neither 110 nor 120.
     """
+    if not isinstance(mission, Mission):
+        raise InvalidArgument(
+            f"mission = {short_repr(mission)} is not a Mission: pass Mission([…]), or plan.mission of a Plan"
+        )
     if version not in (110, 120):
         raise InvalidArgument(f"version = {version!r} is not allowed: 110 (home is item 0) or 120 (no home)")
     rows = [f"QGC WPL {version}"]

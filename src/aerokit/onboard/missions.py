@@ -33,6 +33,7 @@ class ComponentMissions:
     def __init__(self, host: ComponentHost, tasks: BackgroundTasks, commands: ComponentCommands) -> None:
         self._host, self._tasks, self._commands = host, tasks, commands
         self._server = MissionServer(host, self._judge, on_set_current=self._set_current)
+        self._server.listen()
         self._on_upload: Callable[[str, tuple[MissionItem, ...]], Any] | None = None
         self._on_current: Callable[[int], object] | None = None
         commands.add(MavCmd.DO_SET_MISSION_CURRENT, self._current_command)
@@ -47,7 +48,7 @@ class ComponentMissions:
         Raises:
             InvalidArgument: there is no such kind.
         """
-        self._server.replace(_type_of(kind), items)
+        self._server.store(_type_of(kind), items)
 
     def on_upload(
         self, function: Callable[[str, tuple[MissionItem, ...]], Any]

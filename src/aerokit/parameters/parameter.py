@@ -49,7 +49,8 @@ class ParameterType(IntEnum):
 
         The result is REAL32 for unknown numbers, because every value is sent as a float.
         """
-        return cls(number) if 1 <= number <= 10 else cls.REAL32
+        found: ParameterType = cls._value2member_map_.get(number, cls.REAL32)  # type: ignore[assignment]
+        return found
 
     @property
     def is_integer(self) -> bool:
@@ -121,9 +122,9 @@ def checked_value(name: str, value: float, type: ParameterType) -> int | float: 
     """
     number = number_of(name, value)
     if isinstance(number, float) and not math.isfinite(number):
-        raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: a finite number")
+        raise InvalidArgument(f"{name} = {short_repr(value)} must be a finite number")
     if type.is_integer and number != int(number):
-        raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: a whole number (it is an {type.name})")
+        raise InvalidArgument(f"{name} = {short_repr(value)} must be a whole number (it is an {type.name})")
     if not type.minimum <= number <= type.maximum:
         raise InvalidArgument(
             f"{name} = {short_repr(value)} must be in {type.minimum}..{type.maximum} (it is an {type.name})"

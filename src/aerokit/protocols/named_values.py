@@ -238,7 +238,7 @@ class NamedReads(NamedRequests[ValueT]):
     def _reject_unknown(self, names: Iterable[str], now: float) -> None:
         for name in names:
             if self._loss_probability(self._window.attempts(name)) < MAX_LOSS_PROBABILITY:
-                text = f"{self.unknown_text} {name}: it answers other requests, but not this one"
+                text = f"{self.unknown_text} {name}: it answers requests for other names, but not for this one"
                 self._settle(name, ParameterRejected(text, name=name), now)
 
     def _loss_probability(self, attempts: int) -> float:

@@ -70,7 +70,7 @@ class VehicleSigning:
         raise NotImplementedError
 
     def may_change(self) -> bool:
-        """Return True if the key can be changed now; sends the reason if not."""
+        """Return True if the key can be changed now, otherwise send the reason."""
         raise NotImplementedError
 
     def on_key_changed(self) -> None:
@@ -211,7 +211,7 @@ class SimulatedAutopilot(SimulatedVehicle):
         return CommandServer(self, supported, self.refusal_of_command)
 
     def refusal_of_command(self, command: ReceivedCommand) -> int | None:
-        """Return the MAV_RESULT if the command is refused whatever its MAV_CMD, else None."""
+        """Return the MAV_RESULT if the command is refused regardless of the MAV_CMD, else None."""
         return None
 
     def _on_timesync(self, request: m.Timesync, channel: Channel) -> None:

@@ -96,18 +96,19 @@ class Streams:
         self.next_due: float = math.inf
         """Time of the next message; infinity when nothing is streamed."""
         self._intervals: dict[int, tuple[float, int]] = {}
-        self._heap: list[tuple[float, int, int]] = []
+        # (due time, token, message id, time of the first message, number of messages since then)
+        self._heap: list[tuple[float, int, int, float, int]] = []
         self._token = 0
 
     def set_interval(self, message_id: int, interval_s: float, now: float) -> None:
-        """Send a message every ``interval_s`` seconds, starting now; 0 stops it."""
+        """Send a message every ``interval_s`` seconds, starting now; 0 stops the stream."""
         self._token += 1
         if interval_s <= 0.0:
             self._intervals.pop(message_id, None)
         else:
             self._intervals[message_id] = (interval_s, self._token)
-            heappush(self._heap, (now, self._token, message_id))
-        self._update_next_due()
+            heappush(self._heap, (now, self._token, message_id, now, 0))
+        self.take_due(-math.inf)
 
     def interval(self, message_id: int) -> float:
         """Return the interval in seconds; 0 if the message is not streamed."""
@@ -119,33 +120,34 @@ class Streams:
 
     def postpone(self, seconds: float) -> None:
         """Delay all streams."""
-        self._heap = [(due + seconds, token, message_id) for due, token, message_id in self._heap]
-        self._update_next_due()
+        self._heap = [
+            (due + seconds, token, message_id, start + seconds, count)
+            for due, token, message_id, start, count in self._heap
+        ]
+        self.take_due(-math.inf)
 
     def take_due(self, now: float) -> list[int]:
         """Return the message ids that are due, and schedule each again."""
         ids: list[int] = []
         heap, intervals = self._heap, self._intervals
-        while self.next_due <= now:
-            due, token, message_id = heap[0]
-            interval = intervals[message_id][0]
-            following = due + interval
-            heapreplace(heap, (following if following > now else now + interval, token, message_id))
-            ids.append(message_id)
-            self._update_next_due()
-        return ids
-
-    def _update_next_due(self) -> None:
-        """Update `next_due`; drops entries of streams that were stopped or replaced."""
-        heap, intervals = self._heap, self._intervals
         while heap:
-            due, token, message_id = heap[0]
+            due, token, message_id, start, count = heap[0]
             current = intervals.get(message_id)
-            if current is not None and current[1] == token:
+            if current is None or current[1] != token:  # The stream was stopped or replaced.
+                heappop(heap)
+                continue
+            if due > now:
                 self.next_due = due
-                return
-            heappop(heap)
+                return ids
+            ids.append(message_id)
+            # Rounded, so that streams of different rates are due at the same instants.
+            following = round(start + (count + 1) * current[0], 9)
+            if following > now:
+                heapreplace(heap, (following, token, message_id, start, count + 1))
+            else:
+                heapreplace(heap, (now + current[0], token, message_id, now, 1))
         self.next_due = math.inf
+        return ids
 
 
 _DATAGRAM_SIZE = 1200
@@ -160,7 +162,7 @@ class Channel:
         self._wanted = wanted
         self._own = (system_id, component_id)
         self.reader: MessageReader = MessageReader(wanted)
-        """Decodes incoming bytes; vehicles on one link may share it."""
+        """Decodes incoming bytes; vehicles on one link may share a reader."""
         self._encoders: dict[tuple[int, int], FrameEncoder] = {}
         self._outbox: list[bytes] = []
         self.closes_clients: bool = False
@@ -225,7 +227,7 @@ class Channel:
         return datagrams(self.take_pieces())
 
     def reset(self) -> None:
-        """Reset rates, partial frames and sequence numbers, as a reboot does; the outbox stays."""
+        """Reset rates, partial frames and sequence numbers because of a reboot; the outbox stays."""
         self.streams = Streams()
         self.reader = MessageReader(self._wanted)
         self._encoders.clear()

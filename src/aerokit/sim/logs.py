@@ -42,7 +42,7 @@ class SimulatedLog:
     """Seed of the content; None derives it from size and time."""
 
     def make(self) -> bytes:
-        """Return the content; of two logs with the same seed, the longer starts with the shorter."""
+        """Return the content. The contents of two logs with the same seed are equal up to the shorter length."""
         words = -(-self.size // 4)
         return (SAMPLE_LOG + random.Random(self._noise).randbytes(4 * words))[: self.size]
 

@@ -1,7 +1,7 @@
 """Missions, fences and rally points of a simulated vehicle: conversions and the ``@MISSION`` files.
 
-The servers of the mission protocol are separate, because the autopilots differ too much
-(`sim.ardupilot.mission_server`, `sim.px4.mission_server`). https://mavlink.io/en/services/mission.html
+`sim.ardupilot.mission_server` and `sim.px4.mission_server` extend the server of `protocols.servers.missions` with the
+behaviour of the autopilots. https://mavlink.io/en/services/mission.html
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class MissionStore(Protocol):
         ...
 
     def replace(self, mission_type: int, items: Sequence[MissionItem], *, start: int = 0, clear: bool = True) -> int:
-        """Replace the items at once, as a file upload does; returns the MAV_MISSION_RESULT."""
+        """Replace the items at once, like a file upload; return the MAV_MISSION_RESULT."""
         ...
 
 

@@ -1,7 +1,7 @@
 """Local frame and motion of a simulated multicopter: a point mass that leans as its acceleration requires.
 
 Modelled: limits of speed, acceleration and turn rate; braking before a target, by the square-root controller of
-ArduPilot and PX4; drag, for which the copter leans forward in steady flight; constant wind with gusts; ground. Not
+ArduPilot and PX4; drag, against which the copter leans in steady flight; constant wind with gusts; ground. Not
 modelled: propeller dynamics, attitude control loops, ground effect, drift.
 """
 
@@ -16,7 +16,7 @@ from aerokit._internal.rotations import euler_from_quaternion as euler_from_quat
 from aerokit._internal.rotations import quaternion_from_euler as quaternion_from_euler
 from aerokit.errors import InvalidArgument
 
-_METRES_PER_DEGREE_E7 = 0.011131884502145034  # ArduPilot's LOCATION_SCALING_FACTOR: the same sphere and rounding.
+_METRES_PER_DEGREE_E7 = 0.011131884502145034  # ArduPilot's LOCATION_SCALING_FACTOR, for the same sphere and rounding.
 
 
 Ned = tuple[float, float, float]
@@ -61,7 +61,7 @@ class LocalFrame:
 def true_place(vehicle: Any) -> GlobalPoint:
     """Return the true position of a simulated vehicle.
 
-    Raises InvalidArgument for a vehicle without one, such as a recording.
+    Raises InvalidArgument for a vehicle without a position, such as a recording.
     """
     frame, motion = getattr(vehicle, "frame", None), getattr(vehicle, "motion", None)
     if frame is None or motion is None:
@@ -77,10 +77,16 @@ HOME = (-35.363261, 149.165230, 584.09)
 GRAVITY_M_S2 = 9.80665
 _DRAG_PER_S = 0.33  # Deceleration divided by airspeed: a 450 mm quadrotor leans 20 degrees at 10 m/s.
 _VELOCITY_TIME_CONSTANT_S = 0.3
-_LEAN_TIME_CONSTANT_S = 0.15
+_LEAN_KEPT_PER_S = (1.0 - 0.02 / 0.15) ** 50  # A time constant of 0.15 s.
 _TURN_GAIN_PER_S = 2.0
 _TERMINAL_SPEED_M_S = 25.0
 _APPROACH_PER_S, _MAX_APPROACH_M_S = 0.8, 1.5
+# Limits of steady motion, for which steps of 0.1 s suffice. In such a step, a constant jerk of 4 m/s³ changes the
+# position by jerk · 0.1³ / 6, which is less than 1 mm. Touchdown does not count as steady, so its time and speed come
+# from short steps.
+_STEADY_JERK_M_S3 = 4.0
+_STEADY_LEAN_RATE_RAD_S = 0.6
+_STEADY_ABOVE_GROUND_S = 0.3
 
 
 def wrap_pi(angle: float) -> float:
@@ -163,6 +169,7 @@ class Motion:
         self.impact_speed_m_s: float = 0.0
         """Vertical speed at the last touchdown."""
         self._gust_north = self._gust_east = 0.0
+        self._jerk_m_s3 = math.inf
         self._wanted = (0.0, 0.0, 0.0)
         self._leaning: tuple[float, float] | None = None
         self._accelerating = False
@@ -213,6 +220,17 @@ class Motion:
         return self.down >= self.ground_down
 
     @property
+    def is_steady(self) -> bool:
+        """True in flight while acceleration and lean hardly change, so that long steps are exact."""
+        height_m = self.ground_down - self.down
+        return (
+            self._jerk_m_s3 < _STEADY_JERK_M_S3
+            and not self.wind.gusts_m_s
+            and abs(self.roll_rate) + abs(self.pitch_rate) < _STEADY_LEAN_RATE_RAD_S
+            and height_m > max(0.0, self.velocity_down * _STEADY_ABOVE_GROUND_S)
+        )
+
+    @property
     def airspeed_m_s(self) -> float:
         """Horizontal speed through the air."""
         return math.hypot(
@@ -235,6 +253,8 @@ class Motion:
             drag = GRAVITY_M_S2 / _TERMINAL_SPEED_M_S
             north, east = -drag * self.velocity_north, -drag * self.velocity_east
             down = GRAVITY_M_S2 - drag * self.velocity_down
+        change = abs(north - self.acceleration_north) + abs(east - self.acceleration_east)
+        self._jerk_m_s3 = (change + abs(down - self.acceleration_down)) / dt
         self._integrate(north, east, down, dt)
         self._lean(north, east, dt, powered=powered)
         self._turn(dt, powered=powered)
@@ -319,7 +339,7 @@ class Motion:
             limit = self.limits.lean_rad
             pitch = _clamp(-math.atan2(north * cos_yaw + east * sin_yaw, GRAVITY_M_S2), limit)
             roll = _clamp(math.atan2(east * cos_yaw - north * sin_yaw, GRAVITY_M_S2), limit)
-        share = dt / _LEAN_TIME_CONSTANT_S if dt < _LEAN_TIME_CONSTANT_S else 1.0
+        share = 1.0 - _LEAN_KEPT_PER_S**dt
         roll_step, pitch_step = (roll - self.roll) * share, (pitch - self.pitch) * share
         self.roll += roll_step
         self.pitch += pitch_step

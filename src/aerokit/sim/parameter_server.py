@@ -57,9 +57,9 @@ _ROUNDING_OFFSET = 0.01
 class ArduPilotParameterServer(ParameterServer):
     """Parameter protocol of ArduPilot.
 
-    Without ``errors`` it does not answer requests for an unknown name or a value that is not a number, like the
-    development version of 4.7. With ``errors`` it answers them by PARAM_ERROR, like the released version, and confirms
-    PARAM_SET on the sender's port in addition to the broadcast.
+    A request may have an unknown name, or a value that is not a number. Without ``errors``, such a request gets no
+    answer, as in the development version of 4.7. With ``errors``, the answer is PARAM_ERROR, as in the released
+    version, and PARAM_SET is confirmed on the sender's port in addition to the broadcast.
 
     A queue holds 20 read requests, of which one is served each millisecond; further requests are lost. The banner
     texts precede a list.
@@ -132,7 +132,7 @@ class ArduPilotParameterServer(ParameterServer):
 
 
 def rounded(value: float, type_: int) -> float:
-    """Convert a float for an integer parameter as ArduPilot does: add 0.01 away from zero, then truncate."""
+    """Convert a float for an integer parameter like ArduPilot: add 0.01 away from zero, then truncate."""
     if type_ == MavParamType.REAL32:
         return value
     shifted = value + math.copysign(_ROUNDING_OFFSET, value)
@@ -145,7 +145,7 @@ _UNUSED_INDEX = 24400
 
 
 class Px4ParameterServer(ParameterServer):
-    """Parameter protocol of PX4; ``errors`` sends PARAM_ERROR, as PX4's main branch does and v1.16 does not.
+    """Parameter protocol of PX4; ``errors`` sends PARAM_ERROR, like PX4's main branch, but unlike v1.16.
 
     Values are stored unchecked. PARAM_SET is confirmed on the sender's port, and a change is broadcast shortly after.
     Setting _HASH_CHECK stops a running list. A second list request restarts the list without the hash.

@@ -37,7 +37,7 @@ class SimParameter:
     value: float
     default: float
     is_volatile: bool = False
-    """Excluded from PX4's hash, because the vehicle changes it."""
+    """True if the parameter is excluded from PX4's hash, because the vehicle changes its value."""
     switch: str | None = None
     """Name of an enabling parameter. While it is 0, ArduPilot omits this parameter from lists and counts, but answers
     reads by name.
@@ -79,7 +79,7 @@ class SimParameters:
     def __getitem__(self, name: str) -> float:
         try:
             return self._rows[name].value  # type: ignore[union-attr]
-        except AttributeError:  # The row is still a line of text.
+        except AttributeError:  # The row has not been parsed yet.
             return self.row(name).value
 
     def get(self, name: str, default: float) -> float:
@@ -194,8 +194,8 @@ _GUESSED_ROW_SIZE = 12
 class ParameterPackMount(Mount):
     """Files mounted as ``@PARAM``.
 
-    ``apply(name, value)`` is called for each uploaded parameter. ``block`` is the size of the blocks over whose
-    boundaries no value extends. With it, opening the file reports the exact size (PX4). Without it, the first read
+    ``apply(name, value)`` is called for each uploaded parameter. ``block`` is the block size; no value extends over the
+    end of a block. With ``block``, opening the file reports the exact size (PX4). Without ``block``, the first read
     sets the block size (ArduPilot).
     """
 

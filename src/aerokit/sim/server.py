@@ -17,14 +17,11 @@ from aerokit.sim.channel import Channel, SharedMessageReader, datagrams
 from aerokit.sim.vehicle import TICK_S, SimulatedVehicle
 from aerokit.transport import Link, MemoryLink, Peer, TcpListen, create_link, memory_link_pair
 
-# Minimum timer delay in loop time, for many vehicles or above real time: several ticks then run in one callback.
+# Minimum timer delay in loop time. With many vehicles or above real time, several ticks then run in one callback.
 _MIN_WAIT_S = 0.001
 _BATCH_THRESHOLD = 10
 # Output of this many simulated seconds is sent together for more than `_BATCH_THRESHOLD` vehicles.
 _BATCH_INTERVAL_S = TICK_S
-# On virtual time, events less than this apart run in the same callback.
-_INSTANT_S = 1e-8
-_EXTRA_TURNS = 1
 # Simulated seconds that are caught up after the loop was blocked. Except in real time, the rest is skipped.
 _MAX_CATCH_UP_S = 0.5
 
@@ -41,7 +38,7 @@ class SimulatorServer:
     An exception in a vehicle or a callback closes the links and cancels the task that runs the block; the block then
     raises the exception.
 
-    Raises LinkOpenError if a link cannot be opened, after closing the others.
+    Raises LinkOpenError if a link cannot be opened; the other links are closed again.
     """
 
     def __init__(
@@ -67,7 +64,7 @@ class SimulatorServer:
         self._numbers = {id(vehicle): number for number, vehicle in enumerate(self.vehicles)}
         self._min_wait_s = _MIN_WAIT_S if speedup != 1.0 or len(self.vehicles) > _BATCH_THRESHOLD else 0.0
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._jump: Callable[[float], bool] | None = None  # `VirtualClockLoop.jump`, if the loop has one.
+        self._end_source: Callable[[], None] | None = None  # used instead of timers on a `VirtualClockLoop`
         self._started_at = 0.0
         self._now_at_start = max((vehicle.now for vehicle in self.vehicles), default=0.0)
         self._ports: list[_Port] = []
@@ -78,7 +75,7 @@ class SimulatorServer:
         self._owner: asyncio.Task[Any] | None = None
         self._cancels_owner = False
         self.on_datagram: Callable[[float, bytes, bool], object] | None = None
-        """Called with simulated time, bytes and direction of every datagram; True if a vehicle sent the datagram."""
+        """Called with simulated time, bytes and direction of every datagram. True as direction: sent by a vehicle."""
         self.failure: Exception | None = None
         """Exception of a vehicle that stopped the simulation; None while it runs."""
 
@@ -98,13 +95,15 @@ class SimulatorServer:
         if self._loop is not None:
             raise BusyError("this SimulatorServer was already started; create a new one")
         self._loop, self._owner = asyncio.get_running_loop(), asyncio.current_task()
-        self._jump = getattr(self._loop, "jump", None)
-        if self._jump is None and len(self.vehicles) > _BATCH_THRESHOLD:
+        add_source = getattr(self._loop, "add_event_source", None)
+        if add_source is None and len(self.vehicles) > _BATCH_THRESHOLD:
             self._min_wait_s = max(_MIN_WAIT_S, _BATCH_INTERVAL_S / self._speedup)
         self._started_at = self._loop.time()
         try:
             async with AsyncExitStack() as opening:
                 await self._open_links(opening)
+                if add_source is not None:
+                    self._end_source = add_source(self._next_loop_time, self._on_due)
                 self._run(self.now)
                 self._exit = opening.pop_all()
         except BaseException as error:
@@ -153,13 +152,16 @@ class SimulatorServer:
             self._fail(error)
             raise
 
-    def _on_timer(self) -> None:
+    def _on_due(self) -> None:
         self._skip_lateness()
         self._timer = None
         try:
-            self._run_ahead(max(self.now, self._timer_due))  # A timer may fire slightly early.
+            self._run(max(self.now, min(self._dues)))  # A timer may fire slightly early.
         except Exception as error:
             self._fail(error)
+
+    def _next_loop_time(self) -> float:
+        return self._loop_time(min(self._dues, default=math.inf))
 
     def _fail(self, error: Exception) -> None:
         """Close the links and cancel the owner; asyncio only logs an exception that a callback raises."""
@@ -174,6 +176,8 @@ class SimulatorServer:
     def _stop(self) -> None:
         if self._timer is not None:
             self._timer.cancel()
+        if self._end_source is not None:
+            self._end_source()
         self._timer = self._loop = None
         self._ports.clear()
 
@@ -181,42 +185,6 @@ class SimulatorServer:
         self._step(now)
         self._flush()
         self._schedule()
-
-    def _run_ahead(self, now: float) -> None:
-        """Run due events; on virtual time also later events, until another callback or timer of the loop is due."""
-        self._step(now)
-        while not self._flush():
-            if (due := self._jump_ahead()) is None:
-                self._schedule()
-                return
-            self._step(due)
-        loop = self._loop
-        if self._jump is None or loop is None or self._loop_time(min(self._dues)) < loop.time() + _INSTANT_S:
-            self._schedule()
-        else:  # The receivers of the datagrams run first; they might not answer.
-            loop.call_soon(self._continue_run, _EXTRA_TURNS)
-
-    def _continue_run(self, turns: int) -> None:
-        """Continue `_run_ahead` after up to ``turns`` more iterations of the loop, in which woken receivers run."""
-        loop = self._loop
-        if loop is None:
-            return
-        try:
-            if (due := self._jump_ahead()) is not None:
-                self._run_ahead(due)
-            elif turns and self._timer is None:
-                loop.call_soon(self._continue_run, turns - 1)
-            else:
-                self._schedule()
-        except Exception as error:
-            self._fail(error)
-
-    def _jump_ahead(self) -> float | None:
-        """Advance a virtual clock to the next event and return its time; None if the loop has earlier work."""
-        due = min(self._dues)
-        if self._jump is None or due == math.inf or not self._jump(self._loop_time(due)):
-            return None
-        return max(self.now, due)
 
     def _step(self, now: float) -> None:
         dues = self._dues
@@ -244,22 +212,20 @@ class SimulatorServer:
         except Exception as error:
             self._fail(error)
 
-    def _flush(self) -> bool:
-        """Send the outbox; return True if it was not empty."""
-        has_sent = False
+    def _flush(self) -> None:
         for port in self._ports:
-            for datagram in port.take_datagrams(together=self._jump is None):
-                has_sent = True
+            for datagram in port.take_datagrams(together=self._end_source is None):
                 port.link.write(datagram)
                 if self.on_datagram is not None:
                     self.on_datagram(self.now, datagram, True)
             port.hang_up()
-        return has_sent
 
     def _schedule(self) -> None:
         loop = self._loop
+        if loop is None or self._end_source is not None:
+            return
         due = min(self._dues, default=math.inf)
-        if loop is None or due == math.inf:
+        if due == math.inf:
             return
         if self._timer is not None:
             if self._timer_due == due:
@@ -269,13 +235,14 @@ class SimulatorServer:
         if self._min_wait_s:
             when = max(when, loop.time() + self._min_wait_s)
         self._timer_due, self._timer_at = due, when
-        self._timer = loop.call_at(when, self._on_timer)
+        self._timer = loop.call_at(when, self._on_due)
 
     def _skip_lateness(self) -> None:
-        """Except in real time, skip the lateness of the timer beyond ``_MAX_CATCH_UP_S``."""
-        if self._loop is None or self._timer is None or self._speedup == 1.0:
+        """If the timer is late by more than ``_MAX_CATCH_UP_S``, skip the excess, except in real time."""
+        if self._loop is None or self._speedup == 1.0 or (self._timer is None and self._end_source is None):
             return
-        late = self._loop.time() - self._timer_at - _MAX_CATCH_UP_S / self._speedup
+        due_at = self._next_loop_time() if self._timer is None else self._timer_at
+        late = self._loop.time() - due_at - _MAX_CATCH_UP_S / self._speedup
         if late > 0:
             self._started_at += late
             self._timer_at += late
@@ -307,6 +274,8 @@ class _Port:
     def take_datagrams(self, *, together: bool) -> list[bytes]:
         """Return the datagrams to send. With ``together``, many vehicles share datagrams, as a router joins them."""
         active = [channel for channel in self.channels if channel.has_output]
+        if not active:
+            return []
         if together and len(self.channels) > _BATCH_THRESHOLD:
             return datagrams(piece for channel in active for piece in channel.take_pieces())
         return [datagram for channel in active for datagram in channel.take_datagrams()]

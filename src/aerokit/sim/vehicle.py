@@ -23,7 +23,9 @@ from aerokit.sim.channel import Channel
 from aerokit.sim.faults import Faults
 
 TICK_S = 0.02
-"""Interval of motion, modes and failsafes (50 Hz) while the vehicle moves."""
+"""Interval of motion and modes (50 Hz) while the vehicle moves. In steady flight, several make one long tick."""
+
+_STEADY_TICKS = 5
 
 _TEXT_SIZE = 50
 Handler = Callable[[Any, Channel], None]
@@ -64,7 +66,7 @@ class ExtraComponent:
     type: int = MavType.GIMBAL
     autopilot: int = MavAutopilot.INVALID
     system_id: int | None = None
-    """None uses the vehicle's system id."""
+    """System id of the component; None: that of the vehicle."""
     base_mode: int = MavModeFlag(0)
     custom_mode: int = 0
     system_status: int = MavState.ACTIVE
@@ -127,11 +129,14 @@ class SimulatedVehicle:
         if self.faults.frozen or self.faults.silent or not self._is_on:
             return
         messages = channel.messages(data, now, peer)
+        if not messages:
+            return
+        self._tick_until(now)
         for message in messages:
             if sender_of(message) != (self.system_id, self.component_id):
                 self._handle(message, channel)
-        if messages:
-            self.step(now)
+        self._plan_tick(1)
+        self.step(now)
 
     def step(self, now: float) -> None:
         """Run everything that is due up to ``now``."""
@@ -218,16 +223,25 @@ class SimulatedVehicle:
         raise NotImplementedError
 
     def tick(self, dt: float) -> None:
-        """Advance by one tick."""
+        """Advance by ``dt`` seconds: one tick, or several in steady flight."""
         raise NotImplementedError
 
+    @property
+    def is_steady(self) -> bool:
+        """True if a long tick gives the same result as several short ticks.
+
+        A long tick lasts at most 0.1 s. It ends before anything is received, streamed or due, so that samples are as
+        recent as with short ticks.
+        """
+        return False
+
     def call_at(self, when: float, action: Callable[[], None]) -> None:
-        """Call a function at a simulated time; a reboot cancels it."""
+        """Call a function at a simulated time; a reboot cancels the call."""
         self._timer_count += 1
         heappush(self._timers, (when, self._timer_count, action))
 
     def call_later(self, delay: float, action: Callable[[], None]) -> None:
-        """Call a function after ``delay`` simulated seconds; a reboot cancels it."""
+        """Call a function after ``delay`` simulated seconds; a reboot cancels the call."""
         self.call_at(self.now + delay, action)
 
     def every(self, interval: float, action: Callable[[], None], *, first: float | None = None) -> None:
@@ -246,17 +260,27 @@ class SimulatedVehicle:
         self.call_at(start, repeat)
 
     def set_ticking(self, ticking: bool) -> None:
-        """Start or stop calling ``tick`` at 50 Hz."""
+        """Start or stop calling ``tick`` at 50 Hz, and in steady flight at 10 Hz or more."""
         if ticking == (self._ticks_from != math.inf):
             return
-        self._ticks_from, self._ticks_done = (self.now, 1) if ticking else (math.inf, 0)
-        self._next_tick = self._ticks_from + self._ticks_done * TICK_S
+        self._ticks_from, self._ticks_done = self.now if ticking else math.inf, 0
+        self._plan_tick(1)
+
+    def _plan_tick(self, ticks: int) -> None:
+        """Schedule the next tick after this many intervals; it may come earlier."""
+        self._next_tick = self._ticks_from + (self._ticks_done + ticks) * TICK_S
+
+    def _tick_until(self, now: float) -> None:
+        """Advance to ``now`` by a single tick that stands for all ticks since the last one."""
+        done = self._ticks_done
+        while self._ticks_from + (self._ticks_done + 1) * TICK_S <= now:
+            self._ticks_done += 1
+        if self._ticks_done > done:
+            self.tick((self._ticks_done - done) * TICK_S)
+            self._plan_tick(_STEADY_TICKS if self.is_steady else 1)
 
     def _run_due(self, due: float) -> None:
-        if self._next_tick <= due:
-            self._ticks_done += 1
-            self._next_tick = self._ticks_from + self._ticks_done * TICK_S
-            self.tick(TICK_S)
+        self._tick_until(due)
         while self._timers and self._timers[0][0] <= due:
             heappop(self._timers)[2]()
         for channel in self.channels:
@@ -274,7 +298,7 @@ class SimulatedVehicle:
         self.now = now
         self._timers = [(when + late, count, action) for when, count, action in self._timers]
         self._ticks_from += late
-        self._next_tick = self._ticks_from + self._ticks_done * TICK_S
+        self._plan_tick(1)
         for channel in self.channels:
             channel.streams.postpone(late)
 

@@ -315,7 +315,7 @@ _LIMITS = MotionLimits(
 class UnderwaterMotion(Motion):
     """Motion of a submarine. ``down`` is its depth.
 
-    ``bottom_down`` is the depth of the bottom, ``ground_down`` that of the water surface. ``buoyancy_m_s2`` is the
+    ``bottom_down`` is the depth of the bottom, ``ground_down`` the depth of the water surface. ``buoyancy_m_s2`` is the
     upward acceleration without thrust.
     """
 

@@ -157,6 +157,9 @@ class CellTwin(TwinOf["StateCell[T]"], Generic[T]):
                 raise AttributeError(name)
             return getattr(self.aio, name)  # raises AttributeError with a suggestion
 
+        def __getitem__(self, key: object) -> Any:
+            return self.aio[key]  # raises TypeError with a suggestion
+
 
 class IteratorTwin(TwinOf[IteratorA], Generic[IteratorA, ItemT]):
     """Twin of an asynchronous iterator over items."""

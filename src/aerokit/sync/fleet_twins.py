@@ -87,9 +87,10 @@ class Following(BlockTwin["AsyncFollowing"]):
 class Selection(SelectionTwin["AsyncSelection"]):
     """Some members of a fleet: ``fleet.group("alpha")``, ``fleet["north/*"]``.
 
-    Every action runs on all available members at once, which are those that are not lost, taken over or released. The
-    action returns a :class:`FleetResult` when all of them are done. If a member fails, the fleet's policy sends orders
-    to the others, and the action ends when they have executed these. If the action is cancelled, all members hold.
+    Every action runs on all available members at once. A member is available unless it is lost, taken over or released.
+    The action returns a :class:`FleetResult` when all of these members are done. If a member fails, the fleet's policy
+    sends orders to the other members, and the action ends when these orders are executed. If the action is cancelled,
+    all members hold.
     """
 
     @property
@@ -124,7 +125,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
             InvalidArgument: a name is unknown, or a target is too far away. Nothing was sent.
             ValueUnknownError: the position of a member is unknown. Nothing was sent.
             OperationRejected: paths come too close and cannot be separated: nothing was sent. Or a member became
-                unavailable between two legs in layers: the others stay in their layers.
+                unavailable between two legs in layers: the other members stay in their layers.
         """
         return self._loop.run(
             self.aio.go_to,
@@ -153,8 +154,8 @@ class Selection(SelectionTwin["AsyncSelection"]):
         Args:
             targets: as for :meth:`go_to`.
             min_distance_m: minimum distance between any two members in metres; None: that of the fleet.
-            by: ``"layers"``: separate crossing paths by altitude; ``"corridors"``: by time, which needs ``speed_m_s``;
-                ``"refuse"``: refuse crossing paths.
+            by: ``"layers"`` separates crossing paths by altitude, ``"corridors"`` by time, which needs ``speed_m_s``.
+                ``"refuse"`` refuses crossing paths.
             speed_m_s: ground speed of all members.
             max_altitude_m: highest layer in metres above sea level; None: no limit.
             slack_s: for corridors: how early or late a member may be relative to another, in seconds.
@@ -200,7 +201,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
         """Fly a show: all members fly to their first points, start at the same instant, and hold at the end.
 
         The members have to be in the air. Their clocks are measured with TIMESYNC, so that delayed telemetry does not
-        count as deviation. If a member fails, the fleet's policy decides about the others, as in any action.
+        count as deviation. If a member fails, the fleet's policy decides about the other members, as in any action.
 
         Args:
             show: tracks by member's name; :meth:`Show.renamed` assigns tracks to members.
@@ -262,7 +263,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
         """Keep a formation while the leader moves: ``async with fleet.following(formation, leader="north/1"):``.
 
         Each follower is flown by velocity set-points. If the leader is lost or taken over, the followers hold. If a
-        follower fails, the fleet's policy decides about the others.
+        follower fails, the fleet's policy decides about the other followers.
 
         Args:
             formation: the places.
@@ -301,7 +302,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
         Raises:
             InvalidArgument: a name is unknown, or a mission is invalid. Nothing was sent.
             OperationRejected: a member is unavailable, or paths come too close. Nothing was sent.
-            FleetError: an upload failed; ``start_missions`` will start none of them.
+            FleetError: an upload failed; ``start_missions`` will start no mission.
         """
         return self._loop.run(
             self.aio.upload,
@@ -319,7 +320,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
             stagger_s: delay in seconds between the starts of consecutive members; None: all at once.
 
         Raises:
-            OperationRejected: no upload succeeded for all members, or a member is unavailable or not armed. Nothing was
+            OperationRejected: the last upload failed for a member, or a member is unavailable or not armed. Nothing was
                 sent.
         """
         return self._loop.run(self.aio.start_missions, timeout=timeout, stagger_s=stagger_s)
@@ -328,7 +329,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
         """Wait until each member has finished its mission; see ``vehicle.mission.wait_finished``.
 
         Args:
-            timeout: seconds until all of them have; None: no limit.
+            timeout: seconds until all members have finished; None: no limit.
         """
         return self._loop.run(self.aio.wait_missions_finished, timeout=timeout)
 
@@ -393,7 +394,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
         return self._loop.run(self.aio.arm, timeout=timeout, stagger_s=stagger_s)
 
     def disarm(self, *, timeout: float = 10.0) -> FleetResult:
-        """Disarm; refused in the air; see :meth:`aerokit.Vehicle.disarm`.
+        """Disarm; see :meth:`aerokit.Vehicle.disarm`. Vehicles in the air refuse.
 
         Args:
             timeout: seconds for each member.
@@ -458,7 +459,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
 
         Args:
             condition: called with a member, four times a second and when its state changes.
-            timeout: seconds until it is true for all members.
+            timeout: seconds until the condition is true for all members.
             description: name of the barrier in errors.
 
         Raises:
@@ -472,7 +473,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
         Args:
             altitude_m: metres above the home of each member.
             tolerance_m: allowed difference in metres.
-            timeout: seconds until all of them are there.
+            timeout: seconds until all members are at the altitude.
 
         Raises:
             FleetError: a member did not reach the altitude in time.
@@ -505,7 +506,7 @@ class Fleet(FleetTwin, Selection):
     def reclaim(self, name: str) -> None:
         """Make members available again that were taken over or released.
 
-        Sends nothing; the next action includes them. **Ask the pilot first.**
+        Sends nothing. The next action includes these members. **Ask the pilot first.**
 
         Args:
             name: a member's name or a pattern.
@@ -516,7 +517,7 @@ class Fleet(FleetTwin, Selection):
         self._loop.call(self.aio.reclaim, name)
 
     def release(self, name: str, reason: str = "released by the program") -> None:
-        """Exclude members from actions until :meth:`reclaim`. Sends nothing: they continue what they are doing.
+        """Exclude members from actions until :meth:`reclaim`. Nothing is sent, so the members continue as before.
 
         Args:
             name: a member's name or a pattern.
@@ -538,7 +539,7 @@ class Fleet(FleetTwin, Selection):
 
         Raises:
             InvalidArgument: a message is incomplete, damaged or too long, or ``rtcm`` is empty. Nothing was sent.
-            ConnectionClosed, LinkLost: a link has ended; the links before it got the corrections.
+            ConnectionClosed, LinkLost: a link has ended; earlier links got the corrections.
         """
         return self._loop.call(self.aio.send_corrections, rtcm)
 
@@ -551,10 +552,10 @@ class Fleet(FleetTwin, Selection):
         """Subscribe to events of the fleet and its vehicles; use it in a ``with`` block.
 
         Args:
-            *types: events of the fleet (``MemberLost``, ``PolicyCompleted`` …) and of vehicles (``ModeChanged`` …). The
-                latter arrive as :class:`MemberEvent` with the member's name. None: all of both.
+            *types: events of the fleet (``MemberLost``, ``PolicyCompleted`` …) and of vehicles (``ModeChanged`` …).
+                Events of vehicles arrive as :class:`MemberEvent` with the member's name. Without arguments: all events.
             capacity: maximum number of unread events.
-            overflow: what happens to an event that exceeds the capacity; ``missed`` of the stream counts them.
+            overflow: what happens to an event that exceeds the capacity; the stream's ``missed`` counts dropped events.
 
         Raises:
             InvalidArgument: a type is not an event.
@@ -574,7 +575,8 @@ class Fleet(FleetTwin, Selection):
             *names: names of docs/states.md: ``"position"``, ``"batteries"`` …
             every_arrival: also report values that arrive unchanged.
             capacity: maximum number of unread updates.
-            overflow: what happens to an update that exceeds the capacity; ``missed`` of the stream counts them.
+            overflow: what happens to an update that exceeds the capacity; the stream's ``missed`` counts dropped
+                updates.
 
         Raises:
             InvalidArgument: a name is unknown, or none is given.
@@ -605,8 +607,8 @@ def fleet(
     system 7 of network "north". Several networks can therefore use the same system ids.
 
     Args:
-        *sources: addresses, links or open connections, on which all vehicles found become members; or vehicle objects.
-            A mapping gives names to networks or vehicles; other networks are named ``"1"``, ``"2"`` …
+        *sources: addresses, links or open connections, whose vehicles all become members; or vehicle objects. A mapping
+            gives names to networks or vehicles; other networks are named ``"1"``, ``"2"`` …
         count: number of vehicles to wait for, in total; None: at least one on each network, plus those found in the
             next 2.5 seconds.
         system_ids: use these system ids only, on all networks or by network name; None: all that are found.
@@ -617,7 +619,8 @@ def fleet(
         min_distance_m: minimum distance between any two members in metres. Paths are compared before flight, and the
             event ``TooClose`` reports violations in flight; None: no checks.
         on_too_close: ``"hold"``: both members hold, if this program flies them; ``"report"``: event only.
-        timeout: seconds to wait for all members. After five seconds logger "aerokit" warns which are missing.
+        timeout: seconds to wait for all members. After five seconds, a warning of the logger "aerokit" lists the
+            missing members.
         rates: message class → Hz, requested from each member instead of the default rates; ``{}`` requests nothing.
 
     Raises:
@@ -625,7 +628,7 @@ def fleet(
         BusyError: this program already has a vehicle object for one of ``system_ids`` on that connection.
         LinkOpenError: a link could not be opened.
         LinkLost, ConnectionClosed: a link closed while waiting.
-        ConnectFailed: some members were not found in time; the text lists those that were.
+        ConnectFailed: some members were not found in time; the text lists the members found.
     """
     return opened_fleet(
         Fleet,

@@ -298,7 +298,8 @@ class StateCell(CellTwin[T]):
         single message is not missed. Exceptions of the predicate are raised here.
 
         Raises:
-            OperationTimeout: not reached within ``timeout`` seconds; the text has ``description`` and the last values.
+            OperationTimeout: the condition was not met within ``timeout`` seconds; the text has ``description`` and the
+                last values.
         """
         return self._loop.run(
             self.aio.wait_until,
@@ -309,7 +310,7 @@ class StateCell(CellTwin[T]):
         )
 
     def changes(self) -> Changes[T]:
-        """Iterate over values that differ from their predecessor, starting with the current one if there is one.
+        """Iterate over values that differ from their predecessor, starting with the current value if there is one.
 
         A slow reader gets only the latest value. The loop can be left at any time.
         """
@@ -337,7 +338,7 @@ class Subscription(SubscriptionTwin[ItemT]):
     """Asynchronous iterator over received items, for one reader. Active inside its ``with`` block.
 
     The default, ``capacity=1`` with ``drop_oldest``, always yields the latest item; ``missed`` counts the dropped
-    ones. When the connection ends, queued items can still be read; after that, reading raises the connection's error.
+    items. When the connection ends, queued items can still be read; after that, reading raises the connection's error.
     """
 
     @property
@@ -379,7 +380,7 @@ class Connection(ConnectionTwin):
 
     @property
     def signing(self) -> Signing | None:
-        """Key that signs sent frames and verifies received ones; None: frames are neither signed nor verified.
+        """Key that signs sent frames and verifies received frames; None: frames are neither signed nor verified.
 
         ``signing.timestamp`` is the time stamp to store; ``signing.refused`` counts refused frames. May be set while
         the connection is open. Raises InvalidArgument with MAVLink 1, which has no signatures.
@@ -406,7 +407,7 @@ class Connection(ConnectionTwin):
 
     @property
     def unsent_bytes(self) -> int:
-        """Number of written bytes that have not left this machine, if the link can measure it.
+        """Number of written bytes that have not left this machine, if the link can measure that number.
 
         A value that stays above 0 means that the link does not drain (TCP without a network, a serial port with flow
         control asserted); see :class:`LinkStalled`. Always 0 for UDP.
@@ -416,7 +417,7 @@ class Connection(ConnectionTwin):
     def discard_unsent(self) -> None:
         """Discard data that was sent but has not left this program, e.g. an outdated command.
 
-        This applies to all waiting data, for all targets. Data in the system's TCP buffer cannot be discarded and
+        The call discards all waiting data, for all targets. Data in the system's TCP buffer cannot be discarded and
         stays in :attr:`unsent_bytes`.
         """
         self._loop.call(self.aio.discard_unsent)
@@ -431,7 +432,7 @@ class Connection(ConnectionTwin):
         """Return a stream of these messages or events, of one system (0: of all), for use in a ``with`` block.
 
         Raises:
-            InvalidArgument: no type is given, or the dialect does not have it.
+            InvalidArgument: no type is given, or the dialect does not have a given type.
         """
         return Subscription(
             self._loop,
@@ -4601,7 +4602,7 @@ class Vehicle(VehicleTwin):
 
         A PX4 fixed wing flies the figure itself (MAV_CMD_DO_FIGURE_EIGHT), as two circles joined by straight lines, and
         continues until another order. For ArduCopter and PX4's multicopters, aerokit streams the set-points of a
-        lemniscate; at the end the vehicle holds at the center. Errors, cancellation and time-out are as for
+        lemniscate; at the end the vehicle holds at the center. Time-out, cancellation and errors are those of
         :meth:`orbit`.
 
         Args:
@@ -5227,12 +5228,12 @@ def open_connection(
 
     Args:
         address: a connection string (``"udpin:0.0.0.0:14550"``, ``"/dev/ttyACM0,57600"``, …) or an unopened link; or a
-            list of them that lead to the same vehicles (docs/how-to/several-links.md). Then each frame is processed
-            once, and commands use the best link, or the next one when it fails. ``?costly=1`` in an address marks a
-            link that is used only when the others fail. A lost link is reopened while another one works.
+            list of links to the same vehicles (docs/how-to/several-links.md). With a list, each frame is processed
+            once, and commands use the best link that works. ``?costly=1`` in an address marks a link that is used only
+            when the others fail. A lost link is reopened while another link works.
         source_system: own system id, 1–255; ground stations use 255.
         source_component: own component id, 1–255. 0 is allowed for programs that have always used it (DroneKit).
-        baud: bits per second of a serial link whose address has none, above 0.
+        baud: bits per second of a serial link whose address does not give them, above 0.
         dialect: the messages that are decoded.
         mavlink_version: version of sent messages, 1 or 2; both are received.
         signing: key that signs sent frames; received frames without its signature are refused (docs/signing.md). None:

@@ -26,13 +26,14 @@ Rules:
   `aerokit.transport.memory_link_pair` in tests on virtual time.
 - The clock stands still during ``run_in_executor`` (``asyncio.to_thread``, name resolution). Other threads may wake
   the loop by ``call_soon_threadsafe``, but do not stop the clock.
-- If nothing can happen any more, `DeadlockError` names the waiting tasks. If real sockets or other threads could
-  still wake the loop, it waits `DEADLOCK_TIMEOUT_S` of real time first.
+- If nothing can happen any more, the loop raises `DeadlockError`, which names the waiting tasks. If real sockets or
+  other threads could still wake the loop, it first waits for `DEADLOCK_TIMEOUT_S` of real time.
 """
 
 from __future__ import annotations
 
 import asyncio
+import math
 import selectors
 import threading
 from collections.abc import Callable, Coroutine, Mapping
@@ -43,6 +44,10 @@ from typing import Any, TypeVar
 import anyio
 
 T = TypeVar("T")
+
+_POLL_EVERY = 64
+# With more timers than this, mostly cancelled ones, asyncio's own iteration discards the cancelled timers.
+_MANY_TIMERS = 100
 
 DEADLOCK_TIMEOUT_S = 10.0
 """Real seconds to wait for sockets, executor calls and other threads before the loop is considered deadlocked."""
@@ -60,34 +65,88 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
 
     def __init__(self, *, deadlock_timeout_s: float = DEADLOCK_TIMEOUT_S) -> None:
         self._now = 0.0
-        self._outside_calls = 0
+        self._outside_calls = self._turns = 0
         self._deadlock_timeout_s = deadlock_timeout_s
-        self._own_sources: int | None = None  # Size of the selector map while only the loop's self-pipe is registered.
+        self._sources: list[tuple[Callable[[], float], asyncio.Handle]] = []
         super().__init__(_JumpingSelector(self))
-        self._own_sources = len(self._selector_map())
+        selector: selectors.BaseSelector = self._selector  # type: ignore[attr-defined]
+        self._selected: Mapping[Any, Any] = selector.get_map()
+        self._own_selected = len(self._selected)  # just the loop's self-pipe
         self._clock_resolution = 1e-9  # A rounding error in now + (when - now) must not miss a timer.
 
     def time(self) -> float:
         """Return the virtual seconds since the loop was created."""
         return self._now
 
-    def jump(self, when: float) -> bool:
-        """Advance the clock to ``when`` if nothing else is scheduled before; return True if the clock was advanced.
+    def add_event_source(self, next_due: Callable[[], float], run: Callable[[], None]) -> Callable[[], None]:
+        """Call ``run`` whenever the clock would pass ``next_due()``; return a function that ends this.
 
-        Call this in a callback instead of setting a timer for ``when``, to save an iteration of the loop.
+        An event source does the same as a timer in a fraction of the time, because it needs neither timers nor
+        iterations of the loop. ``next_due`` returns seconds on this clock, or infinity for never. After each ``run``,
+        it must return a later time. Event sources run before timers of the same instant.
         """
-        if self._ready or self._stopping or self._outside_calls or self._debug:  # type: ignore[attr-defined]
-            return False
-        timers: list[asyncio.TimerHandle] = self._scheduled  # type: ignore[attr-defined]
-        while timers and timers[0].cancelled():  # asyncio does the same in the next iteration.
+        source = (next_due, asyncio.Handle(run, (), self))
+        self._sources.append(source)
+        return lambda: self._sources.remove(source) if source in self._sources else None
+
+    def _run_once(self) -> None:
+        """Run one iteration of the loop. Without sockets, poll only now and then, for signals."""
+        self._turns += 1
+        ready, timers = self._ready, self._scheduled  # type: ignore[attr-defined]
+        if (
+            self._turns % _POLL_EVERY == 0
+            or not self._is_alone
+            or (not ready and not self._run_sources() and self._next_timer() == math.inf)
+            or _MANY_TIMERS < len(timers) < 2 * self._timer_cancelled_count  # type: ignore[attr-defined]
+        ):
+            super()._run_once()  # type: ignore[misc]
+            return
+        if not ready:
+            self._now = max(self._now, self._next_timer())
+        end = self._now + self._clock_resolution
+        if timers and timers[0]._when < end:
+            ready.extend(handle for next_due, handle in self._sources if next_due() < end)
+            while timers and timers[0]._when < end:
+                timer = heappop(timers)
+                timer._scheduled = False
+                ready.append(timer)
+        for _ in range(len(ready)):
+            handle = ready.popleft()
+            if not handle._cancelled:
+                handle._run()
+
+    @property
+    def _is_alone(self) -> bool:
+        """True if neither sockets nor threads nor the debug mode need asyncio's own iteration."""
+        is_watched = self._outside_calls or self._stopping or self._debug  # type: ignore[attr-defined]
+        return not is_watched and len(self._selected) == self._own_selected
+
+    def _next_timer(self) -> float:
+        """Return the time of the first timer, infinity without timers. Discard cancelled timers before it."""
+        timers: list[Any] = self._scheduled  # type: ignore[attr-defined]
+        while timers and timers[0]._cancelled:
             self._timer_cancelled_count -= 1  # type: ignore[attr-defined]
-            heappop(timers)._scheduled = False  # type: ignore[attr-defined]
-        if timers and timers[0].when() <= when + self._clock_resolution:
-            return False
-        if len(self._selector_map()) != self._own_sources:  # Sockets must be polled before every jump.
-            return False
-        self._now = max(self._now, when)
-        return True
+            heappop(timers)._scheduled = False
+        return timers[0]._when if timers else math.inf
+
+    def _run_sources(self) -> bool:
+        """Run event sources that are due before the next timer, until a callback is ready. Return True if any ran."""
+        sources, ready, has_run = self._sources, self._ready, False  # type: ignore[attr-defined]
+        is_alone = self._is_alone
+        while sources and not ready:
+            due = math.inf
+            for next_due, candidate in sources:
+                if (when := next_due()) < due:
+                    due, handle = when, candidate
+            if not due + self._clock_resolution < self._next_timer():
+                break
+            if due > self._now:
+                self._now = due
+            handle._run()
+            has_run = True
+            if not is_alone:  # Sockets are polled before every jump.
+                break
+        return has_run
 
     def run_in_executor(self, executor: Any, func: Callable[..., T], *args: Any) -> asyncio.Future[T]:  # type: ignore[override]
         """Run ``func`` on a thread; the clock stands still until it returns."""
@@ -109,7 +168,11 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         events = poll(0)
         if events or (timeout is not None and timeout <= 0):
             return events
-        if self._outside_calls or (timeout is None and self._may_be_woken()):
+        if self._outside_calls:
+            return self._wait_in_real_time(poll)
+        if self._run_sources():
+            return []
+        if timeout is None and self._may_be_woken():
             return self._wait_in_real_time(poll)
         if timeout is None:
             raise DeadlockError(self._deadlock("nothing left to wait for"))
@@ -128,11 +191,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         return events
 
     def _may_be_woken(self) -> bool:
-        return len(self._selector_map()) != self._own_sources or threading.active_count() > 1
-
-    def _selector_map(self) -> Mapping[Any, Any]:
-        selector: selectors.BaseSelector = self._selector  # type: ignore[attr-defined]
-        return selector.get_map()
+        return len(self._selected) != self._own_selected or threading.active_count() > 1
 
     def _deadlock(self, reason: str) -> str:
         waiting = "".join(f"\n  - {_where(task)}" for task in asyncio.all_tasks(self))

@@ -1,4 +1,4 @@
-"""Report of a failed test: flights, texts and the paths of pictures and recordings."""
+"""Report on a failed test: its flights, their texts, and the paths of pictures and recordings."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _MAX_TEXTS = 6
 
 
 def failure_report(flown: Iterable[SimulatedFleet | Flight | ServedFlight], test: str, directory: str | None) -> str:
-    """Return lines about each vehicle.
+    """Return the lines of the report on each vehicle.
 
     With ``directory``, also save a picture of all tracks there, named after the test, and recordings with their
     reports.

@@ -1,4 +1,4 @@
-"""``FaultModel``: effects of a bad radio on frames; ``FaultyPath``: applies them to one direction, without I/O."""
+"""``FaultModel``: faults of a radio link; ``FaultyPath``: applies them to frames in one direction, without I/O."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class FaultModel(Snapshot):
     duplication: float = 0.0
     """Share of frames that arrive twice; the copy follows at once."""
     reordering: float = 0.0
-    """Share of frames that are delayed, so that later ones overtake them."""
+    """Share of frames that are delayed, so that later frames overtake them."""
     corruption: float = 0.0
     """Share of frames in which one to eight bits are flipped."""
     delay_s: float = 0.0
@@ -43,7 +43,7 @@ class FaultModel(Snapshot):
     outages: tuple[tuple[float, float], ...] = ()
     """Intervals (begin, end), in seconds since the link was opened, in which all frames are lost."""
     per_frame: bool = True
-    """True applies faults to each MAVLink frame, as a radio does; False to whole writes and datagrams."""
+    """True applies faults to each MAVLink frame, as a radio does; False applies them to whole writes and datagrams."""
 
     def _check(self) -> None:
         for name in _SHARES:
@@ -105,8 +105,8 @@ class FaultyPath:
         return arrivals
 
     def _carry_frame(self, frame: bytes, now: float) -> list[tuple[float, bytes]]:
-        # Each frame consumes the same number of random numbers, so that changing one share does not change which frames
-        # have the other faults.
+        # Each frame consumes the same number of random numbers. A change of one share therefore does not change which
+        # frames have other faults.
         model, draws = self.model, [self._chance() for _ in range(5)]
         lost, doubled = draws[0] < model.loss, draws[1] < model.duplication
         held, bad, jitter = (

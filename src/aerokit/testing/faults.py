@@ -14,7 +14,7 @@ from aerokit.testing.stage import FlightScheduler
 from aerokit.testing.track import true_point
 from aerokit.testing.track_points import TrackPoint
 
-# Function that passes the scheduler of the flight to another function, possibly later.
+# Function that calls its argument with the scheduler of the flight, now or when the flight is opened.
 ScheduleWith = Callable[[Callable[[FlightScheduler], None]], None]
 
 
@@ -66,7 +66,7 @@ class FaultInjector:
         self._set("motor_failed", True, False, after_s, None)
 
     def drop_packets(self, share: float, *, after_s: float = 0.0, for_s: float | None = None) -> None:
-        """Lose this share of packets, 0 to 1, in both directions. The seed of the vehicle determines which."""
+        """Lose this share of packets, 0 to 1, in both directions. The vehicle's seed determines which packets."""
         if not 0.0 <= share <= 1.0:
             raise InvalidArgument(f"share = {share!r} is not allowed: 0 to 1")
         self._set("loss", share, 0.0, after_s, for_s)
@@ -81,7 +81,7 @@ class FaultInjector:
         self._set("frozen", True, False, after_s, for_s)
 
     def fail_prearm(self, reason: str, *, after_s: float = 0.0, for_s: float | None = None) -> None:
-        """Add a reason to the failed arming checks."""
+        """Make an arming check fail for this reason."""
         reasons = self.all.prearm_failures
         self._plan(partial(reasons.append, reason), after_s)
         if for_s is not None:

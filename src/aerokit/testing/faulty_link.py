@@ -4,7 +4,7 @@
 radio = FaultyLink(
     create_link("udpin:0.0.0.0:14550"),
     incoming=FaultModel(loss=0.2, delay_s=0.05),                # from the vehicle
-    outgoing=FaultModel(loss=0.1, delay_s=0.05, bandwidth=5760),  # to it
+    outgoing=FaultModel(loss=0.1, delay_s=0.05, bandwidth=5760),  # to the vehicle
     seed=7,
 )
 async with aerokit.connect(radio) as vehicle:
@@ -83,7 +83,7 @@ class StalledQueue:
             outbox.resume()
 
     def close(self) -> None:
-        """Close the queues, without sending what the operating system has accepted."""
+        """Close the queues. Bytes that the operating system has accepted are not sent."""
         for outbox in self._outboxes.values():
             outbox.discard()
             outbox.close()
@@ -120,9 +120,9 @@ class StalledQueue:
 class FaultyLink(Link):
     """Loses, duplicates, delays and corrupts the traffic of another link, as `FaultModel` specifies.
 
-    ``outgoing`` applies to what this program writes, ``incoming`` to what it receives; ``model`` is the default of
-    both. Each direction has a separate random generator, derived from ``seed``, so that a program on virtual time gets
-    the same faults in every run. With ``half_duplex``, only one direction transmits at a time.
+    ``outgoing`` applies to data that this program writes, ``incoming`` to data that it receives. ``model`` is the
+    default of both. Each direction has a separate random generator, derived from ``seed``, so that a program on virtual
+    time gets the same faults in every run. With ``half_duplex``, only one direction transmits at a time.
 
     The wrapped link must not be open; this link opens and closes it.
     """
@@ -156,12 +156,12 @@ class FaultyLink(Link):
 
     @property
     def address(self) -> str:  # type: ignore[override]
-        """Such as ``faulty(udpin:0.0.0.0:14550)``."""
+        """Address such as ``faulty(udpin:0.0.0.0:14550)``."""
         return f"faulty({self.link.address})"
 
     @property
     def dropped_writes(self) -> int:  # type: ignore[override]
-        """Writes that the wrapped link dropped, that overflowed a queue, or that expired during a stall.
+        """Number of writes that the wrapped link dropped, that overflowed a queue, or that expired during a stall.
 
         Frames lost in transit do not count.
         """
@@ -353,13 +353,16 @@ class _DeliveryQueue:
         self._waiting: list[tuple[float, int, Callable[[], None]]] = []
         self._count = 0
         self._timer: asyncio.TimerHandle | None = None
-        self._timer_at = 0.0  # Stored here because uvloop's TimerHandle.when() fails for a time that has passed.
+        self._timer_at = 0.0  # stored here, because uvloop's TimerHandle.when() fails for a time that has passed
 
     def __bool__(self) -> bool:
         return bool(self._waiting)
 
     def put(self, due: float, action: Callable[[], None]) -> None:
-        """Run the action at once if it is due and the queue is empty, so that a radio without faults adds no delay."""
+        """Queue an action, or run it at once if it is due and the queue is empty.
+
+        A radio without faults therefore adds no delay.
+        """
         if due <= self.loop.time() and not self._waiting:
             action()
             return

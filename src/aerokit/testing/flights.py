@@ -42,7 +42,7 @@ _BOOT_TIME_S = 1.0
 
 
 class Flight:
-    """A simulated vehicle in a test. Faults can be scheduled before it is opened; the track remains afterwards."""
+    """A simulated vehicle in a test. Faults can be scheduled before the flight. The track remains after it."""
 
     def __init__(self, fleet: SimulatedFleet, number: int) -> None:
         self._fleet = fleet
@@ -66,7 +66,7 @@ class Flight:
 
     @property
     def recording(self) -> FlightRecording | None:
-        """Recording of the link, shared by a fleet; None without ``record=True``."""
+        """Recording of the link, which all vehicles of a fleet share; None without ``record=True``."""
         return self._fleet.recording
 
     @property
@@ -85,7 +85,7 @@ class Flight:
 
 
 class SimulatedFleet(Sequence[Flight]):
-    """Simulated vehicles on one link, with system ids 1, 2, 3 …; a sequence of `Flight`. It can be opened once.
+    """Simulated vehicles on one link, with system ids 1, 2, 3 …: a sequence of `Flight`. Can be opened once.
 
     The vehicles stand in a row to the east of ``home``, ``spacing_m`` metres apart.
     """
@@ -131,7 +131,7 @@ class SimulatedFleet(Sequence[Flight]):
         return self._nearest()[0]
 
     def assert_stayed_apart(self, distance_m: float) -> None:
-        """Assert that no two vehicles came nearer to each other than this, in space. They start 5 m apart."""
+        """Assert that no two vehicles came nearer to each other than this distance, in space."""
         __tracebackhide__ = True
         nearest, time_s, names = self._nearest()
         assert nearest >= distance_m, f"{names} came nearer than {distance_m:g} m: {nearest:.1f} m at {time_s:.1f} s"
@@ -250,7 +250,7 @@ async def open_flight(kind: str = "copter", **options: Any) -> AsyncIterator[Fli
 
 
 def open_fleet(*kinds: str, count: int | None = None, **options: Any) -> AbstractAsyncContextManager[SimulatedFleet]:
-    """Open vehicles of these kinds, or ``count`` of one kind, on one link; options as of `open_flight`.
+    """Open vehicles of these kinds, or ``count`` of one kind, on one link. Options are those of `open_flight`.
 
     The vehicles stand in a row to the east of ``home``, ``spacing_m`` metres (by default 5) apart.
     """

@@ -20,8 +20,8 @@ _CONTEXT_FILES = ("interruption.py", "served.py")
 class Interruption:
     """Raises KeyboardInterrupt in the main thread, but only within a block of `allowed`.
 
-    Python may run a signal handler long after the signal was sent, even while the block is entered or left, where no
-    code would catch the exception. In that case the signal is sent again. No signal is pending after the block.
+    Python may run a signal handler long after the signal was sent, even while the block is entered or left. No code
+    would catch the exception there, so the signal is sent again in this case. No signal is pending after the block.
     """
 
     def __init__(self) -> None:

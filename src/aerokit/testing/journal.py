@@ -15,7 +15,7 @@ MessageT = TypeVar("MessageT", bound=Message)
 
 @dataclass(frozen=True)
 class SentText:
-    """A complete status text of the vehicle; it may have been lost in transit."""
+    """A complete status text of the vehicle, which may have been lost in transit."""
 
     time_s: float
     """Simulated seconds."""
@@ -39,7 +39,7 @@ class ReceivedMessage:
 
 
 class Journal:
-    """Texts and messages, oldest first; it grows while the vehicle runs. Assertions raise AssertionError."""
+    """Texts and messages, oldest first. The journal grows while the vehicle runs. Assertions raise AssertionError."""
 
     def __init__(self) -> None:
         self._texts: list[SentText] = []
@@ -68,7 +68,7 @@ class Journal:
         return [received.message for received in self.messages if isinstance(received.message, kind)]
 
     def commands(self, command: int) -> list[CommandLong | CommandInt]:
-        """Return the received commands of one MAV_CMD, COMMAND_LONG or COMMAND_INT, including repetitions."""
+        """Return the received COMMAND_LONG and COMMAND_INT messages with this MAV_CMD, including repetitions."""
         return [order for order in self._orders() if order.command == command]
 
     def assert_sent_text(self, part: str) -> None:
@@ -78,7 +78,7 @@ class Journal:
         assert is_sent, f"no text with {part!r} was sent; sent texts:{_lines(self.texts)}"
 
     def assert_received_command(self, command: int, *, times: int | None = None) -> None:
-        """Assert that the vehicle received this MAV_CMD; with ``times``, exactly that often (0: never)."""
+        """Assert that the vehicle received this MAV_CMD: at least once, or exactly ``times`` times (0: never)."""
         __tracebackhide__ = True
         count = len(self.commands(command))
         right = count > 0 if times is None else count == times

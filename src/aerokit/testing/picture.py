@@ -52,7 +52,7 @@ class Drawable(Protocol):
 def check_picture(path: str | PathLike[str]) -> None:
     """Check a file name.
 
-    Raises InvalidArgument if the suffix is neither .svg nor .png, AerokitError for .png if Pillow is not installed.
+    Raises InvalidArgument unless the suffix is .svg or .png, and AerokitError for .png without Pillow.
     """
     suffix = Path(path).suffix.lower()
     if suffix not in (".svg", ".png"):
@@ -64,7 +64,7 @@ def check_picture(path: str | PathLike[str]) -> None:
 def save_picture(tracks: Iterable[Drawable], path: str | PathLike[str]) -> None:
     """Draw tracks from above and their altitudes over time, as .svg or as .png (with Pillow).
 
-    Raises what `check_picture` raises, and OSError if the file cannot be written.
+    Raises the errors of `check_picture`, and OSError if the file cannot be written.
     """
     check_picture(path)
     tracks = list(tracks)

@@ -6,7 +6,7 @@
 - ``dronekit_address``, ``dronekit``: on a socket, and `aerokit.dronekit` under DroneKit's name
 - ``@pytest.mark.simulated("plane", seed=3)``: selects the simulated vehicle
 
-Tests that use none of them are not affected, and do not import aerokit.
+Tests that use none of these are not affected, and do not import aerokit.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ def dronekit() -> Iterator[ModuleType]:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
-    """Open ``flight`` and ``fleet`` before pytest-asyncio runs the test, if it has the asyncio marker."""
+    """Open ``flight`` and ``fleet`` before pytest-asyncio runs the test, if the test has the asyncio marker."""
     fleets = _fleets(item)
     if not fleets or item.get_closest_marker("asyncio") is None:
         return (yield)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Iterable
-from dataclasses import dataclass, field
 from os import PathLike
 from typing import BinaryIO
 
@@ -12,136 +11,105 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavFtpErr, MavMissionResult, MavParamError, MavResult
 from aerokit.mavlink.message import Message
+from aerokit.missions import MissionItem
 from aerokit.parameters.encoding import UNKNOWN_INDEX
 from aerokit.parameters.pack import HASH_NAME
 from aerokit.protocols.servers.ftp_packets import FtpPacket
-from aerokit.protocols.servers.missions import AnyItem, AnyRequest, item_from, item_message_float
+from aerokit.protocols.servers.missions import (
+    AnyItem,
+    AnyListMessage,
+    AnyRequest,
+    ListUpload,
+    MissionServer,
+    item_from,
+    item_message_float,
+)
+from aerokit.protocols.servers.parameters import ParameterProtocolServer
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandServer, ReceivedCommand
 from aerokit.sim.vehicle import AttachableComponent, SimulatedVehicle, sender_of
 from aerokit.testing.recording import RecordedAnswer, RecordedFlight
 
-_LIST_INTERVAL_S, _BURST = 0.005, 5
+_LIST_RATE_HZ = 1000.0
+_MAX_ITEMS = 1 << 16
 
 
-class RecordedParameters:
+class RecordedParameters(ParameterProtocolServer):
     """Handles PARAM_REQUEST_LIST, PARAM_REQUEST_READ and PARAM_SET."""
 
+    starts_at_once = True
     names: list[str]
 
     def __init__(self, vehicle: RecordedVehicle) -> None:
+        super().__init__(vehicle, self, list_rate_hz=_LIST_RATE_HZ)
         self._vehicle = vehicle
         self._written: dict[str, float] = {}
+        self._recorded: dict[str, list[tuple[float, m.ParamValue]]] = {}
+        for time, value in vehicle.recording.parameters:
+            self._recorded.setdefault(value.param_id, []).append((time, value))
         values = [value for _, value in vehicle.recording.parameters]
         counted = {value.param_id: value.param_index for value in values if value.param_index != UNKNOWN_INDEX}
-        uncounted = [value.param_id for value in values if value.param_id not in counted]
+        uncounted = [name for name in self._recorded if name not in counted]
         is_whole = bool(counted) and len(counted) == max(value.param_count for value in values)
         self.names = sorted(counted, key=lambda name: (counted[name], name))
         """Names in the order in which the vehicle lists its parameters."""
-        self.names += [name for name in dict.fromkeys(uncounted) if name != HASH_NAME]
+        self.names += [name for name in uncounted if name != HASH_NAME]
         # The hash covers all parameters, so it is unknown if some were not recorded.
         self._hash = is_whole and HASH_NAME in uncounted
-        vehicle.on(m.ParamRequestList, self._on_list)
-        vehicle.on(m.ParamRequestRead, self._on_read)
-        vehicle.on(m.ParamSet, self._on_set)
 
-    def _has(self, name: str) -> bool:
-        return name in self.names or (name == HASH_NAME and self._hash)
-
-    def value_message(self, name: str, index: int | None = None) -> m.ParamValue:
-        """Return the latest PARAM_VALUE, written or recorded; before the first recorded one, return that."""
-        position, recorded = self._vehicle.position_s, None
-        for time, value in self._vehicle.recording.parameters:
-            if value.param_id == name and (recorded is None or time <= position):
-                recorded = value
-        assert recorded is not None
-        if index is None:
-            index = UNKNOWN_INDEX if name == HASH_NAME else self.names.index(name)
-        written = self._written.get(name, recorded.param_value)
-        return m.ParamValue(name, written, recorded.param_type, len(self.names), index)
+    def value_message(self, name: str, index: int) -> m.ParamValue:
+        """Return the latest PARAM_VALUE, written or recorded. Before the first recorded value, return that value."""
+        position, recorded = self._vehicle.position_s, self._recorded[name]
+        latest = next((value for time, value in reversed(recorded) if time <= position), recorded[0][1])
+        written = self._written.get(name, latest.param_value)
+        return m.ParamValue(name, written, latest.param_type, len(self.names), index)
 
     def _on_list(self, request: m.ParamRequestList, channel: Channel) -> None:
-        messages = [self.value_message(HASH_NAME)] if self._hash else []
-        latest = self._latest()
-        count = len(self.names)
-        for index, name in enumerate(self.names):
-            value = latest[name]
-            written = self._written.get(name, value.param_value)
-            messages.append(m.ParamValue(name, written, value.param_type, count, index))
-        for number in range(0, len(messages), _BURST):
-            some = messages[number : number + _BURST]
-            delay = number / _BURST * _LIST_INTERVAL_S
-            self._vehicle.call_later(delay, lambda some=some: self._send(some, channel))  # type: ignore[misc]
-
-    def _latest(self) -> dict[str, m.ParamValue]:
-        position, latest = self._vehicle.position_s, {}
-        for time, value in self._vehicle.recording.parameters:
-            if time <= position or value.param_id not in latest:
-                latest[value.param_id] = value
-        return latest
-
-    def _send(self, messages: list[m.ParamValue], channel: Channel) -> None:
-        for message in messages:
-            self._vehicle.send(message, channel)
+        if self._hash:
+            self.send(HASH_NAME, UNKNOWN_INDEX, channel)
+        self.start_list(channel)
 
     def _on_read(self, request: m.ParamRequestRead, channel: Channel) -> None:
-        index = request.param_index
-        if index < 0 and self._has(request.param_id):
-            self._vehicle.send(self.value_message(request.param_id), channel)
-        elif 0 <= index < len(self.names):
-            self._vehicle.send(self.value_message(self.names[index]), channel)
+        name, index, names = request.param_id, request.param_index, self.names
+        if 0 <= index < len(names):
+            self.send(names[index], index, channel)
+        elif index < 0 and name in names:
+            self.send(name, names.index(name), channel)
+        elif index < 0 and name == HASH_NAME and self._hash:
+            self.send(name, UNKNOWN_INDEX, channel)
         else:
-            self._refuse(request, request.param_id, index, channel)
+            self._refuse(request, index, channel)
 
     def _on_set(self, request: m.ParamSet, channel: Channel) -> None:
         name = request.param_id
         if name not in self.names:
-            self._refuse(request, name, -1, channel)
+            self._refuse(request, -1, channel)
             return
         if name in self._vehicle.recording.settable:
             self._written[name] = request.param_value
-        self._vehicle.send(self.value_message(name))
+        self.send(name, self.names.index(name), None)
 
-    def _refuse(self, request: m.ParamRequestRead | m.ParamSet, name: str, index: int, channel: Channel) -> None:
+    def _refuse(self, request: m.ParamRequestRead | m.ParamSet, index: int, channel: Channel) -> None:
         if self._vehicle.recording.has_parameter_errors:
-            error = m.ParamError(*sender_of(request), name, index, MavParamError.DOES_NOT_EXIST)
-            self._vehicle.send(error, channel)
+            self.send_error(sender_of(request), request.param_id, index, MavParamError.DOES_NOT_EXIST, channel)
 
 
-_RETRY_INTERVAL_S, _MAX_ATTEMPTS = 1.0, 5
-
-
-@dataclass
-class _Upload:
-    mission_type: int
-    count: int
-    sender: tuple[int, int]
-    channel: Channel
-    items: list[AnyItem] = field(default_factory=list)
-    attempts: int = 0
-
-
-class RecordedMissions:
+class RecordedMissions(MissionServer):
     """Serves the recorded plans; accepts uploads with their recorded result."""
 
+    retry_interval_s = 1.0
+
     def __init__(self, vehicle: RecordedVehicle) -> None:
+        super().__init__(vehicle, capacity=_MAX_ITEMS)
         self._vehicle = vehicle
+        self.requests_int: bool = vehicle.recording.uses_int
+        self._received: list[AnyItem] = []
         self._written: dict[int, tuple[AnyItem, ...]] = {}
-        self._upload: _Upload | None = None
         self._done: dict[tuple[str, int], int] = {}
-        for kind, handler in (
-            (m.MissionRequestList, self._on_list),
-            (m.MissionRequest, self._on_request),
-            (m.MissionRequestInt, self._on_request),
-            (m.MissionCount, self._on_count),
-            (m.MissionItem, self._on_item),
-            (m.MissionItemInt, self._on_item),
-            (m.MissionClearAll, self._on_clear),
-        ):
-            vehicle.on(kind, handler)
+        self.listen()
 
     def items(self, mission_type: int) -> tuple[AnyItem, ...] | None:
-        """Return the current plan, or the first one if none was recorded yet; None if the recording has none."""
+        """Return the current plan, or the first recorded plan before that; None if the recording has no plan."""
         if mission_type in self._written:
             return self._written[mission_type]
         position, found = self._vehicle.position_s, None
@@ -150,77 +118,53 @@ class RecordedMissions:
                 found = plan.items
         return found
 
-    def _on_list(self, request: m.MissionRequestList, channel: Channel) -> None:
-        items = self.items(request.mission_type)
-        if items is None:
-            self._acknowledge(request, request.mission_type, MavMissionResult.UNSUPPORTED, channel)
-            return
-        count = m.MissionCount(*sender_of(request), len(items), request.mission_type)
-        self._vehicle.send(count, channel)
+    def count(self, mission_type: int) -> int:
+        return len(self.items(mission_type) or ())
 
-    def _on_request(self, request: AnyRequest, channel: Channel) -> None:
-        items = self.items(request.mission_type) or ()
-        if request.seq >= len(items):
-            self._acknowledge(request, request.mission_type, MavMissionResult.INVALID_SEQUENCE, channel)
-            return
-        as_float = isinstance(request, m.MissionRequest)
-        self._vehicle.send(_item_message(items[request.seq], request.seq, sender_of(request), as_float), channel)
+    def _refusal(self, message: AnyListMessage, channel: Channel) -> int | None:
+        kind = message.mission_type
+        is_upload = isinstance(message, m.MissionCount)
+        is_recorded = kind in self._vehicle.recording.uploads if is_upload else self.items(kind) is not None
+        return None if is_recorded else MavMissionResult.UNSUPPORTED
 
-    def _on_count(self, message: m.MissionCount, channel: Channel) -> None:
-        if message.mission_type not in self._vehicle.recording.uploads:
-            self._acknowledge(message, message.mission_type, MavMissionResult.UNSUPPORTED, channel)
-            return
-        self._upload = upload = _Upload(message.mission_type, message.count, sender_of(message), channel)
-        self._continue(upload)
+    def _item(self, mission_type: int, seq: int) -> MissionItem | int:
+        items = self.items(mission_type) or ()
+        return item_from(items[seq]) if seq < len(items) else MavMissionResult.INVALID_SEQUENCE
 
-    def _on_item(self, message: AnyItem, channel: Channel) -> None:
-        upload = self._upload
-        if upload is None or message.mission_type != upload.mission_type or sender_of(message) != upload.sender:
-            return
-        if message.seq == len(upload.items):
-            upload.items.append(message)
-            upload.attempts = 0
-            self._continue(upload)
+    def _message(self, item: MissionItem, request: AnyRequest) -> AnyItem:
+        recorded = (self.items(request.mission_type) or ())[request.seq]
+        return _item_message(recorded, request.seq, sender_of(request), isinstance(request, m.MissionRequest))
 
-    def _continue(self, upload: _Upload) -> None:
-        if len(upload.items) < upload.count:
-            self._request_item(upload, len(upload.items))
-            return
-        self._upload = None
-        result = self._result("upload", self._vehicle.recording.uploads[upload.mission_type], upload.mission_type)
+    def _put(self, upload: ListUpload, message: AnyItem) -> int:
+        self._received[message.seq :] = [message]
+        return MavMissionResult.ACCEPTED
+
+    def _finish(self, upload: ListUpload) -> None:
+        kind = upload.mission_type
+        result = self._recorded_result("upload", self._vehicle.recording.uploads[kind], kind)
         if result == MavMissionResult.ACCEPTED:
-            self._written[upload.mission_type] = tuple(upload.items)
-        ack = m.MissionAck(*upload.sender, result, upload.mission_type)
-        self._vehicle.send(ack, upload.channel)
+            self._written[kind] = tuple(self._received[: upload.end])
+        self._end(upload, result)
 
-    def _request_item(self, upload: _Upload, seq: int) -> None:
-        if self._upload is not upload or len(upload.items) != seq:
-            return
-        if upload.attempts >= _MAX_ATTEMPTS:
-            self._upload = None
-            return
-        upload.attempts += 1
-        kind = m.MissionRequestInt if self._vehicle.recording.uses_int else m.MissionRequest
-        self._vehicle.send(kind(*upload.sender, seq, upload.mission_type), upload.channel)
-        self._vehicle.call_later(_RETRY_INTERVAL_S, lambda: self._request_item(upload, seq))
+    def _time_out(self, upload: ListUpload) -> None:
+        self._drop(upload)
 
-    def _on_clear(self, message: m.MissionClearAll, channel: Channel) -> None:
-        clears = self._vehicle.recording.clears.get(message.mission_type)
-        result = MavMissionResult.UNSUPPORTED
-        if clears is not None:
-            result = MavMissionResult(self._result("clear", clears, message.mission_type))
+    def _on_clear(self, request: m.MissionClearAll, channel: Channel) -> None:
+        kind, result = request.mission_type, int(MavMissionResult.UNSUPPORTED)
+        if kind in self._vehicle.recording.clears:
+            result = self._recorded_result("clear", self._vehicle.recording.clears[kind], kind)
         if result == MavMissionResult.ACCEPTED:
-            self._written[message.mission_type] = ()
-        self._acknowledge(message, message.mission_type, result, channel)
+            self._written[kind] = ()
+        self._acknowledge(sender_of(request), kind, result, channel)
 
-    def _result(self, what: str, results: list[int], mission_type: int) -> int:
-        """Return the recorded results in order; the last one is repeated."""
+    def _on_set_current(self, request: m.MissionSetCurrent, channel: Channel) -> None:
+        """Do nothing: the recording decides which item is current."""
+
+    def _recorded_result(self, what: str, results: list[int], mission_type: int) -> int:
+        """Return the next of the recorded results; the last result is repeated."""
         number = self._done.get((what, mission_type), 0)
         self._done[what, mission_type] = number + 1
         return results[min(number, len(results) - 1)]
-
-    def _acknowledge(self, to: Message, mission_type: int, result: int, channel: Channel) -> None:
-        self._vehicle.send(m.MissionAck(*sender_of(to), result, mission_type), channel)
 
 
 def _item_message(item: AnyItem, seq: int, to: tuple[int, int], as_float: bool) -> AnyItem:
@@ -241,18 +185,18 @@ _MESSAGE_REQUESTS = (MavCmd.SET_MESSAGE_INTERVAL, MavCmd.REQUEST_MESSAGE)
 class RecordedVehicle(SimulatedVehicle):
     """Plays a ``.tlog`` by the simulator's clock. Requests of clients do not change the streamed messages.
 
-    - Commands: a command gets the acknowledgements that were recorded for the same params, otherwise for any params,
-      with the recorded delay. The last acknowledgement repeats. Commands that were not recorded are UNSUPPORTED.
-      REQUEST_MESSAGE sends the latest recorded message.
-    - Parameters: the recorded parameters, renumbered without gaps. Only parameters that were set in the recording can
-      be set. A request for an unknown name gets PARAM_ERROR if the recorded vehicle sent that message, otherwise no
-      answer.
-    - Missions: the recorded missions. Uploads and clearing get their recorded result, or UNSUPPORTED.
+    - Commands: a command gets the acknowledgements that were recorded for the same params or, if there are none, for
+      any params, with the recorded delay. The last acknowledgement repeats. Commands that were not recorded are
+      UNSUPPORTED. REQUEST_MESSAGE sends the latest recorded message.
+    - Parameters: the vehicle has the recorded parameters, renumbered without gaps. Only parameters that were set in the
+      recording can be set. A request for an unknown name gets PARAM_ERROR if the recorded vehicle sent that message,
+      otherwise no answer.
+    - Missions: the vehicle has the recorded missions. An upload or clearing gets the recorded result, or UNSUPPORTED.
     - File operations are refused, the list of logs is empty, and rates cannot be changed. TIMESYNC and PING are
       answered.
 
-    ``system_id`` selects a vehicle of the recording, by default the first; ``start_s`` skips the beginning. At the end
-    the vehicle falls silent; with ``repeat`` the recording starts again. Faults apply, except those of sensors and
+    ``system_id`` selects a vehicle of the recording, by default the first. ``start_s`` skips the beginning. At the end,
+    the vehicle falls silent or, with ``repeat``, the recording starts again. Faults apply, except those of sensors and
     parameters.
 
     Raises InvalidArgument if there is no vehicle in the recording, OSError if it cannot be read.
@@ -368,7 +312,7 @@ class RecordedVehicle(SimulatedVehicle):
         return self._on_command(command)
 
     def _latest_message(self, message_id: int) -> Message | None:
-        """Return the latest message with this id, or the first one if none was played yet."""
+        """Return the latest message with this id. Before the first such message was played, return that message."""
         stream = self.recording.stream
         own = (self.system_id, self.component_id)
         for _, frame in (*reversed(stream[: self._next]), *stream[self._next :]):

@@ -21,7 +21,7 @@ MAX_GAP_S = 60.0
 
 _ITEMS = (m.MissionItemInt, m.MissionItem)
 _COMMANDS = (m.CommandLong, m.CommandInt)
-# Answers to requests of the recorded client, which are not streamed.
+# Answers to requests of the recorded client. The played vehicle does not stream them.
 _ANSWERS = frozenset(
     kind.ID
     for kind in (
@@ -49,7 +49,7 @@ class RecordedAnswer:
 
 @dataclass(frozen=True)
 class RecordedPlan:
-    """A plan on the vehicle since a point in time."""
+    """A plan that the vehicle had from a point in time on."""
 
     since: float
     mission_type: int

@@ -23,7 +23,7 @@ SPEEDUP = 10.0
 
 
 class ServedFlight:
-    """A simulated vehicle that a thread serves faster than real time. Seconds are simulated."""
+    """A simulated vehicle that a thread serves faster than real time. All times are simulated seconds."""
 
     def __init__(
         self,
@@ -37,7 +37,7 @@ class ServedFlight:
         self.address: str = server.addresses[0].replace("tcpin:", "tcp:")
         """Address to connect to, such as "tcp:127.0.0.1:5760"."""
         self.simulated: Any = vehicle
-        """The simulated vehicle, which runs on another thread: only read it, and change it by ``faults``."""
+        """The simulated vehicle. It runs on another thread, so only read it here, and change it by ``faults``."""
         self.track: Track = scheduler.tracks[0]
         """True track of the vehicle."""
         self.journal: Journal = scheduler.journals[0]
@@ -116,9 +116,9 @@ def hosted_flight(
 ) -> Iterator[ServedFlight]:
     """Serve a vehicle on an address while the block runs; ``options`` are those of the vehicle.
 
-    Timeouts of the vehicle for the client are multiplied by ``speedup``, except those in ``parameters``; see
-    `aerokit.sim.kinds.scale_timeouts`. Raises InvalidArgument for a wrong kind or address, LinkOpenError if the
-    address cannot be opened, and on exit an exception of the vehicle that was not raised before.
+    Timeouts after which the vehicle reacts to a silent client are multiplied by ``speedup``, except those in
+    ``parameters``; see `aerokit.sim.kinds.scale_timeouts`. Raises InvalidArgument for a wrong kind or address,
+    LinkOpenError if the address cannot be opened, and on exit an exception of the vehicle that was not raised before.
     """
     from anyio.from_thread import start_blocking_portal
 

@@ -24,8 +24,8 @@ _POLL_INTERVAL_S = 0.1
 class FlightScheduler(SimulatedVehicle):
     """A silent vehicle on the links that runs scheduled actions.
 
-    Its timers survive a reboot of a vehicle, and are not delayed while a vehicle is frozen. Pass it to the server
-    before the vehicles: it advances them to the time of each action.
+    Its timers survive a reboot of a vehicle, and are not delayed while a vehicle is frozen. Pass the scheduler to the
+    server before the vehicles, because it advances them to the time of each action.
     """
 
     def __init__(self, vehicles: Sequence[Any]) -> None:
@@ -39,7 +39,7 @@ class FlightScheduler(SimulatedVehicle):
             vehicle.journal = journal
 
     def step(self, now: float) -> None:
-        """Advance all vehicles to each action, and run it."""
+        """For each due action, advance all vehicles to the time of the action, then run it."""
         while (due := self.next_due) <= now:
             for vehicle in self._vehicles:
                 vehicle.step(max(due, vehicle.now))
@@ -64,7 +64,7 @@ class FlightScheduler(SimulatedVehicle):
             action()
 
     def do_when(self, condition: Callable[[], bool], action: Callable[[], None]) -> None:
-        """Run an action once, when a condition is true; it is checked ten times per simulated second."""
+        """Run an action once, when a condition is true. The condition is checked ten times per simulated second."""
         if condition():
             action()
         else:

@@ -35,7 +35,7 @@ _ON_GROUND_M = 0.3
 
 
 class Track(Sequence[TrackPoint]):
-    """True points of a flight, oldest first; it grows while the vehicle runs.
+    """True points of a flight, oldest first. The track grows while the vehicle runs.
 
     Assertions raise AssertionError; all of them fail on an empty track.
     """
@@ -64,13 +64,13 @@ class Track(Sequence[TrackPoint]):
         return self._refreshed()[index]
 
     def append(self, point: TrackPoint) -> None:
-        """Append a point; replaces the last one if its time is not later."""
+        """Append a point. If its time is not later than that of the last point, replace the last point."""
         if self._points and self._points[-1].time_s >= point.time_s:
             self._points.pop()
         self._points.append(point)
 
     def refresh_with(self, refresh: Callable[[], None] | None) -> None:
-        """Set a function that is called before each read of the track, to append recent points; None removes it."""
+        """Set a function that appends recent points before each read of the track; None removes the function."""
         self._refresh = refresh
 
     def _refreshed(self) -> list[TrackPoint]:

@@ -35,7 +35,7 @@ class LinkAddress(Snapshot):
     host: str = ""
     """Name or IP address without brackets; "0.0.0.0" for listening without a host."""
     port: int = 0
-    """1 to 65535, or 0 for listening: the system chooses."""
+    """1 to 65535. 0 is allowed for listening: the system then chooses the port."""
     device: str = ""
     """Serial port, e.g. "/dev/ttyACM0" or "COM14"."""
     baud: int | None = None
@@ -43,7 +43,8 @@ class LinkAddress(Snapshot):
     path: str = ""
     """Path of a recording or of a pseudo-terminal's symbolic link ("": none), or "fleet/name" on a zenoh network."""
     options: tuple[tuple[str, str], ...] = ()
-    """(name, value) pairs sorted by name: ``rtscts``, ``costly`` ("1"), ``speed``, ``timeout`` (s), zenoh's."""
+    """(name, value) pairs sorted by name: ``rtscts``, ``costly`` ("1"), ``speed``, ``timeout`` (s), options of zenoh.
+    """
 
     def __str__(self) -> str:
         as_written = _quote_option if self.kind in _ZENOH_KINDS else str
@@ -121,7 +122,7 @@ _PYMAVLINK_ONLY = ("uds", "unix", "mcast", "ws", "wss", "wsserver", "csv")
 
 _ENDPOINT = re.compile(r"[a-z][a-z0-9_-]*/[^/].*", re.IGNORECASE | re.DOTALL)
 
-_SCHEME = re.compile(r"([a-z][a-z0-9_+.-]+):(.*)", re.IGNORECASE | re.DOTALL)  # one letter is a drive
+_SCHEME = re.compile(r"([a-z][a-z0-9_+.-]+):(.*)", re.IGNORECASE | re.DOTALL)  # a single letter is a Windows drive
 
 _URL = re.compile(r"([a-z][a-z0-9_+.-]*)://(.*)", re.IGNORECASE | re.DOTALL)
 
@@ -172,7 +173,7 @@ class _Parser:
         return self.bare(text)
 
     def split_scheme(self, text: str) -> tuple[str, str]:
-        """Return the scheme in lower case ("" if there is none), and the rest."""
+        """Return the scheme in lower case ("" if there is none), and the text after it."""
         if match := _URL.fullmatch(text):
             return match[1].lower(), match[2]
         match = _SCHEME.fullmatch(text)

@@ -18,7 +18,7 @@ def create_link(address: str | LinkAddress, *, baud: int = 57600, peers: PeerFil
 
     Args:
         address: a connection string, or the result of :func:`parse_address`.
-        baud: bits per second of a serial port whose string has none.
+        baud: bits per second of a serial port whose string does not give them.
         peers: IP addresses and networks to accept, for udpin, udpbcast and tcpin; None: all.
 
     Raises:
@@ -30,7 +30,7 @@ def create_link(address: str | LinkAddress, *, baud: int = 57600, peers: PeerFil
             f"peers = … is not allowed with {where}: only udpin, udpbcast and tcpin links filter senders"
         )
     if where.kind == "serial":
-        from aerokit.transport.serial import SerialLink  # imported here because a program has few kinds
+        from aerokit.transport.serial import SerialLink  # imported here because a program uses few kinds of links
 
         return SerialLink(where.device, where.baud or baud, rtscts=where.option("rtscts") == "1")
     if where.kind == "replay":

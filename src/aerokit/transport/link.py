@@ -34,10 +34,10 @@ class Receiver(Protocol):
 
 @runtime_checkable
 class DrainListener(Receiver, Protocol):
-    """A receiver that is notified when written data does not leave."""
+    """A receiver that is notified when written data does not leave this machine."""
 
     def link_stalled(self, unsent_bytes: int) -> None:
-        """Called when no waiting data has left for a second. Commands in it may arrive late or never."""
+        """Called when no waiting data has left for a second. Commands in the data may arrive late or never."""
 
     def link_drained(self, stalled_s: float) -> None:
         """Called when data leaves again, after ``stalled_s`` seconds."""
@@ -50,16 +50,16 @@ class OrderRefusalListener(Receiver, Protocol):
     def order_refused(self, message: str, reason: str, lease_holder: str | None, answers: tuple[bytes, ...]) -> None:
         """Called when a message with this name was not forwarded to the vehicle.
 
-        ``lease_holder`` is the client that has control, if that is the reason. ``answers`` are frames by which a
-        vehicle would reject the command; some messages have none.
+        ``lease_holder`` is the client that has control, if its control is the reason. ``answers`` are the frames by
+        which a vehicle would reject the command, if there are such frames.
         """
 
 
 @runtime_checkable
 class PeerKeeper(Receiver, Protocol):
-    """A receiver that decides by `Link.keep_peer` which peers a link remembers; the link forgets senders of noise.
+    """A receiver that decides by `Link.keep_peer` which peers a link remembers. Senders of noise are then forgotten.
 
-    A link that wraps another one forwards `Link.keep_peer`, `Link.forget_peer` and `Link.host_of`.
+    A link that wraps another link forwards `Link.keep_peer`, `Link.forget_peer` and `Link.host_of`.
     """
 
     keeps_peers: bool
@@ -71,7 +71,7 @@ class BurstListener(Receiver, Protocol):
     """A receiver that processes the data of one read burst together. Used by links with `Link.reports_bursts`."""
 
     def burst_ended(self) -> None:
-        """Called after one or more ``bytes_received``, before the next one in a later loop iteration."""
+        """Called after the ``bytes_received`` calls of one burst, before those of a later loop iteration."""
 
 
 @runtime_checkable
@@ -134,7 +134,7 @@ class Link(ABC):
     def unsent_bytes(self) -> int:
         """Written bytes that have not left this machine: in the link, in its transport and, on Linux, in the kernel.
 
-        Commands in them may still arrive. 0 does not mean that the other end has received everything.
+        Commands in these bytes may still arrive. 0 does not mean that the other end has received everything.
         """
         return 0
 
@@ -158,7 +158,7 @@ class Link(ABC):
         return
 
     def host_of(self, peer: Peer) -> object:
-        """Return what identifies the peer's host: its IP address, or the peer itself if it has none."""
+        """Return an identifier of the peer's host: the IP address, or the peer itself if there is none."""
         return peer[0] if isinstance(peer, tuple) else peer
 
     def has_peer(self, peer: Peer) -> bool:
@@ -329,8 +329,8 @@ def memory_link_pair(*, latency_s: float = 0.0) -> tuple[MemoryLink, MemoryLink]
     """Return two links that are connected to each other. Open both on the same event loop.
 
     Each write arrives unsplit and in order, ``latency_s`` seconds later, but never before `Link.write` returns. Data
-    for an end that is not open is dropped, as with UDP. When one end closes, the other receives the data written
-    before, and is then lost.
+    for an end that is not open is dropped, as with UDP. When one end closes, the other end first receives the data
+    written before, and then reports its loss.
     """
     near, far = MemoryLink("memory:near", latency_s), MemoryLink("memory:far", latency_s)
     near._far, far._far = far, near

@@ -43,7 +43,7 @@ class MemberLinkListener(Receiver, Protocol):
 
 
 class MultiLink(Link):
-    """Several links to the same vehicles. A link that cannot be opened is retried while another one is open.
+    """Several links to the same vehicles. A link that cannot be opened is retried while another link is open.
 
     Args:
         factories: functions that create the links, called for the first and every later attempt to open them.
@@ -75,7 +75,7 @@ class MultiLink(Link):
         self._is_available = [False] * len(self._links)
         self._kept: list[set[Peer]] = [set() for _ in self._links]
         self._openings: set[asyncio.Task[None]] = set()
-        self._foreign: set[int] = set()  # opened by another owner, which closes them
+        self._foreign: set[int] = set()  # links that another owner opened and closes
         self._is_opening = False
         self._last_loss: LinkLost | None = None
         self._lost_at: float | None = None
@@ -105,7 +105,7 @@ class MultiLink(Link):
             link.discard_unsent()
 
     def discard_unsent_of(self, link: int) -> None:
-        """Discard unsent data of one link, so that it does not arrive after commands over another one."""
+        """Discard unsent data of one link, so that it does not arrive after commands over another link."""
         self._links[link].discard_unsent()
 
     def is_available(self, link: int) -> bool:

@@ -27,7 +27,7 @@ class Outbox:
     Args:
         send: writes bytes to the transport.
         pending: returns the number of unsent bytes in the transport and the kernel.
-        limit: bytes.
+        limit: maximum number of bytes kept.
         dropped: called with the number of dropped writes.
         stalled: called with True when no waiting data has left for `STALLED_AFTER_S`, with False when it leaves again.
     """
@@ -48,8 +48,8 @@ class Outbox:
         self._waiting_bytes = 0
         self._forwarded = 0  # bytes written to the transport
         self._left = 0  # bytes that had left this machine at the last poll
-        self._progress_at = 0.0  # last progress, or start of waiting
-        self._is_full = False  # between pause() and resume()
+        self._progress_at = 0.0  # time of the last progress, or of the start of waiting
+        self._is_full = False  # True between pause() and resume()
         self._is_stalled = self._is_closed = False
         self._timer: asyncio.TimerHandle | None = None
 
@@ -124,7 +124,7 @@ class Outbox:
             self._forward(self._joined())
 
     def _joined(self) -> bytes:
-        """Return the next write, joined with following ones up to `_MAX_JOINED_BYTES`."""
+        """Return the next write, joined with following writes up to `_MAX_JOINED_BYTES`."""
         data = self._next()
         while self._waiting and len(data) + len(self._waiting[0][1]) <= _MAX_JOINED_BYTES:
             data += self._next()
@@ -183,6 +183,6 @@ def kernel_unsent_bytes(fd: int) -> int:
     import fcntl
     import termios
 
-    with contextlib.suppress(OSError, ValueError):  # closed meanwhile
+    with contextlib.suppress(OSError, ValueError):  # the descriptor was closed meanwhile
         return int.from_bytes(fcntl.ioctl(fd, termios.TIOCOUTQ, bytes(4)), sys.byteorder)
     return 0

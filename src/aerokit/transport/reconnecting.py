@@ -85,9 +85,9 @@ class ReconnectingLink(Link):
         self._link = make_link()
         self._backoff = Backoff(min_delay_s, max_delay_s)
         self._receiver: Receiver | None = None  # None: no callbacks
-        self._current: _CurrentReceiver | None = None  # receiver of the current link; callbacks of others are ignored
+        self._current: _CurrentReceiver | None = None  # callbacks of earlier links are ignored
         self._was_opened = self._is_closed = self._is_up = False
-        self._lost_at: float | None = None  # None: not reported as lost
+        self._lost_at: float | None = None  # None while the link is not reported as lost
         self._reopening: asyncio.Task[None] | None = None
         self._stable_timer: asyncio.TimerHandle | None = None
         self._dropped = 0
@@ -200,7 +200,7 @@ class ReconnectingLink(Link):
             logger.warning("%s; reopening it", error)
             if isinstance(self._receiver, InterruptionListener):
                 self._receiver.link_interrupted(error)
-        if self._reopening is None and self._receiver is not None:  # not closed by the callback above
+        if self._reopening is None and self._receiver is not None:  # the callback above has not closed the link
             self._reopening = asyncio.get_running_loop().create_task(self._reopen(), name="aerokit reopening")
 
     # ----------------------------------------------------------------------- reopening

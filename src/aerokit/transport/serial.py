@@ -42,15 +42,15 @@ _MAX_BUFFER_S = 2.0  # data that waits for longer would be outdated when it arri
 
 
 class AddressError(SerialException, InvalidArgument):  # type: ignore[misc]  # pyserial has no types
-    """An invalid connection string, for programs that expect pyserial's error as pymavlink raises it."""
+    """An invalid connection string. Also a SerialException, because pymavlink raises that."""
 
 
 class SerialLink(BaseLink):
-    """A serial port, 8N1, opened exclusively. Unplugging it is a lost link.
+    """A serial port, 8N1, opened exclusively. Unplugging the device counts as a lost link.
 
-    ``baud`` is in bits per second. It matters for UARTs, not for USB ports such as /dev/ttyACM0. ``rtscts`` enables
-    hardware flow control. The write buffer holds about two seconds of data (at least 4096 bytes), and drops data after
-    a second.
+    ``baud`` is in bits per second. The rate matters for UARTs, not for USB ports such as /dev/ttyACM0. ``rtscts``
+    enables hardware flow control. The write buffer holds about two seconds of data (at least 4096 bytes), and drops
+    data after a second.
     """
 
     def __init__(self, device: str, baud: int = 57600, *, rtscts: bool = False) -> None:
@@ -121,7 +121,7 @@ class SerialLink(BaseLink):
             raise serial.SerialException(*error.args) from error
 
     def _device_failed(self, error: OSError) -> None:
-        # Reported in a later loop iteration, because this may run inside write().
+        # Report the loss in a later loop iteration, because this method may run inside write().
         if self._loop is not None and self._transport is not None:
             self._transport.pause_reading()
             self._loop.call_soon(self._lose, f"the device failed: {error.strerror or error}", error)
@@ -156,11 +156,11 @@ class SerialLink(BaseLink):
     def _close_port(self, transport: Any) -> None:
         unsent = self._waiting_to_be_sent(transport)
         with contextlib.suppress(RuntimeError):  # the loop is closed
-            transport.pause_reading()  # a second call, because the first has no effect before the first loop iteration
+            transport.pause_reading()  # again, because the first call has no effect before the first loop iteration
             transport.flush()
         if unsent:
             with contextlib.suppress(Exception):
-                self._port.reset_output_buffer()  # otherwise close() waits up to 30 s until the buffer is sent
+                self._port.reset_output_buffer()  # with data in the buffer, close() would wait for up to 30 s
         self._port.close()
         self._released.set()
 
@@ -177,7 +177,7 @@ class _SerialProtocol(asyncio.Protocol):
             self._link._outbox.pause()
 
     def resume_writing(self) -> None:
-        # In a later loop iteration, because the transport is in the middle of a write.
+        # Report the failure in a later loop iteration, because the transport is in the middle of a write.
         if self._link._outbox is not None and self._link._loop is not None:
             with contextlib.suppress(RuntimeError):  # the loop is closed
                 self._link._loop.call_soon(self._link._outbox.resume)
@@ -187,7 +187,7 @@ class _SerialProtocol(asyncio.Protocol):
 
 
 def _replace_calls(port: Any, on_failure: _OnFailure) -> None:
-    """Replace the methods of a port by ones that never block and report a lost device to ``on_failure``."""
+    """Replace the methods of a port by methods that never block and report a lost device to ``on_failure``."""
     port.flush = lambda: None
     if os.name == "posix":
         port.read = partial(_read, port.fileno(), on_failure)
@@ -247,9 +247,9 @@ _HINTS = {
 class PtyLink(BaseLink):
     """One end of a pseudo-terminal. Another program opens the other end; `address` has its name once the link is open.
 
-    ``path`` is the name of a symbolic link to the other end. It is removed when the link is closed. A dangling symbolic
-    link of that name is replaced; any other existing file is a LinkOpenError. Baud rates have no effect. Programs may
-    open and close the other end repeatedly; unread data is dropped. Not available on Windows.
+    ``path`` is the name of a symbolic link to the other end, which is removed when this link is closed. A dangling
+    symbolic link of that name is replaced; any other existing file is a LinkOpenError. Baud rates have no effect.
+    Programs may open and close the other end repeatedly; unread data is dropped. Not available on Windows.
     """
 
     def __init__(self, path: str = "") -> None:

@@ -82,7 +82,7 @@ def discard_on_close(sock: socket.socket) -> None:
 
 
 def has_more(sock: socket.socket) -> Callable[[], object]:
-    """Return a function whose result is true if data can be read. It costs a third of a failed read."""
+    """Return a function whose result is true if data can be read. A call costs a third of a failed read."""
     if sys.platform == "win32":  # Windows has no poll
         return partial(bool, True)
     poll = select.poll()

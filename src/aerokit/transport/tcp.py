@@ -27,10 +27,10 @@ CONNECT_TIMEOUT_S = 10.0
 """Default time-out of `TcpConnect.open`."""
 
 MAX_PENDING_BYTES = 256 * 1024
-"""Write buffer per connection. Writes beyond it are dropped, as is data that has waited for a second."""
+"""Write buffer per connection. Writes beyond this size are dropped, and so is data that has waited for a second."""
 
 SEND_BUFFER = 16 * 1024
-"""Kernel send buffer (Linux doubles it). It is small because its data cannot be discarded."""
+"""Kernel send buffer (Linux doubles it). The buffer is small because data in it cannot be discarded."""
 
 NOT_SENT_LOW_WATER = 1024
 """Limit of unsent data in the kernel (TCP_NOTSENT_LOWAT, where available)."""
@@ -48,7 +48,7 @@ class _TcpLink(BaseLink):
     def __init__(self, scheme: str, host: str, port: int) -> None:
         super().__init__(f"{scheme}:{host_and_port(host, port)}")
         self._host, self._port = host, port
-        self._streams: set[_Stream] = set()  # including closing ones
+        self._streams: set[_Stream] = set()  # including closing streams
         self._stalled: set[_Stream] = set()
 
     @property
@@ -156,15 +156,15 @@ class TcpConnect(_TcpLink):
 class TcpListen(_TcpLink):
     """``tcpin:`` link: serves clients. Each client is a peer; the link is not lost when clients disconnect.
 
-    With port 0 the system chooses one; `address` and `local_address` have it once the link is open. ``peers`` are the
-    IP addresses and networks that may connect; None: all.
+    With port 0, the system chooses a port. `address` and `local_address` have this port once the link is open.
+    ``peers`` are the IP addresses and networks that may connect; None: all.
     """
 
     def __init__(self, host: str, port: int, *, peers: PeerFilter | None = None) -> None:
         super().__init__("tcpin", host, port)
         self._allowed = AllowedPeers(peers)
         self._kept: set[Peer] = set()
-        self._socket: socket.socket | None = None  # until the server owns it
+        self._socket: socket.socket | None = None  # None once the server owns the socket
         self._server: asyncio.AbstractServer | None = None
         self._local_address = ("", 0)
         self._clients: dict[Peer, _Stream] = {}
@@ -180,7 +180,7 @@ class TcpListen(_TcpLink):
         return tuple(self._clients)
 
     def write(self, data: bytes, peer: Peer = None) -> None:
-        """See `Link.write`. Drops data for a client beyond `MAX_PENDING_BYTES`, or that has waited for a second."""
+        """See `Link.write`. For each client, drops data beyond `MAX_PENDING_BYTES` or older than a second."""
         if peer is None:
             for client in tuple(self._clients.values()):
                 client.write(data)
@@ -194,12 +194,12 @@ class TcpListen(_TcpLink):
         return 0 if stream is None else stream.unsent_bytes
 
     def keep_peer(self, peer: Peer) -> None:
-        """See `Link.keep_peer`. A kept client is not replaced by another one."""
+        """See `Link.keep_peer`. A kept client is not replaced by a new client."""
         if peer in self._clients:
             self._kept.add(peer)
 
     def forget_peer(self, peer: Peer) -> None:
-        """See `Link.forget_peer`. The client may be replaced by another one."""
+        """See `Link.forget_peer`. The client may then be replaced by a new client."""
         self._kept.discard(peer)
 
     def has_peer(self, peer: Peer) -> bool:
@@ -318,7 +318,7 @@ class _Stream(asyncio.Protocol):
 
     def connection_made(self, transport: Any) -> None:  # not every loop's transport inherits from Transport
         self._transport = transport
-        self.peer = transport.get_extra_info("peername") or f"client {id(self):#x}"  # it may have disconnected already
+        self.peer = transport.get_extra_info("peername") or f"client {id(self):#x}"  # None after a disconnection
         transport.set_write_buffer_limits(high=0)  # data that cannot be sent at once waits in the outbox
         sock = transport.get_extra_info("socket")
         with contextlib.suppress(OSError):
@@ -355,7 +355,7 @@ class _Stream(asyncio.Protocol):
         return self._transport.get_write_buffer_size() + kernel_unsent_bytes(self._fd)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._fd = -1  # the number may be reused
+        self._fd = -1  # the system may reuse the number
         if self._outbox is not None:
             self._outbox.discard()
             self._outbox.close()

@@ -1,7 +1,7 @@
 """UDP links: listen for many peers, connect to one, or broadcast until a peer answers.
 
 Sockets are read in bounded bursts with ``loop.add_reader``, which costs a third of asyncio's datagram transport (one
-datagram per loop iteration). That transport is used on loops without ``add_reader`` (Proactor on Windows).
+datagram per loop iteration). asyncio's transport is used on loops without ``add_reader`` (Proactor on Windows).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ MAX_BURST_DATAGRAMS = 64
 """Maximum number of datagrams read in one loop iteration, so that other tasks can run."""
 
 MAX_PEERS = 256
-"""Maximum number of peers without a `PeerKeeper` as receiver. A new peer replaces the least recent one."""
+"""Maximum number of peers if the receiver is not a `PeerKeeper`. A new peer replaces the least recent one."""
 
 REMOTE_TIMEOUT_S = 3.5
 """Silence of the peer that answered a broadcast, after which its port or address may have changed."""
@@ -155,8 +155,8 @@ class _UdpLink(BaseLink):
 class UdpListen(_UdpLink):
     """``udpin:`` link: binds a port. Each sender is a peer, and gets what is written to all.
 
-    With port 0 the system chooses one; `address` and `local_address` have it once the link is open. ``peers`` are the
-    IP addresses and networks to accept; None: all.
+    With port 0, the system chooses a port. `address` and `local_address` have this port once the link is open.
+    ``peers`` are the IP addresses and networks to accept; None: all.
     """
 
     def __init__(self, host: str, port: int, *, peers: PeerFilter | None = None) -> None:

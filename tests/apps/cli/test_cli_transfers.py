@@ -109,8 +109,8 @@ def test_params_set_and_get_round_trip(run: Run) -> None:
 
 def test_params_set_with_unknown_name_sets_the_others(run: Run) -> None:
     code, out, _ = run("params", "set", "WPNAV_ACCEL=210", "NO_SUCH=1")
-    assert code == 1
-    assert "WPNAV_ACCEL      210          set" in out
+    assert code == 5
+    assert "WPNAV_ACCEL      210          set range not checked (--metadata FILE checks it)" in out
     assert "NO_SUCH          not set: " in out
 
 
@@ -148,6 +148,16 @@ def test_mission_check_works_without_vehicle(capsys: pytest.CaptureFixture[str])
     Path("m.waypoints").write_text(WAYPOINTS)
     assert main(["mission", "check", "m.waypoints"]) == 0
     assert "mission: 3 items\n    0  NAV_TAKEOFF" in capsys.readouterr().out
+
+
+def test_mission_check_prints_parts_of_the_file_only(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("m.waypoints").write_text(WAYPOINTS.replace("\t22\t0\t0\t0\t0\t", "\t22\t0\t0\t0\tnan\t"))
+    assert main(["mission", "check", "m.waypoints"]) == 0
+    out = capsys.readouterr().out
+    assert "    0  NAV_TAKEOFF                      0 0 0 – 0 0 " in out
+    assert "fence" not in out
+    assert "rally" not in out
+    assert "nan" not in out
 
 
 @pytest.mark.parametrize(

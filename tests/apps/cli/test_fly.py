@@ -50,6 +50,12 @@ def test_fly_sim_starts_at_planned_home(capsys: pytest.CaptureFixture[str]) -> N
     assert "simulated copter at 47.397742, 8.545594" in capsys.readouterr().out
 
 
+def test_example_plan_is_flown_to_its_end(capsys: pytest.CaptureFixture[str]) -> None:
+    plan = Path(__file__).parents[3] / "examples" / "survey.plan"
+    assert run_virtual(run_on(None, "fly", str(plan), "--sim")) == 0
+    assert "mission finished: in AUTO, disarmed" in capsys.readouterr().out
+
+
 # ------------------------------------------------------------------------------------ refusals
 
 

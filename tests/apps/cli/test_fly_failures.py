@@ -15,7 +15,8 @@ from cli_harness import HOME, MISSION, ctrl_c, run_on, wait_until
 import aerokit
 from aerokit.apps.cli import fly
 from aerokit.apps.cli import fly as flown_plan
-from aerokit.apps.cli.output import emit
+from aerokit.apps.cli.output import emit, emit_error
+from aerokit.errors import OperationRejected
 from aerokit.mavlink.enums import CopterMode
 from aerokit.missions import read_waypoint_file
 from aerokit.sim import SimulatedCopter, SimulatorServer, simulated_link
@@ -135,7 +136,7 @@ def test_fly_fall_ends_with_error_and_sends_nothing(
     assert run_virtual(scenario()) == 4
     out, err = capsys.readouterr()
     assert "the vehicle accepted the order and has not moved for 12 s, after it descended" in err
-    assert "failed: mission.wait_finished" in out
+    assert "failed: flying the mission: the vehicle accepted the order and has not moved" in out
 
 
 class FullDisk(io.StringIO):
@@ -165,3 +166,32 @@ def test_emit_on_ascii_terminal_replaces_characters(as_json: bool, monkeypatch: 
     options = argparse.Namespace(json=as_json)
     emit(options, "text", {"text": "Grüße"}, "Grüße")
     assert written.getvalue().decode() == ('{"type": "text", "text": "Gr\\u00fc\\u00dfe"}\n' if as_json else "Gr??e\n")
+
+
+@pytest.mark.parametrize(
+    ("text", "plain"),
+    [
+        ("mission.wait_finished: the mode changed to RTL", "flying the mission: the mode changed to RTL"),
+        ("go_to(-35.1, 149.2): the mode changed", "flight to -35.1, 149.2: the mode changed"),
+        ("arm(): not done within 10 s", "arming: not done within 10 s"),
+        ("mission.plan: line 1: expected 'QGC WPL 110'", "mission.plan: line 1: expected 'QGC WPL 110'"),
+        ("landing.waypoints: line 2", "landing.waypoints: line 2"),
+    ],
+)
+def test_command_prints_no_names_of_calls(text: str, plain: str, capsys: pytest.CaptureFixture[str]) -> None:
+    emit_error(OperationRejected(text), 5, as_json=False)
+    assert capsys.readouterr().err == f"aerokit: {plain}\n"
+
+
+def test_demo_repeats_reasons_of_vehicle_while_not_ready(capsys: pytest.CaptureFixture[str]) -> None:
+    async def scenario() -> int:
+        copter = SimulatedCopter(boot_time_s=0.0, home=HOME)
+        copter.faults.prearm_failures = ["Compass not healthy"]
+        async with simulated_link(copter) as link:
+            return await run_on(link, "demo", "--record", "x.tlog")
+
+    assert run_virtual(scenario()) == 1
+    after_text = capsys.readouterr().out.partition("! PreArm: Compass not healthy\n")[2]
+    lines = [line for line in after_text.splitlines() if "    still missing: " in line]
+    assert len(lines) > 5
+    assert all(line.endswith("; PreArm: Compass not healthy") for line in lines)

@@ -79,7 +79,7 @@ def test_unknown_option_gets_no_far_suggestion(capsys: pytest.CaptureFixture[str
 def test_params_set_of_unknown_name_suggests_names(
     assignment: str, hint: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run_with(SimulatedCopter(boot_time_s=0.0), ["params", "set", assignment]) == [1]
+    assert run_with(SimulatedCopter(boot_time_s=0.0), ["params", "set", assignment]) == [5]
     assert capsys.readouterr().out.strip().endswith(hint)
 
 

@@ -10,6 +10,7 @@ import pytest
 from cli_harness import GROUND_STATION, HOME, ctrl_c, run_on, run_on_messages, run_with
 from flight_harness import Wire
 
+import aerokit
 from aerokit import messages as m
 from aerokit.apps.cli import main
 from aerokit.apps.cli.output import TIMED_OUT
@@ -41,6 +42,21 @@ def test_status_of_signing_vehicle_names_missing_key(
     assert "it signs its frames, and without its key" in out.splitlines()[1]
     assert "frames are signed" in err.splitlines()[0]
     assert copter.now < 25.0, "both commands must finish soon"
+
+
+def test_status_of_armed_vehicle_does_not_call_it_ready(capsys: pytest.CaptureFixture[str]) -> None:
+    async def scenario() -> int:
+        copter = SimulatedCopter(boot_time_s=0.0, home=HOME)
+        async with simulated_link(copter) as link, aerokit.connect(link) as vehicle:
+            await vehicle.wait_ready()
+            await vehicle.arm()
+        async with simulated_link(copter) as link:
+            return await run_on(link, "status")
+
+    assert run_virtual(scenario()) == 0
+    out = capsys.readouterr().out
+    assert "ARMED, on ground" in out
+    assert "ready    armed already; arming checks do not apply\n" in out
 
 
 @pytest.mark.parametrize("kind", [SimulatedCopter, SimulatedPx4])

@@ -49,6 +49,22 @@ def test_set_outside_range_with_force_is_set(metadata: str, capsys: pytest.Captu
     assert copter.parameters["RTL_ALT"] == 9000
 
 
+@pytest.mark.parametrize(
+    ("value", "options", "note"),
+    [
+        ("RTL_ALT=-99999", (), "RTL_ALT          -99999       set range not checked (--metadata FILE checks it)\n"),
+        ("LOG_BITMASK=1", ("--metadata",), "set range not checked (the metadata does not have this parameter)\n"),
+        ("RTL_ALT=2000", ("--metadata",), "RTL_ALT          2000         set\n"),
+    ],
+)
+def test_set_says_that_range_was_not_checked(
+    value: str, options: tuple[str, ...], note: str, metadata: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = (*options, metadata) if options else ()
+    assert run_with(SimulatedCopter(boot_time_s=0.0), ["params", "set", value, *given]) == [0]
+    assert capsys.readouterr().out.endswith(note)
+
+
 def test_set_names_reboot_of_metadata(metadata: str, capsys: pytest.CaptureFixture[str]) -> None:
     copter = SimulatedCopter(boot_time_s=0.0)
     assert run_with(copter, ["params", "set", "FS_THR_ENABLE=0", "--metadata", metadata]) == [0]

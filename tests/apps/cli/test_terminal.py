@@ -158,7 +158,7 @@ def test_mistyped_argument_suggests_correction(
     [
         (["params", "get", "RTL_ATL"], 5),
         (["params", "list", "RTL_ATL"], 1),
-        (["params", "set", "RTL_ATL=1500"], 1),
+        (["params", "set", "RTL_ATL=1500"], 5),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )

@@ -10,7 +10,7 @@ from typing import Any
 
 import anyio
 import pytest
-from flight_harness import Wire
+from flight_harness import Wire, open_flight
 from rich.style import Style
 from textual.widgets import RichLog
 
@@ -19,7 +19,7 @@ from aerokit.apps.cli.listening import _event_text
 from aerokit.apps.monitor import app as monitor
 from aerokit.apps.monitor import model as model_module
 from aerokit.apps.monitor.app import ConfirmScreen, Monitor, Panel
-from aerokit.apps.monitor.lines import DANGER, LINK_STYLES, WARNING, Canvas, number
+from aerokit.apps.monitor.lines import DANGER, LINK_STYLES, WARNING, Canvas, VehicleText, number
 from aerokit.apps.monitor.model import SEVERITY_STYLES, MonitorModel, _event_line
 from aerokit.connection.opening import open_connection
 from aerokit.connection.tasks import BackgroundTasks
@@ -234,6 +234,20 @@ async def test_wide_terminal_shows_more_and_puts_texts_below_map() -> None:
         assert any(label in line for line in lines)
     empty = sum(line[1:60].strip() == "" for line in lines)
     assert empty < len(lines) / 3
+
+
+async def test_wide_row_of_armed_vehicle_is_not_ready() -> None:
+    async with open_flight() as flight:
+        await flight.vehicle.wait_ready()
+        assert VehicleText(flight.vehicle).row(is_selected=True, more=True).plain.split()[-1] == "ready"
+        await flight.vehicle.arm()
+        assert VehicleText(flight.vehicle).row(is_selected=True, more=True).plain.split()[-1] == "armed"
+
+
+async def test_vehicle_without_mission_shows_no_item() -> None:
+    async with stage(1, size=(200, 50)) as it:
+        await it.wait_drawn("mission")
+        assert "No mission" in it.screen()
 
 
 async def test_slow_streams_are_one_line_with_count() -> None:

@@ -7,17 +7,19 @@ import json
 from typing import Any
 
 import anyio
+import httpx
 import pytest
 from flight_harness import open_flight
-from serve_stage import HOST, TOKEN, open_stage
+from serve_stage import HOST, TOKEN, Stage, open_stage
 
 from aerokit.apps.serve import make_app
 from aerokit.apps.serve.orders import ORDERS
 from aerokit.apps.serve.requests import MAX_BODY_SIZE, MAX_PLAN_SIZE
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavResult
-from aerokit.mavlink.messages import FileTransferProtocol, MissionCount
+from aerokit.mavlink.messages import FileTransferProtocol, MissionCount, ParamSet
 from aerokit.missions import Fence, FencePolygon, Mission, Plan, format_plan, take_off, waypoint
+from aerokit.parameters import Metadata, ParameterMetadata
 from aerokit.position import Position
 
 pytestmark = pytest.mark.anyio
@@ -317,6 +319,54 @@ async def test_upload_with_repeated_key_is_sent_once() -> None:
         other = await stage.submit("mission/upload", {"plan": plan_of(3)}, **key)
         assert (again.status_code, again.json()["state"], other.status_code) == (200, "done", 409)
         assert stage.flight.wire.all(MissionCount) + stage.flight.wire.all(FileTransferProtocol) == []
+
+
+METADATA = Metadata(
+    [
+        ParameterMetadata("RTL_ALT", unit="cm", minimum=30, maximum=300000),
+        ParameterMetadata("FS_THR_ENABLE", values={0: "Disabled", 1: "Enabled"}),
+    ]
+)
+
+
+async def set_parameter(stage: Stage, name: str, body: object) -> httpx.Response:
+    stage.keys += 1
+    headers = {**BEARER, "Idempotency-Key": f"set-{stage.keys:08}"}
+    return await stage.client.put(f"/api/vehicles/1/parameters/{name}", json=body, headers=headers)
+
+
+@pytest.mark.parametrize(
+    ("name", "body", "text"),
+    [
+        ("RTL_ALT", {"value": -99999}, "RTL_ALT = -99999 is not in 30..300000 cm; nothing was set; "),
+        ("RTL_ALT", {"value": 10**400}, "RTL_ALT"),
+        ("RTL_ALT", {"value": -99999, "force": False}, "RTL_ALT = -99999 is not in 30..300000 cm; nothing was set; "),
+        ("RTL_ALT", {"value": -99999, "force": 1}, "force = 1 is not of type boolean"),
+        ("RTL_ALT", {"value": True, "force": True}, "value = True is not of type number"),
+        ("RTL_ALT", {"value": "-99999"}, "number"),
+        ("rtl_alt", {"value": 29}, "rtl_alt = 29: RTL_ALT = 29 is not in 30..300000 cm"),
+        ("RTL_ALT_M", {"value": 9000}, "RTL_ALT_M = 9000: RTL_ALT = 900000 is not in 30..300000 cm"),
+        ("FS_THR_ENABLE", {"value": 9}, "FS_THR_ENABLE = 9 is not a documented value: 0 Disabled, 1 Enabled"),
+    ],
+)
+async def test_parameter_outside_metadata_is_not_sent(name: str, body: object, text: str) -> None:
+    async with open_stage(metadata=METADATA) as stage:
+        stage.flight.wire.clear()
+        answer = await set_parameter(stage, name, body)
+        assert (answer.status_code, answer.json()["error"]) == (400, "InvalidArgument")
+        assert text in answer.json()["detail"]
+        assert stage.flight.wire.all(ParamSet) == []
+        assert stage.flight.copter.parameters["RTL_ALT"] == 1500
+
+
+async def test_parameter_outside_metadata_needs_force() -> None:
+    async with open_stage(metadata=METADATA) as stage:
+        refused = await set_parameter(stage, "RTL_ALT", {"value": 20})
+        assert refused.json()["detail"].endswith('nothing was set; "force": true sets such values too')
+        assert (await set_parameter(stage, "RTL_ALT", {"value": 30})).status_code == 200
+        assert stage.flight.copter.parameters["RTL_ALT"] == 30
+        assert (await set_parameter(stage, "RTL_ALT", {"value": 20, "force": True})).status_code == 200
+        assert stage.flight.copter.parameters["RTL_ALT"] == 20
 
 
 @pytest.mark.parametrize(

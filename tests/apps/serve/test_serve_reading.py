@@ -364,6 +364,30 @@ async def test_parameters_have_metadata(tmp_path: Path) -> None:
         assert "unit" not in rows["RTL_SPEED"]
 
 
+async def test_state_names_unarmable_mode_and_running_mission() -> None:
+    async with open_stage() as stage, Socket(stage.app) as socket:
+
+        async def state() -> tuple[object, object]:
+            await anyio.sleep(1.5)
+            socket.sent.clear()
+            await socket.next("state")
+            found = (await socket.next("state"))["vehicles"][0]
+            return found["unarmable_mode"], found["is_flying_mission"]
+
+        assert await state() == (None, False)
+        await stage.flight.vehicle.mission.upload(Mission([take_off(altitude_relative_m=10)]))
+        await stage.submit("mode", {"mode": "LAND"})
+        assert await state() == ({"mode": "LAND", "arms_in": "GUIDED", "unless": None}, False)
+        await stage.submit("mode", {"mode": "AUTO"})
+        assert (await state())[0] == {"mode": "AUTO", "arms_in": "GUIDED", "unless": "AUTO_OPTIONS"}
+        await stage.submit("mode", {"mode": "GUIDED"})
+        await stage.submit("arm")
+        assert (await stage.submit("mission/start")).status_code == 200
+        assert (await state())[1] is True
+        await stage.submit("mission/pause")
+        assert (await state())[1] is False
+
+
 async def test_failing_checks_are_requested_once_per_change() -> None:
     async with open_flight() as flight:
         await flight.vehicle.wait_ready()

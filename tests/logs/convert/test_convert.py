@@ -18,6 +18,7 @@ from aerokit import messages as m
 from aerokit.apps.cli import main
 from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.logs.convert import convert
+from aerokit.logs.convert.tables import CsvTable
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.frame import Frame
@@ -151,6 +152,15 @@ def test_folder_has_table_per_message_type(tmp_path: Path, kind: str) -> None:
         assert int(row["system_id"]) == 1
 
 
+@pytest.mark.parametrize("unix_s", [0.0, 1.0000005, 1764115200.9999998, 1764115200.25, -1.25])
+def test_csv_times_have_rounded_microseconds(unix_s: float, tmp_path: Path) -> None:
+    table = CsvTable(tmp_path / "times.csv", [])
+    table.add(unix_s, [])
+    table.close()
+    expected = datetime.fromtimestamp(unix_s, timezone.utc).isoformat(timespec="microseconds")
+    assert (tmp_path / "times.csv").read_text().splitlines()[1] == expected
+
+
 def test_gpx_has_times_elevations_and_mission(log: Path, tmp_path: Path) -> None:
     gpxpy = pytest.importorskip("gpxpy")
     convert(log, tmp_path / "out.gpx")
@@ -261,7 +271,7 @@ def test_unknown_log_or_format_raises(log: Path, tmp_path: Path) -> None:
 def test_convert_command_prints_result(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["convert", str(log), str(tmp_path / "out.gpx")]) == 0
     assert "2023-11-14 22:13:20" in capsys.readouterr().out
-    assert main(["convert", str(log), str(tmp_path / "out.gpx")]) == 2
+    assert main(["convert", str(log), str(tmp_path / "out.gpx")]) == 6
     assert "--force" in capsys.readouterr().err
 
 

@@ -92,16 +92,32 @@ def test_measurements_of_fall_are_those_of_the_descent() -> None:
     (fall,) = falls(flight)
     assert fall_measurements(flight, fall) == []
     for step in range(600):
-        is_falling = fall.begins_s <= step / 10 < fall.time_s - 0.3
+        is_falling = fall.begins_s <= step / 10 < fall.time_s - 0.1
         flight.air.add(step / 10, 0.0, 100.0 if is_falling else 40.0)
         flight.attitude.add(step / 10, 62.0 if is_falling else 0.0, 0.0, 0.0)
         flight.attitude_target.add(step / 10, 0.0, 0.0, 0.0)
     assert fall_measurements(flight, fall) == [
-        "throttle up to 100 %, so look at motors, propellers and battery",
+        "throttle 100 % (before: 40 %), so look at motors, propellers and battery",
         "tilt up to 62°",
         "attitude up to 62° off its set-point, so look at the attitude charts",
     ]
-    assert findings(flight)[1].startswith("Measured in the descent: throttle up to 100 %")
+    assert findings(flight)[1].startswith("Measured in the descent: throttle 100 % (before: 40 %), so")
+
+
+def test_measurements_of_fall_without_power_name_the_current() -> None:
+    flight = descending(free_fall)
+    (fall,) = falls(flight)
+    for step in range(60):
+        is_falling = fall.begins_s <= step / 2 < fall.time_s
+        flight.air.add(step / 2, 0.0, (9.0 if step % 2 else 1.0) if is_falling else 36.0)
+        flight.battery(0).add(step / 2, 12.0, 1.0 if is_falling else 28.0, math.nan, math.nan)
+        flight.attitude.add(step / 2, 3.0, 0.0, 0.0)
+        flight.attitude_target.add(step / 2, math.nan, math.nan, 0.0)
+    assert fall_measurements(flight, fall) == [
+        "throttle 1 to 9 % (before: 36 %)",
+        "tilt up to 3°",
+        "battery current 1 A (before: 28 A), so look at what stopped the motors: ESCs, their supply, a command",
+    ]
 
 
 def test_hover_for_minutes_after_fast_descent_is_no_fall() -> None:

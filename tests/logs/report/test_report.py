@@ -242,7 +242,7 @@ def test_existing_report_needs_force(flown: dict[str, Any], tmp_path: Path, caps
     log = Path(shutil.copy(flown["path"], tmp_path))
     target = log.with_suffix(".html")
     target.write_text("mine")
-    assert main(["report", str(log)]) == 2
+    assert main(["report", str(log)]) == 6
     assert "--force" in capsys.readouterr().err
     assert target.read_text() == "mine"
     assert main(["report", str(log), "-o", str(log), "--force"]) == 2

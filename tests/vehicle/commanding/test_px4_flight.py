@@ -204,7 +204,7 @@ async def test_land_current_mode_before_heartbeat_ends_landing(
         async def current_mode() -> None:
             await flying.vehicle.mode.wait_until(lambda mode: mode.name == "LAND")
             if is_taken:
-                await anyio.sleep(2.0)
+                await anyio.sleep(2.5)
                 flying.px4.switch_to(POSITION)
             else:
                 while flying.px4.is_armed:  # noqa: ASYNC110

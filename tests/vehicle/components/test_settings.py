@@ -127,7 +127,7 @@ async def test_invalid_names_and_values_are_refused() -> None:
 
 async def test_unknown_setting_is_rejected() -> None:
     async with on_board() as shelf:
-        with pytest.raises(ParameterRejected, match="no setting CAM_NOPE: it answers other requests"):
+        with pytest.raises(ParameterRejected, match="no setting CAM_NOPE: it answers requests for other names"):
             await shelf.settings.get("CAM_NOPE")
         with pytest.raises(ParameterRejected, match="no setting CAM_NOPE"):
             await shelf.settings.set("CAM_NOPE", 1)

@@ -291,7 +291,7 @@ async def test_clock_requests_are_answered_only_inside_block() -> None:
         await anyio.sleep(2.0)
         assert flight.px4.external.clock_answers == 0
         async with flight.vehicle.external.odometry(), flight.vehicle.external.range_finder():
-            await anyio.sleep(2.0)
+            await anyio.sleep(2.05)
         answers = flight.px4.external.clock_answers
         assert answers >= 15
         answer = next(message for message in flight.wire.all(m.Timesync) if message.tc1)

@@ -35,7 +35,8 @@ def is_address_template(address: str) -> bool:
 def expand_address(address: str, number: int, system_id: int) -> str:
     """Fill in the placeholders of an address template for one vehicle.
 
-    ``{n}`` is the number of the vehicle, from 0; ``{id}`` its system id. ``{5760+10n}`` computes with them.
+    ``{n}`` is the number of the vehicle, from 0; ``{id}`` its system id. ``{5760+10n}`` is an expression with such a
+    value.
     """
 
     def value(match: re.Match[str]) -> str:

@@ -95,7 +95,7 @@ def _add_common(action: argparse.ArgumentParser, rate_hz: float, what: str) -> N
 
 
 def _network(text: str) -> str:
-    # Checked before a link is opened, because the two addresses are easily swapped.
+    # Check this before a link is opened, because the two addresses are easily swapped.
     if parse_address(address(text)).kind not in ("zenoh", "zenohin"):
         raise argparse.ArgumentTypeError(f"{text!r} is not a zenoh address, zenoh://FLEET/NAME")
     return text

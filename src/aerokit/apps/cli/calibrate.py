@@ -28,7 +28,8 @@ _BAR_WIDTH = 30
 _CANCEL_TIMEOUT_S = 20.0
 
 _GROUND = "    ~~~~~~~~~~~~~~~~~~~~~~~~~~~~"
-# A vehicle with its nose to the right, seen from its right side, or from behind where a side is down.
+# Pictures of a vehicle with its nose to the right, seen from its right side. Poses with a side down are seen from
+# behind.
 _FROM_BEHIND = (CalibrationPose.LEFT, CalibrationPose.RIGHT)
 PICTURES: dict[CalibrationPose, str] = {
     CalibrationPose.LEVEL: r"""

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from aerokit.transport.link import Link
     from aerokit.vehicle.vehicle import Vehicle
 
-# HEARTBEAT is sent once a second.
+# Long enough to receive the heartbeats of all vehicles, which come once a second.
 _OTHER_VEHICLES_TIMEOUT_S = 1.5
 SIGNING_KEY_VARIABLE = "AEROKIT_SIGNING_KEY"
 """Environment variable with the signing key: a passphrase, or 64 hexadecimal digits."""
@@ -68,7 +68,7 @@ def add_signing_key(command: argparse._ActionsContainer, text: str) -> None:
 
 
 def key_file(path: str) -> SigningKey:
-    """Parse the path of a signing key, and read it."""
+    """Read the signing key from the file at this path."""
     from aerokit.mavlink.signing import SigningKey
 
     try:
@@ -103,7 +103,7 @@ def add_address(
 
     Args:
         command: the parser or group.
-        name: name of the argument, or with leading dashes of the option.
+        name: name of the argument; with leading dashes, name of the option.
         what: text before the examples in the help.
         default: description of the default in the help; None if the usual default address is used.
     """

@@ -107,7 +107,7 @@ async def _photo(options: argparse.Namespace) -> int:
 
 
 async def _show(options: argparse.Namespace, camera: Camera, capture: Capture) -> bool:
-    """Print a picture, and download it with ``--to``. Return False if it was not taken or not downloaded."""
+    """Print a picture, and download it with ``--to``. Return False if taking or downloading it failed."""
     place, to = capture.place, options.to
     where = "position unknown" if place is None else f"{place.latitude_deg:.7f} {place.longitude_deg:.7f}"
     text = f"{capture.index:>5}  {where}  {_plain(capture.file_url)}".rstrip()
@@ -133,16 +133,14 @@ def _plain(text: str) -> str:
 
 
 def _file_name(capture: Capture) -> str | None:
-    """Return ``INDEX-NAME``, from the last part of the address; None if that is a path, or not a portable file
-    name.
-    """
+    """Return ``INDEX-NAME``, made from the last part of the address; None if that is no portable file name."""
     base = unquote(capture.file_url.rpartition("/")[2]) or "capture.jpg"
     is_name = base.isprintable() and not set(base) & set('/\\:*?"<>|') and base.strip(" .") == base
     return f"{capture.index:05}-{base}" if is_name and len(base) <= _MAX_FILE_NAME else None
 
 
 def _write_new(to: Path, name: str, content: bytes) -> Path:
-    """Write to a new file; append a number to the name if it exists."""
+    """Write to a new file; append a number to the name if the file exists."""
     stem, dot, ending = name.rpartition(".")
     at, target = 1, to / name
     while True:

@@ -43,7 +43,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
 }
 """Modules of each extra. A test compares them with pyproject.toml."""
 
-# Number, usual purpose, and True for UDP.
+# Number of each port, its usual purpose, and True for UDP.
 _COMMON_PORTS = (
     (14550, "the port of ground stations such as QGroundControl and MAVProxy", True),
     (14540, "PX4's simulator sends to it", True),
@@ -103,7 +103,7 @@ def _users_of(device: str) -> list[str]:
     """Return the names of other programs that have the port open. Linux shows programs of other users only to root."""
     users: list[str] = []
     if sys.platform != "linux" or os.path.realpath(device).startswith("/dev/pts/"):
-        return users  # ignore the creator of a pseudo-terminal, which keeps it open
+        return users  # no users, because the creator of a pseudo-terminal keeps it open
     for process in glob("/proc/[0-9]*"):
         number = int(process.rpartition("/")[2])
         if number == os.getpid():
@@ -112,7 +112,7 @@ def _users_of(device: str) -> list[str]:
             opened = {os.readlink(f"{process}/fd/{descriptor}") for descriptor in os.listdir(f"{process}/fd")}
             if os.path.realpath(device) in opened:
                 users.append(f"{Path(process, 'comm').read_text().strip()} (process {number})")
-        except OSError:  # another user's process, or one that has ended
+        except OSError:  # the process belongs to another user, or has ended
             continue
     return users
 

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from aerokit._internal.formatting import printable
-from aerokit.apps.cli.output import DONE, add_json, emit, import_extra
+from aerokit.apps.cli.output import DONE, add_json, check_not_existing, emit, import_extra
 from aerokit.apps.cli.terminal import progress_bar
+from aerokit.logs.flights import check_log_name
 from aerokit.logs.report.statistics import clock, fall_text
 
 if TYPE_CHECKING:
@@ -47,6 +48,9 @@ async def _convert(options: argparse.Namespace) -> int:
         import_extra("pyulog", "convert")
     from aerokit.logs.convert import convert
 
+    check_log_name(options.log)
+    if not (options.out.is_dir() and not any(options.out.iterdir())):
+        check_not_existing(options.out, options)
     with progress_bar(options.log.name, "B") as on_progress:
         done = convert(options.log, options.out, tables=options.tables, force=options.force, on_progress=on_progress)
     for note in done.notes:
@@ -101,6 +105,9 @@ async def _report(options: argparse.Namespace) -> int:
     from aerokit.logs.report import write_report
 
     target = options.output or options.log.with_suffix(".html")
+    for log in logs:
+        check_log_name(log)  # checked first, because the default target is derived from this name
+    check_not_existing(target, options)
     with progress_bar(options.log.name, "B") as on_progress:
         report = write_report(
             options.log,

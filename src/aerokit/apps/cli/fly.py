@@ -158,7 +158,8 @@ class PlanFlight(SupervisedFlight):
         return DONE
 
     def _our_purposes(self) -> tuple[Purpose, ...]:
-        # Land and return modes may come from a failsafe, so they do not count. A cancelled mission start ends in hold.
+        # Land and return modes may come from a failsafe, so they are not included. A cancelled mission start ends in
+        # hold.
         return ("mission",) if self._has_started else ("mission", "hold")
 
 

@@ -145,7 +145,7 @@ async def run_events(options: argparse.Namespace) -> int:
 
     async with AsyncExitStack() as stack:
         connection = await stack.enter_async_context(opened(options, reconnect=True))
-        # Subscribed before the vehicles connect, so that their first events are printed too.
+        # Subscribe before the vehicles connect, so that their first events are printed, too.
         printing = asyncio.create_task(_print_all(connection, options))
         stack.push_async_callback(_cancel, printing)
         await stack.enter_async_context(vehicles_on(connection, rates={}))
@@ -160,7 +160,7 @@ async def _print_all(connection: Connection, options: argparse.Namespace) -> Non
         missed = 0
         async with waiting(options, connection.link.address, _COUNTDOWN_S):
             event = await events.get()
-        with suppress(AerokitError):  # the end of the connection; await_end raises it
+        with suppress(AerokitError):  # the connection has ended; await_end raises the error
             while True:
                 if options.all or not isinstance(event, LinkReport):
                     _emit_event(event, wall_at_0 + event.at, options)

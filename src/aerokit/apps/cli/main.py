@@ -40,7 +40,7 @@ class CliCommand:
     """A subcommand, ``aerokit NAME``. Its module is imported only when the command is called.
 
     ``location`` is ``"module:function"`` in `aerokit.apps.cli`; the function is ``add_arguments`` by default.
-    It adds the arguments to a parser, and sets ``run`` to a coroutine function that takes the parsed options
+    That function adds the arguments to a parser, and sets ``run`` to a coroutine function that takes the parsed options
     and returns the exit code. The first sentence of ``description`` appears in the list of commands.
     """
 
@@ -182,8 +182,8 @@ class Parser(argparse.ArgumentParser):
         return namespace, unknown
 
     def _check_option_names(self, args: Sequence[str]) -> None:
-        # Checked first: otherwise argparse takes the value after an unknown option for a positional argument.
-        # misplaced_address() reports --connect, with the right command line.
+        # Unknown options are checked first. Otherwise argparse takes the value after an unknown option for a positional
+        # argument. misplaced_address() reports --connect, with the right command line.
         options = list(args[: args.index("--")] if "--" in args else args)
         names = [option.partition("=")[0] for option in options if option.startswith("--")]
         for name in names:
@@ -250,7 +250,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with plain_warnings():
             code: int = asyncio.run(options.run(options))
     except BrokenPipeError:
-        # Otherwise the interpreter reports another BrokenPipeError when it flushes stdout at exit.
+        # Without this, the interpreter would report another BrokenPipeError when it flushes stdout at exit.
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115
         return FAILED
     except KeyboardInterrupt:

@@ -33,7 +33,7 @@ def is_address(word: str) -> bool:
 
 
 def misplaced_file(word: str) -> str | None:
-    """Return an error text if a word given as an address is a file, with the right command; None for an address."""
+    """Return an error text, with the right command, if a word given as an address is a file; otherwise None."""
     path = Path(word)
     advice = _COMMANDS_BY_SUFFIX.get(path.suffix.lower())
     if advice is None and not (path.is_file() and path.suffix.lower() != ".tlog"):
@@ -43,7 +43,7 @@ def misplaced_file(word: str) -> str | None:
 
 
 def misplaced_address(parser: argparse.ArgumentParser, words: Sequence[str]) -> str | None:
-    """Return an error text if a command's words have an address in the wrong place, with the right command line."""
+    """Return an error text, with the right command line, if an address is in the wrong place; otherwise None."""
     words = list(words[: words.index("--")] if "--" in words else words)
     command = parser.prog.split()
     if parser._subparsers is not None:
@@ -79,7 +79,7 @@ def _address_before_action(parser: argparse.ArgumentParser, words: list[str]) ->
 
 
 def _takes_value(parser: argparse.ArgumentParser, option: str) -> bool:
-    """Return True for an option, possibly abbreviated, that the next word belongs to."""
+    """Return True if this option, possibly abbreviated, takes the next word as its value."""
     actions = (action for name, action in parser._option_string_actions.items() if name.startswith(option))
     return option.startswith("--") and any(action.nargs != 0 for action in actions)
 

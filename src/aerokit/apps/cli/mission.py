@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -45,7 +46,7 @@ def begins_with_take_off(items: Sequence[MissionItem]) -> bool:
 
 
 def plan_warnings(plan: Plan) -> list[str]:
-    """Return what a vehicle will probably refuse, although the plan can be sent."""
+    """Return texts about parts of a plan that can be sent, but that a vehicle will probably refuse."""
     from aerokit.autopilots.ardupilot import COPTERS
 
     standard = frozenset(MavCmd)
@@ -68,7 +69,7 @@ def emit_part(options: argparse.Namespace, part: str, items: int, state: str, te
 
 
 def emit_items(options: argparse.Namespace, part: str, items: Sequence[MissionItem], state: str) -> None:
-    """Print a part of a plan, item by item."""
+    """Print a part of a plan, item by item. NaN, which MAVLink uses for "not set", is printed as "–"."""
     emit_part(options, part, len(items), state, f"{part}: {len(items)} items")
     for index, item in enumerate(items):
         position = item.position
@@ -113,7 +114,7 @@ def _place(item: MissionItem) -> str:
     if position is not None:
         return f"{position.latitude_deg:.7f} {position.longitude_deg:.7f} {item.z:g} m"
     numbers = (item.param1, item.param2, item.param3, item.param4, item.x, item.y, item.z)
-    return " ".join(f"{number:g}" for number in numbers) if any(numbers) else ""
+    return " ".join("–" if math.isnan(number) else f"{number:g}" for number in numbers) if any(numbers) else ""
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
@@ -221,7 +222,11 @@ async def _upload(options: argparse.Namespace) -> int:
 async def _check(options: argparse.Namespace) -> int:
     plan = read_plan(options.file)
     for part in PARTS:
-        emit_items(options, part, getattr(plan, part).to_items(), "in the file")
+        items = getattr(plan, part).to_items()
+        if items or options.json:  # "fence: 0 items" would look as if the upload cleared the fence
+            emit_items(options, part, items, "in the file")
+    if not any(getattr(plan, part).to_items() for part in PARTS) and not options.json:
+        print(f"{options.file} has no items")
     warnings = plan_warnings(plan)
     for warning in warnings:
         emit(options, "warning", {"text": warning}, f"warning: {warning}")

@@ -6,6 +6,7 @@ import argparse
 import errno
 import json
 import os
+import re
 import sys
 from contextlib import contextmanager
 from importlib import import_module
@@ -80,7 +81,35 @@ def emit_error(error: BaseException, code: int, *, as_json: bool) -> None:
 def _text(error: BaseException) -> str:
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         return f"{error.filename}: {error.strerror}"
-    return str(error) or type(error).__name__
+    return plain_text(error) or type(error).__name__
+
+
+# Maps names of calls with which error texts of the library begin to the words that a command prints instead.
+_PLAIN_NAMES = {
+    "arm": "arming",
+    "disarm": "disarming",
+    "take_off": "take-off",
+    "go_to": "flight to",
+    "land": "landing",
+    "return_to_launch": "return to launch",
+    "hold": "holding",
+    "mission.start": "start of the mission",
+    "mission.pause": "pause of the mission",
+    "mission.resume": "continuing the mission",
+    "mission.wait_finished": "flying the mission",
+}
+_CALL = re.compile(rf"({'|'.join(map(re.escape, _PLAIN_NAMES))})(?:\(([^()]*)\))?(?=: )")
+
+
+def plain_text(error: BaseException) -> str:
+    """Return the text of an error. The name of the call that raised it is replaced, because users do not know the call.
+
+    ``mission.wait_finished: the mode changed to RTL`` becomes ``flying the mission: the mode changed to RTL``.
+    """
+    text = str(error)
+    if (found := _CALL.match(text)) is None:
+        return text
+    return " ".join(filter(None, (_PLAIN_NAMES[found[1]], found[2]))) + text[found.end() :]
 
 
 @contextmanager
@@ -98,17 +127,19 @@ def plain_warnings() -> Iterator[None]:
         else:
             original(message, category, *arguments, **options)
 
-    logger.addFilter(_describe_busy_computer)
+    logger.addFilter(_rewrite_for_commands)
     try:
         with warnings.catch_warnings():
             warnings.showwarning = show
             yield
     finally:
-        logger.removeFilter(_describe_busy_computer)
+        logger.removeFilter(_rewrite_for_commands)
 
 
-def _describe_busy_computer(record: logging.LogRecord) -> bool:
-    """Replace the warning of a blocked event loop, which advises programmers: a command only waits for the computer."""
+def _rewrite_for_commands(record: logging.LogRecord) -> bool:
+    """Replace warnings about a program's code: about a blocked event loop, and about the block of a vehicle."""
+    if str(record.msg).startswith("the block of vehicle %d was left: "):
+        record.msg = "disconnected from vehicle %d: %s"
     if str(record.msg).startswith("the event loop was blocked") and isinstance(record.args, tuple):
         record.msg = "this computer was busy for %.1f s: no messages or heartbeats were processed"
         record.args = record.args[:1]
@@ -213,14 +244,14 @@ def add_force(command: argparse.ArgumentParser) -> None:
     command.add_argument("--force", action="store_true", help="replace an existing file")
 
 
-def check_not_existing(file: str, options: argparse.Namespace) -> None:
+def check_not_existing(file: str | Path, options: argparse.Namespace) -> None:
     """Check that the output file does not exist, before anything is sent.
 
     Raises:
         FileExistsError: the file exists, and ``--force`` is not given.
     """
     if not options.force and Path(file).exists():
-        raise FileExistsError(errno.EEXIST, "file exists; use --force to replace it", file)
+        raise FileExistsError(errno.EEXIST, "file exists; use --force to replace it", str(file))
 
 
 def create_recording(path: str) -> None:
@@ -244,7 +275,7 @@ def remove_if_empty(path: str) -> None:
 
 @contextmanager
 def new_recording(path: str | None) -> Iterator[None]:
-    """Create the recording of ``--record``, and delete it after the block if it is empty; None: do nothing."""
+    """Create the recording of ``--record``, and delete an empty one after the block. ``path`` None: do nothing."""
     if path is None:
         yield
         return

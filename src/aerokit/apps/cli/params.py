@@ -11,15 +11,17 @@ from aerokit.apps.cli import connecting
 from aerokit.apps.cli.arguments import assignment, writable_file
 from aerokit.apps.cli.completion import assignments, offer, parameter_names
 from aerokit.apps.cli.connecting import add_action
-from aerokit.apps.cli.output import DONE, FAILED, add_force, check_not_existing, emit, suggestion
+from aerokit.apps.cli.output import DONE, FAILED, add_force, check_not_existing, emit, exit_code, suggestion
 from aerokit.apps.cli.params_metadata import (
+    RANGES_NOT_CHECKED,
     about,
     about_text,
     add_metadata,
-    check_values,
+    check_given,
     load_given,
     metadata_for_check,
     reboot_note,
+    with_range_note,
 )
 from aerokit.apps.cli.terminal import progress_bar
 from aerokit.errors import ParameterRejected, ParameterTimeout
@@ -130,12 +132,14 @@ async def _diff(options: argparse.Namespace) -> int:
 async def _set(options: argparse.Namespace) -> int:
     given = load_given(options)
     if not options.force:
-        check_values(given, dict(options.values))
+        check_given(given, dict(options.values))
     async with connected(options, changes=True) as vehicle:
         if given is None:
             given = await metadata_for_check(vehicle, None, options)
-            check_values(given, dict(options.values))
+            check_given(given, dict(options.values))
         results = await vehicle.parameters.set_many(dict(options.values), idle_timeout_s=options.patience)
+    if not options.force:
+        results = {name: result.replace(note=with_range_note(given, result)) for name, result in results.items()}
     return _emit_results(options, results.values(), vehicle, given)
 
 
@@ -147,16 +151,17 @@ async def _load(options: argparse.Namespace) -> int:
         await _download(vehicle, options)
         metadata = await metadata_for_check(vehicle, given, options)
         if metadata is not None:
-            # A backup may have unusual values that the vehicle has already.
+            # Only changes are checked, because a backup may have unusual values that the vehicle has already.
             differences = await vehicle.parameters.diff(wanted, idle_timeout_s=options.patience)
-            check_values(metadata, {one.name: one.after for one in differences if one.after is not None})
+            check_given(metadata, {one.name: one.after for one in differences if one.after is not None})
         with progress_bar("parameters", "parameter") as show:
             results = await vehicle.parameters.upload(wanted, idle_timeout_s=options.patience, on_progress=show)
     if options.json:
         return _emit_results(options, results.values(), vehicle, metadata)
     changed = [result for result in results.values() if result.outcome != "unchanged"]
     code = _emit_results(options, changed, vehicle, metadata)
-    print(f"{len(results)} parameters in {options.file}, {len(changed)} of them differed")
+    unchecked = f"; {RANGES_NOT_CHECKED}" if changed and metadata is None and not options.force else ""
+    print(f"{len(results)} parameters in {options.file}, {len(changed)} of them differed{unchecked}")
     return code
 
 
@@ -176,7 +181,7 @@ async def _read(vehicle: Vehicle, name: str, options: argparse.Namespace) -> Par
 def _hint(name: str, error: Exception, vehicle: Vehicle) -> str:
     """Suggest similar parameter names, or the command that lists them. Empty if the error contains a suggestion."""
     names = parameter_names(vehicle.autopilot.name)
-    is_lacking = "has no parameter" in str(error)  # the names are of all vehicle types
+    is_lacking = "has no parameter" in str(error)  # `names` are those of all vehicle types
     if "did you mean" in str(error) or (name.upper() in names and not is_lacking):
         return ""
     return (
@@ -198,7 +203,11 @@ def _emit_parameters(options: argparse.Namespace, parameters: Iterable[Parameter
 def _emit_results(
     options: argparse.Namespace, results: Iterable[ParameterWrite], vehicle: Vehicle, metadata: Metadata | None
 ) -> int:
-    """Print a line for each result. Return FAILED if a value differs from the requested one by more than rounding."""
+    """Print a line for each result, and return the exit code.
+
+    The exit code is that of the first error, as for ``get``. Without an error, it is FAILED if a value differs from the
+    requested value by more than rounding.
+    """
     code = DONE
     for result in results:
         if result.error is None and result.outcome != "unchanged":
@@ -209,7 +218,9 @@ def _emit_results(
         else:
             text = f"{result.name:16} not set: {result.error}{_hint(result.name, result.error, vehicle)}"
         emit(options, "parameter_write", _record(result), text)
-        if result.error is not None or result.outcome == "clamped":
+        if result.error is not None and code in (DONE, FAILED):
+            code = exit_code(result.error)
+        elif result.outcome == "clamped" and code == DONE:
             code = FAILED
     return code
 

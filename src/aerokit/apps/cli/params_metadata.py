@@ -8,19 +8,22 @@ from typing import TYPE_CHECKING, Any
 
 import anyio
 
-from aerokit.errors import AerokitError, CommandRejected, FileError, InvalidArgument, NotSupported
+from aerokit.apps.parameter_values import check_values, metadata_entry
+from aerokit.errors import AerokitError, CommandRejected, FileError, NotSupported
 
 if TYPE_CHECKING:
     import argparse
     from collections.abc import Mapping
 
-    from aerokit.parameters import Metadata, Parameter, ParameterMetadata
+    from aerokit.parameters import Metadata, Parameter
+    from aerokit.vehicle.parameters.parameters import ParameterWrite
     from aerokit.vehicle.vehicle import Vehicle
 
 # ArduPilot uses a new system id at once (GCS_Common.cpp, update_send), PX4 and old ArduPilots after a reboot.
 _SYSTEM_ID_NAMES = ("SYSID_THISMAV", "MAV_SYSID", "MAV_SYS_ID")
-# Limits the time that reading the metadata from the vehicle takes; over a slow radio it takes longer.
+# Maximum time for reading the metadata from the vehicle. Reading takes longer over a slow radio and is then given up.
 _FETCH_TIMEOUT_S = 10.0
+RANGES_NOT_CHECKED = "ranges not checked (--metadata FILE checks them)"
 
 
 def add_metadata(command: argparse.ArgumentParser, *, checks: bool = False) -> None:
@@ -45,7 +48,7 @@ def load_given(options: argparse.Namespace) -> Metadata | None:
 
 
 async def metadata_for_check(vehicle: Vehicle, given: Metadata | None, options: argparse.Namespace) -> Metadata | None:
-    """Return the metadata to check values with: the given one, or the vehicle's if it has some. None with --force."""
+    """Return the metadata for checking values: the given metadata, else that of the vehicle. None with --force."""
     if options.force:
         return None
     # ArduPilot has no component metadata.
@@ -60,7 +63,7 @@ async def _fetch(vehicle: Vehicle) -> Metadata | None:
         try:
             content = await vehicle.component(vehicle.component_id).metadata("parameter")
             return parse_metadata(json.dumps(content).encode(), "the vehicle's metadata")
-        except (NotSupported, CommandRejected, FileError):  # the vehicle has none
+        except (NotSupported, CommandRejected, FileError):  # the vehicle has no metadata
             return None
         except AerokitError as error:
             problem = str(error)
@@ -69,40 +72,27 @@ async def _fetch(vehicle: Vehicle) -> Metadata | None:
     return None
 
 
-def check_values(metadata: Metadata | None, values: Mapping[str, float]) -> None:
+def check_given(metadata: Metadata | None, values: Mapping[str, float]) -> None:
     """Raise InvalidArgument with all values that the metadata does not allow. Unknown names are accepted."""
+    check_values(metadata, values, "--force")
+
+
+def with_range_note(metadata: Metadata | None, result: ParameterWrite) -> str:
+    """Return the note of a result, which says whether the value was set without a check of its range."""
+    text = ""
     if metadata is None:
-        return
-    problems = [problem for name, value in values.items() if (problem := _problem(metadata, name, value))]
-    if problems:
-        raise InvalidArgument(f"{'; '.join(problems)}; nothing was set; --force sets such values too")
-
-
-def _problem(metadata: Metadata, name: str, value: float) -> str | None:
-    """Return why the value is not allowed, in the name and unit of the user."""
-    entry, convert = _entry(metadata, name)
-    problem = None if entry is None else entry.problem(convert(value))
-    if problem is None or entry is None or entry.name == name:
-        return problem
-    return f"{name} = {value:g}: {problem}"
-
-
-def _entry(metadata: Metadata, name: str) -> tuple[ParameterMetadata | None, Any]:
-    """Return the metadata of a parameter under any of its names, and the conversion to its unit."""
-    from aerokit.parameters.renames import resolve_rename
-
-    for spelled in (name, name.upper()):
-        if spelled in metadata:
-            return metadata[spelled], lambda value: value
-    renamed = resolve_rename(name.upper(), metadata)
-    return (None, lambda value: value) if renamed is None else (metadata[renamed.name], renamed.to_vehicle)
+        text = RANGES_NOT_CHECKED.replace("ranges", "range").replace("them", "it")
+    elif metadata_entry(metadata, result.name)[0] is None:
+        text = "range not checked (the metadata does not have this parameter)"
+    is_set = result.error is None and result.outcome != "unchanged"
+    return "; ".join(filter(None, (result.note, text if is_set else "")))
 
 
 def reboot_note(metadata: Metadata | None, name: str, value: float) -> str:
-    """Return what is still to do until the new value takes effect; empty if nothing is known."""
+    """Return a note on the steps until the new value takes effect, e.g. a reboot; empty if none is known."""
     if name.upper() in _SYSTEM_ID_NAMES:
         return f"the system id changes at the next reboot at the latest; then connect with --system-id {value:g}"
-    entry = None if metadata is None else _entry(metadata, name)[0]
+    entry = None if metadata is None else metadata_entry(metadata, name)[0]
     return "takes effect after a reboot" if entry is not None and entry.reboot_required else ""
 
 

@@ -77,13 +77,16 @@ def _vehicle_lines(vehicle: Vehicle, missing: Sequence[str]) -> list[str]:
 
 def _readiness(vehicle: Vehicle, missing: Sequence[str]) -> list[str]:
     if not missing:
+        if vehicle.armed.latest:
+            return _aligned("ready", ["armed already; arming checks do not apply"])
         return _aligned("ready", ["no reason against arming is reported"])
     sensors = vehicle.sensors.latest
     can_arm = sensors is not None and sensors.prearm_checks_pass is True
     is_about_estimates = all(text.startswith(("the estimator has no ", "no GPS receiver has ")) for text in missing)
     # ArduCopter arms in STABILIZE without a position, for example.
     note = [f"for autonomous flight; {vehicle.mode_name} allows arming:"] if can_arm and is_about_estimates else []
-    return _aligned("missing", [*note, *missing])
+    plain = [text.replace("arm() changes to", "aerokit changes to") for text in missing]
+    return _aligned("missing", [*note, *plain])
 
 
 def _component_line(heartbeat: Heartbeat, system_id: int, component_id: int) -> tuple[dict[str, Any], str]:
@@ -216,7 +219,7 @@ async def _missing_for_flight(vehicle: Vehicle) -> list[str]:
             try:
                 await _request(vehicle, message, cell)
             except CommandTimeout as error:
-                # A vehicle that does not answer this request would not answer the others either.
+                # A vehicle that does not answer this request would not answer the other requests either.
                 return [str(error), *vehicle.missing_for_flight()]
     return list(dict.fromkeys([*await vehicle.why_not_armable(), *vehicle.missing_for_flight()]))
 

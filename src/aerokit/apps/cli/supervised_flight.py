@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import anyio
 
 from aerokit import events
-from aerokit.apps.cli.output import DONE, INTERRUPTED, emit
+from aerokit.apps.cli.output import DONE, INTERRUPTED, emit, plain_text
 from aerokit.errors import (
     AerokitError,
     CommandRejected,
@@ -26,6 +26,7 @@ from aerokit.errors import (
 )
 from aerokit.events import SILENT_AFTER_S
 from aerokit.mavlink.enums import MavLandedState
+from aerokit.vehicle.commanding.arming import PREARM_REPORT_INTERVAL_S
 from aerokit.vehicle.commanding.cleanup import ARM_WATCH_S
 
 if TYPE_CHECKING:
@@ -75,7 +76,7 @@ class SupervisedFlight(ABC):
             code = await self._interrupts.run(self._fly)
         except Exception as error:
             # After any error, a vehicle that this program has armed must not stay armed on the ground.
-            self._print(f"failed: {error}")
+            self._print(f"failed: {plain_text(error)}")
             if self.armed_by_us:
                 await self._make_safe(partial(self._after_failure, error))
             raise
@@ -124,7 +125,7 @@ class SupervisedFlight(ABC):
             if await self._interrupts.run(action) is None:
                 self._print(f"interrupted again; no further commands: vehicle {self._vehicle.describe_now()}")
         except AerokitError as error:
-            self._print(f"failed again: {error}")
+            self._print(f"failed again: {plain_text(error)}")
             self._print(f"no further commands: vehicle {self._vehicle.describe_now()}")
 
     async def _after_failure(self, error: Exception) -> int:
@@ -150,7 +151,7 @@ class SupervisedFlight(ABC):
             try:
                 await self._disarm()
             except CommandRejected as error:  # the vehicle has taken off since it last reported its landed state
-                self._print(f"disarming failed: {error}")
+                self._print(f"disarming failed: {plain_text(error)}")
             if vehicle.is_confirmed_disarmed or not self._check_control():
                 return DONE
         self._print(INTERRUPT_ACTIONS[wanted] + ("" if wanted == "nothing" else "; press Ctrl-C again to exit at once"))
@@ -166,7 +167,7 @@ class SupervisedFlight(ABC):
         return DONE
 
     async def _watch_late_arming(self) -> None:
-        """Wait for an arm command that may still arrive; the library then disarms the vehicle while connected."""
+        """Stay connected while an arm command may still arrive, so that the library can disarm the vehicle."""
         if not self._may_arm_late:
             return
         self._print(
@@ -213,6 +214,7 @@ class FlightReport:
     def __init__(self, vehicle: Vehicle, options: argparse.Namespace, speedup: float) -> None:
         self._vehicle, self._options, self._speedup = vehicle, options, speedup
         self._armed_at: float | None = None
+        self._arming_texts: dict[str, float] = {}  # the vehicle's reasons against arming, with their times
         self._armed_s = 0.0
         self._started = self._last_line = vehicle.connection.now()
         self._highest_m = self._fastest_m_s = self._flown_m = 0.0
@@ -308,6 +310,8 @@ class FlightReport:
                 if isinstance(event, events.ModeChanged):
                     self.print_line(f"  mode {event.after}")
                 elif isinstance(event, events.StatusTextReceived) and not _MISSION_TEXT.match(event.text):
+                    if self._vehicle.autopilot.arming_reason(event.text) is not None:
+                        self._arming_texts[event.text] = self._vehicle.connection.now()
                     self.print_line(f"  {'! ' if event.severity <= _WARNING else ''}{event.text}")
 
     async def _print_status(self) -> None:
@@ -318,7 +322,9 @@ class FlightReport:
                 continue
             missing = [] if vehicle.is_armed else vehicle.missing_for_flight()
             if missing:
-                self.print_line(f"  still missing: {'; '.join(missing)}")
+                since = vehicle.connection.now() - PREARM_REPORT_INTERVAL_S
+                texts = [text for text, at in self._arming_texts.items() if at >= since]
+                self.print_line(f"  still missing: {'; '.join([*missing, *texts])}")
             else:
                 self.print_line(f"  {vehicle.mode_name}, {vehicle.ground_speed_m_s.latest or 0.0:.1f} m/s")
 

@@ -33,7 +33,7 @@ def is_interactive() -> bool:
 
 
 async def confirm(question: str) -> bool:
-    """Ask a yes/no question. Return True for "y" or "yes", False for any other input and at its end."""
+    """Ask a yes/no question. Return True for "y" or "yes", False for any other input and at the end of the input."""
     _discard_typed_input()
     print(f"{question} [y/N] ", end="", file=sys.stderr, flush=True)
     try:

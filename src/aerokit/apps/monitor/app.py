@@ -319,7 +319,7 @@ async def run_monitor(
 
     Args:
         address: address of the link; a lost link is reopened.
-        baud: baud rate of a serial port whose address has none.
+        baud: baud rate of a serial port whose address does not give it.
         signing: as in :func:`aerokit.open_connection`.
         record: a .tlog file for everything that is sent and received.
         on_start: called with the application before it runs.

@@ -13,11 +13,13 @@ from rich.text import Text
 
 from aerokit._internal.formatting import printable
 from aerokit.events import SILENT_AFTER_S, LinkState
+from aerokit.mavlink.enums import MissionState
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
     from aerokit.connection.cells import StateCell
+    from aerokit.vehicle.state.condition import MissionProgress
     from aerokit.vehicle.vehicle import Vehicle
 
 UNKNOWN = "—"
@@ -32,7 +34,7 @@ _MIN_SPAN_M = 20.0
 
 
 def number(value: float | None, digits: int = 1, unit: str = "", sign: str = "-") -> str:
-    """Format a number, without a sign if it rounds to 0. ``sign`` is that of format specifications."""
+    """Format a number, without a sign if it rounds to 0. ``sign`` is as in format specifications."""
     if value is None:
         return UNKNOWN
     rounded = round(value, digits) + 0.0  # -0.0 + 0.0 is 0.0
@@ -44,7 +46,7 @@ def age(seconds: float) -> str:
 
 
 class VehicleText:
-    """Texts of one vehicle. While it is silent, its values are dimmed, and one line shows the time of silence."""
+    """Texts of one vehicle. While the vehicle is silent, values are dimmed, and one line shows the time of silence."""
 
     def __init__(self, vehicle: Vehicle) -> None:
         self._vehicle = vehicle
@@ -85,7 +87,7 @@ class VehicleText:
         vehicle, cell = self._vehicle, self.cell
         return [
             ("home", self._home()),
-            ("mission", cell(vehicle.mission_current, lambda mission: f"item {number(mission.current, 0)}")),
+            ("mission", cell(vehicle.mission_current, _mission)),
             ("airspeed", cell(vehicle.air_speed_m_s, _speed)),
             ("throttle", cell(vehicle.throttle_percent, lambda percent: number(percent, 0, " %"))),
             ("wind", cell(vehicle.wind, lambda w: f"{number(w.speed_m_s)} m/s from {w.direction_deg:.0f}°")),
@@ -111,7 +113,7 @@ class VehicleText:
                 (40, cell(vehicle.gps, lambda receivers: _gps(receivers[0]))),
             ]
         if not self._silent_s and more:
-            columns.append((0, self._missing() if vehicle.missing_for_flight() else Text("ready")))
+            columns.append((0, self._missing() if vehicle.missing_for_flight() else self._ready()))
         for width, column in columns:
             column.pad_right(width - len(column))
             text.append_text(column)
@@ -128,6 +130,9 @@ class VehicleText:
     def _armed(self) -> Text:
         style = DANGER if self._vehicle.armed.latest else ""
         return self.cell(self._vehicle.armed, lambda is_armed: "ARMED" if is_armed else "disarmed", style)
+
+    def _ready(self) -> Text:
+        return Text("armed" if self._vehicle.armed.latest else "ready")
 
     def _speeds(self) -> Text:
         ground, climb = self._vehicle.ground_speed_m_s, self._vehicle.climb_m_s
@@ -174,6 +179,12 @@ def _attitude(attitude: Any) -> str:
 def _altitude(place: Any) -> str:
     above_home, above_sea = place.altitude_relative_m, place.altitude_amsl_m
     return f"{number(above_home, 1, ' m')} above home, {number(above_sea, 0, ' m')} AMSL"
+
+
+def _mission(mission: MissionProgress) -> str:
+    if mission.state == MissionState.NO_MISSION or mission.current is None:
+        return "No mission"
+    return f"item {mission.current}"
 
 
 def _speed(speed: float) -> str:

@@ -136,7 +136,7 @@ class MqttLink(BaseLink):
             client.username_pw_set(where.user, where.password)
         self._answered = loop.create_future()
 
-        def connect() -> Any:  # name resolution, connection and TLS handshake block
+        def connect() -> Any:  # runs on a thread, because name resolution, connection and TLS handshake block
             if where.scheme == "mqtts":
                 client.tls_set_context(ssl.create_default_context())
             client.connect(where.host, where.port, KEEPALIVE_S)
@@ -206,7 +206,7 @@ class MqttLink(BaseLink):
         loop = asyncio.get_running_loop()
         loop.remove_reader(sock)
         loop.remove_writer(sock)
-        if client is self._client:  # lost: unsent data must not arrive when the network is back
+        if client is self._client:  # the connection was lost; unsent data must not arrive when the network is back
             discard_on_close(sock)
 
     def _answer(self, text: str) -> None:
@@ -263,9 +263,9 @@ async def mqtt_publisher(address: str) -> AsyncIterator[Publisher]:
     """Connect to an MQTT broker while the block lasts.
 
     States are published to the topics ``aerokit/FLEET/NAME/state/…``, with QoS 0, not retained.
-    ``aerokit/FLEET/NAME/alive`` is retained: "online" within the block, "offline" after it or after the broker has lost
-    the connection. A lost connection is reopened; values published meanwhile are dropped. The event loop must support
-    ``add_reader``: on Windows only ``asyncio.SelectorEventLoop`` does.
+    ``aerokit/FLEET/NAME/alive`` is retained: "online" within the block, "offline" after the block or once the broker
+    has lost the connection. A lost connection is reopened; values published meanwhile are dropped. The event loop must
+    support ``add_reader``; on Windows, only ``asyncio.SelectorEventLoop`` has it.
 
     Args:
         address: ``"mqtt://10.0.0.5:1883/fleet/alpha"``, ``"mqtt://user:password@…"``; ``mqtts`` for TLS (port

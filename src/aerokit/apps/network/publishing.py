@@ -112,9 +112,9 @@ async def publishing(
 ) -> AsyncIterator[Publishing]:
     """Publish the state of a vehicle on a network while the block lasts, as JSON, one message for each state.
 
-    A changed state is published at most ``rate_hz`` times a second, an unchanged one every two seconds.
-    docs/state.schema.json has the schema of the messages. Nothing is requested from the vehicle, and subscribers
-    cannot send anything to it.
+    A changed state is published at most ``rate_hz`` times a second, an unchanged state every two seconds.
+    docs/state.schema.json has the schema of the messages. Nothing is requested from the vehicle, and subscribers cannot
+    send anything to it.
 
     Args:
         vehicle: a connected vehicle.

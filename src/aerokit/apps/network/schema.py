@@ -45,7 +45,7 @@ ENUMS: dict[str, type[Enum]] = {
     "Odometry.child_frame": enums.MavFrame,
     "Aircraft.emitter": enums.AdsbEmitterType,
 }
-"""Integers that are published by their MAVLink enum names, if the number has one."""
+"""Fields whose integers are published as names of a MAVLink enum, if the number has a name."""
 
 
 def document() -> dict[str, Any]:
@@ -122,9 +122,7 @@ def _schema_of(kind: Any, values: dict[str, dict[str, Any]]) -> dict[str, Any]:
 
 
 def _named(name: str) -> dict[str, Any] | None:
-    """Return the schema of an integer with names: the name, a list of names for flags, or the number if it has no
-    name.
-    """
+    """Return the schema of an integer with names. Values are a name, a list of names (flags), or else the number."""
     enum = ENUMS.get(name)
     if enum is None:
         return None

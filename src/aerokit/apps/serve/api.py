@@ -20,6 +20,7 @@ from aerokit.apps.serve.orders import (
     OrderRecord,
     OrderRunner,
     OrderType,
+    check_parameter,
     parse_plan_body,
 )
 from aerokit.apps.serve.requests import (
@@ -124,7 +125,7 @@ _BITS = {
         "ESTIMATOR_STATUS": EstimatorStatusFlags,
     }.items()
 }
-# With wait=false, wait this long, so that an order that is refused locally is answered with the reason.
+# Even with wait=false, wait this long, so that the answer has the reason if the order is refused locally.
 _REFUSAL_TIMEOUT_S = 0.2
 
 
@@ -241,10 +242,10 @@ Handler = Callable[["Request"], Awaitable[Response]]
 
 @dataclass(frozen=True)
 class Operation:
-    """One method of one path.
+    """One HTTP method of one path.
 
-    ``name`` is its operationId and ``order`` the order that it gives. An operation that gives no order may have a
-    ``body``, which is an order whose body it shares.
+    ``name`` is the operationId, ``order`` is the order that the operation gives. An operation without an order may have
+    ``body``: an order with the same request body.
     """
 
     method: str
@@ -375,7 +376,7 @@ class HttpApi:
                     del self._plans[vehicle, kind]
 
     async def _check_plan(self, request: Request) -> Response:
-        self._access.check(request.headers, needs_token=True)  # large plans take time to parse
+        self._access.check(request.headers, needs_token=True)  # checked first, because large plans take time to parse
         arguments = await read_body(request, UPLOAD.max_body_size)
         UPLOAD.check(arguments)
         _, _, plan = parse_plan_body(arguments)
@@ -416,6 +417,7 @@ class HttpApi:
         kind.check(arguments)
         if kind is SET_PARAMETER:
             arguments["name"] = request.path_params["name"]
+            check_parameter(vehicle.parameters.metadata or self._metadata, arguments)
         key = request.headers.get("idempotency-key", "").strip().strip('"')
         record = self._orders.submit(vehicle, kind, arguments, key, seen_at(request))
         await _wait_ended(record, None if waits else _REFUSAL_TIMEOUT_S)
@@ -431,7 +433,7 @@ class HttpApi:
         return self._served.vehicle(system_id_of(request))
 
     def _is_refresh(self, request: Request) -> bool:
-        # Reading from the vehicle uses its link, so it needs the token, like an order.
+        # A refresh uses the vehicle's link, and therefore needs the token, like an order.
         is_new = query_flag(request, "refresh", default=False)
         if is_new:
             self._access.check(request.headers, needs_token=True)
@@ -457,6 +459,7 @@ def _parameter(parameter: Parameter, metadata: Metadata | None) -> dict[str, Any
     default = known.default if parameter.default is None else parameter.default
     about = {name: to_jsonable(getattr(known, name)) for name in _METADATA}
     about |= {"default": to_jsonable(default), "meaning": known.describe(parameter.value)}
+    about |= {"values": {str(value): text for value, text in known.values.items()}, "has_bits": bool(known.bitmask)}
     return {**fields, **about}
 
 

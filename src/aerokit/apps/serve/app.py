@@ -103,8 +103,8 @@ def make_app(
     """Make an ASGI application that serves vehicles, to be mounted or run with uvicorn in the running loop.
 
     Args:
-        source: a connection, whose vehicles are served as they appear; one vehicle; or a mapping from system id
-            to vehicle. The caller closes them, after the application.
+        source: a connection (its vehicles are served as they appear), one vehicle, or a mapping from system id to
+            vehicle. The caller closes them, after the application.
         token: 16 to 256 characters of A-Z, a-z, 0-9, - . _ ~; None: a random token, in ``app.token``.
         read_only: reject all orders.
         open_reading: allow reading without the token; orders always need it.

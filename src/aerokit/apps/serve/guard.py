@@ -26,16 +26,18 @@ _TOKEN_PREFIX = "bearer."
 MIN_TOKEN_LENGTH = 16
 _TOKEN_CHARACTERS = frozenset("ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789-._~")
 MAX_ANONYMOUS_CONNECTIONS = 64
-"""Maximum number of connections that have not sent the token. When it is exceeded, the server closes the oldest one of
-the address that has most of them.
+"""Maximum number of connections that have not sent the token.
+
+Above this number, the server closes the oldest connection of the address with the most connections.
 """
 REQUEST_TIMEOUT_S = 10.0
 """Seconds from the first byte of a request, or from the start of the connection, to the end of its headers."""
 
 
 def check_token(token: str) -> str:
-    """Return the token; raise InvalidArgument if it is too short, or not valid in a header. The message does not
-    contain it.
+    """Return the token; raise InvalidArgument if it is too short, or not valid in a header.
+
+    The error text does not contain the token.
     """
     if not (MIN_TOKEN_LENGTH <= len(token) <= 256 and set(token) <= _TOKEN_CHARACTERS):
         raise InvalidArgument(
@@ -81,7 +83,7 @@ def _token_of(headers: Headers) -> str | None:
 
 
 def content_policy(tiles: str | None) -> str:
-    """Return the Content-Security-Policy of all responses; it allows images from the tile server."""
+    """Return the Content-Security-Policy of all responses, which allows images from the tile server."""
     pictures = "'self'"
     if tiles is not None:
         place = urlsplit(tiles)
@@ -203,7 +205,7 @@ class _HttpConnection(H11Protocol):
     def handle_events(self) -> None:
         before = self.scope
         super().handle_events()
-        if self.scope is not before:  # the headers of a new request are complete
+        if self.scope is not before:  # True once the headers of a new request are complete
             self._stop_timer()
             if self._has_token():
                 self._anonymous.pop(self, None)

@@ -7,11 +7,13 @@ import hashlib
 import json
 import logging
 import re
+import sys
 from collections import OrderedDict
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from aerokit._internal.formatting import to_jsonable
+from aerokit.apps.parameter_values import check_values
 from aerokit.apps.plan_text import parse_plan_text
 from aerokit.apps.serve.requests import MAX_BODY_SIZE, MAX_PLAN_SIZE, HttpProblem, problem_of
 from aerokit.connection.tasks import BackgroundTasks
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
 
     from aerokit.apps.serve.served_vehicles import ServedVehicles
     from aerokit.missions import Plan
+    from aerokit.parameters import Metadata
     from aerokit.vehicle.vehicle import Vehicle
 
 logger: logging.Logger = logging.getLogger("aerokit")
@@ -35,7 +38,7 @@ MAX_RESULTS = 500
 MAX_USED_KEYS = 100_000
 """Maximum number of older keys that are stored to detect their reuse."""
 STATE_MAX_AGE_S = 5.0
-"""Maximum age in seconds of the state that the client of an order has seen."""
+"""Maximum age in seconds of the state on which a client bases an order."""
 _KEY = re.compile(r"[A-Za-z0-9._~-]{8,64}")
 
 
@@ -71,8 +74,9 @@ class OrderType:
                 known = ", ".join(self.arguments) or "none"
                 raise InvalidArgument(f"{self.name}: unknown argument {name[:40]!r}; arguments: {known}")
         for name, argument in self.arguments.items():
-            if isinstance(values.get(name), bool):  # bool is a subclass of int, but True is not a mode number
-                raise InvalidArgument(f"{self.name}: {name} = {values[name]} is not of type {argument.type}")
+            value = values.get(name)  # bool is a subclass of int, but True is not a mode number
+            if value is not None and isinstance(value, bool) != (argument.type == "boolean"):
+                raise InvalidArgument(f"{self.name}: {name} = {value!r:.40} is not of type {argument.type}")
             if argument.is_required and values.get(name) is None:
                 raise InvalidArgument(f"{self.name}: argument {name} is missing ({argument.text})")
 
@@ -84,6 +88,14 @@ async def _go_to(vehicle: Vehicle, values: dict[str, Any]) -> None:
 
 async def _set_parameter(vehicle: Vehicle, values: dict[str, Any]) -> object:
     return await vehicle.parameters.set(values["name"], values["value"])
+
+
+def check_parameter(metadata: Metadata | None, values: Mapping[str, Any]) -> None:
+    """Raise InvalidArgument for a value that the metadata does not allow, unless ``force`` is set."""
+    value = values["value"]
+    # The library rejects values of other types, and those that MAVLink cannot represent.
+    if isinstance(value, (int, float)) and abs(value) <= sys.float_info.max and not values.get("force"):
+        check_values(metadata, {values["name"]: value}, '"force": true')
 
 
 async def _upload(vehicle: Vehicle, values: dict[str, Any]) -> None:
@@ -100,7 +112,7 @@ def parse_plan_body(values: Mapping[str, Any]) -> tuple[str, str, Plan]:
     """Return name, text and plan of a request body: an object of a .plan file, or the text of either format.
 
     Raises:
-        FileFormatError: neither format; the text names the position of the error.
+        FileFormatError: the body has neither format; the text names the position of the error.
         InvalidArgument: an item cannot be sent.
     """
     content, name = values["plan"], values.get("name")
@@ -135,7 +147,10 @@ _GO_TO = {
 _ALTITUDE = {"altitude_m": OrderArgument("number", "metres above home, above 0, at most 10,000", True)}
 _MODE = {"mode": OrderArgument(("string", "integer"), "the autopilot's name or number of the mode", True)}
 _ITEM = {"item": OrderArgument("integer", "first item, counted from 0 (0)")}
-_VALUE = {"value": OrderArgument("number", "finite", True)}
+_VALUE = {
+    "value": OrderArgument("number", "finite", True),
+    "force": OrderArgument("boolean", "true: also set a value that the metadata does not allow (false)"),
+}
 _PLAN = {
     "plan": OrderArgument(
         ("object", "string"),
@@ -195,7 +210,7 @@ class OrderRecord:
 
 
 class OrderRunner:
-    """Runs each order once, in a task of the server: a disconnecting client does not affect it."""
+    """Runs each order once, in a task of the server, so that a disconnecting client does not affect the order."""
 
     def __init__(self, served: ServedVehicles) -> None:
         self._served = served
@@ -206,7 +221,7 @@ class OrderRunner:
     def submit(
         self, vehicle: Vehicle, kind: OrderType, arguments: dict[str, Any], key: str, seen_at_s: float | None
     ) -> OrderRecord:
-        """Start an order, or return the one with this key. The arguments have been checked by ``kind.check``.
+        """Start an order, or return the earlier order with this key. The arguments have been checked by ``kind.check``.
 
         Raises:
             HttpProblem: the key is missing, or was used for another order; the client has seen an old state.

@@ -49,11 +49,11 @@ MIN_CHECK_INTERVAL_S = 5.0
 class ServedVehicles:
     """Follows the vehicles of a source, and keeps their recent events, texts and tracks.
 
-    Requests only the reasons for not arming: once, when a disarmed vehicle begins to report that its checks fail, and
-    when its failing sensors change.
+    Requests nothing but the reasons for not arming. These are requested when a disarmed vehicle begins to report
+    failing checks, and again when the failing sensors change.
 
-    ``source``: a connection, whose vehicles are added as they appear; one vehicle; or a mapping from system id
-    to vehicle, which may grow.
+    ``source`` is a connection (its vehicles are added as they appear), one vehicle, or a mapping from system id to
+    vehicle, which may grow.
     """
 
     def __init__(self, source: Connection | Vehicle | Mapping[int, Vehicle]) -> None:
@@ -102,7 +102,7 @@ class ServedVehicles:
         return list(self._texts.get(system_id, ()))
 
     def track(self, system_id: int) -> list[tuple[float, float, bool]]:
-        """Return a track, the oldest position first: latitude, longitude, and True for the first one after a gap."""
+        """Return a track, the oldest position first: latitude, longitude, and True after a gap."""
         points = self._tracks.get(system_id, ())
         return [(at.latitude_deg, at.longitude_deg, is_after_gap) for at, is_after_gap in points]
 
@@ -193,7 +193,7 @@ class ServedVehicles:
         """Return the overview of a vehicle, with the conditions missing for flight and the mission progress.
 
         ``mission_item`` counts items without home, unlike the state ``mission_current``, which counts them as on the
-        wire, where ArduPilot's item 0 is home.
+        wire, where ArduPilot's item 0 is home. ``unarmable_mode`` is None if ``arm`` does not change the mode.
         """
         mission = vehicle.mission
         return {
@@ -202,6 +202,8 @@ class ServedVehicles:
             "failsafe": ground_station_failsafe(vehicle),
             "mission_item": mission.current.latest,
             "mission_items": mission.count.latest,
+            "is_flying_mission": _is_flying_mission(vehicle),
+            "unarmable_mode": _unarmable_mode(vehicle),
         }
 
     def _missing_for_flight(self, vehicle: Vehicle) -> list[str]:
@@ -222,6 +224,21 @@ def _failing_checks(vehicle: Vehicle) -> tuple[str, ...] | None:
     if vehicle.link_state.latest is not LinkState.CONNECTED or vehicle.armed.latest is not False or sensors is None:
         return None
     return tuple(sensors.failing) if sensors.prearm_checks_pass is False else None
+
+
+def _is_flying_mission(vehicle: Vehicle) -> bool:
+    """Return True while the vehicle is armed in its mission mode, the condition of ``mission.pause``."""
+    mode = vehicle.autopilot.mode_for("mission", is_vtol=vehicle.telemetry.is_vtol)
+    return mode is not None and vehicle.telemetry.is_in(mode) and not vehicle.telemetry.is_confirmed_disarmed
+
+
+def _unarmable_mode(vehicle: Vehicle) -> dict[str, str | None] | None:
+    """Return the current mode if ``arm`` would leave it, the mode to arm in, and the parameter that permits arming."""
+    autopilot, mode = vehicle.autopilot, vehicle.mode.latest
+    if mode is None or mode.name not in autopilot.unarmable_modes.union(autopilot.armable_by_option):
+        return None
+    better, option = autopilot.mode_to_arm_in(), autopilot.armable_by_option.get(mode.name)
+    return {"mode": mode.name, "arms_in": None if better is None else better.name, "unless": option}
 
 
 async def _run_checks(vehicle: Vehicle) -> None:

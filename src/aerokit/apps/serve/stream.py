@@ -31,7 +31,7 @@ DEFAULT_RATE_HZ, MAX_RATE_HZ, MIN_RATE_HZ = 5.0, 20.0, 0.1
 
 
 class StateStream:
-    """The endpoint ``/api/stream``. Clients must not send; one that does not read for 10 seconds is disconnected."""
+    """The endpoint ``/api/stream``. Clients must not send. Clients that do not read for 10 seconds are disconnected."""
 
     def __init__(self, served: ServedVehicles, orders: OrderRunner, access: AccessControl) -> None:
         self._served, self._orders, self._access = served, orders, access

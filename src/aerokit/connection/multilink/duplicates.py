@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from aerokit.connection.multilink.link_choice import Candidate, LinkChoice
     from aerokit.mavlink.frame import Frame
 
-MAX_REMEMBERED = 4096  # frames: 10 s at 400 frames per second
+MAX_REMEMBERED = 4096  # frames, i.e. 10 s at 400 frames per second
 
 # A copy within this time is always a duplicate.
 COPY_WINDOW_S = 3.0
@@ -22,7 +22,7 @@ COPY_WINDOW_S = 3.0
 # A later copy, within this time, is a duplicate only if the first copy was accepted. Slow links deliver such copies.
 LATE_COPY_WINDOW_S = 10.0
 
-# Sequence numbers repeat after 256 frames; after half of them, equal bytes are another frame.
+# Sequence numbers repeat after 256 frames. Equal bytes after at least half as many frames are a different frame.
 COPY_WINDOW_FRAMES = 128
 
 
@@ -30,7 +30,7 @@ class _Seen:
     __slots__ = ("at", "count", "is_accepted", "is_admitted", "links")
 
     def __init__(self, at: float, links: int, count: int) -> None:
-        self.at, self.links = at, links  # one bit for each link
+        self.at, self.links = at, links  # links: one bit for each link
         self.count = count  # the sender's frame count when this frame arrived
         self.is_admitted = self.is_accepted = False
 
@@ -49,7 +49,7 @@ class Copies:
         """True if the last checked frame equals one that was accepted over another link some seconds ago."""
 
     def is_copy(self, frame: Frame, link: int) -> bool:
-        """Return True if an equal frame arrived over another link within the last seconds, and not over this one."""
+        """Return True if an equal frame arrived within the last seconds, over another link and not over this one."""
         sender = frame.component_id << 8 | frame.system_id
         key = frame.body, frame.checksum, frame.signature
         count = self._counts.get(sender, 0)
@@ -90,15 +90,15 @@ class Copies:
             self._current.is_accepted = True
 
 
-# After a change of links, requests sent over the former link are still answered over it for this time.
+# For this time after a change of links, answers to earlier requests may still arrive over the former link.
 ANSWER_TIMEOUT_S = 3.0
 
-# A component counts as reachable over a link for this time after a frame of it.
+# A component counts as reachable over a link for this time after its last frame there.
 COMPONENT_TTL_S = 10.0
 
 MAX_STREAMS = 1024
 
-# Answers to requests. They do not become outdated in transit as telemetry does.
+# Answers to requests. Unlike telemetry, they do not become outdated in transit.
 ANSWERS = frozenset(
     message_type.ID
     for message_type in (
@@ -124,7 +124,7 @@ class _Stream:
         self.acknowledgements: dict[bytes, list[int]] = {}
 
     def is_repeated(self, payload: bytes, link: int) -> bool:
-        """Count an acknowledgement; return True if another link has delivered it as often as this one."""
+        """Count an acknowledgement. Return True if another link has delivered it at least as often as this one."""
         counts = self.acknowledgements.setdefault(payload, [0] * len(self.received_at))
         counts[link] += 1
         return counts[link] <= max(count for other, count in enumerate(counts) if other != link)
@@ -134,7 +134,7 @@ class MergedStreams:
     """Accepts each frame once, whichever copy arrives first.
 
     If two links carry separate streams (each port of an autopilot has its own sequence numbers), only frames of the
-    link in use are accepted, because those of the other link may be older. ``choices`` has the links to each system.
+    link in use are accepted, because frames of the other link may be older. ``choices`` has the links to each system.
     """
 
     def __init__(self, links: int, choices: Mapping[int, LinkChoice]) -> None:
@@ -210,7 +210,7 @@ def _is_accepted_from_unused(frame: Frame, candidate: Candidate | None, choice: 
 
 
 def _may_be_equal(frame: Frame, link: int, choice: LinkChoice) -> bool:
-    """Return True if frames with equal bytes may be different frames, as heartbeats of separate streams are."""
+    """Return True if frames with equal bytes may be different frames, such as heartbeats of separate streams."""
     candidate = choice.used
     if candidate is None or candidate.link != link or frame.message_id != m.Heartbeat.ID:
         return False

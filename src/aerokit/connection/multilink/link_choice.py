@@ -1,4 +1,4 @@
-"""``LinkChoice``: which of several links is used for a system, and which of them lead to the same vehicle. Sans-IO."""
+"""``LinkChoice``: selects a link to a system, and checks which links lead to the same vehicle. Sans-IO."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ UNPROBED_TIMEOUT_S = 2.5
 # Consecutive matching clock samples that prove that a second link leads to the same vehicle.
 MIN_CLOCK_MATCHES = 3
 
-# A vehicle that answers this many TIMESYNC probes, but not the request for its hardware id, does not support it.
+# A vehicle that answers this many TIMESYNC probes, but not the request for its hardware id, has none to report.
 MAX_TIMES_WITHOUT_HARDWARE = 3
 
 MAX_HARDWARE_REQUESTS = 20
@@ -50,7 +50,7 @@ class Candidate:
         self.is_doubted: bool = False
         """True if another vehicle with the same system id seems to be behind the link."""
         self.hardware: HardwareId | None = None
-        """Hardware id received over the link; None before that."""
+        """Hardware id received over the link; None if none was received."""
         self.is_other_hardware: bool = False
         """True if :attr:`hardware` belongs to another vehicle: neither clock nor copies can then prove the link."""
         self._hardware_requests = self._times_since_request = 0
@@ -112,7 +112,7 @@ class Candidate:
         return self._hardware_requests > 0 and self._times_since_request < MAX_TIMES_WITHOUT_HARDWARE
 
     def record_hardware(self, *, is_other: bool) -> None:
-        """Record whether the hardware id received over the link contradicts the vehicle's."""
+        """Record whether the hardware id received over the link contradicts that of the vehicle."""
         if is_other:
             self._doubt()
             self.was_proven = False
@@ -154,18 +154,18 @@ class Candidate:
 # Two links that carried the same frame within this time carry one stream.
 SHARED_MAX_AGE_S = 5.0
 
-# A working link is replaced only if the cost of another one stays below this share of its cost for MIN_BETTER_S.
+# A working link is replaced only if another link costs less than this share of its cost for MIN_BETTER_S.
 MAX_COST_RATIO = 0.5
 MIN_BETTER_S = 3.0
 
 JITTER_S = 0.05
 
-# Maximum wait for a moment without a command in transit: set-points may be sent continuously.
+# Maximum wait for a moment without a command in transit, because set-points may be sent continuously.
 MAX_SWITCH_DELAY_S = 10.0
 
 
 class LinkChoice:
-    """The links to one system, and the one in use.
+    """The links to one system, and the link in use.
 
     Systems with an autopilot need proof (``needs_proof``) that a second link leads to the same vehicle: a matching
     clock, or the same frames. Without proof, the frames of the link are refused, and no command is sent over it. A link
@@ -197,10 +197,10 @@ class LinkChoice:
         return candidate
 
     def start_with(self, candidate: Candidate) -> None:
-        """Make this link, which received the system's first autopilot, the reference for all others."""
+        """Make this link the reference for all other links, because it received the system's first autopilot."""
         self.needs_proof = True
         if candidate is not self.used:
-            self.used = None  # it leads to another component, e.g. a camera
+            self.used = None  # the old link leads to another component, e.g. a camera
             self.candidates = {candidate.link: candidate}
 
     def record_answer(self, link: int, at: float, vehicle_s: float, round_trip_s: float, now: float) -> None:
@@ -210,7 +210,8 @@ class LinkChoice:
         candidate.record_round_trip(round_trip_s, now)
         if candidate is self.used:
             if not self.clock.add(at, vehicle_s, round_trip_s):
-                # Another vehicle may have been switched on in its place; its hardware id is then accepted.
+                # The vehicle may have rebooted or been replaced by another one, so the next hardware id over this link
+                # is accepted.
                 self._hardware_link = link
                 for other in self.candidates.values():
                     other.reset_proof()
@@ -252,7 +253,7 @@ class LinkChoice:
         return now - candidate.shared_at <= SHARED_MAX_AGE_S
 
     def choose(self, now: float) -> str | None:
-        """Select the link to use. Return the reason if it changes."""
+        """Select the link to use. Return the reason for a change; None without a change."""
         alive = sorted(
             (link for link in self.candidates.values() if self.may_be_used(link) and link.is_alive(now)),
             key=lambda candidate: (candidate.is_costly, candidate.cost_s),
@@ -306,7 +307,7 @@ class LinkChoice:
             self.hardware, self._hardware_link = hardware, used.link
 
     def _must_wait(self, used: Candidate, now: float) -> bool:
-        """Return True while a command in transit over the link in use could arrive after one over the other link."""
+        """Return True while a command in transit could arrive after a later command over the better link."""
         transit_s = (used.round_trip_s or 0.0) + JITTER_S
         waited_s = now - self._better_since - MIN_BETTER_S
         return now - self._command_at <= transit_s and waited_s <= MAX_SWITCH_DELAY_S
@@ -316,7 +317,7 @@ class LinkChoice:
         if former is not None:
             longer_s = ((to.round_trip_s or 0.0) - (former.round_trip_s or 0.0)) / 2
             self.fresh_after = former.received_at + longer_s + JITTER_S
-            # Both links lead to the same vehicle, otherwise the new one would not be used.
+            # Both links lead to the same vehicle; otherwise the new link would not be used.
             former.is_proven = not former.is_other_hardware
         self.former, self.used, self.changed_at, self._better = former, to, now, None
         self._adopt_hardware(to)

@@ -27,10 +27,10 @@ logger: logging.Logger = logging.getLogger("aerokit")
 
 PROBE_INTERVAL_S = 0.5
 IDLE_COSTLY_PROBE_INTERVAL_S = 5.0
-TIMER_TOLERANCE_S = 0.05  # probe() is called ten times a second
+TIMER_TOLERANCE_S = 0.05  # for probe(), which is called only ten times a second
 MAX_PENDING = 256
 
-# Probes per second to all systems without a vehicle object: forged system ids must not saturate a slow radio.
+# Probes per second to all systems without a vehicle object, so that forged system ids cannot saturate a slow radio.
 UNATTACHED_RATE_HZ = 40.0
 
 _AUTOPILOT = int(MavComponent.AUTOPILOT1)
@@ -39,8 +39,8 @@ _AUTOPILOT = int(MavComponent.AUTOPILOT1)
 class LinkProbes:
     """Probes each link to a system twice a second, an idle costly link every five seconds.
 
-    Answers are recorded in ``choices``. A second vehicle under the same system id is reported once until it stops.
-    ``send(message, peer)`` sends a probe.
+    Answers are recorded in ``choices``. A second vehicle under the same system id is reported once, and again after a
+    pause. ``send(message, peer)`` sends a probe.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class LinkProbes:
         if not is_attached and not self._take_budget(now):
             return
         self._probed_at[key] = now
-        # Our time in nanoseconds; the last digits make it unique per system and link.
+        # The number is our time in nanoseconds, with last digits that are unique per system and link.
         number = int(now * 1e9) // 1000 * 1000 + (system_id * len(self._names) + candidate.link) % 1000
         if number <= 0 or number in self._pending:
             return
@@ -91,7 +91,7 @@ class LinkProbes:
             self._send(request, peer)
 
     def is_answer(self, frame: Frame, link: int) -> bool:
-        """Return True if this TIMESYNC answers one of our probes, over any link, and record it."""
+        """Return True if this TIMESYNC answers one of our probes over any link. Record such an answer."""
         message = self._bus.dialect.decode(frame)
         if not isinstance(message, m.Timesync) or not message.tc1 or message.ts1 not in self._pending:
             return False

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from aerokit.transport.link import Peer
     from aerokit.transport.multilink import MultiLink
 
-STATUS_INTERVAL_S = 0.95  # once a second, checked ten times a second
+STATUS_INTERVAL_S = 0.95  # a little below one second, because the time is checked ten times a second
 
 
 class LinkStates:
@@ -97,7 +97,7 @@ POLL_INTERVAL_S = 0.1
 # A link over which a system was silent for this time is neither probed nor counted until the next heartbeat.
 CANDIDATE_TIMEOUT_S = 30.0
 
-# Commands that must not arrive after a newer one.
+# Commands that must not arrive after a newer command.
 COMMANDS = frozenset(
     message_type.ID
     for message_type in (
@@ -106,7 +106,7 @@ COMMANDS = frozenset(
     )
 )  # fmt: skip
 
-# Broadcasts without effect on a vehicle: they go to every peer on every link.
+# Broadcasts without effect on a vehicle. These go to every peer on every link.
 BROADCASTS = frozenset(message_type.ID for message_type in (m.Heartbeat, m.Timesync, m.Ping))
 
 
@@ -208,7 +208,7 @@ class MultiLinkRoutes:
     def is_copy(self, frame: Frame, peer: Peer) -> bool:
         """Return True if this frame was already accepted over another link, or is our own.
 
-        PX4 forwards our heartbeats from one of its ports to the others.
+        PX4 forwards our heartbeats from one of its ports to its other ports.
         """
         if frame.system_id == self._own_source[0] and frame.component_id == self._own_source[1]:
             return True
@@ -276,7 +276,7 @@ class MultiLinkRoutes:
     # ---------------------------------------------------------------------------- internal
 
     def _link_to(self, choice: LinkChoice, source: tuple[int, int]) -> int:
-        """Return the link in use, or another link to the same system if only that one reaches the component."""
+        """Return the link in use, or another link to the same system if only that link reaches the component."""
         assert choice.used is not None
         if not self._routes[choice.used.link].has_route(source):
             for link, candidate in choice.candidates.items():
@@ -316,7 +316,7 @@ class MultiLinkRoutes:
         if reason is None or used is None:
             return
         if before is not None:
-            self._link.discard_unsent_of(before.link)  # it must not arrive after commands over the new link
+            self._link.discard_unsent_of(before.link)  # old data must not arrive after commands over the new link
             self._merged.reset(system_id)
             name, former = self._link.names[used.link], self._link.names[before.link]
             log = logger.info if reason in ("better", "cheaper") else logger.warning

@@ -1,7 +1,7 @@
 """``VehicleClock`` and ``HardwareId``: evidence that two links lead to the same vehicle.
 
-The time in a TIMESYNC answer counts from boot on ArduPilot and PX4. Two vehicles with the same system id therefore
-differ by more than the round-trip time.
+The time in a TIMESYNC answer counts from boot on ArduPilot and PX4. The times of two vehicles with the same system id
+therefore differ by more than the round-trip time.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 MAX_SAMPLES = 20
 TOLERANCE_S = 0.1
 MAX_SPEED_ERROR = 0.02  # simulations do not keep their nominal speed exactly
-MAX_DRIFT_S = 0.5  # otherwise any clock would match after a long enough silence
-REAL_TIME_TOLERANCE = 0.05  # a measured speed of 1 ± this counts as 1, because its error adds up in a long silence
+MAX_DRIFT_S = 0.5  # without this limit, any clock would match after a long enough silence
+REAL_TIME_TOLERANCE = 0.05  # a measured speed of 1 ± this counts as 1: the error adds up in a long silence
 MIN_SPAN_S = 1.0
 MAX_SPEED = 200.0  # maximum speed of a simulation, relative to real time
 MAX_PAUSE_S = 10.0  # a simulation that was paused for longer counts as rebooted
@@ -35,7 +35,7 @@ class VehicleClock:
     def add(self, at: float, vehicle_s: float, round_trip_s: float) -> bool:
         """Add a sample from the link in use. Return False if the clock does not continue, i.e. the vehicle rebooted.
 
-        A clock that was paused for a moment continues, but later than expected.
+        A clock that was paused for a moment counts as continuing, although it is late.
         """
         continues = not self._samples or self._continues(at, vehicle_s, round_trip_s)
         self.is_steady = continues and self._fits(at, vehicle_s, round_trip_s) is not False
@@ -49,8 +49,8 @@ class VehicleClock:
     def matches(self, at: float, vehicle_s: float, round_trip_s: float) -> bool | None:
         """Return True if a sample from another link is this clock's time; ``at`` is the middle of the round trip.
 
-        None while the speed is unknown, because a simulation may run at any speed. The speed from before a pause or
-        reboot can confirm a sample, but not contradict it.
+        Return None while the speed is unknown, because a simulation may run at any speed. The speed from before a pause
+        or reboot can confirm a sample, but not contradict it.
         """
         fits = self._fits(at, vehicle_s, round_trip_s)
         return None if not fits and self._measured_speed is None else fits

@@ -63,8 +63,10 @@ class Conversion(Snapshot):
     entries: int
     """Number of records read from the log: messages or rows."""
     written: int
-    """Number of messages, rows or points written. In an ``.mcap``, each record is written as one message, plus one for
-    each state that the record changes. A flight table or track has rows or points for positions only.
+    """Number of messages, rows or points written.
+
+    In an ``.mcap``, each record becomes one message, plus one message for each state that the record changes. A flight
+    table or track has rows or points for positions only.
     """
     bytes: int
     """Total size of the written files."""
@@ -84,7 +86,7 @@ def convert(
     force: bool = False,
     on_progress: OnProgress | None = None,
 ) -> Conversion:
-    """Convert a flight log. Of a damaged log, the readable part is converted.
+    """Convert a flight log. If the log is damaged, only its readable part is converted.
 
     The target appears only when it is complete. The function blocks and needs no event loop.
 
@@ -113,7 +115,7 @@ def convert(
         kinds = ("folder", "file") if to.is_dir() else ("file", "folder")
         raise InvalidArgument(f"{to} is a {kinds[0]} and cannot be replaced by a {kinds[1]}")
     on_bytes = _byte_callback(source, on_progress)
-    # In the target's directory, so that it can be renamed.
+    # The temporary folder is in the target's directory, so that the result can be renamed.
     with tempfile.TemporaryDirectory(dir=to.parent, prefix=f".{to.name}.") as folder:
         part = Path(folder) / to.name
         if not to.suffix:

@@ -6,8 +6,11 @@ import csv
 import math
 import re
 from datetime import datetime, timezone
+from functools import lru_cache
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, TextIO
+from operator import attrgetter
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
 
 from aerokit.logs.flights.records import TableColumn
 
@@ -17,7 +20,7 @@ if TYPE_CHECKING:
 
     from aerokit.logs.flights.records import LogReader, LogRecord
 
-_ROWS = 1 << 15
+_ROWS, _LINES = 1 << 15, 1 << 8
 _SENDER = (
     TableColumn("time_utc", "", "time"),
     TableColumn("system_id", "", "int"),
@@ -50,19 +53,12 @@ FLIGHT = (
 """Columns of the flight table after time and system id. Each row has the newest values at one position."""
 
 
-class _UnixLines:
-    """Converts the line ends of rows from CR LF to LF."""
-
-    def __init__(self, file: TextIO) -> None:
-        self._file = file
-
-    def write(self, row: str) -> None:
-        self._file.write(row[:-2] + "\n")
-
-
-# Places in a text where spreadsheets recognise a formula (owasp.org/www-community/attacks/CSV_Injection): at the
-# beginning, even after white space, and after the separators of other locales, which quotes do not protect.
+# Places in a text where spreadsheets recognise a formula (owasp.org/www-community/attacks/CSV_Injection). These are the
+# beginning, even after white space, and the places after separators of other locales, even in quotes.
 _FORMULA = re.compile(r"(^|[;\t])(?=[\s\0]*[=+\-@\uff1d\uff0b\uff0d\uff20])|^(?=[\t\r\n\0])")
+
+
+_NUMBERS = (float, int)
 
 
 def _csv_cell(value: Any) -> Any:
@@ -81,19 +77,29 @@ class CsvTable:
 
     def __init__(self, path: Path, columns: Sequence[TableColumn]) -> None:
         self._file = path.open("w", encoding="utf-8", newline="")
+        self._lines: list[str] = []
         # The csv module quotes values with "\r" and "\n" only if the line terminator contains both.
-        self._writer = csv.writer(_UnixLines(self._file), lineterminator="\r\n")
+        lines: Any = SimpleNamespace(write=self._lines.append)
+        self._writer = csv.writer(lines, lineterminator="\r\n")
         self._writer.writerow([_csv_cell(column.name) for column in columns])
 
     def add(self, unix_s: float, values: Sequence[Any]) -> None:
         """Add a row; the time is ISO 8601 in UTC with microseconds."""
-        shown = [_csv_cell(value) for value in values]
-        self._writer.writerow([_utc(unix_s).isoformat(timespec="microseconds"), *shown])
+        shown = [value if type(value) in _NUMBERS and value == value else _csv_cell(value) for value in values]
+        self._writer.writerow([_iso_time(unix_s), *shown])
+        if len(self._lines) >= _LINES:
+            self._flush()
 
     def close(self) -> None:
+        self._flush()
         self._file.close()
 
-    discard = close
+    def discard(self) -> None:
+        self._file.close()
+
+    def _flush(self) -> None:
+        self._file.write("".join([line[:-2] + "\n" for line in self._lines]))
+        self._lines.clear()
 
 
 class ParquetTable:
@@ -141,7 +147,7 @@ Table = CsvTable | ParquetTable
 
 
 class FlightTableWriter:
-    """Writes one table, with a row for each position of each vehicle, which includes the newest other values."""
+    """Writes one table, with a row for each position of each vehicle. A row includes the newest other values."""
 
     def __init__(self, path: Path, log: LogReader, kind: type[Table]) -> None:
         self._table = kind(path, (*_SENDER[:2], *FLIGHT))
@@ -174,6 +180,7 @@ class MessageTablesWriter:
 
     def __init__(self, path: Path, log: LogReader, kind: type[Table]) -> None:
         self._path, self._log, self._kind = path, log, kind
+        log.needs_states = False
         self._tables: dict[str, tuple[Table, Callable[[LogRecord], list[Any]]]] = {}
         self.written: int = 0
 
@@ -200,8 +207,17 @@ class MessageTablesWriter:
             table.discard()
 
 
-def _utc(unix_s: float) -> datetime:
-    return datetime.fromtimestamp(unix_s, timezone.utc)
+def _iso_time(unix_s: float) -> str:
+    fraction, second = math.modf(unix_s)
+    microseconds = round(fraction * 1e6)
+    if not 0 <= microseconds < 1_000_000:
+        return datetime.fromtimestamp(unix_s, timezone.utc).isoformat(timespec="microseconds")
+    return f"{_iso_second(second)}.{microseconds:06}+00:00"
+
+
+@lru_cache(maxsize=1)
+def _iso_second(unix_s: float) -> str:
+    return datetime.fromtimestamp(unix_s, timezone.utc).isoformat()[:19]
 
 
 def _row_of(columns: Sequence[TableColumn], record: LogRecord) -> Callable[[LogRecord], list[Any]]:
@@ -210,11 +226,17 @@ def _row_of(columns: Sequence[TableColumn], record: LogRecord) -> Callable[[LogR
         names = [column.field for column in columns]
         return lambda record: [_cell(record.fields.get(name)) for name in names]
     parts = [column.field.partition(".") for column in columns]
-    places = [(name, int(index) if index else None) for name, _, index in parts]
+    fields = attrgetter("NAME", *(name for name, _, _ in parts))  # a tuple, due to the additional name
+    elements = [(place, int(index)) for place, (_, _, index) in enumerate(parts) if index]
+    texts = [place for place, column in enumerate(columns) if column.kind == "str"]
 
     def row(record: LogRecord) -> list[Any]:
-        values = ((getattr(record.message, name), index) for name, index in places)
-        return [_cell(value) if index is None else value[index] for value, index in values]
+        _, *values = fields(record.message)
+        for place, index in elements:
+            values[place] = values[place][index]
+        for place in texts:
+            values[place] = _cell(values[place])
+        return values
 
     return row
 

@@ -1,7 +1,7 @@
 """Foxglove topics of a vehicle: names, JSON schemas and messages, for the live bridge and for files.
 
-Schemas named ``foxglove.…`` are known to Foxglove's panels (https://docs.foxglove.dev/docs/sdk/schemas). The
-others contain the fields of aerokit's values. Everything is JSON.
+Schemas named ``foxglove.…`` are known to Foxglove's panels (https://docs.foxglove.dev/docs/sdk/schemas). Other schemas
+contain the fields of aerokit's values. Everything is JSON.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ class MapFrame:
         self._origin: tuple[float, float, float] | None = None
 
     def east_north_up_m(self, position: Position) -> tuple[float, float, float]:
-        """Convert a position. The first one becomes the origin, at the altitude of home if that is known."""
+        """Convert a position. The first position becomes the origin, at the altitude of home if that is known."""
         altitude, relative = position.altitude_amsl_m, position.altitude_relative_m
         if self._origin is None:
             self._origin = (

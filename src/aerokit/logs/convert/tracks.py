@@ -137,8 +137,8 @@ class KmlWriter(_TrackWriter):
         file = kml.Kml(name=self._log.path.name)
         for system_id, track in self._tracks.items():
             folder = file.newfolder(name=f"vehicle {system_id}")
-            # Use altitudes above sea level if all are known. Otherwise altitudes above home come closest to
-            # KML's "relativeToGround".
+            # Use altitudes above sea level if all of them are known. Otherwise use altitudes above home, which come
+            # closest to KML's "relativeToGround".
             is_absolute = all(place.altitude_amsl_m is not None for _, place in track.points)
             mode = kml.AltitudeMode.absolute if is_absolute else kml.AltitudeMode.relativetoground
             line = folder.newgxtrack(name="track", altitudemode=mode)

@@ -64,13 +64,13 @@ def check_log_name(path: Path) -> None:
 def read_flight(
     log: str | os.PathLike[str], *, system_id: int | None = None, on_progress: OnProgress | None = None
 ) -> FlightLog:
-    """Read a flight from a log. Of a damaged log, the readable part is returned.
+    """Read a flight from a log. If the log is damaged, only its readable part is returned.
 
     The function blocks and needs no event loop.
 
     Args:
         log: a ``.tlog`` of a ground station or of ``record=``, a ``.bin`` of ArduPilot, a ``.ulg`` of PX4.
-        system_id: system id of the vehicle, if a ``.tlog`` contains several; None: the first one.
+        system_id: system id of the vehicle, if a ``.tlog`` contains several vehicles; None: the first vehicle.
         on_progress: called from time to time with the bytes that were read.
 
     Raises:
@@ -112,7 +112,7 @@ def _complete(flight: FlightLog) -> None:
 def _fill_relative(flight: FlightLog) -> None:
     """Derive heights above home from altitudes above sea level.
 
-    Until ArduPilot knows home, or the altitude above sea level, it logs the same value for both.
+    While ArduPilot does not know home or the altitude above sea level, it logs the same value as both altitudes.
     """
     home = flight.home.altitude_amsl_m if flight.home is not None else None
     if home is None:

@@ -1,6 +1,6 @@
 """Meanings of numbers in ArduPilot logs: mode reasons, and errors of subsystems.
 
-From ``ModeReason.h`` and ``AP_Logger.h`` of ArduPilot 4.7.
+The meanings are from ``ModeReason.h`` and ``AP_Logger.h`` of ArduPilot 4.7.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ MODE_REASONS: Mapping[int | None, tuple[str, str | None, bool | None]] = {
     54: ("automatic landing", None, True),
     55: ("fence re-enabled", None, True),
 }
-"""By number: description, kind of failsafe (if any), and True if the autopilot changed the mode itself."""
+"""Maps a number to description, kind of failsafe (or None), and True if the autopilot changed the mode itself."""
 
 ERRORS: Mapping[int, tuple[str, str]] = {
     1: ("general", "main loop"),
@@ -97,7 +97,7 @@ ERRORS: Mapping[int, tuple[str, str]] = {
     30: ("general", "internal error"),
     31: ("estimator", "dead reckoning"),
 }
-"""By subsystem: kind of failsafe, description."""
+"""Maps a subsystem to the kind of failsafe and a description."""
 
 _CODES: Mapping[tuple[int, int], str] = {
     (2, 2): "late frames",

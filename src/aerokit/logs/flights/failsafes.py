@@ -1,4 +1,4 @@
-"""Detection of failsafes in a flight, from texts, modes, errors and flags, with the values before them."""
+"""Detection of failsafes in a flight by texts, modes, errors and flags, and the values before each failsafe."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 # Evidence of the same kind within this time belongs to one failsafe.
 _SAME_KIND_GAP_S = 8.0
-# Evidence of the kind "general" belongs to the same failsafe as specific evidence within this time.
+# Evidence of the kind "general" belongs to the failsafe of specific evidence if they are at most this time apart.
 _GENERAL_GAP_S = 3.0
 _REACTION_TIMEOUT_S = 12.0
 _CONTEXT_S = 10.0
@@ -179,8 +179,8 @@ def _explain(flight: FlightLog, group: Sequence[FailsafeEvidence]) -> Failsafe:
 def _reaction(flight: FlightLog, time_s: float, group: Sequence[FailsafeEvidence]) -> tuple[str, bool]:
     """Return a description of the reaction, and True if the autopilot caused it.
 
-    The reaction is the first mode change that was not commanded, or disarming. If the log does not contain the cause
-    of a change, an immediate change is attributed to the autopilot; a later one may have been made by the pilot.
+    The reaction is the first mode change that was not commanded, or disarming. If the log does not contain the cause of
+    a change, an immediate change is attributed to the autopilot. The pilot may have made a later change.
     """
     last = group[-1].time_s
     for change in flight.modes:

@@ -18,7 +18,7 @@ _MIN_SINK_M_S, _STOPPED_M_S = 3.0, 1.0
 _MIN_HEIGHT_M = 2.0
 # Free fall reaches this speed after two metres.
 _FALL_SINK_M_S = 6.0
-# The ground stops a vehicle within this time, a motor does not.
+# The ground stops a vehicle within this time. Motors need longer.
 _IMPACT_S = 0.6
 _SAME_HEIGHT_M = 1.5
 _DISARM_TIMEOUT_S = 30.0
@@ -37,7 +37,8 @@ class Fall(Snapshot):
     sink_m_s: float
     """Sink rate at the end."""
     is_hard_landing: bool
-    """True below 6 m/s, unless the vehicle was disarmed in the air or the autopilot reported a crash."""
+    """True below 6 m/s sink rate, unless the vehicle was disarmed in the air or the autopilot reported a crash.
+    """
     has_impact: bool
     """False if the log ends in the descent."""
     reasons: tuple[str, ...]
@@ -51,9 +52,13 @@ class Fall(Snapshot):
 def falls(flight: FlightLog) -> list[Fall]:
     """Return the falls and hard landings of a flight, the oldest first; none without heights and sink rates.
 
-    A descent counts if the vehicle sank at more than 3 m/s, was stopped within 0.6 s, and one of these is true: it
-    stayed at that height until it was disarmed; it stayed less than 3 m above home for 30 s, still armed; the autopilot
-    reported a crash. A descent near the ground in which the log ends counts too.
+    A descent counts if the vehicle sank at more than 3 m/s, was stopped within 0.6 s, and one of these is true:
+
+    - The vehicle stayed at that height until it was disarmed.
+    - The vehicle stayed armed and less than 3 m above home for 30 s.
+    - The autopilot reported a crash.
+
+    A descent near the ground also counts if the log ends in it.
     """
     if not flight.armed:
         return []

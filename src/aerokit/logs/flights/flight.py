@@ -46,7 +46,7 @@ class TimeSeries:
         return f"<TimeSeries {', '.join(self.names)}: {len(self)} rows>"
 
     def add(self, time_s: float, *values: float) -> None:
-        """Add a row with one value for each column. A row older than the last one gets the time of the last one."""
+        """Add a row with one value for each column. A row older than the last row gets the time of the last row."""
         times = self.times
         if times and time_s < times[-1]:
             time_s = times[-1]
@@ -62,7 +62,7 @@ class TimeSeries:
             column.extend(columns.get(name, missing))
 
     def has(self, *names: str) -> bool:
-        """Return True if any of these columns (all by default) has a known value."""
+        """Return True if any of these columns (without names: any column) has a known value."""
         return any(value == value for name in names or self.names for value in self._values[name])
 
     def index_at(self, time_s: float) -> int:
@@ -70,7 +70,7 @@ class TimeSeries:
         return bisect_right(self.times, time_s) - 1
 
     def at(self, name: str, time_s: float, *, not_older_s: float = 10.0) -> float:
-        """Return the last known value at this time; NaN if it is older than ``not_older_s``."""
+        """Return the last known value at this time; NaN if the value is older than ``not_older_s``."""
         column, index = self._values[name], self.index_at(time_s)
         while index >= 0 and self.times[index] >= time_s - not_older_s:
             if column[index] == column[index]:
@@ -185,7 +185,7 @@ class FlightLog:
     path: Path
     """Path of the log."""
     begins_at: float = 0.0
-    """UTC of the first entry, in seconds since 1970. A value below one year means that no clock was set."""
+    """UTC of the first entry, in seconds since 1970. A value below one year means that the clock was not set."""
     ends_at: float = 0.0
     """UTC of the last entry."""
     vehicle: str = ""
@@ -194,7 +194,7 @@ class FlightLog:
     """``"ArduPilot"``, ``"PX4"``."""
     system_id: int = 1
     home: Position | None = None
-    """Home of the first flight in the log. If home was not logged, the position of the first arming."""
+    """Home of the first flight in the log or, if home was not logged, the position at the first arming."""
     track: TimeSeries = field(
         default_factory=lambda: TimeSeries("latitude_deg", "longitude_deg", "altitude_amsl_m", "altitude_relative_m")
     )
@@ -208,9 +208,9 @@ class FlightLog:
     velocity_target: TimeSeries = field(default_factory=lambda: TimeSeries("north_m_s", "east_m_s", "down_m_s"))
     attitude_target: TimeSeries = field(default_factory=lambda: TimeSeries("roll_deg", "pitch_deg", "yaw_deg"))
     batteries: dict[int, TimeSeries] = field(default_factory=dict)
-    """By battery number, from 0: ``voltage_v``, ``current_a``, ``used_mah``, ``remaining_percent``."""
+    """Time series by battery number, from 0: ``voltage_v``, ``current_a``, ``used_mah``, ``remaining_percent``."""
     gps: dict[int, TimeSeries] = field(default_factory=dict)
-    """By receiver number: ``fix_type`` (GPS_FIX_TYPE), ``satellites``, ``hdop``, ``accuracy_m``."""
+    """Time series by receiver number: ``fix_type`` (GPS_FIX_TYPE), ``satellites``, ``hdop``, ``accuracy_m``."""
     vibration: TimeSeries = field(default_factory=lambda: TimeSeries("x_m_s2", "y_m_s2", "z_m_s2", "clips"))
     """Vibration levels, and the count of accelerometer clipping. PX4 logs one level, stored as ``x_m_s2``."""
     estimator: TimeSeries = field(
@@ -220,7 +220,7 @@ class FlightLog:
     )
     """Innovation test ratios: above 1, the estimator rejects the measurement."""
     link: TimeSeries = field(default_factory=lambda: TimeSeries("lost_percent", "received_hz"))
-    """For each second: the percentage of lost messages, and the rate of received ones."""
+    """Percentage of lost messages, and number of received messages per second. One row for each second."""
     radio: TimeSeries = field(default_factory=lambda: TimeSeries("rssi", "remote_rssi", "noise", "remote_noise"))
     """Signal values of a telemetry radio, in the units of the radio."""
     gcs_heartbeats: array[float] = field(default_factory=lambda: array("d"))
@@ -275,14 +275,14 @@ class FlightLog:
         return value
 
     def add_mode(self, time_s: float, name: str, reason: str = "", by_autopilot: bool | None = None) -> bool:
-        """Record a mode. Return False if it is the current one."""
+        """Record a mode. Return False if the flight is in this mode already."""
         if self.modes and self.modes[-1].name == name:
             return False
         self.modes.append(ModeChange(time_s, name, reason, by_autopilot))
         return True
 
     def set_armed(self, time_s: float, armed: bool) -> None:
-        """Record the arming state. The end of an open span is infinity."""
+        """Record the arming state. A span ends at infinity until the vehicle is disarmed."""
         is_open = bool(self.armed) and math.isinf(self.armed[-1][1])
         if armed and not is_open:
             self.armed.append((time_s, math.inf))

@@ -62,7 +62,7 @@ def opened_bin(path: Path, on_percent: Callable[[float], object] | None = None) 
 
 def close_bin(reader: Any) -> None:
     for name in ("data_map", "filehandle"):
-        with suppress(AttributeError, BufferError):  # never opened, or still referenced by a traceback
+        with suppress(AttributeError, BufferError):  # the file was never opened, or is still referenced by a traceback
             getattr(reader, name).close()
 
 
@@ -85,7 +85,7 @@ class _RowReader(LogReader):
     _skipped = 0
 
     def _is_plausible_time(self, unix_s: float) -> bool:
-        """Return False and count the row as damaged if its time is impossible."""
+        """Return True if this time is possible. Otherwise, count the row as damaged."""
         is_plausible = 0 <= unix_s < _MAX_UNIX_S
         self._skipped += not is_plausible
         return is_plausible
@@ -154,7 +154,7 @@ class BinReader(_RowReader):
         try:
             with redirect_stdout(sys.stderr):  # see opened_bin
                 return reader.recv_msg()
-        except Exception as error:  # arbitrary errors for a damaged row
+        except Exception as error:  # pymavlink raises arbitrary errors for a damaged row
             self.notes.append(f"damaged at byte {reader.offset}; the rest was skipped: {error}")
             return None
 
@@ -181,13 +181,13 @@ def _ardupilot_attitude(fields: Mapping[str, Any], _: Any) -> States:
 
 
 def _known(value: float) -> float | None:
-    """Return None for NaN, which batteries without a sensor have."""
+    """Convert NaN, the value of batteries without a sensor, to None."""
     return value if math.isfinite(value) else None
 
 
 def _ardupilot_battery(fields: Mapping[str, Any]) -> States:
     number = fields.get("Instance", fields.get("Inst", 0))
-    if number != 0:  # the state lists all batteries, but a row has only one
+    if number != 0:  # the state lists all batteries, but a row has a single battery
         return ()
     return (("batteries", (Battery(number, _known(fields["Volt"]), _known(fields["Curr"])),)),)
 

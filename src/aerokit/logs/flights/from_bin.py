@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from aerokit.logs.flights.flight import FlightLog
 
 NAN = math.nan
-_CHUNK = 1 << 9  # rows unpacked at once; with more, the garbage collector takes longer to traverse their tuples
+_CHUNK = 1 << 9  # rows unpacked at once; more rows would take the garbage collector longer to traverse
 # Unknown charge: AP_BattMonitor_Logging.cpp writes -1 as a byte.
 _NO_PERCENT = 255
 _FIRMWARES = {
@@ -36,14 +36,14 @@ _ARMED, _DISARMED = 10, 11  # events in old logs without ARM
 _HOME = 1
 # A position closer to 0° N 0° E means that the estimator has no position yet.
 _NULL_ISLAND_DEG = 0.01
-_INDEXING_SHARE = 0.3  # share of the total time, for the progress
+_INDEXING_SHARE = 0.3  # share of the total time that indexing takes, for the progress
 
 
 def read_bin_flight(flight: FlightLog, system_id: int | None, on_bytes: Callable[[int], object]) -> None:
     """Fill a flight from its file.
 
     Raises:
-        FileFormatError: the file is not an ArduPilot log, or is from before 2015.
+        FileFormatError: the file is not an ArduPilot log, or was written before 2015.
     """
     size = flight.path.stat().st_size
     reader = opened_bin(flight.path, lambda percent: on_bytes(round(size * _INDEXING_SHARE * percent / 100)))
@@ -81,7 +81,7 @@ class _Tables:
             yield from zip(*chunk, strict=True)
 
     def columns(self, table: str, *columns: str) -> list[list[Any]]:
-        """Return the data of :meth:`rows` as a list for each column."""
+        """Like :meth:`rows`, but return one list for each column."""
         found: list[list[Any]] = [[] for _ in range(len(columns) + 1)]
         for chunk in self._chunks(table, columns):
             for whole, part in zip(found, chunk, strict=True):
@@ -126,7 +126,7 @@ class _Tables:
             raise FileFormatError(
                 f"{reader.filehandle.name} has no row with a time (TimeUS): it is empty, or from before 2015"
             )
-        return int(min(found)[1])  # not the minimum of all times, because a damaged row can have any time
+        return int(min(found)[1])  # the minimum of all times could be that of a damaged row
 
 
 def _pattern(row_format: Any, indices: Sequence[int]) -> str:

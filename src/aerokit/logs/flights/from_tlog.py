@@ -33,8 +33,8 @@ _NULL_ISLAND_E7 = 100_000
 _HEARTBEAT, _MAX_SEQUENCE_GAP = b"\0\0\0", 200
 # A mode change within this time after a command is attributed to the command.
 _COMMAND_MAX_AGE_S = 5.0
-# Clocks of vehicles and computers drift by less than this share, so a larger drift means a simulation faster or slower
-# than real time. Over the minimum time of comparison, delays of the link average out.
+# Clocks of vehicles and computers drift by less than this share. A larger drift means that a simulation ran faster or
+# slower than real time. Over the minimum time of comparison, delays of the link average out.
 _MAX_CLOCK_DRIFT, _MIN_CLOCK_COMPARISON_S, _MAX_CLOCK_GAP_S = 0.2, 1.0, 10.0
 # Bits of a type mask that mark position and velocity as ignored.
 _NO_POSITION, _NO_VELOCITY = 0x7, 0x38
@@ -187,7 +187,7 @@ class _Reader:
             )
 
     def _use_destinations(self) -> None:
-        """Use destinations (POSITION_TARGET_GLOBAL_INT) as set-points, if there are no continuous ones."""
+        """Use destinations (POSITION_TARGET_GLOBAL_INT) as set-points, if there are no continuous set-points."""
         target, destinations = self._flight.position_target, self._destinations
         if target.has("latitude_deg"):
             return
@@ -320,12 +320,12 @@ class _Reader:
         )
 
     def _mission_count(self, time_s: float, message: m.MissionCount) -> None:
-        """Drop items beyond the new count: they belong to an earlier mission."""
+        """Drop items beyond the new count, because they belong to an earlier mission."""
         if self._is_our_mission(message):
             self._items = {number: item for number, item in self._items.items() if number < message.count}
 
     def _is_our_mission(self, message: m.MissionItemInt | m.MissionItem | m.MissionCount) -> bool:
-        """Return True for missions of this vehicle, not of others, and not fences."""
+        """Return True for missions of this vehicle. Fences, rally points and missions of other vehicles are ignored."""
         frame, ours = message.received_frame, self._flight.system_id
         sender = None if frame is None else frame.system_id
         return message.mission_type == 0 and ours in (sender, message.target_system)
@@ -462,7 +462,7 @@ class _ClockComparison:
     def compare(self, time_s: float, boot_ms: int) -> None:
         before_s, before_ms = self._before
         self._before = time_s, boot_ms
-        # Skips reboots, and pauses of the recording or its clock.
+        # This condition skips reboots, and pauses of the recording or of its clock.
         if boot_ms >= before_ms and 0 <= time_s - before_s < _MAX_CLOCK_GAP_S:
             self._recorded_s += time_s - before_s
             self._vehicle_s += (boot_ms - before_ms) / 1e3

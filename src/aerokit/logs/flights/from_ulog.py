@@ -71,7 +71,7 @@ _FLAGS = {
     "vtol_fixed_wing_system_failure": ("transition", "fixed-wing system failure"),
 }
 _WARNINGS = {1: "low", 2: "critical", 3: "emergency", 4: "failed"}
-_LOADING_SHARE = 0.9  # share of the total time, for the progress
+_LOADING_SHARE = 0.9  # share of the total time that loading takes, for the progress
 _BUFFER = 1 << 20
 
 
@@ -212,7 +212,7 @@ class _Reader:
             self._flight.add_mode(time_s, name, reason, by_itself)
 
     def _failsafe_flags(self) -> None:
-        # Ignore the flags while disarmed: on the ground many are set without meaning.
+        # Ignore the flags while disarmed, because many flags are set without meaning on the ground.
         flight, flags = self._flight, self._topic("failsafe_flags")
         if flags is None:
             return
@@ -363,7 +363,7 @@ class _Reader:
         self._links()
 
     def _links(self) -> None:
-        # If there are several links, use the one that received the most messages.
+        # If there are several links, use the link that received the most messages.
         links = [topic for _, topic in self._topics("telemetry_status") if "rx_message_lost_rate" in topic]
         if links:
             best = max(links, key=lambda topic: float(topic.array("rx_message_count")[-1]))

@@ -53,6 +53,8 @@ class LogReader:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.needs_states: bool = True
+        """False to leave out the states of records of a ``.tlog``. Decoding them takes most of the time."""
         self.notes: list[str] = []
 
     def entries(self, on_bytes: Callable[[int], object]) -> Iterator[LogRecord]:
@@ -82,6 +84,7 @@ class TlogReader(LogReader):
     def entries(self, on_bytes: Callable[[int], object]) -> Iterator[LogRecord]:
         """Yield all messages of the standard with valid checksums."""
         framer, decode, count = self._framer, STANDARD.decode, 0
+        states: tuple[tuple[str, Any], ...] = ()
         with self.path.open("rb") as file:
             for unix_s, raw in read_tlog(file):
                 count += 1
@@ -89,7 +92,8 @@ class TlogReader(LogReader):
                     on_bytes(file.tell())
                 for frame in framer.receive(raw, unix_s):
                     message = decode(frame)
-                    states = self._states(frame.system_id, frame.component_id, unix_s, message)
+                    if self.needs_states:
+                        states = self._states(frame.system_id, frame.component_id, unix_s, message)
                     yield LogRecord(unix_s, frame.system_id, frame.component_id, message.NAME, {}, states, message)
             on_bytes(file.tell())
         self._note(count)

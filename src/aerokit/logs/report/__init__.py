@@ -59,7 +59,7 @@ def write_report(
         log: a ``.tlog`` of a ground station or of ``record=``, a ``.bin`` of ArduPilot, a ``.ulg`` of PX4.
         target: the file, ``flight.html``.
         compare_with: a second log, of any kind.
-        system_id: system id of the vehicle, if a ``.tlog`` contains several; None: the first one.
+        system_id: system id of the vehicle, if a ``.tlog`` contains several vehicles; None: the first vehicle.
         force: replace an existing file.
         on_progress: called from time to time with the bytes that were read, for each log.
 

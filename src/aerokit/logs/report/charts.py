@@ -99,7 +99,7 @@ def rows_to_draw(values: Sequence[float], max_rows: int = MAX_POINTS) -> list[in
         known = part
         if math.isnan(sum(part)):
             known = [value for value in part if value == value]
-            # Single unknown values are not drawn as gaps.
+            # A part in which only a few values are unknown is drawn without a gap.
             if len(known) * 2 < len(part):
                 found.add(next(row for row in range(begin, end) if values[row] != values[row]))
         if known:
@@ -233,7 +233,7 @@ def map_layout(traces: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _track_lines(flight: FlightLog, places: Sequence[tuple[float, float]]) -> tuple[list[dict[str, Any]], float]:
-    """Return a line for each mode, and the largest distance of the track from them."""
+    """Return a line for each mode, and the largest distance of the track from these lines."""
     times, heights = flight.track.times, flight.track["altitude_relative_m"]
     changes = flight.modes or [ModeChange(0.0, "")]
     starts = [0, *(bisect_left(times, change.time_s) for change in changes[1:]), len(places)]
@@ -271,7 +271,7 @@ def _here(time_s: float, height_m: float) -> str:
 
 
 def rounded(value: float) -> float | None:
-    """Round a coordinate for drawing. Return None, which is a gap, if it is unknown or damaged."""
+    """Round a coordinate for drawing. Return None, which is a gap, if the coordinate is unknown or damaged."""
     return round(value, 2) if abs(value) <= MAX_COORDINATE else None
 
 

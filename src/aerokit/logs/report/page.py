@@ -1,4 +1,4 @@
-"""Renders sections as one HTML file. It is self-contained, loads nothing, and all text from logs is escaped."""
+"""Renders sections as one HTML file. The file is self-contained, loads nothing, and all text from logs is escaped."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Paragraphs:
 
 @dataclass(frozen=True)
 class Table:
-    """A table of texts. A long one is collapsed."""
+    """A table of texts. A long table is collapsed."""
 
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
@@ -61,7 +61,8 @@ class Chart:
     label: str = ""
     """Text alternative for screen readers."""
     is_timeline: bool = False
-    """True for a chart over time: it has the page's shapes as background, and zooms with the other timelines."""
+    """True for a chart over time. Such a chart has the page's shapes as background, and zooms with the other timelines.
+    """
 
 
 Summary: TypeAlias = "tuple[str, Sequence[str], Sequence[str]]"
@@ -91,11 +92,11 @@ def page(
 ) -> str:
     """Return the HTML.
 
-    ``summaries`` has a heading, sentences, and those to emphasise for each flight, ``colours`` the colours by theme
-    ("light", "dark") and name, ``shapes`` Plotly's shapes for all timelines.
+    ``summaries`` has, for each flight, a heading, the sentences, and the sentences to emphasise. ``colours`` has the
+    colours by theme ("light", "dark") and name, ``shapes`` has Plotly's shapes for all timelines.
 
-    The Content-Security-Policy allows only the two included scripts, and no network access. It is a second
-    barrier after escaping, for hostile logs.
+    The Content-Security-Policy allows only the two included scripts, and no network access. Against hostile logs, this
+    policy is a second barrier after escaping.
 
     Raises:
         ModuleNotFoundError: plotly is not installed.
@@ -135,7 +136,7 @@ def _hash(script: str) -> str:
 
 
 def _escape(text: str) -> str:
-    """Escape text for HTML. Characters that could disguise it (control, bidirectional, invisible) become U+FFFD."""
+    """Escape text for HTML. Control, bidirectional and invisible characters could disguise text, so become U+FFFD."""
     return escape(printable(text.replace("\t", " ").replace("\xa0", " ")))
 
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from aerokit.logs.report.page import Part
 
 _SEVERITIES = ("emergency", "alert", "critical", "error", "warning", "notice", "info", "debug")
-# GPS_FIX_TYPE, only the values with the same meaning in MAVLink, in ArduPilot's logs and in PX4's logs.
+# Names of GPS_FIX_TYPE values, as far as MAVLink, ArduPilot's logs and PX4's logs give them the same meaning.
 _FIXES = ("no receiver", "no fix", "2D", "3D", "DGPS", "RTK float", "RTK fixed")
 _MAX_TEXTS, _MAX_CHANGES, _MAX_PARAMETERS = 2000, 2000, 5000
 _MAX_OPEN_FAILSAFES = 10
@@ -38,7 +38,7 @@ _AUTOPILOT_WRITTEN = (
 
 
 def _with_parts(section: Section, *charts: Part | None) -> Section:
-    """Return the section with the charts that exist. Without any, it shows its text for missing data."""
+    """Return the section with the charts that exist. Without any chart, the section shows its text for missing data."""
     parts = [part for part in charts if part is not None]
     return Section(section.title, parts, section.explanation, "" if parts else section.missing)
 

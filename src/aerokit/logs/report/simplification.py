@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-# At least one of this many points is kept. Without this limit, spirals and repeated figures take quadratic time.
+# Of this many consecutive points, at least one is kept. Otherwise spirals and repeated figures take quadratic time.
 _MAX_SEGMENT = 1024
 MAX_COORDINATE = 1e9
 """Larger coordinates are damaged data and are ignored, because their squares could overflow."""
@@ -29,8 +29,8 @@ def simplify(
         keep: indices that are always selected.
 
     Returns:
-        The selected indices, with one for each gap, and the largest distance of any point from the line through
-        the selected ones.
+        The selected indices, with one for each gap, and the largest distance of any point from the line through the
+        selected points.
     """
     known = [abs(x) <= MAX_COORDINATE and abs(y) <= MAX_COORDINATE for x, y in places]
     if not any(known):

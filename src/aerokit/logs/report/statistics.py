@@ -6,12 +6,13 @@ import math
 from bisect import bisect_left, bisect_right
 from datetime import datetime, timezone
 from itertools import pairwise
+from statistics import median
 from typing import TYPE_CHECKING
 
 from aerokit._internal.values import Snapshot
 from aerokit.logs.flights.failsafes import failsafes
 from aerokit.logs.flights.falls import falls
-from aerokit.logs.flights.flight import TangentPlane
+from aerokit.logs.flights.flight import TangentPlane, battery_name
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -23,12 +24,15 @@ if TYPE_CHECKING:
 _STEP_M = 1.0
 _A_YEAR_S = 365 * 86_400.0
 _MAX_LISTED = 5
-# A hovering multicopter needs 20 to 60 % throttle, and ArduCopter and PX4 limit the tilt to 30 and 45 degrees.
-_HIGH_THROTTLE_PERCENT, _HIGH_TILT_DEG, _HIGH_ATTITUDE_ERROR_DEG = 90.0, 50.0, 20.0
+# A hovering multicopter needs 20 to 60 % throttle.
+_HIGH_THROTTLE_PERCENT, _HIGH_ATTITUDE_ERROR_DEG = 90.0, 20.0
+# Below this share of the current before a descent, the motors take less power than a controlled descent needs.
+_LESS_CURRENT = 0.5
+_BEFORE_FALL_S = 5.0
 
 
 class FlightStatistics(Snapshot):
-    """Statistics of the time while the vehicle was armed, or of the whole log if it never was; None is unknown."""
+    """Statistics of the armed time, or of the whole log if the vehicle was never armed; None means unknown."""
 
     armed_s: float | None
     distance_m: float | None
@@ -46,7 +50,7 @@ class FlightStatistics(Snapshot):
     end_distance_m: float | None
     """Distance from home at the end."""
     start_voltage_v: float | None
-    """Voltage of the first battery at the start. The other battery values are also of the first battery."""
+    """Voltage of the first battery at the start. All battery values are those of the first battery."""
     end_voltage_v: float | None
     min_voltage_v: float | None
     start_remaining_percent: float | None
@@ -176,25 +180,57 @@ def findings(flight: FlightLog) -> list[str]:
 
 
 def fall_measurements(flight: FlightLog, fall: Fall) -> list[str]:
-    """Return unusual values in the descent that hint at a cause: high throttle, tilt, and attitude error."""
+    """Return throttle, tilt, attitude error and battery current in the descent, where the log has them.
+
+    An unusual value is followed by advice on what to look at.
+    """
     span_s = fall.begins_s, fall.time_s - 0.2  # without the impact
     found = []
-    throttle = _max(list(flight.air.between("throttle_percent", *span_s)))
-    if throttle is not None and throttle >= _HIGH_THROTTLE_PERCENT:
-        found.append(f"throttle up to {throttle:.0f} %, so look at motors, propellers and battery")
+    if (throttle := _span_and_before(flight.air, "throttle_percent", *span_s)) is not None:
+        advice = ", so look at motors, propellers and battery" if throttle.high >= _HIGH_THROTTLE_PERCENT else ""
+        found.append(f"throttle {throttle.text('%')}{advice}")
     tilt = _max([abs(x) for name in ("roll_deg", "pitch_deg") for x in flight.attitude.between(name, *span_s)])
-    if tilt is not None and tilt >= _HIGH_TILT_DEG:
+    if tilt is not None:
         found.append(f"tilt up to {tilt:.0f}°")
     error = _max([abs(x) for name in ("roll_deg", "pitch_deg") for x in _attitude_errors(flight, name, *span_s)])
-    if error is not None and error >= _HIGH_ATTITUDE_ERROR_DEG:
-        found.append(f"attitude up to {error:.0f}° off its set-point, so look at the attitude charts")
+    if error is not None:
+        advice = ", so look at the attitude charts" if error >= _HIGH_ATTITUDE_ERROR_DEG else ""
+        found.append(f"attitude up to {error:.0f}° off its set-point{advice}")
+    for battery, series in sorted(flight.batteries.items()):
+        if (current := _span_and_before(series, "current_a", *span_s)) is not None:
+            is_less = current.high < _LESS_CURRENT * current.before
+            advice = ", so look at what stopped the motors: ESCs, their supply, a command" if is_less else ""
+            name = battery_name(battery) if len(flight.batteries) > 1 else "battery"
+            found.append(f"{name} current {current.text('A')}{advice}")
     return found
+
+
+class _SpanAndBefore(Snapshot):
+    """Lowest and highest value in a descent, and the median of the seconds before the descent; NaN if unknown."""
+
+    low: float
+    high: float
+    before: float
+
+    def text(self, unit: str) -> str:
+        low, high = f"{self.low:.0f}", f"{self.high:.0f}"
+        values = f"{low} {unit}" if low == high else f"{low} to {high} {unit}"
+        return values if math.isnan(self.before) else f"{values} (before: {self.before:.0f} {unit})"
+
+
+def _span_and_before(series: TimeSeries, name: str, begin_s: float, end_s: float) -> _SpanAndBefore | None:
+    """Return the values of a span and before it; None if the series has no known value in the span."""
+    values = series.between(name, begin_s, end_s)
+    before = series.between(name, begin_s - _BEFORE_FALL_S, begin_s)
+    return _SpanAndBefore(min(values), max(values), median(before) if before else math.nan) if values else None
 
 
 def _attitude_errors(flight: FlightLog, name: str, begin_s: float, end_s: float) -> Iterator[float]:
     times, values = flight.attitude_target.times, flight.attitude_target[name]
     for row in range(bisect_left(times, begin_s), bisect_right(times, end_s)):
-        yield math.remainder(values[row] - flight.attitude.at(name, times[row]), 360)
+        error = math.remainder(values[row] - flight.attitude.at(name, times[row]), 360)
+        if not math.isnan(error):
+            yield error
 
 
 def fall_text(fall: Fall) -> str:

@@ -10,48 +10,15 @@ from typing import Any, ClassVar, Generic, TypeVar
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
 from aerokit.mavlink.messages import FileTransferProtocol
 from aerokit.protocols.ftp import DATA_SIZE
-from aerokit.protocols.servers.files import EFBIG, EINVAL, FileFault, FileHandle, FileSystem
-from aerokit.protocols.servers.ftp_packets import FtpPacket, ProtectedPath, checked_path, crc32
+from aerokit.protocols.servers.files import EFBIG, EINVAL, Entry, FileFault, FileHandle, FileSystem
+from aerokit.protocols.servers.ftp_packets import FtpPacket, Refused, checked_path, crc32
 from aerokit.protocols.servers.host import Channel, ServerHost
 
 FilesT = TypeVar("FilesT", bound=FileSystem)
 
 
-class FtpRequestServer(Generic[FilesT]):
-    """Receives MAVFTP requests; subclasses answer them."""
-
-    def __init__(self, host: ServerHost, files: FilesT) -> None:
-        self.files = files
-        self._host = host
-        host.on(FileTransferProtocol, self._on_message)
-
-    @property
-    def is_enabled(self) -> bool:
-        """True normally; False to answer no request, like a component without MAVFTP."""
-        return True
-
-    @property
-    def open_sessions(self) -> int:
-        """Number of sessions that have an open file and have not timed out."""
-        raise NotImplementedError
-
-    def restart(self) -> None:
-        raise NotImplementedError
-
-    def receive(self, request: FtpPacket, channel: Channel) -> None:
-        """Handle one request; the answer is sent now or later."""
-        raise NotImplementedError
-
-    def _on_message(self, message: FileTransferProtocol, channel: Channel) -> None:
-        if self.is_enabled:
-            self.receive(FtpPacket.parse(message), channel)
-
-
-_REPLY_KEPT = 4
 _BURST_BYTES = 35_000
 _BURST_BLOCKS = 24
-_CRC_BLOCK = 65_536
-_CRC_BLOCKS_AT_ONCE = 8
 _CRC_PAUSE_S = 0.002
 _MAX_SIZE = 0xFFFFFFFF
 
@@ -59,13 +26,13 @@ Op = MavFtpOpcode
 
 
 @dataclass(eq=False)
-class _Session:
+class FtpSession:
     """An open file."""
 
     number: int
     file: FileHandle
-    path: str
     size: int
+    is_writing: bool
     burst: FtpPacket | None = field(default=None, repr=False)
     """Sequence number and offset of the next block."""
     burst_sent: int = 0
@@ -77,7 +44,7 @@ class FtpPeer:
     """State for one client."""
 
     channel: Channel
-    sessions: dict[int, _Session] = field(default_factory=dict)
+    sessions: dict[int, FtpSession] = field(default_factory=dict)
     used_at: float = 0.0
     errno: int = 0
     """Error of the latest failure."""
@@ -86,13 +53,14 @@ class FtpPeer:
     """CalcFileCRC32 request that is being executed."""
 
 
-class SessionFtpServer(FtpRequestServer[FilesT]):
+class SessionFtpServer(Generic[FilesT]):
     """MAVFTP server that answers immediately, with several sessions for each client.
 
     A session is closed when its client has sent nothing for ``session_timeout_s``. A burst sends ``burst`` blocks every
     ``burst_interval_s`` seconds, and none while ``is_congested()``. A burst ends after 35 kB, and the client must
     request the next burst, so that a single request with a forged sender cannot cause a whole file to be sent. If a
-    request is repeated, a reply without file content is sent again.
+    request is repeated, a reply without file content is sent again. Subclasses for firmware that behaves differently
+    override methods.
     """
 
     burst: int = _BURST_BLOCKS
@@ -102,6 +70,14 @@ class SessionFtpServer(FtpRequestServer[FilesT]):
     session_timeout_s: ClassVar[float] = 10.0
     list_prefix: ClassVar[tuple[bytes, ...]] = ()
     """Lines before the entries of each folder."""
+    line_end: ClassVar[bytes] = b"\0"
+    creates_missing: ClassVar[bool] = True
+    """True if OpenFileWO creates a missing file."""
+    reply_kept: ClassVar[int] = 4
+    """Size of the largest reply that is sent again, in bytes."""
+    crc_block: ClassVar[int] = 65_536
+    crc_blocks_at_once: ClassVar[int] = 8
+    """Blocks of a file that are read for a checksum before the event loop continues."""
 
     def __init__(
         self,
@@ -110,11 +86,15 @@ class SessionFtpServer(FtpRequestServer[FilesT]):
         *,
         burst_interval_s: float = 0.005,
         is_congested: Callable[[], bool] = lambda: False,
+        is_enabled: Callable[[], bool] = lambda: True,
     ) -> None:
-        super().__init__(host, files)
+        self.files = files
+        self._host = host
         self.burst_interval_s = burst_interval_s
+        self._is_enabled = is_enabled
         self._is_congested = is_congested
         self._peers: dict[Hashable, FtpPeer] = {}
+        host.on(FileTransferProtocol, self._on_message)
 
     @property
     def open_sessions(self) -> int:
@@ -131,6 +111,10 @@ class SessionFtpServer(FtpRequestServer[FilesT]):
             with suppress(FileFault):
                 self._close_all(peer)
         self._peers.clear()
+
+    def _on_message(self, message: FileTransferProtocol, channel: Channel) -> None:
+        if self._is_enabled():
+            self.receive(FtpPacket.parse(message), channel)
 
     def _key(self, request: FtpPacket, channel: Channel) -> Hashable:
         """Return the key of the client."""
@@ -169,6 +153,7 @@ class SessionFtpServer(FtpRequestServer[FilesT]):
         return peer
 
     def receive(self, request: FtpPacket, channel: Channel) -> None:
+        """Handle one request; the answer is sent now or later."""
         peer = self._peer(request, channel)
         if peer is None:
             self._host.send(request.refuse(MavFtpErr.NOSESSIONSAVAILABLE).message(), channel)
@@ -177,50 +162,56 @@ class SessionFtpServer(FtpRequestServer[FilesT]):
         if request.size > DATA_SIZE:
             self._reply(peer, request.refuse(MavFtpErr.INVALIDDATASIZE))
         elif (last := peer.reply) is not None and self._is_repeated(request, last):
-            self._host.send(last.message(), channel)
+            self._reply(peer, last)
         else:
             self._answer(peer, request)
 
     def _answer(self, peer: FtpPeer, request: FtpPacket) -> None:
         handler = _HANDLERS.get(request.opcode)
+        peer.reply = None
         try:
-            if handler is None:
-                answer: FtpPacket | None = request.refuse(MavFtpErr.UNKNOWNCOMMAND)
-            else:
-                answer = handler(self, peer, request)
-        except ProtectedPath:
-            answer = request.refuse(MavFtpErr.FILEPROTECTED)
+            answer = self._unknown(request) if handler is None else handler(self, peer, request)
+        except Refused as refused:
+            answer = request.refuse(refused.code)
         except FileFault as fault:
             answer = self._fault(peer, request, fault)
-        peer.reply = None
-        if answer is None:
-            return
-        if answer.opcode == Op.NAK:
-            answer = self._refusal(peer, request, answer).replace(offset=request.offset)
-        self._reply(peer, answer)
+        if answer is not None:
+            self._reply(peer, self._adapted(peer, request, answer))
 
-    def _refusal(self, peer: FtpPeer, request: FtpPacket, answer: FtpPacket) -> FtpPacket:
-        return answer
+    def _adapted(self, peer: FtpPeer, request: FtpPacket, answer: FtpPacket) -> FtpPacket:
+        """Return the answer as it is sent."""
+        return answer.replace(offset=request.offset)
 
     def _reply(self, peer: FtpPeer, answer: FtpPacket) -> None:
-        if answer.size <= _REPLY_KEPT and answer.data[:1] != bytes([MavFtpErr.NOSESSIONSAVAILABLE]):
+        if answer.size <= self.reply_kept and answer.data[:1] != bytes([MavFtpErr.NOSESSIONSAVAILABLE]):
             peer.reply = answer
         self._host.send(answer.message(), peer.channel)
 
+    def _path(self, request: FtpPacket) -> str:
+        return checked_path(request.data[: request.size])
+
+    def _opened(self, peer: FtpPeer, request: FtpPacket) -> FtpSession:
+        session = peer.sessions.get(request.session)
+        if session is None:
+            raise Refused(MavFtpErr.INVALIDSESSION)
+        return session
+
+    def _unknown(self, request: FtpPacket) -> FtpPacket:
+        return request.refuse(MavFtpErr.UNKNOWNCOMMAND)
+
     def _none(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
-        return request.acknowledge(request.data[: request.size], offset=request.offset)
+        return request.acknowledge(request.data[: request.size])
 
     def _terminate(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
-        session = peer.sessions.pop(request.session, None)
-        if session is None:
-            return request.refuse(MavFtpErr.INVALIDSESSION)
+        session = self._opened(peer, request)
+        del peer.sessions[request.session]
         session.burst = None
         session.file.close()
-        return request.acknowledge(offset=request.offset)
+        return request.acknowledge()
 
     def _reset(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
         self._close_all(peer)
-        return request.acknowledge(offset=request.offset)
+        return request.acknowledge()
 
     def _close_all(self, peer: FtpPeer) -> None:
         sessions = list(peer.sessions.values())
@@ -238,17 +229,17 @@ class SessionFtpServer(FtpRequestServer[FilesT]):
     def _open(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
         if len(peer.sessions) >= self.max_sessions:
             return request.refuse(MavFtpErr.NOSESSIONSAVAILABLE)
-        path = checked_path(request.data[: request.size])
+        path = self._path(request)
         reading = request.opcode == Op.OPENFILERO
         size = self._size(path, reading=reading)
         if size > _MAX_SIZE:
             raise FileFault(EFBIG)
-        create = request.opcode == Op.CREATEFILE or (not reading and path not in self.files)
+        create = request.opcode == Op.CREATEFILE or (not reading and self.creates_missing and path not in self.files)
         file = self.files.open(path, writing=not reading, create=create)
         number = self._new_number(peer, request)
-        session = peer.sessions[number] = _Session(number, file, path, size)
+        session = peer.sessions[number] = FtpSession(number, file, size, not reading)
         self._watch(peer, session)
-        return request.acknowledge(size.to_bytes(4, "little"), offset=request.offset, session=number)
+        return request.acknowledge(size.to_bytes(4, "little"), session=number)
 
     def _size(self, path: str, *, reading: bool) -> int:
         try:
@@ -258,7 +249,7 @@ class SessionFtpServer(FtpRequestServer[FilesT]):
                 raise
             return 0
 
-    def _watch(self, peer: FtpPeer, session: _Session) -> None:
+    def _watch(self, peer: FtpPeer, session: FtpSession) -> None:
         """Schedule the time-out that closes the session."""
 
         def close_if_due() -> None:
@@ -276,31 +267,25 @@ class SessionFtpServer(FtpRequestServer[FilesT]):
         self._host.call_at(peer.used_at + self.session_timeout_s, close_if_due)
 
     def _read(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
-        session = peer.sessions.get(request.session)
-        if session is None:
-            return request.refuse(MavFtpErr.INVALIDSESSION)
+        session = self._opened(peer, request)
         if request.offset >= session.size:
             return request.refuse(MavFtpErr.EOF)
-        return request.acknowledge(session.file.read(request.offset, request.size), offset=request.offset)
+        return request.acknowledge(session.file.read(request.offset, request.size))
 
     def _write(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
-        session = peer.sessions.get(request.session)
-        if session is None:
-            return request.refuse(MavFtpErr.INVALIDSESSION)
+        session = self._opened(peer, request)
         session.file.write(request.offset, request.data[: request.size])
-        return request.acknowledge(request.size.to_bytes(4, "little"), offset=request.offset)
+        return request.acknowledge(request.size.to_bytes(4, "little"))
 
     def _start_burst(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket | None:
-        session = peer.sessions.get(request.session)
-        if session is None:
-            return request.refuse(MavFtpErr.INVALIDSESSION)
+        session = self._opened(peer, request)
         is_running = session.burst is not None
         session.burst, session.burst_sent = request.replace(sequence=request.sequence + 1 & 0xFFFF), 0
         if not is_running:
             self._host.call_later(self.burst_interval_s, lambda: self._send_blocks(peer, session))
         return None
 
-    def _send_blocks(self, peer: FtpPeer, session: _Session) -> None:
+    def _send_blocks(self, peer: FtpPeer, session: FtpSession) -> None:
         for number in range(0 if self._is_congested() else self.burst):
             if session.burst is None:
                 return
@@ -309,7 +294,7 @@ class SessionFtpServer(FtpRequestServer[FilesT]):
             return
         self._host.call_later(self.burst_interval_s, lambda: self._send_blocks(peer, session))
 
-    def _send_block(self, peer: FtpPeer, session: _Session, burst: FtpPacket, *, may_end: bool) -> None:
+    def _send_block(self, peer: FtpPeer, session: FtpSession, burst: FtpPacket, *, may_end: bool) -> None:
         own = session.number
         answer = burst.acknowledge(offset=burst.offset, session=own).replace(sequence=burst.sequence)
         refusal = burst.refuse(MavFtpErr.EOF).replace(sequence=burst.sequence, offset=burst.offset, session=own)
@@ -329,19 +314,26 @@ class SessionFtpServer(FtpRequestServer[FilesT]):
         session.burst = None if complete else following
 
     def _list(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
-        entries = self.files.entries(checked_path(request.data[: request.size]))
+        entries = self._entries(self._path(request))
         listing = b""
         for text in [*self.list_prefix, *map(_line, entries)][request.offset :]:
-            if len(listing) + len(text) + 1 > DATA_SIZE:
+            if len(listing) + len(text) + len(self.line_end) > DATA_SIZE:
                 break
-            listing += text + b"\0"
+            listing += text + self.line_end
         if not listing:
             return request.refuse(MavFtpErr.EOF)
-        return request.acknowledge(listing, offset=request.offset)
+        return request.acknowledge(listing)
+
+    def _entries(self, path: str) -> list[Entry]:
+        return self.files.entries(path)
 
     def _change(self, request: FtpPacket, change: Callable[[str], None]) -> FtpPacket:
-        change(checked_path(request.data[: request.size]))
-        return request.acknowledge(offset=request.offset)
+        change(self._path(request))
+        return request.acknowledge()
+
+    def _remove(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
+        is_file = request.opcode == Op.REMOVEFILE
+        return self._change(request, self.files.remove_file if is_file else self.files.remove_folder)
 
     def _truncate(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
         return self._change(request, lambda path: self.files.truncate(path, request.offset))
@@ -351,25 +343,25 @@ class SessionFtpServer(FtpRequestServer[FilesT]):
         if len(first) + 2 >= request.size:
             return self._fault(peer, request, FileFault(EINVAL))
         self.files.rename(checked_path(first), checked_path(rest))
-        return request.acknowledge(offset=request.offset)
+        return request.acknowledge()
 
     def _crc32(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket | None:
         """Compute a checksum in slices, so that a large file does not block the event loop."""
-        path = checked_path(request.data[: request.size])
+        path = self._path(request)
         is_repeated = peer.checksum is not None and peer.checksum.sequence == request.sequence
         if not is_repeated:
-            peer.checksum = request
-            self._continue_crc32(peer, request, self.files.open(path), 0, 0)
+            file, peer.checksum = self.files.open(path), request
+            self._continue_crc32(peer, request, file, 0, 0)
         return None
 
     def _continue_crc32(self, peer: FtpPeer, request: FtpPacket, file: FileHandle, offset: int, checksum: int) -> None:
         data = b"?"
         try:
-            for _ in range(_CRC_BLOCKS_AT_ONCE):
-                if not (data := file.read(offset, _CRC_BLOCK)):
+            for _ in range(self.crc_blocks_at_once):
+                if not (data := file.read(offset, self.crc_block)):
                     break
                 checksum, offset = crc32(data, checksum), offset + len(data)
-            answer = request.acknowledge(checksum.to_bytes(4, "little"), offset=request.offset)
+            answer = request.acknowledge(checksum.to_bytes(4, "little"))
         except FileFault as fault:
             data, answer = b"", self._fault(peer, request, fault)
         if peer.checksum is request and data:
@@ -379,10 +371,10 @@ class SessionFtpServer(FtpRequestServer[FilesT]):
             file.close()
         if peer.checksum is request:  # otherwise a newer request has replaced this one
             peer.checksum, peer.used_at = None, self._host.now
-            self._reply(peer, answer)
+            self._reply(peer, self._adapted(peer, request, answer))
 
 
-def _line(entry: tuple[str, int | None]) -> bytes:
+def _line(entry: Entry) -> bytes:
     name, size = entry
     return (f"D{name}" if size is None else f"F{name}\t{size}").encode()
 
@@ -396,9 +388,9 @@ _HANDLERS: dict[int, Callable[[SessionFtpServer[Any], FtpPeer, FtpPacket], FtpPa
     Op.READFILE: lambda server, peer, request: server._read(peer, request),
     Op.CREATEFILE: lambda server, peer, request: server._open(peer, request),
     Op.WRITEFILE: lambda server, peer, request: server._write(peer, request),
-    Op.REMOVEFILE: lambda server, _, request: server._change(request, server.files.remove_file),
+    Op.REMOVEFILE: lambda server, peer, request: server._remove(peer, request),
     Op.CREATEDIRECTORY: lambda server, _, request: server._change(request, server.files.make_folder),
-    Op.REMOVEDIRECTORY: lambda server, _, request: server._change(request, server.files.remove_folder),
+    Op.REMOVEDIRECTORY: lambda server, peer, request: server._remove(peer, request),
     Op.OPENFILEWO: lambda server, peer, request: server._open(peer, request),
     Op.TRUNCATEFILE: lambda server, peer, request: server._truncate(peer, request),
     Op.RENAME: lambda server, peer, request: server._rename(peer, request),

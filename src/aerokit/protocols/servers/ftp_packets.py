@@ -7,7 +7,7 @@ import zlib
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
 from aerokit.mavlink.messages import FileTransferProtocol
 from aerokit.protocols.ftp import FtpMessage
-from aerokit.protocols.servers.files import EEXIST, ENOENT, FileSystem
+from aerokit.protocols.servers.files import EEXIST, ENOENT
 from aerokit.protocols.servers.host import sender_of
 
 
@@ -55,22 +55,16 @@ def crc32(data: bytes, start: int = 0) -> int:
     return zlib.crc32(data, start ^ 0xFFFFFFFF) ^ 0xFFFFFFFF
 
 
-def read_crc32(files: FileSystem, path: str, block: int) -> int:
-    """Return the checksum of a file, read in blocks; raises FileFault if it cannot be read."""
-    file, checksum, offset = files.open(path), 0, 0
-    while data := file.read(offset, block):
-        checksum, offset = crc32(data, checksum), offset + len(data)
-    file.close()
-    return checksum
+class Refused(Exception):
+    """A request that the server refuses; ``code`` is the MAV_FTP_ERR."""
 
-
-class ProtectedPath(Exception):
-    """The path of a request contains ``..``."""
+    def __init__(self, code: int) -> None:
+        self.code = code
 
 
 def checked_path(data: bytes) -> str:
-    """Return the path of a request; raises ProtectedPath if it contains ``..``."""
+    """Return the path of a request; raises Refused if it contains ``..``."""
     path = path_in(data)
     if ".." in path.split("/"):
-        raise ProtectedPath
+        raise Refused(MavFtpErr.FILEPROTECTED)
     return path

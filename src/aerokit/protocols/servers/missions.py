@@ -5,6 +5,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages as m
@@ -15,6 +16,7 @@ from aerokit.protocols.servers.host import Channel, ServerHost, sender_of
 
 AnyItem = m.MissionItemInt | m.MissionItem
 AnyRequest = m.MissionRequestInt | m.MissionRequest
+AnyListMessage = m.MissionRequestList | AnyRequest | m.MissionCount | m.MissionWritePartialList
 
 
 def item_from(message: AnyItem) -> MissionItem:
@@ -41,8 +43,6 @@ def item_message_float(
     return m.MissionItem(*head, *numbers, *place, item.z, mission_type)
 
 
-ITEM_RETRY_INTERVAL_S = 0.5
-TRANSFER_TIMEOUT_S = 5.0
 MAX_ITEMS = 2000
 _TYPES = (MavMissionType.MISSION, MavMissionType.FENCE, MavMissionType.RALLY)
 _R = MavMissionResult
@@ -53,14 +53,20 @@ Judge = Callable[[int, tuple[MissionItem, ...], Callable[[int], None]], None]
 
 
 @dataclass(eq=False)
-class _Upload:
+class ListUpload:
+    """A list that a client uploads."""
+
     client: tuple[int, int]
     channel: Channel
     mission_type: int
-    count: int
+    next: int
+    """Index of the item that is requested."""
+    end: int
+    """Index after the last item."""
     received_at: float
-    items: list[MissionItem] = field(default_factory=list)
+    requested_at: float
     uses_int: bool = True
+    items: list[MissionItem] = field(default_factory=list)
     is_judged: bool = False
     """True from the call of ``judge`` until its answer."""
 
@@ -69,45 +75,57 @@ class MissionServer:
     """Stores missions, fences and rally points. Downloads have no state; one upload runs at a time.
 
     When ``judge`` has accepted an upload, the upload replaces the whole list. A missing item is requested again every
-    half second. An upload without progress for five seconds ends with OPERATION_CANCELLED. During an upload, other
-    clients are DENIED.
+    ``retry_interval_s`` seconds. An upload without progress for ``timeout_s`` seconds ends with OPERATION_CANCELLED.
+    During an upload, other clients are DENIED. Subclasses for firmware that behaves differently override methods.
     """
+
+    retry_interval_s: ClassVar[float] = 0.5
+    timeout_s: ClassVar[float] = 5.0
+    requests_int: bool = True
+    """True if an upload begins with MISSION_REQUEST_INT, False if with MISSION_REQUEST."""
 
     def __init__(
         self,
         host: ServerHost,
-        judge: Judge,
+        judge: Judge = lambda _, __, answer: answer(_R.ACCEPTED),
         *,
         on_set_current: Callable[[int], bool] = lambda _: False,
         capacity: int = MAX_ITEMS,
     ) -> None:
         self.lists: dict[int, tuple[MissionItem, ...]] = dict.fromkeys(_TYPES, ())
-        """Maps MAV_MISSION_TYPE to items. Call `replace` to change the items."""
+        """Maps MAV_MISSION_TYPE to items. Call `store` to change the items."""
         self._opaque_ids: dict[int, int] = {}  # Cached, because MISSION_CURRENT, which is streamed, contains them.
         self.current: int = 0
         """Index of the current item of the mission."""
         self._host = host
         self._judge = judge
-        self._on_set_current = on_set_current
+        self._may_set_current = on_set_current
         self._capacity = capacity
-        self._upload: _Upload | None = None
-        host.on(m.MissionRequestList, self._on_request_list)
-        host.on(m.MissionRequestInt, self._on_request)
-        host.on(m.MissionRequest, self._on_request)
-        host.on(m.MissionCount, self._on_count)
-        host.on(m.MissionItemInt, self._on_item)
-        host.on(m.MissionItem, self._on_item)
-        host.on(m.MissionAck, self._on_ack)
-        host.on(m.MissionClearAll, self._on_clear)
-        host.on(m.MissionSetCurrent, self._on_set_current_message)
+        self._uploads: dict[int, ListUpload] = {}
+
+    def listen(self) -> None:
+        on = self._host.on
+        on(m.MissionRequestList, self._on_request_list)
+        on(m.MissionRequestInt, self._on_request)
+        on(m.MissionRequest, self._on_request)
+        on(m.MissionCount, self._on_count)
+        on(m.MissionItemInt, self._on_item)
+        on(m.MissionItem, self._on_item)
+        on(m.MissionAck, self._on_ack)
+        on(m.MissionClearAll, self._on_clear)
+        on(m.MissionSetCurrent, self._on_set_current)
 
     @property
     def transfer_is_open(self) -> bool:
         """True during an upload."""
-        return self._upload is not None
+        return bool(self._uploads)
 
-    def opaque_id(self, mission_type: int) -> int:
-        """Return a checksum of a list, or 0 for an empty list. The current item does not change it."""
+    def reset(self) -> None:
+        """Drop transfers, as a reboot does; stored items stay."""
+        self._uploads.clear()
+
+    def id(self, mission_type: int) -> int:
+        """Return the opaque id: a checksum of a list, or 0 for an empty list. The current item does not change it."""
         items = self.lists.get(mission_type, ())
         if items and mission_type not in self._opaque_ids:
             messages = (_item_message(item, seq, (0, 0), mission_type, current=False) for seq, item in enumerate(items))
@@ -115,14 +133,12 @@ class MissionServer:
         return self._opaque_ids[mission_type] if items else 0
 
     def current_message(self) -> m.MissionCurrent:
-        mission = self.lists[MavMissionType.MISSION]
-        fence, rally = self.opaque_id(MavMissionType.FENCE), self.opaque_id(MavMissionType.RALLY)
-        total = len(mission)
+        fence, rally = self.id(MavMissionType.FENCE), self.id(MavMissionType.RALLY)
         return m.MissionCurrent(
-            self.current, total, mission_id=self.opaque_id(0), fence_id=fence, rally_points_id=rally
+            self.current, self.count(0), mission_id=self.id(0), fence_id=fence, rally_points_id=rally
         )
 
-    def replace(self, mission_type: int, items: Sequence[MissionItem]) -> None:
+    def store(self, mission_type: int, items: Sequence[MissionItem]) -> None:
         """Replace a list."""
         self.lists[mission_type] = tuple(items)
         self._opaque_ids.pop(mission_type, None)
@@ -131,100 +147,172 @@ class MissionServer:
 
     def set_current(self, seq: int) -> bool:
         """Make the component continue its mission at an item, and announce the item; return False if it refuses."""
-        if not 0 <= seq < len(self.lists[MavMissionType.MISSION]) or not self._on_set_current(seq):
+        if not 0 <= seq < self.count(MavMissionType.MISSION) or not self._may_set_current(seq):
             return False
         self.current = seq
         self._host.send(self.current_message())
         return True
 
-    def _is_current(self, seq: int, mission_type: int) -> bool:
-        return seq == self.current and mission_type == MavMissionType.MISSION
+    def capacity(self, mission_type: int) -> int:
+        """Return the maximum number of items."""
+        return self._capacity
+
+    def count(self, mission_type: int) -> int:
+        """Return the number of stored items; 0 for an unknown type."""
+        return len(self.lists.get(mission_type, ()))
+
+    def _refusal(self, message: AnyListMessage, channel: Channel) -> int | None:
+        """Return the MAV_MISSION_RESULT that refuses a transfer, else None."""
+        return None if message.mission_type in self.lists else _R.UNSUPPORTED
+
+    def _item(self, mission_type: int, seq: int) -> MissionItem | int:
+        """Return a stored item, or the MAV_MISSION_RESULT that reports its absence."""
+        items = self.lists.get(mission_type, ())
+        return items[seq] if 0 <= seq < len(items) else _R.INVALID_SEQUENCE
+
+    def _message(self, item: MissionItem, request: AnyRequest) -> AnyItem:
+        seq, (system, component), kind = request.seq, sender_of(request), request.mission_type
+        current = seq == self.current and kind == MavMissionType.MISSION
+        if isinstance(request, m.MissionRequestInt):
+            return _item_message(item, seq, (system, component), kind, current=current)
+        return to_wire_float(
+            item, seq, target_system=system, target_component=component, mission_type=kind, current=current
+        )
+
+    def _put(self, upload: ListUpload, message: AnyItem) -> int:
+        """Store the expected item of an upload; return the MAV_MISSION_RESULT."""
+        upload.uses_int = isinstance(message, m.MissionItemInt)
+        upload.items.append(from_wire(message))
+        return _R.ACCEPTED
+
+    def _key(self, mission_type: int) -> int:
+        """Return the key of an upload; uploads with different keys can run at the same time."""
+        return 0
 
     def _acknowledge(self, to: tuple[int, int], kind: int, result: int, channel: Channel, opaque_id: int = 0) -> None:
         self._host.send(m.MissionAck(*to, result, kind, opaque_id), channel)
 
     def _on_request_list(self, request: m.MissionRequestList, channel: Channel) -> None:
         kind, to = request.mission_type, sender_of(request)
-        if kind not in self.lists:
-            self._acknowledge(to, kind, _R.UNSUPPORTED, channel)
-            return
-        self._host.send(m.MissionCount(*to, len(self.lists[kind]), kind, self.opaque_id(kind)), channel)
+        if (refusal := self._refusal(request, channel)) is not None:
+            self._acknowledge(to, kind, refusal, channel)
+        else:
+            self._host.send(m.MissionCount(*to, self.count(kind), kind, self.id(kind)), channel)
 
     def _on_request(self, request: AnyRequest, channel: Channel) -> None:
-        kind, to, seq = request.mission_type, sender_of(request), request.seq
-        items = self.lists.get(kind, ())
-        if not 0 <= seq < len(items):
-            self._acknowledge(to, kind, _R.INVALID_SEQUENCE, channel)
-        elif isinstance(request, m.MissionRequestInt):
-            message = _item_message(items[seq], seq, to, kind, current=self._is_current(seq, kind))
-            self._host.send(message, channel)
+        refusal = self._refusal(request, channel)
+        item = self._item(request.mission_type, request.seq) if refusal is None else refusal
+        if isinstance(item, int):
+            self._refuse_item(request, item, channel)
         else:
-            system, component = to
-            self._host.send(
-                to_wire_float(
-                    items[seq],
-                    seq,
-                    target_system=system,
-                    target_component=component,
-                    mission_type=kind,
-                    current=self._is_current(seq, kind),
-                ),
-                channel,
-            )
+            self._host.send(self._message(item, request), channel)
+
+    def _refuse_item(self, request: AnyRequest, result: int, channel: Channel) -> None:
+        self._acknowledge(sender_of(request), request.mission_type, result, channel)
 
     def _on_count(self, count: m.MissionCount, channel: Channel) -> None:
         client, kind = sender_of(count), count.mission_type
-        before = self._upload
-        if kind not in self.lists:
-            self._acknowledge(client, kind, _R.UNSUPPORTED, channel)
-        elif before is not None and (before.client != client or before.is_judged):
-            self._acknowledge(client, kind, _R.DENIED, channel)
-        elif count.count > self._capacity:
-            self._upload = None
-            self._acknowledge(client, kind, _R.NO_SPACE, channel)
+        before = self._uploads.get(self._key(kind))
+        refusal = self._refusal(count, channel)
+        if refusal is None and before is not None and (before.client != client or before.is_judged):
+            refusal = _R.DENIED
+        if refusal is not None:
+            self._acknowledge(client, kind, refusal, channel)
+            return
+        if before is not None:
+            self._drop(before)
+        if count.count > self.capacity(kind):
+            self._refuse_size(count, channel)
+            return
+        upload = self._begin(count, channel, 0, count.count)
+        if count.count:
+            self._start(upload)
         else:
-            self._upload = upload = _Upload(client, channel, kind, count.count, self._host.now)
-            if count.count:
-                self._request_item(upload)
-            else:
-                self._finish(upload)
+            self._finish(upload)
 
-    def _request_item(self, upload: _Upload) -> None:
-        """Request the next item until it arrives."""
-        seq = len(upload.items)
+    def _refuse_size(self, count: m.MissionCount, channel: Channel) -> None:
+        self._acknowledge(sender_of(count), count.mission_type, _R.NO_SPACE, channel)
+
+    def _begin(self, message: AnyListMessage, channel: Channel, first: int, end: int) -> ListUpload:
+        now, kind = self._host.now, message.mission_type
+        upload = ListUpload(sender_of(message), channel, kind, first, end, now, now, self.requests_int)
+        self._uploads[self._key(kind)] = upload
+        return upload
+
+    def _start(self, upload: ListUpload) -> None:
+        self._request_item(upload)
+        self._watch(upload)
+
+    def _drop(self, upload: ListUpload) -> None:
+        """End an upload without an answer."""
+        self._uploads.pop(self._key(upload.mission_type), None)
+
+    def _end(self, upload: ListUpload, result: int) -> None:
+        self._drop(upload)
+        opaque_id = self.id(upload.mission_type) if result == _R.ACCEPTED else 0
+        self._acknowledge(upload.client, upload.mission_type, result, upload.channel, opaque_id)
+
+    def _request_item(self, upload: ListUpload) -> None:
+        upload.requested_at = self._host.now
         request = m.MissionRequestInt if upload.uses_int else m.MissionRequest
-        self._host.send(request(*upload.client, seq, upload.mission_type), upload.channel)
+        self._host.send(request(*upload.client, upload.next, upload.mission_type), upload.channel)
 
-        def check() -> None:
-            if self._upload is not upload or len(upload.items) != seq:
-                return
-            if self._host.now - upload.received_at >= TRANSFER_TIMEOUT_S:
-                self._end(upload, _R.OPERATION_CANCELLED)
-            else:
-                self._request_item(upload)
+    def _watch(self, upload: ListUpload) -> None:
+        """Schedule the next retry or the time-out."""
+        due = min(upload.requested_at + self.retry_interval_s, upload.received_at + self.timeout_s)
+        self._host.call_at(due, lambda: self._check(upload))
 
-        self._host.call_later(ITEM_RETRY_INTERVAL_S, check)
+    def _check(self, upload: ListUpload) -> None:
+        if not self._is_watched(upload):
+            return
+        if self._host.now >= upload.received_at + self.timeout_s:
+            self._time_out(upload)
+            return
+        if self._host.now >= upload.requested_at + self.retry_interval_s:
+            self._repeat(upload)
+        self._watch(upload)
+
+    def _is_watched(self, upload: ListUpload) -> bool:
+        return self._uploads.get(self._key(upload.mission_type)) is upload and not upload.is_judged
+
+    def _repeat(self, upload: ListUpload) -> None:
+        self._request_item(upload)
+
+    def _time_out(self, upload: ListUpload) -> None:
+        self._end(upload, _R.OPERATION_CANCELLED)
 
     def _on_item(self, message: AnyItem, channel: Channel) -> None:
-        upload = self._upload
-        if upload is None or sender_of(message) != upload.client or upload.is_judged:
+        upload = self._uploads.get(self._key(message.mission_type))
+        if upload is None or message.mission_type != upload.mission_type:
+            self._answer_item(message, _R.ERROR, channel)
+        elif message.seq != upload.next:
+            self._answer_item(message, _R.INVALID_SEQUENCE, upload.channel)
+        elif sender_of(message) != upload.client:
+            self._answer_item(message, _R.DENIED, upload.channel)
+        elif not upload.is_judged:
+            self._receive_item(upload, message)
+
+    def _answer_item(self, message: AnyItem, result: int, channel: Channel) -> None:
+        """Answer an item that no upload expects. It is ignored here; the expected item is requested again."""
+
+    def _receive_item(self, upload: ListUpload, message: AnyItem) -> None:
+        if (result := self._put(upload, message)) != _R.ACCEPTED:
+            self._end(upload, result)
             return
-        if message.mission_type != upload.mission_type or message.seq != len(upload.items):
-            return  # A late copy of an earlier item; the expected item is requested again.
-        upload.received_at, upload.uses_int = self._host.now, isinstance(message, m.MissionItemInt)
-        upload.items.append(from_wire(message))
-        if len(upload.items) < upload.count:
+        upload.received_at, upload.next = self._host.now, upload.next + 1
+        if upload.next < upload.end:
             self._request_item(upload)
         else:
             self._finish(upload)
 
-    def _finish(self, upload: _Upload) -> None:
+    def _finish(self, upload: ListUpload) -> None:
+        """Handle the arrival of the last item."""
         upload.is_judged = True
 
         def answer(result: int) -> None:
-            if self._upload is upload:
+            if self._uploads.get(0) is upload:
                 if result == _R.ACCEPTED:
-                    self.replace(upload.mission_type, upload.items)
+                    self.store(upload.mission_type, upload.items)
                 self._end(upload, result)
 
         try:
@@ -232,23 +320,17 @@ class MissionServer:
         except InvalidArgument:
             answer(_R.INVALID)
 
-    def _end(self, upload: _Upload, result: int) -> None:
-        self._upload = None
-        kind = upload.mission_type
-        opaque_id = self.opaque_id(kind) if result == _R.ACCEPTED else 0
-        self._acknowledge(upload.client, kind, result, upload.channel, opaque_id)
-
     def _on_ack(self, ack: m.MissionAck, channel: Channel) -> None:
         """End the client's own upload. At the end of a download there is nothing to do."""
-        upload = self._upload
+        upload = self._uploads.get(0)
         if upload is not None and sender_of(ack) == upload.client and not upload.is_judged and ack.type != _R.ACCEPTED:
-            self._upload = None
+            self._drop(upload)
 
     def _on_clear(self, request: m.MissionClearAll, channel: Channel) -> None:
         client, kind = sender_of(request), request.mission_type
         if kind not in (*self.lists, MavMissionType.ALL):
             self._acknowledge(client, kind, _R.UNSUPPORTED, channel)
-        elif self._upload is not None:
+        elif self.transfer_is_open:
             self._acknowledge(client, kind, _R.DENIED, channel)
         elif kind == MavMissionType.ALL:
             self._clear([each for each in _TYPES if self.lists[each]], client, kind, channel)
@@ -265,12 +347,12 @@ class MissionServer:
             if result != _R.ACCEPTED:
                 self._acknowledge(client, answered, result, channel)
                 return
-            self.replace(kinds[0], ())
+            self.store(kinds[0], ())
             self._clear(kinds[1:], client, answered, channel)
 
         self._judge(kinds[0], (), answer)
 
-    def _on_set_current_message(self, request: m.MissionSetCurrent, channel: Channel) -> None:
+    def _on_set_current(self, request: m.MissionSetCurrent, channel: Channel) -> None:
         if not self.set_current(request.seq):
             self._host.send(self.current_message(), channel)
 

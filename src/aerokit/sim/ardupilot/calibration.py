@@ -126,7 +126,7 @@ class CompassCalibration:
         }
 
     def _start(self, command: ReceivedCommand) -> int:
-        """Start; param 1 is a mask of compasses (0: all), param 3 is 1 to save the result without acceptance."""
+        """Start a calibration. Param 1 is a mask of compasses (0: all); param 3 is 1 to save without acceptance."""
         if self._vehicle.motors.is_armed:
             self._vehicle.send_text(MavSeverity.NOTICE, "Disarm to allow compass calibration")
             return MavResult.FAILED
@@ -197,7 +197,7 @@ class Calibrations:
         return self.compasses.is_running
 
     def reset(self) -> None:
-        """Cancel all calibrations, as a reboot does."""
+        """Cancel all calibrations, because of a reboot."""
         self.compasses.reset()
         self.accelerometers.reset()
 

@@ -200,7 +200,7 @@ class _CommonCommands:
         return _R.ACCEPTED
 
     def control_high_latency(self, command: ReceivedCommand) -> int:
-        """Refuse to start high-latency mode, which no port supports; accept to stop it."""
+        """Refuse to start high-latency mode, which no port supports. Accept requests to stop it."""
         if command.param1:
             return _R.FAILED
         self._vehicle.send_text(_NOTICE, "High Latency disabled")
@@ -277,7 +277,7 @@ class HomeAndOrigin:
         return _R.ACCEPTED
 
     def _on_origin(self, message: m.SetGpsGlobalOrigin, channel: Channel) -> None:
-        """Set the origin and send it to the requester. Invalid values are ignored, as is a second request."""
+        """Set the origin and send it to the requester. Invalid values and second requests are ignored."""
         vehicle = self._vehicle
         place = (message.latitude, message.longitude)
         point = vehicle.point(*place, message.altitude / 1000.0, MavFrame.GLOBAL)

@@ -99,7 +99,7 @@ class CopterThrow(CopterHold):
 
 
 class CopterFollow(CopterHold):
-    """FOLLOW: needs FOLL_ENABLE, and holds the position as the firmware does without a vehicle to follow."""
+    """FOLLOW: needs FOLL_ENABLE, and holds the position, like the firmware without a vehicle to follow."""
 
     def enter(self, *, force: bool) -> bool:
         if self.vehicle.parameters["FOLL_ENABLE"]:
@@ -125,7 +125,7 @@ _refusing = partial(
     entry_severity=MavSeverity.WARNING,
 )
 
-# In the order of AVAILABLE_MODES. SPORT and AUTOROTATE do not exist, as in the firmware for quadrotors.
+# Modes in the order of AVAILABLE_MODES. SPORT and AUTOROTATE do not exist, as in the firmware for quadrotors.
 _MODES: tuple[Callable[[Any], ArduPilotMode], ...] = (
     _refusing(
         CopterMode.AUTO_RTL, "AUTO RTL", entry_texts=("Unable to start landing sequence",),

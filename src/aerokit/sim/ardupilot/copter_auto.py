@@ -223,10 +223,10 @@ class CopterAuto(MissionMode):
         return True
 
     def enter(self, *, force: bool) -> bool:
-        """Enter AUTO, which requires a mission; on the ground its first navigation command must be a take-off."""
+        """Enter AUTO, which requires a mission. On the ground, its first navigation command must be a take-off."""
         copter, run = self.vehicle, self.vehicle.mission
         if copter.mode is self:
-            return True  # Arming in AUTO enters it again.
+            return True  # Arming in AUTO enters the mode again.
         if not run.is_present and not force:
             return False
         if copter.is_armed and copter.is_landed and not run.starts_with_take_off():
@@ -248,6 +248,7 @@ class CopterAuto(MissionMode):
             if self._has_changed() and isinstance(self._leg, _FlyLeg):
                 self._restart_command()
             self.vehicle.mission.update()
+            self._has_changed()
         if self.vehicle.mode is not self:
             return
         is_stopped = self.is_paused and isinstance(self._leg, _FlyLeg)
@@ -347,7 +348,7 @@ class CopterAuto(MissionMode):
         return False
 
     def _place(self, item: MissionItem) -> Ned:
-        """Return the place of an item; zero coordinates keep the vehicle's current ones."""
+        """Return the place of an item; zero coordinates mean the vehicle's current coordinates."""
         leg = self._leg
         here: Ned = self.vehicle.motion.place
         if isinstance(leg, _FlyLeg) and leg.is_complete:
@@ -397,7 +398,7 @@ class CopterAuto(MissionMode):
         leg.enter(force=True)
 
     def _delay(self, item: MissionItem) -> None:
-        # A delay until a time of day is not simulated; it counts as no delay.
+        # A delay until a time of day is not simulated, so it counts as no delay.
         seconds = max(0.0, item.param1)
         self._delay_until = self.vehicle.now + seconds
         self.vehicle.info(f"Delaying {int(seconds)} sec")

@@ -74,7 +74,7 @@ _FALLBACK_TEXTS = {
     _SMART_RTL_OR_LAND: "SmartRTL Unavailable, Using Land Mode",
     _BRAKE: "Trying Land Mode",
 }
-# FS_OPTIONS that continue the flight in spite of a failsafe: (modes, bit, text).
+# Bits of FS_OPTIONS that continue the flight in spite of a failsafe: (modes, bit, text).
 _IF_LANDING = 8
 _RADIO_OPTIONS = (
     (frozenset({"AUTO"}), 1, "Continuing Auto"),
@@ -273,7 +273,7 @@ _FENCE_ACTIONS: dict[int, tuple[int, ...]] = {
 class CopterFence(ArduPilotFence[CopterHost]):
     """Fence. FENCE_ACTION: report only (0), RTL (1), LAND (2), SMART_RTL (3, 5), BRAKE (4).
 
-    It changes to LAND instead if the mode is refused, or more than 100 m outside the fence.
+    If that mode is refused, or the copter is more than 100 m outside the fence, the mode is LAND instead.
     """
 
     PERIOD_S: ClassVar[float] = 0.1
@@ -306,7 +306,7 @@ class CopterFence(ArduPilotFence[CopterHost]):
         return MavSeverity.WARNING, f"Mode change to {mode.name} failed: in fence recovery"
 
     def mode_changed(self) -> None:
-        """Suspend the fence's actions for ten seconds, unless it only reports."""
+        """Suspend the fence's actions for ten seconds, unless FENCE_ACTION only reports."""
         super().mode_changed()
         if self.vehicle.parameters["FENCE_ACTION"] != REPORT_ONLY:
             self.recover_by_hand()

@@ -62,7 +62,7 @@ class AutoYaw:
         self._rate, self._apply = rate, self._turn
 
     def region_of_interest(self, point: Ned | None) -> None:
-        """Turn towards a place until the next target; None stops. If a gimbal is fitted, it turns instead."""
+        """Turn towards a place until the next target; None stops. A gimbal, if fitted, turns instead of the copter."""
         gimbal = self._copter.gimbal
         gimbal.look_at(point)
         if point is None:

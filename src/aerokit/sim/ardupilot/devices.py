@@ -33,7 +33,7 @@ class ArduPilotDevices:
         return bool(self._vehicle.parameters.get(name, 0))
 
     def grip(self, command: ReceivedCommand) -> int:
-        """Move the servo gripper: acknowledged at once, its end is a status text (AP_Gripper_Servo.cpp)."""
+        """Move the servo gripper. The answer comes at once, a status text at the end (AP_Gripper_Servo.cpp)."""
         is_known = command.param2 in (GripperActions.GRAB, GripperActions.RELEASE)
         if not self._is_set("GRIP_ENABLE") or not is_known:
             return _R.FAILED
@@ -49,7 +49,7 @@ class ArduPilotDevices:
         return _R.ACCEPTED
 
     def move_gear(self, command: ReceivedCommand) -> int:
-        """Accept always, as the firmware does without a landing gear."""
+        """Accept every command, like the firmware without a landing gear."""
         up = command.param2 == 1
         if self._is_set("LGR_ENABLE") and up is not self.gear_is_up:
             self.gear_is_up = up

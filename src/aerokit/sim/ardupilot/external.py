@@ -29,11 +29,11 @@ class ArduPilotExternal:
         self.reset()
 
     def reset(self) -> None:
-        """Forget all measurements, as a reboot does."""
+        """Forget all measurements, because of a reboot."""
         self.latest: dict[type[Message], Message] = {}
         self._navigation_at = self._target_at = -math.inf
         self._target: tuple[float, float] = (0.0, 0.0)
-        self.wind: tuple[float, float] | None = None  # Speed in m/s, and direction in degrees that it comes from.
+        self.wind: tuple[float, float] | None = None  # Speed in m/s, and direction in degrees that the wind comes from.
 
     def listen(self) -> None:
         vehicle = self._vehicle
@@ -45,7 +45,7 @@ class ArduPilotExternal:
 
     @property
     def navigation_age_s(self) -> float:
-        """Seconds since the last pose; infinity before the first one."""
+        """Seconds since the last pose; infinity before the first pose."""
         return self._vehicle.now - self._navigation_at
 
     def velocity_to_target(self) -> tuple[float, float]:

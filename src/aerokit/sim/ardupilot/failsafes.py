@@ -66,14 +66,14 @@ class BatteryFailsafe:
         return None
 
     def _below(self, level: int) -> int:
-        """Return the level if the battery has been below its limits for long enough, else 0."""
+        """Return the level if the battery has been below the limits of this level for long enough, else 0."""
         volts, charge = self._is_below(level)
         low_for = self._voltage_low[level].seconds(volts, self._vehicle.now)
         timer = self._vehicle.parameters["BATT_LOW_TIMER"]
         return level if charge or 0 < timer < low_for else _OK
 
     def _is_below(self, level: int) -> tuple[bool, bool]:
-        """Return two values: True if the voltage is below the limit of the level, and True if the charge is."""
+        """Return two values: True if the voltage, and True if the charge, is below the limit of the level."""
         parameters, name = self._vehicle.parameters, _NAMES[level]
         volts, charge = parameters[f"BATT_{name}_VOLT"], parameters[f"BATT_{name}_MAH"]
         is_charge_low = charge > 0 and self._remaining_mah() < charge
@@ -97,7 +97,7 @@ class ArduPilotFailsafes(Generic[HostT]):
         self.battery: BatteryFailsafe = BatteryFailsafe(vehicle, self.BATTERY_PRIORITIES, self.act_on_battery)
         self.ground_station = False
         self.estimator = False
-        self.radio = False  # True while the RC link counts as lost; the vehicle cannot be armed then.
+        self.radio = False  # True while the RC link counts as lost, which also prevents arming.
         self.ground_station_seen_at: float = math.nan
         """Time of the last heartbeat of the ground station MAV_GCS_SYSID."""
         self.radio_received_at: float = math.nan  # Time of the last RC pulses or overrides.
@@ -125,7 +125,7 @@ class ArduPilotFailsafes(Generic[HostT]):
 
     @property
     def ground_station_silence(self) -> float:
-        """Seconds since the last heartbeat of the ground station; NaN before the first one."""
+        """Seconds since the last heartbeat of the ground station; NaN before the first heartbeat."""
         return self.vehicle.now - self.ground_station_seen_at
 
     def update(self) -> None:
@@ -167,8 +167,8 @@ class ArmingCheck(IntFlag):
 class ArduPilotArming(Generic[HostT]):
     """Arms and disarms. Runs the arming checks once a second and reports failures every 30 s while disarmed.
 
-    `common_reasons` has the checks of all firmwares, whose new failures are reported at once. A subclass adds its own
-    checks in `own_reasons` and `final_reasons`.
+    `common_reasons` has the checks of all firmwares. New failures of these checks are reported at once. A subclass adds
+    its own checks in `own_reasons` and `final_reasons`.
     """
 
     ARMED_TEXT: ClassVar[str] = "Throttle armed"
@@ -176,7 +176,7 @@ class ArduPilotArming(Generic[HostT]):
 
     def __init__(self, vehicle: HostT) -> None:
         self.vehicle = vehicle
-        self.passes: bool = False  # Health of the pre-arm checks in SYS_STATUS.
+        self.passes: bool = False  # True if SYS_STATUS reports healthy pre-arm checks.
         self._reported_at = -math.inf
         self._passed_common = self._is_news = False
         self._needs_no_arming = False

@@ -125,8 +125,9 @@ REPORT_ONLY = 0
 class ArduPilotFence(Generic[HostT]):
     """Checks height, distance from home and the uploaded zones; `update` is called 10 times a second.
 
-    FENCE_STATUS reports a breach; a subclass adds the reaction of its firmware in `act`. This class is the fence of
-    ArduSub, which only reports breaches, while armed. Braking before the fence (AVOID_ENABLE) is not simulated.
+    FENCE_STATUS reports a breach; a subclass adds the reaction of its firmware in `act`. This class itself is the fence
+    of ArduSub, which does nothing but report breaches while armed. Braking before the fence (AVOID_ENABLE) is not
+    simulated.
     """
 
     PERIOD_S: ClassVar[float] = 1.0 / 3.0
@@ -176,7 +177,7 @@ class ArduPilotFence(Generic[HostT]):
 
     @property
     def health(self) -> tuple[bool, bool, bool]:
-        """Present, enabled and healthy in SYS_STATUS."""
+        """The fence's bits in SYS_STATUS: present, enabled, healthy."""
         present = self.present != 0
         enforced = present and self.enabled != 0 and self.vehicle.parameters["FENCE_ACTION"] != REPORT_ONLY
         return present, enforced, not (present and self.breached)
@@ -387,7 +388,7 @@ class ArduPilotFence(Generic[HostT]):
 
 
 def _joined_names(kinds: int) -> str:
-    """Join names of fences as the firmware does: Max Alt, Circle and Polygon fences."""
+    """Join names of fences like the firmware: Max Alt, Circle and Polygon fences."""
     words = [name for kind, name in _NAMES.items() if kinds & kind]
     text = words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
     return f"{text} fence" + "s" * (len(words) > 1)

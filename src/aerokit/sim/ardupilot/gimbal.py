@@ -206,7 +206,7 @@ class ArduPilotGimbal:
             self._vehicle.send(status)
 
     def manage(self, flags: int, angles: tuple[float, float, float], rates: tuple[float, float, float]) -> int:
-        """Apply GIMBAL_MANAGER_FLAGS with angles or rates (roll, pitch, yaw; NaN if not given); return a MAV_RESULT."""
+        """Apply GIMBAL_MANAGER_FLAGS with angles or rates: roll, pitch, yaw; NaN means none. Return a MAV_RESULT."""
         from_north = bool(flags & GimbalManagerFlags.YAW_LOCK)
         if flags & GimbalManagerFlags.RETRACT:
             self.set_mode(MavMountMode.RETRACT)

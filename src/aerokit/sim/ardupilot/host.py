@@ -76,7 +76,7 @@ class ArduPilotMode:
         return False
 
     def go_to(self, position: Ned) -> None:
-        """Go to a point of the world frame and stay there; only the guided mode implements it."""
+        """Go to a point of the world frame and stay there; only the guided mode implements this method."""
         raise NotImplementedError
 
     @property
@@ -107,7 +107,7 @@ class ConditionTimer:
         self._since: float | None = None
 
     def seconds(self, condition: bool, now: float) -> float:
-        """Return seconds since the condition became true; 0 at its first check and while it is false."""
+        """Return seconds since the condition became true; 0 at the first call and while the condition is false."""
         if not condition:
             self._since = None
         elif self._since is None:

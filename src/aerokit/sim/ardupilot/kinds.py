@@ -17,7 +17,7 @@ KINDS: tuple[Kind, ...] = ("copter", "plane", "rover", "sub")
 
 
 def parameters_of(kind: Kind, count: int | None = None) -> SimParameters:
-    """Return the parameters of a firmware; ``count`` limits them, but keeps all that the simulation reads."""
+    """Return the parameters of a firmware: all, or about ``count``, including all that the simulation reads."""
     used = [name for (name,) in rows_of(kind, "used_parameters.csv")]
     return SimParameters.from_text(_read(f"{kind}.param.csv"), used=used, count=count)
 
@@ -55,7 +55,7 @@ class BootTimeline:
     position_good: float = 41.55
     """The estimator uses GPS; modes that need a position become available."""
     estimator_leads_early: bool = True
-    """True if the estimator provides the attitude as soon as it is active, False if only once it uses GPS."""
+    """True if the estimator provides the attitude once it is active, False if only once it uses GPS."""
 
     def scaled(self, seconds: float) -> BootTimeline:
         """Return the timeline scaled to end after ``seconds``; with 0 the vehicle is ready at once."""

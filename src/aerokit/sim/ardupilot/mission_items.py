@@ -79,7 +79,7 @@ def has_location(command: int) -> bool:
 def is_place(latitude_e7: float, longitude_e7: float) -> int:
     """Return ACCEPTED, or the MAV_MISSION_RESULT of the invalid coordinate.
 
-    Like the firmware, it compares in single precision.
+    Like the firmware, the function compares in single precision.
     """
     if not abs(float32(latitude_e7)) <= 900_000_000:
         return MavMissionResult.INVALID_PARAM5_X
@@ -153,7 +153,7 @@ def _kept_turns(item: MissionItem) -> tuple[float, float, float, float]:
 
 
 def whole(value: float) -> int:
-    """Truncate towards zero, as C does; 0 for values beyond 32 bits."""
+    """Truncate towards zero, like C; 0 for values beyond 32 bits."""
     return int(value) if abs(value) < 2**31 else 0
 
 

@@ -126,7 +126,7 @@ class MissionRun:
 
     @property
     def is_being_flown(self) -> bool:
-        """True while the mission runs with armed motors; it cannot be cleared then."""
+        """True while the mission runs with armed motors. The mission cannot be cleared meanwhile."""
         return self.is_running and self._vehicle.motors.is_armed
 
     @property
@@ -195,7 +195,7 @@ class MissionRun:
             self._state = MissionState.NOT_STARTED
 
     def reset(self) -> None:
-        """Reset progress and jump counters, as disarming does."""
+        """Reset progress and jump counters, e.g. because the vehicle was disarmed."""
         self.nav_index, self._nav, self._do, self._do_index = 0, None, None, 0
         self._jumps.clear()
 
@@ -240,7 +240,7 @@ class MissionRun:
         return False
 
     def update(self) -> None:
-        """Verify the running commands and start the next ones."""
+        """Check whether the running commands are complete, and start the next commands."""
         if not self.is_running or not self._list.count:
             return
         if self._nav is None or self._is_complete(self.nav_index, self._nav):
@@ -339,13 +339,13 @@ class MissionRun:
 
 
 def horizontal_distance(vehicle: ArduPilotHost, place: Ned | None) -> float:
-    """Return the horizontal distance to a place in metres; 0 without one."""
+    """Return the horizontal distance to a place in metres; 0 without a place."""
     motion = vehicle.motion
     return 0.0 if place is None else math.hypot(place[0] - motion.north, place[1] - motion.east)
 
 
 def set_home_from(vehicle: ArduPilotHost, item: MissionItem) -> None:
-    """Execute DO_SET_HOME of a mission: set home to the item's position, or to the vehicle's if it has none."""
+    """Execute DO_SET_HOME of a mission: set home to the item's position, or else to the vehicle's position."""
     point: Ned | None = vehicle.motion.place
     if item.param1 != 1 and (item.x, item.y, item.z) != (0, 0, 0):
         point = vehicle.point(int(item.x), int(item.y), item.z, item.frame)

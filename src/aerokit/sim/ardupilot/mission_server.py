@@ -8,13 +8,21 @@ https://mavlink.io/en/services/mission.html
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavMissionResult, MavMissionType, MavSeverity
 from aerokit.mavlink.message import Message
 from aerokit.missions import MissionItem
-from aerokit.protocols.servers.missions import AnyItem, item_from, item_message_float, item_message_int
+from aerokit.protocols.servers.missions import (
+    AnyItem,
+    AnyListMessage,
+    AnyRequest,
+    ListUpload,
+    MissionServer,
+    item_from,
+    item_message_float,
+    item_message_int,
+)
 from aerokit.sim.ardupilot.host import ArduPilotHost
 from aerokit.sim.ardupilot.mission_items import has_location, stored, whole
 from aerokit.sim.ardupilot.mission_lists import CommandList, FenceList, ItemList, RallyList
@@ -22,30 +30,20 @@ from aerokit.sim.channel import Channel
 from aerokit.sim.missions import float32
 from aerokit.sim.vehicle import sender_of
 
-_RETRY_INTERVAL_S, _UPLOAD_TIMEOUT_S = 1.0, 8.0
 _DEGREE = 1e7
 _MAX_COMMANDS, _MAX_RALLY_POINTS = 650, 46
 _GUIDED_TARGET, _ALTITUDE_CHANGE = 2, 3
 _R = MavMissionResult
 
 
-@dataclass
-class _Upload:
-    items: ItemList
-    mission_type: int
-    partner: tuple[int, int]
-    channel: Channel
-    next: int
-    last: int
-    received_at: float
-    requested_at: float
-    has_warned: bool = False
-
-
-class ArduPilotMissionServer:
+class ArduPilotMissionServer(MissionServer):
     """Stores mission, fence and rally points, and transfers them."""
 
+    retry_interval_s, timeout_s = 1.0, 8.0
+    requests_int = False
+
     def __init__(self, vehicle: ArduPilotHost) -> None:
+        super().__init__(vehicle)
         self._vehicle = vehicle
         self.commands: CommandList = CommandList(
             _MAX_COMMANDS, self._home, lambda: vehicle.mission.is_being_flown, vehicle.KIND
@@ -58,24 +56,11 @@ class ArduPilotMissionServer:
             MavMissionType.FENCE: self.fence,
             MavMissionType.RALLY: self.rally,
         }
-        self._uploads: dict[int, _Upload] = {}
-        self._has_warned_of_request: set[int] = set()
+        self._warnings: set[tuple[type[Message], int]] = set()
 
     def listen(self) -> None:
-        on = self._vehicle.on
-        on(m.MissionRequestList, self._on_request_list)
-        on(m.MissionRequestInt, self._on_request_int)
-        on(m.MissionRequest, self._on_request)
-        on(m.MissionCount, self._on_count)
-        on(m.MissionWritePartialList, self._on_write_partial_list)
-        on(m.MissionItemInt, self._on_item)
-        on(m.MissionItem, self._on_item)
-        on(m.MissionClearAll, self._on_clear_all)
-        on(m.MissionSetCurrent, self._on_set_current)
-
-    @property
-    def transfer_is_open(self) -> bool:
-        return bool(self._uploads)
+        super().listen()
+        self._vehicle.on(m.MissionWritePartialList, self._on_write_partial_list)
 
     def items(self, mission_type: int) -> list[MissionItem]:
         """Return the items that a download sends, home first; empty for an unknown type."""
@@ -83,10 +68,10 @@ class ArduPilotMissionServer:
         return [] if items is None else items.items()
 
     def replace(self, mission_type: int, items: Sequence[MissionItem], *, start: int = 0, clear: bool = True) -> int:
-        """Store items as a file upload does; return the MAV_MISSION_RESULT. Only missions support ``clear=False``."""
+        """Store items like a file upload; return the MAV_MISSION_RESULT. Only missions support ``clear=False``."""
         if mission_type == MavMissionType.MISSION:
             if clear:
-                self._clear(self.commands)
+                self._clear_list(self.commands)
             return self.commands.write_file(list(items), start)
         if not clear:
             return _R.ERROR
@@ -99,10 +84,6 @@ class ArduPilotMissionServer:
                 return result
         return _R.ACCEPTED
 
-    def reset(self) -> None:
-        """Drop uploads, as a reboot does; stored items stay."""
-        self._uploads.clear()
-
     def _home(self) -> MissionItem:
         home = self._vehicle.navigation.home
         if home is None:
@@ -114,223 +95,145 @@ class ArduPilotMissionServer:
     def _warn(self, text: str) -> None:
         self._vehicle.send_text(MavSeverity.WARNING, text)
 
-    def _acknowledge(self, message: Message, result: int, mission_type: int, channel: Channel) -> None:
-        self._vehicle.send(m.MissionAck(*sender_of(message), result, mission_type), channel)
+    def _warn_once(self, message: AnyItem | m.MissionRequest, text: str) -> None:
+        """Send a warning about a kind of message, once for each upload of this type."""
+        warning = (type(message), message.mission_type)
+        if warning not in self._warnings:
+            self._warnings.add(warning)
+            self._warn(text)
 
-    def _list_for(self, message: Message, mission_type: int, channel: Channel) -> ItemList | None:
-        """Return the list of this type; if it is not supported, refuse the request and return None."""
-        items = self._lists.get(mission_type)
-        if items is not None and mission_type != MavMissionType.MISSION and channel.version == 1:
+    def capacity(self, mission_type: int) -> int:
+        """Return the capacity of a list. The capacity of the mission is 0 until the vehicle is initialised."""
+        is_late = mission_type == MavMissionType.MISSION and not self._vehicle.is_initialised
+        return 0 if is_late else self._lists[mission_type].capacity
+
+    def count(self, mission_type: int) -> int:
+        return self._lists[mission_type].count
+
+    def _key(self, mission_type: int) -> int:
+        return mission_type
+
+    def _refusal(self, message: AnyListMessage, channel: Channel) -> int | None:
+        kind = message.mission_type
+        if kind in self._lists and kind != MavMissionType.MISSION and channel.version == 1:
             self._warn("Need mavlink2 for item transfer")
-            items = None
-        if items is None:
-            self._acknowledge(message, _R.UNSUPPORTED, mission_type, channel)
-        return items
+            return _R.UNSUPPORTED
+        if kind in self._uploads and not isinstance(message, (m.MissionCount, m.MissionRequest)):
+            return _R.DENIED
+        return None if kind in self._lists else _R.UNSUPPORTED
 
-    def _capacity(self, items: ItemList) -> int:
-        """Return the capacity; that of the mission is 0 until the vehicle is initialised."""
-        return 0 if items is self.commands and not self._vehicle.is_initialised else items.capacity
+    def _on_request(self, request: AnyRequest, channel: Channel) -> None:
+        if request.mission_type in self._lists:
+            super()._on_request(request, channel)
 
-    def _on_request_list(self, request: m.MissionRequestList, channel: Channel) -> None:
-        mission_type = request.mission_type
-        items = self._list_for(request, mission_type, channel)
-        if items is None:
-            return
-        if mission_type in self._uploads:
-            self._acknowledge(request, _R.DENIED, mission_type, channel)
-            return
-        self._vehicle.send(m.MissionCount(*sender_of(request), items.count, mission_type), channel)
+    def _refuse_item(self, request: AnyRequest, result: int, channel: Channel) -> None:
+        if result == _R.INVALID_SEQUENCE and isinstance(request, m.MissionRequestInt):
+            kind = request.mission_type
+            self._vehicle.send(m.MissionCount(*sender_of(request), self.count(kind), kind), channel)
+        super()._refuse_item(request, result, channel)
 
-    def _on_request_int(self, request: m.MissionRequestInt, channel: Channel) -> None:
-        mission_type = request.mission_type
-        if mission_type not in self._lists or (items := self._list_for(request, mission_type, channel)) is None:
-            return
-        if mission_type in self._uploads:
-            self._acknowledge(request, _R.DENIED, mission_type, channel)
-            return
-        item = items.item(request.seq)
-        to = sender_of(request)
-        if isinstance(item, int):
-            if item == _R.INVALID_SEQUENCE:
-                self._vehicle.send(m.MissionCount(*to, items.count, mission_type), channel)
-            self._acknowledge(request, item, mission_type, channel)
-            return
-        current = self._is_current(item, mission_type)
-        message = item_message_int(item, request.seq, to, mission_type, current=current)
-        self._vehicle.send(message, channel)
+    def _item(self, mission_type: int, seq: int) -> MissionItem | int:
+        return self._lists[mission_type].item(seq)
 
-    def _on_request(self, request: m.MissionRequest, channel: Channel) -> None:
-        mission_type = request.mission_type
-        if mission_type not in self._lists or (items := self._list_for(request, mission_type, channel)) is None:
-            return
-        item = items.item(request.seq)
-        if isinstance(item, int):
-            self._acknowledge(request, item, mission_type, channel)
-            return
+    def _message(self, item: MissionItem, request: AnyRequest) -> AnyItem:
+        to, kind = sender_of(request), request.mission_type
+        # The firmware compares the item's command, instead of its index, with the index of the current item.
+        current = kind == MavMissionType.MISSION and item.command == self._vehicle.mission.nav_index
+        if isinstance(request, m.MissionRequestInt):
+            return item_message_int(item, request.seq, to, kind, current=current)
         place: tuple[float, float] = (item.x, item.y)
         if has_location(item.command):
             place = (float32(item.x * float32(1e-7)), float32(item.y * float32(1e-7)))
-        if mission_type not in self._has_warned_of_request:
-            self._has_warned_of_request.add(mission_type)
-            self._warn("got MISSION_REQUEST; use MISSION_REQUEST_INT!")
-        current = int(self._is_current(item, mission_type))
-        to = sender_of(request)
-        self._vehicle.send(item_message_float(item, place, request.seq, to, mission_type, current), channel)
+        self._warn_once(request, "got MISSION_REQUEST; use MISSION_REQUEST_INT!")
+        return item_message_float(item, place, request.seq, to, kind, int(current))
 
-    def _is_current(self, item: MissionItem, mission_type: int) -> bool:
-        """Return True if the firmware marks the item as current.
+    def _refuse_size(self, count: m.MissionCount, channel: Channel) -> None:
+        super()._refuse_size(count, channel)
+        self._warn(f"Only {self.capacity(count.mission_type)} items are supported")
 
-        The firmware compares the item's command, instead of its index, with the index of the current item.
-        """
-        return mission_type == MavMissionType.MISSION and item.command == self._vehicle.mission.nav_index
-
-    def _on_count(self, count: m.MissionCount, channel: Channel) -> None:
-        mission_type = count.mission_type
-        items = self._list_for(count, mission_type, channel)
-        if items is None or not self._cancel(count, mission_type, channel):
-            return
-        if count.count > self._capacity(items):
-            self._acknowledge(count, _R.NO_SPACE, mission_type, channel)
-            self._warn(f"Only {self._capacity(items)} items are supported")
-            return
-        items.begin(count.count)
-        upload = self._upload(items, count, mission_type, channel, 0, count.count - 1)
-        if count.count == 0:
-            self._complete(upload)
-        else:
-            self._start(upload)
+    def _begin(self, message: AnyListMessage, channel: Channel, first: int, end: int) -> ListUpload:
+        if isinstance(message, m.MissionCount):
+            self._lists[message.mission_type].begin(message.count)
+        return super()._begin(message, channel, first, end)
 
     def _on_write_partial_list(self, request: m.MissionWritePartialList, channel: Channel) -> None:
-        mission_type, start, end = request.mission_type, request.start_index, request.end_index
-        items = self._list_for(request, mission_type, channel)
-        if items is None:
-            return
-        if mission_type in self._uploads:
-            self._acknowledge(request, _R.DENIED, mission_type, channel)
-        elif not 0 <= start <= end <= items.count:
+        kind, start, end = request.mission_type, request.start_index, request.end_index
+        refusal = self._refusal(request, channel)
+        if refusal is None and not 0 <= start <= end <= self.count(kind):
             self._warn("Flight plan update rejected")
-            self._acknowledge(request, _R.ERROR, mission_type, channel)
-        else:
-            items.begin_update()
-            self._start(self._upload(items, request, mission_type, channel, start, end))
+            refusal = _R.ERROR
+        if refusal is not None:
+            self._acknowledge(sender_of(request), kind, refusal, channel)
+            return
+        self._lists[kind].begin_update()
+        self._start(self._begin(request, channel, start, end + 1))
 
-    def _cancel(self, message: Message, mission_type: int, channel: Channel) -> bool:
-        """Cancel the sender's upload; return False if another component is uploading."""
-        upload = self._uploads.get(mission_type)
-        if upload is None:
-            return True
-        if upload.partner != sender_of(message):
-            self._acknowledge(message, _R.DENIED, mission_type, channel)
-            return False
-        self._end(upload)
-        return True
+    def _start(self, upload: ListUpload) -> None:
+        self._warnings -= {(kind, upload.mission_type) for kind in (m.MissionItem, m.MissionRequest)}
+        super()._start(upload)
 
-    def _upload(
-        self, items: ItemList, message: Message, mission_type: int, channel: Channel, first: int, last: int
-    ) -> _Upload:
-        now = self._vehicle.now
-        return _Upload(items, mission_type, sender_of(message), channel, first, last, now, now)
+    def _drop(self, upload: ListUpload) -> None:
+        super()._drop(upload)
+        self._lists[upload.mission_type].abandon()
 
-    def _start(self, upload: _Upload) -> None:
-        self._uploads[upload.mission_type] = upload
-        self._has_warned_of_request.discard(upload.mission_type)
-        self._request_item(upload)
-        self._watch(upload)
-
-    def _end(self, upload: _Upload) -> None:
-        self._uploads.pop(upload.mission_type, None)
-        upload.items.abandon()
-
-    def _request_item(self, upload: _Upload) -> None:
+    def _request_item(self, upload: ListUpload) -> None:
         upload.requested_at = self._vehicle.now
         if self._vehicle.is_initialised:
-            request = m.MissionRequest(*upload.partner, upload.next, upload.mission_type)
-            self._vehicle.send(request, upload.channel)
+            super()._request_item(upload)
 
-    def _watch(self, upload: _Upload) -> None:
-        """Schedule the next retry or the time-out."""
-        due = min(upload.requested_at + _RETRY_INTERVAL_S, upload.received_at + _UPLOAD_TIMEOUT_S)
-        self._vehicle.call_at(due, lambda: self._check(upload))
-
-    def _check(self, upload: _Upload) -> None:
-        if self._uploads.get(upload.mission_type) is not upload:
-            return
-        now = self._vehicle.now
-        if now >= upload.received_at + _UPLOAD_TIMEOUT_S:
-            self._end(upload)
-            self._warn(f"{upload.items.name} upload timeout")
-            ack = m.MissionAck(*upload.partner, _R.OPERATION_CANCELLED, upload.mission_type)
-            self._vehicle.send(ack, upload.channel)
-            return
-        if now >= upload.requested_at + _RETRY_INTERVAL_S:
-            self._request_item(upload)
-        self._watch(upload)
+    def _time_out(self, upload: ListUpload) -> None:
+        self._warn(f"{self._lists[upload.mission_type].name} upload timeout")
+        super()._time_out(upload)
 
     def _on_item(self, message: AnyItem, channel: Channel) -> None:
-        mission_type = message.mission_type
-        item = item_from(message)
-        if isinstance(message, m.MissionItem):
-            converted = _without_floats(item)
-            if isinstance(converted, int):
-                self._acknowledge(message, converted, mission_type, channel)
-                return
-            item = converted
-        if mission_type == MavMissionType.MISSION and message.current in (_GUIDED_TARGET, _ALTITUDE_CHANGE):
-            self._acknowledge(message, self._guide(item, message.current), mission_type, channel)
-            return
-        if mission_type not in self._lists:
-            self._acknowledge(message, _R.UNSUPPORTED, mission_type, channel)
-            return
-        upload = self._uploads.get(mission_type)
-        if upload is None:
-            self._acknowledge(message, _R.ERROR, mission_type, channel)
-            return
-        if isinstance(message, m.MissionItem) and not upload.has_warned:
-            upload.has_warned = True
-            self._warn("got MISSION_ITEM; GCS should send MISSION_ITEM_INT")
-        self._receive_item(upload, message, item)
-
-    def _receive_item(self, upload: _Upload, message: AnyItem, item: MissionItem) -> None:
-        def refuse(result: int) -> None:
-            self._acknowledge(message, result, upload.mission_type, upload.channel)
-
-        if message.seq != upload.next:
-            refuse(_R.INVALID_SEQUENCE)
-        elif sender_of(message) != upload.partner:
-            refuse(_R.DENIED)
-        elif (result := upload.items.put(message.seq, item, upload.last)) != _R.ACCEPTED:
-            refuse(result)
-            self._end(upload)
+        item, kind = _without_floats(message), message.mission_type
+        if isinstance(item, int):
+            self._answer_item(message, item, channel)
+        elif kind == MavMissionType.MISSION and message.current in (_GUIDED_TARGET, _ALTITUDE_CHANGE):
+            self._answer_item(message, self._guide(item, message.current), channel)
+        elif kind not in self._lists:
+            self._answer_item(message, _R.UNSUPPORTED, channel)
         else:
-            upload.received_at = self._vehicle.now
-            upload.next += 1
-            if upload.next > upload.last:
-                self._complete(upload)
-            else:
-                self._request_item(upload)
+            if isinstance(message, m.MissionItem) and kind in self._uploads:
+                self._warn_once(message, "got MISSION_ITEM; GCS should send MISSION_ITEM_INT")
+            super()._on_item(message, channel)
 
-    def _complete(self, upload: _Upload) -> None:
-        result = upload.items.finish(self._warn)
-        if upload.items is self.commands:
+    def _answer_item(self, message: AnyItem, result: int, channel: Channel) -> None:
+        self._acknowledge(sender_of(message), message.mission_type, result, channel)
+
+    def _put(self, upload: ListUpload, message: AnyItem) -> int:
+        item = _without_floats(message)
+        assert not isinstance(item, int)
+        return self._lists[upload.mission_type].put(message.seq, item, upload.end - 1)
+
+    def _finish(self, upload: ListUpload) -> None:
+        result = self._lists[upload.mission_type].finish(self._warn)
+        if upload.mission_type == MavMissionType.MISSION:
             self._vehicle.info("Flight plan received")
-        self._vehicle.send(m.MissionAck(*upload.partner, result, upload.mission_type), upload.channel)
-        self._end(upload)
+        self._end(upload, result)
 
-    def _on_clear_all(self, request: m.MissionClearAll, channel: Channel) -> None:
-        mission_type = request.mission_type
-        items = self._lists.get(mission_type)
-        if items is None:
-            self._acknowledge(request, _R.UNSUPPORTED, mission_type, channel)
-            return
-        done = self._cancel(request, mission_type, channel) and self._clear(items)
-        self._acknowledge(request, _R.ACCEPTED if done else _R.ERROR, mission_type, channel)
+    def _on_ack(self, ack: m.MissionAck, channel: Channel) -> None:
+        """Do nothing: ArduPilot ignores this message."""
+
+    def _on_clear(self, request: m.MissionClearAll, channel: Channel) -> None:
+        kind, to = request.mission_type, sender_of(request)
+        upload = self._uploads.get(kind)
+        result: int = _R.UNSUPPORTED
+        if upload is not None and upload.client != to:
+            self._acknowledge(to, kind, _R.DENIED, channel)
+            result = _R.ERROR
+        elif kind in self._lists:
+            if upload is not None:
+                self._drop(upload)
+            result = _R.ACCEPTED if self._clear_list(self._lists[kind]) else _R.ERROR
+        self._acknowledge(to, kind, result, channel)
 
     def _on_set_current(self, request: m.MissionSetCurrent, channel: Channel) -> None:
         """Set the current item; MISSION_CURRENT has the requested index, even if another item runs."""
         if self._vehicle.mission.set_current(request.seq):
             self._vehicle.send(self._vehicle.mission.message(request.seq), channel)
 
-    def _clear(self, items: ItemList) -> bool:
+    def _clear_list(self, items: ItemList) -> bool:
         done = items.clear()
         if done and items is self.commands:
             self._vehicle.mission.clear()
@@ -351,8 +254,11 @@ class ArduPilotMissionServer:
         return _R.ACCEPTED
 
 
-def _without_floats(item: MissionItem) -> MissionItem | int:
+def _without_floats(message: AnyItem) -> MissionItem | int:
     """Convert the degrees of a MISSION_ITEM to integers, in single precision."""
+    item = item_from(message)
+    if isinstance(message, m.MissionItemInt):
+        return item
     if not has_location(item.command):
         return item.replace(x=whole(item.x), y=whole(item.y))
     if not abs(item.x) <= 90.0:

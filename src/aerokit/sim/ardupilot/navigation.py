@@ -98,7 +98,7 @@ class ArduPilotNavigation:
         return (local[0] + north, local[1] + east, local[2] + down)
 
     def set_home(self, point: Ned, *, lock: bool) -> None:
-        """Set home and broadcast it; with ``lock`` later arming does not move it."""
+        """Set home and broadcast it. With ``lock``, later arming does not move home."""
         self.home = point
         self.home_is_locked = self.home_is_locked or lock
         self._vehicle.missions.commands.add_home()
@@ -265,7 +265,7 @@ class SmartPath:
         self._vehicle.every(_PERIOD_S, self.update)
 
     def reset(self) -> None:
-        """Discard the path and start a new one at the vehicle, as arming does; inactive without a position."""
+        """Discard the path and start a new path at the vehicle; without a position, the path is inactive."""
         parameters = self._vehicle.parameters
         self._points.clear()
         self._cleaned, self.is_active, self._is_started = 0, False, True
@@ -349,7 +349,7 @@ def simplify(path: Sequence[Ned], tolerance: float) -> list[Ned]:
 def prune(path: Sequence[Ned], tolerance: float) -> list[Ned]:
     """Return the path without loops: segments within ``tolerance`` metres of each other are joined.
 
-    Loops are removed in the order of their starts; of loops with the same start, only the longest.
+    Loops are removed in the order of their starts. If several loops have the same start, only the longest is removed.
     """
     points = list(path)
     first = 0
@@ -383,7 +383,7 @@ def _distance_to_line(point: Ned, start: Ned, end: Ned) -> float:
 
 
 def _closest_approach(one: Ned, one_end: Ned, other: Ned, other_end: Ned) -> tuple[float, Ned] | None:
-    """Return the distance of two line segments and the midpoint between them; None if they are parallel."""
+    """Return the distance of two line segments and the midpoint between them; None for parallel segments."""
     line1, line2, between = _minus(one_end, one), _minus(other_end, other), _minus(one, other)
     a, b, c = _dot(line1, line1), _dot(line1, line2), _dot(line2, line2)
     d, e = _dot(line1, between), _dot(line2, between)

@@ -58,7 +58,7 @@ _FULL_AMPERES = 25.0
 
 
 class PlaneEngine(ArduPilotMotors):
-    """Engine of a plane; its throttle is that of the motion model."""
+    """Engine of a plane, with the throttle of the motion model."""
 
     @property
     def current_a(self) -> float:
@@ -72,7 +72,7 @@ class PlaneEngine(ArduPilotMotors):
 _REST_S = 1.0
 _LIFTING_MODES = range(PlaneMode.QSTABILIZE, PlaneMode.QACRO + 1)
 
-# In the order of AVAILABLE_MODES. As with Q_ENABLE 0, modes of lifting rotors do not exist.
+# Modes in the order of AVAILABLE_MODES. Modes of lifting rotors do not exist, as with Q_ENABLE 0.
 _MODES: tuple[Callable[[Any], ArduPilotMode], ...] = (
     variant(
         modes.PlanePilotedMode, PlaneMode.MANUAL, "MANUAL",

@@ -187,7 +187,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         plane.info(f"Landing approach start at {plane.altitude_m:.1f}m")
 
     def _return(self, _: MissionItem) -> None:
-        # ArduPlane changes the mode (`start_command` in commands_logic.cpp), which stops the mission.
+        # ArduPlane changes the mode (`start_command` in commands_logic.cpp). This stops the mission.
         self.vehicle.set_mode(PlaneMode.RTL)
 
     def _wait(self, _: MissionItem) -> None:
@@ -250,7 +250,7 @@ class PlaneGuided(PlaneNavigatingMode):
         self._course = course
 
     def set_attitude(self, message: m.SetAttitudeTarget) -> None:
-        """Follow bank, pitch and throttle if the mask selects them. The bit of a rate selects its angle."""
+        """Follow bank, pitch and throttle if the mask selects them. The mask bit of a rate selects the angle."""
         ignored, now = message.type_mask, self.vehicle.now
         roll, pitch, _ = euler_from_quaternion(*message.q)
         whole = not ignored & Mask.ATTITUDE_IGNORE and ignored & _RATES == _RATES

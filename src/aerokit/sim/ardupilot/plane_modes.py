@@ -244,7 +244,7 @@ class PlaneCircle(PlaneAltitudeMode):
 
 
 class PlaneNavigatingMode(PlaneModeBase):
-    """LOITER, and base of modes that fly to a place and circle there; by default where the mode was entered."""
+    """LOITER, and base of modes that fly to a place (by default where the mode was entered) and circle there."""
 
     flags: int = _NAVIGATES
 
@@ -329,7 +329,7 @@ class PlaneTakeOff(PlaneNavigatingMode):
 
 
 class PlaneAutoland(PlaneNavigatingMode):
-    """AUTOLAND: lands at home in the direction of the take-off. It can only be entered in flight.
+    """AUTOLAND: lands at home in the direction of the take-off. The mode can only be entered in flight.
 
     If the plane is armed again after landing, it disarms at once.
     """
@@ -338,7 +338,7 @@ class PlaneAutoland(PlaneNavigatingMode):
 
     def enter(self, *, force: bool) -> bool:
         plane = self.vehicle
-        if plane.mode is self and plane.is_landed:  # Arming in AUTOLAND enters it again.
+        if plane.mode is self and plane.is_landed:  # Arming in AUTOLAND enters the mode again.
             return True
         if plane.is_landed:
             plane.send_text(MavSeverity.WARNING, "Must already be flying!")

@@ -77,7 +77,7 @@ class ArduPilotRadio:
         return self._vehicle.parameters.get("SIM_RC_FAIL", 0.0)
 
     def release_overrides(self) -> None:
-        """Drop all overrides, as a reboot or the loss of the ground station does."""
+        """Drop all overrides, because of a reboot or the loss of the ground station."""
         self._overrides.clear()
 
     def listen(self) -> None:
@@ -110,8 +110,8 @@ _CENTRE, _SUB_MIN_PWM, _SUB_MAX_PWM, _SUB_SCALE = 1500, 1100, 1900, 0.4
 class ArduPilotJoystick:
     """MANUAL_CONTROL of Copter and Plane: x is pitch, y roll, z throttle (0 to 1000), r yaw (-1000 to 1000).
 
-    Only messages from the ground station MAV_GCS_SYSID to this vehicle are used; they also count as its heartbeats.
-    Axes become overrides like those of RC_CHANNELS_OVERRIDE; an axis without a value releases its channel.
+    Only messages from the ground station MAV_GCS_SYSID to this vehicle are used. They also count as heartbeats of that
+    station. Axes become overrides like those of RC_CHANNELS_OVERRIDE; an axis without a value releases its channel.
     """
 
     def __init__(self, vehicle: ArduPilotHost) -> None:

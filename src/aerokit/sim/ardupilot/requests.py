@@ -50,7 +50,7 @@ class ArduPilotMessageRequests:
     """SET_MESSAGE_INTERVAL, GET_MESSAGE_INTERVAL, REQUEST_MESSAGE and REQUEST_DATA_STREAM.
 
     Stream rates are parameters of the port (MAV1_EXTRA1 …), which take effect at boot. REQUEST_DATA_STREAM changes
-    them: Plane saves and broadcasts the change, the other firmwares undo it at the next reboot.
+    these parameters. Plane saves and broadcasts the change; the other firmwares undo it at the next reboot.
     """
 
     def __init__(self, vehicle: ArduPilotHost, *, stream_groups: bool = True) -> None:
@@ -149,7 +149,7 @@ class ArduPilotMessageRequests:
         return f"MAV{self._vehicle.channels.index(channel) + 1}_"
 
     def restart(self) -> None:
-        """Restore the saved rates, as a reboot does."""
+        """Restore the saved rates, because of a reboot."""
         parameters = self._vehicle.parameters
         for name, (saved, present) in self._saved.items():
             if parameters[name] == present:

@@ -92,8 +92,8 @@ _DRIVES_ITSELF = frozenset(
 class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
     """Failsafes. FS_ACTION is executed FS_TIMEOUT after radio or ground station are lost, except in RTL and HOLD.
 
-    It is also executed on a disarmed rover. The firmware treats both links as one failsafe. If the check of the radio
-    is enabled, it reports a lost ground station as "Radio Failsafe" too.
+    The action is also executed on a disarmed rover. The firmware treats both links as one failsafe. If the check of the
+    radio is enabled, the firmware reports a lost ground station as "Radio Failsafe", too.
     """
 
     BATTERY_PRIORITIES: ClassVar[tuple[int, ...]] = (
@@ -109,7 +109,7 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
 
     @property
     def is_any_active(self) -> bool:
-        return bool(self._triggered) or self.estimator  # On Rover a low battery is not MAV_STATE_CRITICAL.
+        return bool(self._triggered) or self.estimator  # On Rover, a low battery does not cause MAV_STATE_CRITICAL.
 
     def update(self) -> None:
         self._check_radio()

@@ -196,11 +196,11 @@ class RoverSubAuto(MissionMode):
         }
 
     def default_speed(self) -> float:
-        """Return the speed of the parameters in m/s."""
+        """Return the speed that the parameters define, in m/s."""
         raise NotImplementedError
 
     def refuse(self) -> None:
-        """Send a text, if the firmware does, because there is no mission."""
+        """Report that there is no mission, by a text if the firmware sends one."""
 
     def travel(self, place: Ned, *, stops: bool) -> None:
         raise NotImplementedError

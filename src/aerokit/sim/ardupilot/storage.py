@@ -72,7 +72,7 @@ class ArduPilotStorage:
             self.parameters.burst = self.logs.burst = 1
 
     def restart(self) -> None:
-        """Drop transfers and sessions, as a reboot does; files stay."""
+        """Drop transfers and sessions because of a reboot; files stay."""
         self.parameters.restart()
         self.ftp.restart()
         self.logs.restart()
@@ -101,7 +101,7 @@ _SIGNING_OFF = 1
 
 
 class ArduPilotSigning(VehicleSigning):
-    """Message signing of ArduPilot. The time stamp is stored every 30 seconds; after a boot it starts a minute ahead.
+    """Message signing of ArduPilot. The time stamp is stored every 30 seconds. After a boot, it is a minute ahead.
 
     The first port is considered secure, like USB on a flight controller: it signs, but accepts unsigned frames. Set
     ``trusts_first_port`` to False, and call `load`, for a vehicle whose only link is a radio. Bit 0 of MAV1_OPTIONS,

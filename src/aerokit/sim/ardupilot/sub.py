@@ -90,7 +90,7 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
 
     @property
     def is_any_active(self) -> bool:
-        # On Sub a lost radio alone is not MAV_STATE_CRITICAL.
+        # On Sub, a lost radio alone does not cause MAV_STATE_CRITICAL.
         hull = self.pressure.is_exceeded or self.temperature.is_exceeded
         return self.pilot or self.battery_is_low or self.ground_station or self.leak or hull
 

@@ -214,7 +214,7 @@ def _target_local(vehicle: ArduPilotVehicle) -> m.PositionTargetLocalNed | None:
 
 
 def _is_navigating(vehicle: ArduPilotVehicle) -> bool:
-    """Return True in modes with NAV_CONTROLLER_OUTPUT: on Plane all but MANUAL, on Rover those that navigate."""
+    """Return True in modes with NAV_CONTROLLER_OUTPUT: on Plane all but MANUAL, on Rover the navigating modes."""
     mode = vehicle.mode
     if vehicle.KIND == "plane":
         return mode.number != PlaneMode.MANUAL
@@ -243,7 +243,7 @@ def _terrain_report(vehicle: ArduPilotVehicle) -> m.TerrainReport:
 
 
 def _terrain_request(vehicle: ArduPilotVehicle) -> m.TerrainRequest | None:
-    """Build a request for all terrain data around the vehicle, because it has none."""
+    """Build a request for all terrain data around the vehicle, because no data is stored."""
     place = vehicle.navigation.position
     if place is None:
         return None

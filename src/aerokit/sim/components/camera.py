@@ -52,7 +52,7 @@ _FORMAT_S, _FORMAT_PERCENTS = 0.5, (0, 25, 50, 75)
 
 
 def _format(camera: CameraBody, command: ReceivedCommand) -> int | CommandProgress:
-    """Takes two seconds; param 3 is 1 to reset the image log."""
+    """Format the card, which takes two seconds. Param 3 is 1 to reset the image log."""
     captures = camera.captures
     if command.param1 not in (0.0, 1.0) or not camera.card.is_inserted:
         return MavResult.DENIED
@@ -85,12 +85,12 @@ def _at_once(handler: AsyncHandler) -> CommandHandler:
 class SimulatedCamera(CameraBody):
     """Camera component that takes images, series and videos, with the true position and attitude of each image.
 
-    - ``component_id``: MAVLink reserves 100 to 105 for cameras; ``system_id``: None uses the vehicle's
+    - ``component_id``: MAVLink reserves 100 to 105 for cameras; ``system_id``: None uses that of the vehicle
     - ``vendor``, ``model``, ``definition_uri``, ``capabilities`` (CAMERA_CAP_FLAGS), ``resolution`` (pixels):
       content of CAMERA_INFORMATION. Without HAS_MODES it takes images and videos at any time.
     - ``streams``: addresses of video streams, such as ``rtsp://192.168.0.10:8554/main``; no video is sent
-    - ``thermal_celsius``: lowest and highest temperature in the image, for a thermal camera whose last stream is the
-      thermal one; None for a visible-light camera
+    - ``thermal_celsius``: lowest and highest temperature in the image, for a thermal camera, whose last stream is
+      thermal; None for a visible-light camera
     - ``picture``: content of image files (JPEG), or a function of the capture that returns it; the files are in
       ``/DCIM`` and served by MAVFTP
     - ``gimbal``: the gimbal that carries the camera and determines the direction of images

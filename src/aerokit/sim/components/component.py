@@ -34,7 +34,7 @@ class Pose(NamedTuple):
 
 
 def pose_of(vehicle: SimulatedVehicle) -> Pose | None:
-    """Return the true pose of a vehicle; None for a vehicle without one, such as a recording."""
+    """Return the true pose of a vehicle; None for a vehicle without a pose, such as a recording."""
     try:
         place = true_place(vehicle)
     except InvalidArgument:
@@ -45,7 +45,7 @@ def pose_of(vehicle: SimulatedVehicle) -> Pose | None:
 
 
 def serve_files(component: SimulatedComponent, files: FileTree) -> SessionFtpServer[FileTree]:
-    """Serve files by MAVFTP under the component's address, as PX4 does; call it in ``listen()``.
+    """Serve files by MAVFTP like PX4, under the component's address. Call this function in ``listen()``.
 
     The files may change at any time, see `FileTree.put`. Power-off ends sessions and keeps files. The component's
     ``faults.no_ftp`` turns the server off.
@@ -159,11 +159,11 @@ class SimulatedComponent:
         self.send(Statustext(severity, text[:50], 0, 0))
 
     def call_later(self, delay: float, action: Callable[[], None]) -> None:
-        """Call a function after ``delay`` simulated seconds; a reboot cancels it."""
+        """Call a function after ``delay`` simulated seconds; a reboot cancels the call."""
         self.vehicle.call_later(delay, action)
 
     def call_at(self, when: float, action: Callable[[], None]) -> None:
-        """Call a function at a simulated time; a reboot cancels it."""
+        """Call a function at a simulated time; a reboot cancels the call."""
         self.vehicle.call_at(when, action)
 
     def stream(self, message_id: int, interval_s: float, channel: Channel | None = None) -> None:

@@ -32,10 +32,10 @@ _STILL: Angles = (0.0, 0.0, 0.0)
 class SimulatedGimbal(SimulatedComponent, GimbalMount):
     """A gimbal device and its gimbal manager; it turns at a limited rate and can point at positions.
 
-    Only the component in control can command the gimbal; initially no component is. Take control with
+    Only the component in control can command the gimbal. Initially, no component is in control. Take control with
     MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE. Commands of other components are DENIED, their messages are ignored.
 
-    - ``component_id``: MAVLink reserves 154 and 171 to 175 for gimbals; ``system_id``: None uses the vehicle's
+    - ``component_id``: MAVLink reserves 154 and 171 to 175 for gimbals; ``system_id``: None uses that of the vehicle
     - ``roll_deg``, ``pitch_deg``, ``yaw_deg``: minimum and maximum angle; roll and pitch relative to the horizon
     - ``slew_deg_s``: turn rate
     - ``attitude_rate_hz``: rate of GIMBAL_DEVICE_ATTITUDE_STATUS

@@ -54,7 +54,7 @@ class Px4Calibration:
 
     @property
     def is_running(self) -> bool:
-        """True during a calibration; HEARTBEAT reports it and arming is denied."""
+        """True during a calibration, which HEARTBEAT reports and during which arming is denied."""
         return bool(self._sensor)
 
     def command(self, command: ReceivedCommand) -> int:
@@ -72,7 +72,7 @@ class Px4Calibration:
             self._start(sensor)
             self._begin_side(0, self._number)
         elif sensor == "esc":
-            # check_battery_disconnected in esc_calibration.cpp; the simulated battery is always connected.
+            # As check_battery_disconnected in esc_calibration.cpp, because the simulated battery is always connected.
             self._px4.send_text(MavSeverity.CRITICAL, "[cal] calibration failed: Disconnect battery and try again")
             return MavResult.DENIED
         elif sensor == "airspeed":

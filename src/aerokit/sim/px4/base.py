@@ -244,7 +244,7 @@ class Px4Vehicle(Px4Host):
         self.reboot(math.inf)
 
     def send_text(self, severity: int, text: str) -> None:
-        """Queue a text with an id, and mostly a final tab; it follows the answer that is being sent."""
+        """Queue a text with an id and usually a final tab. The text follows the answer that is being sent."""
         self.call_later(0.0, partial(self.events.send_for, text))
         text = on_the_wire(text)
         number, self._next_text_id = self._next_text_id, (self._next_text_id + 1) & 0xFFFF
@@ -320,6 +320,10 @@ class Px4Vehicle(Px4Host):
         if self.is_armed and not self.is_landed and self.failsafes.can_be_overridden(size):
             self.info("Pilot took over using sticks")
             self.change_mode(modes.POSITION)
+
+    @property
+    def is_steady(self) -> bool:
+        return self.motion.is_steady
 
     def tick(self, dt: float) -> None:
         """Update mode, motion, land detector, battery and motors."""

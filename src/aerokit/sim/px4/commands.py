@@ -24,13 +24,13 @@ from aerokit.sim.px4.payload import gimbal_commands
 from aerokit.sim.px4.telemetry import available_modes
 
 _C = MavCmd
-# Accepted without a visible effect.
+# Commands that are accepted without a visible effect.
 _ACCEPTED = (
     _C.NAV_ROI, _C.NAV_VTOL_TAKEOFF, _C.DO_SET_ACTUATOR, _C.DO_SET_ROI_LOCATION, _C.DO_SET_ROI_WPNEXT_OFFSET,
     _C.DO_SET_ROI_NONE, _C.DO_SET_ROI, _C.DO_SET_SAFETY_SWITCH_STATE,
 )  # fmt: skip
 
-# Not answered, because the modules that handle them do not run in this configuration.
+# Commands without an answer, because their modules do not run in this configuration.
 _UNANSWERED = (
     _C.NAV_DELAY, _C.DO_DIGICAM_CONTROL, _C.DO_MOUNT_CONFIGURE, _C.DO_MOUNT_CONTROL, _C.DO_SET_CAM_TRIGG_DIST,
     _C.DO_SET_CAM_TRIGG_INTERVAL, _C.PREFLIGHT_UAVCAN, _C.REQUEST_CAMERA_INFORMATION, _C.SET_CAMERA_MODE,
@@ -68,7 +68,7 @@ _FAILURES = {
 
 
 def _inject_failure(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
-    """Acknowledge a failure of the motors or the battery, as SIH does; the failure has no effect."""
+    """Acknowledge a failure of the motors or the battery, like SIH. The failure has no effect."""
     if not px4.parameters.get("SYS_FAILURE_EN", 0):
         return MavResult.DENIED
     unit, kind = whole(command.param1), whole(command.param2)
@@ -278,7 +278,7 @@ class _Flight:
         return self._change(modes.ORBIT)
 
     def tune(self, command: ReceivedCommand) -> int | None:
-        """Start tuning, or report its progress. Complete tuning waits for disarming, as with MC_AT_APPLY 1."""
+        """Start tuning, or report its progress. A complete tuning waits for disarming, as with MC_AT_APPLY 1."""
         px4 = self._px4
         if command.param1 != 1.0 or command.param2 != 0.0:
             return MavResult.DENIED

@@ -55,7 +55,7 @@ class Px4External:
 
     @property
     def target(self) -> tuple[float, float] | None:
-        """Place of the landing target (north, east) in the world frame; None if it was lost for PLD_BTOUT seconds."""
+        """Landing target (north, east) in the world frame; None if the target was lost for PLD_BTOUT seconds."""
         is_fresh = self._px4.now - self._target_at <= self._px4.parameters["PLD_BTOUT"]
         return self._target if is_fresh else None
 

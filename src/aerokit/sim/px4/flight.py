@@ -65,7 +65,7 @@ _RELATIVE = (MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT)
 
 
 def return_destination(px4: Px4Host) -> Ned:
-    """Return the place of the return: north, east, and the down coordinate from which its heights are counted."""
+    """Return the destination of a return: north, east, and the down coordinate that its heights refer to."""
     kind = round(px4.parameters["RTL_TYPE"])
     points = [_place(px4, item) for item in px4.missions.items(MavMissionType.RALLY)]
     if kind not in (*_NEAREST, _RALLY_FIRST) or not points:
@@ -221,7 +221,7 @@ class Px4Flight:
         return slow + (fast - slow) * share
 
     def _plan_return(self) -> None:
-        """Plan a return at RTL_RETURN_ALT above the landing point, or at RTL_DESCEND_ALT if it is near."""
+        """Plan a return at RTL_RETURN_ALT above the landing point, or at RTL_DESCEND_ALT if this point is near."""
         vehicle = self._vehicle
         self.destination = return_destination(vehicle)
         north, east, down = vehicle.motion.north, vehicle.motion.east, vehicle.motion.down
@@ -232,7 +232,7 @@ class Px4Flight:
         self.target = (north, east, min(down, self.destination[2] - height))
         amsl = vehicle.frame.origin.altitude_m - self.target[2]
         text = f"RTL: start return at {amsl:.0f} m ({height:.0f} m above destination)"
-        vehicle.call_later(0.0, lambda: vehicle.info(text))  # PX4 sends it after the text of the command.
+        vehicle.call_later(0.0, lambda: vehicle.info(text))  # PX4 sends this text after that of the command.
 
     def _return(self) -> None:
         vehicle, motion = self._vehicle, self._vehicle.motion

@@ -53,7 +53,7 @@ def rejection(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
 
 def _missing_landing(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
     """Check MIS_TKO_LAND_REQ: 1 requires a take-off, 2 (a plane's default) a landing, 3 both, 4 both or none."""
-    if "MIS_TKO_LAND_REQ" not in px4.parameters or not items:  # The multicopter's parameter table does not contain it.
+    if "MIS_TKO_LAND_REQ" not in px4.parameters or not items:  # The multicopter's table lacks this parameter.
         return None
     takes_off, lands = (any(item.command in kind for item in items) for kind in (_TAKE_OFFS, _LANDINGS))
     required = round(px4.parameters["MIS_TKO_LAND_REQ"])
@@ -100,7 +100,7 @@ def outside_fence(px4: Px4Host, items: Sequence[MissionItem]) -> int | None:
 
 
 def warning(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
-    """Return a warning if the first waypoint of a mission is far away, or None."""
+    """Return a warning if the first waypoint of a mission is far away, otherwise None."""
     for item in items:
         if item.command in _WITH_PLACE:
             north, east = px4.frame.to_local(round(item.x), round(item.y))
@@ -162,7 +162,7 @@ class Px4Mission:
 
     @property
     def state(self) -> int:
-        """MISSION_STATE; a disarmed mission without progress keeps the previous state."""
+        """MISSION_STATE. Out of mission mode, the state stays the same until an item is reached."""
         if not self.is_valid:
             self._state = MissionState.NO_MISSION
         elif self.is_finished:
@@ -180,7 +180,7 @@ class Px4Mission:
         return self._item is not None and not self.is_finished and self._phase != "land"
 
     def on_replaced(self, current: int) -> None:
-        """Handle an uploaded mission; in mission mode, restart with it."""
+        """Handle an uploaded mission. In mission mode, start the new mission."""
         self.current, self.is_finished = max(0, current), False
         self.forget_reached()
         self._jumps.clear()

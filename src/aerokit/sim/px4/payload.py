@@ -51,7 +51,7 @@ class Px4Gimbal:
         self._flags = 0
         self._place: tuple[int, int, float] | None = None
         self._was_returning = False
-        self.is_fitted: bool = False  # True if MNT_MODE_IN enabled it at power-on.
+        self.is_fitted: bool = False  # True if MNT_MODE_IN enabled the gimbal at power-on.
         px4.on(m.GimbalManagerSetAttitude, self._on_attitude)
 
     def start(self) -> None:

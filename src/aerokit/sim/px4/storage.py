@@ -42,7 +42,7 @@ RTL_LOITER_RAD RTL_MIN_DIST RTL_RETURN_ALT RTL_TYPE RWTO_RAMP_TIME SDLOG_MODE SY
 def px4_parameters(count: int | None = None, table: str = "quadrotor") -> SimParameters:
     """Return the parameters of a "quadrotor" (910) or an "airplane" (978).
 
-    ``count`` limits their number, but keeps all that the simulation reads.
+    ``count`` limits the number of parameters. All parameters that the simulation reads are kept.
     """
     data = pkgutil.get_data(__name__, f"{table}.param.csv")
     assert data is not None
@@ -52,8 +52,8 @@ def px4_parameters(count: int | None = None, table: str = "quadrotor") -> SimPar
 class Px4ParameterMount(ParameterPackMount):
     """``@PARAM`` files of PX4.
 
-    Unlike in ArduPilot, opening the file reports the exact size, neither a value nor its default extends over the end
-    of a block of 239 bytes, and uploaded parameters are applied as they arrive.
+    Differences from ArduPilot: opening the file reports the exact size; neither a value nor a default extends over the
+    end of a block of 239 bytes; uploaded parameters are applied as they arrive.
     """
 
     def __init__(self, parameters: SimParameters, apply: Callable[[str, float], None]) -> None:
@@ -67,8 +67,8 @@ class Px4ParameterMount(ParameterPackMount):
 class _Writer(FileHandle):
     """Upload of parameters, which are applied as they arrive.
 
-    Repeated bytes are acknowledged again. A gap makes the upload fail, as does closing an incomplete upload; the
-    parameters applied until then are kept.
+    Repeated bytes are acknowledged again. A gap makes the upload fail. Closing an incomplete upload fails, too.
+    Parameters applied until then are kept.
     """
 
     def __init__(self, parameters: SimParameters, apply: Callable[[str, float], None]) -> None:
@@ -175,7 +175,7 @@ class Px4Storage:
             self.parameters.burst = self.ftp.burst = self.logs.burst = 1
 
     def restart(self) -> None:
-        """Drop transfers and sessions, as a reboot does; files stay."""
+        """Drop transfers and sessions because of a reboot; files stay."""
         self.parameters.restart()
         self.ftp.restart()
         self.logs.restart()

@@ -228,7 +228,7 @@ def _home_position(px4: Px4Vehicle) -> m.HomePosition | None:
 
 
 def global_origin(px4: Px4Vehicle) -> m.GpsGlobalOrigin | None:
-    """Return GPS_GLOBAL_ORIGIN, the origin of the local frame; None without one."""
+    """Return GPS_GLOBAL_ORIGIN, the origin of the local frame; None without an origin."""
     if not px4.has_origin:
         return None
     origin = px4.external.origin or px4.frame.origin

@@ -34,7 +34,7 @@ class SimulatedPx4(Px4Vehicle):
     - ``home``: latitude, longitude (degrees), altitude AMSL (m); ``heading_deg``: initial heading
     - ``boot_time_s``: seconds until the vehicle can be armed
     - ``version``: 1.16 accepts unknown modes, and switches to POSITION when offboard set-points stop. 1.17 refuses
-      unknown modes, switches to RTL instead, and refuses a COMMAND_INT in a frame other than GLOBAL_INT
+      unknown modes, switches to RTL when these stop, and refuses a COMMAND_INT in a frame other than GLOBAL_INT
     - ``fast_rate_hz``: rate of attitude, position and targets on "normal" links
     - ``link_modes``: MAV_n_MODE of the first link, the second …: "normal", "onboard", "config" or "minimal"
     - ``parameters``: values that differ from the defaults; ``parameter_count``: limits their number, for quick tests;

@@ -57,8 +57,8 @@ class ZenohConnect(NetworkLink):
         name: name of the vehicle side in the fleet.
         options: connection to the network.
         client: name of this program, unique on the network; "": the name of this computer and a number.
-        control: "free": acquire control with the first command while it is free; "take": take control when the link
-            opens; "never": read only.
+        control: "free" acquires control with the first command, if no other client has it. "take" takes control when
+            the link opens. "never" is read only.
         open_timeout_s: time-out for finding the vehicle side, above 0.
 
     Raises:
@@ -120,7 +120,7 @@ class ZenohConnect(NetworkLink):
         raise LinkOpenError(f"cannot open {self.address}: {self._describe_missing()}")
 
     def _declare(self, queue: LoopQueue[Callable[[], object]], zenoh: Any, session: Any) -> None:
-        # Runs on a thread, as do the callbacks.
+        # This function and the callbacks run on threads.
         def callback(process: Callable[[bytes, bytes, bool], object]) -> Callable[[Any], None]:
             def on_sample(sample: Any) -> None:
                 is_put, payload = sample.kind == zenoh.SampleKind.PUT, payload_of(sample)

@@ -133,7 +133,7 @@ class ControlLease:
         return self._holder == client
 
     def take(self, client: str, now: float) -> None:
-        """Give the lease to this client, even if another one holds it."""
+        """Give the lease to this client, even if another client holds it."""
         self._holder, self._received_at = client, now
 
     def release(self, client: str) -> None:
@@ -148,7 +148,7 @@ class ClientFilter:
         self.refused: int = 0
         """Number of refused frames."""
         self.received_at: float = 0.0
-        """Time of the last data of the client; set by the owner."""
+        """Time of the last data of the client; set by the link that owns this filter."""
         self._client, self._lease = client, lease
         self._framer = _framer()
         self._nonce: int | None = None  # nonce of the program that uses this client name
@@ -158,7 +158,7 @@ class ClientFilter:
     def receive(self, data: bytes, mode: ControlMode, now: float, nonce: int = 0) -> tuple[bytes, list[RefusalNotice]]:
         """Process a fresh datagram. Return the accepted frames, and the notices for the client.
 
-        ``nonce`` distinguishes programs that use the same client name by mistake; only the first one gets control.
+        ``nonce`` distinguishes programs that use the same client name by mistake; only the first program gets control.
         """
         is_namesake = self._is_namesake(nonce, mode, now)
         if not is_namesake:
@@ -260,7 +260,7 @@ MAX_DELAY_S = 2.0
 
 _MAX_NONCES = 256
 
-_MAX_DRIFT = 0.001  # relative drift of two clocks; quartz is ten times better
+_MAX_DRIFT = 0.001  # maximum relative drift of two clocks; quartz clocks are ten times better
 
 
 class FreshnessChecker:
@@ -271,7 +271,7 @@ class FreshnessChecker:
         self.late: int = 0
         """Datagrams refused because their stamp was too old, or from another vehicle side."""
         self.duplicates: int = 0
-        """Datagrams refused because an equal or later one was received before."""
+        """Datagrams refused because an equal or later datagram was received before."""
         self._number = 0
         self._sent: deque[tuple[int, float]] = deque()  # (number, time) of valid beacons
         self._sequences: OrderedDict[tuple[str, int], int] = OrderedDict()
@@ -283,7 +283,7 @@ class FreshnessChecker:
         return Beacon(self.epoch, self._number, now, lease_holder)
 
     def accepts(self, client: str, stamp: Stamp | None, now: float) -> bool:
-        """Return True if a datagram with this stamp is fresh and new. Refused ones are counted."""
+        """Return True if a datagram with this stamp is fresh and new. Refused datagrams are counted."""
         self._expire(now)
         is_fresh = (
             stamp is not None

@@ -27,7 +27,7 @@ VERSION = 1
 """Protocol version. Messages of other versions are ignored."""
 
 ControlMode = str
-"""Control that a client requests: "free" (if it is free), "take" (in any case), "never" (read only)."""
+"""Control that a client requests: "free" (if no client has it), "take" (in any case), "never" (read only)."""
 
 CONTROL_MODES: tuple[ControlMode, ...] = ("free", "take", "never")
 
@@ -155,7 +155,7 @@ class RefusalNotice(Snapshot):
     reason: str
     """Reason for the refusal, as a clause."""
     lease_holder: str | None = None
-    """Client that has control, if that is the reason."""
+    """Client that has control, if its control is the reason."""
     answer: bytes = b""
     """Frames by which a vehicle would reject the command: COMMAND_ACK or MISSION_ACK, and STATUSTEXT."""
     count: int = 1

@@ -36,7 +36,7 @@ MAX_CLIENTS = 64
 """Maximum number of clients. A further one is ignored unless a client has been silent for `CLIENT_TIMEOUT_S`."""
 
 CLIENT_TIMEOUT_S = 30.0
-"""Silence after which a client may be replaced by a new one."""
+"""Silence after which a client may be replaced by a new client."""
 
 _MIN_BEACON_INTERVAL_S = 0.02
 _RIVAL_TIMEOUT_S = 2.5 * BEACON_INTERVAL_S
@@ -46,7 +46,7 @@ logger: logging.Logger = logging.getLogger("aerokit")
 
 
 class ZenohListen(NetworkLink):
-    """``zenohin:`` link: serves the clients (`ZenohConnect`) of one name. Each client is a peer.
+    """``zenohin:`` link: serves the clients (`ZenohConnect`) that use its name. Each client is a peer.
 
     The link is not lost when clients or the network fail. Outdated datagrams, and commands while another client has
     control, are refused and counted, and the client is notified.
@@ -86,12 +86,12 @@ class ZenohListen(NetworkLink):
 
     @property
     def late_datagrams(self) -> int:
-        """Datagrams of clients that were refused as outdated."""
+        """Number of datagrams of clients that were refused as outdated."""
         return self._freshness.late
 
     @property
     def refused_frames(self) -> int:
-        """Frames of clients that were refused: outdated, or commands without control."""
+        """Number of refused frames of clients: outdated frames, and commands without control."""
         return self._refused + sum(client.refused for client in self._clients.values())
 
     def write(self, data: bytes, peer: Peer = None) -> None:
@@ -124,8 +124,8 @@ class ZenohListen(NetworkLink):
         self._send_beacon()
 
     def _find_rivals(self, queue: LoopQueue[Callable[[], object]], zenoh: Any, session: Any) -> None:
-        # Runs on a thread. A liveliness token alone does not prove that the name is in use, because the token of a
-        # killed program remains for a while.
+        # This function runs on a thread. A liveliness token alone does not prove that the name is in use, because the
+        # token of a killed program remains for a while.
         def on_beacon(sample: Any) -> None:
             payload = payload_of(sample)
             if len(payload) <= MAX_PAYLOAD_BYTES:
@@ -205,7 +205,7 @@ class ZenohListen(NetworkLink):
             self._remove_client(str(oldest))
 
     def _on_client_joined(self, name: str) -> None:
-        # Send an extra beacon, so that the client need not wait for the next one.
+        # Send an extra beacon, so that the client need not wait for the next periodic beacon.
         if self._add_client(name) is not None and self._timer is not None:
             self._timer.cancel()
             delay_s = max(0.0, self._beacon_at + _MIN_BEACON_INTERVAL_S - self._now())

@@ -20,7 +20,7 @@ ItemT = TypeVar("ItemT")
 MAX_QUEUED = 2048
 """Maximum number of items that wait for a blocked event loop. A further item replaces the oldest."""
 
-_MAX_PER_ITERATION = 256  # so that other tasks can run
+_MAX_PER_ITERATION = 256  # a limit, so that other tasks can run
 
 
 class LoopQueue(Generic[ItemT]):
@@ -95,22 +95,22 @@ async def open_in_thread(work: Callable[[], ItemT], close: Callable[[ItemT], obj
 
 
 MAX_PAYLOAD_BYTES = 65535
-"""Maximum payload; larger ones are ignored. Both sides send single frames or the frames of one datagram."""
+"""Maximum payload; larger payloads are ignored. Both sides send single frames or the frames of one datagram."""
 
 _CONNECT_FAILED = "Unable to connect to any of"
 
-_ENDPOINTS = re.compile(r"[a-z]+/[^\s,()\[\]]+")  # zenoh 1.6 writes "[tcp/a:1]", others "[Single(tcp/a:1)]"
+_ENDPOINTS = re.compile(r"[a-z]+/[^\s,()\[\]]+")  # zenoh 1.6: "[tcp/a:1]", other versions: "[Single(tcp/a:1)]"
 
 _TX = "transport/link/tx/queue"
 
-# Without this, each put that drops data may block the loop for a millisecond.
+# Without this setting, each put that drops data may block the loop for a millisecond.
 _DROP_AT_ONCE = (f"{_TX}/congestion_control/drop/wait_before_drop", 0)
 
 _SETTINGS = (
     # Batches of up to 64 KB: enough for a burst of 1000 frames, and the maximum that a broken connection delays.
     (f"{_TX}/size/data", 4),
     (f"{_TX}/size/real_time", 4),
-    ("transport/shared_memory/enabled", False),  # its pool for large messages takes 16 MB
+    ("transport/shared_memory/enabled", False),  # the memory pool for large messages would take 16 MB
 )
 
 
@@ -138,7 +138,7 @@ class NetworkLink(BaseLink):
     def __init__(self, address: str) -> None:
         super().__init__(address)
         self._session: Any = None
-        self._declared: list[Any] = []  # they end when they are garbage-collected
+        self._declared: list[Any] = []  # declarations end when they are garbage-collected
         self._queue: LoopQueue[Callable[[], object]] | None = None
         self._timer: asyncio.TimerHandle | None = None
 
@@ -228,7 +228,7 @@ def _config(zenoh: Any, address: str, options: NetworkOptions) -> Any:
     except zenoh.ZError as error:
         raise InvalidArgument(f"{address}: {_reason(error)}") from error
     for key, value in (_DROP_AT_ONCE, *(_SETTINGS if not options.config else ())):
-        with contextlib.suppress(zenoh.ZError):  # unknown to this version of zenoh
+        with contextlib.suppress(zenoh.ZError):  # this version of zenoh does not know the option
             config.insert_json5(key, json.dumps(value))
     return config
 

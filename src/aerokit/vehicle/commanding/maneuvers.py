@@ -115,7 +115,7 @@ class ManeuverActions(VehicleBase):
 
         A PX4 fixed wing flies the figure itself (MAV_CMD_DO_FIGURE_EIGHT), as two circles joined by straight lines, and
         continues until another order. For ArduCopter and PX4's multicopters, aerokit streams the set-points of a
-        lemniscate; at the end the vehicle holds at the center. Errors, cancellation and time-out are as for
+        lemniscate; at the end the vehicle holds at the center. Time-out, cancellation and errors are those of
         :meth:`orbit`.
 
         Args:

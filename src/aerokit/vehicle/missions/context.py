@@ -138,6 +138,7 @@ class MissionTracker:
 
     def __init__(self, session: VehicleSession) -> None:
         self._session = session
+        self._source = Source(session.system_id, session.component_id, "MISSION_CURRENT")
         self._offset = int(session.autopilot.home_is_item_0)
         self._repeats = session.autopilot.repeats_item_reached
         new_cell = session.connection.new_cell
@@ -175,7 +176,7 @@ class MissionTracker:
         return self._session.connection.now() - self._at_last_at <= FINAL_ITEM_MAX_AGE_S
 
     def on_transfer_count(self, count: int) -> None:
-        self._set_count(count, "MISSION_COUNT")
+        self.count.set(count, Source(self._session.system_id, self._session.component_id, "MISSION_COUNT"))
 
     def start(self) -> None:
         self.is_complete = self._was_active = False
@@ -197,11 +198,11 @@ class MissionTracker:
             current = None
         if reported.total is None and reported.state == MissionState.NO_MISSION:
             current = None
-            self._set_count(0, "MISSION_CURRENT")
+            self.count.set(0, self._source)
         elif reported.total is not None:
-            self._set_count(reported.total, "MISSION_CURRENT")
-        self.progress.set(MissionProgress(current, self.count.latest, reported.state), self._source("MISSION_CURRENT"))
-        self.current.set(current, self._source("MISSION_CURRENT"))
+            self.count.set(reported.total, self._source)
+        self.progress.set(MissionProgress(current, self.count.latest, reported.state), self._source)
+        self.current.set(current, self._source)
         if current is not None and current == self.last:
             self._at_last_at = self._session.connection.now()
         if current != before:
@@ -249,9 +250,3 @@ class MissionTracker:
     def is_in_mission_mode(self) -> bool:
         mode = self._session.autopilot.mode_for("mission", is_vtol=self._session.telemetry.is_vtol)
         return mode is not None and self._session.telemetry.is_in(mode)
-
-    def _set_count(self, count: int, message: str) -> None:
-        self.count.set(count, self._source(message))
-
-    def _source(self, message: str) -> Source:
-        return Source(self._session.system_id, self._session.component_id, message)

@@ -105,7 +105,7 @@ class MissionEndDetector:
         if now - self._left_at < END_GRACE_S or now < self._grace_until:
             return None
         if session.telemetry.is_confirmed_disarmed:
-            return f"the vehicle is not armed, {self.describe()}"
+            return f"the mission has not ended ({self.describe()}), but the vehicle is disarmed"
         if self._was_in_mode:
             return f"the mode changed to {session.telemetry.mode_name}, {self.describe()}"
         return f"the vehicle is not flying its mission, it is in {session.telemetry.mode_name}"

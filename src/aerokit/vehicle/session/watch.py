@@ -58,7 +58,7 @@ class VehicleWatch:
         on_reboot: Callable[[], None],
     ) -> None:
         self._connection, self._system_id, self._component_id = connection, system_id, component_id
-        self._on_reboot = on_reboot
+        self._now, self._on_reboot = connection.now, on_reboot
         self.last_heartbeat_at: float = connection.now()
         self._heartbeat_read_at = connection.now()
         self.link_state: StateCell[LinkState] = StateCell("link_state", connection.now, "HEARTBEAT")
@@ -187,7 +187,7 @@ class VehicleWatch:
             self._note_time(frame, "TIMESYNC", message.tc1 // 1_000_000)
 
     def _note_time(self, frame: Frame, clock: str, milliseconds: int) -> None:
-        now = self._connection.now()
+        now = self._now()
         before, then = self._times.get(clock, (milliseconds, now))
         # This is a lower bound, because the earlier message may have been delayed as well.
         late = 1000 * (frame.received_at - then) - (milliseconds - before)

@@ -210,15 +210,14 @@ class StreamedMessage:
             self._look_at = frame.received_at + MAX_DECODE_DELAY_S
             # Observers must be called in the loop's thread, so another thread must not decode the frame.
             with self._lock:
-                self.catch_up()
+                if self.pending:
+                    self.catch_up()
                 self._apply(frame, message)
             return
-        instance_at = self._number_at
-        if instance_at is None:
-            self.pending[0] = frame if message is None else message
-        else:
-            number = frame.body[instance_at] if len(frame.body) > instance_at else 0
-            self.pending[number] = frame if message is None else message
+        number, number_at = 0, self._number_at
+        if number_at is not None and len(frame.body) > number_at:
+            number = frame.body[number_at]
+        self.pending[number] = message or frame
 
     def catch_up(self) -> None:
         """Decode the pending frames in the order of their arrival."""

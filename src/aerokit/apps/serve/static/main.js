@@ -4,7 +4,7 @@ import { drawAttitude } from "./attitude.js";
 import { age, byId, element, number, show } from "./dom.js";
 import { colourOf, MapView } from "./map.js";
 import { Orders } from "./orders.js";
-import { currentItem, MissionPanel, OrderPanel, orderText, ParameterPanel, TextPanel } from "./panels.js";
+import { currentItem, MissionPanel, OrderPanel, outcome, ParameterPanel, TextPanel } from "./panels.js";
 import { inWords, isConnected, showReadiness, showSilences } from "./readiness.js";
 import { ask, hasToken, openStream, useToken } from "./server.js";
 import { ageOf, BigValues, bitNames, StateTable } from "./state.js";
@@ -12,14 +12,14 @@ import { ageOf, BigValues, bitNames, StateTable } from "./state.js";
 const page = { vehicles: new Map(), selected: undefined, receivedAt: 0, atSeconds: null, isOpen: false, isReadOnly: false, modesOf: undefined };
 const selected = () => page.vehicles.get(page.selected);
 
-const map = new MapView(byId("map"), (place) => { pick(false); orders.goTo(place, heightNow()); });
+const map = new MapView(byId("map"), (place, y) => { pick(false); orders.goTo(place, heightNow(), y); });
 const big = new BigValues(byId("tiles-of-state"));
 const table = new StateTable();
 const missions = new MissionPanel(draw, (file) => orders.upload(file));
 const texts = new TextPanel();
 const orderList = new OrderPanel();
 const orders = new Orders(byId("orders"), {
-  vehicle: selected, seenAt: () => page.atSeconds, pick: () => pick(!map.isPicking), toast, record,
+  vehicle: selected, seenAt: () => page.atSeconds, pick: () => pick(!map.isPicking), toast, record, changed: draw,
 });
 const parameters = new ParameterPanel((id, parameter) => { if (!page.isReadOnly && hasToken()) orders.setParameter(id, parameter); });
 
@@ -33,6 +33,7 @@ byId("tabs").append(...tabButtons);
 function open(panel) {
   tab = panel;
   TABS.forEach(([, each], index) => tabButtons[index].setAttribute("aria-selected", String(each === panel)));
+  panel.show(selected(), page.receivedAt); // at once, because it has the values from when it was last open
   byId("panel").replaceChildren(panel.node);
   draw();
 }
@@ -179,20 +180,39 @@ function drawNow() {
   tab.show(vehicle, page.receivedAt);
   const attitude = vehicle && vehicle.states.attitude;
   drawAttitude(byId("attitude"), attitude && attitude.value, ageOf(attitude, page.receivedAt) > 3);
-  const going = orderList.running(page.selected, "go_to");
+  const target = orders.target ?? orderList.running(page.selected, "go_to")?.arguments;
   const plan = { items: missions.items(page.selected), current: vehicle ? currentItem(vehicle) : null };
-  map.draw([...page.vehicles.values()].map(onMap), page.selected, plan, going && going.arguments, missions.fence(page.selected));
+  map.draw([...page.vehicles.values()].map(onMap), page.selected, plan, target, missions.fence(page.selected));
   byId("follow").setAttribute("aria-pressed", String(map.follows !== null));
   page.hasToken = hasToken();
   orders.enable(vehicle, page);
+  orders.showTarget(vehicle, page.receivedAt);
+  placeToasts();
   showServer();
   showTokenNotice();
 }
 
-function toast(text, kind) {
+// A newer toast with the same key replaces the older one.
+function toast(text, kind, key) {
   const made = element("button", { type: "button", class: `toast ${kind}`, title: "close", onclick: () => made.remove() }, text);
+  if (key !== undefined) {
+    made.dataset.key = key;
+    byId("toasts").querySelector(`[data-key="${CSS.escape(key)}"]`)?.remove();
+  }
   byId("toasts").append(made);
+  placeToasts();
+  byId("toasts").scrollTop = byId("toasts").scrollHeight;
   setTimeout(() => made.remove(), kind === "failed" ? 15000 : 5000);
+}
+
+// Toasts never cover the orders: they are above them, or below where there is more room.
+function placeToasts() {
+  const { top, bottom } = byId("orders").getBoundingClientRect(), gap = 8;
+  const ceiling = Math.max(0, document.querySelector("header").getBoundingClientRect().bottom) + gap;
+  const above = Math.min(top, innerHeight) - gap - ceiling, below = innerHeight - Math.max(bottom, ceiling) - 2 * gap;
+  const box = byId("toasts").style, isAbove = above >= below;
+  box.bottom = `${isAbove ? Math.max(gap, innerHeight - top + gap) : gap}px`;
+  box.maxHeight = `${Math.max(0, isAbove ? above : below)}px`;
 }
 
 const announced = new Set();
@@ -208,7 +228,7 @@ function record(order, isNew = true) {
   if (isNew && !announced.has(order.key + order.state)) {
     announced.add(order.key + order.state);
     const why = order.problem ? `: ${inWords(order.problem)}` : "";
-    toast(`Vehicle ${order.system_id}: ${orderText(order)}: ${order.state === "running" ? "ordered" : order.state}${why}`, order.state);
+    toast(`Vehicle ${order.system_id}: ${outcome(order)}${why}`, order.state, order.key);
   }
   draw();
 }
@@ -288,3 +308,4 @@ open(table);
 openStream({ message: onMessage, opened, closed });
 setInterval(draw, 500);
 window.addEventListener("resize", draw);
+window.addEventListener("scroll", placeToasts, { passive: true });

@@ -8,6 +8,18 @@ const METRES_PER_DEGREE = 111195;
 const MAX_POINTS = 5000;
 const MAX_AGE_S = 3;
 
+const DIRECTIONS = ["north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west"];
+
+// "13 m north-east of": from one position to another.
+export function distanceText(from, to) {
+  const north = (to.latitude_deg - from.latitude_deg) * METRES_PER_DEGREE;
+  const away = ((to.longitude_deg - from.longitude_deg + 540) % 360) - 180;
+  const east = away * METRES_PER_DEGREE * Math.cos(from.latitude_deg * Math.PI / 180), metres = Math.hypot(north, east);
+  if (metres < 1) return "less than 1 m from";
+  const direction = DIRECTIONS[(Math.round(Math.atan2(east, north) * 4 / Math.PI) + 8) % 8];
+  return `${metres < 1000 ? `${metres.toFixed(0)} m` : `${(metres / 1000).toFixed(1)} km`} ${direction} of`;
+}
+
 export class MapView {
   constructor(canvas, picked) {
     this.canvas = canvas;
@@ -120,7 +132,7 @@ export class MapView {
       const place = fingers.get(event.pointerId);
       fingers.delete(event.pointerId);
       if (place && event.type === "pointerup" && travelled <= 4 && this.isPicking && this.origin) {
-        this.picked(this.toPlace(this.fromScreen(place.x, place.y)));
+        this.picked(this.toPlace(this.fromScreen(place.x, place.y)), event.clientY);
       }
     };
     this.canvas.addEventListener("pointerup", lift);
@@ -286,11 +298,13 @@ export class MapView {
     const at = this.place(position), pen = this.context;
     pen.lineWidth = 2;
     if (vehicle && vehicle.position) this.line([this.place(vehicle.position), at], colour("plan"), [3, 5]);
-    this.line([{ x: at.x - 8, y: at.y }, { x: at.x + 8, y: at.y }], colour("text"));
-    this.line([{ x: at.x, y: at.y - 8 }, { x: at.x, y: at.y + 8 }], colour("text"));
+    this.line([{ x: at.x - 14, y: at.y }, { x: at.x + 14, y: at.y }], colour("accent"));
+    this.line([{ x: at.x, y: at.y - 14 }, { x: at.x, y: at.y + 14 }], colour("accent"));
+    pen.lineWidth = 3;
     pen.beginPath();
-    pen.arc(at.x, at.y, 5, 0, 7);
+    pen.arc(at.x, at.y, 9, 0, 7);
     pen.stroke();
+    this.take(at, 15);
   }
 
   drawVehicle(vehicle, isSelected) {

@@ -1,9 +1,11 @@
 // Orders: buttons, and the confirmation dialog that names vehicle and order. Every order needs it, and is sent once.
 
-import { byId, element, show } from "./dom.js";
-import { aboutParameter } from "./panels.js";
+import { age, byId, element, show } from "./dom.js";
+import { distanceText } from "./map.js";
+import { aboutParameter, parameterProblem } from "./panels.js";
 import { inWords, obstacle } from "./readiness.js";
 import { ask, hasToken, newKey, Refusal, useToken } from "./server.js";
+import { ageOf } from "./state.js";
 
 // name, text of the button, text of the dialog, fields [name, label, value, step], class of the button
 export const BUTTONS = [
@@ -14,20 +16,19 @@ export const BUTTONS = [
   ["land", "Land", "land at its current position", [], "rest"],
   ["return_to_launch", "Return", "return to the launch position", [], "rest"],
   ["disarm", "Disarm", "stop the motors", [], ""],
-  null,
   ["mission/start", "Start mission", "fly its mission from an item; it takes off if the mission has a takeoff item", [["item", "From item", 0, "1"]], ""],
   ["mission/pause", "Pause", "pause its mission and hold", [], ""],
   ["mission/resume", "Resume", "resume its mission", [], ""],
 ];
 
 export class Orders {
-  // page: {vehicle(), seenAt(), pick(), toast(text, kind), record(order)}
+  // page: {vehicle(), seenAt(), pick(), toast(text, kind), record(order), changed()}
   constructor(box, page) {
     this.page = page;
     this.buttons = [];
-    for (const each of BUTTONS) {
-      if (!each) { box.append(element("span", { class: "gap" })); continue; }
-      const [name, title, text, fields, kind] = each;
+    this.target = null; // the position that the open dialog asks about
+    byId("dialog").addEventListener("close", () => { if (!byId("dialog").open) this.target = null; this.page.changed(); });
+    for (const [name, title, text, fields, kind] of BUTTONS) {
       const clicked = () => (name === "pick" ? page.pick() : this.confirm({ order: name, title, text, fields }));
       const button = element("button", { type: "button", class: kind, onclick: clicked }, element("span", {}, title), element("small", {}));
       button.dataset.order = name;
@@ -82,16 +83,27 @@ export class Orders {
     if (mode) this.confirm({ order: "mode", title: `Mode ${mode}`, text: `change its flight mode to ${mode}`, fields: [], fixed: { mode } });
   }
 
-  goTo(place, altitude) {
+  // y: where the position is on the screen; the dialog leaves it free
+  goTo(place, altitude, y) {
     this.confirm({
-      order: "go_to", title: "Go to", fixed: place,
+      order: "go_to", title: "Go to", fixed: place, target: place, place: `beside ${y < innerHeight / 2 ? "low" : "high"}`,
       text: `go to ${place.latitude_deg.toFixed(6)}, ${place.longitude_deg.toFixed(6)}`,
       fields: [["altitude_relative_m", "Metres above home", altitude, "any"], ["speed_m_s", "Speed in m/s (optional)", "", "any"]],
     });
   }
 
+  // Shows where the target of the open dialog is, seen from the vehicle, which may be moving.
+  showTarget(vehicle, receivedAt) {
+    const line = this.target && byId("dialog").querySelector(".where"), position = vehicle?.states.position;
+    if (!line) return;
+    const old = ageOf(position, receivedAt);
+    const name = old > 3 ? `the last position of the vehicle, ${age(old)} old` : "the vehicle";
+    show(line, position ? `${distanceText(position.value, this.target)} ${name}` : "The position of the vehicle is unknown.");
+  }
+
   setParameter(id, parameter) {
     this.confirm({
+      problem: ({ value }) => (value === undefined ? "" : parameterProblem(parameter, value)),
       vehicle: id, title: `Set ${parameter.name}`, text: `set ${parameter.name}, currently ${parameter.value} ${parameter.unit ?? ""}`.trim(), about: aboutParameter(parameter),
       fields: [["value", "New value", parameter.value, "any"]], order: "parameter", parameter: parameter.name,
     });
@@ -107,26 +119,47 @@ export class Orders {
       input.value = typeof value === "number" ? String(+value.toFixed(7)) : value;
       return [name, input, element("label", {}, label, input)];
     });
+    const yes = element("button", { type: "submit", class: "yes" }, `Yes, ${wanted.title.charAt(0).toLowerCase()}${wanted.title.slice(1)} · vehicle ${id}`);
+    const problem = element("p", { class: "problem", hidden: true, role: "alert" });
+    const force = element("input", { type: "checkbox", name: "force", onchange: () => { yes.disabled = !force.checked; } });
+    const forced = element("label", { class: "force", hidden: true }, "Set it all the same", force);
+    const values = () => Object.fromEntries(inputs.filter(([, input]) => input.value !== "").map(([name, input]) => [name, Number(input.value)]));
+    const check = () => {
+      const text = wanted.problem?.(values()) || "";
+      show(problem, text);
+      problem.hidden = forced.hidden = !text;
+      force.checked = false;
+      yes.disabled = Boolean(text);
+    };
     const token = hasToken() ? null : element("input", { type: "password", required: true, autocomplete: "off" });
     const give = (event) => {
       event.preventDefault();
       if (token) useToken(token.value);
-      const body = { ...wanted.fixed };
-      for (const [name, input] of inputs) if (input.value !== "") body[name] = Number(input.value);
+      const body = { ...wanted.fixed, ...values(), ...(force.checked ? { force: true } : {}) };
       dialog.close();
       this.give(id, wanted, body, key);
     };
     const cancel = element("button", { type: "button", onclick: () => dialog.close() }, "Cancel");
-    dialog.replaceChildren(element("form", { onsubmit: give },
+    dialog.className = wanted.place ?? "";
+    dialog.replaceChildren(element("form", { onsubmit: give, oninput: (event) => { if (event.target !== force) check(); } },
       element("h2", {}, `${wanted.title}?`),
       element("p", {}, element("span", { class: "target" }, `Vehicle ${id}`), ` (${vehicle.firmware}) will ${wanted.text}.`),
+      wanted.target ? element("p", { class: "where" }) : null,
       ...(wanted.about ?? []).map((line) => element("p", { class: "detail" }, line)),
-      ...inputs.map(([, , label]) => label),
+      ...inputs.map(([, , label]) => label), problem, forced,
       token ? element("label", {}, "Token", token) : null,
-      element("div", { class: "buttons" }, cancel, element("button", { type: "submit", class: "yes" }, `Yes, ${wanted.title.charAt(0).toLowerCase()}${wanted.title.slice(1)} · vehicle ${id}`))));
+      element("div", { class: "buttons" }, cancel, yes)));
     if (dialog.open) dialog.close();
+    this.target = wanted.target ?? null;
     dialog.showModal();
+    check();
+    this.page.changed();
     (inputs.length ? inputs[0][1] : token ?? cancel).focus();
+  }
+
+  // The server refuses values that metadata of the parameter's other name does not allow, which the page does not have.
+  confirmRefused(wanted, { value }, problem) {
+    this.confirm({ ...wanted, fields: [["value", "New value", value, "any"]], problem: (given) => (given.value === value ? problem.detail.split("; nothing was set")[0] : wanted.problem(given)) });
   }
 
   async give(id, wanted, body, key) {
@@ -142,6 +175,7 @@ export class Orders {
       if (error instanceof Refusal) {
         if (error.problem.status === 401) useToken("");
         if (error.problem.order) this.page.record(error.problem.order);
+        else if (isParameter && !body.force && error.problem.detail?.includes('"force": true')) this.confirmRefused(wanted, body, error.problem);
         else this.page.toast(`${what}: ${inWords(error.problem)}`, "failed");
       } else this.page.toast(`${what}: the server did not answer, so it is unknown whether the order was sent. Check the tab Orders.`, "failed");
     }

@@ -165,11 +165,22 @@ function range(each) {
   return `${isKnown(each.minimum) ? short(each.minimum) : ""} … ${isKnown(each.maximum) ? short(each.maximum) : ""}`;
 }
 
+// Why the metadata does not allow a value, like ParameterMetadata.problem in metadata.py; "" if it does.
+export function parameterProblem(each, value) {
+  if (each.read_only) return `${each.name} can only be read`;
+  const names = Object.entries(each.values ?? {}), hasRange = isKnown(each.minimum) || isKnown(each.maximum);
+  const isInside = (!isKnown(each.minimum) || value >= each.minimum) && (!isKnown(each.maximum) || value <= each.maximum);
+  if (names.some(([code]) => Number(code) === value) || (isInside && (hasRange || !names.length || each.has_bits))) return "";
+  if (!hasRange) return `${each.name} = ${short(value)} is not a documented value: ${names.map((one) => one.join(" ")).join(", ")}`;
+  const bound = (limit) => (isKnown(limit) ? short(limit) : "");
+  return `${each.name} = ${short(value)} is not in ${bound(each.minimum)}..${bound(each.maximum)} ${each.unit ?? ""}`.trimEnd();
+}
+
 // What is known about a parameter, one line each, for the dialog that sets it.
 export function aboutParameter(each) {
   return [
     each.description || each.short_description,
-    range(each) ? `Recommended: ${range(each)} ${each.unit ?? ""}` : "",
+    range(each) ? `Range: ${range(each)} ${each.unit ?? ""}` : "",
     isKnown(each.default) ? `Default: ${withUnit(each, each.default)}` : "",
     each.reboot_required ? "Takes effect after a reboot." : "",
   ].filter(Boolean);
@@ -276,7 +287,7 @@ export class OrderPanel {
     const shown = [...this.records.values()].reverse();
     this.node.replaceChildren(...shown.map((each) => element("div", { class: "text" },
       element("time", {}, clock(each.given_unix_s)),
-      element("span", {}, `vehicle ${each.system_id}: ${orderText(each)}: `, element("b", { class: each.state }, each.state),
+      element("span", {}, `vehicle ${each.system_id}: `, element("span", { class: each.state }, outcome(each)),
         each.problem ? element("div", { class: "detail" }, inWords(each.problem)) : null))));
     if (!shown.length) this.node.replaceChildren(element("p", { class: "note" }, "no orders yet"));
   }
@@ -284,11 +295,24 @@ export class OrderPanel {
 
 // Text after the name of an order; other orders list their arguments.
 const ORDER_TEXTS = {
+  "mission/start": ({ item }) => ` at item ${item ?? 0}`,
   take_off: ({ altitude_m }) => ` to ${+altitude_m.toFixed(2)} m`,
   mode: ({ mode }) => ` ${mode}`,
   "mission/upload": ({ name, mission_items }) => ` ${name} (${mission_items} items)`,
   set_parameter: ({ name, value }) => ` ${name} to ${+value.toPrecision(7)}`,
 };
+
+// Orders that only begin something: "done" would read like its end.
+const BEGUN = {
+  "mission/start": ({ item }) => `mission started at item ${item ?? 0}`,
+  "mission/resume": () => "mission resumed",
+};
+
+// An order and its state, in words.
+export function outcome(record) {
+  const text = record.state === "done" && BEGUN[record.order];
+  return text ? text(record.arguments) : `${orderText(record)}: ${record.state === "running" ? "ordered" : record.state}`;
+}
 
 export function orderText(record) {
   const name = record.order.replace("mission/upload", "upload").replace(/[_/]/g, " ").replace("set parameter", "set"), text = ORDER_TEXTS[record.order];

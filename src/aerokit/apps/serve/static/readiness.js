@@ -26,24 +26,40 @@ export function obstacle(order, vehicle, page) {
   if (page.isReadOnly) return "Read-only";
   if (page.hasToken === false) return "No token";
   if (!vehicle) return "No vehicle";
-  if (!isConnected(vehicle)) return SAFE_ORDERS.has(order) && order !== "disarm" ? "" : "Silent";
   const isArmed = valueOf(vehicle, "armed"), landed = landedState(vehicle);
   const isOnGround = landed === "ON_GROUND", isFlying = FLYING.has(landed);
   const mission = valueOf(vehicle, "mission_current"), isSurface = SURFACE_TYPES.has(vehicle.vehicle_type);
+  // Motors that stop in the air make the vehicle fall: the page disarms only what is known to stand.
+  if (!isConnected(vehicle)) return order === "disarm" && !isSurface ? "May be flying" : SAFE_ORDERS.has(order) ? "" : "Silent";
   switch (order) {
     case "arm":
       if (isArmed) return "Armed";
       return vehicle.missing_for_flight.length && valueOf(vehicle, "sensors")?.prearm_checks_pass === false ? "Not ready" : "";
-    case "disarm": // motors that stop in the air make the vehicle fall, so only where it is known to stand
-      return isArmed === false ? "Disarmed" : isSurface || isOnGround ? "" : isFlying ? "Land first" : "Unknown if landed";
-    case "take_off": return isSurface ? "Does not fly" : isArmed === false ? "Arm first" : isFlying ? "Flying" : "";
-    case "go_to": return isArmed === false ? "Arm first" : isOnGround && !isSurface ? "Take off first" : "";
+    case "disarm":
+      return isArmed === false ? "Disarmed" : isSurface || isOnGround ? "" : isFlying ? "Land first" : "May be flying";
+    case "take_off":
+      return isSurface ? "Does not fly" : isArmed === false ? "Arm first" : isFlying ? "Flying" : lacksPosition(vehicle) ? "No position" : "";
+    case "go_to":
+      return isArmed === false ? "Arm first" : isOnGround && !isSurface ? "Take off first" : lacksPosition(vehicle) ? "No position" : "";
     case "hold": case "land": case "return_to_launch": return isArmed === false && isOnGround ? "Not flying" : "";
     case "mission/start": case "mission/resume":
-      return vehicle.mission_items === 0 ? "No mission" : isArmed === false ? "Arm first" : "";
-    case "mission/pause": return isArmed === false || mission?.state === "NO_MISSION" ? "None runs" : "";
+      if (vehicle.mission_items === 0) return "No mission";
+      if (isArmed === false) return "Arm first";
+      if (vehicle.is_flying_mission && mission?.state === "ACTIVE" && (isFlying || isSurface)) return "Running";
+      return lacksPosition(vehicle) ? "No position" : "";
+    case "mission/pause":
+      return isArmed === false || mission?.state === "NO_MISSION" || !vehicle.is_flying_mission ? "None runs" : "";
     default: return "";
   }
+}
+
+const EKF_POS_HORIZ = 8 + 16, EKF_CONST_POS_MODE = 128; // bits of EKF_STATUS_REPORT: relative or absolute position
+
+// ArduCopter, armed, changes to GUIDED and AUTO only with a horizontal position (system.cpp, position_ok).
+function lacksPosition(vehicle) {
+  const estimator = vehicle.states.estimator;
+  if (vehicle.firmware !== "ArduCopter" || estimator?.value?.message !== "EKF_STATUS_REPORT" || estimator.age_s > 5) return false;
+  return !(estimator.value.flags & EKF_POS_HORIZ) || Boolean(estimator.value.flags & EKF_CONST_POS_MODE);
 }
 
 // An error of the library for a person: without names of functions and messages.
@@ -67,7 +83,11 @@ function readiness(vehicle, page, heartbeatAge) {
     const title = landed === "ON_GROUND" ? "Armed: propellers may turn" : FLYING.has(landed) ? "Flying" : "Armed";
     return [missing.length || landed === "ON_GROUND" ? "warn" : "good", title, missing];
   }
-  return missing.length ? ["warn", "Not ready", missing] : ["good", "Ready to arm", []];
+  const mode = vehicle.unarmable_mode, unless = mode?.unless ? ` unless ${mode.unless} allows it` : "";
+  const cannot = mode && `${vehicle.firmware} cannot arm in ${mode.mode}${unless}`;
+  if (cannot && !mode.arms_in) return ["warn", "Not ready", [cannot, ...missing]];
+  const note = cannot ? [`Arm changes the mode to ${mode.arms_in} first: ${cannot}`] : [];
+  return missing.length ? ["warn", "Not ready", [...missing, ...note]] : ["good", "Ready to arm", note];
 }
 
 export function showReadiness(box, vehicle, page) {
@@ -75,10 +95,11 @@ export function showReadiness(box, vehicle, page) {
   const drawn = [kind, title, ...reasons].join("\n");
   if (box.dataset.drawn === drawn) return;
   box.dataset.drawn = drawn;
-  const shown = reasons.slice(0, MAX_REASONS).map((reason) => element("li", {}, capitalized(reason.replace(/ \([A-Z_]+\)$/, ""))));
-  if (reasons.length > MAX_REASONS) shown.push(element("li", {}, `and ${reasons.length - MAX_REASONS} more`));
+  const items = reasons.map((reason) => element("li", {}, capitalized(reason.replace(/ \([A-Z_]+\)$/, ""))));
+  const more = items.splice(MAX_REASONS), isOpen = box.querySelector("details")?.open ?? false;
+  const rest = more.length ? element("details", { open: isOpen }, element("summary", {}, `and ${more.length} more`), element("ul", {}, ...more)) : null;
   box.className = kind;
-  box.replaceChildren(element("span", { class: "light" }), element("strong", {}, title), element("ul", {}, ...shown));
+  box.replaceChildren(...[element("span", { class: "light" }), element("strong", {}, title), element("ul", {}, ...items), rest].filter(Boolean));
 }
 
 const heartbeatAge = (vehicle, page) => ageOf({ age_s: vehicle.link.heartbeat_age_s }, page.receivedAt);

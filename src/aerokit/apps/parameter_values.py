@@ -1,0 +1,45 @@
+"""Check of parameter values against metadata, for ``aerokit params`` and ``aerokit serve``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from aerokit.errors import InvalidArgument
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from aerokit.parameters import Metadata, ParameterMetadata
+
+
+def check_values(metadata: Metadata | None, values: Mapping[str, float], force: str) -> None:
+    """Raise InvalidArgument with all values that the metadata does not allow. Unknown names are accepted.
+
+    ``force`` is the option with which the user can set such values, too; it appears in the error text.
+    """
+    if metadata is None:
+        return
+    problems = [problem for name, value in values.items() if (problem := _problem(metadata, name, value))]
+    if problems:
+        raise InvalidArgument(f"{'; '.join(problems)}; nothing was set; {force} sets such values too")
+
+
+def _problem(metadata: Metadata, name: str, value: float) -> str | None:
+    """Return the reason why the value is not allowed, with the name and unit that the user gave; None if it is."""
+    entry, convert = metadata_entry(metadata, name)
+    problem = None if entry is None else entry.problem(convert(value))
+    if problem is None or entry is None or entry.name == name:
+        return problem
+    return f"{name} = {value:g}: {problem}"
+
+
+def metadata_entry(metadata: Metadata, name: str) -> tuple[ParameterMetadata | None, Callable[[float], float]]:
+    """Return the metadata of a parameter under any of its names, and the conversion to its unit."""
+    from aerokit.parameters.renames import resolve_rename
+
+    for spelled in (name, name.upper()):
+        if spelled in metadata:
+            return metadata[spelled], lambda value: value
+    renamed = resolve_rename(name.upper(), metadata)
+    return (None, lambda value: value) if renamed is None else (metadata[renamed.name], renamed.to_vehicle)
