@@ -77,7 +77,7 @@ class SessionFtpServer(Generic[FilesT]):
     """Size of the largest reply that is sent again, in bytes."""
     crc_block: ClassVar[int] = 65_536
     crc_blocks_at_once: ClassVar[int] = 8
-    """Blocks of a file that are read for a checksum before the event loop continues."""
+    """Number of blocks of a file that are read for a checksum before the event loop continues."""
 
     def __init__(
         self,

@@ -82,7 +82,7 @@ class MissionServer:
     retry_interval_s: ClassVar[float] = 0.5
     timeout_s: ClassVar[float] = 5.0
     requests_int: bool = True
-    """True if an upload begins with MISSION_REQUEST_INT, False if with MISSION_REQUEST."""
+    """True if the first request of an upload is a MISSION_REQUEST_INT, False if it is a MISSION_REQUEST."""
 
     def __init__(
         self,
@@ -121,7 +121,7 @@ class MissionServer:
         return bool(self._uploads)
 
     def reset(self) -> None:
-        """Drop transfers, as a reboot does; stored items stay."""
+        """Drop transfers, as by a reboot. Stored items stay."""
         self._uploads.clear()
 
     def id(self, mission_type: int) -> int:
@@ -154,7 +154,7 @@ class MissionServer:
         return True
 
     def capacity(self, mission_type: int) -> int:
-        """Return the maximum number of items."""
+        """Return the maximum number of items of a list."""
         return self._capacity
 
     def count(self, mission_type: int) -> int:
@@ -293,7 +293,7 @@ class MissionServer:
             self._receive_item(upload, message)
 
     def _answer_item(self, message: AnyItem, result: int, channel: Channel) -> None:
-        """Answer an item that no upload expects. It is ignored here; the expected item is requested again."""
+        """Answer an item that no upload expects. Here it is ignored, because the expected item is requested again."""
 
     def _receive_item(self, upload: ListUpload, message: AnyItem) -> None:
         if (result := self._put(upload, message)) != _R.ACCEPTED:
