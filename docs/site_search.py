@@ -26,7 +26,7 @@ STANDARD = ("reference/messages", "reference/enums")
 """Pages whose titles often differ only in the last word: ``GLOBAL_POSITION_INT``, ``GLOBAL_POSITION_INT_COV``."""
 MAX_TEXT = 300
 """Maximum number of characters of a section's text."""
-MAX_REFERENCE_TEXT = 110
+MAX_REFERENCE_TEXT = 90
 TITLES_ONLY = ("reference/sync", "reference/fleets", "reference/enums", "reference/onboard", "about/changelog")
 """Prefixes of pages whose titles are indexed without text."""
 WITHOUT_MEMBERS = (
