@@ -178,9 +178,7 @@ class StallDetector:
 
 
 def _metres(one: Position, other: Position) -> float:
-    """Return the distance within one per cent. It is computed for every position, in a tenth of the time of
-    `Position.distance_to`.
-    """
+    """Return the distance within one per cent, in a tenth of the time that `Position.distance_to` takes."""
     north = (one.latitude_deg - other.latitude_deg) * _METRES_PER_DEGREE
     east = math.remainder(one.longitude_deg - other.longitude_deg, 360.0) * _METRES_PER_DEGREE
     across = math.hypot(north, east * math.cos(math.radians(one.latitude_deg)))
