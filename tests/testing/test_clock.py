@@ -189,7 +189,8 @@ async def test_earliest_of_several_event_sources_runs_first() -> None:
     other = Metronome(lambda: order.append("other"))
     await asyncio.sleep(1.1)
     assert order == ["one", "other", "one", "other"]
-    one.end(), other.end()
+    one.end()
+    other.end()
 
 
 @pytest.mark.anyio

@@ -214,7 +214,7 @@ class Port:
         """True to write each frame separately, because autopilots read datagrams into small buffers."""
         self.batch: list[bytes] = []
         """Data to write: single frames, or pieces of several."""
-        self.joined_frames = 0
+        self.joined_frames: int = 0
         """Number of frames in ``batch``, minus the number of its pieces."""
         self.node: RouterPort[Port] | None = None
         self._dialect = dialect

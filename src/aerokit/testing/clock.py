@@ -134,7 +134,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         sources, ready, has_run = self._sources, self._ready, False  # type: ignore[attr-defined]
         is_alone = self._is_alone
         while sources and not ready:
-            due = math.inf
+            due, handle = math.inf, sources[0][1]
             for next_due, candidate in sources:
                 if (when := next_due()) < due:
                     due, handle = when, candidate

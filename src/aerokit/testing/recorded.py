@@ -5,7 +5,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Iterable
 from os import PathLike
-from typing import BinaryIO
+from typing import BinaryIO, ClassVar
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.dialect import STANDARD
@@ -97,7 +97,7 @@ class RecordedParameters(ParameterProtocolServer):
 class RecordedMissions(MissionServer):
     """Serves the recorded plans; accepts uploads with their recorded result."""
 
-    retry_interval_s = 1.0
+    retry_interval_s: ClassVar[float] = 1.0
 
     def __init__(self, vehicle: RecordedVehicle) -> None:
         super().__init__(vehicle, capacity=_MAX_ITEMS)

@@ -8,6 +8,7 @@ https://mavlink.io/en/services/mission.html
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavMissionResult, MavMissionType, MavSeverity
@@ -39,8 +40,9 @@ _R = MavMissionResult
 class ArduPilotMissionServer(MissionServer):
     """Stores mission, fence and rally points, and transfers them."""
 
-    retry_interval_s, timeout_s = 1.0, 8.0
-    requests_int = False
+    retry_interval_s: ClassVar[float] = 1.0
+    timeout_s: ClassVar[float] = 8.0
+    requests_int: bool = False
 
     def __init__(self, vehicle: ArduPilotHost) -> None:
         super().__init__(vehicle)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
+from typing import ClassVar
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavFrame, MavMissionResult, MavMissionType, MavSeverity
@@ -59,7 +60,7 @@ class _Link(ListUpload):
 class Px4MissionServer(MissionServer):
     """Server of mission, fence and rally points, which all links share. Texts and results are the firmware's."""
 
-    retry_interval_s = 0.26
+    retry_interval_s: ClassVar[float] = 0.26
 
     def __init__(self, px4: Px4Host) -> None:
         super().__init__(px4)
