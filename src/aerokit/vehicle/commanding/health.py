@@ -100,7 +100,8 @@ class Health:
         else:
             text = f"{self._autopilot.firmware} cannot arm in {mode.name} unless {option} allows it"
         better = self._autopilot.mode_to_arm_in()
-        return text if better is None else f"{text}; arm() changes to {better.name} first"
+        when = "first" if option is None else "after a refusal"
+        return text if better is None else f"{text}; arm() changes to {better.name} {when}"
 
     def _left_modes(self) -> frozenset[str]:
         """Return the modes that `arm` leaves."""
