@@ -208,7 +208,9 @@ def test_page_keeps_chosen_theme(browser: Any, copters: tuple[list[SimulatedCopt
 
 def test_page_words_errors_for_people(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
     said = {
-        "take_off: the vehicle is not armed: arm() comes first": "The vehicle is not armed: “Arm” comes first",
+        "take_off: the vehicle is not armed: call arm() first; nothing was sent": (
+            "The vehicle is not armed: press “Arm” first; nothing was sent"
+        ),
         "MAV_CMD_NAV_TAKEOFF was refused: FAILED": "The vehicle refused (failed)",
         "MAV_CMD_COMPONENT_ARM_DISARM was refused: FAILED\n  - not on the ground": (
             "The vehicle refused (failed)\n  - not on the ground"

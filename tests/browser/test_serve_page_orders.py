@@ -198,6 +198,35 @@ def test_disarm_needs_known_ground(browser: Any, copters: tuple[list[SimulatedCo
         assert page.evaluate(obstacles, [None, 0, 10, "connected"]) == ""  # a rover has no landed state
 
 
+def test_resume_is_disabled_on_known_ground(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
+    on_ground = "On the ground: use Start mission"
+    cases = {("ON_GROUND", 0, 2): on_ground, ("IN_AIR", 0, 2): "", ("ON_GROUND", 9, 2): "", ("ON_GROUND", 0, 10): ""}
+    with serving(copters[1]) as server, opened(browser, server["page"]) as page:
+        obstacles = """async ([landed, age, type]) => {
+            const { obstacle } = await import("/static/readiness.js");
+            const states = { armed: { value: true, age_s: 0 }, landed_state: { value: landed, age_s: age } };
+            const link = { state: "connected" };
+            return obstacle("mission/resume", { states, link, vehicle_type: type, missing_for_flight: [] }, { isOpen: true });
+        }"""
+        assert {case: page.evaluate(obstacles, [*case]) for case in cases} == cases
+
+
+def test_take_off_dialog_reports_disarming(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
+    with serving(copters[1]) as server, opened(browser, server["page"]) as page:
+        page.locator("#readiness.good", has_text="Ready to arm").wait_for(timeout=30_000)
+        order(page, "arm")
+        page.locator("button[data-order='mission/resume'][disabled]", has_text="Use Start mission").wait_for()
+        picture(page, "resume-on-ground")
+        page.locator("button[data-order='take_off']:enabled").click()
+        page.locator("dialog .yes:enabled").wait_for()
+        blocked = page.locator("dialog .blocked")
+        blocked.filter(has_text="It disarmed").wait_for(timeout=30_000)  # after DISARM_DELAY
+        assert "The vehicle is not armed: press “Arm” first. It disarmed 1 s ago." in blocked.inner_text()
+        assert "ArduCopter disarms itself on the ground after DISARM_DELAY, 10 s by default." in blocked.inner_text()
+        assert page.locator("dialog .yes").is_disabled()
+        picture(page, "disarmed-in-dialog")
+
+
 DROP = """([name, text]) => {
     const data = new DataTransfer();
     data.items.add(new File([text], name));

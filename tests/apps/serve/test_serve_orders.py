@@ -16,7 +16,7 @@ from aerokit.apps.serve import make_app
 from aerokit.apps.serve.orders import ORDERS
 from aerokit.apps.serve.requests import MAX_BODY_SIZE, MAX_PLAN_SIZE
 from aerokit.errors import InvalidArgument
-from aerokit.mavlink.enums import MavCmd, MavResult
+from aerokit.mavlink.enums import MavCmd, MavLandedState, MavResult
 from aerokit.mavlink.messages import FileTransferProtocol, MissionCount, ParamSet
 from aerokit.missions import Fence, FencePolygon, Mission, Plan, format_plan, take_off, waypoint
 from aerokit.parameters import Metadata, ParameterMetadata
@@ -196,6 +196,23 @@ async def test_refusal_contains_reasons() -> None:
         assert "Arm: Compass not healthy" in refused.json()["reasons"]
         not_armed = await stage.submit("take_off", {"altitude_m": 5})
         assert (not_armed.status_code, not_armed.json()["error"]) == (409, "OperationRejected")
+
+
+async def test_resume_needs_flying_vehicle() -> None:
+    async with open_stage() as stage:
+        vehicle = stage.flight.vehicle
+        await vehicle.mission.upload(Mission([take_off(10), waypoint(vehicle.position.value.offset(north_m=500))]))
+        await stage.submit("mode", {"mode": "GUIDED"})
+        await stage.submit("arm")
+        await vehicle.landed_state.wait_until(lambda landed: landed == MavLandedState.ON_GROUND, timeout=5.0)
+        stage.flight.wire.clear()
+        refused = await stage.submit("mission/resume")
+        assert (refused.status_code, refused.json()["error"]) == (409, "OperationRejected")
+        assert "on the ground" in refused.json()["detail"]
+        assert stage.flight.wire.mode_orders() == []
+        await stage.submit("take_off", {"altitude_m": 10})
+        assert (await stage.submit("mission/resume")).json()["state"] == "done"
+        assert vehicle.mode_name == "AUTO"
 
 
 async def test_silent_vehicle_accepts_safe_commands_only() -> None:

@@ -17,8 +17,9 @@ from aerokit.apps.parameter_values import check_values
 from aerokit.apps.plan_text import parse_plan_text
 from aerokit.apps.serve.requests import MAX_BODY_SIZE, MAX_PLAN_SIZE, HttpProblem, problem_of
 from aerokit.connection.tasks import BackgroundTasks
-from aerokit.errors import BusyError, HeartbeatTimeout, InvalidArgument
+from aerokit.errors import BusyError, HeartbeatTimeout, InvalidArgument, OperationRejected
 from aerokit.events import LinkState
+from aerokit.mavlink.enums import MavLandedState, MavType
 from aerokit.position import Position
 
 if TYPE_CHECKING:
@@ -39,6 +40,8 @@ MAX_USED_KEYS = 100_000
 """Maximum number of older keys that are stored to detect their reuse."""
 STATE_MAX_AGE_S = 5.0
 """Maximum age in seconds of the state on which a client bases an order."""
+_LANDED_STATE_MAX_AGE_S = 3.0
+_SURFACE_TYPES = (MavType.GROUND_ROVER, MavType.SURFACE_BOAT, MavType.SUBMARINE)
 _KEY = re.compile(r"[A-Za-z0-9._~-]{8,64}")
 
 
@@ -84,6 +87,17 @@ class OrderType:
 async def _go_to(vehicle: Vehicle, values: dict[str, Any]) -> None:
     position = {name: values.pop(name) for name in tuple(values) if name in _POSITION}
     await vehicle.go_to(Position(**position), **values)
+
+
+async def _resume(vehicle: Vehicle, values: dict[str, Any]) -> None:
+    # ArduCopter, on the ground after a finished mission, takes off and flies from the first item.
+    landed = vehicle.landed_state
+    is_on_ground = landed.latest == MavLandedState.ON_GROUND and landed.age <= _LANDED_STATE_MAX_AGE_S
+    if vehicle.is_armed and is_on_ground and vehicle.autopilot.vehicle_type not in _SURFACE_TYPES:
+        raise OperationRejected(
+            "mission/resume: the vehicle is on the ground, where it would take off: order mission/start; nothing was sent"
+        )
+    await vehicle.mission.resume()
 
 
 async def _set_parameter(vehicle: Vehicle, values: dict[str, Any]) -> object:
@@ -180,7 +194,7 @@ ORDERS = (
     UPLOAD,
     OrderType("mission/start", "Fly the mission", lambda v, a: v.mission.start(**a), _ITEM),
     OrderType("mission/pause", "Pause the mission", lambda v, a: v.mission.pause(), is_safe=True),
-    OrderType("mission/resume", "Resume the mission", lambda v, a: v.mission.resume()),
+    OrderType("mission/resume", "Resume the mission, in the air", _resume),
 )
 SET_PARAMETER = OrderType("set_parameter", "Set a parameter", _set_parameter, _VALUE)
 

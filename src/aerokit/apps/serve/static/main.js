@@ -187,6 +187,7 @@ function drawNow() {
   page.hasToken = hasToken();
   orders.enable(vehicle, page);
   orders.showTarget(vehicle, page.receivedAt);
+  orders.recheck?.(page);
   placeToasts();
   showServer();
   showTokenNotice();
@@ -227,7 +228,7 @@ function record(order, isNew = true) {
   }
   if (isNew && !announced.has(order.key + order.state)) {
     announced.add(order.key + order.state);
-    const why = order.problem ? `: ${inWords(order.problem)}` : "";
+    const why = order.problem ? `: ${inWords(order.problem, page.vehicles.get(order.system_id))}` : "";
     toast(`Vehicle ${order.system_id}: ${outcome(order)}${why}`, order.state, order.key);
   }
   draw();
@@ -235,11 +236,18 @@ function record(order, isNew = true) {
 
 // ------------------------------------------------------------------------------------------- the stream
 
+// When the page saw the vehicle disarm, of performance.now().
+function disarmedAt(before, now) {
+  const hasDisarmed = before?.states.armed?.value === true && now.states.armed?.value === false;
+  return hasDisarmed ? performance.now() : before?.disarmedAt;
+}
+
 function onMessage(message) {
   if (message.type === "state") {
     page.receivedAt = performance.now();
     page.atSeconds = message.at_s;
     for (const { system_id } of message.vehicles) if (!page.vehicles.has(system_id)) loadTrack(system_id);
+    message.vehicles.forEach((each) => { each.disarmedAt = disarmedAt(page.vehicles.get(each.system_id), each); });
     page.vehicles = new Map(message.vehicles.map((each) => [each.system_id, each]));
     message.vehicles.forEach(loadFailsafe);
     for (const { system_id, states } of message.vehicles) addToTrack(system_id, states.position);

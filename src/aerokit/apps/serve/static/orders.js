@@ -3,7 +3,7 @@
 import { age, byId, element, show } from "./dom.js";
 import { distanceText } from "./map.js";
 import { aboutParameter, parameterProblem } from "./panels.js";
-import { inWords, obstacle } from "./readiness.js";
+import { capitalized, dialogObstacle, inWords, obstacle } from "./readiness.js";
 import { ask, hasToken, newKey, Refusal, useToken } from "./server.js";
 import { ageOf } from "./state.js";
 
@@ -16,7 +16,7 @@ export const BUTTONS = [
   ["land", "Land", "land at its current position", [], "rest"],
   ["return_to_launch", "Return", "return to the launch position", [], "rest"],
   ["disarm", "Disarm", "stop the motors", [], ""],
-  ["mission/start", "Start mission", "fly its mission from an item; it takes off if the mission has a takeoff item", [["item", "From item", 0, "1"]], ""],
+  ["mission/start", "Start mission", "fly its mission from item N; it takes off if the mission has a takeoff item", [["item", "From item", 0, "1"]], ""],
   ["mission/pause", "Pause", "pause its mission and hold", [], ""],
   ["mission/resume", "Resume", "resume its mission", [], ""],
 ];
@@ -27,7 +27,8 @@ export class Orders {
     this.page = page;
     this.buttons = [];
     this.target = null; // the position that the open dialog asks about
-    byId("dialog").addEventListener("close", () => { if (!byId("dialog").open) this.target = null; this.page.changed(); });
+    this.recheck = null; // updates the open dialog
+    byId("dialog").addEventListener("close", () => { if (!byId("dialog").open) this.target = this.recheck = null; this.page.changed(); });
     for (const [name, title, text, fields, kind] of BUTTONS) {
       const clicked = () => (name === "pick" ? page.pick() : this.confirm({ order: name, title, text, fields }));
       const button = element("button", { type: "button", class: kind, onclick: clicked }, element("span", {}, title), element("small", {}));
@@ -48,7 +49,7 @@ export class Orders {
       const name = button.dataset.order ?? "mode", why = obstacle(name === "pick" ? "go_to" : name, vehicle, page);
       if (button.disabled !== Boolean(why)) button.disabled = Boolean(why);
       if (button.title !== why) button.title = why;
-      if (button !== this.modes) show(button.children[1], why);
+      if (button !== this.modes) show(button.children[1], capitalized(why.split(": ").pop())); // the button is narrow
     }
   }
 
@@ -121,15 +122,23 @@ export class Orders {
     });
     const yes = element("button", { type: "submit", class: "yes" }, `Yes, ${wanted.title.charAt(0).toLowerCase()}${wanted.title.slice(1)} · vehicle ${id}`);
     const problem = element("p", { class: "problem", hidden: true, role: "alert" });
-    const force = element("input", { type: "checkbox", name: "force", onchange: () => { yes.disabled = !force.checked; } });
+    const force = element("input", { type: "checkbox", name: "force", onchange: () => { yes.disabled = !force.checked || !blocked.hidden; } });
     const forced = element("label", { class: "force", hidden: true }, "Set it all the same", force);
     const values = () => Object.fromEntries(inputs.filter(([, input]) => input.value !== "").map(([name, input]) => [name, Number(input.value)]));
+    const blocked = element("p", { class: "problem blocked", hidden: true, role: "alert" });
+    // The vehicle can disarm itself, land or become silent while the dialog is open.
+    this.recheck = (page) => {
+      const why = dialogObstacle(wanted.order, page.vehicles.get(id), page);
+      show(blocked, why);
+      blocked.hidden = !why;
+      yes.disabled = Boolean(why) || (!problem.hidden && !force.checked);
+    };
     const check = () => {
       const text = wanted.problem?.(values()) || "";
       show(problem, text);
       problem.hidden = forced.hidden = !text;
       force.checked = false;
-      yes.disabled = Boolean(text);
+      yes.disabled = Boolean(text) || !blocked.hidden;
     };
     const token = hasToken() ? null : element("input", { type: "password", required: true, autocomplete: "off" });
     const give = (event) => {
@@ -146,7 +155,7 @@ export class Orders {
       element("p", {}, element("span", { class: "target" }, `Vehicle ${id}`), ` (${vehicle.firmware}) will ${wanted.text}.`),
       wanted.target ? element("p", { class: "where" }) : null,
       ...(wanted.about ?? []).map((line) => element("p", { class: "detail" }, line)),
-      ...inputs.map(([, , label]) => label), problem, forced,
+      ...inputs.map(([, , label]) => label), blocked, problem, forced,
       token ? element("label", {}, "Token", token) : null,
       element("div", { class: "buttons" }, cancel, yes)));
     if (dialog.open) dialog.close();

@@ -46,6 +46,8 @@ export function obstacle(order, vehicle, page) {
       if (vehicle.mission_items === 0) return "No mission";
       if (isArmed === false) return "Arm first";
       if (vehicle.is_flying_mission && mission?.state === "ACTIVE" && (isFlying || isSurface)) return "Running";
+      // ArduCopter, on the ground after a finished mission, would take off and fly from the first item.
+      if (order === "mission/resume" && isOnGround && !isSurface) return "On the ground: use Start mission";
       return lacksPosition(vehicle) ? "No position" : "";
     case "mission/pause":
       return isArmed === false || mission?.state === "NO_MISSION" || !vehicle.is_flying_mission ? "None runs" : "";
@@ -62,16 +64,35 @@ function lacksPosition(vehicle) {
   return !(estimator.value.flags & EKF_POS_HORIZ) || Boolean(estimator.value.flags & EKF_CONST_POS_MODE);
 }
 
+const RECENT_MS = 60_000;
+
+// Why a vehicle that was armed a short time ago is disarmed; "" if the page has not seen it armed, or longer ago.
+function recentDisarm(vehicle) {
+  const since = performance.now() - (vehicle?.disarmedAt ?? -Infinity);
+  if (valueOf(vehicle ?? { states: {} }, "armed") || since > RECENT_MS) return "";
+  const parameter = vehicle.firmware === "ArduCopter" ? "DISARM_DELAY" : vehicle.firmware.startsWith("PX4") ? "COM_DISARM_PRFLT" : "";
+  const delay = parameter && ` ${vehicle.firmware} disarms itself on the ground after ${parameter}, 10 s by default.`;
+  return ` It disarmed ${age(Math.max(1, since / 1000))} ago.${delay}`;
+}
+
+// The reason why the order of an open dialog cannot work now, as sentences; "" if it may work.
+export function dialogObstacle(order, vehicle, page) {
+  const why = obstacle(order, vehicle, { ...page, hasToken: true }); // the dialog asks for the token
+  if (why === "Arm first") return `The vehicle is not armed: press “Arm” first.${recentDisarm(vehicle)}`;
+  return why && `Not possible now: ${why.charAt(0).toLowerCase()}${why.slice(1)}.`;
+}
+
 // An error of the library for a person: without names of functions and messages.
-export function inWords(problem) {
+export function inWords(problem, vehicle) {
   const text = problem.detail
     .replace(/^(?:[a-z]+\.)?([a-z_]+)(?:\(\))?: /, (prefix, name) => (name in TITLES ? "" : prefix))
     .replace(/MAV_CMD_\w+ was refused: (\w+)/g, (_, result) => `The vehicle refused (${result.toLowerCase().replaceAll("_", " ")})`)
+    .replace(/\bcall (?=[a-z_]+\(\))/g, "press ")
     .replace(/\b([a-z_]+)\(\)/g, (_, name) => `“${TITLES[name] ?? name.replaceAll("_", " ")}”`);
-  return capitalized(text);
+  return capitalized(text) + (text.includes("not armed") ? recentDisarm(vehicle).replace(/^ /, ". ") : "");
 }
 
-const capitalized = (text) => text.replace(/^[a-z](?=[a-z]* )/, (letter) => letter.toUpperCase()); // not file names
+export const capitalized = (text) => text.replace(/^[a-z](?=[a-z]* )/, (letter) => letter.toUpperCase()); // not file names
 
 // [class of the light, title, reasons]
 function readiness(vehicle, page, heartbeatAge) {
