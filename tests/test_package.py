@@ -19,8 +19,14 @@ def test_public_names_are_importable(name: str) -> None:
 
 
 def test_unknown_name_raises_attribute_error() -> None:
-    with pytest.raises(AttributeError, match="module 'aerokit' has no attribute 'conect'"):
+    with pytest.raises(AttributeError, match=r"module 'aerokit' has no attribute 'conect'$"):
         getattr(aerokit, "conect")  # noqa: B009
+
+
+@pytest.mark.parametrize(("name", "module"), [("AerokitError", "errors"), ("ModeChanged", "events")])
+def test_name_of_submodule_is_suggested(name: str, module: str) -> None:
+    with pytest.raises(AttributeError, match=rf"no attribute '{name}': did you mean aerokit\.{module}\.{name}\?$"):
+        getattr(aerokit, name)
 
 
 def test_import_is_lazy() -> None:

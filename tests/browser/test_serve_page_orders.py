@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -88,6 +89,8 @@ def test_page_sets_parameter_after_confirmation(browser: Any, copters: tuple[lis
     with serving(address) as server, opened(browser, server["page"]) as page:
         page.locator(".vehicle", has_text="2 ArduCopter").click()
         page.get_by_role("tab", name="Parameters").click()
+        page.fill("input[type=search]", "rtl_atl")
+        page.locator("#panel .note", has_text=re.compile("^0 of .*: did you mean RTL_ALT[?]$")).wait_for()
         page.fill("input[type=search]", "wpnav_speed")
         page.locator("tr", has_text="WPNAV_SPEED_UP").wait_for()
         page.fill("input[type=search]", "wp_spd_up")  # its other name
@@ -95,7 +98,7 @@ def test_page_sets_parameter_after_confirmation(browser: Any, copters: tuple[lis
         page.fill("dialog input[name=value]", "321")
         assert "Vehicle 2" in page.locator("dialog").inner_text()
         page.click("dialog .yes")
-        wait_done(page, "WPNAV_SPEED_UP")
+        wait_done(page, "WPNAV_SPEED_UP to 321: done; range not checked (serve --metadata FILE checks it)")
         page.locator("tr", has_text="321").wait_for()
         picture(page, "parameters")
 
@@ -206,7 +209,8 @@ def test_resume_is_disabled_on_known_ground(browser: Any, copters: tuple[list[Si
             const { obstacle } = await import("/static/readiness.js");
             const states = { armed: { value: true, age_s: 0 }, landed_state: { value: landed, age_s: age } };
             const link = { state: "connected" };
-            return obstacle("mission/resume", { states, link, vehicle_type: type, missing_for_flight: [] }, { isOpen: true });
+            const vehicle = { states, link, vehicle_type: type, missing_for_flight: [] };
+            return obstacle("mission/resume", vehicle, { isOpen: true });
         }"""
         assert {case: page.evaluate(obstacles, [*case]) for case in cases} == cases
 

@@ -106,14 +106,22 @@ class _Rules:
     def check(self, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> None:
         rules = self._read() if self._by_name is None else self._by_name
         for name, value in zip(self._positional, args):  # noqa: B905 - Python rejects surplus arguments itself
-            if name in rules:
-                _check_value(rules[name], name, value)
+            if name in rules and not rules[name][0](value):
+                raise self._error(name, value, args, kwargs)
         if self._var_positional:
             for value in args[len(self._positional) :]:
                 _check_value(rules[self._var_positional], self._var_positional, value)
         for name, value in kwargs.items():
-            if name in rules:
-                _check_value(rules[name], name, value)
+            if name in rules and not rules[name][0](value):
+                raise self._error(name, value, args, kwargs)
+
+    def _error(self, name: str, value: object, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> InvalidArgument:
+        check, allowed = ({} if self._by_name is None else self._by_name)[name]
+        given = {**dict(zip(self._positional, args)), **kwargs}.get("name")  # noqa: B905 - as in check()
+        if name == "value" and isinstance(given, str):  # set("RTL_ALT", "abc")
+            hint = _hint(check, value)
+            return InvalidArgument(f"{given[:40]} = {short_repr(value)} is not allowed: it must be {allowed}{hint}")
+        return _error(check, allowed, name, value)
 
     def _read(self) -> dict[str, Rule]:
         parameters = inspect.signature(self._function).parameters.values()
@@ -138,7 +146,11 @@ def _is_time(parameter: inspect.Parameter) -> bool:
 def _check_value(rule: Rule, name: str, value: object) -> None:
     check, allowed = rule
     if not check(value):
-        raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: {allowed}{_hint(check, value)}")
+        raise _error(check, allowed, name, value)
+
+
+def _error(check: Check, allowed: str, name: str, value: object) -> InvalidArgument:
+    return InvalidArgument(f"{name} = {short_repr(value)} is not allowed: {allowed}{_hint(check, value)}")
 
 
 def _hint(check: Check, value: object) -> str:

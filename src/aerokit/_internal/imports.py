@@ -10,6 +10,9 @@ from importlib import import_module
 # Packages of the other project only: ``aerokit.aero`` and so on.
 _OTHER_PACKAGES = ("aero", "engine", "stability")
 
+# Modules whose names are looked for in the package itself.
+_NAMED_MODULES = ("aerokit.errors", "aerokit.events")
+
 
 def installation_problem(folder: str, *, is_ours: bool = True) -> str | None:
     """Describe what is wrong with the installation in ``folder`` and how to repair it; None if nothing is wrong.
@@ -27,6 +30,14 @@ def installation_problem(folder: str, *, is_ours: bool = True) -> str | None:
     )
 
 
+def _suggestion(package: str, name: str) -> str:
+    """Return the right place of a name that ``aerokit.errors`` or ``aerokit.events`` has; empty for other names."""
+    if package != "aerokit" or name.startswith("_"):
+        return ""
+    places = (module for module in _NAMED_MODULES if name in import_module(module).__all__)
+    return next((f": did you mean {module}.{name}?" for module in places), "")
+
+
 def lazy_exports(
     package: str, exports: Mapping[str, tuple[str, ...]]
 ) -> tuple[Callable[[str], object], Callable[[], list[str]], list[str]]:
@@ -39,7 +50,7 @@ def lazy_exports(
 
     def get_attribute(name: str) -> object:
         if name not in modules:
-            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+            raise AttributeError(f"module {package!r} has no attribute {name!r}{_suggestion(package, name)}")
         module = import_module(modules[name])
         value = getattr(module, name, module)
         setattr(sys.modules[package], name, value)

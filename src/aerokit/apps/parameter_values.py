@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from aerokit.parameters import Metadata, ParameterMetadata
+    from aerokit.vehicle.parameters.writing import ParameterWrite
 
 
 def check_values(metadata: Metadata | None, values: Mapping[str, float], force: str) -> None:
@@ -23,6 +24,20 @@ def check_values(metadata: Metadata | None, values: Mapping[str, float], force: 
     problems = [problem for name, value in values.items() if (problem := _problem(metadata, name, value))]
     if problems:
         raise InvalidArgument(f"{'; '.join(problems)}; nothing was set; {force} sets such values too")
+
+
+def range_note(metadata: Metadata | None, result: ParameterWrite, option: str) -> str:
+    """Return the note of a result, which says if the value was set without a check of its range.
+
+    ``option`` is the option that gives the metadata; it appears in the note.
+    """
+    text = ""
+    if metadata is None:
+        text = f"range not checked ({option} checks it)"
+    elif metadata_entry(metadata, result.name)[0] is None:
+        text = "range not checked (the metadata does not have this parameter)"
+    is_set = result.error is None and result.outcome != "unchanged"
+    return "; ".join(filter(None, (result.note, text if is_set else "")))
 
 
 def _problem(metadata: Metadata, name: str, value: float) -> str | None:

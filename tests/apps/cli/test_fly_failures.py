@@ -127,7 +127,7 @@ def test_fly_fall_ends_with_error_and_sends_nothing(
 ) -> None:
     async def scenario() -> int:
         async with simulated_link(copter) as link:
-            flight = asyncio.create_task(run_on(link, "fly", "m.waypoints", "--yes"))
+            flight = asyncio.create_task(run_on(link, "fly", "m.waypoints", "--yes", "--record", "fall.tlog"))
             await wait_until(lambda: copter.altitude_m > 8)
             copter.faults.motor_failed = True
             with anyio.fail_after(60):
@@ -137,6 +137,26 @@ def test_fly_fall_ends_with_error_and_sends_nothing(
     out, err = capsys.readouterr()
     assert "the vehicle accepted the order and has not moved for 12 s, after it descended" in err
     assert "failed: flying the mission: the vehicle accepted the order and has not moved" in out
+    assert out.endswith("recorded in fall.tlog\nnext: aerokit report fall.tlog\n")
+
+
+def test_fly_disarmed_in_air_prints_reasons_once(copter: SimulatedCopter, capsys: pytest.CaptureFixture[str]) -> None:
+    async def scenario() -> int:
+        async with simulated_link(copter) as link:
+            flight = asyncio.create_task(run_on(link, "fly", "m.waypoints", "--yes"))
+            await wait_until(lambda: copter.altitude_m > 8)
+            copter.info("Crash: Disarming: AngErr=121>30, Accel=0.9<3.0")
+            copter.arming.disarm()
+            with anyio.fail_after(60):
+                return await flight
+
+    assert run_virtual(scenario()) == 5
+    out, err = capsys.readouterr()
+    assert err.startswith("aerokit: flying the mission: the vehicle ")
+    assert "\n  - Crash: Disarming" in err
+    assert "  - Crash: Disarming" not in out
+    assert "Mission: " not in err
+    assert "Reached command" not in err
 
 
 class FullDisk(io.StringIO):

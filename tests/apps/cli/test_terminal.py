@@ -153,6 +153,15 @@ def test_mistyped_argument_suggests_correction(
     assert f"(did you mean {meant}?)" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("word", ["arm", "takeoff"])
+def test_action_that_is_no_command_names_what_arms(word: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main([word])
+    error = capsys.readouterr().err
+    assert f"unknown command '{word}'" in error
+    assert all(command in error for command in ("aerokit fly", "aerokit serve", "Python"))
+
+
 @pytest.mark.parametrize(
     ("arguments", "code"),
     [

@@ -244,6 +244,23 @@ async def test_wide_row_of_armed_vehicle_is_not_ready() -> None:
         assert VehicleText(flight.vehicle).row(is_selected=True, more=True).plain.split()[-1] == "armed"
 
 
+@pytest.mark.parametrize(
+    ("size", "shown"),
+    [
+        ((60, 30), ["Compass", "RC", "Gyro"]),
+        ((60, 11), ["Compass", "RC (and 1 more)"]),
+        ((0, 0), ["Compass (and 2 more)"]),
+    ],
+)
+async def test_state_lists_missing_reasons_where_room(size: tuple[int, int], shown: list[str]) -> None:
+    async with open_flight() as flight:
+        await flight.vehicle.wait_ready()
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(type(flight.vehicle), "missing_for_flight", lambda _: ["Compass", "RC", "Gyro"])
+            rows = dict(VehicleText(flight.vehicle).rows(size=size))
+        assert rows["missing"].plain.split("\n") == shown
+
+
 async def test_vehicle_without_mission_shows_no_item() -> None:
     async with stage(1, size=(200, 50)) as it:
         await it.wait_drawn("mission")

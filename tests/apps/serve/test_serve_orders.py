@@ -429,3 +429,12 @@ async def test_plan_is_checked_in_either_format_and_nothing_is_sent() -> None:
         uploaded = await stage.submit("mission/upload", {"plan": waypoints, "name": "a.waypoints"})
         assert uploaded.json()["arguments"]["mission_items"] == 1
         assert len(await stage.flight.vehicle.mission.download()) == 1
+
+
+async def test_parameter_result_says_that_range_is_not_checked() -> None:
+    async with open_stage() as stage:
+        answer = await set_parameter(stage, "RTL_ALT", {"value": 2000})
+        assert answer.json()["result"]["note"] == "range not checked (serve --metadata FILE checks it)"
+    async with open_stage(metadata=METADATA) as stage:
+        answer = await set_parameter(stage, "RTL_ALT", {"value": 2000})
+        assert answer.json()["result"]["note"] == ""

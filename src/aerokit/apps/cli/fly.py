@@ -39,6 +39,8 @@ _NOTHING_SENT = "nothing was sent"
 class PlanFlight(SupervisedFlight):
     """Flies the mission of a plan."""
 
+    _prints_reasons = False
+
     def __init__(
         self,
         vehicle: Vehicle,
@@ -247,7 +249,12 @@ async def _connect_and_fly(
         report = FlightReport(vehicle, options, options.speedup if options.sim else 1.0)
         async with report.running():
             flights.append(PlanFlight(vehicle, plan, report, interrupts, options))
-            code = await flights[-1].fly()
+            try:
+                code = await flights[-1].fly()
+            except AerokitError:
+                if flights[-1].armed_by_us:
+                    report.print_summary(options.record)
+                raise
         if flights[-1].armed_by_us:
             report.print_summary(options.record)
     return code

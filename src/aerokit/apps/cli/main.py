@@ -202,8 +202,14 @@ class Parser(argparse.ArgumentParser):
             is_command = message.startswith("argument COMMAND:")
             if is_command and is_address(found[1]):
                 hint = f"; to see the vehicle there: aerokit status {found[1]}"
+            if found[1].lower() in _ARMING_WORDS:
+                hint = "; `aerokit fly PLAN`, the web page of `aerokit serve` and Python programs arm and fly a vehicle"
             message = f"unknown command {found[1]!r}{hint}; `aerokit` lists them" if is_command else message + hint
         super().error(message)
+
+
+# Actions of the library that are no commands, because a command ends before the action does.
+_ARMING_WORDS = ("arm", "disarm", "takeoff", "take_off", "take-off", "land", "goto", "go_to", "rtl")
 
 
 class _TopParser(Parser):

@@ -98,15 +98,19 @@ _PLAIN_NAMES = {
     "mission.resume": "continuing the mission",
     "mission.wait_finished": "flying the mission",
 }
+# ArduPilot announces each mission item in texts that repeat what the commands print, and that explain no failure.
+MISSION_TEXT: re.Pattern[str] = re.compile(r"(?:Mission: \d+ |Reached command #\d+)[^\n]*")
+_MISSION_REASON = re.compile(rf"\n  - {MISSION_TEXT.pattern}")
 _CALL = re.compile(rf"({'|'.join(map(re.escape, _PLAIN_NAMES))})(?:\(([^()]*)\))?(?=: )")
 
 
 def plain_text(error: BaseException) -> str:
     """Return the text of an error. The name of the call that raised it is replaced, because users do not know the call.
 
-    ``mission.wait_finished: the mode changed to RTL`` becomes ``flying the mission: the mode changed to RTL``.
+    ``mission.wait_finished: the mode changed to RTL`` becomes ``flying the mission: the mode changed to RTL``. Reasons
+    that only announce a mission item are left out.
     """
-    text = str(error)
+    text = _MISSION_REASON.sub("", str(error))
     if (found := _CALL.match(text)) is None:
         return text
     return " ".join(filter(None, (_PLAIN_NAMES[found[1]], found[2]))) + text[found.end() :]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import anyio
 
-from aerokit.apps.parameter_values import check_values, metadata_entry
+from aerokit.apps.parameter_values import check_values, metadata_entry, range_note
 from aerokit.errors import AerokitError, CommandRejected, FileError, NotSupported
 
 if TYPE_CHECKING:
@@ -79,13 +79,7 @@ def check_given(metadata: Metadata | None, values: Mapping[str, float]) -> None:
 
 def with_range_note(metadata: Metadata | None, result: ParameterWrite) -> str:
     """Return the note of a result, which says whether the value was set without a check of its range."""
-    text = ""
-    if metadata is None:
-        text = RANGES_NOT_CHECKED.replace("ranges", "range").replace("them", "it")
-    elif metadata_entry(metadata, result.name)[0] is None:
-        text = "range not checked (the metadata does not have this parameter)"
-    is_set = result.error is None and result.outcome != "unchanged"
-    return "; ".join(filter(None, (result.note, text if is_set else "")))
+    return range_note(metadata, result, "--metadata FILE")
 
 
 def reboot_note(metadata: Metadata | None, name: str, value: float) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
-import re
 import shlex
 import sys
 from abc import ABC, abstractmethod
@@ -16,7 +15,7 @@ from typing import TYPE_CHECKING
 import anyio
 
 from aerokit import events
-from aerokit.apps.cli.output import DONE, INTERRUPTED, emit, plain_text
+from aerokit.apps.cli.output import DONE, INTERRUPTED, MISSION_TEXT, emit, plain_text
 from aerokit.errors import (
     AerokitError,
     CommandRejected,
@@ -49,8 +48,6 @@ INTERRUPT_ACTIONS: dict[str, str] = {
 """Maps the choices of ``--on-interrupt`` to the texts that are printed."""
 _AUTO_DISARM_TIMEOUT_S = 30.0
 _WARNING = 4
-# ArduPilot announces each mission item in texts that repeat what the commands print.
-_MISSION_TEXT = re.compile(r"Mission: \d+ |Reached command #\d+")
 # A status line is printed after this time without output.
 _STATUS_INTERVAL_S = 5.0
 
@@ -60,6 +57,8 @@ class SupervisedFlight(ABC):
 
     Never commands a vehicle that was armed before, or whose mode another party has changed.
     """
+
+    _prints_reasons = True  # False if the command prints the error with its reasons when it ends
 
     def __init__(self, vehicle: Vehicle, report: FlightReport, interrupts: InterruptStack, on_interrupt: str) -> None:
         self._vehicle, self._print, self._interrupts = vehicle, report.print_line, interrupts
@@ -76,7 +75,8 @@ class SupervisedFlight(ABC):
             code = await self._interrupts.run(self._fly)
         except Exception as error:
             # After any error, a vehicle that this program has armed must not stay armed on the ground.
-            self._print(f"failed: {plain_text(error)}")
+            cause, _, reasons = plain_text(error).partition("\n")
+            self._print(f"failed: {cause}" + (f"\n{reasons}" if reasons and self._prints_reasons else ""))
             if self.armed_by_us:
                 await self._make_safe(partial(self._after_failure, error))
             raise
@@ -309,7 +309,7 @@ class FlightReport:
             async for event in messages:
                 if isinstance(event, events.ModeChanged):
                     self.print_line(f"  mode {event.after}")
-                elif isinstance(event, events.StatusTextReceived) and not _MISSION_TEXT.match(event.text):
+                elif isinstance(event, events.StatusTextReceived) and not MISSION_TEXT.match(event.text):
                     if self._vehicle.autopilot.arming_reason(event.text) is not None:
                         self._arming_texts[event.text] = self._vehicle.connection.now()
                     self.print_line(f"  {'! ' if event.severity <= _WARNING else ''}{event.text}")

@@ -252,12 +252,16 @@ class Monitor(App[None]):
     def _state_rows(self) -> list[tuple[str, Text]] | Text:
         vehicle = self.selected
         if vehicle is not None:
-            return VehicleText(vehicle).rows(more=self._is_wide)
+            return VehicleText(vehicle).rows(more=self._is_wide, size=self._state_size())
         waited = self._model.connection.now() - self._began_at
         return Text(
             f"waiting for a vehicle's heartbeat on {self._name} ({waited:.0f} s)\n\n"
             f"{explain_no_vehicle(self._model.connection, None)}"
         )
+
+    def _state_size(self) -> tuple[int, int]:
+        size = self.screen_stack[0].query_one("#state", Panel).content_size
+        return size.width, size.height
 
     def _show_map(self, widget: Panel) -> None:
         model, size = self._model, widget.content_size

@@ -31,6 +31,8 @@ ARROWS = "↑↗→↘↓↙←↖"
 """Arrows by heading, clockwise from north."""
 _DOTS = ((0x01, 0x08), (0x02, 0x10), (0x04, 0x20), (0x40, 0x80))
 _MIN_SPAN_M = 20.0
+# Columns between labels and values, and of " (and 10 more)".
+_LABEL_PADDING, _MORE_WIDTH = 2, 14
 
 
 def number(value: float | None, digits: int = 1, unit: str = "", sign: str = "-") -> str:
@@ -62,8 +64,18 @@ class VehicleText:
             return Text(f"{text} ({age(cell.age if not self._silent_s else older_s)} old)", "dim italic")
         return Text(text, "dim" if self._silent_s else style)
 
-    def rows(self, *, more: bool = False) -> list[tuple[str, Text]]:
-        """Return labels and values. ``more`` includes values of secondary importance."""
+    def rows(self, *, more: bool = False, size: tuple[int, int] = (0, 0)) -> list[tuple[str, Text]]:
+        """Return labels and values. ``more`` includes values of secondary importance.
+
+        ``size`` is the space, in columns and lines: where it has room, all missing reasons are listed.
+        """
+        rows = self._main_rows() + (self._more_rows() if more else [])
+        if rows[1][0] == "missing":
+            width = size[0] - max(len(label) for label, _ in rows) - _LABEL_PADDING
+            rows[1] = ("missing", self._missing(1 + size[1] - len(rows), width))
+        return rows
+
+    def _main_rows(self) -> list[tuple[str, Text]]:
         vehicle, cell = self._vehicle, self.cell
         rows = [
             ("mode", Text("  ").join([cell(vehicle.mode, _name, "bold"), self._armed()])),
@@ -81,7 +93,7 @@ class VehicleText:
         ]
         if not self._silent_s:
             rows.append(("link", self._link()))
-        return rows + self._more_rows() if more else rows
+        return rows
 
     def _more_rows(self) -> list[tuple[str, Text]]:
         vehicle, cell = self._vehicle, self.cell
@@ -155,12 +167,16 @@ class VehicleText:
             self.cell(quality, lambda report: number(report.round_trip_s and report.round_trip_s * 1000, 0, " ms"))
         )
 
-    def _missing(self) -> Text:
+    def _missing(self, lines: int = 1, width: int = 0) -> Text:
         missing = self._vehicle.missing_for_flight()
         if not missing:
             return Text("nothing")
-        more = f" (and {len(missing) - 1} more)" if len(missing) > 1 else ""
-        return Text(printable(f"{missing[0]}{more}"), WARNING)
+        count, used = 1, 0
+        for number_, reason in enumerate(missing, 1):
+            used += math.ceil((len(reason) + _MORE_WIDTH) / max(1, width))
+            count = number_ if used <= lines else count
+        more = f" (and {len(missing) - count} more)" if len(missing) > count else ""
+        return Text("\n".join(map(printable, missing[:count])) + more, WARNING)
 
 
 def cell_of_constant(cell: StateCell[Any]) -> Text:

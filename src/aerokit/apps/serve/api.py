@@ -21,6 +21,7 @@ from aerokit.apps.serve.orders import (
     OrderRunner,
     OrderType,
     check_parameter,
+    parameter_order,
     parse_plan_body,
 )
 from aerokit.apps.serve.requests import (
@@ -417,7 +418,9 @@ class HttpApi:
         kind.check(arguments)
         if kind is SET_PARAMETER:
             arguments["name"] = request.path_params["name"]
-            check_parameter(vehicle.parameters.metadata or self._metadata, arguments)
+            metadata = vehicle.parameters.metadata or self._metadata
+            check_parameter(metadata, arguments)
+            kind = parameter_order(metadata)
         key = request.headers.get("idempotency-key", "").strip().strip('"')
         record = self._orders.submit(vehicle, kind, arguments, key, seen_at(request))
         await _wait_ended(record, None if waits else _REFUSAL_TIMEOUT_S)

@@ -9,11 +9,12 @@ import logging
 import re
 import sys
 from collections import OrderedDict
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from aerokit._internal.formatting import to_jsonable
-from aerokit.apps.parameter_values import check_values
+from aerokit.apps.parameter_values import check_values, range_note
 from aerokit.apps.plan_text import parse_plan_text
 from aerokit.apps.serve.requests import MAX_BODY_SIZE, MAX_PLAN_SIZE, HttpProblem, problem_of
 from aerokit.connection.tasks import BackgroundTasks
@@ -95,13 +96,20 @@ async def _resume(vehicle: Vehicle, values: dict[str, Any]) -> None:
     is_on_ground = landed.latest == MavLandedState.ON_GROUND and landed.age <= _LANDED_STATE_MAX_AGE_S
     if vehicle.is_armed and is_on_ground and vehicle.autopilot.vehicle_type not in _SURFACE_TYPES:
         raise OperationRejected(
-            "mission/resume: the vehicle is on the ground, where it would take off: order mission/start; nothing was sent"
+            "mission/resume: the vehicle is on the ground, where it would take off: order mission/start;"
+            " nothing was sent"
         )
     await vehicle.mission.resume()
 
 
-async def _set_parameter(vehicle: Vehicle, values: dict[str, Any]) -> object:
-    return await vehicle.parameters.set(values["name"], values["value"])
+async def _set_parameter(vehicle: Vehicle, values: dict[str, Any], metadata: Metadata | None = None) -> object:
+    result = await vehicle.parameters.set(values["name"], values["value"])
+    return result.replace(note=range_note(metadata, result, "serve --metadata FILE"))
+
+
+def parameter_order(metadata: Metadata | None) -> OrderType:
+    """Return the order that sets a parameter; its result has a note if the metadata could not check the value."""
+    return replace(SET_PARAMETER, run=partial(_set_parameter, metadata=metadata))
 
 
 def check_parameter(metadata: Metadata | None, values: Mapping[str, Any]) -> None:

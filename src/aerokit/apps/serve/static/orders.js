@@ -125,7 +125,7 @@ export class Orders {
     const force = element("input", { type: "checkbox", name: "force", onchange: () => { yes.disabled = !force.checked || !blocked.hidden; } });
     const forced = element("label", { class: "force", hidden: true }, "Set it all the same", force);
     const values = () => Object.fromEntries(inputs.filter(([, input]) => input.value !== "").map(([name, input]) => [name, Number(input.value)]));
-    const blocked = element("p", { class: "problem blocked", hidden: true, role: "alert" });
+    const blocked = element("p", { class: "blocked", hidden: true, role: "alert" });
     // The vehicle can disarm itself, land or become silent while the dialog is open.
     this.recheck = (page) => {
       const why = dialogObstacle(wanted.order, page.vehicles.get(id), page);

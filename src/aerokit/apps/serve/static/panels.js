@@ -133,7 +133,7 @@ export class ParameterPanel {
         element("td", {}, name, each.other_names?.length ? element("div", { class: "detail" }, `other versions: ${each.other_names.join(", ")}`) : null, about ? element("div", { class: "detail" }, about) : null),
         element("td", { class: "number" }, withUnit(each, each.value), element("div", { class: "detail" }, meaning(each) || facts, meaning(each) && facts ? ` · ${facts}` : "")));
       const names = [each.name, ...(each.other_names ?? [])].join(" ");
-      return { node, text: `${names} ${about ?? ""} ${each.description ?? ""}`.toUpperCase() };
+      return { node, name: each.name, text: `${names} ${about ?? ""} ${each.description ?? ""}`.toUpperCase() };
     });
     this.body.replaceChildren(...this.rows.map((each) => each.node));
     this.filter();
@@ -147,8 +147,33 @@ export class ParameterPanel {
       count += !node.hidden;
     }
     const note = (this.tables.get(this.vehicle) || {}).note;
-    show(this.note, note ?? `${count} of ${this.rows.length} parameters`);
+    const near = !count && words.length === 1 ? nearName(words[0], this.rows.map((each) => each.name)) : "";
+    show(this.note, note ?? `${count} of ${this.rows.length} parameters${near ? `: did you mean ${near}?` : ""}`);
   }
+}
+
+const MAX_EDITS = 2;
+
+// The name with the fewest differences from a misspelt one; "" if all differ in more than two places.
+export function nearName(word, names) {
+  const ranked = names.map((name) => [edits(word, name), name]).sort(([a, one], [b, other]) => a - b || one.localeCompare(other));
+  const [[count, name] = [Infinity, ""]] = ranked;
+  return count <= Math.min(MAX_EDITS, word.length / 3) ? name : "";
+}
+
+// How many characters must be added, removed or replaced to turn a word into a name (Levenshtein).
+function edits(word, name) {
+  if (name.length < word.length - MAX_EDITS) return Infinity;
+  let row = Array.from({ length: name.length + 1 }, (_, column) => column);
+  for (let line = 1; line <= word.length; line++) {
+    const next = [line];
+    for (let column = 1; column <= name.length; column++) {
+      const replaced = row[column - 1] + (word[line - 1] === name[column - 1] ? 0 : 1);
+      next.push(Math.min(replaced, row[column] + 1, next[column - 1] + 1));
+    }
+    row = next;
+  }
+  return row[name.length];
 }
 
 const short = (value) => (value === null || value === undefined ? UNKNOWN : String(+value.toPrecision(7)));
@@ -226,9 +251,12 @@ export class TextPanel {
 const seconds = (value) => `${number(value, value < 10 ? 1 : 0)} s`;
 const LANDED = { ON_GROUND: "On the ground", IN_AIR: "In the air", TAKEOFF: "Taking off", LANDING: "Landing" };
 
+// ArduPilot announces each mission item in texts that repeat the events of the mission, as in supervised_flight.py.
+const ITEM_TEXT = /^(Mission: \d+ |Reached command #\d+)/;
+
 // Sentences for events; others list their fields.
 const EVENT_TEXTS = {
-  StatusTextReceived: (e) => e.text,
+  StatusTextReceived: (e) => (ITEM_TEXT.test(e.text) ? "" : e.text),
   ArmedChanged: (e) => (e.is_armed ? "Armed" : "Disarmed"),
   ModeChanged: (e) => (e.before === null ? `Mode ${e.after}` : `Mode ${e.before} → ${e.after}`),
   LandedStateChanged: (e) => LANDED[e.after] ?? "Unknown whether it has landed",
@@ -311,7 +339,9 @@ const BEGUN = {
 // An order and its state, in words.
 export function outcome(record) {
   const text = record.state === "done" && BEGUN[record.order];
-  return text ? text(record.arguments) : `${orderText(record)}: ${record.state === "running" ? "ordered" : record.state}`;
+  if (text) return text(record.arguments);
+  const note = record.order === "set_parameter" && record.result?.note;
+  return `${orderText(record)}: ${record.state === "running" ? "ordered" : record.state}${note ? `; ${note}` : ""}`;
 }
 
 export function orderText(record) {
