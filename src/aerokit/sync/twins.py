@@ -4411,7 +4411,7 @@ class Vehicle(VehicleTwin):
 
         Raises:
             OperationTimeout: not ready within ``timeout`` seconds; the text lists what is missing, and recent status
-                texts.
+                texts. If the pre-arm checks fail, the vehicle is asked for its reasons three seconds before the end.
         """
         self._loop.run(self.aio.wait_ready, timeout=timeout)
 
@@ -4427,12 +4427,13 @@ class Vehicle(VehicleTwin):
         """Arm the motors and wait until HEARTBEAT reports armed: **propellers may start to turn**.
 
         If the present mode does not allow arming (RTL or LAND after a flight, OFFBOARD), the mode is changed first.
-        The command is sent only once: a repetition might arm a vehicle that a pilot has just disarmed. After a
-        cancellation, or an error other than a refusal, the command may still be executed. aerokit therefore monitors
-        the vehicle for 15 seconds, as long as the connection is open. If this command arms the vehicle after all,
-        aerokit disarms it. Arming is attributed to this command if the vehicle accepts it, or reports armed in the next
-        HEARTBEAT without a takeover. A vehicle that was armed otherwise stays armed. Logger "aerokit" warns about the
-        outcome.
+        ArduCopter decides by AUTO_OPTIONS whether it arms in AUTO; if it refuses there, the mode is changed and the
+        command is sent again. Otherwise it is sent only once: a repetition might arm a vehicle that a pilot has just
+        disarmed. After a cancellation, or an error other than a refusal, the command may still be executed. aerokit
+        therefore monitors the vehicle for 15 seconds, as long as the connection is open. If this command arms the
+        vehicle after all, aerokit disarms it. Arming is attributed to this command if the vehicle accepts it, or
+        reports armed in the next HEARTBEAT without a takeover. A vehicle that was armed otherwise stays armed. Logger
+        "aerokit" warns about the outcome.
 
         Args:
             mode: the mode to arm in. None: the present mode; if it does not allow arming, the mode in which

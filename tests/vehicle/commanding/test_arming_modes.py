@@ -87,10 +87,30 @@ async def test_mission_is_flown_twice() -> None:
             await flight.vehicle.armed.wait_until(lambda armed: not armed, timeout=30)
         assert flight.vehicle.mode_name == "AUTO"
         (reason,) = await flight.vehicle.why_not_armable()
-        assert reason == "ArduCopter cannot arm in AUTO unless AUTO_OPTIONS allows it; arm() changes to GUIDED first"
+        assert (
+            reason
+            == "ArduCopter cannot arm in AUTO unless AUTO_OPTIONS allows it; arm() changes to GUIDED after a refusal"
+        )
         flight.wire.clear()
         with pytest.raises(CommandRejected, match="AUTO mode not armable"):
             await flight.vehicle.arm(mode="AUTO")
+        assert not flight.wire.mode_orders()
+
+
+@pytest.mark.parametrize("armed_before_s", [None, 0.3])
+async def test_arm_where_option_allows_it_keeps_mode(armed_before_s: float | None) -> None:
+    """Another station may have armed, so that the vehicle already flies its mission."""
+    async with open_flight() as flight:
+        await flight.vehicle.wait_ready()
+        await flight.vehicle.parameters.set("AUTO_OPTIONS", 1)
+        await flight.vehicle.mission.upload(missions.Mission([missions.take_off(10)]))
+        await flight.vehicle.set_mode("AUTO")
+        if armed_before_s is not None:
+            flight.copter.arming.arm()
+            await anyio.sleep(armed_before_s)
+        flight.wire.clear()
+        await flight.vehicle.arm()
+        assert flight.vehicle.is_armed
         assert not flight.wire.mode_orders()
 
 

@@ -23,7 +23,9 @@ from aerokit.errors import (
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavLandedState, MavResult
 from aerokit.sim import SimulatedCopter
 from aerokit.vehicle.commanding import flight
+from aerokit.vehicle.commanding.ground import GroundCheck
 from aerokit.vehicle.commanding.setpoints import VelocitySetpoint
+from aerokit.vehicle.state.movement import Velocity
 
 pytestmark = pytest.mark.anyio
 
@@ -555,6 +557,55 @@ async def test_fall_on_the_way_to_the_ground_is_rejected(name: str) -> None:
         group.start_soon(fail)
         with pytest.raises(OperationRejected, match=rf"{name}: the vehicle hit the ground at \d+\.\d m/s"):
             await getattr(flight.vehicle, name)()
+
+
+async def test_return_disarmed_while_climbing_is_rejected() -> None:
+    """The vehicle rises for half a second, and then falls."""
+    async with open_px4() as flight, anyio.create_task_group() as group:
+        await flight.take_off(10.0)
+        await flight.vehicle.parameters.set("MPC_Z_V_AUTO_UP", 8.0)
+        await flight.vehicle.parameters.set("RTL_RETURN_ALT", 60.0)
+        place = flight.vehicle.position.value.offset(north_m=60.0)
+        await flight.vehicle.go_to(place)
+        group.start_soon(disarm_later, flight, 3.0)
+        with pytest.raises(OperationRejected, match="disarmed in the air"):
+            await flight.vehicle.return_to_launch()
+
+
+@pytest.mark.parametrize("rate_hz", [10.0, 4.0, 1.0, 0.4])
+async def test_impact_is_detected_at_any_rate(rate_hz: float, flying: Flight) -> None:
+    flying.copter.faults.silent = True
+    ground, cell = GroundCheck(flying.vehicle._context.session), flying.vehicle.velocity
+    for tick in range(100):
+        seconds = tick / 10
+        sink = 5 * seconds if seconds < 3 else 0.0
+        if seconds * rate_hz % 1 < 0.1 * rate_hz - 1e-6:
+            cell.set(Velocity(0.0, 0.0, sink), Source(1, 1, "the test"))
+        assert not ground.confirms(seconds >= 3)
+        await anyio.sleep(0.1)
+    assert "the vehicle hit the ground at" in (ground.trouble(lambda: None) or "")
+
+
+@pytest.mark.parametrize("moves_m_s", [0.0, 0.6])
+async def test_vehicle_that_tumbles_after_impact_has_fallen(moves_m_s: float, flying: Flight) -> None:
+    flying.copter.faults.silent = True
+    ground = GroundCheck(flying.vehicle._context.session)
+    sinks = [*(0.5 * tick for tick in range(30)), *(moves_m_s, -moves_m_s) * 8, *[0.0] * 20]
+    for sink in sinks:
+        flying.vehicle.velocity.set(Velocity(0.0, 0.0, sink), Source(1, 1, "the test"))
+        assert not ground.confirms(sink == 0.0)
+        await anyio.sleep(0.1)
+
+
+async def test_braking_before_touchdown_is_no_impact(flying: Flight) -> None:
+    flying.copter.faults.silent = True
+    ground = GroundCheck(flying.vehicle._context.session)
+    sinks = [*[8.0] * 10, *(8.0 - 0.64 * tick for tick in range(12)), *[0.4] * 5, *[0.0] * 7]
+    for sink in sinks:
+        flying.vehicle.velocity.set(Velocity(0.0, 0.0, sink), Source(1, 1, "the test"))
+        is_down = ground.confirms(sink == 0.0)
+        await anyio.sleep(0.1)
+    assert is_down
 
 
 async def test_fast_descent_before_landing_is_no_fall() -> None:

@@ -25,8 +25,8 @@ def fitted_copter() -> SimulatedCopter:
 
 
 @asynccontextmanager
-async def on_ground() -> AsyncIterator[Flight]:
-    async with open_flight(fitted_copter()) as flight:
+async def on_ground(**options: Any) -> AsyncIterator[Flight]:
+    async with open_flight(fitted_copter(), **options) as flight:
         await flight.vehicle.wait_ready()
         flight.wire.clear()
         yield flight
@@ -199,6 +199,25 @@ async def test_unanswered_motor_test_is_neither_repeated_nor_stopped() -> None:
         flight.copter.faults.ignore(C.DO_MOTOR_TEST)
         with pytest.raises(CommandTimeout):
             await flight.vehicle.actuators.test_motor(1, throttle_percent=5, duration_s=3, intent="spin motor")
+        assert len(params(flight, C.DO_MOTOR_TEST)) == 1
+
+
+async def test_motor_tests_of_px4_are_stopped_each() -> None:
+    async with on_px4() as flight:
+        with anyio.move_on_after(0.8):
+            async with anyio.create_task_group() as group:
+                for number in (1, 2):
+                    spin = {"throttle_percent": 5, "duration_s": 3, "intent": "spin motor"}
+                    group.start_soon(lambda n=number, s=spin: flight.vehicle.actuators.test_motor(n, **s))
+                    await anyio.sleep(0.3)
+        stops = [sent[4] for sent in params(flight, C.ACTUATOR_TEST) if sent[1] == 0]
+        assert sorted(stops) == [1, 2]
+
+
+async def test_motor_test_over_slow_link_is_not_stopped_after_its_end() -> None:
+    async with on_ground(latency_s=0.3) as flight:
+        with anyio.move_on_after(1.2):
+            await flight.vehicle.actuators.test_motor(1, **SPIN)
         assert len(params(flight, C.DO_MOTOR_TEST)) == 1
 
 

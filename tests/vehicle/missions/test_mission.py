@@ -285,6 +285,33 @@ async def test_disarming_ends_wait_finished() -> None:
                 await flight.vehicle.mission.wait_finished()
 
 
+@pytest.mark.parametrize("opened", [open_flight, open_px4])
+async def test_mission_that_ends_in_a_fall_is_not_finished(opened: Any) -> None:
+    """The vehicle disarms during the landing or the return at its end."""
+    async with opened() as flight:
+        mission = flight.vehicle.mission
+        await flight.vehicle.wait_ready()
+        await mission.upload(short_mission(flight, return_to_launch()))
+        await flight.vehicle.arm()
+        await mission.start()
+        async with anyio.create_task_group() as group:
+            group.start_soon(disarm_in_return, flight)
+            with pytest.raises(OperationRejected, match=r"disarmed in the air|hit the ground"):
+                await mission.wait_finished(timeout=120)
+
+
+async def disarm_in_return(flight: Any) -> None:
+    is_px4 = not isinstance(flight, Flight)
+    await flight.vehicle.mission.current.wait_until(lambda item: item == flight.vehicle.mission.count.value - 1)
+    if is_px4:
+        await flight.vehicle.mode.wait_until(lambda mode: mode.name == "RTL")
+    await anyio.sleep(3.0)
+    if is_px4:
+        flight.px4.arming.disarm("test", force=True)
+    else:
+        flight.copter.arming.disarm()
+
+
 async def test_wait_finished_silence_and_timeout() -> None:
     async with armed(open_flight) as flight:
         await flight.vehicle.mission.start()

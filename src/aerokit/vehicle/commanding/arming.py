@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from typing import TYPE_CHECKING, Any
 
 import anyio
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
 FORCE_REBOOT = 20190226
 PREARM_REPORT_INTERVAL_S = 35.0
 """Seconds in which ArduPilot surely repeats its pre-arm failures, which it does every 30 s."""
+REASONS_S = 3.0
+"""Seconds in which a vehicle answers a request to run its pre-arm checks, and reports the reasons."""
 POLL_INTERVAL_S = 0.1
 """Poll interval in seconds while waiting for a reboot."""
 # MAV_STATE_BOOT and MAV_STATE_CALIBRATING.
@@ -68,7 +71,7 @@ class ArmingActions(VehicleBase):
 
         Raises:
             OperationTimeout: not ready within ``timeout`` seconds; the text lists what is missing, and recent status
-                texts.
+                texts. If the pre-arm checks fail, the vehicle is asked for its reasons three seconds before the end.
         """
         telemetry = self.telemetry
         cells = (telemetry.sensors, telemetry.estimator, telemetry.position, telemetry.home, telemetry.armed)
@@ -77,9 +80,14 @@ class ArmingActions(VehicleBase):
             ChangeSignal(self._session, *cells, every_arrival=True) as changes,
             anyio.move_on_after(timeout),
         ):
+            asks_at = self.connection.now() + timeout - REASONS_S
             while self._health.missing_for_flight():
                 self.connection.raise_if_ended()
-                await changes.next(timeout)
+                if self.connection.now() >= asks_at:
+                    asks_at = math.inf
+                    await self._health.request_reasons(self.connection.now() - PREARM_REPORT_INTERVAL_S)
+                else:
+                    await changes.next(min(timeout, asks_at - self.connection.now()))
             return
         recent_texts = dict.fromkeys(self._health.arming_texts(self.connection.now() - PREARM_REPORT_INTERVAL_S))
         still = [*self._health.missing_for_flight(), *recent_texts] or ["nothing"]
@@ -101,12 +109,13 @@ class ArmingActions(VehicleBase):
         """Arm the motors and wait until HEARTBEAT reports armed: **propellers may start to turn**.
 
         If the present mode does not allow arming (RTL or LAND after a flight, OFFBOARD), the mode is changed first.
-        The command is sent only once: a repetition might arm a vehicle that a pilot has just disarmed. After a
-        cancellation, or an error other than a refusal, the command may still be executed. aerokit therefore monitors
-        the vehicle for 15 seconds, as long as the connection is open. If this command arms the vehicle after all,
-        aerokit disarms it. Arming is attributed to this command if the vehicle accepts it, or reports armed in the next
-        HEARTBEAT without a takeover. A vehicle that was armed otherwise stays armed. Logger "aerokit" warns about the
-        outcome.
+        ArduCopter decides by AUTO_OPTIONS whether it arms in AUTO; if it refuses there, the mode is changed and the
+        command is sent again. Otherwise it is sent only once: a repetition might arm a vehicle that a pilot has just
+        disarmed. After a cancellation, or an error other than a refusal, the command may still be executed. aerokit
+        therefore monitors the vehicle for 15 seconds, as long as the connection is open. If this command arms the
+        vehicle after all, aerokit disarms it. Arming is attributed to this command if the vehicle accepts it, or
+        reports armed in the next HEARTBEAT without a takeover. A vehicle that was armed otherwise stays armed. Logger
+        "aerokit" warns about the outcome.
 
         Args:
             mode: the mode to arm in. None: the present mode; if it does not allow arming, the mode in which
@@ -139,14 +148,31 @@ class ArmingActions(VehicleBase):
         if reason:
             logger.info("arming vehicle %d: %s", self.system_id, reason)
             self.connection.send(Statustext(MavSeverity.INFO, reason, 0, 0))
+        started = self.connection.now()
+        try:
+            try:
+                await self._arm_in_present_mode(force, timeout, max_silence_s)
+            except CommandRejected:
+                if (
+                    mode is not None
+                    or not self._is_in_optional_mode()
+                    or not (better := self.autopilot.mode_to_arm_in())
+                ):
+                    raise
+                await self._change_to_arming_mode(better)
+                await self._arm_in_present_mode(force, timeout, max_silence_s)
+        except CommandRejected as error:
+            reasons = await self._health.arming_reasons(started)
+            raise self._session.with_reasons(error, started, reasons) from None
+
+    async def _arm_in_present_mode(self, force: bool, timeout: float, max_silence_s: float | None) -> None:
         started, was_armed = self.connection.now(), self.telemetry.is_armed
         with self._arbiter.auxiliary_order() as order:
             try:
                 await self._sender.send_arm(order, True, force=force)
                 await self._await_armed(True, order, started, timeout, max_silence_s)
-            except CommandRejected as error:
-                reasons = await self._health.arming_reasons(started)
-                raise self._session.with_reasons(error, started, reasons) from None
+            except CommandRejected:
+                raise
             except CommandTimeout as error:
                 self._arm_cleanup.watch(order, was_armed)
                 raise CommandTimeout(f"{error}; {self._arm_cleanup.text()}") from None
@@ -226,9 +252,16 @@ class ArmingActions(VehicleBase):
             or is_booting
             or not self.telemetry.is_confirmed_disarmed
             or not self._health.unarmable_mode()
+            or self._is_in_optional_mode()
         ):
             return None
         return self.autopilot.mode_to_arm_in()
+
+    def _is_in_optional_mode(self) -> bool:
+        """Return True if only the vehicle knows whether its mode allows arming, which it decides by a parameter."""
+        mode = self.telemetry.mode.latest
+        is_optional = mode is not None and mode.name in self.autopilot.armable_by_option
+        return is_optional and self.telemetry.is_confirmed_disarmed and self._flight_cleanup.stop_stream is None
 
     async def _change_to_arming_mode(self, wanted: Mode) -> None:
         """Change the mode for arming; raise if the order to arm was superseded meanwhile."""

@@ -5,52 +5,73 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from aerokit.vehicle.commanding.progress import FALL_SINK_M_S, FALL_STOP_S, POSITION_MAX_AGE_S
+from aerokit.vehicle.commanding.progress import FALL_SINK_M_S
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from aerokit.vehicle.session.session import VehicleSession
 
-FALL_EVIDENT_S = 0.5
-"""Seconds after which a falling vehicle sinks faster than ``FALL_SINK_M_S``, even with air resistance."""
+SETTLING_S, SETTLED_M_S = 0.5, 2.0
+"""A vehicle on the ground moves up or down slower than this for this time, even on a ship. In the air, a vehicle whose
+motors stop while it climbs is so slow for 0.4 s at most."""
+
+UNSETTLED_S, UNSETTLED_M = 5.0, 2.0
+"""A vehicle whose height has not changed by this distance for this time is on the ground, whatever its velocity is."""
 
 IMPACT_M_S = 6.0
 """Sink rate in m/s that no landing has right before touchdown. Autopilots descend at 5 m/s at most, and slow down."""
 
-STILL_M_S = 0.5
+IMPACT_STOP_S = 0.7
+"""A descent at ``IMPACT_M_S`` that ends within this time is an impact. Autopilots need longer to brake."""
+
+MAX_INTERVAL_S = 3.5
+"""After a longer interval between two velocities, nothing is known about what happened in between."""
+
+STILL_M_S = 1.0
+
+VELOCITY_MAX_AGE_S = 4.0
+
+IMPACT_HEIGHT_M = 3.0
+"""After a change of height by this distance, an earlier stop was not on the ground."""
 
 
 class ImpactDetector:
-    """Detects that a vehicle hits the ground: it sinks at ``IMPACT_M_S`` or faster, and stops within 1.5 s."""
+    """Detects that a vehicle hits the ground: it sinks at ``IMPACT_M_S`` or faster, and suddenly stops."""
 
     def __init__(self, session: VehicleSession) -> None:
         self._session = session
-        self._fast_at, self._max_sink_m_s = -math.inf, 0.0
+        self._updated_at = self._fast_at = -math.inf
+        self._max_sink_m_s = 0.0
         self._impact_m_s: float | None = None
+        self._height_m: float | None = None
 
     def update(self) -> None:
         """Process the vehicle's last reported velocity."""
         cell = self._session.telemetry.velocity
         velocity = cell.latest
-        if velocity is None:
+        if velocity is None or cell.updated_at == self._updated_at:
             return
+        # Velocities may arrive less often than the time that an impact takes.
+        interval_s = min(cell.updated_at - self._updated_at, MAX_INTERVAL_S)
+        limit_s = max(IMPACT_STOP_S, 1.5 * interval_s)
+        self._updated_at = cell.updated_at
         if velocity.down_m_s >= IMPACT_M_S:
-            is_new = cell.updated_at - self._fast_at > FALL_STOP_S
+            is_new = cell.updated_at - self._fast_at > limit_s
             self._max_sink_m_s = velocity.down_m_s if is_new else max(self._max_sink_m_s, velocity.down_m_s)
             self._fast_at = cell.updated_at
-        elif abs(velocity.down_m_s) >= STILL_M_S:
-            self._impact_m_s = None
-        elif cell.updated_at - self._fast_at <= FALL_STOP_S:
-            self._impact_m_s = self._max_sink_m_s
+        elif abs(velocity.down_m_s) < STILL_M_S and cell.updated_at - self._fast_at <= limit_s:
+            self._impact_m_s, self._height_m = self._max_sink_m_s, height_above_home(self._session)
+        elif _has_changed(self._height_m, height_above_home(self._session), IMPACT_HEIGHT_M):
+            self._impact_m_s = self._height_m = None
 
     def text(self) -> str:
-        """Return the impact as a clause; empty if there was no impact, or the vehicle has moved up or down since."""
+        """Return the impact as a clause; empty if there was none, or the vehicle has left the place of the impact."""
         return "" if self._impact_m_s is None else f"the vehicle hit the ground at {self._impact_m_s:.1f} m/s"
 
 
 class GroundCheck:
-    """Distinguishes a vehicle that has landed from one that falls or has fallen.
+    """Distinguishes a vehicle on the ground from one that falls, and a landing from a fall.
 
     ArduCopter and PX4 report ON_GROUND whenever they are disarmed (AP_Arming_Copter.cpp, MulticopterLandDetector.cpp).
     """
@@ -58,10 +79,18 @@ class GroundCheck:
     def __init__(self, session: VehicleSession) -> None:
         self._session = session
         self._impact = ImpactDetector(session)
+        # Time and height of the report that the vehicle is on the ground.
         self._reported_at: float | None = None
+        self._reported_height_m: float | None = None
+        self._settled_since = math.inf
+
+    @property
+    def is_pending(self) -> bool:
+        """True while the vehicle is reported on the ground."""
+        return self._reported_at is not None
 
     def confirms(self, is_reported: bool) -> bool:
-        """Return True if the vehicle is reported on the ground, does not sink half a second later, and did not fall.
+        """Return True if the vehicle is reported on the ground, has settled since, and did not fall.
 
         If no velocity is received, the report alone counts.
         """
@@ -71,23 +100,45 @@ class GroundCheck:
             self._reported_at = None
             return False
         if self._reported_at is None:
-            self._reported_at = now
-        if now - velocity.updated_at > POSITION_MAX_AGE_S:
-            return not self._impact.text()
-        is_settled = velocity.updated_at >= self._reported_at + FALL_EVIDENT_S and self._sink_m_s() < FALL_SINK_M_S
-        return is_settled and not self._impact.text()
+            self._reported_at, self._settled_since = now, math.inf
+            self._reported_height_m = height_above_home(self._session)
+        return self._has_settled(now, velocity.updated_at) and not self._impact.text()
 
     def trouble(self, before: Callable[[], str | None]) -> str | None:
         """Return a clause if a vehicle that is reported on the ground falls or fell; otherwise ``before()``."""
-        if self._reported_at is None:
-            return before()
-        telemetry = self._session.telemetry
-        if telemetry.velocity.updated_at <= self._reported_at or self._sink_m_s() < FALL_SINK_M_S:
-            return self._impact.text() or None
-        if not telemetry.is_confirmed_disarmed:
-            return None
-        return f"the vehicle was disarmed in the air and sinks at {self._sink_m_s():.1f} m/s"
+        return self.fall() if self.is_pending else before()
 
-    def _sink_m_s(self) -> float:
+    def fall(self) -> str | None:
+        """Return a clause if the vehicle has hit the ground, or sinks fast although it is reported on the ground."""
+        telemetry = self._session.telemetry
+        is_newer = self._reported_at is not None and telemetry.velocity.updated_at > self._reported_at
+        if is_newer and telemetry.is_confirmed_disarmed and self._down_m_s() >= FALL_SINK_M_S:
+            return f"the vehicle was disarmed in the air and sinks at {self._down_m_s():.1f} m/s"
+        return self._impact.text() or None
+
+    def _has_settled(self, now: float, updated_at: float) -> bool:
+        reported_at = now if self._reported_at is None else self._reported_at
+        if now - updated_at > VELOCITY_MAX_AGE_S:
+            return True
+        if abs(self._down_m_s()) >= SETTLED_M_S:
+            self._settled_since = math.inf
+            height_m = height_above_home(self._session)
+            is_known = height_m is not None and self._reported_height_m is not None
+            is_still = is_known and not _has_changed(self._reported_height_m, height_m, UNSETTLED_M)
+            return is_still and now - reported_at >= UNSETTLED_S
+        self._settled_since = min(self._settled_since, max(updated_at, reported_at))
+        return updated_at >= self._settled_since + SETTLING_S
+
+    def _down_m_s(self) -> float:
         velocity = self._session.telemetry.velocity.latest
         return 0.0 if velocity is None else velocity.down_m_s
+
+
+def height_above_home(session: VehicleSession) -> float | None:
+    """Return the reported height above home in metres; None if it is unknown."""
+    here = session.telemetry.position.latest
+    return None if here is None else here.altitude_relative_m
+
+
+def _has_changed(before_m: float | None, now_m: float | None, by_m: float) -> bool:
+    return before_m is not None and now_m is not None and abs(now_m - before_m) > by_m

@@ -239,11 +239,11 @@ class Actuators(ReadOnly):
             command, start = MavCmd.DO_MOTOR_TEST, (number, PERCENT, throttle_percent, duration_s, 1)
             stop = (number, PERCENT, 0, 0, 1)
         session.check_disarmed("test_motor", is_current=arbiter.is_known)
-        order = arbiter.of_device("motor test")
+        # On ArduPilot, a new test ends the test of another motor.
+        order = arbiter.of_device("motor test" if command == MavCmd.DO_MOTOR_TEST else f"motor test {number}")
         spins_until = order.given_at + duration_s
         try:
             await SimpleOrder("test_motor", command, start).send(self._context, of=order)
-            spins_until = session.connection.now() + duration_s
             await anyio.sleep(duration_s)
             armed, ended_at = session.telemetry.armed, session.connection.now()
             await await_progress(

@@ -11,7 +11,7 @@ from aerokit.errors import CommandRejected, InvalidArgument, OperationRejected, 
 from aerokit.mavlink.enums import MavCmd, MavLandedState, MavResult, MissionState
 from aerokit.position import Position
 from aerokit.vehicle.commanding.arbiter import MODE_GRACE_S
-from aerokit.vehicle.commanding.ground import ImpactDetector
+from aerokit.vehicle.commanding.ground import GroundCheck
 from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, await_progress
 from aerokit.vehicle.missions.plans import VehiclePlan
 from aerokit.vehicle.missions.stalling import MissionStallDetector
@@ -66,12 +66,16 @@ class MissionEndDetector:
         self._grace_until = session.connection.now() + MODE_GRACE_S
         self._was_in_mode = False
         self._left_at: float | None = None
-        self._impact = ImpactDetector(session)
+        self._ground = GroundCheck(session)
 
     def has_ended(self) -> bool:
-        self._impact.update()
-        if self._impact.text() and self._is_on_ground:
-            return False
+        is_over = self._is_over()
+        if self._is_on_ground:
+            return self._ground.confirms(is_over)
+        self._ground.confirms(False)
+        return is_over
+
+    def _is_over(self) -> bool:
         if self._tracker.is_complete:
             at_home = self._ends_in_air and (self._session.autopilot.mission_completes_at_home or self._is_home)
             return not self._ends_by_landing or self._is_on_ground or at_home
@@ -91,8 +95,10 @@ class MissionEndDetector:
         session, now = self._session, self._session.connection.now()
         if self._vehicle_context.arbiter.newest not in (self._order, order):
             return "another order was given"
-        if self._is_on_ground and (impact := self._impact.text()):
-            return f"{impact}, {self.describe()}"
+        if self._is_on_ground and (fall := self._ground.fall()):
+            return f"{fall}, {self.describe()}"
+        if self._ground.is_pending:
+            return None
         is_in_mode = session.telemetry.is_in(self._mode)
         self._was_in_mode = self._was_in_mode or is_in_mode
         if not session.telemetry.is_confirmed_disarmed and (
