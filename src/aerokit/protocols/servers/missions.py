@@ -343,8 +343,8 @@ class MissionServer:
             self._acknowledge(client, kind, _R.DENIED, channel)
         else:
             self._clearing = request
-            kinds = [each for each in _TYPES if self.lists[each]] if kind == MavMissionType.ALL else [kind]
-            self._clear(kinds, request, channel)
+            stored: list[int] = [each for each in _TYPES if self.lists[each]]
+            self._clear(stored if kind == MavMissionType.ALL else [kind], request, channel)
 
     def _clear(self, kinds: list[int], request: m.MissionClearAll, channel: Channel) -> None:
         """Clear these lists one after the other, each only if ``judge`` accepts that."""
