@@ -220,6 +220,24 @@ async def test_values_are_older_after_the_computer_slept(grounded: Flight, caplo
     assert vehicle.armed.age < 1.5
 
 
+async def test_sink_of_sleep_may_close_the_watch() -> None:
+    asleep, pauses = [0.0], list[float]()
+
+    def close(seconds: float) -> None:
+        pauses.append(seconds)
+        watch.close()
+
+    watch = LoopWatch(pauses.append, close, lambda: asleep[0])
+    watch.start()
+    asleep[0] = 600.0
+    await anyio.sleep(1.0)
+    assert pauses == [600.0]
+    assert watch._timer is None
+    asleep[0] = 1200.0
+    await anyio.sleep(1.0)
+    assert pauses == [600.0]
+
+
 def test_suspended_time_comes_from_a_system_clock() -> None:
     before = suspended_s()
     assert suspended_s() - before == pytest.approx(0.0, abs=0.01)

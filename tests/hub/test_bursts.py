@@ -154,6 +154,20 @@ async def test_halves_of_a_frame_leave_together() -> None:
 
 
 @virtual
+async def test_noise_after_a_completed_frame_is_not_forwarded() -> None:
+    """The noise is as long as the part of the frame that was read before."""
+    vehicles, station = BurstLink(), SlowLink()
+    async with Hub([Endpoint(vehicles, name="a"), Endpoint(station, name="b")]):
+        vehicle = FrameEncoder(1, 1)
+        vehicles.read(vehicle.encode(COPTER))
+        station.written.clear()
+        (frame,) = encoded(vehicle, *telemetry(1))
+        vehicles.read(frame[:7])
+        vehicles.read(frame[7:] + bytes(7))
+        assert station.written == [frame]
+
+
+@virtual
 async def test_vehicle_gets_single_frames_of_a_burst() -> None:
     stations, vehicle = BurstLink(), SlowLink()
     async with Hub([Endpoint(stations, name="a"), Endpoint(vehicle, name="b")]):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 from pathlib import Path
 
 import pytest
@@ -11,9 +12,10 @@ from onboard_peers import payload_and_station
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd, MavFtpErr, MavFtpOpcode, MavMissionResult, MavResult
+from aerokit.missions import MissionItem
 from aerokit.onboard import CommandRequest
 from aerokit.protocols.servers.commands import MAX_RUNNING_COMMANDS
-from aerokit.protocols.servers.ftp_packets import FtpPacket
+from aerokit.protocols.servers.ftp_packets import FtpPacket, crc32
 
 pytestmark = pytest.mark.anyio
 
@@ -77,6 +79,34 @@ async def test_file_is_opened_with_session_and_number_of_mavproxy(tmp_path: Path
     assert answers[1].session == 131
 
 
+async def test_other_request_with_same_number_is_executed(tmp_path: Path) -> None:
+    names = ("a", "b", "b")
+    for name in names:
+        (tmp_path / name).write_bytes(b"1")
+    async with payload_and_station() as (payload, station):
+        payload.serve_files(tmp_path, writable=True)
+        answers = []
+        for name in names:
+            request = FtpPacket(0xFFFF, MavFtpOpcode.REMOVEFILE, 0, 2, data=f"/{name}".encode(), client=station.target)
+            answers.append(FtpPacket.parse(await station.ask(request.message(), m.FileTransferProtocol)))
+    assert not os.listdir(tmp_path)
+    assert [answer.opcode for answer in answers] == [MavFtpOpcode.ACK] * 3  # the last request is a repetition
+
+
+async def test_checksum_of_other_file_replaces_the_running_one(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        (tmp_path / name).write_bytes(name.encode() * 2_000_000)
+    async with payload_and_station() as (payload, station):
+        payload.serve_files(tmp_path)
+        with station.collecting(m.FileTransferProtocol) as replies:
+            for name in ("a", "b", "b"):
+                request = FtpPacket(0, MavFtpOpcode.CALCFILECRC, 0, 2, data=f"/{name}".encode(), client=station.target)
+                station.connection.send(request.message())
+            await asyncio.sleep(1.0)
+    expected = crc32((tmp_path / "b").read_bytes()).to_bytes(4, "little")
+    assert [FtpPacket.parse(reply).data[:4] for reply in replies] == [expected]
+
+
 async def test_checksum_of_missing_file_is_refused_each_time(tmp_path: Path) -> None:
     """MAVProxy begins each operation with number 0."""
     (tmp_path / "a").write_bytes(b"1")
@@ -107,6 +137,48 @@ async def test_second_upload_is_denied_and_silent_one_is_cancelled() -> None:
     assert acks == [MavMissionResult.DENIED, MavMissionResult.OPERATION_CANCELLED]
     assert len(received) - len(acks) == 9
     assert payload.missions.items() == ()
+
+
+async def test_clear_that_is_judged_occupies_the_server() -> None:
+    async with payload_and_station() as (payload, station):
+        judged: list[tuple[str, int]] = []
+
+        @payload.missions.on_upload
+        async def check(kind: str, items: tuple[MissionItem, ...]) -> None:
+            judged.append((kind, len(items)))
+            await asyncio.sleep(2.0)
+
+        payload.missions.replace([MissionItem(16, 6, x=1, y=1)])
+        clear, denied = m.MissionClearAll(*station.target), MavMissionResult.DENIED
+        with station.collecting(m.MissionAck, m.MissionRequestInt) as answers:
+            station.connection.send(clear)
+            station.connection.send(m.MissionCount(*station.target, 2))
+            station.connection.send(clear)
+            station.connection.send_as(FrameEncoder(200, 1), clear)
+            await asyncio.sleep(1.0)
+            assert [answer.type for answer in answers] == [denied, denied]
+            await asyncio.sleep(2.0)
+            assert [answer.type for answer in answers[2:]] == [MavMissionResult.ACCEPTED]
+        assert (payload.missions.items(), judged) == ((), [("mission", 0)])
+        await station.ask(m.MissionCount(*station.target, 2), m.MissionRequestInt)
+
+
+async def test_clear_is_denied_while_an_upload_is_judged() -> None:
+    async with payload_and_station() as (payload, station):
+
+        @payload.missions.on_upload
+        async def check(kind: str, items: tuple[MissionItem, ...]) -> None:
+            await asyncio.sleep(2.0)
+
+        with station.collecting(m.MissionAck) as acks:
+            station.connection.send(m.MissionCount(*station.target, 1))
+            item = m.MissionItemInt(*station.target, 0, 6, 16, 0, 1, 0, 0, 0, 0, 1, 1, 1)
+            station.connection.send(item)
+            await asyncio.sleep(0.5)
+            station.connection.send(m.MissionClearAll(*station.target))
+            await asyncio.sleep(3.0)
+        assert [ack.type for ack in acks] == [MavMissionResult.DENIED, MavMissionResult.ACCEPTED]
+        assert len(payload.missions.items()) == 1
 
 
 @pytest.mark.parametrize(("count", "kind", "result"), [(2001, 0, 4), (1, 77, 3)])

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import os
 import signal
 import socket
@@ -111,6 +112,22 @@ def test_deadlock_error_names_the_waiting_task(monkeypatch: pytest.MonkeyPatch) 
     assert "Event.wait" in str(caught.value)
 
 
+def test_call_of_a_thread_that_has_ended_is_no_deadlock(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The thread calls the loop after the poll, and ends before the loop counts the threads."""
+
+    async def main() -> None:
+        loop, done = asyncio.get_running_loop(), asyncio.Event()
+
+        def count_threads(_: VirtualClockLoop) -> bool:
+            loop.call_soon_threadsafe(done.set)
+            return False
+
+        monkeypatch.setattr(VirtualClockLoop, "_may_be_woken", count_threads)
+        await done.wait()
+
+    run_virtual(main())
+
+
 def test_silent_socket_raises_after_deadlock_timeout() -> None:
     async def receive_without_sender() -> None:
         left, right = socket.socketpair()
@@ -204,6 +221,44 @@ async def test_event_source_runs_before_timer_of_same_instant() -> None:
 
 
 @pytest.mark.anyio
+@pytest.mark.parametrize("has_socket", [False, True])
+async def test_event_source_runs_first_at_each_instant(has_socket: bool) -> None:
+    """An open socket, or every 64th iteration, leads to asyncio's own iteration."""
+    order: list[str] = []
+    source = Metronome(lambda: order.append("source"))
+    near, far = socket.socketpair()
+    with near, far:
+        near.setblocking(False)
+        if has_socket:
+            source.loop.add_reader(near, lambda: None)
+        for number in range(1, 201):
+            source.loop.call_at(source.start + 0.5 * number, order.append, "timer")
+        await asyncio.sleep(100.2)
+        source.loop.remove_reader(near)
+    source.end()
+    assert order == ["source", "timer"] * 200
+
+
+@pytest.mark.anyio
+async def test_clock_stays_finite_after_the_last_event() -> None:
+    loop, dues = asyncio.get_running_loop(), [1.0]
+    assert isinstance(loop, VirtualClockLoop)
+    start, done, is_due = loop.time(), asyncio.Event(), threading.Event()
+    thread = threading.Thread(target=lambda: is_due.wait(10.0) and loop.call_soon_threadsafe(done.set))
+
+    def run() -> None:
+        dues[0] = math.inf
+        is_due.set()
+
+    end = loop.add_event_source(lambda: start + dues[0], run)
+    thread.start()
+    await done.wait()
+    assert loop.time() == start + 1.0
+    thread.join()
+    end()
+
+
+@pytest.mark.anyio
 async def test_ready_callbacks_run_before_the_next_event() -> None:
     order: list[str] = []
 
@@ -272,4 +327,20 @@ async def test_signals_arrive_while_events_run() -> None:
     os.kill(os.getpid(), signal.SIGUSR1)
     await asyncio.wait_for(arrived.wait(), 3600.0)
     source.loop.remove_signal_handler(signal.SIGUSR1)
+    source.end()
+
+
+@pytest.mark.anyio
+async def test_signals_arrive_while_only_event_sources_run() -> None:
+    def act() -> None:
+        if len(source.ran) == 1:
+            os.kill(os.getpid(), signal.SIGUSR1)
+        if len(source.ran) == 1000:
+            source.end()  # else a lost signal would never end the test
+
+    source, arrived = Metronome(act), asyncio.Event()
+    source.loop.add_signal_handler(signal.SIGUSR1, arrived.set)
+    await arrived.wait()
+    source.loop.remove_signal_handler(signal.SIGUSR1)
+    assert len(source.ran) < 200
     source.end()

@@ -101,7 +101,10 @@ class LoopWatch:
     def _tick(self) -> None:
         now = self._loop.time()
         late = now - self._due
-        if self._has_slept() or late > LATE_THRESHOLD_S:
+        has_slept = self._has_slept()
+        if self._timer is None:  # A sink of ComputerSlept has closed the connection.
+            return
+        if has_slept or late > LATE_THRESHOLD_S:
             self._fall_behind()
         self._set_timer(now)
         if late > BLOCKED_THRESHOLD_S:

@@ -155,6 +155,8 @@ class Attachment:
                 self._switch.take(port, framer, frames, data, now)
                 if port_peer != peer:  # this peer has answered a broadcast
                     self.link.keep_peer(peer)
+            elif (waiting := self._ports.get(port_peer)) is not None:
+                waiting.note_partial_read()
         except Exception as error:
             self._report(self, "internal_error", f"internal error of aerokit: {error!r}")
 

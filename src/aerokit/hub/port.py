@@ -244,6 +244,10 @@ class Port:
         self._framed_bytes = _INCOMPLETE if framer.waiting else statistics.bytes - statistics.bad_bytes
         return self._framed_bytes - len(data) == before
 
+    def note_partial_read(self) -> None:
+        """Note received data that completed no frame, so that `is_whole` is False for the data with the rest of one."""
+        self._framed_bytes = _INCOMPLETE
+
     def must_hold(self) -> bool:
         return self._may_hold and (bool(self._queue) or self._is_full())
 

@@ -4411,7 +4411,7 @@ class Vehicle(VehicleTwin):
 
         Raises:
             OperationTimeout: not ready within ``timeout`` seconds; the text lists what is missing, and recent status
-                texts.
+                texts. If the pre-arm checks fail, the vehicle is asked for its reasons three seconds before the end.
         """
         self._loop.run(self.aio.wait_ready, timeout=timeout)
 

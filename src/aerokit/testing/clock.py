@@ -45,6 +45,7 @@ import anyio
 
 T = TypeVar("T")
 
+# Iterations and events of event sources between two polls.
 _POLL_EVERY = 64
 # With more timers than this, mostly cancelled ones, asyncio's own iteration discards the cancelled timers.
 _MANY_TIMERS = 100
@@ -90,26 +91,29 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         return lambda: self._sources.remove(source) if source in self._sources else None
 
     def _run_once(self) -> None:
-        """Run one iteration of the loop. Without sockets, poll only now and then, for signals."""
+        """Run one iteration of the loop. Without sockets, poll only now and then, for signals and other threads."""
         self._turns += 1
         ready, timers = self._ready, self._scheduled  # type: ignore[attr-defined]
         if (
-            self._turns % _POLL_EVERY == 0
+            self._turns >= _POLL_EVERY
             or not self._is_alone
             or (not ready and not self._run_sources() and self._next_timer() == math.inf)
             or _MANY_TIMERS < len(timers) < 2 * self._timer_cancelled_count  # type: ignore[attr-defined]
         ):
+            self._turns = 0
             super()._run_once()  # type: ignore[misc]
             return
         if not ready:
+            # Event sources have run until the next poll, or the last event was run and there is no timer.
+            if self._turns >= _POLL_EVERY or self._next_timer() == math.inf:
+                return
             self._now = max(self._now, self._next_timer())
+        self._ready_sources()
         end = self._now + self._clock_resolution
-        if timers and timers[0]._when < end:
-            ready.extend(handle for next_due, handle in self._sources if next_due() < end)
-            while timers and timers[0]._when < end:
-                timer = heappop(timers)
-                timer._scheduled = False
-                ready.append(timer)
+        while timers and timers[0]._when < end:
+            timer = heappop(timers)
+            timer._scheduled = False
+            ready.append(timer)
         for _ in range(len(ready)):
             handle = ready.popleft()
             if not handle._cancelled:
@@ -130,7 +134,10 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         return timers[0]._when if timers else math.inf
 
     def _run_sources(self) -> bool:
-        """Run event sources that are due before the next timer, until a callback is ready. Return True if any ran."""
+        """Run event sources that are due before the next timer, until a callback is ready or a poll is due.
+
+        Return True if any ran.
+        """
         sources, ready, has_run = self._sources, self._ready, False  # type: ignore[attr-defined]
         is_alone = self._is_alone
         while sources and not ready:
@@ -144,9 +151,16 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
                 self._now = due
             handle._run()
             has_run = True
-            if not is_alone:  # Sockets are polled before every jump.
+            self._turns += 1
+            if self._turns >= _POLL_EVERY or not is_alone:  # Sockets are polled before every jump.
                 break
         return has_run
+
+    def _ready_sources(self) -> None:
+        """If a timer is due, make the event sources of this instant ready. They run before the timer."""
+        timers, end = self._scheduled, self._now + self._clock_resolution  # type: ignore[attr-defined]
+        if timers and timers[0]._when < end:
+            self._ready.extend(handle for next_due, handle in self._sources if next_due() < end)  # type: ignore[attr-defined]
 
     def run_in_executor(self, executor: Any, func: Callable[..., T], *args: Any) -> asyncio.Future[T]:  # type: ignore[override]
         """Run ``func`` on a thread; the clock stands still until it returns."""
@@ -165,6 +179,11 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
 
     def wait_for_events(self, poll: Callable[[float], list[Any]], timeout: float | None) -> list[Any]:
         """Replace the selector's wait for ``timeout`` virtual seconds; None waits without a limit."""
+        events = self._wait(poll, timeout)
+        self._ready_sources()
+        return events
+
+    def _wait(self, poll: Callable[[float], list[Any]], timeout: float | None) -> list[Any]:
         events = poll(0)
         if events or (timeout is not None and timeout <= 0):
             return events
@@ -174,6 +193,8 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
             return []
         if timeout is None and self._may_be_woken():
             return self._wait_in_real_time(poll)
+        if self._ready:  # type: ignore[attr-defined]  # Another thread has called the loop since the poll.
+            return []
         if timeout is None:
             raise DeadlockError(self._deadlock("nothing left to wait for"))
         self._now += timeout

@@ -337,3 +337,17 @@ async def test_lost_gps_prevents_arming_in_guided() -> None:
         assert "no GPS receiver has a 3D fix (GPS_RAW_INT)" in await flight.vehicle.why_not_armable()
         with pytest.raises(CommandRejected, match="no GPS receiver has a 3D fix"):
             await flight.vehicle.arm()
+
+
+@pytest.mark.parametrize("timeout", [2.0, 10.0])
+async def test_wait_ready_timeout_names_failing_check(timeout: float) -> None:
+    """ArduPilot repeats its reasons every 30 s only."""
+    async with open_flight() as flight:
+        await flight.vehicle.wait_ready()
+        flight.copter.faults.prearm_failures.append("Compass not healthy")
+        await anyio.sleep(3.0)
+        started = now()
+        with pytest.raises(OperationTimeout, match="PreArm: Compass not healthy"):
+            await flight.vehicle.wait_ready(timeout=timeout)
+        assert now() - started == pytest.approx(timeout, abs=0.01)
+        assert len(flight.wire.commands(MavCmd.RUN_PREARM_CHECKS)) <= 1  # the vehicle may report it by itself

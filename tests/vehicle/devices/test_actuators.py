@@ -202,13 +202,16 @@ async def test_unanswered_motor_test_is_neither_repeated_nor_stopped() -> None:
         assert len(params(flight, C.DO_MOTOR_TEST)) == 1
 
 
+async def spin_three_seconds(flight: Px4Flight, number: int) -> None:
+    await flight.vehicle.actuators.test_motor(number, throttle_percent=5, duration_s=3, intent="spin motor")
+
+
 async def test_motor_tests_of_px4_are_stopped_each() -> None:
     async with on_px4() as flight:
         with anyio.move_on_after(0.8):
             async with anyio.create_task_group() as group:
                 for number in (1, 2):
-                    spin = {"throttle_percent": 5, "duration_s": 3, "intent": "spin motor"}
-                    group.start_soon(lambda n=number, s=spin: flight.vehicle.actuators.test_motor(n, **s))
+                    group.start_soon(spin_three_seconds, flight, number)
                     await anyio.sleep(0.3)
         stops = [sent[4] for sent in params(flight, C.ACTUATOR_TEST) if sent[1] == 0]
         assert sorted(stops) == [1, 2]

@@ -48,6 +48,8 @@ class FtpPeer:
     used_at: float = 0.0
     errno: int = 0
     """Error of the latest failure."""
+    request: FtpPacket | None = None
+    """The latest request that was executed."""
     reply: FtpPacket | None = None
     checksum: FtpPacket | None = None
     """CalcFileCRC32 request that is being executed."""
@@ -120,13 +122,14 @@ class SessionFtpServer(Generic[FilesT]):
         """Return the key of the client."""
         return request.client
 
-    def _is_repeated(self, request: FtpPacket, last: FtpPacket) -> bool:
-        """Return True if the last reply answers this request.
+    def _is_repeated(self, peer: FtpPeer, request: FtpPacket, last: FtpPacket) -> bool:
+        """Return True if this request is the latest one again, and the last reply answers it.
 
-        Equal sequence numbers are not sufficient, because MAVProxy starts each operation with number 0.
+        Equal sequence numbers are not sufficient, because MAVProxy starts each operation with number 0. The last reply
+        may be the end of a burst, which does not replace the blocks of the burst.
         """
-        same = request.client == last.client and request.opcode == last.request_opcode
-        return same and request.sequence + 1 == last.sequence
+        same = peer.request is not None and request.repeats(peer.request)
+        return same and request.opcode == last.request_opcode and request.sequence + 1 & 0xFFFF == last.sequence
 
     def _new_number(self, peer: FtpPeer, request: FtpPacket) -> int:
         """Return the number for a new session: the number that the client requests (as MAVProxy does), or a free
@@ -161,14 +164,14 @@ class SessionFtpServer(Generic[FilesT]):
         peer.used_at = self._host.now
         if request.size > DATA_SIZE:
             self._reply(peer, request.refuse(MavFtpErr.INVALIDDATASIZE))
-        elif (last := peer.reply) is not None and self._is_repeated(request, last):
+        elif (last := peer.reply) is not None and self._is_repeated(peer, request, last):
             self._reply(peer, last)
         else:
             self._answer(peer, request)
 
     def _answer(self, peer: FtpPeer, request: FtpPacket) -> None:
         handler = _HANDLERS.get(request.opcode)
-        peer.reply = None
+        peer.request, peer.reply = request, None
         try:
             answer = self._unknown(request) if handler is None else handler(self, peer, request)
         except Refused as refused:
@@ -348,7 +351,7 @@ class SessionFtpServer(Generic[FilesT]):
     def _crc32(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket | None:
         """Compute a checksum in slices, so that a large file does not block the event loop."""
         path = self._path(request)
-        is_repeated = peer.checksum is not None and peer.checksum.sequence == request.sequence
+        is_repeated = peer.checksum is not None and request.repeats(peer.checksum)
         if not is_repeated:
             file, peer.checksum = self.files.open(path), request
             self._continue_crc32(peer, request, file, 0, 0)

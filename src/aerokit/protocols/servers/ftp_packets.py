@@ -24,6 +24,12 @@ class FtpPacket(FtpMessage):
     def parse(cls, message: FileTransferProtocol) -> FtpPacket:
         return cls.decode(message.payload, cut=False).replace(client=sender_of(message))
 
+    def repeats(self, other: FtpPacket) -> bool:
+        """Return True if this request equals another one; bytes after their ``size`` do not matter."""
+        fields = ("client", "sequence", "session", "opcode", "offset", "size")
+        are_equal = all(getattr(self, field) == getattr(other, field) for field in fields)
+        return are_equal and self.data[: self.size] == other.data[: other.size]
+
     def message(self) -> FileTransferProtocol:
         return FileTransferProtocol(0, *self.client, self.encode())
 

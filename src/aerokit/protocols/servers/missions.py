@@ -76,7 +76,9 @@ class MissionServer:
 
     When ``judge`` has accepted an upload, the upload replaces the whole list. A missing item is requested again every
     ``retry_interval_s`` seconds. An upload without progress for ``timeout_s`` seconds ends with OPERATION_CANCELLED.
-    During an upload, other clients are DENIED. Subclasses for firmware that behaves differently override methods.
+    During an upload, other clients are DENIED. While ``judge`` decides on a MISSION_CLEAR_ALL, uploads and other
+    requests to clear are DENIED, but a repeated request is ignored. Subclasses for firmware that behaves
+    differently override methods.
     """
 
     retry_interval_s: ClassVar[float] = 0.5
@@ -102,6 +104,8 @@ class MissionServer:
         self._may_set_current = on_set_current
         self._capacity = capacity
         self._uploads: dict[int, ListUpload] = {}
+        self._clearing: m.MissionClearAll | None = None
+        """Request to clear that ``judge`` decides on."""
 
     def listen(self) -> None:
         on = self._host.on
@@ -123,6 +127,7 @@ class MissionServer:
     def reset(self) -> None:
         """Drop transfers, as by a reboot. Stored items stay."""
         self._uploads.clear()
+        self._clearing = None
 
     def id(self, mission_type: int) -> int:
         """Return the opaque id: a checksum of a list, or 0 for an empty list. The current item does not change it."""
@@ -215,6 +220,8 @@ class MissionServer:
         before = self._uploads.get(self._key(kind))
         refusal = self._refusal(count, channel)
         if refusal is None and before is not None and (before.client != client or before.is_judged):
+            refusal = _R.DENIED
+        if refusal is None and self._clearing is not None:
             refusal = _R.DENIED
         if refusal is not None:
             self._acknowledge(client, kind, refusal, channel)
@@ -330,27 +337,35 @@ class MissionServer:
         client, kind = sender_of(request), request.mission_type
         if kind not in (*self.lists, MavMissionType.ALL):
             self._acknowledge(client, kind, _R.UNSUPPORTED, channel)
-        elif self.transfer_is_open:
+        elif (running := self._clearing) is not None and (sender_of(running), running.mission_type) == (client, kind):
+            return  # A repetition; the answer follows.
+        elif self.transfer_is_open or running is not None:
             self._acknowledge(client, kind, _R.DENIED, channel)
-        elif kind == MavMissionType.ALL:
-            self._clear([each for each in _TYPES if self.lists[each]], client, kind, channel)
         else:
-            self._clear([kind], client, kind, channel)
+            self._clearing = request
+            stored: list[int] = [each for each in _TYPES if self.lists[each]]
+            self._clear(stored if kind == MavMissionType.ALL else [kind], request, channel)
 
-    def _clear(self, kinds: list[int], client: tuple[int, int], answered: int, channel: Channel) -> None:
+    def _clear(self, kinds: list[int], request: m.MissionClearAll, channel: Channel) -> None:
         """Clear these lists one after the other, each only if ``judge`` accepts that."""
-        if not kinds:
-            self._acknowledge(client, answered, _R.ACCEPTED, channel)
-            return
 
         def answer(result: int) -> None:
-            if result != _R.ACCEPTED:
-                self._acknowledge(client, answered, result, channel)
+            if self._clearing is not request:  # after a reset
                 return
-            self.store(kinds[0], ())
-            self._clear(kinds[1:], client, answered, channel)
+            if result == _R.ACCEPTED and kinds:
+                self.store(kinds[0], ())
+                self._clear(kinds[1:], request, channel)
+                return
+            self._clearing = None
+            self._acknowledge(sender_of(request), request.mission_type, result, channel)
 
-        self._judge(kinds[0], (), answer)
+        if not kinds:
+            answer(_R.ACCEPTED)
+            return
+        try:
+            self._judge(kinds[0], (), answer)
+        except InvalidArgument:
+            answer(_R.INVALID)
 
     def _on_set_current(self, request: m.MissionSetCurrent, channel: Channel) -> None:
         if not self.set_current(request.seq):

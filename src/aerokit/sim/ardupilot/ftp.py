@@ -77,7 +77,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
             request, channel = self._queue.popleft()
             peer = self._peer(request, channel)
             assert peer is not None
-            if peer.reply is not None and self._is_repeated(request, peer.reply):
+            if peer.reply is not None and self._is_repeated(peer, request, peer.reply):
                 self._reply(peer, peer.reply)
             elif request.opcode not in (Op.ACK, Op.NAK):
                 super().receive(request, channel)
@@ -86,7 +86,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
     def _key(self, request: FtpPacket, channel: Channel) -> Hashable:
         return None  # All clients share one state.
 
-    def _is_repeated(self, request: FtpPacket, last: FtpPacket) -> bool:
+    def _is_repeated(self, peer: FtpPeer, request: FtpPacket, last: FtpPacket) -> bool:
         same = request.client == last.client and request.session == last.session
         return same and request.sequence + 1 == last.sequence
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from typing import TYPE_CHECKING, Any
 
 import anyio
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
 FORCE_REBOOT = 20190226
 PREARM_REPORT_INTERVAL_S = 35.0
 """Seconds in which ArduPilot surely repeats its pre-arm failures, which it does every 30 s."""
+REASONS_S = 3.0
+"""Seconds in which a vehicle answers a request to run its pre-arm checks, and reports the reasons."""
 POLL_INTERVAL_S = 0.1
 """Poll interval in seconds while waiting for a reboot."""
 # MAV_STATE_BOOT and MAV_STATE_CALIBRATING.
@@ -68,7 +71,7 @@ class ArmingActions(VehicleBase):
 
         Raises:
             OperationTimeout: not ready within ``timeout`` seconds; the text lists what is missing, and recent status
-                texts.
+                texts. If the pre-arm checks fail, the vehicle is asked for its reasons three seconds before the end.
         """
         telemetry = self.telemetry
         cells = (telemetry.sensors, telemetry.estimator, telemetry.position, telemetry.home, telemetry.armed)
@@ -77,9 +80,14 @@ class ArmingActions(VehicleBase):
             ChangeSignal(self._session, *cells, every_arrival=True) as changes,
             anyio.move_on_after(timeout),
         ):
+            asks_at = self.connection.now() + timeout - REASONS_S
             while self._health.missing_for_flight():
                 self.connection.raise_if_ended()
-                await changes.next(timeout)
+                if self.connection.now() >= asks_at:
+                    asks_at = math.inf
+                    await self._health.request_reasons(self.connection.now() - PREARM_REPORT_INTERVAL_S)
+                else:
+                    await changes.next(min(timeout, asks_at - self.connection.now()))
             return
         recent_texts = dict.fromkeys(self._health.arming_texts(self.connection.now() - PREARM_REPORT_INTERVAL_S))
         still = [*self._health.missing_for_flight(), *recent_texts] or ["nothing"]

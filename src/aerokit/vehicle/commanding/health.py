@@ -77,8 +77,7 @@ class Health:
         """
         with self._session.streaming("sensors", "estimator"):
             await self._session.wait_for_status_texts()
-            if not self.arming_texts(since) and self._autopilot.runs_prearm_checks:
-                await self._run_prearm_checks()
+            await self._ask_for_texts(since)
             await self._refresh()
         mode = self._telemetry.mode.latest
         needs_position = mode is None or mode.name not in self._autopilot.modes_without_position
@@ -113,7 +112,15 @@ class Health:
             await self._telemetry.sensors.wait_until(lambda _: self._telemetry.sensors.age <= HEALTH_MAX_AGE_S)
             await self._telemetry.estimator.wait_until(lambda _: self._telemetry.estimator.age <= HEALTH_MAX_AGE_S)
 
-    async def _run_prearm_checks(self) -> None:
+    async def request_reasons(self, since: float) -> None:
+        """Make the vehicle report why its pre-arm checks fail, unless it has done so since this time."""
+        sensors = self._telemetry.sensors.latest
+        if sensors is not None and sensors.prearm_checks_pass is False and not self._telemetry.is_armed:
+            await self._ask_for_texts(since)
+
+    async def _ask_for_texts(self, since: float) -> None:
+        if self.arming_texts(since) or not self._autopilot.runs_prearm_checks:
+            return
         try:
             await self._session.commands.send_long(MavCmd.RUN_PREARM_CHECKS, attempts=2)
         except (CommandRejected, CommandTimeout):
