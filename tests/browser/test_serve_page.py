@@ -225,6 +225,41 @@ def test_page_words_errors_for_people(browser: Any, copters: tuple[list[Simulate
         assert page.evaluate(words, [*said]) == [*said.values()]
 
 
+def test_refused_take_off_names_automatic_disarming(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
+    texts = {
+        (
+            "ArduCopter",
+            5,
+        ): "It disarmed 5 s ago. ArduCopter disarms itself on the ground after DISARM_DELAY, 10 s by default.",
+        ("PX4", 5): "It disarmed 5 s ago. PX4 disarms itself on the ground after COM_DISARM_PRFLT, 10 s by default.",
+        ("ArduPlane", 5): "It disarmed 5 s ago.",
+        ("ArduCopter", 61): "",
+    }
+    with serving(copters[1]) as server, opened(browser, server["page"]) as page:
+        words = """async ([firmware, seconds]) => {
+            const { inWords } = await import("/static/readiness.js");
+            const disarmedAt = performance.now() - 1000 * seconds;
+            const states = { armed: { value: false } };
+            return inWords({ detail: "it is not armed" }, { firmware, disarmedAt, states });
+        }"""
+        for case, text in texts.items():
+            assert page.evaluate(words, [*case]) == ". ".join(filter(None, ("It is not armed", text)))
+
+
+def test_messages_leave_out_item_texts(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
+    texts = ["Mission: 4 WP", "Reached command #3", "Mission finished early", "Crash: Disarming"]
+    with serving(copters[1]) as server, opened(browser, server["page"]) as page:
+        shown = """async (texts) => {
+            const { TextPanel } = await import("/static/panels.js");
+            const panel = new TextPanel();
+            const event = { event: "StatusTextReceived", severity: 6, system_id: 1, time_unix_s: 0 };
+            texts.forEach((text, number) => panel.add({ ...event, number, text }));
+            panel.show({ system_id: 1 });
+            return [...panel.node.querySelectorAll(".text span")].map((each) => each.textContent);
+        }"""
+        assert page.evaluate(shown, texts) == ["Crash: Disarming", "Mission finished early"]
+
+
 def test_map_labels_do_not_overlap_on_phone(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
     _, address = copters
     with serving(address) as server, opened(browser, server["page"], 390, 844) as page:
