@@ -600,6 +600,7 @@ async def test_vehicle_that_tumbles_after_impact_has_fallen(moves_m_s: float, fl
 async def test_braking_before_touchdown_is_no_impact(flying: Flight) -> None:
     flying.copter.faults.silent = True
     ground = GroundCheck(flying.vehicle._context.session)
+    is_down = False
     sinks = [*[8.0] * 10, *(8.0 - 0.64 * tick for tick in range(12)), *[0.4] * 5, *[0.0] * 7]
     for sink in sinks:
         flying.vehicle.velocity.set(Velocity(0.0, 0.0, sink), Source(1, 1, "the test"))

@@ -217,7 +217,7 @@ async def test_motor_tests_of_px4_are_stopped_each() -> None:
         assert sorted(stops) == [1, 2]
 
 
-async def test_motor_test_over_slow_link_is_not_stopped_after_its_end() -> None:
+async def test_motor_test_over_slow_link_gets_no_late_stop() -> None:
     async with on_ground(latency_s=0.3) as flight:
         with anyio.move_on_after(1.2):
             await flight.vehicle.actuators.test_motor(1, **SPIN)
