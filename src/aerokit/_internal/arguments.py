@@ -120,7 +120,9 @@ class _Rules:
         given = {**dict(zip(self._positional, args)), **kwargs}.get("name")  # noqa: B905 - as in check()
         if name == "value" and isinstance(given, str):  # set("RTL_ALT", "abc")
             hint = _hint(check, value)
-            return InvalidArgument(f"{given[:40]} = {short_repr(value)} is not allowed: it must be {allowed}{hint}")
+            return InvalidArgument(
+                f"value = {short_repr(value)} of {given[:40]} is not allowed: it must be {allowed}{hint}"
+            )
         return _error(check, allowed, name, value)
 
     def _read(self) -> dict[str, Rule]:
