@@ -421,6 +421,6 @@ class LinkStatus(Snapshot):
     used_for: tuple[int, ...]
     """Ids of the systems whose traffic uses this link."""
     loss_percent: float | None
-    """Loss in the last seconds, from sequence numbers, of the system that loses most frames; None until known."""
+    """Percentage of frames lost in the last seconds, of the system that loses most; None until known."""
     round_trip_s: float | None
     """Round-trip time (TIMESYNC) of the slowest system; None before the first answer."""

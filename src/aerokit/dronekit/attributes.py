@@ -33,12 +33,12 @@ if TYPE_CHECKING:
     from aerokit.dronekit.mavlink import MAVConnection
 
 STATES = ("UNINIT", "BOOT", "CALIBRATING", "STANDBY", "ACTIVE", "CRITICAL", "EMERGENCY", "POWEROFF")
+# Flags of EKF_STATUS_REPORT, which are also those of ESTIMATOR_STATUS.
 POS_HORIZ_ABS, CONST_POS_MODE, PRED_POS_HORIZ_ABS = (
     EkfStatusFlags.POS_HORIZ_ABS.value,
     EkfStatusFlags.CONST_POS_MODE.value,
     EkfStatusFlags.PRED_POS_HORIZ_ABS.value,
 )
-# ESTIMATOR_STATUS has the same flags.
 FACING_DOWN = 25
 NO_MODE = (None, "INITIALISING", "MAV")  # while booting
 GLOBAL_FRAMES = ("location.global_relative_frame", "location.global_frame")

@@ -61,7 +61,8 @@ POSITION_MAX_AGE_S = 2.0
 TIMESYNC_INTERVAL_S = 0.1
 TIMESYNC_TIMEOUT_S = 2.0
 
-# If `time_boot_ms` differs by more than this from the time of arrival, it is not on the clock that TIMESYNC measures.
+# If `time_boot_ms`, converted to our time by TIMESYNC, differs by more than this from the time of arrival, the vehicle
+# uses another clock for `time_boot_ms` than for TIMESYNC.
 MAX_CLOCK_ERROR_S = 1.0
 
 

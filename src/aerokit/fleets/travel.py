@@ -48,7 +48,8 @@ class Travel(SelectionBase):
     ) -> FleetResult:
         """Fly each member to its own target; see :meth:`aerokit.Vehicle.go_to`.
 
-        A fleet with a ``min_distance_m`` compares the paths first, and separates crossing paths by altitude.
+        A fleet with a ``min_distance_m`` compares the paths first, and separates crossing paths by altitude: members
+        change to different altitudes (layers), cross, and change to the altitude of their targets, in separate legs.
 
         Args:
             targets: mapping of member names to targets; members without a target stay where they are. Or a function
@@ -63,7 +64,7 @@ class Travel(SelectionBase):
             InvalidArgument: a name is unknown, or a target is too far away. Nothing was sent.
             ValueUnknownError: the position of a member is unknown. Nothing was sent.
             OperationRejected: paths come too close and cannot be separated: nothing was sent. Or a member became
-                unavailable between two legs in layers: the other members stay in their layers.
+                unavailable after a leg: the other members stay in their layers.
         """
         if speed_m_s is not None:
             check_range("speed_m_s", speed_m_s, 0, 1000, above=True)

@@ -302,7 +302,7 @@ def _same_place(
     scale = xy_scale(wanted.command, wanted.frame)
     if scale != 1:
         return bool(abs(value - other) <= 1 + (_float_step(value / scale) * scale if single_precision else 0))
-    if has_place(wanted.command):  # with the frame MISSION the coordinates are not scaled
+    if has_place(wanted.command):  # In the frame MISSION, coordinates are floats that are not scaled.
         return bool(value == other)
     return value == other or any(_close(stored, other) for stored in _stored_values(wanted, field, storage))
 

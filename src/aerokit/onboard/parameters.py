@@ -168,7 +168,7 @@ class ComponentParameters(Mapping[str, ParameterValue]):
     def _checked(self, row: _Row, value: object) -> ParameterValue:
         metadata, name = row.metadata, row.metadata.name
         if isinstance(value, bool):
-            raise InvalidArgument(f"{name} = {value!r} is not allowed: a number")
+            raise InvalidArgument(f"{name} = {value!r} is not allowed: it must be a number")
         checked = checked_setting(name, value, row.type)
         if isinstance(checked, str):
             return checked

@@ -114,7 +114,7 @@ class LogDownload(Transfer[int]):
         self._proceed(now)
 
     def _is_plausible(self, offset: int) -> bool:
-        # A block far behind all others would create millions of gaps.
+        # A block far beyond the data received so far would create millions of gaps.
         return offset < self._size and offset - self._into.tail < MAX_RANGE * LOG_BLOCK
 
     def _on_block(self, message: LogData, now: float) -> None:
@@ -185,7 +185,7 @@ class LogDownload(Transfer[int]):
         self._request(start, self._range_end - start)
 
     def _adapt_range(self) -> None:
-        # Radios lose up to a third of the messages. A larger loss means that a queue overflows.
+        # Radios lose up to a third of the messages. A loss of more than half means that a queue overflows.
         if self._stream.failures or not self._requested:
             return
         if self._received < self._requested / 2:

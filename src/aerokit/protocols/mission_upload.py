@@ -312,7 +312,8 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     def _is_in_flight(self, seq: int, now: float) -> bool:
         sent_at, round_trip_s = self._sent_at.get(seq), self.round_trip.smoothed_s
-        # Without a limit, the answer to every superfluous item would cause a whole window of items to be sent.
+        # The vehicle answers a duplicate item with another request. Without this limit, each such request would cause
+        # a whole window of items to be sent again.
         if round_trip_s is None:
             round_trip_s = self.round_trip.timeout_s()
         return sent_at is not None and now - sent_at < IN_FLIGHT_ROUND_TRIPS * round_trip_s

@@ -211,7 +211,7 @@ class SimulatedAutopilot(SimulatedVehicle):
         return CommandServer(self, supported, self.refusal_of_command)
 
     def refusal_of_command(self, command: ReceivedCommand) -> int | None:
-        """Return the MAV_RESULT if the command is refused regardless of the MAV_CMD, else None."""
+        """Return the MAV_RESULT with which any command is refused at present; None if commands are handled."""
         return None
 
     def _on_timesync(self, request: m.Timesync, channel: Channel) -> None:

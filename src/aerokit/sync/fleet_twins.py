@@ -110,7 +110,8 @@ class Selection(SelectionTwin["AsyncSelection"]):
     ) -> FleetResult:
         """Fly each member to its own target; see :meth:`aerokit.Vehicle.go_to`.
 
-        A fleet with a ``min_distance_m`` compares the paths first, and separates crossing paths by altitude.
+        A fleet with a ``min_distance_m`` compares the paths first, and separates crossing paths by altitude: members
+        change to different altitudes (layers), cross, and change to the altitude of their targets, in separate legs.
 
         Args:
             targets: mapping of member names to targets; members without a target stay where they are. Or a function
@@ -125,7 +126,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
             InvalidArgument: a name is unknown, or a target is too far away. Nothing was sent.
             ValueUnknownError: the position of a member is unknown. Nothing was sent.
             OperationRejected: paths come too close and cannot be separated: nothing was sent. Or a member became
-                unavailable between two legs in layers: the other members stay in their layers.
+                unavailable after a leg: the other members stay in their layers.
         """
         return self._loop.run(
             self.aio.go_to,

@@ -4406,7 +4406,7 @@ class Vehicle(VehicleTwin):
     def wait_ready(self, *, timeout: float = 90.0) -> None:
         """Wait until position and home are known, the estimator is healthy and the pre-arm checks pass.
 
-        The present mode does not matter, because :meth:`arm` leaves a mode in which the vehicle cannot arm.
+        The present mode does not matter: if the vehicle cannot arm in it, :meth:`arm` changes the mode first.
         :meth:`why_not_armable` reports such a mode.
 
         Raises:
@@ -5089,8 +5089,8 @@ class Vehicle(VehicleTwin):
             NotSupported: this type of vehicle has no precision landing. Nothing was sent.
             CommandRejected: the vehicle refused the mode.
             CommandTimeout: there was no acknowledgement.
-            OperationRejected: a parameter makes the vehicle ignore the target, and nothing else was sent; or the mode
-                changed, another order was given, or the vehicle fell after the start.
+            OperationRejected: a parameter makes the vehicle ignore the target, so the landing was not ordered. Or the
+                mode changed, another order was given, or the vehicle fell during the landing.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the target was not visible in time (the landing was not ordered), or the vehicle was not
                 on the ground in time.

@@ -217,8 +217,8 @@ class Vehicle(
             NotSupported: this type of vehicle has no precision landing. Nothing was sent.
             CommandRejected: the vehicle refused the mode.
             CommandTimeout: there was no acknowledgement.
-            OperationRejected: a parameter makes the vehicle ignore the target, and nothing else was sent; or the mode
-                changed, another order was given, or the vehicle fell after the start.
+            OperationRejected: a parameter makes the vehicle ignore the target, so the landing was not ordered. Or the
+                mode changed, another order was given, or the vehicle fell during the landing.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the target was not visible in time (the landing was not ordered), or the vehicle was not
                 on the ground in time.

@@ -154,7 +154,8 @@ class Candidate:
 # Two links that carried the same frame within this time carry one stream.
 SHARED_MAX_AGE_S = 5.0
 
-# A working link is replaced only if another link costs less than this share of its cost for MIN_BETTER_S.
+# A working link is replaced only if another link has cost less than this share of the working link's cost for
+# MIN_BETTER_S.
 MAX_COST_RATIO = 0.5
 MIN_BETTER_S = 3.0
 

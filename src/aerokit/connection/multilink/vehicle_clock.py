@@ -20,7 +20,7 @@ REAL_TIME_TOLERANCE = 0.05  # a measured speed of 1 ± this counts as 1: the err
 MIN_SPAN_S = 1.0
 MAX_SPEED = 200.0  # maximum speed of a simulation, relative to real time
 MAX_PAUSE_S = 10.0  # a simulation that was paused for longer counts as rebooted
-SPEED_MAX_AGE_S = 5.0  # validity of the previous speed after a pause or reboot
+SPEED_MAX_AGE_S = 5.0  # after a pause or reboot, the speed measured before remains valid for this time
 
 
 class VehicleClock:

@@ -149,7 +149,7 @@ class CompassCalibration:
         return MavResult.ACCEPTED
 
     def progress(self) -> m.MagCalProgress | None:
-        """Return the progress of the next compass; None if no calibration runs."""
+        """Return the progress of one compass, each compass in turn; None if no calibration runs."""
         if not self.is_running:
             return None
         self._next = self._next_compass(self._next)

@@ -203,7 +203,7 @@ class AuxiliaryOutputs:
         return _RELAYS.get(self._vehicle.KIND, 1)
 
     def is_free(self, output: int) -> bool:
-        """Return True if SERVOn_FUNCTION assigns an output no function or only a stick."""
+        """Return True if the output's SERVOn_FUNCTION is 0 (none) or passes an RC channel through."""
         return self._vehicle.parameters.get(f"SERVO{output}_FUNCTION", 0) in _FREE_FUNCTIONS
 
     def set_servo(self, command: ReceivedCommand) -> int:

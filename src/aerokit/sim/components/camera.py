@@ -77,7 +77,7 @@ def _at_once(handler: AsyncHandler) -> CommandHandler:
             handler(command).send(None)
         except StopIteration as end:
             return int(end.value)
-        raise AssertionError("a simulated camera does not wait")
+        raise AssertionError("the handler of a simulated camera awaited something")
 
     return execute
 

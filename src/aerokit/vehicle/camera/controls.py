@@ -231,7 +231,7 @@ class TrackingMixin(CameraMixin):
         if left >= right or top >= bottom:
             raise InvalidArgument(
                 f"left = {left:g}, top = {top:g}, right = {right:g}, bottom = {bottom:g} is not allowed:"
-                " left must be below right, and top below bottom"
+                " left must be less than right, and top less than bottom"
             )
         await self._link.require_capability("track_rectangle", "has_tracking_rectangle")
         await self._track(MavCmd.CAMERA_TRACK_RECTANGLE, left, top, right, bottom)

@@ -66,7 +66,7 @@ class ArmingActions(VehicleBase):
     async def wait_ready(self, *, timeout: float = 90.0) -> None:
         """Wait until position and home are known, the estimator is healthy and the pre-arm checks pass.
 
-        The present mode does not matter, because :meth:`arm` leaves a mode in which the vehicle cannot arm.
+        The present mode does not matter: if the vehicle cannot arm in it, :meth:`arm` changes the mode first.
         :meth:`why_not_armable` reports such a mode.
 
         Raises:

@@ -246,7 +246,8 @@ class VehiclePosition:
             if place is None:
                 continue
             degrees = abs(place.latitude_deg - here.latitude_deg) + abs(place.longitude_deg - here.longitude_deg)
-            if degrees * METRES_PER_DEGREE < max_distance_m:  # Missions may have thousands of nearby places.
+            # A mission may have thousands of places, and the exact distance is slow to compute.
+            if degrees * METRES_PER_DEGREE < max_distance_m:
                 continue
             distance_m = self.distance_to(place)
             if distance_m > max_distance_m:

@@ -44,7 +44,7 @@ class GimbalRegistry:
         # Stands for the first gimbal until one is discovered. Its cells always mirror those of the first gimbal.
         self.placeholder: GimbalDevice = GimbalDevice(context, 0, 0)
         self.placeholder.topic = ROI
-        # Open control blocks of this program.
+        # Claims of this program's `gimbal.control()` blocks that have not ended.
         self.claims: list[ControlClaim] = []
         # Component id → loop time of the last HEARTBEAT or gimbal message.
         self._received_at: dict[int, float] = {}

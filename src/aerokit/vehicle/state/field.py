@@ -223,8 +223,8 @@ class StreamedMessage:
         """Decode the pending frames in the order of their arrival."""
         with self._lock:
             waiting: list[tuple[Frame, Message | None]] = []
-            # A frame is removed only after decoding. The decoder may read the previous value, which calls this function
-            # again.
+            # All frames are removed before the first one is decoded. A decoder may read the previous value, which calls
+            # this function again.
             while self.pending:
                 came = self.pending.popitem()[1]
                 if isinstance(came, Frame):
