@@ -145,18 +145,19 @@ class Attachment:
         try:
             now, port_peer = self._now(), None if self._is_single else peer
             framer = self._peers.framers.get(port_peer)
+            is_whole = False  # True if the data consists of whole valid frames only
             if framer is not None:
+                had_waiting, bad_bytes = framer.waiting, framer.statistics.bad_bytes
                 frames = framer.receive(data, now)
+                is_whole = not (had_waiting or framer.waiting) and framer.statistics.bad_bytes == bad_bytes
             else:
                 framer, frames = self._peers.receive_unverified(port_peer, data, now)
                 self._report_full(framer, port_peer)
             if frames:
                 port = self._ports.get(port_peer) or self._add_port(port_peer)
-                self._switch.take(port, framer, frames, data, now)
+                self._switch.take(port, framer, frames, data if is_whole else None, now)
                 if port_peer != peer:  # this peer has answered a broadcast
                     self.link.keep_peer(peer)
-            elif (waiting := self._ports.get(port_peer)) is not None:
-                waiting.note_partial_read()
         except Exception as error:
             self._report(self, "internal_error", f"internal error of aerokit: {error!r}")
 

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from aerokit.hub.senders import IdentityGuard
     from aerokit.hub.values import HubEventKind
     from aerokit.mavlink.dialect import Dialect
-    from aerokit.mavlink.framer import Framer
     from aerokit.mavlink.signing import Signing
     from aerokit.transport.link import Link, Peer
 
@@ -157,7 +156,6 @@ class SigningGateway:
 MAX_JOINED_BYTES = 1200
 """Frames sent together are joined up to this size, so that their datagram is not fragmented."""
 UNLIMITED = 1 << 62
-_INCOMPLETE = -1 << 62  # a value that equals no number of bytes
 MAX_RATE_LIMITS = 4096
 """Maximum number of (sender, message) pairs whose rate is tracked."""
 
@@ -222,7 +220,6 @@ class Port:
         self._on_drop = on_drop
         self._queue = FrameQueue()
         self._due: dict[int, float] = {}
-        self._framed_bytes = _INCOMPLETE
 
     @property
     def is_holding(self) -> bool:
@@ -236,17 +233,6 @@ class Port:
     def joins_frames(self) -> bool:
         """True if frames are written together, so that they may be collected in one piece."""
         return self.gateway is None and not self.writes_single_frames
-
-    def is_whole(self, framer: Framer, data: bytes) -> bool:
-        """Return True if ``data``, the last data received, consists of whole valid frames only."""
-        before = self._framed_bytes
-        statistics = framer.statistics
-        self._framed_bytes = _INCOMPLETE if framer.waiting else statistics.bytes - statistics.bad_bytes
-        return self._framed_bytes - len(data) == before
-
-    def note_partial_read(self) -> None:
-        """Note received data that completed no frame, so that `is_whole` is False for the data with the rest of one."""
-        self._framed_bytes = _INCOMPLETE
 
     def must_hold(self) -> bool:
         return self._may_hold and (bool(self._queue) or self._is_full())

@@ -79,8 +79,8 @@ class Switch:
         self._dirty.clear()
         self._holding.clear()
 
-    def take(self, port: Port, framer: Framer, frames: list[Frame], data: bytes, now: float) -> None:
-        """Forward frames received at a port. ``data`` is the received data that contains them."""
+    def take(self, port: Port, framer: Framer, frames: list[Frame], data: bytes | None, now: float) -> None:
+        """Forward frames received at a port. ``data``: these frames as received, None if there were other bytes."""
         # Hot path.
         node, guard, peer = port.node, port.guard, port.peer
         if node is None or port.is_read_only:
@@ -89,12 +89,13 @@ class Switch:
                     guard.admits(frame, framer, peer)
             port.counters.dropped["read_only"] += len(frames)
             return
-        late, is_whole = framer.late, port.is_whole(framer, data)
+        late = framer.late
         if port.gateway is not None or (guard is not None and (guard.is_shared or 0 in map(_message_id, frames))):
             count, (frames, late) = len(frames), self._admitted(port, framer, frames)
-            is_whole = is_whole and port.gateway is None and len(frames) == count
+            if port.gateway is not None or len(frames) != count:
+                data = None
         plans = self.router.route_all(node, frames, now, late)
-        if not (is_whole and self.recording is None and self._forward_together(plans, data)):
+        if data is None or self.recording is not None or not self._forward_together(plans, data):
             for frame, plan in zip(frames, plans, strict=True):
                 self._forward(port, frame.raw, plan, now)
         if self._dirty:
