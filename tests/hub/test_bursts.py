@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import random
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import asynccontextmanager
 from typing import Any
 
 import pytest
@@ -58,6 +59,21 @@ class LoneLink(BurstLink):
             super().read_from([one])
 
 
+@asynccontextmanager
+async def known_vehicle(
+    station: SlowLink | None = None, **fields: Any
+) -> AsyncIterator[tuple[Hub, BurstLink, SlowLink, FrameEncoder]]:
+    """A hub that knows a vehicle; links of vehicles and station, and the vehicle's encoder.
+
+    The station's link starts with nothing written. ``fields`` are those of its endpoint.
+    """
+    vehicles, station, vehicle = BurstLink(), station or SlowLink(), FrameEncoder(1, 1)
+    async with Hub([Endpoint(vehicles, name="a"), Endpoint(station, name="b", **fields)]) as hub:
+        vehicles.read(vehicle.encode(COPTER))
+        station.written.clear()
+        yield hub, vehicles, station, vehicle
+
+
 def frames_of(link: SlowLink) -> list[bytes]:
     framer = Framer()
     framer.keep_unknown = True
@@ -93,14 +109,11 @@ async def test_mixed_destinations_of_one_datagram_are_separated() -> None:
 
 @virtual
 async def test_burst_leaves_in_one_unchanged_datagram() -> None:
-    vehicles, station = BurstLink(), SlowLink()
-    async with Hub([Endpoint(vehicles, name="a"), Endpoint(station, name="b")]) as hub:
-        vehicle, old = FrameEncoder(1, 1), FrameEncoder(1, 1, version=1)
-        vehicles.read(vehicle.encode(COPTER))
+    async with known_vehicle() as (hub, vehicles, station, vehicle):
+        old = FrameEncoder(1, 1, version=1)
         old.sequence = 1
         vehicle.sequence = 2
         frames = [old.encode(Statustext(6, "x")), *encoded(vehicle, *telemetry(4))]
-        station.written.clear()
         vehicles.read(*frames[:3], frames[3] + frames[4])
         assert station.written == [b"".join(frames)]
         statistics = hub.endpoints[1]
@@ -109,11 +122,7 @@ async def test_burst_leaves_in_one_unchanged_datagram() -> None:
 
 @virtual
 async def test_long_burst_leaves_in_bounded_datagrams() -> None:
-    vehicles, station = BurstLink(), SlowLink()
-    async with Hub([Endpoint(vehicles, name="a"), Endpoint(station, name="b")]) as hub:
-        vehicle = FrameEncoder(1, 1)
-        vehicles.read(vehicle.encode(COPTER))
-        station.written.clear()
+    async with known_vehicle() as (hub, vehicles, station, vehicle):
         frames = encoded(vehicle, *[Attitude(number, 1, 2, 3, 4, 5, 6) for number in range(200)])
         vehicles.read(*frames[:100], b"".join(frames[100:]))
         assert b"".join(station.written) == b"".join(frames)
@@ -124,11 +133,7 @@ async def test_long_burst_leaves_in_bounded_datagrams() -> None:
 
 @virtual
 async def test_malformed_datagram_between_good_ones_is_dropped() -> None:
-    vehicles, station = BurstLink(), SlowLink()
-    async with Hub([Endpoint(vehicles, name="a"), Endpoint(station, name="b")]) as hub:
-        vehicle = FrameEncoder(1, 1)
-        vehicles.read(vehicle.encode(COPTER))
-        station.written.clear()
+    async with known_vehicle() as (hub, vehicles, station, vehicle):
         good = encoded(vehicle, *telemetry(5))
         damaged = good[1][:-1] + bytes((good[1][-1] ^ 1,))
         vehicles.read(good[0], damaged, good[2] + b"noise" + good[3], good[4])
@@ -139,11 +144,7 @@ async def test_malformed_datagram_between_good_ones_is_dropped() -> None:
 
 @virtual
 async def test_halves_of_a_frame_leave_together() -> None:
-    vehicles, station = BurstLink(), SlowLink()
-    async with Hub([Endpoint(vehicles, name="a"), Endpoint(station, name="b")]):
-        vehicle = FrameEncoder(1, 1)
-        vehicles.read(vehicle.encode(COPTER))
-        station.written.clear()
+    async with known_vehicle() as (_, vehicles, station, vehicle):
         frames = encoded(vehicle, *telemetry(4))
         stream = b"".join(frames)
         cuts = 5, len(frames[0]) + 5, len(frames[0] + frames[1]), len(stream)
@@ -156,11 +157,7 @@ async def test_halves_of_a_frame_leave_together() -> None:
 @virtual
 async def test_noise_after_a_completed_frame_is_not_forwarded() -> None:
     """The noise is as long as the part of the frame that was read before."""
-    vehicles, station = BurstLink(), SlowLink()
-    async with Hub([Endpoint(vehicles, name="a"), Endpoint(station, name="b")]):
-        vehicle = FrameEncoder(1, 1)
-        vehicles.read(vehicle.encode(COPTER))
-        station.written.clear()
+    async with known_vehicle() as (_, vehicles, station, vehicle):
         (frame,) = encoded(vehicle, *telemetry(1))
         vehicles.read(frame[:7])
         vehicles.read(frame[7:] + bytes(7))
@@ -183,11 +180,7 @@ async def test_vehicle_gets_single_frames_of_a_burst() -> None:
 
 @virtual
 async def test_frames_of_full_link_are_queued_singly() -> None:
-    vehicles, station = BurstLink(), SlowLink("serial:x")
-    async with Hub([Endpoint(vehicles, name="a"), Endpoint(station, name="b")]) as hub:
-        vehicle = FrameEncoder(1, 1)
-        vehicles.read(vehicle.encode(COPTER))
-        station.written.clear()
+    async with known_vehicle(SlowLink("serial:x")) as (hub, vehicles, station, vehicle):
         station.unsent = 10_000
         frames = encoded(vehicle, Statustext(6, "one"), *telemetry(3), Statustext(6, "two"))
         vehicles.read(*frames)
@@ -197,11 +190,7 @@ async def test_frames_of_full_link_are_queued_singly() -> None:
 
 @virtual
 async def test_signing_link_signs_each_frame_of_a_burst() -> None:
-    vehicles, station = BurstLink(), SlowLink()
-    async with Hub([Endpoint(vehicles, name="a"), Endpoint(station, name="b", signing=Signing(KEY))]):
-        vehicle = FrameEncoder(1, 1)
-        vehicles.read(vehicle.encode(COPTER))
-        station.written.clear()
+    async with known_vehicle(signing=Signing(KEY)) as (_, vehicles, station, vehicle):
         vehicles.read(*encoded(vehicle, *telemetry(3)))
         checker = Signing(KEY)
         received = Framer().receive(b"".join(station.written))
@@ -252,11 +241,7 @@ async def test_port_that_closes_in_mid_burst_gets_nothing() -> None:
 
 @virtual
 async def test_frames_before_the_loss_of_a_link_are_forwarded() -> None:
-    vehicles, station = BurstLink(), SlowLink()
-    async with Hub([Endpoint(vehicles, name="a"), Endpoint(station, name="b")]) as hub:
-        vehicle = FrameEncoder(1, 1)
-        vehicles.read(vehicle.encode(COPTER))
-        station.written.clear()
+    async with known_vehicle() as (hub, vehicles, station, vehicle):
         frames = encoded(vehicle, *telemetry(2))
         for frame in frames:
             vehicles.receiver.bytes_received(frame, PEER)
