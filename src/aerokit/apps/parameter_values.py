@@ -26,8 +26,8 @@ def check_values(metadata: Metadata | None, values: Mapping[str, float], force: 
         raise InvalidArgument(f"{'; '.join(problems)}; nothing was set; {force} sets such values too")
 
 
-def range_note(metadata: Metadata | None, result: ParameterWrite, option: str) -> str:
-    """Return the note of a result, which says if the value was set without a check of its range.
+def with_range_note(metadata: Metadata | None, result: ParameterWrite, option: str) -> ParameterWrite:
+    """Return the result with a note that says if the value was set without a check of its range.
 
     ``option`` is the option that gives the metadata; it appears in the note.
     """
@@ -37,7 +37,7 @@ def range_note(metadata: Metadata | None, result: ParameterWrite, option: str) -
     elif metadata_entry(metadata, result.name)[0] is None:
         text = "range not checked (the metadata does not have this parameter)"
     is_set = result.error is None and result.outcome != "unchanged"
-    return "; ".join(filter(None, (result.note, text if is_set else "")))
+    return result.replace(note="; ".join(filter(None, (result.note, text if is_set else ""))))
 
 
 def _problem(metadata: Metadata, name: str, value: float) -> str | None:

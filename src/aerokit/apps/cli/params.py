@@ -21,9 +21,9 @@ from aerokit.apps.cli.params_metadata import (
     load_given,
     metadata_for_check,
     reboot_note,
-    with_range_note,
 )
 from aerokit.apps.cli.terminal import progress_bar
+from aerokit.apps.parameter_values import with_range_note
 from aerokit.errors import ParameterRejected, ParameterTimeout
 
 if TYPE_CHECKING:
@@ -139,7 +139,7 @@ async def _set(options: argparse.Namespace) -> int:
             check_given(given, dict(options.values))
         results = await vehicle.parameters.set_many(dict(options.values), idle_timeout_s=options.patience)
     if not options.force:
-        results = {name: result.replace(note=with_range_note(given, result)) for name, result in results.items()}
+        results = {name: with_range_note(given, each, "--metadata FILE") for name, each in results.items()}
     return _emit_results(options, results.values(), vehicle, given)
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import anyio
 
-from aerokit.apps.parameter_values import check_values, metadata_entry, range_note
+from aerokit.apps.parameter_values import check_values, metadata_entry
 from aerokit.errors import AerokitError, CommandRejected, FileError, NotSupported
 
 if TYPE_CHECKING:
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from aerokit.parameters import Metadata, Parameter
-    from aerokit.vehicle.parameters.parameters import ParameterWrite
     from aerokit.vehicle.vehicle import Vehicle
 
 # ArduPilot uses a new system id at once (GCS_Common.cpp, update_send), PX4 and old ArduPilots after a reboot.
@@ -75,11 +74,6 @@ async def _fetch(vehicle: Vehicle) -> Metadata | None:
 def check_given(metadata: Metadata | None, values: Mapping[str, float]) -> None:
     """Raise InvalidArgument with all values that the metadata does not allow. Unknown names are accepted."""
     check_values(metadata, values, "--force")
-
-
-def with_range_note(metadata: Metadata | None, result: ParameterWrite) -> str:
-    """Return the note of a result, which says whether the value was set without a check of its range."""
-    return range_note(metadata, result, "--metadata FILE")
 
 
 def reboot_note(metadata: Metadata | None, name: str, value: float) -> str:

@@ -14,7 +14,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from aerokit._internal.formatting import to_jsonable
-from aerokit.apps.parameter_values import check_values, range_note
+from aerokit.apps.parameter_values import check_values, with_range_note
 from aerokit.apps.plan_text import parse_plan_text
 from aerokit.apps.serve.requests import MAX_BODY_SIZE, MAX_PLAN_SIZE, HttpProblem, problem_of
 from aerokit.connection.tasks import BackgroundTasks
@@ -104,7 +104,7 @@ async def _resume(vehicle: Vehicle, values: dict[str, Any]) -> None:
 
 async def _set_parameter(vehicle: Vehicle, values: dict[str, Any], metadata: Metadata | None = None) -> object:
     result = await vehicle.parameters.set(values["name"], values["value"])
-    return result.replace(note=range_note(metadata, result, "serve --metadata FILE"))
+    return with_range_note(metadata, result, "serve --metadata FILE")
 
 
 def parameter_order(metadata: Metadata | None) -> OrderType:
