@@ -122,23 +122,24 @@ export class Orders {
     });
     const yes = element("button", { type: "submit", class: "yes" }, `Yes, ${wanted.title.charAt(0).toLowerCase()}${wanted.title.slice(1)} · vehicle ${id}`);
     const problem = element("p", { class: "problem", hidden: true, role: "alert" });
-    const force = element("input", { type: "checkbox", name: "force", onchange: () => { yes.disabled = !force.checked || !blocked.hidden; } });
+    const force = element("input", { type: "checkbox", name: "force", onchange: () => enable() });
     const forced = element("label", { class: "force", hidden: true }, "Set it all the same", force);
     const values = () => Object.fromEntries(inputs.filter(([, input]) => input.value !== "").map(([name, input]) => [name, Number(input.value)]));
     const blocked = element("p", { class: "blocked", hidden: true, role: "alert" });
+    const enable = () => { yes.disabled = !blocked.hidden || (!problem.hidden && !force.checked); };
     // The vehicle can disarm itself, land or become silent while the dialog is open.
     this.recheck = (page) => {
       const why = dialogObstacle(wanted.order, page.vehicles.get(id), page);
       show(blocked, why);
       blocked.hidden = !why;
-      yes.disabled = Boolean(why) || (!problem.hidden && !force.checked);
+      enable();
     };
     const check = () => {
       const text = wanted.problem?.(values()) || "";
       show(problem, text);
       problem.hidden = forced.hidden = !text;
       force.checked = false;
-      yes.disabled = Boolean(text) || !blocked.hidden;
+      enable();
     };
     const token = hasToken() ? null : element("input", { type: "password", required: true, autocomplete: "off" });
     const give = (event) => {

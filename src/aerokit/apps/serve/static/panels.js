@@ -155,7 +155,7 @@ export class ParameterPanel {
 const MAX_EDITS = 2;
 
 // The name with the fewest differences from a misspelt one; "" if all differ in more than two places.
-export function nearName(word, names) {
+function nearName(word, names) {
   const ranked = names.map((name) => [edits(word, name), name]).sort(([a, one], [b, other]) => a - b || one.localeCompare(other));
   const [[count, name] = [Infinity, ""]] = ranked;
   return count <= Math.min(MAX_EDITS, word.length / 3) ? name : "";
@@ -180,6 +180,7 @@ const short = (value) => (value === null || value === undefined ? UNKNOWN : Stri
 const withUnit = (each, value) => `${short(value)}${each.unit ? ` ${each.unit}` : ""}`;
 const meaning = (each) => (each.meaning && each.meaning !== withUnit(each, each.value) ? each.meaning : "");
 const isKnown = (value) => value !== null && value !== undefined;
+const bound = (limit) => (isKnown(limit) ? short(limit) : "");
 
 function changedFrom(each) {
   return isKnown(each.default) && each.default !== each.value ? `default ${short(each.default)}` : "";
@@ -187,7 +188,7 @@ function changedFrom(each) {
 
 function range(each) {
   if (!isKnown(each.minimum) && !isKnown(each.maximum)) return "";
-  return `${isKnown(each.minimum) ? short(each.minimum) : ""} … ${isKnown(each.maximum) ? short(each.maximum) : ""}`;
+  return `${bound(each.minimum)} … ${bound(each.maximum)}`;
 }
 
 // Why the metadata does not allow a value, like ParameterMetadata.problem in metadata.py; "" if it does.
@@ -197,7 +198,6 @@ export function parameterProblem(each, value) {
   const isInside = (!isKnown(each.minimum) || value >= each.minimum) && (!isKnown(each.maximum) || value <= each.maximum);
   if (names.some(([code]) => Number(code) === value) || (isInside && (hasRange || !names.length || each.has_bits))) return "";
   if (!hasRange) return `${each.name} = ${short(value)} is not a documented value: ${names.map((one) => one.join(" ")).join(", ")}`;
-  const bound = (limit) => (isKnown(limit) ? short(limit) : "");
   return `${each.name} = ${short(value)} is not in ${bound(each.minimum)}..${bound(each.maximum)} ${each.unit ?? ""}`.trimEnd();
 }
 
@@ -344,7 +344,7 @@ export function outcome(record) {
   return `${orderText(record)}: ${record.state === "running" ? "ordered" : record.state}${note ? `; ${note}` : ""}`;
 }
 
-export function orderText(record) {
+function orderText(record) {
   const name = record.order.replace("mission/upload", "upload").replace(/[_/]/g, " ").replace("set parameter", "set"), text = ORDER_TEXTS[record.order];
   if (text) return name + text(record.arguments);
   const given = Object.entries(record.arguments).map(([each, value]) => {
