@@ -184,35 +184,31 @@ def test_readiness_shows_all_reasons_and_notes(browser: Any, copters: tuple[list
         ]
 
 
+OBSTACLE = """async ([order, landed, age, type, link]) => {
+    const { obstacle } = await import("/static/readiness.js");
+    const states = { armed: { value: true, age_s: 0 }, landed_state: { value: landed, age_s: age } };
+    const vehicle = { states, link: { state: link }, vehicle_type: type, missing_for_flight: [] };
+    return obstacle(order, vehicle, { isOpen: true });
+}"""
+
+
 def test_disarm_needs_known_ground(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
     expected = {"ON_GROUND": "", "TAKEOFF": "Land first", "LANDING": "Land first", "IN_AIR": "Land first"}
     with serving(copters[1]) as server, opened(browser, server["page"]) as page:
-        obstacles = """async ([landed, age, type, link]) => {
-            const { obstacle } = await import("/static/readiness.js");
-            const states = { armed: { value: true, age_s: 0 }, landed_state: { value: landed, age_s: age } };
-            const vehicle = { states, link: { state: link }, vehicle_type: type, missing_for_flight: [] };
-            return obstacle("disarm", vehicle, { isOpen: true });
-        }"""
         for landed, text in expected.items():
-            assert page.evaluate(obstacles, [landed, 0, 2, "connected"]) == text
-        assert page.evaluate(obstacles, ["ON_GROUND", 10, 2, "connected"]) == "May be flying"
-        assert page.evaluate(obstacles, ["ON_GROUND", 0, 2, "silent"]) == "May be flying"
-        assert page.evaluate(obstacles, [None, 0, 10, "silent"]) == ""
-        assert page.evaluate(obstacles, [None, 0, 10, "connected"]) == ""  # a rover has no landed state
+            assert page.evaluate(OBSTACLE, ["disarm", landed, 0, 2, "connected"]) == text
+        assert page.evaluate(OBSTACLE, ["disarm", "ON_GROUND", 10, 2, "connected"]) == "May be flying"
+        assert page.evaluate(OBSTACLE, ["disarm", "ON_GROUND", 0, 2, "silent"]) == "May be flying"
+        assert page.evaluate(OBSTACLE, ["disarm", None, 0, 10, "silent"]) == ""
+        assert page.evaluate(OBSTACLE, ["disarm", None, 0, 10, "connected"]) == ""  # a rover has no landed state
 
 
 def test_resume_is_disabled_on_known_ground(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
     on_ground = "On the ground: use Start mission"
     cases = {("ON_GROUND", 0, 2): on_ground, ("IN_AIR", 0, 2): "", ("ON_GROUND", 9, 2): "", ("ON_GROUND", 0, 10): ""}
     with serving(copters[1]) as server, opened(browser, server["page"]) as page:
-        obstacles = """async ([landed, age, type]) => {
-            const { obstacle } = await import("/static/readiness.js");
-            const states = { armed: { value: true, age_s: 0 }, landed_state: { value: landed, age_s: age } };
-            const link = { state: "connected" };
-            const vehicle = { states, link, vehicle_type: type, missing_for_flight: [] };
-            return obstacle("mission/resume", vehicle, { isOpen: true });
-        }"""
-        assert {case: page.evaluate(obstacles, [*case]) for case in cases} == cases
+        found = {case: page.evaluate(OBSTACLE, ["mission/resume", *case, "connected"]) for case in cases}
+        assert found == cases
 
 
 def test_take_off_dialog_reports_disarming(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
