@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from aerokit._internal.formatting import printable
-from aerokit.apps.cli.output import DONE, add_json, check_not_existing, emit, import_extra
+from aerokit.apps.cli.output import DONE, add_force, add_json, check_not_existing, emit, import_extra
 from aerokit.apps.cli.terminal import progress_bar
 from aerokit.logs.flights import check_log_name
 from aerokit.logs.report.statistics import clock, fall_text
@@ -92,7 +92,7 @@ def add_report_arguments(command: argparse.ArgumentParser) -> None:
         metavar="ID",
         help="system id of the vehicle, if a .tlog has several (the first)",
     )
-    command.add_argument("--force", action="store_true", help="replace an existing file")
+    add_force(command)
     command.add_argument("--open", action="store_true", help="open the report in the browser")
     add_json(command)
 
