@@ -392,7 +392,7 @@ class HttpApi:
         vehicle, is_new = self._vehicle_of(request), self._is_refresh(request)
         async with self._lock(vehicle):
             table = await vehicle.parameters.download(refresh=is_new)
-        metadata = vehicle.parameters.metadata or self._metadata
+        metadata = self._metadata_of(vehicle)
         return json_response({"parameters": [_parameter(table[name], metadata) for name in sorted(table)]})
 
     async def _parameter(self, request: Request) -> Response:
@@ -418,7 +418,7 @@ class HttpApi:
         kind.check(arguments)
         if kind is SET_PARAMETER:
             arguments["name"] = request.path_params["name"]
-            metadata = vehicle.parameters.metadata or self._metadata
+            metadata = self._metadata_of(vehicle)
             check_parameter(metadata, arguments)
             kind = parameter_order(metadata)
         key = request.headers.get("idempotency-key", "").strip().strip('"')
@@ -434,6 +434,9 @@ class HttpApi:
 
     def _vehicle_of(self, request: Request) -> Vehicle:
         return self._served.vehicle(system_id_of(request))
+
+    def _metadata_of(self, vehicle: Vehicle) -> Metadata | None:
+        return vehicle.parameters.metadata or self._metadata
 
     def _is_refresh(self, request: Request) -> bool:
         # A refresh uses the vehicle's link, and therefore needs the token, like an order.
