@@ -105,25 +105,15 @@ class _Rules:
 
     def check(self, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> None:
         rules = self._read() if self._by_name is None else self._by_name
-        for name, value in zip(self._positional, args):  # noqa: B905 - Python rejects surplus arguments itself
+        rest = args[len(self._positional) :]
+        given = [
+            *zip(self._positional, args),  # noqa: B905 - Python rejects surplus arguments itself
+            *((self._var_positional, value) for value in rest),
+            *kwargs.items(),
+        ]
+        for name, value in given:
             if name in rules and not rules[name][0](value):
-                raise self._error(name, value, args, kwargs)
-        if self._var_positional:
-            for value in args[len(self._positional) :]:
-                _check_value(rules[self._var_positional], self._var_positional, value)
-        for name, value in kwargs.items():
-            if name in rules and not rules[name][0](value):
-                raise self._error(name, value, args, kwargs)
-
-    def _error(self, name: str, value: object, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> InvalidArgument:
-        check, allowed = ({} if self._by_name is None else self._by_name)[name]
-        given = {**dict(zip(self._positional, args)), **kwargs}.get("name")  # noqa: B905 - as in check()
-        if name == "value" and isinstance(given, str):  # set("RTL_ALT", "abc")
-            hint = _hint(check, value)
-            return InvalidArgument(
-                f"value = {short_repr(value)} of {given[:40]} is not allowed: it must be {allowed}{hint}"
-            )
-        return _error(check, allowed, name, value)
+                raise _error(rules[name], name, value, dict(given).get("name"))
 
     def _read(self) -> dict[str, Rule]:
         parameters = inspect.signature(self._function).parameters.values()
@@ -145,14 +135,15 @@ def _is_time(parameter: inspect.Parameter) -> bool:
     return str(parameter.annotation) in _SECONDS and name.endswith(("timeout", "_s")) and not is_speed
 
 
-def _check_value(rule: Rule, name: str, value: object) -> None:
+def _error(rule: Rule, name: str, value: object, parameter: object) -> InvalidArgument:
+    """Describe an invalid argument. ``parameter`` is the argument called ``name``, which a ``value`` belongs to."""
     check, allowed = rule
-    if not check(value):
-        raise _error(check, allowed, name, value)
-
-
-def _error(check: Check, allowed: str, name: str, value: object) -> InvalidArgument:
-    return InvalidArgument(f"{name} = {short_repr(value)} is not allowed: {allowed}{_hint(check, value)}")
+    hint = _hint(check, value)
+    if name == "value" and isinstance(parameter, str):  # set("RTL_ALT", "abc")
+        return InvalidArgument(
+            f"value = {short_repr(value)} of {parameter[:40]} is not allowed: it must be {allowed}{hint}"
+        )
+    return InvalidArgument(f"{name} = {short_repr(value)} is not allowed: {allowed}{hint}")
 
 
 def _hint(check: Check, value: object) -> str:

@@ -2602,7 +2602,6 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
             InvalidArgument: there is no such item. Nothing was sent.
             CommandRejected: the vehicle refused.
             OperationRejected: a pilot took over, or a newer order was given, before the item was confirmed.
-
             OperationTimeout: MISSION_CURRENT did not confirm the item.
         """
         self._loop.run(self.aio.set_current, item, timeout=timeout)

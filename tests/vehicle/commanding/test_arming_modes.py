@@ -4,10 +4,17 @@ from __future__ import annotations
 
 import anyio
 import pytest
-from flight_harness import in_the_air, open_flight, open_px4
+from flight_harness import Flight, in_the_air, open_flight, open_px4
 
 from aerokit import connect, missions
-from aerokit.errors import CommandRejected, InvalidArgument, LinkLost, OperationRejected, OperationTimeout
+from aerokit.errors import (
+    CommandRejected,
+    CommandTimeout,
+    InvalidArgument,
+    LinkLost,
+    OperationRejected,
+    OperationTimeout,
+)
 from aerokit.mavlink.enums import CopterMode, MavCmd, PlaneMode
 from aerokit.sim import SimulatedPlane, simulated_link
 from aerokit.sim.px4.modes import OFFBOARD
@@ -112,6 +119,39 @@ async def test_arm_where_option_allows_it_keeps_mode(armed_before_s: float | Non
         await flight.vehicle.arm()
         assert flight.vehicle.is_armed
         assert not flight.wire.mode_orders()
+
+
+async def test_unanswered_arm_in_auto_is_not_repeated() -> None:
+    """Only a refusal shows that the vehicle is still disarmed."""
+    async with open_flight() as flight:
+        await flight.vehicle.wait_ready()
+        await flight.vehicle.mission.upload(missions.Mission([missions.take_off(10)]))
+        await flight.vehicle.set_mode("AUTO")
+        flight.wire.clear()
+        flight.copter.faults.ignore(ARM)
+        with pytest.raises(CommandTimeout):
+            await flight.vehicle.arm()
+        assert len(flight.wire.commands(ARM)) == 1
+        assert not flight.wire.mode_orders()
+
+
+async def test_pilot_between_refusal_and_repetition_ends_arming() -> None:
+    async with open_flight() as flight:
+        await flight.vehicle.wait_ready()
+        await flight.vehicle.mission.upload(missions.Mission([missions.take_off(10)]))
+        await flight.vehicle.set_mode("AUTO")
+        flight.wire.clear()
+        flight.copter.faults.ignore(MavCmd.DO_SET_MODE)
+        async with anyio.create_task_group() as group:
+            group.start_soon(take_over_later, flight)
+            with pytest.raises(OperationRejected):
+                await flight.vehicle.arm()
+        assert len(flight.wire.commands(ARM)) == 1
+
+
+async def take_over_later(flight: Flight) -> None:
+    await anyio.sleep(0.2)
+    flight.copter.set_mode(CopterMode.LOITER)
 
 
 async def test_px4_left_in_offboard_arms() -> None:

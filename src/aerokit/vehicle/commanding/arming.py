@@ -150,20 +150,24 @@ class ArmingActions(VehicleBase):
             self.connection.send(Statustext(MavSeverity.INFO, reason, 0, 0))
         started = self.connection.now()
         try:
-            try:
-                await self._arm_in_present_mode(force, timeout, max_silence_s)
-            except CommandRejected:
-                if (
-                    mode is not None
-                    or not self._is_in_optional_mode()
-                    or not (better := self.autopilot.mode_to_arm_in())
-                ):
-                    raise
-                await self._change_to_arming_mode(better)
-                await self._arm_in_present_mode(force, timeout, max_silence_s)
+            await self._arm_where_allowed(mode is None, force, timeout, max_silence_s)
         except CommandRejected as error:
             reasons = await self._health.arming_reasons(started)
             raise self._session.with_reasons(error, started, reasons) from None
+
+    async def _arm_where_allowed(
+        self, may_change_mode: bool, force: bool, timeout: float, max_silence_s: float | None
+    ) -> None:
+        """Arm in the present mode; after a refusal there, change a mode that a parameter may exclude from arming."""
+        try:
+            await self._arm_in_present_mode(force, timeout, max_silence_s)
+        except CommandRejected:
+            is_excluded = may_change_mode and self._is_in_optional_mode()
+            better = self.autopilot.mode_to_arm_in() if is_excluded else None
+            if better is None:
+                raise
+            await self._change_to_arming_mode(better)
+            await self._arm_in_present_mode(force, timeout, max_silence_s)
 
     async def _arm_in_present_mode(self, force: bool, timeout: float, max_silence_s: float | None) -> None:
         started, was_armed = self.connection.now(), self.telemetry.is_armed

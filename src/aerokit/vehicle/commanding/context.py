@@ -11,6 +11,7 @@ from aerokit.vehicle.commanding.health import Health
 from aerokit.vehicle.commanding.progress import VehiclePosition
 from aerokit.vehicle.commanding.sender import OrderSender
 from aerokit.vehicle.state.states import States
+from aerokit.vehicle.state.telemetry import height_above_home
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -53,8 +54,7 @@ class VehicleContext:
         autopilot, telemetry = self.session.autopilot, self.session.telemetry
         hold, mode = autopilot.mode_for("hold", is_vtol=telemetry.is_vtol), telemetry.mode.latest
         disarmed = "disarmed" if telemetry.is_confirmed_disarmed else "possibly armed"
-        position = telemetry.position.latest
-        height = None if position is None else position.altitude_relative_m
+        height = height_above_home(telemetry)
         # A copter in LAND disarms some seconds after the touchdown.
         has_landed = telemetry.is_armed and telemetry.landed_state.latest == MavLandedState.ON_GROUND
         where = "on the ground in" if has_landed else "in"

@@ -6,6 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from aerokit.vehicle.commanding.progress import FALL_SINK_M_S
+from aerokit.vehicle.state.telemetry import height_above_home
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -61,8 +62,8 @@ class ImpactDetector:
             self._max_sink_m_s = velocity.down_m_s if is_new else max(self._max_sink_m_s, velocity.down_m_s)
             self._fast_at = cell.updated_at
         elif abs(velocity.down_m_s) < STILL_M_S and cell.updated_at - self._fast_at <= limit_s:
-            self._impact_m_s, self._height_m = self._max_sink_m_s, height_above_home(self._session)
-        elif _has_changed(self._height_m, height_above_home(self._session), IMPACT_HEIGHT_M):
+            self._impact_m_s, self._height_m = self._max_sink_m_s, height_above_home(self._session.telemetry)
+        elif _has_changed(self._height_m, height_above_home(self._session.telemetry), IMPACT_HEIGHT_M):
             self._impact_m_s = self._height_m = None
 
     def text(self) -> str:
@@ -101,7 +102,7 @@ class GroundCheck:
             return False
         if self._reported_at is None:
             self._reported_at, self._settled_since = now, math.inf
-            self._reported_height_m = height_above_home(self._session)
+            self._reported_height_m = height_above_home(self._session.telemetry)
         return self._has_settled(now, velocity.updated_at) and not self._impact.text()
 
     def trouble(self, before: Callable[[], str | None]) -> str | None:
@@ -122,7 +123,7 @@ class GroundCheck:
             return True
         if abs(self._down_m_s()) >= SETTLED_M_S:
             self._settled_since = math.inf
-            height_m = height_above_home(self._session)
+            height_m = height_above_home(self._session.telemetry)
             is_known = height_m is not None and self._reported_height_m is not None
             is_still = is_known and not _has_changed(self._reported_height_m, height_m, UNSETTLED_M)
             return is_still and now - reported_at >= UNSETTLED_S
@@ -132,12 +133,6 @@ class GroundCheck:
     def _down_m_s(self) -> float:
         velocity = self._session.telemetry.velocity.latest
         return 0.0 if velocity is None else velocity.down_m_s
-
-
-def height_above_home(session: VehicleSession) -> float | None:
-    """Return the reported height above home in metres; None if it is unknown."""
-    here = session.telemetry.position.latest
-    return None if here is None else here.altitude_relative_m
 
 
 def _has_changed(before_m: float | None, now_m: float | None, by_m: float) -> bool:

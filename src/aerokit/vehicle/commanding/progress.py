@@ -11,6 +11,7 @@ from aerokit._internal.arguments import check_range
 from aerokit.errors import HeartbeatTimeout, InvalidArgument, OperationRejected, OperationTimeout
 from aerokit.mavlink.enums import MavFrame, MavLandedState
 from aerokit.position import Position
+from aerokit.vehicle.state.telemetry import height_above_home
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -89,8 +90,7 @@ async def await_progress(
 
 def _height_when_disarmed(session: VehicleSession) -> str:
     """Return the height of a vehicle that is disarmed in the air, as a clause; empty otherwise."""
-    here = session.telemetry.position.latest
-    height_m = None if here is None else here.altitude_relative_m
+    height_m = height_above_home(session.telemetry)
     is_falling = session.telemetry.is_confirmed_disarmed and height_m is not None and height_m > 1.0
     return f" {height_m:.1f} m above home" if is_falling else ""
 
@@ -284,8 +284,7 @@ class VehiclePosition:
 
     def altitude_relative(self) -> float:
         """Return the altitude above home in metres; −inf while unknown."""
-        here = self._telemetry.position.latest
-        altitude = None if here is None else here.altitude_relative_m
+        altitude = height_above_home(self._telemetry)
         return -math.inf if altitude is None else altitude
 
     def home_altitude(self) -> float:

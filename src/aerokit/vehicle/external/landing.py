@@ -18,6 +18,7 @@ from aerokit.vehicle.commanding.ground import GroundCheck
 from aerokit.vehicle.commanding.progress import await_progress
 from aerokit.vehicle.commanding.streams import TakeoverCheck
 from aerokit.vehicle.external.values import TargetMeasurement
+from aerokit.vehicle.state.telemetry import height_above_home
 
 if TYPE_CHECKING:
     from aerokit.vehicle.commanding.context import VehicleContext
@@ -142,7 +143,7 @@ class TargetLanding:
         stays = self._context.sender.stays_until_disarmed(order)
 
         def is_down() -> bool:
-            height = self._height_m()
+            height = height_above_home(self._session.telemetry)
             if height is not None:
                 self._lowest_m = min(self._lowest_m, height)
                 self._climbed_m = max(self._climbed_m, height - self._lowest_m)
@@ -150,7 +151,7 @@ class TargetLanding:
             return ground.confirms(telemetry.is_confirmed_disarmed and telemetry.armed.updated_at > order.given_at)
 
         def describe() -> str:
-            height = self._height_m()
+            height = height_above_home(self._session.telemetry)
             where = "at an unknown height" if height is None else f"at {height:.1f} m"
             return f"the vehicle is {where}; the target was last seen {self._now() - self._seen_at:.1f} s ago"
 
@@ -172,10 +173,6 @@ class TargetLanding:
     def _now(self) -> float:
         return self._session.connection.now()
 
-    def _height_m(self) -> float | None:
-        position = self._session.telemetry.position.latest
-        return None if position is None else position.altitude_relative_m
-
     def _raise_error(self) -> None:
         if self._error is not None:
             raise self._error
@@ -189,4 +186,8 @@ class TargetLanding:
             gap = self._now() - self._seen_at
             if LOST_AFTER_S < gap < math.inf:
                 self._losses.append(TargetLoss(gap, self._seen_height_m))
-            self._last, self._seen_at, self._seen_height_m = target, self._now(), self._height_m()
+            self._last, self._seen_at, self._seen_height_m = (
+                target,
+                self._now(),
+                height_above_home(self._session.telemetry),
+            )

@@ -69,11 +69,9 @@ class MissionEndDetector:
         self._ground = GroundCheck(session)
 
     def has_ended(self) -> bool:
-        is_over = self._is_over()
-        if self._is_on_ground:
-            return self._ground.confirms(is_over)
-        self._ground.confirms(False)
-        return is_over
+        is_over, is_on_ground = self._is_over(), self._is_on_ground
+        is_down = self._ground.confirms(is_over and is_on_ground)
+        return is_down if is_on_ground else is_over
 
     def _is_over(self) -> bool:
         if self._tracker.is_complete:
@@ -195,7 +193,6 @@ class MissionControl(VehiclePlan["Mission"]):
             InvalidArgument: there is no such item. Nothing was sent.
             CommandRejected: the vehicle refused.
             OperationRejected: a pilot took over, or a newer order was given, before the item was confirmed.
-
             OperationTimeout: MISSION_CURRENT did not confirm the item.
         """
         self._check_item(item)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavCmd, MavLandedState, MissionState
 from aerokit.vehicle.commanding.progress import StallDetector
+from aerokit.vehicle.state.telemetry import height_above_home
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -80,7 +81,6 @@ class MissionStallDetector:
     @property
     def _is_on_ground(self) -> bool:
         telemetry = self._session.telemetry
-        here = telemetry.position.latest
-        height_m = None if here is None else here.altitude_relative_m
+        height_m = height_above_home(telemetry)
         is_low = height_m is not None and height_m < GROUND_HEIGHT_M
         return is_low or telemetry.landed_state.latest == MavLandedState.ON_GROUND

@@ -289,3 +289,9 @@ class Telemetry(States):
     def _publish_texts(self, texts: Iterable[StatusText], source: Source) -> None:
         for text in texts:
             self.status_text.set(text, source)
+
+
+def height_above_home(telemetry: Telemetry) -> float | None:
+    """Return the reported height above home in metres; None if it is unknown."""
+    here = telemetry.position.latest
+    return None if here is None else here.altitude_relative_m
