@@ -95,18 +95,20 @@ class Client:
         self.received.clear()
 
 
-def ready_copter(**options: object) -> tuple[SimulatedCopter, Client]:
+def ready_copter(kind: type[SimulatedCopter] = SimulatedCopter, **options: object) -> tuple[SimulatedCopter, Client]:
     """Return a copter that is booted, disarmed and has a position."""
-    copter = SimulatedCopter(boot_time_s=0.0, **options)  # type: ignore[arg-type]
+    copter = kind(boot_time_s=0.0, **options)  # type: ignore[arg-type]
     client = Client(copter)
     client.run(3.0)
     client.clear()
     return copter, client
 
 
-def flying_copter(altitude_m: float = 10.0, **options: object) -> tuple[SimulatedCopter, Client]:
+def flying_copter(
+    altitude_m: float = 10.0, kind: type[SimulatedCopter] = SimulatedCopter, **options: object
+) -> tuple[SimulatedCopter, Client]:
     """Return a copter that hovers in GUIDED."""
-    copter, client = ready_copter(**options)
+    copter, client = ready_copter(kind, **options)
     assert set_mode(client, CopterMode.GUIDED) == 0
     assert client.command(MavCmd.COMPONENT_ARM_DISARM, 1) == 0
     assert client.command(MavCmd.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude_m) == 0

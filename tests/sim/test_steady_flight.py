@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from simulated_client import Client, set_mode
+from simulated_client import Client, flying_copter, set_mode
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import CopterMode, MavCmd
@@ -18,19 +18,13 @@ from aerokit.sim.px4 import modes
 TICK_S = 0.02
 
 
-def flying_copter(kind: type[SimulatedCopter] = SimulatedCopter, **options: Any) -> tuple[SimulatedCopter, Client]:
-    """Return a copter that hovers 20 m above the ground, without streams."""
-    copter = kind(boot_time_s=0.0, **options)
-    client = Client(copter)
-    client.run(3.0)
-    set_mode(client, CopterMode.GUIDED)
-    client.command(MavCmd.COMPONENT_ARM_DISARM, 1)
-    client.command(MavCmd.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 20)
-    client.run(25.0)
+def hovering_copter(**options: Any) -> tuple[SimulatedCopter, Client]:
+    copter, client = flying_copter(20.0, **options)
+    client.run(10.0)
     return copter, client
 
 
-def flying_px4(kind: type[SimulatedPx4] = SimulatedPx4, **options: Any) -> tuple[SimulatedPx4, Client]:
+def hovering_px4(kind: type[SimulatedPx4] = SimulatedPx4, **options: Any) -> tuple[SimulatedPx4, Client]:
     px4 = kind(boot_time_s=0.0, link_modes=("minimal",), **options)
     client = Client(px4)
     client.run(3.0)
@@ -64,7 +58,7 @@ def recorded_ticks(vehicle: Any) -> list[tuple[float, float]]:
     return ticks
 
 
-BOTH = pytest.mark.parametrize("fly", [flying_copter, flying_px4])
+BOTH = pytest.mark.parametrize("fly", [hovering_copter, hovering_px4])
 Take = Callable[[], tuple[Any, Client]]
 
 
@@ -97,14 +91,14 @@ def test_any_message_is_followed_by_a_short_tick(fly: Take) -> None:
 
 
 def test_gusts_prevent_long_ticks() -> None:
-    copter, client = flying_copter(wind=SimulatedWind(3.0, 0.0, gusts_m_s=1.0))
+    copter, client = hovering_copter(wind=SimulatedWind(3.0, 0.0, gusts_m_s=1.0))
     ticks = recorded_ticks(copter)
     client.run(2.0)
     assert max(dt for _, dt in ticks) == pytest.approx(TICK_S)
 
 
 def test_descent_near_the_ground_ticks_at_full_rate() -> None:
-    copter, client = flying_copter()
+    copter, client = hovering_copter()
     set_mode(client, CopterMode.LAND)
     client.run_until(lambda: copter.altitude_m < 0.15)
     ticks = recorded_ticks(copter)
@@ -143,7 +137,7 @@ class FinePx4(SimulatedPx4):
 
 
 @pytest.mark.parametrize(
-    ("fly", "fine"), [(flying_copter, FineCopter), (flying_px4, FinePx4)], ids=["ardupilot", "px4"]
+    ("fly", "fine"), [(hovering_copter, FineCopter), (hovering_px4, FinePx4)], ids=["ardupilot", "px4"]
 )
 def test_flight_with_long_ticks_equals_flight_without(
     fly: Callable[..., tuple[Any, Client]], fine: type[SimulatedVehicle]

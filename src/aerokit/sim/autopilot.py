@@ -16,6 +16,7 @@ from aerokit.protocols.rtcm import FRAGMENT_SIZE, MAX_FRAGMENTS
 from aerokit.protocols.servers.files import FileTree
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandHandler, CommandServer, ReceivedCommand
+from aerokit.sim.motion import Motion
 from aerokit.sim.vehicle import AttachableComponent, SimulatedVehicle
 
 _CORRECTIONS_MAX_AGE_S = 5.0
@@ -155,6 +156,7 @@ class SimulatedAutopilot(SimulatedVehicle):
     """Files on the memory card and generated files; they survive a reboot."""
     signing: VehicleSigning
     """Message signing; its key survives a reboot."""
+    motion: Motion
 
     def __init__(
         self,
@@ -189,6 +191,10 @@ class SimulatedAutopilot(SimulatedVehicle):
     def capabilities(self) -> int:
         """MAV_PROTOCOL_CAPABILITY flags of AUTOPILOT_VERSION."""
         return self.CAPABILITIES & ~MavProtocolCapability.FTP if self.faults.no_ftp else self.CAPABILITIES
+
+    @property
+    def is_steady(self) -> bool:
+        return self.motion.is_steady
 
     @property
     def unix_time(self) -> float:

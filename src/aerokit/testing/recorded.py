@@ -70,11 +70,9 @@ class RecordedParameters(ParameterProtocolServer):
         self.start_list(channel)
 
     def _on_read(self, request: m.ParamRequestRead, channel: Channel) -> None:
-        name, index, names = request.param_id, request.param_index, self.names
-        if 0 <= index < len(names):
-            self.send(names[index], index, channel)
-        elif index < 0 and name in names:
-            self.send(name, names.index(name), channel)
+        name, index = request.param_id, request.param_index
+        if (found := self.requested(name, index)) is not None:
+            self.send(*found, channel)
         elif index < 0 and name == HASH_NAME and self._hash:
             self.send(name, UNKNOWN_INDEX, channel)
         else:

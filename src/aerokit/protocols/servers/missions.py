@@ -279,8 +279,11 @@ class MissionServer:
             self._repeat(upload)
         self._watch(upload)
 
+    def _is_running(self, upload: ListUpload) -> bool:
+        return self._uploads.get(self._key(upload.mission_type)) is upload
+
     def _is_watched(self, upload: ListUpload) -> bool:
-        return self._uploads.get(self._key(upload.mission_type)) is upload and not upload.is_judged
+        return self._is_running(upload) and not upload.is_judged
 
     def _repeat(self, upload: ListUpload) -> None:
         self._request_item(upload)
@@ -317,7 +320,7 @@ class MissionServer:
         upload.is_judged = True
 
         def answer(result: int) -> None:
-            if self._uploads.get(0) is upload:
+            if self._is_running(upload):
                 if result == _R.ACCEPTED:
                     self.store(upload.mission_type, upload.items)
                 self._end(upload, result)
@@ -329,7 +332,7 @@ class MissionServer:
 
     def _on_ack(self, ack: m.MissionAck, channel: Channel) -> None:
         """End the client's own upload. At the end of a download there is nothing to do."""
-        upload = self._uploads.get(0)
+        upload = self._uploads.get(self._key(ack.mission_type))
         if upload is not None and sender_of(ack) == upload.client and not upload.is_judged and ack.type != _R.ACCEPTED:
             self._drop(upload)
 

@@ -72,6 +72,16 @@ class ParameterLists:
             return
         self._host.call_later(self.burst / self.list_rate_hz, lambda: self._send_from(end, channel, number))
 
+    def requested(self, name: str, index: int) -> tuple[str, int] | None:
+        """Return name and index of the parameter that a request selects: by ``name`` if ``index`` is negative.
+
+        Return None if there is no such parameter.
+        """
+        names = self._listed.names
+        if index < 0:
+            return (name, names.index(name)) if name in names else None
+        return (names[index], index) if index < len(names) else None
+
     def send(self, name: str, index: int, channel: Channel) -> None:
         """Send a value on one channel, or on all if ``channel`` is None."""
         raise NotImplementedError
@@ -162,12 +172,12 @@ class TypedParameterServer(ParameterProtocolServer):
             self.start_list(channel)
 
     def _on_read(self, request: m.ParamRequestRead, channel: Channel) -> None:
-        names, index = self.names, request.param_index
-        name = request.param_id if index < 0 else names[index] if index < len(names) else ""
-        if name in names:
-            self.send(name, names.index(name), channel)
+        name, index = request.param_id, request.param_index
+        if (found := self.requested(name, index)) is not None:
+            self.send(*found, channel)
         else:
-            self.send_error(sender_of(request), name, index, MavParamError.DOES_NOT_EXIST, channel)
+            unknown = name if index < 0 else ""
+            self.send_error(sender_of(request), unknown, index, MavParamError.DOES_NOT_EXIST, channel)
 
     def _on_set(self, request: m.ParamSet, channel: Channel) -> None:
         name, names, store = request.param_id, self.names, self._store
@@ -220,11 +230,8 @@ class ExtendedParameterServer(ParameterLists):
         self.start_list(channel)
 
     def _on_read(self, request: m.ParamExtRequestRead, channel: Channel) -> None:
-        names = self._listed.names
-        if 0 <= request.param_index < len(names):
-            self.send(names[request.param_index], request.param_index, channel)
-        elif request.param_index < 0 and request.param_id in names:
-            self.send(request.param_id, names.index(request.param_id), channel)
+        if (found := self.requested(request.param_id, request.param_index)) is not None:
+            self.send(*found, channel)
 
     def send(self, name: str, index: int, channel: Channel) -> None:
         value, kind = self.value(name)

@@ -18,7 +18,7 @@ from aerokit.sim.autopilot import SimulatedAutopilot, SimulatedBattery
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import rotated
 from aerokit.sim.missions import MissionStore
-from aerokit.sim.motion import GRAVITY_M_S2, GlobalPoint, LocalFrame, Motion, Ned
+from aerokit.sim.motion import GRAVITY_M_S2, GlobalPoint, LocalFrame, Ned
 from aerokit.sim.parameters import SimParameters
 
 HostT = TypeVar("HostT", bound="ArduPilotHost")
@@ -314,7 +314,6 @@ class ArduPilotHost(SimulatedAutopilot):
     timeline: BootTimeline
     uid: bytes
     battery: SimulatedBattery
-    motion: Motion
     motors: ArduPilotMotors
     frame: LocalFrame
     """World frame: metres north and east of the power-on location."""

@@ -348,10 +348,6 @@ class ArduPilotVehicle(ArduPilotHost):
             return m.Timesync(0, int(self.uptime * 1e9) + self.system_id)
         return m.AvailableModesMonitor(0) if message_id == m.AvailableModesMonitor.ID else None
 
-    @property
-    def is_steady(self) -> bool:
-        return self.motion.is_steady
-
     def tick(self, dt: float) -> None:
         if self.motors.is_armed:
             self.mode.update(dt)

@@ -321,10 +321,6 @@ class Px4Vehicle(Px4Host):
             self.info("Pilot took over using sticks")
             self.change_mode(modes.POSITION)
 
-    @property
-    def is_steady(self) -> bool:
-        return self.motion.is_steady
-
     def tick(self, dt: float) -> None:
         """Update mode, motion, land detector, battery and motors."""
         if self.is_armed:

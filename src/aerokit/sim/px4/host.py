@@ -12,7 +12,7 @@ from typing import ClassVar, Protocol
 from aerokit.missions import MissionItem
 from aerokit.sim.autopilot import SimulatedAutopilot, SimulatedBattery
 from aerokit.sim.channel import Channel
-from aerokit.sim.motion import LocalFrame, Motion, Ned
+from aerokit.sim.motion import LocalFrame, Ned
 from aerokit.sim.parameters import SimParameters
 from aerokit.sim.px4.modes import Px4Mode
 
@@ -130,7 +130,6 @@ class Px4Host(SimulatedAutopilot):
     """Parameters; they survive a reboot."""
     frame: LocalFrame
     battery: SimulatedBattery
-    motion: Motion
     home: Ned
     mode: Px4Mode
     intended_mode: Px4Mode

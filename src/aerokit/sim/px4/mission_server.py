@@ -170,7 +170,7 @@ class Px4MissionServer(MissionServer):
     def _watch(self, upload: ListUpload) -> None:
         due = upload.received_at + self.timeout_s
         if self._link(upload.channel).is_retried:
-            due = min(due, max(self._px4.now, upload.requested_at) + self.retry_interval_s)
+            due = min(due, self._px4.now + self.retry_interval_s)
         self._px4.call_at(due, lambda: self._check(upload))
 
     def _is_watched(self, upload: ListUpload) -> bool:
