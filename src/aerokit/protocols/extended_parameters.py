@@ -40,7 +40,7 @@ SettingAnswer = Setting | ParameterRejected | ParameterTimeout
 """Answer to one request: the setting as the component reports it, or the error."""
 
 UNKNOWN_INDEX = 0xFFFF
-MAX_QUIET_S = 1.1
+MAX_QUIET_S = 1.1  # silence after which the stream of the list has stopped in any case
 READ_WINDOW = 10
 # Seconds to wait after PARAM_ACK_IN_PROGRESS before the value is requested.
 PROGRESS_TIMEOUT_S = 5.0
@@ -175,7 +175,7 @@ class SettingReads(NamedReads[Setting]):
         if message.param_index == PROBE_INDEX and self._window.attempts(PROBE):
             self._count_probe()
             self._window.on_answer(PROBE, now)
-            unanswered = [other for other in self._names if other not in self._answers and other != name]
+            unanswered = [asked for asked in self._names if asked not in self._answers and asked != name]
             self._reject_unknown(unanswered, now)
         if name and name in self._window:
             self._window.on_answer(name, now)
@@ -252,7 +252,7 @@ class SettingWrite(Transfer[Setting]):
             self._measure(now)
             self._finish(reported)
         elif self._is_stale(now):
-            return  # the answer is for another station
+            return  # the answer came too early for our request, so it is for another station
         elif result == ParamAck.IN_PROGRESS:
             self._progress_at = now
             self._is_writing = True
@@ -302,5 +302,5 @@ class SettingWrite(Transfer[Setting]):
         return self._stale_answers.is_stale(self._name, self._sent_at, now, attempts=self._attempts)
 
 
-def _is_same(one: Setting, other: Setting) -> bool:
-    return settings_equal(one.value, other.value)
+def _is_same(first: Setting, second: Setting) -> bool:
+    return settings_equal(first.value, second.value)

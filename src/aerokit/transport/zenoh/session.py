@@ -190,6 +190,7 @@ async def open_session(address: str, options: NetworkOptions, prepare: Callable[
 
 
 def close_session(session: Any, closed: Callable[[], object]) -> None:
+    """Close a session on a thread, because closing may block, and then call ``closed()``."""
 
     def work() -> None:
         with contextlib.suppress(Exception):  # the session is closed in any case
@@ -205,6 +206,7 @@ def close_session(session: Any, closed: Callable[[], object]) -> None:
 
 
 def call(function: Callable[[], object]) -> object:
+    """Call a function: the ``process`` argument of a `LoopQueue` of functions."""
     return function()
 
 
@@ -252,8 +254,8 @@ def _reason(error: Exception) -> str:
     """Return the error text without zenoh's source location."""
     text = str(error).split(" at /", 1)[0].strip().rstrip("!.") or type(error).__name__
     if text.startswith(_CONNECT_FAILED):
-        where = ", ".join(_ENDPOINTS.findall(text)) or text
-        return f"cannot connect to {where} (is a router or peer running there, and is this its address?)"
+        endpoints = ", ".join(_ENDPOINTS.findall(text)) or text
+        return f"cannot connect to {endpoints} (is a router or peer running there, and is this its address?)"
     return text.replace(": [", ": ")
 
 
