@@ -41,8 +41,8 @@ class _Request:
 class RequestWindow(Generic[KeyT]):
     """Requests by key. ``size`` requests are in flight, or more while that does not delay their answers.
 
-    With ``duplicate_last``, the last few requests are sent twice from their third attempt on. A request is repeated when
-    its answer is overdue (:class:`RoundTrip`), or when later requests were answered first.
+    With ``duplicate_last``, the last few requests are sent twice from their third attempt on. A request is repeated
+    when its answer is overdue (:class:`RoundTrip`), or when later requests were answered first.
     """
 
     def __init__(self, round_trip: RoundTrip, *, size: int = DEFAULT_SIZE, duplicate_last: bool = True) -> None:
