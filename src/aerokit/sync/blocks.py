@@ -95,13 +95,13 @@ class BlockingContext:
         )
 
 
-A = TypeVar("A")
+AsyncT = TypeVar("AsyncT")
 
 T = TypeVar("T")
 
 EnteredT = TypeVar("EnteredT")
 
-IteratorA = TypeVar("IteratorA", bound="AsyncIterator[Any]")
+IteratorT = TypeVar("IteratorT", bound="AsyncIterator[Any]")
 
 ItemT = TypeVar("ItemT")
 
@@ -112,14 +112,14 @@ ShieldedT = TypeVar("ShieldedT", bound="TemporaryParameters | Transaction")
 TwinT = TypeVar("TwinT", bound="ConnectionTwin | VehicleTwin")
 
 
-class TwinOf(ReadOnly, Generic[A]):
+class TwinOf(ReadOnly, Generic[AsyncT]):
     """Blocking twin of an asynchronous object, whose methods it calls on the loop thread."""
 
-    def __init__(self, loop: LoopThread, aio: A) -> None:
+    def __init__(self, loop: LoopThread, aio: AsyncT) -> None:
         self._loop, self._aio = loop, aio
 
     @property
-    def aio(self) -> A:
+    def aio(self) -> AsyncT:
         """The asynchronous object, for code that runs on the loop."""
         self._loop.feed()
         return self._aio
@@ -161,7 +161,7 @@ class CellTwin(TwinOf["StateCell[T]"], Generic[T]):
             return self.aio[key]  # raises TypeError with a suggestion
 
 
-class IteratorTwin(TwinOf[IteratorA], Generic[IteratorA, ItemT]):
+class IteratorTwin(TwinOf[IteratorT], Generic[IteratorT, ItemT]):
     """Twin of an asynchronous iterator over items."""
 
     def __iter__(self) -> Self:
@@ -170,16 +170,16 @@ class IteratorTwin(TwinOf[IteratorA], Generic[IteratorA, ItemT]):
     def __next__(self) -> ItemT:
         items = self.aio
 
-        async def read() -> tuple[ItemT, ...]:  # a coroutine cannot raise StopAsyncIteration
+        async def read() -> tuple[ItemT, ...]:  # empty at the end: a coroutine cannot raise StopAsyncIteration
             try:
                 return (await items.__anext__(),)
             except StopAsyncIteration:
                 return ()
 
-        found = self._loop.run(read)
-        if not found:
+        item_or_nothing = self._loop.run(read)
+        if not item_or_nothing:
             raise StopIteration
-        return found[0]
+        return item_or_nothing[0]
 
 
 class ChangesTwin(IteratorTwin["Changes[T]", T], Generic[T]):
@@ -249,7 +249,7 @@ class PhotoIntervalTwin(BlockTwin["PhotoInterval"], IteratorTwin["PhotoInterval"
 
 
 class LogStreamTwin(BlockTwin["LogStream"], IteratorTwin["LogStream", bytes]):
-    """A flight log while PX4 writes it; an iterator over its bytes."""
+    """AsyncT flight log while PX4 writes it; an iterator over its bytes."""
 
 
 class ShieldedBlockTwin(TwinOf[ShieldedT]):
@@ -279,9 +279,9 @@ class ConnectionTwin(TwinOf["Connection"], BlockingContext):
 
     _opened_by = "open_connection"
 
-    def __init__(self, loop: LoopThread, aio: Connection, held: OpenContext[Connection] | None = None) -> None:
+    def __init__(self, loop: LoopThread, aio: Connection, context: OpenContext[Connection] | None = None) -> None:
         super().__init__(loop, aio)
-        self._held = held
+        self._context = context
 
     def vehicles(self) -> Iterator[VehicleFound]:
         """Yield each autopilot once: those found so far, then new ones, until the connection ends.
@@ -289,22 +289,22 @@ class ConnectionTwin(TwinOf["Connection"], BlockingContext):
         Raises:
             ConnectionClosed, LinkLost: the connection ended.
         """
-        found = self.aio.vehicles()
+        discoveries = self.aio.vehicles()
         try:
-            while True:
-                yield self._loop.run(found.__anext__)
+            while True:  # until the connection's end raises its error
+                yield self._loop.run(discoveries.__anext__)
         finally:
             with contextlib.suppress(ConnectionClosed):
-                self._loop.run(found.aclose)
+                self._loop.run(discoveries.aclose)
 
     def close(self) -> None:
         """Close the connection and end the loop thread. Idempotent. Waiting calls raise ConnectionClosed.
 
-        A connection that ``connect`` opened for a vehicle closes with the vehicle.
+        AsyncT connection that ``connect`` opened for a vehicle closes with the vehicle.
         """
-        if self._held is not None:
+        if self._context is not None:
             try:
-                self._held.close()
+                self._context.close()
             finally:
                 self._loop.close()
 
@@ -312,14 +312,14 @@ class ConnectionTwin(TwinOf["Connection"], BlockingContext):
 class OpenedTwin(TwinOf[T], BlockingContext):
     """Twin of an object whose context is open on the loop thread, which ends with it if it was started for it."""
 
-    def __init__(self, loop: LoopThread, held: OpenContext[T], *, owns_loop: bool) -> None:
-        super().__init__(loop, held.value)
-        self._held, self._owns_loop = held, owns_loop
+    def __init__(self, loop: LoopThread, context: OpenContext[T], *, owns_loop: bool) -> None:
+        super().__init__(loop, context.value)
+        self._context, self._owns_loop = context, owns_loop
 
     def close(self) -> None:
         """Close the context and end the loop thread. Idempotent."""
         try:
-            self._held.close()
+            self._context.close()
         finally:
             if self._owns_loop:
                 self._loop.close()
@@ -343,20 +343,21 @@ class VehicleTwin(OpenedTwin["Vehicle"]):
             except ConnectionClosed:
                 original = read()  # the loop has ended
             vars(self).setdefault(key, twin(self._loop, original))
-        made: T = vars(self)[key]
-        return made
+        part: T = vars(self)[key]
+        return part
 
     def close(self) -> None:
         """Disconnect: close the link and end the loop thread. Idempotent. Waiting calls raise ConnectionClosed.
 
-        Sends nothing: a vehicle in the air continues what it does. A connection passed to ``connect`` stays open.
+        Sends nothing: a vehicle in the air continues what it does. AsyncT connection passed to ``connect`` stays open.
         """
         super().close()
 
     def __exit__(self, exc_type: Any, exc: Any, traceback: Any) -> None:
-        holds = self.aio.is_hold_pending
+        is_hold_pending = self.aio.is_hold_pending
         self.close()
-        if exc is not None and not holds:  # the asynchronous side did not see the exception
+        # The asynchronous context warns on an exception, but did not get this one.
+        if exc is not None and not is_hold_pending:
             warn_if_left_flying(self.aio)
 
     def __repr__(self) -> str:
@@ -373,16 +374,16 @@ def opened(
     is_connection = isinstance(address, ConnectionTwin)
     loop = address._loop if is_connection else LoopThread()
     try:
-        held: OpenContext[Any] = loop.open_context(open_async(address.aio if is_connection else address, **options))
+        context: OpenContext[Any] = loop.open_context(open_async(address.aio if is_connection else address, **options))
     except BaseException as error:
         if not is_connection:
             loop.close()
-        if isinstance(error, KeyboardInterrupt):  # the places where this library waited do not help a user
+        if isinstance(error, KeyboardInterrupt):  # without the traceback of this library, which does not help a user
             raise error.with_traceback(None) from error.__cause__
         raise
     if not is_connection:
-        connection: Connection = getattr(held.value, "connection", held.value)
+        connection: Connection = getattr(context.value, "connection", context.value)
         connection._use_activity_monitor(loop.activity)
     if issubclass(twin, VehicleTwin):
-        return twin(loop, held, owns_loop=not is_connection)
-    return twin(loop, held.value, held)
+        return twin(loop, context, owns_loop=not is_connection)
+    return twin(loop, context.value, context)
