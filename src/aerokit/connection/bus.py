@@ -99,7 +99,7 @@ class Bus:
         Sinks that ``create()`` attaches get that first message too.
         """
 
-        def on_first_frame(frame: Frame) -> None:
+        def on_first(frame: Frame) -> None:
             entries_before = self._entries(frame)
             create()
             detach_all()
@@ -109,9 +109,7 @@ class Bus:
                     kind, sink = entry
                     sink(self.dialect.decode(frame) if kind == MESSAGE else frame)
 
-        detachers = [
-            self._attach((system_id, message_id), (FRAME, on_first_frame), ahead=True) for message_id in message_ids
-        ]
+        detachers = [self._attach((system_id, message_id), (FRAME, on_first), ahead=True) for message_id in message_ids]
 
         def detach_all() -> None:
             for detach in detachers:

@@ -482,6 +482,7 @@ class Connection:
             self._background.start(self._multilink.watch, "aerokit links")
 
     async def _send_heartbeats(self) -> None:
+        """Once a second: send our heartbeat if the program is active, update the link's state, save the recording."""
         while self.is_open:
             if self._heartbeat is not None and self._heartbeat.should_send():
                 self.send(self._heartbeat.message)
@@ -493,8 +494,9 @@ class Connection:
     def _end(self, error: Exception) -> None:
         if not self.is_open:
             return
-        self._end_signal.error = error
+        self._end_signal.error = error  # first, so that sinks of the following events find the connection closed
         self._receiver.close()
+        # A program that closes the connection itself needs no event about it.
         self._state_watch.mark_lost(self._clock(), publish=isinstance(error, LinkLost))
         self.link_state.close(error)
         if self._multilink is not None:

@@ -102,6 +102,7 @@ class PeerTable:
         return framer
 
     def _make_room(self, now: float) -> bool:
+        """Evict a peer if the table is full. Return False if there is still no room."""
         if len(self.framers) < MAX_PEERS:
             return True
         evicted = list(self._evictable_peers(self.framers, now))
@@ -226,6 +227,7 @@ class FrameReceiver:
         return (framer.statistics for framer in self._peers)
 
     def counts(self, system_id: int) -> tuple[int, int]:
+        """Return how many frames of this system were received, and how many were lost by sequence number."""
         sources = [
             source
             for statistics in self.statistics()
@@ -301,6 +303,6 @@ class FrameReceiver:
             self.heartbeats[source] = heartbeat
             if is_new:
                 self._bus.publish(discovery_event(heartbeat, self._clock(), *source))
-            if len(self.heartbeats) > MAX_ROUTES:
+            if len(self.heartbeats) > MAX_ROUTES:  # more than there are routes, so some belong to expired routes
                 for expired in [source for source in self.heartbeats if not self._routes.has_route(source)]:
                     del self.heartbeats[expired]

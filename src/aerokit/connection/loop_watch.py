@@ -119,7 +119,7 @@ class LoopWatch:
         slept_s = self._suspended_before - before
         if slept_s <= LATE_THRESHOLD_S:
             return False
-        self._ran_at -= slept_s
+        self._ran_at -= slept_s  # the loop's clock stood still, so data may have waited for this time, too
         self._on_slept(slept_s)
         return True
 

@@ -167,8 +167,9 @@ class Routes:
                 return False
             route = self._routes[source] = _Route()
         if counters is not None:
-            if route.counters is counters and (elapsed := frame.received_at - route.heartbeat_at) > 0:
-                route.rate = (counters.expected - route.expected) / elapsed
+            is_first = route.counters is not counters
+            if not is_first and frame.received_at > route.heartbeat_at:
+                route.rate = (counters.expected - route.expected) / (frame.received_at - route.heartbeat_at)
             route.counters, route.expected = counters, counters.expected
         route.peer, route.heartbeat_at, route.sequence = peer, frame.received_at, frame.sequence
         return True
@@ -256,7 +257,7 @@ class Routes:
         claim = self._claims.get(key)
         if claim is None:
             if len(self._claims) >= MAX_CLAIMS:
-                del self._claims[next(iter(self._claims))]
+                del self._claims[next(iter(self._claims))]  # the oldest
             claim = self._claims[key] = RouteClaim()
         return claim
 

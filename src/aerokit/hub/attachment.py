@@ -123,7 +123,8 @@ class Attachment:
     # -------------------------------------------------------------------- called by the link
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
-        # Hot path. The datagrams of one burst of a peer are processed together.
+        # Hot path. The datagrams of one burst of a peer are processed together. A datagram that does not begin with a
+        # frame is processed alone, because joined data is forwarded unchanged only if it consists of whole frames.
         if self._burst:
             if peer == self._burst_peer and data[:1] in _MAGICS:
                 self._burst.append(data)
@@ -271,7 +272,7 @@ class Attachment:
         self._is_full_reported = is_rejected
 
     def _on_drop(self, reason: str, frame: QueuedFrame) -> None:
-        if frame.kind is not MessageKind.ORDER:
+        if frame.kind is not MessageKind.ORDER:  # other frames are only counted
             return
         name = self._dialect[frame.message_id].NAME
         waited_s = self._now() - frame.since

@@ -264,6 +264,7 @@ class Port:
         return True
 
     def flush(self, unix_time: float) -> None:
+        """Write the batch, signed if the endpoint signs."""
         batch, self.batch = self.batch, []
         if self.gateway is not None:
             batch = self._signed(batch, unix_time)

@@ -83,10 +83,12 @@ class RouterPort(Generic[PortT]):
         self.number: int = number
         """Unique number above 0."""
         self.plans: dict[int, ForwardingPlan[PortT]] = {}
+        """Maps message id, target and sender (as one number) to the plan for such frames that arrive at this port."""
         self.streams: dict[bytes, ForwardingPlan[PortT]] = {}
         """Maps sender and message, as bytes of a frame, to the plan for broadcasts of senders that this port reaches.
         """
         self.destinations: dict[tuple[PortT, ...], tuple[PortT, ...]] = {}
+        """Maps each tuple of ports to the equal tuple that all plans use."""
         self.echoes: dict[int, int] = {}
         """Maps senders to the number of returning frames minus the number of new frames at this port."""
         self.loop_until: float = -math.inf
@@ -121,11 +123,11 @@ class Router(Generic[PortT]):
     def __init__(self, targets: TargetFields, period: Callable[[PortT, int], float | None]) -> None:
         self._targets, self._period = targets, period
         self._offsets = targets.offsets
-        self._nodes: dict[int, RouterPort[PortT]] = {}
-        self._senders: dict[int, Sender] = {}
+        self._nodes: dict[int, RouterPort[PortT]] = {}  # by port number
+        self._senders: dict[int, Sender] = {}  # by system id + 256 · component id
         self._recent = RecentFrames()
-        self._port_count = 0
-        self._unproven: dict[int, None] = {}
+        self._port_count = 0  # number of ports created so far
+        self._unproven: dict[int, None] = {}  # senders without a HEARTBEAT, which may be noise
         self._swept_at = -math.inf
         self._duplicate: ForwardingPlan[PortT] = ForwardingPlan(0, -1, (0, 0), reason="duplicate")
         self._loop: ForwardingPlan[PortT] = ForwardingPlan(0, -1, (0, 0), reason="loop")
@@ -236,6 +238,7 @@ class Router(Generic[PortT]):
     # ------------------------------------------------------------------------------------ senders
 
     def _add_sender(self, source: int, node: RouterPort[PortT], now: float) -> Sender:
+        """Return a new sender, which is remembered if there is room."""
         sender = Sender(source, node.number, now)
         if len(self._senders) < MAX_ROUTES or self._make_room(now):
             self._senders[source] = sender
@@ -244,6 +247,7 @@ class Router(Generic[PortT]):
         return sender
 
     def _make_room(self, now: float) -> bool:
+        """Forget a sender without heartbeats, or else all silent senders. Return True if there is room."""
         if self._unproven:
             source = next(iter(self._unproven))
             del self._unproven[source], self._senders[source]
@@ -301,6 +305,7 @@ class Router(Generic[PortT]):
             self.on_change(kind, source, node.port, None if other_node is None else other_node.port)
 
     def _record_heartbeat(self, sender: Sender, node: RouterPort[PortT], body: bytes) -> None:
+        """Record the type of a sender, and report an autopilot that is received at a port for the first time."""
         self._unproven.pop(sender.source, None)
         if sender.record_heartbeat(body):
             self.forget_plans()

@@ -98,7 +98,7 @@ class Sender:
         return is_new
 
     def record_heartbeat(self, body: bytes) -> bool:
-        """Record the type of sender from a HEARTBEAT. Return True if this changes routes."""
+        """Record from a HEARTBEAT whether the sender is a vehicle or an autopilot. Return True if that has changed."""
         if len(body) <= _AUTOPILOT:
             return False
         before = self.is_vehicle, self.is_autopilot

@@ -158,9 +158,10 @@ class Switch:
         return True
 
     def _forward(self, port: Port, raw: bytes, plan: ForwardingPlan[Port], now: float) -> None:
+        """Forward one frame. Whether a port must queue it is checked only for the first frame of a batch."""
         for out in plan.outs:
-            if batch := out.batch:
-                batch.append(raw)
+            if out.batch:
+                out.batch.append(raw)
             else:
                 self._start_batch(out, raw, plan, now)
         if plan.rate_limited:
@@ -193,6 +194,7 @@ class Switch:
                     self._start_batch(out, raw, plan, now)
 
     def _poll(self) -> None:
+        """Write queued frames of full links that accept data again."""
         now, unix_time = self._clock(), self.unix_time()
         self._timer = None
         self._poll_interval_s = min(2 * self._poll_interval_s, MAX_POLL_INTERVAL_S)

@@ -272,6 +272,7 @@ def _message(node: Element, origin: str) -> MessageDefinition:
 
 
 def _field(node: Element, extension: bool, message: str) -> FieldDefinition:
+    # The field mavlink_version of HEARTBEAT has a type of its own, and is always 3.
     match = _FIELD_TYPE.match(node.attrib["type"])
     if match is None or match[1] not in SIZES or match[2] == "0":
         raise ValueError(f"unknown field type {node.attrib['type']!r}")

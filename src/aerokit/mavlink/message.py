@@ -270,6 +270,7 @@ class Message:
         return f"{type(self).__name__}({fields})"
 
     def _encode_error(self) -> InvalidArgument:
+        """Return the error for the first field with an invalid value."""
         for field in self.FIELDS:
             value = getattr(self, field.name, None)
             problem = field.problem(value)
@@ -321,6 +322,7 @@ def _same(left: Any, right: Any) -> bool:
 
 
 def _number_problem(value: Any, kind: str) -> str | None:
+    """Explain why a value does not fit into this type, or return None. The module struct decides what is a number."""
     if kind in INTEGER_RANGES:
         low, high = INTEGER_RANGES[kind]
         try:

@@ -106,6 +106,7 @@ def _has(message: Any, name: str) -> bool:
 
 
 def _converted(message_class: type[Message], field: Field, value: Any) -> Any:
+    """Convert a value of pymavlink to the type of aerokit's field."""
     if field.is_text:
         return _text(value)
     if field.type == "char" and isinstance(value, str):
@@ -166,6 +167,7 @@ def _original_text(message: Any, name: str) -> Any:
 
 
 def _text(value: Any) -> Any:
+    """Convert a text to str without trailing NULs. Other values are returned for `Message.encode` to reject."""
     if isinstance(value, str):
         return value.rstrip("\0")
     if not isinstance(value, (bytes, bytearray, memoryview)):
@@ -217,6 +219,7 @@ def to_pymavlink(frame: Frame, *, dialect: ModuleType | None = None, timestamp: 
 
 @cache
 def _decoder(message_id: int, preferred: ModuleType | None) -> Decoder:
+    """Return the decoder of the first pymavlink dialect that has the message with the definition of the standard."""
     row = STANDARD.rows.get(message_id)
     for module in _dialects(preferred):
         message_class = module.mavlink_map.get(message_id)
@@ -224,7 +227,8 @@ def _decoder(message_id: int, preferred: ModuleType | None) -> Decoder:
             continue
         if row is None:
             return _checked(message_class, _decoder_for(message_class))
-        if message_class.crc_extra == row[0]:
+        crc_extra, *_ = row
+        if message_class.crc_extra == crc_extra:
             return _decoder_for(message_class)
     return _unknown
 
@@ -364,6 +368,7 @@ def _checked(message_class: Any, decode: Decoder) -> Decoder:
 
 
 def _unknown(frame: Frame, timestamp: float) -> Any:
+    """Return pymavlink's message for a frame that cannot be decoded."""
     module: Any = import_module("pymavlink.dialects.v20.ardupilotmega")
     message = module.MAVLink_unknown(frame.message_id, bytearray(frame.raw))
     header = message.get_header()

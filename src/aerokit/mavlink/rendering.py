@@ -176,6 +176,7 @@ def _is_tuple(field: FieldDefinition) -> bool:
 
 
 def _annotation(field: FieldDefinition, *, argument: bool = False) -> str:
+    """Return the type of an attribute, or of the constructor's ``argument``, which may be any sequence."""
     if field.is_text:
         return "str"
     if field.is_bytes:
@@ -187,6 +188,7 @@ def _annotation(field: FieldDefinition, *, argument: bool = False) -> str:
 
 
 def _default(field: FieldDefinition) -> str:
+    """Return `` = value`` for a field that a program may omit, i.e. an extension field; else an empty text."""
     if field.default is not None:
         return f" = {field.default}"
     if not field.extension:
@@ -216,6 +218,7 @@ def _init(message: MessageDefinition) -> list[str]:
 
 
 def _decode(message: MessageDefinition) -> list[str]:
+    """Render ``decode_body``, which unpacks all fields in one statement, and then converts arrays and texts."""
     unpacked = f"_S{message.id}.unpack_from(body, {HEADER_LENGTH})"
     lines = [
         "    @classmethod",
@@ -246,6 +249,7 @@ def _decode(message: MessageDefinition) -> list[str]:
 
 
 def _decode_by_index(fields: Iterable[FieldDefinition], unpacked: str) -> list[str]:
+    """Render the statements for a message with long arrays, which are slices of the unpacked values."""
     lines = [f"        values = {unpacked}"]
     index = 0
     for field in fields:

@@ -245,6 +245,7 @@ class Signing:
         return refusal
 
     def _refusal(self, frame: Frame, now: float) -> Refusal | None:
+        """Return why a frame has no valid signature, or None. Has no side effects."""
         if not frame.incompat_flags & SIGNED:
             return Refusal.UNSIGNED
         if not self.has_signed(frame):
@@ -305,7 +306,7 @@ class TimestampFile:
         """Timestamp in the file; 0 if there is no file."""
         self.error: OSError | None = None
         """Error of the last write; None if it succeeded."""
-        self._write(self.timestamp)
+        self._write(self.timestamp)  # raises now if the file cannot be written later
 
     def reserve(self, timestamp: int, ahead: int) -> None:
         """Ensure that the stored timestamp is later than ``timestamp``: if needed, write ``timestamp + ahead``."""

@@ -122,6 +122,7 @@ class SourceStatistics(SourceFields):
         self._unreceived += count
 
     def _on_gap(self, ahead: int, sequence: int, now: float) -> None:
+        """Process a frame after ``ahead`` missing frames, which count as lost until they arrive late."""
         self.lost += ahead
         if ahead > _MAX_GAP:
             self._begin_stream(now)
@@ -138,10 +139,12 @@ class SourceStatistics(SourceFields):
         self._stream_start, self._returns, self._skipped_over = self.received, 0, 0
 
     def _shifted(self, further: int) -> int:
+        """Return the bits of `_missing`, relative to ``further`` numbers after `expected`."""
         distance = self.expected - self._missing_at + further
         return self._missing << distance & _WINDOW if distance < _HALF else 0
 
     def _was_missing(self, behind: int) -> bool:
+        """Return True if the frame ``behind`` numbers before `expected` counted as lost. It no longer does."""
         self._missing, self._missing_at = self._shifted(0), self.expected
         bit = 1 << behind - 1
         was_missing = bool(self._missing & bit)
@@ -165,6 +168,7 @@ class SourceStatistics(SourceFields):
         return OTHERS if self.has_duplicates(now) else LATE
 
     def _continue_at(self, sequence: int) -> None:
+        """Make a frame with this number the newest one, without counting the numbers before it as lost."""
         self.skip((sequence - self.expected) & 0xFF)
         self.expected += 1
         self._missing, self._missing_at, self._skipped_over = 0, self.expected, 0
@@ -190,6 +194,7 @@ class SourceStatistics(SourceFields):
         return LATE if is_other_longer else OTHERS
 
     def _swap(self, sequence: int, now: float, count: int, other_count: int) -> None:
+        """Make the other stream the sender's stream, and the current stream the other one."""
         # The gap before the current stream was no loss. The difference is below 0 if frames of the gap arrived late.
         self.lost = max(0, self.lost - self._skipped_over)
         self._other_expected, self._other_count, self._other_at = self.expected & 0xFF, count, now
@@ -197,6 +202,7 @@ class SourceStatistics(SourceFields):
         self._continue_at(sequence)
 
     def _count_alternations(self, now: float, count: int) -> None:
+        """Add to the number of times that two streams have alternated, within the last `_EXPIRY_S`."""
         if now - self._alternated_at > _EXPIRY_S:
             self._alternations = 0
         self._alternations = max(0, self._alternations + count)
@@ -277,8 +283,8 @@ class FramerStatistics(CounterFields):
         self.sources: dict[tuple[int, int], SourceStatistics] = {}
         """Counters by (system id, component id), for the first 1024 of 65,536 possible senders."""
         self._by_key: dict[int, SourceStatistics] = {}
-        self._last_received: dict[int, int] = {}
-        self._others = 0
+        self._last_received: dict[int, int] = {}  # key → `received` at the last call of `discard_silent`
+        self._others = 0  # frames of senders without counters of their own
 
     @property
     def frames(self) -> int:

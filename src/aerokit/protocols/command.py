@@ -310,7 +310,7 @@ class CommandExchange(Exchange[CommandAck]):
         self._sent_count += 1
         self._sent_at = now
         wait_s = self._attempt_timeout
-        if self._order_status is not None:
+        if self._order_status is not None:  # `_expire_order` then checks for a HEARTBEAT, or that the order has ended
             wait_s = min(MIN_RESEND_FRACTION * wait_s, ATTEMPT_TIMEOUT_S)
         self.deadline = now + wait_s
 

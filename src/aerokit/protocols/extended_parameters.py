@@ -100,6 +100,7 @@ class SettingList(ValueList[dict[str, Setting], Setting]):
             self._end_stream()
 
     def _on_value(self, setting: Setting, index: int, count: int, now: float) -> None:
+        """Store a value of the stream, or the answer to a request. Request the indices that the stream has left out."""
         if self._is_streaming and index >= self._next:
             for missing in range(self._next, index):
                 self._window.request(missing)
@@ -264,6 +265,7 @@ class SettingWrite(Transfer[Setting]):
             self._fail(ParameterRejected(f"{self._name} was refused: {reason}", name=self._name, code=result))
 
     def _on_unexpected_value(self, reported: Setting, now: float) -> None:
+        """Handle another value than the requested one: write or read again until it is conclusive."""
         self._unexpected.add(reported)
         is_unchanged = self._before is not None and settings_equal(reported.value, self._before)
         if not self._unexpected.are_conclusive(is_unchanged=is_unchanged):

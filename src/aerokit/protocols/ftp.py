@@ -372,7 +372,7 @@ class FtpRequest(FtpExchange[FtpMessage]):
     def _receive_reply(self, reply: FtpMessage, now: float) -> None:
         if reply.sequence != (self._request.sequence + 1) % SEQUENCE_COUNT:
             self._receive_other(reply, now)
-        elif reply.request_opcode != self._request.opcode:
+        elif reply.request_opcode != self._request.opcode:  # a repeated reply to an earlier request
             self._renumber(now)
         else:
             if self.attempts == 1 and self._request.opcode not in SLOW_REQUESTS:

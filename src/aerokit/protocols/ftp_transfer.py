@@ -148,6 +148,7 @@ class FtpDownload(FtpExchange[int]):
         if reply.request_opcode == MavFtpOpcode.BURSTREADFILE:
             self._receive_burst(reply, now)
         elif reply.request_opcode == MavFtpOpcode.READFILE:
+            # A reply has the sequence number of its request plus 1.
             sent = self._reads.pop((reply.sequence - 1) % SEQUENCE_COUNT, None)
             if sent is not None:
                 self._receive_read(sent, reply, now)
@@ -155,6 +156,7 @@ class FtpDownload(FtpExchange[int]):
             self._proceed(now)
 
     def _receive_burst(self, reply: FtpMessage, now: float) -> None:
+        """Process a block of a burst, or its end. Replies to earlier bursts may still arrive."""
         for burst in reversed(self._bursts):
             if reply.is_ack and burst.contains(reply):
                 self._on_block(burst, reply, now)
@@ -197,6 +199,7 @@ class FtpDownload(FtpExchange[int]):
             self._requests.window.widen(self.round_trip.smoothed_s / self._interval.smoothed_s)
 
     def _end_burst(self, burst: _Burst, end: int, reply: FtpMessage) -> None:
+        """Handle the NAK that ends a burst. Only the latest burst can fail the download."""
         is_latest = burst is self._bursts[-1]
         if is_latest:
             self._failed_bursts = 0
@@ -211,9 +214,10 @@ class FtpDownload(FtpExchange[int]):
     def _receive_read(self, sent: _SentRequest, reply: FtpMessage, now: float) -> None:
         offset = sent.offset
         self._requests.on_answer(offset, now, sent_at=sent.at)
+        is_end = reply.is_ack or reply.error_code == MavFtpErr.EOF or self._is_past_size(offset)
         if reply.is_ack and reply.data:
             self._add(offset, reply.data, now)
-        elif reply.is_ack or reply.error_code == MavFtpErr.EOF or self._is_past_size(offset):
+        elif is_end:  # an ACK without data, or EOF
             self._end_at(offset)
         else:
             self._fail(self._refused(reply))
@@ -328,6 +332,7 @@ class FtpDownload(FtpExchange[int]):
         return self._size if self._into.end is None else self._into.end
 
     def _end(self) -> None:
+        """Finish at the end of the file, which must be at the size that the server reported (unless estimated)."""
         end = self._into.position
         if self._size is None:
             self._finish(end)
@@ -386,6 +391,7 @@ class FtpUpload(FtpExchange[None]):
     def _receive_reply(self, reply: FtpMessage, now: float) -> None:
         if reply.request_opcode != MavFtpOpcode.WRITEFILE:
             return
+        # A reply has the sequence number of its request plus 1.
         sent = self._writes.pop((reply.sequence - 1) % SEQUENCE_COUNT, None)
         if sent is None or sent.offset not in self._unwritten:
             return

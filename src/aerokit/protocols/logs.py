@@ -90,7 +90,8 @@ class LogDownload(Transfer[int]):
         if message.id != self._id or not self._is_from_target(message) or not self._is_plausible(message.ofs):
             return
         end = message.ofs + message.count
-        if message.count < LOG_BLOCK and end < self._size:
+        is_end_too_early = message.count < LOG_BLOCK and end < self._size
+        if is_end_too_early:
             self._end_early(end)
         else:
             self._on_block(message, now)
@@ -141,6 +142,7 @@ class LogDownload(Transfer[int]):
             self._send_end()
 
     def _proceed(self, now: float) -> None:
+        """Finish, or request the gaps of the last range, or the next range."""
         into = self._into
         if into.position >= self._size:
             self._finish(into.position)
@@ -166,9 +168,11 @@ class LogDownload(Transfer[int]):
             self._request(offset, LOG_BLOCK)
 
     def _first_long_gap(self) -> tuple[int, int] | None:
+        """Return start and end of the first gap of at least `LONG_GAP` blocks."""
         start = end = -1
         for offset in self._into.gaps:
-            if offset != end:
+            is_new_gap = offset != end
+            if is_new_gap:
                 if end - start >= LONG_GAP * LOG_BLOCK:
                     break
                 start = offset

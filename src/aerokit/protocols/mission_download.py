@@ -110,7 +110,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
         elif self._count is None:
             self._attempt += 1
             self._request_list(now)
-        elif now - self._received_at >= TRANSFER_EXPIRY_S:
+        elif now - self._received_at >= TRANSFER_EXPIRY_S:  # the vehicle may have dropped the transfer
             self._restart_after_error(now)
         else:
             for seq in [seq for seq in self._requested_at if self._due_at(seq) <= now]:

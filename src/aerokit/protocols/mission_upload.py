@@ -130,7 +130,8 @@ class MissionUpload(MissionExchange[UploadResult]):
             return
         silence_s, self._received_at = now - self._received_at, now
         if isinstance(message, MissionAck):
-            if message.type == MavMissionResult.ERROR and self._is_accepted and silence_s >= TRANSFER_EXPIRY_S:
+            has_expired = self._is_accepted and silence_s >= TRANSFER_EXPIRY_S
+            if message.type == MavMissionResult.ERROR and has_expired:
                 self._restart(now)
             else:
                 self._on_ack(message, now)
@@ -182,6 +183,7 @@ class MissionUpload(MissionExchange[UploadResult]):
         self._wait(now)
 
     def _advance(self, seq: int, now: float) -> None:
+        """Record that the vehicle has all items before ``seq``."""
         if self._send_counts.get(seq - 1) == 1:
             self._measure(now - self._sent_at[seq - 1])
         self._confirmed_end = seq
@@ -199,7 +201,7 @@ class MissionUpload(MissionExchange[UploadResult]):
     def _on_ack(self, ack: MissionAck, now: float) -> None:
         result = ack.type
         if result == MavMissionResult.ACCEPTED:
-            if self._is_accepted and self._sent_end == self._end:
+            if self._is_accepted and self._sent_end == self._end:  # otherwise it is the answer to an earlier upload
                 self._succeed(not self._was_tail_repeated, ack.opaque_id, now)
         elif result == MavMissionResult.INVALID_SEQUENCE:
             if self._is_accepted:

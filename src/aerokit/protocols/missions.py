@@ -235,7 +235,7 @@ class SetCurrentItem(Transfer[None]):
                 )
             )
         elif self._order_status is not None and self._order_status.heartbeat_at < self._sent_at:
-            self.deadline = now + POLL_INTERVAL_S
+            self.deadline = now + POLL_INTERVAL_S  # the vehicle is silent: wait for its HEARTBEAT
         else:
             self._send(now)
 

@@ -73,11 +73,11 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
     ) -> None:
         super().__init__(target_system, target_component, **options)
         self._bytewise = bytewise
-        self._names: dict[str, Parameter] = {}
-        self._refusals: dict[int, int] = {}
-        self._streamed_count: int | None = None
-        self._needs_check = False
-        self._streamed = 0
+        self._names: dict[str, Parameter] = {}  # latest value of each name
+        self._refusals: dict[int, int] = {}  # index → number of PARAM_ERROR messages
+        self._streamed_count: int | None = None  # number of parameters according to the stream
+        self._needs_check = False  # True to look for missing indices
+        self._streamed = 0  # number of values of the stream
 
     # ---------------------------------------------------------------------------- as an exchange
 
@@ -104,6 +104,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
     # ------------------------------------------------------------------------------------ answers
 
     def _on_value(self, message: ParamValue, now: float) -> None:
+        """Process a value: of the stream, the answer to a request, or (index 65535) one outside the list."""
         index = message.param_index
         if index == UNKNOWN_INDEX or message.param_id == HASH_NAME:
             self._on_uncounted_value(message, now)
@@ -118,7 +119,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
             self._quiet_at = now + self._quiet_s()
         parameter = parameter_of(message, self._bytewise)
         if parameter.name not in self._names and len(self._names) >= MAX_PARAMETERS:
-            return
+            return  # a limit for the memory that a faulty vehicle can fill
         self._names[parameter.name] = parameter
         self._store(index, parameter, message.param_count, now)
 

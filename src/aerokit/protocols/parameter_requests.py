@@ -148,7 +148,8 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
             self._is_probe_wanted = True
 
     def _on_value(self, message: ParamValue, now: float) -> None:
-        if message.param_index == PROBE_INDEX and self._window.attempts(PROBE):
+        is_probe_answer = message.param_index == PROBE_INDEX and self._window.attempts(PROBE)
+        if is_probe_answer:
             self._count_probe()
             overtaken = self._window.on_answer(PROBE, now, overtaken=1)
             self._reject_unknown(overtaken, now)
@@ -159,7 +160,7 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
             reported = parameter_of(message, self._bytewise)
             old_value = self._possibly_stale.pop(name, None)
             if old_value is not None and same_value(old_value, reported.value):
-                self._window.request(name)
+                self._window.request(name)  # it may be a delayed message: read once more
             else:
                 self._settle(name, reported, now)
                 self._reject_alternatives(name, now)

@@ -126,6 +126,7 @@ class TwinOf(ReadOnly, Generic[AsyncT]):
 
     @contextmanager
     def _block(self, block: AbstractContextManager[T]) -> Iterator[T]:
+        """Enter and exit a synchronous context manager on the loop."""
         entered = self._loop.enter_sync(block)
         try:
             yield entered

@@ -253,6 +253,7 @@ class Page:
     def _render_context_manager(
         self, node: ast.FunctionDef | ast.AsyncFunctionDef, member: ClassMember, arguments: Sequence[str]
     ) -> str:
+        """Return the source for a method that is a generator in a ``contextmanager`` decorator."""
         self.for_types.add(("contextlib", "AbstractContextManager"))
         yielded = node.returns.slice if isinstance(node.returns, ast.Subscript) else ast.Constant(None)
         returns = ast.Subscript(ast.Name("AbstractContextManager"), yielded)
@@ -264,6 +265,7 @@ class Page:
         return render_function(node, returns, member.text, body)
 
     def _property_twin(self, twin: Twin, member: ClassMember) -> str:
+        """Return the source of a property. It is cached if its value is a twin, so that each access gives the same."""
         name, read = member.name, f"self.aio.{member.name}"
         if name in twin.called:
             read = f"self._loop.call(lambda: {read})"
@@ -328,6 +330,7 @@ def _class(page: Page, twin: Twin) -> str:
 
 
 def _opener(page: Page, path: str) -> str:
+    """Return the source of a function such as ``connect``, which opens the twin on a loop thread."""
     module, _, name = path.rpartition(".")
     node = function_node(module, name)
     for argument in (*node.args.args, *node.args.kwonlyargs, node.args.vararg):

@@ -342,6 +342,7 @@ class _Calls:
         thread.join(CLOSE_TIMEOUT_S)
 
     async def run(self, started: ThreadFuture[asyncio.AbstractEventLoop]) -> None:
+        """Keep the loop running until `end_soon`, then cancel all calls. The main function of the thread's loop."""
         self.context = contextvars.copy_context()
         self._loop = asyncio.get_running_loop()
         started.set_result(self._loop)
@@ -389,6 +390,7 @@ class _Call(ThreadFuture[T]):
 
 
 def _run(calls: _Calls, started: ThreadFuture[asyncio.AbstractEventLoop]) -> None:
+    """Run the loop: the target of the thread. An error before the start goes to ``started``."""
     try:
         anyio.run(calls.run, started)
     except BaseException as error:

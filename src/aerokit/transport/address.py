@@ -60,7 +60,9 @@ class LinkAddress(Snapshot):
             baud = "" if self.baud is None else f":{self.baud}"
             return f"serial://{_quote_device(self.device)}{baud}"
         if self.kind == "replay":
-            return f"replay:{'//' if self.path.startswith('//') else ''}{_quote(self.path)}"
+            # In replay://…, the slashes belong to the scheme. A path that begins with two slashes gets two more.
+            slashes = "//" if self.path.startswith("//") else ""
+            return f"replay:{slashes}{_quote(self.path)}"
         if self.kind == "pty":
             return f"pty:{self.path}" if self.path else "pty"
         if self.kind in _ZENOH_KINDS:
@@ -196,6 +198,7 @@ class _Parser:
         return self.network(kind, target.removesuffix("/"), options)
 
     def bare(self, text: str) -> LinkAddress:
+        """Parse an address without a scheme: a recording, a serial port, or host:port to listen on."""
         if _RECORDING.fullmatch(text):
             end = text.lower().rindex(".tlog") + len(".tlog")
             return self.replay(text[:end], self.options("replay", text[end + 1 :]))
@@ -212,6 +215,7 @@ class _Parser:
         return self.network("udpin", text, {})
 
     def network(self, kind: LinkKind, text: str, options: dict[str, str]) -> LinkAddress:
+        """Parse ``host:port``."""
         if text.startswith("["):
             host, bracket, tail = text[1:].partition("]")
             if not bracket or not _is_ipv6(host):
@@ -236,6 +240,7 @@ class _Parser:
         return LinkAddress(kind, host=host, port=self.port(kind, tail), options=tuple(sorted(options.items())))
 
     def zenoh(self, kind: LinkKind, text: str, options: dict[str, str]) -> LinkAddress:
+        """Parse ``fleet/name``."""
         from aerokit.transport.zenoh.keys import check_name  # imported here because few addresses need it
 
         for key in ("connect", "listen"):
@@ -255,6 +260,7 @@ class _Parser:
         return LinkAddress(kind, path=f"{fleet}/{name}", options=tuple(sorted(options.items())))
 
     def port(self, kind: LinkKind, tail: str) -> int:
+        """Parse the text after a host, which must be ``:port``."""
         if not tail.startswith(":") or tail == ":":
             self.fail("the port is missing" if tail in ("", ":") else f"{tail!r} follows the host, not :port")
         port = self.whole_number("the port", tail[1:])
@@ -264,6 +270,7 @@ class _Parser:
         return port
 
     def serial(self, text: str, options: dict[str, str], *, decode: bool) -> LinkAddress:
+        """Parse a serial port and its baud rate. ``decode`` is True for an address with a scheme."""
         baud_text: str | None
         if "," in text:
             device, _, baud_text = text.partition(",")
@@ -308,6 +315,7 @@ class _Parser:
         return {key: value for key, value in options.items() if (key, value) not in defaults}
 
     def option_value(self, key: str, value: str) -> str:
+        """Check a value, and return its canonical form."""
         if key == "baud":
             return value
         if key in _CHOICES:

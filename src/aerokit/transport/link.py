@@ -216,7 +216,7 @@ class BaseLink(Link):
         if self._is_closed:
             self._release()
             raise ConnectionClosed(f"{self.address} was closed while it was being opened")
-        if self._state is _State.OPENING:
+        if self._state is _State.OPENING:  # otherwise the link was lost already
             self._state = _State.OPEN
 
     def close(self) -> None:

@@ -185,12 +185,13 @@ class MultiLink(Link):
     # ------------------------------------------------------------------------------- opening
 
     async def _open_one(self, index: int) -> LinkOpenError | None:
+        """Open one link. Return the error if it cannot be opened; another attempt may succeed."""
         receiver = _MemberReceiver(self, index)
         try:
             await self._links[index].open(receiver)
         except LinkOpenError as error:
             return error
-        except BusyError:
+        except BusyError:  # a link object that another connection uses
             self._foreign.add(index)
             raise
         if not receiver.is_lost:
@@ -242,6 +243,7 @@ class MultiLink(Link):
         self._check_all_lost()
 
     def _check_all_lost(self) -> None:
+        """Report a loss or an interruption if no link is available. Does nothing during the first opening."""
         receiver, error = self._receiver, self._last_loss
         if error is None or receiver is None or self._is_opening:
             return

@@ -79,6 +79,7 @@ class Outbox:
         self._is_full = True
 
     def resume(self) -> None:
+        """Forward the kept data, because the transport accepts data again."""
         self._is_full = False
         if self._is_closed:
             return
@@ -155,6 +156,7 @@ class Outbox:
             self._timer = None
 
     def _poll(self) -> None:
+        """Check whether data has left since the last poll. Polling ends when there is no unsent data."""
         self._timer = None
         self._drop_outdated()
         pending, now = self._pending(), self._loop.time()

@@ -132,7 +132,7 @@ class ReconnectingLink(Link):
         try:
             await self._link.open(current)
         except BaseException:
-            self._cancel_reopening()
+            self._cancel_reopening()  # the link may have been lost while it was being opened
             self._receiver = self._current = self._lost_at = None
             self._was_opened = False
             raise

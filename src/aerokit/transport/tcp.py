@@ -70,7 +70,7 @@ class _TcpLink(BaseLink):
     def _add_stream(self, stream: _Stream) -> None:
         self._streams.add(stream)
         self._released.clear()
-        if self._receiver is None:
+        if self._receiver is None:  # the link was closed while this connection was being made
             stream.close()
         else:
             self._on_connected(stream)
@@ -216,7 +216,7 @@ class TcpListen(_TcpLink):
             stream.close()
 
     async def wait_closed(self) -> None:
-        for _ in range(ACCEPT_ITERATIONS):
+        for _ in range(ACCEPT_ITERATIONS):  # a client that was just accepted is closed by `_add_stream`
             await asyncio.sleep(0)
         await super().wait_closed()
         if self._server is not None and self._receiver is None:
@@ -229,7 +229,7 @@ class TcpListen(_TcpLink):
         self.address: str = f"tcpin:{host_and_port(self._host, self._local_address[1])}"
         loop = asyncio.get_running_loop()
         self._server = await loop.create_server(lambda: _Stream(self), sock=sock, backlog=16, start_serving=False)
-        self._socket = None
+        self._socket = None  # from now on, closing the server closes the socket
         await self._server.start_serving()
 
     def _on_connected(self, stream: _Stream) -> None:

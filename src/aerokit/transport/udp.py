@@ -277,6 +277,7 @@ class UdpBroadcast(_UdpLink):
             return
         elif not self._keeps_peers:
             self.keep_peer(source)
+        # Without peers to keep, this is a link with a single remote end, whose peer is None.
         self._deliver(data, source if self._keeps_peers else None)
 
     def _is_accepted(self, source: Any) -> bool:

@@ -192,6 +192,7 @@ class MergedStreams:
         return True
 
     def _stream(self, frame: Frame) -> _Stream:
+        """Return the stream of the frame's sender; a new stream replaces the oldest if there are too many."""
         key = frame.component_id << 8 | frame.system_id
         stream = self._streams.get(key)
         if stream is None:

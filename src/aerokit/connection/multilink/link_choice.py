@@ -35,10 +35,15 @@ class Candidate:
         self.link = link
         self.is_costly = is_costly
         self.received_at: float = now
+        """Time of the last frame of the system over the link."""
         self.answered_at: float = -math.inf
+        """Time of the last answer to a probe."""
         self.shared_at: float = -math.inf
+        """Time of the last frame that was received both over this link and over the link in use."""
         self.is_available: bool = True
+        """True while the link is open."""
         self.is_stalled: bool = False
+        """True while written data does not leave this machine."""
         self.loss: float | None = None
         """Share of frames lost over the last seconds, 0 to 1; None: unknown."""
         self.round_trip_s: float | None = None
@@ -55,7 +60,7 @@ class Candidate:
         """True if :attr:`hardware` belongs to another vehicle: neither clock nor copies can then prove the link."""
         self._hardware_requests = self._answers_since_request = 0
         self._clock_matches = self._clock_mismatches = self._copies = 0
-        self._last_counts = (0, 0)
+        self._last_counts = (0, 0)  # frames received and lost
 
     def record_counts(self, received: int, lost: int, now: float) -> None:
         """Update :attr:`loss` from the total numbers of frames that were received and lost over this link."""
@@ -76,6 +81,10 @@ class Candidate:
         self.round_trip_s = seconds if before is None else 0.7 * before + 0.3 * seconds
 
     def record_clock(self, matches: bool, *, may_prove: bool) -> None:
+        """Record whether the time in a probe's answer matches the vehicle's clock.
+
+        ``may_prove`` is False while the hardware id, which is stronger evidence, may still be received.
+        """
         if matches:
             self._clock_matches, self._clock_mismatches = self._clock_matches + 1, 0
         else:
@@ -188,16 +197,17 @@ class LinkChoice:
         self.clock: VehicleClock = VehicleClock()
         self.hardware: HardwareId | None = None
         """The vehicle's hardware id, as received over the link that was in use then."""
-        self._hardware_link = -1
+        self._hardware_link = -1  # index of that link
         self.used: Candidate | None = None
+        """The link in use; None before the first choice."""
         self.former: Candidate | None = None
         """The link used before; it may still deliver answers."""
         self.changed_at: float = -math.inf
         self.fresh_after: float = -math.inf
         """Telemetry received before this time is older than the last telemetry of the former link."""
-        self._better: Candidate | None = None
+        self._better: Candidate | None = None  # a link that has been better than the link in use since `_better_since`
         self._better_since = 0.0
-        self._command_at = -math.inf
+        self._command_at = -math.inf  # time of the last command to the system
 
     def record_heartbeat(self, link: int, now: float, *, is_costly: bool) -> Candidate:
         candidate = self.candidates.get(link)
@@ -311,6 +321,7 @@ class LinkChoice:
         return candidate.is_hardware_pending and not can_compare_ids
 
     def _adopt_hardware(self, used: Candidate) -> None:
+        """Make the id received over the link in use the vehicle's id, unless another link's id contradicts it."""
         hardware = used.hardware
         if hardware is None or not hardware.has_value:
             return

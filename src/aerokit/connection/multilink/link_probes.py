@@ -105,6 +105,7 @@ class LinkProbes:
         return True
 
     def record_hardware(self, frame: Frame, link: int) -> None:
+        """Record the hardware id if the frame is an AUTOPILOT_VERSION of an autopilot."""
         if frame.message_id != m.AutopilotVersion.ID or frame.component_id != _AUTOPILOT:
             return
         choice, message = self._choices.get(frame.system_id), self._bus.dialect.decode(frame)
@@ -114,6 +115,7 @@ class LinkProbes:
                 self._report_doubt(frame, candidate)
 
     def _consume_budget(self, now: float) -> bool:
+        """Count a probe to a system without a vehicle object. Return False if there were too many (token bucket)."""
         self._budget = min(UNATTACHED_RATE_HZ, self._budget + UNATTACHED_RATE_HZ * (now - self._budget_at))
         self._budget_at = now
         if self._budget < 1:
@@ -130,6 +132,7 @@ class LinkProbes:
         return max(0.0, now - sent_at)
 
     def _report_doubt(self, frame: Frame, candidate: Candidate) -> None:
+        """Report once that another vehicle has the same system id, until the link leads to the known vehicle again."""
         key = frame.system_id, candidate.link
         if not candidate.is_doubted:
             self._reported.discard(key)

@@ -51,6 +51,7 @@ class LinkStates:
         self.cell: StateCell[tuple[LinkStatus, ...]] = StateCell("links", clock, "frame")
 
     def update(self, now: float) -> None:
+        """Set CONNECTED or SILENT for each open link over which a system is known. Refresh the cell once a second."""
         for link in range(len(self._states)):
             candidates = [choice.candidates[link] for choice in self._choices.values() if link in choice.candidates]
             if candidates and self._link.is_available(link):
@@ -210,11 +211,12 @@ class MultiLinkRoutes:
 
         PX4 forwards our heartbeats from one of its ports to its other ports.
         """
-        if frame.system_id == self._own_source[0] and frame.component_id == self._own_source[1]:
+        if (frame.system_id, frame.component_id) == self._own_source:
             return True
         link = _link(peer)
         if not self._merged.was_accepted(frame, link):
             return False
+        # A copy is not delivered, but shows what this link leads to, and that it works.
         self._probes.record_hardware(frame, link)
         if frame.message_id == m.Heartbeat.ID and not self.arrived_on_other_peer(frame, peer):
             counters = self._counters.get((frame.system_id, link), {}).get(frame.component_id)
@@ -239,7 +241,7 @@ class MultiLinkRoutes:
             if (candidate := choice.candidates.get(link)) is not None:
                 candidate.is_available = is_available
                 if not is_available:
-                    candidate.is_stalled = False
+                    candidate.is_stalled = False  # a lost link has no unsent data
                 self._choose(system_id, choice, now)
         self._states.set_state(link, LinkState.CONNECTED if is_available else LinkState.LOST, now)
 

@@ -56,6 +56,7 @@ class VehicleClock:
         return None if not fits and self._measured_speed is None else fits
 
     def _fits(self, at: float, vehicle_s: float, round_trip_s: float) -> bool | None:
+        """Return True if a sample is where the clock's speed leads to; None if the speed is unknown."""
         speed = self._speed
         if speed is None:
             return None
@@ -64,6 +65,7 @@ class VehicleClock:
         return abs(last_vehicle_s + speed * (at - last_at) - vehicle_s) <= tolerance
 
     def _continues(self, at: float, vehicle_s: float, round_trip_s: float) -> bool:
+        """Return True if a sample may follow the last one: the clock is not too fast, and was paused only briefly."""
         last_at, last_vehicle_s = self._samples[-1]
         advance_s = vehicle_s - last_vehicle_s
         speed = self._measured_speed
@@ -91,6 +93,7 @@ class VehicleClock:
 
     @property
     def _measured_speed(self) -> float | None:
+        """Seconds of the vehicle's clock per second of ours, from the stored samples; None if they span too little."""
         if not self._samples:
             return None
         (first_at, first_vehicle_s), (last_at, last_vehicle_s) = self._samples[0], self._samples[-1]

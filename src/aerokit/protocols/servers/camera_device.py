@@ -204,6 +204,7 @@ class Captures:
         self.images.clear()
 
     def _begin_image(self, series: int) -> None:
+        """Take the next image of a series, and schedule the one after it."""
         camera = self._camera
         if series != self._series or self._remaining == 0:
             return

@@ -66,6 +66,7 @@ class DefinedParameterServer(ExtendedParameterServer):
         return self.values[name], self.definition.settings[name].wire_type
 
     def set(self, name: str, data: bytes, kind: int) -> tuple[int, bytes, int]:
+        """Set a value, at once or after the time in `slow`. Return PARAM_ACK, and the value and type to report."""
         setting = self.definition.settings.get(name)
         if setting is None:
             return ParamAck.VALUE_UNSUPPORTED, data, kind

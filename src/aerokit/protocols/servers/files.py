@@ -245,6 +245,7 @@ class FileTree:
         return _Opened(self, self._file(path))
 
     def _create(self, path: str) -> None:
+        """Create an empty file, or empty an existing one."""
         folder, name = self._parent(path)
         node = folder.get(name)
         if isinstance(node, dict):
@@ -341,6 +342,7 @@ class FileTree:
         return node
 
     def _parent(self, path: str) -> tuple[_Folder, str]:
+        """Return the folder that contains a path, and the last part of the path, which need not exist."""
         parts = _parts(path)
         if not parts:
             raise FileFault(EEXIST)
@@ -351,6 +353,7 @@ class FileTree:
 
 
 def _parts(path: str) -> list[str]:
+    """Split a path. ``..`` removes the folder before it, and never leads above the root."""
     parts: list[str] = []
     for part in path.split("/"):
         if part == "..":

@@ -171,6 +171,7 @@ class SessionFtpServer(Generic[FilesT]):
             self._answer(peer, request)
 
     def _answer(self, peer: FtpPeer, request: FtpPacket) -> None:
+        """Execute a request. A handler that returns None answers later."""
         handler = _HANDLERS.get(request.opcode)
         peer.request, peer.reply = request, None
         try:
@@ -220,6 +221,7 @@ class SessionFtpServer(Generic[FilesT]):
         return request.acknowledge()
 
     def _close_all(self, peer: FtpPeer) -> None:
+        """Close all files of a client, then raise the last error, if any."""
         sessions = list(peer.sessions.values())
         peer.sessions.clear()
         fault = None
@@ -249,6 +251,7 @@ class SessionFtpServer(Generic[FilesT]):
         return request.acknowledge(size.to_bytes(4, "little"), session=number)
 
     def _size(self, path: str, *, reading: bool) -> int:
+        """Return the size of a file; 0 for a missing file that is opened for writing."""
         try:
             return self.files.size(path)
         except FileFault:
@@ -286,6 +289,7 @@ class SessionFtpServer(Generic[FilesT]):
         return request.acknowledge(request.size.to_bytes(4, "little"))
 
     def _start_burst(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket | None:
+        """Start a burst, or continue a running one from another offset. The blocks are the answer, so return None."""
         session = self._opened(peer, request)
         is_running = session.burst is not None
         session.burst, session.burst_sent = request.replace(sequence=request.sequence + 1 & 0xFFFF), 0
@@ -294,6 +298,7 @@ class SessionFtpServer(Generic[FilesT]):
         return None
 
     def _send_blocks(self, peer: FtpPeer, session: FtpSession) -> None:
+        """Send the next blocks of a burst, none while the link is congested, until the burst has ended."""
         for number in range(0 if self._is_congested() else self.burst):
             if session.burst is None:
                 return
@@ -323,6 +328,7 @@ class SessionFtpServer(Generic[FilesT]):
         session.burst = None if is_complete else next_block
 
     def _list(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
+        """Return as many entries of a folder as fit, from entry number ``offset`` on."""
         entries = self._entries(self._path(request))
         listing = b""
         for text in [*self.list_prefix, *map(_line, entries)][request.offset :]:

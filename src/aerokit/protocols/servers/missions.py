@@ -177,6 +177,7 @@ class MissionServer:
         return items[seq] if 0 <= seq < len(items) else _R.INVALID_SEQUENCE
 
     def _message(self, item: MissionItem, request: AnyRequest) -> AnyItem:
+        """Return the item as MISSION_ITEM_INT or MISSION_ITEM, like the request."""
         seq, (system, component), kind = request.seq, sender_of(request), request.mission_type
         current = seq == self.current and kind == MavMissionType.MISSION
         if isinstance(request, m.MissionRequestInt):
@@ -207,11 +208,11 @@ class MissionServer:
 
     def _on_request(self, request: AnyRequest, channel: Channel) -> None:
         refusal = self._refusal(request, channel)
-        item = self._item(request.mission_type, request.seq) if refusal is None else refusal
-        if isinstance(item, int):
-            self._refuse_item(request, item, channel)
+        item_or_result = self._item(request.mission_type, request.seq) if refusal is None else refusal
+        if isinstance(item_or_result, int):
+            self._refuse_item(request, item_or_result, channel)
         else:
-            self._host.send(self._message(item, request), channel)
+            self._host.send(self._message(item_or_result, request), channel)
 
     def _refuse_item(self, request: AnyRequest, result: int, channel: Channel) -> None:
         self._acknowledge(sender_of(request), request.mission_type, result, channel)
@@ -271,6 +272,7 @@ class MissionServer:
         self._host.call_at(due, lambda: self._check(upload))
 
     def _check(self, upload: ListUpload) -> None:
+        """End an upload that has timed out, or request the missing item again."""
         if not self._is_watched(upload):
             return
         if self._host.now >= upload.received_at + self.timeout_s:
@@ -307,7 +309,8 @@ class MissionServer:
         """Answer an item that no upload expects. Here it is ignored, because the expected item is requested again."""
 
     def _receive_item(self, upload: ListUpload, message: AnyItem) -> None:
-        if (result := self._put(upload, message)) != _R.ACCEPTED:
+        result = self._put(upload, message)
+        if result != _R.ACCEPTED:
             self._end(upload, result)
             return
         upload.received_at, upload.next = self._host.now, upload.next + 1

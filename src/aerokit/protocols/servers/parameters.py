@@ -62,7 +62,8 @@ class ParameterLists:
         self._lists.pop(channel, None)
 
     def _send_from(self, index: int, channel: Channel, number: int) -> None:
-        if self._lists.get(channel) != number:
+        """Send the group of parameters from ``index`` on, and schedule the next group of list ``number``."""
+        if self._lists.get(channel) != number:  # the list was stopped or restarted
             return
         names, end = self._listed.names, index + self.burst
         for position, name in enumerate(names[index:end], start=index):

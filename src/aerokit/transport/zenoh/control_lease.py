@@ -152,7 +152,7 @@ class ClientFilter:
         self._client, self._lease = client, lease
         self._framer = _framer()
         self._nonce: int | None = None  # nonce of the program that uses this client name
-        self._nonce_at = 0.0
+        self._nonce_at = 0.0  # time at which that program was last heard
         self._notices: dict[str, tuple[float, int]] = {}  # message name → time of the last notice, refusals since then
 
     def receive(self, data: bytes, mode: ControlMode, now: float, nonce: int = 0) -> tuple[bytes, list[RefusalNotice]]:
@@ -349,8 +349,8 @@ class VehicleSideTracker:
         self.received_at: float = 0.0
         """Time of the last valid beacon."""
         self._nonce, self._mode = nonce, mode
-        self._beacon = 0
-        self._sequence = 0
+        self._beacon = 0  # number of the last valid beacon; 0: none
+        self._sequence = 0  # number of the last datagram sent
         self._delays = DelayEstimator()
 
     def receive_beacon(self, beacon: Beacon, now: float) -> bool:

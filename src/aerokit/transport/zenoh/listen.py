@@ -118,6 +118,7 @@ class ZenohListen(NetworkLink):
         if self._may_have_rival:
             with anyio.move_on_after(_RIVAL_TIMEOUT_S):
                 await self._rival_found.wait()
+                # Reached only if another vehicle side has sent a beacon before the time-out.
                 raise LinkOpenError(f"cannot open {self.address}: another program serves this name")
         self._is_serving = True
         self._serve(self._queue)
@@ -138,6 +139,7 @@ class ZenohListen(NetworkLink):
         )
 
     def _serve(self, queue: LoopQueue[Callable[[], object]]) -> None:
+        """Declare what clients need. The callbacks run on threads of zenoh, and post to the event loop."""
         zenoh, session, keys = self._zenoh, self._session, self._keys
 
         def on_datagram(sample: Any) -> None:
@@ -164,7 +166,9 @@ class ZenohListen(NetworkLink):
         self._clients.clear()
         if session is not None and self._is_serving:
             self._is_serving = False
-            goodbye = encode_sent_at(self._freshness.epoch, 0.0)
+            goodbye = encode_sent_at(
+                self._freshness.epoch, 0.0
+            )  # deleting the beacon tells clients that we have closed
             drop = self._zenoh.CongestionControl.DROP
             with contextlib.suppress(Exception):
                 session.delete(self._keys.beacon, congestion_control=drop, attachment=goodbye)

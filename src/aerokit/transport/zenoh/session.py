@@ -34,7 +34,7 @@ class LoopQueue(Generic[ItemT]):
         self.dropped: int = 0
         """Number of dropped items."""
         self._loop = asyncio.get_running_loop()
-        self._process: Callable[[ItemT], object] | None = process
+        self._process: Callable[[ItemT], object] | None = process  # None after close()
         self._limit = limit
         self._waiting: deque[ItemT] = deque()
         self._is_scheduled = False
