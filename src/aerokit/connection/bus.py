@@ -237,7 +237,7 @@ def once(action: Callable[[], None]) -> Detach:
 
     def detach() -> None:
         if pending:
-            pending.pop()()
+            pending.pop()()  # popped first, so that a call from within the action does nothing
 
     return detach
 

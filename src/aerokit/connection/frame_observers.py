@@ -27,7 +27,7 @@ logger: logging.Logger = logging.getLogger("aerokit")
 
 MAX_WAITING = 1000  # frames
 
-SETUP_SIGNING = (256).to_bytes(3, "little")  # its message id, as the header of a MAVLink 2 frame has it
+SETUP_SIGNING = (256).to_bytes(3, "little")  # message id, as in the header of a MAVLink 2 frame
 
 
 class Recording:

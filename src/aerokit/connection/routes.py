@@ -167,7 +167,7 @@ class Routes:
                 return False
             route = self._routes[source] = _Route()
         if counters is not None:
-            is_first = route.counters is not counters
+            is_first = route.counters is not counters  # the first heartbeat, or the first that a new framer counted
             if not is_first and frame.received_at > route.heartbeat_at:
                 route.rate = (counters.expected - route.expected) / (frame.received_at - route.heartbeat_at)
             route.counters, route.expected = counters, counters.expected
@@ -257,7 +257,7 @@ class Routes:
         claim = self._claims.get(key)
         if claim is None:
             if len(self._claims) >= MAX_CLAIMS:
-                del self._claims[next(iter(self._claims))]  # the oldest
+                del self._claims[next(iter(self._claims))]  # drop the oldest claim
             claim = self._claims[key] = RouteClaim()
         return claim
 

@@ -61,9 +61,8 @@ class Attachment:
         self.keeps_peers = True
         self.is_open: bool = False
         self._is_on_link = self._reports_bursts = False
-        self._is_single = (
-            False  # True if the link has one remote end, e.g. a serial port; its port is that of peer None
-        )
+        # True if the link has one remote end, e.g. a serial port. Its port is that of peer None.
+        self._is_single = False
         self._burst: list[bytes] = []
         self._burst_peer: Peer = None
         self._ports: dict[Peer, Port] = {}

@@ -168,7 +168,7 @@ class DialectDefinition:
 def cap_words(name: str) -> str:
     """Convert ``GLOBAL_POSITION_INT`` to ``GlobalPositionInt``."""
     words = "".join(part.capitalize() for part in name.split("_"))
-    return words + "_" if keyword.iskeyword(words) else words  # for None, True and False
+    return words + "_" if keyword.iskeyword(words) else words  # "None", "True" and "False" are keywords
 
 
 def read_dialect(path: Path, search: Sequence[Path] = ()) -> list[DialectDefinition]:

@@ -54,6 +54,7 @@ class Frame(FrameFields):
         payload_end = raw[1] + (6 if raw[0] == MAGIC_V1 else 10)
         frame.checksum = int.from_bytes(raw[payload_end : payload_end + 2], "little")
         if raw[0] == MAGIC_V1:
+            # The MAVLink 1 header in the layout of MAVLink 2.
             frame.body = bytes((raw[1], 0, 0, *raw[2:6], 0, 0)) + raw[6:payload_end]
         else:
             frame.body = raw[1:payload_end]
@@ -120,7 +121,7 @@ def x25_in_python() -> Callable[[bytes], int]:
     table: list[int] = []
     for byte in range(256):
         for _ in range(8):
-            byte = (byte >> 1) ^ 0x8408 if byte & 1 else byte >> 1
+            byte = (byte >> 1) ^ 0x8408 if byte & 1 else byte >> 1  # the reversed polynomial of CRC-16/MCRF4XX
         table.append(byte)
 
     def x25(data: bytes) -> int:

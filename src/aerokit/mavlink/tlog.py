@@ -105,7 +105,7 @@ def _looks_shifted(data: bytes, begin: int, end: int) -> bool:
 
 def _frame_end(data: bytes, begin: int) -> int | None:
     """Return the end of a frame according to its header, which may be beyond the data. None if there is no header."""
-    start = begin + 8  # of the frame, after the time
+    start = begin + 8  # the frame follows the time, which has 8 bytes
     if len(data) - start < 3 or data[start] not in _MAGICS or _TIME.unpack_from(data, begin)[0] > _LAST_TIME:
         return None
     magic, payload_length, flags = data[start : start + 3]

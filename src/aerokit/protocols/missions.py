@@ -245,7 +245,7 @@ class SetCurrentItem(Transfer[None]):
         if last is None:
             return False
         has_moved_on = last <= self._seq < seq
-        has_jumped_back = self._seq < seq < last  # to our item, and from there on
+        has_jumped_back = self._seq < seq < last  # it jumped back to our item or before, and has passed it since
         return has_moved_on or has_jumped_back
 
     def _send(self, now: float) -> None:

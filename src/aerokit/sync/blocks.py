@@ -222,7 +222,7 @@ class MeasurementTwin(BlockTwin["MeasurementStream[T]"], Generic[T]):
 class GimbalsTwin(TwinOf["Gimbals"], Generic[T]):
     """Gimbals by device id; ``T`` is the twin of a gimbal."""
 
-    if TYPE_CHECKING:  # generated
+    if TYPE_CHECKING:  # the generated twin defines these
 
         @property
         def ids(self) -> tuple[int, ...]:

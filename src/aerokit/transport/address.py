@@ -271,10 +271,12 @@ class _Parser:
 
     def serial(self, text: str, options: dict[str, str], *, decode: bool) -> LinkAddress:
         """Parse a serial port and its baud rate. ``decode`` is True for an address with a scheme."""
+        # Without a scheme, a colon before the baud rate is accepted only after a COM port.
+        colon_baud = _COLON_BAUD if decode else _COM_COLON_BAUD
         baud_text: str | None
         if "," in text:
             device, _, baud_text = text.partition(",")
-        elif match := (_COLON_BAUD if decode else _COM_COLON_BAUD).fullmatch(text):
+        elif match := colon_baud.fullmatch(text):
             device, baud_text = match[1], match[2]
         else:
             device, baud_text = text, None

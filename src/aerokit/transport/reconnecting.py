@@ -210,7 +210,7 @@ class ReconnectingLink(Link):
         try:
             while not await self._try_to_open():
                 pass
-        except Exception as error:  # make_link failed, so that further attempts are useless
+        except Exception as error:  # make_link failed, so further attempts are useless
             lost = LinkLost(f"{self.address} cannot be reopened: {error}")
             lost.__cause__ = error
             self._end(lost)

@@ -20,7 +20,7 @@ FilesT = TypeVar("FilesT", bound=FileSystem)
 _BURST_BYTES = 35_000  # size after which a burst ends
 _BURST_BLOCKS = 24  # blocks that a burst sends at once
 _CRC_PAUSE_S = 0.002
-_MAX_SIZE = 0xFFFFFFFF  # of a file, because sizes and offsets have 32 bits
+_MAX_SIZE = 0xFFFFFFFF  # maximum file size, because sizes and offsets have 32 bits
 
 Op = MavFtpOpcode
 

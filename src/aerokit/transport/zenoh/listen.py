@@ -166,9 +166,8 @@ class ZenohListen(NetworkLink):
         self._clients.clear()
         if session is not None and self._is_serving:
             self._is_serving = False
-            goodbye = encode_sent_at(
-                self._freshness.epoch, 0.0
-            )  # deleting the beacon tells clients that we have closed
+            # Deleting the beacon tells clients that we have closed.
+            goodbye = encode_sent_at(self._freshness.epoch, 0.0)
             drop = self._zenoh.CongestionControl.DROP
             with contextlib.suppress(Exception):
                 session.delete(self._keys.beacon, congestion_control=drop, attachment=goodbye)

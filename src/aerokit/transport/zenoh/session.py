@@ -229,7 +229,8 @@ def _config(zenoh: Any, address: str, options: NetworkOptions) -> Any:
             config.insert_json5(key, json.dumps(value))
     except zenoh.ZError as error:
         raise InvalidArgument(f"{address}: {_reason(error)}") from error
-    for key, value in (_DROP_AT_ONCE, *(_SETTINGS if not options.config else ())):
+    defaults = () if options.config else _SETTINGS  # a configuration file replaces them
+    for key, value in (_DROP_AT_ONCE, *defaults):
         with contextlib.suppress(zenoh.ZError):  # this version of zenoh does not know the option
             config.insert_json5(key, json.dumps(value))
     return config
@@ -247,7 +248,7 @@ def _settings(options: NetworkOptions) -> Iterable[tuple[str, object]]:
         yield "scouting/multicast/enabled", False
         yield "scouting/delay", 0  # do not wait for discovered peers
         if not options.listen:
-            yield "listen/endpoints", []
+            yield "listen/endpoints", []  # by default, a peer listens on all interfaces
 
 
 def _reason(error: Exception) -> str:
