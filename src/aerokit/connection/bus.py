@@ -193,19 +193,16 @@ class Bus:
         if not entries or self.dialect.get(frame.message_id) is None:
             return FRAME, ()
         kinds = {kind for kind, _ in entries}
+        kind = MESSAGE if kinds == {MESSAGE} else BOTH
         if MESSAGE not in kinds:
             kind = FRAME  # BOTH sinks take the frame alone when no other sink needs the decoded message.
-        elif kinds == {MESSAGE}:
-            kind = MESSAGE
-        else:
-            kind = BOTH
         plan = self._plans[frame.system_id << 24 | frame.message_id] = kind, tuple(sink for _, sink in entries)
         return plan
 
     def _entries(self, frame: Frame) -> tuple[_Entry, ...]:
         system_id, message_id = frame.system_id, frame.message_id
         for_all_systems = self._sinks.get((EVERY_SYSTEM, message_id), ())
-        if system_id == EVERY_SYSTEM:  # an invalid sender, whose key would give the same sinks a second time
+        if system_id == EVERY_SYSTEM:  # an invalid sender, whose own key is that of the sinks for all systems
             return for_all_systems
         return self._sinks.get((system_id, message_id), ()) + for_all_systems
 
@@ -225,9 +222,8 @@ def _remove_sink(table: dict[Any, tuple[Any, ...]], key: object, sink: object) -
     """Remove one occurrence of the sink. A delivery in progress continues with the old tuple."""
     remaining = list(table[key])
     remaining.remove(sink)
-    if remaining:
-        table[key] = tuple(remaining)
-    else:
+    table[key] = tuple(remaining)
+    if not remaining:
         del table[key]
 
 

@@ -280,10 +280,10 @@ class Connection:
         """
         self.raise_if_ended()
         with self.subscribe(VehicleFound, capacity=MAX_ROUTES) as discoveries:
-            known_components = [
+            earlier_discoveries = [
                 discovery_event(heartbeat, self.now(), *source) for source, heartbeat in self.heartbeats.items()
             ]
-            for event in known_components:
+            for event in earlier_discoveries:
                 if isinstance(event, VehicleFound):
                     yield event
             async for event in discoveries:

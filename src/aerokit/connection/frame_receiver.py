@@ -184,7 +184,7 @@ class FrameReceiver:
             self._check_and_deliver(frames, framer, peer)
             return
         last = self._bus.deliver_all(frames, self._record_heartbeat, framer, peer)
-        if last is not None:  # a sink has closed the connection, set a key or added an observer
+        if last is not None:  # a sink of this frame has closed the connection, set a key or added an observer
             self.observers.notify_received(last, peer)
             self._check_and_deliver(frames[frames.index(last) + 1 :], framer, peer)
 

@@ -45,7 +45,8 @@ class RouteClaim:
     )
 
     def __init__(self) -> None:
-        self._expected: int | None = None
+        self._expected: int | None = None  # sequence number expected of the owner when the claim was made
+        # True if the peer's sequence numbers and time since boot continue the owner's stream; None: unknown.
         self._sequence_matches: bool | None = None
         self._clock_matches: bool | None = None
         # Number of the peer's frames since the owner's last frame, and the time of the first of them.

@@ -40,7 +40,7 @@ class SignatureGate:
         self._reported: set[Refusal] = set()
         self._handover: _Handover | None = None  # None again after the switch
         self._is_handing_over = False  # True until the block of key_handover() ends
-        self._keep_error: OSError | None = None
+        self._logged_keep_error: OSError | None = None
         self.is_open: bool = True
         """True while all frames are admitted without a check."""
         self.on_change: Callable[[], object] = bool  # bool() does nothing
@@ -126,9 +126,9 @@ class SignatureGate:
         """Log once when the file of ``Signing(keep=…)`` cannot be written."""
         signing = self._encoder.signing
         error = None if signing is None else signing.keep_error
-        if error is not None and self._keep_error is None:
+        if error is not None and self._logged_keep_error is None:
             logger.error("the time stamp of %r cannot be stored: %s", signing, error)
-        self._keep_error = error
+        self._logged_keep_error = error
 
     def describe(self, heartbeats: Iterable[Heartbeat]) -> str:
         """Explain, for error texts, why signatures block communication with these senders; "" if none do."""

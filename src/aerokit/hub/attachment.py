@@ -60,7 +60,8 @@ class Attachment:
         self.name: str = endpoint.name or self.link.address
         self.keeps_peers = True
         self.is_open: bool = False
-        self._is_on_link = self._reports_bursts = False
+        self._is_on_link = False  # True once the link was opened here, so that it must be closed here
+        self._reports_bursts = False
         # True if the link has one remote end, e.g. a serial port. Its port is that of peer None.
         self._is_single = False
         self._burst: list[bytes] = []

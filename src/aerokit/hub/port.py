@@ -60,13 +60,13 @@ class FrameQueue:
                 self._frames[key] = frame
                 return [("superseded", replaced)]
         else:
-            self._last_key -= 1
+            self._last_key -= 1  # a key of its own, so that no other frame replaces this one
             key = self._last_key
         while self._is_full(len(frame.raw)):
             if not self._telemetry:
                 return [*dropped, ("queue_full", frame)]
-            oldest = next(key for key, queued in self._frames.items() if queued.kind is MessageKind.TELEMETRY)
-            dropped.append(("queue_full", self._remove(oldest)))
+            oldest_key = next(at for at, queued in self._frames.items() if queued.kind is MessageKind.TELEMETRY)
+            dropped.append(("queue_full", self._remove(oldest_key)))
         self._frames[key] = frame
         self._bytes += len(frame.raw)
         self._orders += frame.kind is MessageKind.ORDER

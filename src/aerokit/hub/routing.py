@@ -336,7 +336,7 @@ class Router(Generic[PortT]):
             if self._targets.is_order(message_id):
                 numbers = {number: None for number in numbers if not self._is_redundant(number)}
         numbers.pop(node.number, None)
-        if message_id in _RADIOS:
+        if message_id in _RADIOS:  # an autopilot would adapt its rates to a radio that is not its own
             numbers = {number: None for number in numbers if not self._has_autopilot(number)}
         outs, rate_limited = [], []
         for number in numbers:

@@ -300,6 +300,7 @@ def _enum(node: Element, origin: str) -> EnumDefinition:
     entries: list[EntryDefinition] = []
     highest = 0
     for child in node.findall("entry"):
+        # Without a value, the entry follows the highest one, as in pymavlink's mavparse.py.
         value = _integer(child.attrib["value"]) if "value" in child.attrib else highest + 1
         highest = max(highest, value)
         entries.append(

@@ -19,7 +19,7 @@ _BYTES = tuple(bytes((message_id,)) for message_id in range(256))
 
 
 class FrameEncoder:
-    """Adds ids, sequence message_id, checksum and signature of one component to its messages.
+    """Adds ids, sequence number, checksum and signature of one component to its messages.
 
     Use a separate encoder for each link, so that the peer can detect losses.
     """
@@ -38,7 +38,7 @@ class FrameEncoder:
         self.system_id: int = int(system_id)
         self.component_id: int = int(component_id)
         self.sequence: int = 0
-        """Sequence message_id of the next frame, 0..255."""
+        """Sequence number of the next frame, 0..255."""
         self.signing: Signing | None = None
         """Signs MAVLink 2 frames; None to send them unsigned. MAVLink 1 has no signatures."""
         self._version = 2
@@ -62,7 +62,7 @@ class FrameEncoder:
         ``now`` is in seconds since 1970, for the timestamp of the signature.
 
         Raises:
-            InvalidArgument: a field has an invalid value; no sequence message_id is used.
+            InvalidArgument: a field has an invalid value; no sequence number is used.
         """
         signing = self.signing if self._version == 2 else None
         if self._encode_frame is not None:

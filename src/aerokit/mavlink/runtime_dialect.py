@@ -151,7 +151,7 @@ def _message(cls: Any) -> MessageDefinition:
         array_length = int(cls.array_lengths[order.index(name)])
         units = getattr(cls, "fieldunits_by_name", {}).get(name, "")
         enum = getattr(cls, "fieldenums_by_name", {}).get(name, "")
-        default = 3 if name == "mavlink_version" else None
+        default = 3 if name == "mavlink_version" else None  # the field of HEARTBEAT, which is always 3
         is_bytes = carries_bytes(message_name, name, kind)
         fields.append(FieldDefinition(name, kind, array_length, units, enum, default=default, carries_bytes=is_bytes))
     description = " ".join((cls.__doc__ or "").split())

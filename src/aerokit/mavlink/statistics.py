@@ -127,7 +127,8 @@ class SourceStatistics(SourceFields):
         if ahead > _MAX_GAP:
             self._begin_stream(now)
             self._skipped_over = ahead
-        self._missing = self._shifted(ahead + 1) | ((1 << ahead) - 1) << 1 & _WINDOW
+        missing_bits = ((1 << ahead) - 1) << 1  # bit 0 is this frame
+        self._missing = self._shifted(ahead + 1) | missing_bits & _WINDOW
         self.skip(ahead)
         self.expected += 1
         self._missing_at = self.expected
@@ -162,8 +163,9 @@ class SourceStatistics(SourceFields):
             self._begin_stream(now)
             self._continue_at(sequence)
             return IN_ORDER
+        # Repeated frames in sequence may be those of a second sender. Otherwise the count starts again from 0.
         self._count_alternations(now, 1 if follows else -self._alternations)
-        self._unreceived -= 1
+        self._unreceived -= 1  # `received` counts the frame, although `expected` does not advance
         self._late_sequence, self._late_at = sequence, self.received
         return OTHERS if self.has_duplicates(now) else LATE
 
@@ -189,8 +191,8 @@ class SourceStatistics(SourceFields):
             self._skipped_over -= 1
         self._other_expected, self._other_count = (sequence + 1) & 0xFF, self._other_count + 1
         self._other_at = now
-        self._unreceived -= 1
-        self._stream_start += 1
+        self._unreceived -= 1  # `received` counts the frame, although `expected` does not advance
+        self._stream_start += 1  # the frame does not count for the current stream
         return LATE if is_other_longer else OTHERS
 
     def _swap(self, sequence: int, now: float, count: int, other_count: int) -> None:

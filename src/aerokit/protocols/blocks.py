@@ -36,7 +36,7 @@ class AdaptiveWindow:
         self._size = float(start)
         self._min_size, self._max_size = min_size, max_size
         self._fastest_s: float | None = None
-        self._loss = 0.0
+        self._loss = 0.0  # share of lost requests, averaged over about the last 16
 
     @property
     def size(self) -> int:

@@ -217,7 +217,7 @@ class SettingWrite(Transfer[Setting]):
         self._is_writing = False
         self._sent_at = 0.0
         self._attempts = 0  # number of transmissions of the current request
-        self._writes = 0
+        self._writes = 0  # number of PARAM_EXT_SET messages sent
 
     def start(self, now: float) -> None:
         self._start_clock(now)

@@ -209,8 +209,8 @@ ATTEMPTS_BEFORE_BACKOFF = 3
 
 SESSION_OPCODES = (MavFtpOpcode.READFILE, MavFtpOpcode.WRITEFILE, MavFtpOpcode.BURSTREADFILE)
 
-# Answers to SESSION_OPCODES requests while no file is open: INVALIDSESSION from PX4, FILENOTFOUND from ArduPilot. After
-# PX4 has answered FILEEXISTS once, it gives this answer for any refusal, until an operation fails with an errno.
+# Answers to these requests while no file is open: INVALIDSESSION from PX4, FILENOTFOUND from ArduPilot. After PX4 has
+# answered FILEEXISTS once, it gives this answer for any refusal, until an operation fails with an errno.
 NO_SESSION_ERRORS = (MavFtpErr.INVALIDSESSION, MavFtpErr.FILENOTFOUND, MavFtpErr.FILEEXISTS)
 
 

@@ -147,7 +147,7 @@ class MissionUpload(MissionExchange[UploadResult]):
         if not self._is_accepted:
             self._announce(now)
         elif self._sent_end < self._end:
-            self._send_window(now, ahead=int(self._window > 1))
+            self._send_window(now, ahead=1 if self._window > 1 else 0)  # with a window of 1, each item is requested
         elif self._attempt % 2 == 0:  # a vehicle that has all items confirms again on the last item
             self._send(self._end - 1, now)
         else:
@@ -228,7 +228,8 @@ class MissionUpload(MissionExchange[UploadResult]):
             self._wait_while_busy(now)
         elif self._error_at is None:
             self._error_at = now
-            self._send(self._end - 1 if self._sent_end == self._end else self._confirmed_end, now, again=True)
+            are_all_sent = self._sent_end == self._end
+            self._send(self._end - 1 if are_all_sent else self._confirmed_end, now, again=True)
             self._wait(now)
         elif now - self._error_at >= IN_FLIGHT_ROUND_TRIPS * (self.round_trip.smoothed_s or 0.0):
             if self._sent_end == self._end:

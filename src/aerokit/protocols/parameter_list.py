@@ -232,7 +232,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
     def _in_order(self, parameters: list[Parameter], names: set[str]) -> list[Parameter]:
         """Sort parameters by index, each name once with its latest value. Names without an index come last."""
         ordered = dict.fromkeys(parameter.name for parameter in parameters)
-        if self._refreshes == 0:
+        if self._refreshes == 0:  # otherwise the list has changed, and other names may no longer exist
             ordered.update(dict.fromkeys(name for name in self._names if name not in names))
         table = []
         for index, name in enumerate(ordered):

@@ -251,7 +251,7 @@ class ParameterWrites(ParameterRequests):
         unexpected = self._unexpected.setdefault(name, UnexpectedAnswers(_is_same))
         is_as_requested = same_value(reported.value, requested.value)
         if is_as_requested and name in self._recent:
-            self._recent.remove(name)
+            self._recent.remove(name)  # this may be the answer to the write a moment ago: read once more
             unexpected.add(reported)
             self._window.on_answer(name, now)
             self._window.request(name)

@@ -207,7 +207,7 @@ class BlockTwin(TwinOf[BlockT]):
         return self
 
     def __exit__(self, exc_type: Any, exc: Any, traceback: Any) -> None:
-        exit_block: Any = self.aio.__aexit__  # the blocks name its parameters differently
+        exit_block: Any = self.aio.__aexit__  # Any, because its parameters have other names in each class
         self._loop.run(exit_block, exc_type, exc, traceback)
 
 
@@ -250,7 +250,7 @@ class PhotoIntervalTwin(BlockTwin["PhotoInterval"], IteratorTwin["PhotoInterval"
 
 
 class LogStreamTwin(BlockTwin["LogStream"], IteratorTwin["LogStream", bytes]):
-    """AsyncT flight log while PX4 writes it; an iterator over its bytes."""
+    """A flight log while PX4 writes it; an iterator over its bytes."""
 
 
 class ShieldedBlockTwin(TwinOf[ShieldedT]):
@@ -301,7 +301,7 @@ class ConnectionTwin(TwinOf["Connection"], BlockingContext):
     def close(self) -> None:
         """Close the connection and end the loop thread. Idempotent. Waiting calls raise ConnectionClosed.
 
-        AsyncT connection that ``connect`` opened for a vehicle closes with the vehicle.
+        A connection that ``connect`` opened for a vehicle closes with the vehicle.
         """
         if self._context is not None:
             try:
@@ -350,7 +350,7 @@ class VehicleTwin(OpenedTwin["Vehicle"]):
     def close(self) -> None:
         """Disconnect: close the link and end the loop thread. Idempotent. Waiting calls raise ConnectionClosed.
 
-        Sends nothing: a vehicle in the air continues what it does. AsyncT connection passed to ``connect`` stays open.
+        Sends nothing: a vehicle in the air continues what it does. A connection passed to ``connect`` stays open.
         """
         super().close()
 

@@ -302,15 +302,16 @@ def generate(name: str = "twins") -> str:
     variables = TYPE_VARIABLES if name == "twins" else {}
     page.for_types |= {("aerokit.mavlink.message", "Message"), ("aerokit.events", "Event")}
     for path in FUNCTIONS[name]:
-        module, _, name = path.rpartition(".")
-        page.at_run_time.add((module, f"{name} as {name}_async"))
+        module, _, function_name = path.rpartition(".")
+        page.at_run_time.add((module, f"{function_name} as {function_name}_async"))
     page.for_types -= page.at_run_time
     text = HEAD if variables else HEAD.replace("import TYPE_CHECKING, TypeVar", "import TYPE_CHECKING")
     if "@cached_property" not in "".join(classes):
         text = text.replace("from functools import cached_property\n", "")
     head = text + _import_lines(page.at_run_time, "") + "\nif TYPE_CHECKING:\n"
     head += _import_lines(page.for_types, "    ") + "\n"
-    head += "__all__ = [\n" + "".join(f'    "{name}",\n' for name in names) + "]\n" + "\n" * bool(variables)
+    head += "__all__ = [\n" + "".join(f'    "{exported}",\n' for exported in names) + "]\n"
+    head += "\n" if variables else ""
     for variable, bound in variables.items():
         head += f'{variable} = TypeVar("{variable}"{f", bound={bound}" if bound else ""})\n'
     return head + "\n\n" + "\n\n".join([*classes, *functions])

@@ -367,6 +367,7 @@ class MemoryLink(BaseLink):
             self._far._post(None, self)
 
     def _post(self, data: bytes | None, sender: MemoryLink) -> None:
+        """Schedule the arrival of ``sender``'s data; None: ``sender`` was closed."""
         if self._loop is None or self._receiver is None:
             if data is not None:
                 sender.dropped_writes += 1

@@ -57,7 +57,8 @@ class _UdpLink(BaseLink):
         self._socket: socket.socket | None = None
         self._transport: asyncio.DatagramTransport | None = None  # only on loops without add_reader
         self._transport_owns_socket = False
-        self._has_more: Callable[[], object] = bool  # true if another datagram waits; bool() until the socket is open
+        # Tells whether another datagram waits. bool() returns False, because no socket is open yet.
+        self._has_more: Callable[[], object] = bool
         self._burst_listener: BurstListener | None = None
 
     @property

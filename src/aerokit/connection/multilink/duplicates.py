@@ -177,14 +177,14 @@ class MergedStreams:
         if candidate is not None and not choice.may_be_used(candidate):
             return False
         if frame.received_at <= choice.fresh_after and frame.message_id not in ANSWERS:
-            return False
+            return False  # older than the telemetry that the former link has delivered
         if self.copies.is_late and not _may_be_different_frame(frame, link, choice):
             return False
         if link != choice.used.link and not _is_accepted_from_unused(frame, candidate, choice, stream):
             return False
         is_after_change = frame.received_at - choice.changed_at <= ANSWER_TIMEOUT_S
         if is_after_change and frame.message_id in ACKNOWLEDGEMENTS:
-            is_repeated = stream.is_repeated(frame.payload, link)
+            is_repeated = stream.is_repeated(frame.payload, link)  # also called for the link in use, to count
             if is_repeated and link != choice.used.link:
                 return False
         stream.newest = frame.sequence
@@ -208,8 +208,10 @@ def _is_accepted_from_unused(frame: Frame, candidate: Candidate | None, choice: 
         return False
     is_answer = frame.message_id in ANSWERS
     if choice.is_shared(candidate, frame.received_at):
+        # The link in use has lost this frame, or its copy arrives later.
         is_late = stream.newest >= 0 and (frame.sequence - stream.newest) & 0xFF >= 128
         return is_answer or not is_late
+    # Separate streams. The component may be reached over this link only, or answer what was sent before a change.
     is_on_used_link = frame.received_at - stream.received_at[choice.used.link] <= COMPONENT_TTL_S
     is_after_change = frame.received_at - choice.changed_at <= ANSWER_TIMEOUT_S
     return not is_on_used_link or (is_answer and candidate is choice.former and is_after_change)

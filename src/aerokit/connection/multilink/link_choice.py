@@ -197,7 +197,7 @@ class LinkChoice:
         self.clock: VehicleClock = VehicleClock()
         self.hardware: HardwareId | None = None
         """The vehicle's hardware id, as received over the link that was in use then."""
-        self._hardware_link = -1  # index of the link that named the hardware
+        self._hardware_link = -1  # the link over which `hardware` was received; its next id replaces `hardware`
         self.used: Candidate | None = None
         """The link in use; None before the first choice."""
         self.former: Candidate | None = None

@@ -53,7 +53,9 @@ class VehicleClock:
         or reboot can confirm a sample, but not contradict it.
         """
         fits = self._fits(at, vehicle_s, round_trip_s)
-        return None if not fits and self._measured_speed is None else fits
+        if self._measured_speed is None and not fits:
+            return None
+        return fits
 
     def _fits(self, at: float, vehicle_s: float, round_trip_s: float) -> bool | None:
         """Return True if a sample is where the clock's speed leads to; None if the speed is unknown."""
