@@ -290,13 +290,13 @@ class StateCell(Generic[T]):
     if not TYPE_CHECKING:  # type checkers know the attributes of a cell
 
         def __getattr__(self, name: str) -> NoReturn:
-            """Suggest ``.value`` for an attribute of the value, e.g. ``vehicle.position.latitude_deg``."""
+            """Raise an error that suggests ``.value``, e.g. for ``vehicle.position.latitude_deg``."""
             if not name.startswith("_") and hasattr(self.latest, name):
                 raise AttributeError(f"{self.name} is a StateCell: did you mean .value.{name}?")
             raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
 
         def __getitem__(self, key: object) -> NoReturn:
-            """Suggest ``.value[…]``. Iteration over a cell also calls this method."""
+            """Raise an error that suggests ``.value[…]``. Iteration over a cell also calls this method."""
             camera = ", or camera_at(number) for a camera" if self.name == "cameras" else ""
             raise TypeError(f"{self.name} is a StateCell, not its value: use {self.name}.value[…]{camera}")
 

@@ -137,7 +137,7 @@ class LoopWatch:
         return self.oldest_arrival
 
     def _end_assumption_when_idle(self) -> None:
-        """Date data to the time of reading again, after `IDLE_ITERATIONS` iterations without a read."""
+        """After `IDLE_ITERATIONS` iterations without a read, take data as received when it is read again."""
         self._idle_iterations = 0 if self._has_read else self._idle_iterations + 1
         self._has_read = False
         if self._timer is None:

@@ -143,7 +143,7 @@ class TwinOf(ReadOnly, Generic[AsyncT]):
 
 
 class CellTwin(TwinOf["StateCell[T]"], Generic[T]):
-    """Reading takes a snapshot on the caller's thread; it sends nothing and does not wait for the loop."""
+    """Twin of a state cell. Reading takes a snapshot on the caller's thread, without waiting for the loop."""
 
     def __repr__(self) -> str:
         return repr(self.aio)

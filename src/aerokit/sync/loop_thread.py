@@ -390,7 +390,7 @@ class _Call(ThreadFuture[T]):
 
 
 def _run(calls: _Calls, started: ThreadFuture[asyncio.AbstractEventLoop]) -> None:
-    """Run the loop: the target of the thread. An error before the start goes to ``started``."""
+    """Run the loop; the thread's target function. An error before the start goes to ``started``."""
     try:
         anyio.run(calls.run, started)
     except BaseException as error:

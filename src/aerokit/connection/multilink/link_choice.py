@@ -265,7 +265,7 @@ class LinkChoice:
                 compared.record_hardware(is_other=self.hardware.contradicts(compared.hardware))
 
     def may_be_used(self, candidate: Candidate) -> bool:
-        """Return True if the link leads to the same system."""
+        """Return True if frames and commands may use the link: it is in use, is proven, or needs no proof."""
         if candidate.is_other_hardware:
             return False
         return self.used in (None, candidate) or candidate.is_proven or not self.needs_proof

@@ -47,7 +47,7 @@ class VehicleClock:
         return continues
 
     def matches(self, at: float, vehicle_s: float, round_trip_s: float) -> bool | None:
-        """Return True if a sample from another link is this clock's time; ``at`` is the middle of the round trip.
+        """Return True if a sample from another link agrees with this clock; ``at`` is the middle of the round trip.
 
         Return None while the speed is unknown, because a simulation may run at any speed. The speed from before a pause
         or reboot can confirm a sample, but not contradict it.

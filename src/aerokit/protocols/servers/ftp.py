@@ -184,7 +184,7 @@ class SessionFtpServer(Generic[FilesT]):
             self._reply(peer, self._adapted(peer, request, answer))
 
     def _adapted(self, peer: FtpPeer, request: FtpPacket, answer: FtpPacket) -> FtpPacket:
-        """Return the answer as it is sent."""
+        """Return the answer with the fields that this firmware sends. Subclasses change them."""
         return answer.replace(offset=request.offset)
 
     def _reply(self, peer: FtpPeer, answer: FtpPacket) -> None:
