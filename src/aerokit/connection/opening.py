@@ -155,7 +155,7 @@ def _create_multilink(addresses: Sequence[str | Link], baud: int, reconnect: boo
         )
     if len(addresses) < 2:
         if not addresses:
-            raise InvalidArgument("address = [] is not allowed: at least one")
+            raise InvalidArgument("address = [] is not allowed: at least one address or link")
         return _create_link(addresses[0], baud, reconnect, peers)
     from aerokit.transport import MultiLink, parse_address  # imported here because few programs need them
 

@@ -76,7 +76,7 @@ class Hub:
         names = [endpoint.name for endpoint in self._endpoints if endpoint.name]
         for name in names:
             if names.count(name) > 1:
-                raise InvalidArgument(f"two endpoints have the name {name!r}")
+                raise InvalidArgument(f"two endpoints have the name {name!r}: give each its own name")
         self._dialect = dialect
         self._attachments: dict[str, Attachment] = {}
         self._listeners: list[Callable[[HubEvent], object]] = []

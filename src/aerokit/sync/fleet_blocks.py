@@ -35,7 +35,7 @@ class _Borrowed(Generic[T]):
 
 
 class SelectionTwin(TwinOf[SelectionT]):
-    """Twin of a selection of vehicles. ``vehicles`` are twins; ``member.vehicle`` is asynchronous, for code on the loop."""
+    """Twin of a selection of vehicles. ``vehicles`` are twins, ``member.vehicle`` is the asynchronous object."""
 
     @cached_property
     def vehicles(self) -> Mapping[str, Vehicle]:

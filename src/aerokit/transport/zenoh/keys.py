@@ -48,7 +48,7 @@ def check_name(argument: str, name: str) -> str:
         InvalidArgument: the name is not allowed.
     """
     if argument == "client" and name == _ALL_CLIENTS:
-        raise InvalidArgument(f"client = {name!r} is not allowed: this key is for all clients")
+        raise InvalidArgument(f"client = {name!r} is not allowed: this name stands for all clients")
     if not _NAME.fullmatch(name):
         raise InvalidArgument(
             f"{argument} = {name!r} is not allowed: up to 63 letters, digits, '_', '.' and '-', a letter or digit first"
