@@ -11,7 +11,7 @@ import anyio
 
 from aerokit.connection.cells import StateCell
 from aerokit.connection.heartbeats import LinkStateTracker
-from aerokit.connection.loop_watch import CHECK_INTERVAL_S
+from aerokit.connection.loop_watch import BLOCKED_THRESHOLD_S, CHECK_INTERVAL_S
 from aerokit.errors import LinkLost
 from aerokit.events import (
     SILENT_AFTER_S,
@@ -256,7 +256,11 @@ class LinkWatch:
         self.request_time()
         self._next_request_at = self._connection.now()  # The first report sends another request.
         while self._connection.is_open:
+            started = self._connection.now()
             await anyio.sleep(REPORT_PERIOD_S)
+            if self._connection.now() - started > REPORT_PERIOD_S + BLOCKED_THRESHOLD_S:
+                # The program was blocked. Heartbeats that arrived meanwhile may not have been read yet.
+                await anyio.sleep(CHECK_INTERVAL_S)
             if self._connection.is_open:
                 if self._connection.now() >= self._next_request_at:
                     self.request_time()
