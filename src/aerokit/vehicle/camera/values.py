@@ -181,7 +181,7 @@ class ThermalRange(Snapshot):
     min_at: tuple[float, float] | None
 
 
-# A position this close to 0, 0 means that the vehicle did not know its position.
+# A position closer to 0, 0 than this means that the vehicle did not know its position.
 MIN_COORDINATE_DEG = 0.01
 
 # Values of CAMERA_CAPTURE_STATUS.image_status.
@@ -200,8 +200,8 @@ def place_of(
 ) -> Position | None:
     """Decode a position; return None if it is invalid, or so close to 0, 0 that it stands for "unknown"."""
     latitude, longitude = latitude_e7 * 1e-7, longitude_e7 * 1e-7
-    is_somewhere = abs(latitude) > MIN_COORDINATE_DEG or abs(longitude) > MIN_COORDINATE_DEG
-    if not is_somewhere or abs(latitude) > 90.0 or abs(longitude) > 180.0:
+    is_unknown = abs(latitude) <= MIN_COORDINATE_DEG and abs(longitude) <= MIN_COORDINATE_DEG
+    if is_unknown or abs(latitude) > 90.0 or abs(longitude) > 180.0:
         return None
     relative = None if altitude_relative_m is None else finite_or_none(altitude_relative_m)
     return Position(latitude, longitude, finite_or_none(altitude_amsl_m), relative)
@@ -265,6 +265,7 @@ def storage_of(message: m.StorageInformation) -> CameraStorage:
 
 
 def stream_of(message: m.VideoStreamInformation) -> CameraStream:
+    """Decode VIDEO_STREAM_INFORMATION."""
     return CameraStream(
         number=message.stream_id or 1,  # MAVSDK's camera server sends 0.
         count=message.count,
@@ -293,10 +294,8 @@ def stream_state(message: m.VideoStreamInformation | m.VideoStreamStatus) -> dic
 
 def tracking_of(message: m.CameraTrackingImageStatus) -> TrackingStatus:
     corners = (message.rec_top_x, message.rec_top_y, message.rec_bottom_x, message.rec_bottom_y)
-    is_point, is_rectangle = (
-        message.tracking_mode == Tracking.POINT,
-        message.tracking_mode == Tracking.RECTANGLE,
-    )
+    is_point = message.tracking_mode == Tracking.POINT
+    is_rectangle = message.tracking_mode == Tracking.RECTANGLE
     return TrackingStatus(
         is_active=bool(message.tracking_status & TrackingFlags.ACTIVE),
         has_failed=bool(message.tracking_status & TrackingFlags.ERROR),

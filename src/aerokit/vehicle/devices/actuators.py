@@ -155,9 +155,8 @@ class Actuators(ReadOnly):
             if value is not None:
                 check_range("values", value, -1, 1)
         params = [math.nan if value is None else float(value) for value in values]
-        order = SimpleOrder(
-            "set_actuators", MavCmd.DO_SET_ACTUATOR, (*params, *(math.nan,) * (ACTUATORS - len(params)), 0)
-        )
+        params += [math.nan] * (ACTUATORS - len(params))
+        order = SimpleOrder("set_actuators", MavCmd.DO_SET_ACTUATOR, (*params, 0))
         await order.send(self._context, topic="actuators")
 
     async def raise_landing_gear(self) -> None:
@@ -254,7 +253,7 @@ class Actuators(ReadOnly):
                 describe=lambda: "the vehicle still reports armed",
                 timeout=TEST_END_TIMEOUT_S,
             )
-        except CommandRejected:
+        except CommandRejected:  # The motor does not turn.
             raise
         except BaseException:
             # After the end of the test, no stop command is sent, because it would start another test, which arms the

@@ -55,10 +55,11 @@ class Gripper(ReadOnly):
         if not context.session.autopilot.reports_gripper_by_text:
             await order.send(context, self._number, topic=topic)
             return
+
+        def has_moved(text: str, age_s: float) -> bool:
+            # While the only text is that of the start, it is passed again with its age: the gripper may be an EPM.
+            return text == ENDS[action] or (text == BEGINS[action] and age_s >= EPM_WAIT_S)
+
         await order.send_until_text(
-            context,
-            self._number,
-            topic=topic,
-            is_done=lambda text, after_s: text == ENDS[action] or (text == BEGINS[action] and after_s >= EPM_WAIT_S),
-            timeout=GRIP_TIMEOUT_S,
+            context, self._number, topic=topic, is_done=has_moved, timeout=GRIP_TIMEOUT_S
         )
