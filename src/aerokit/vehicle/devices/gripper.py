@@ -56,9 +56,9 @@ class Gripper(ReadOnly):
             await order.send(context, self._number, topic=topic)
             return
 
-        def has_moved(text: str, age_s: float) -> bool:
-            # While the only text is that of the start, it is passed again with its age: the gripper may be an EPM.
-            return text == ENDS[action] or (text == BEGINS[action] and age_s >= EPM_WAIT_S)
+        def has_moved(text: str, since_acknowledgement_s: float) -> bool:
+            has_begun = text == BEGINS[action]
+            return text == ENDS[action] or (has_begun and since_acknowledgement_s >= EPM_WAIT_S)
 
         await order.send_until_text(
             context, self._number, topic=topic, is_done=has_moved, timeout=GRIP_TIMEOUT_S
