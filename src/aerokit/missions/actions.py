@@ -38,7 +38,7 @@ def change_speed(
     return action_item(
         MavCmd.DO_CHANGE_SPEED,
         _SPEEDS[kind],
-        in_range("speed_m_s", speed_m_s, 0, 1000, or_=(-1, -2)),
+        in_range("speed_m_s", speed_m_s, 0, 1000, also_allowed=(-1, -2)),
         -1.0 if throttle_percent is None else in_range("throttle_percent", throttle_percent, 0, 100),
     )
 
@@ -115,7 +115,7 @@ def set_servo(servo: int, pwm_us: int) -> MissionItem:
     https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_SERVO
     """
     number = whole_number("servo", servo, 1, 32)
-    return action_item(MavCmd.DO_SET_SERVO, number, in_range("pwm_us", pwm_us, 500, 2500, or_=(0,)))
+    return action_item(MavCmd.DO_SET_SERVO, number, in_range("pwm_us", pwm_us, 500, 2500, also_allowed=(0,)))
 
 
 def set_relay(relay: int, on: bool) -> MissionItem:
@@ -241,7 +241,7 @@ def trigger_camera() -> MissionItem:
 
     https://mavlink.io/en/messages/common.html#MAV_CMD_DO_DIGICAM_CONTROL
     """
-    return action_item(MavCmd.DO_DIGICAM_CONTROL).replace(x=1)
+    return action_item(MavCmd.DO_DIGICAM_CONTROL).replace(x=1)  # param5 = 1: take a picture.
 
 
 @overload

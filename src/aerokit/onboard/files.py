@@ -21,8 +21,8 @@ MAX_FILE_BYTES = 1 << 30
 """Maximum size of a file that a client writes."""
 MAX_ENTRIES = 10_000
 """Maximum number of directory entries that are listed."""
-# Flags for `os.open`, where the platform has them: follow no symbolic link, do not convert line ends, and do not wait for
-# the other end of a pipe.
+# Flags for `os.open`, if the platform has them: follow no symbolic link, do not convert line ends, do not wait for the
+# other end of a pipe.
 _SAFE_FLAGS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0)
 # Linux's error numbers, which MAVFTP clients expect on every platform.
 _ERROR_NUMBERS = {errno.ENOTEMPTY: 39, errno.ELOOP: ENOENT, errno.ENAMETOOLONG: 36}

@@ -91,7 +91,9 @@ class ComponentMissions:
     def _build_current(self, _: object) -> Iterable[Message]:
         return [self._server.current_message()]
 
-    def _accept_or_refuse(self, mission_type: int, items: tuple[MissionItem, ...], answer: Callable[[int], None]) -> None:
+    def _accept_or_refuse(
+        self, mission_type: int, items: tuple[MissionItem, ...], answer: Callable[[int], None]
+    ) -> None:
         kind = next(name for name, number in _NAMES.items() if number == mission_type)
         function = self._on_upload
         verdict: Any = None
@@ -140,8 +142,9 @@ class ComponentMissions:
 
 def _result_of(verdict: object) -> int:
     """Return the MAV_MISSION_RESULT that a function returned; ACCEPTED for all other values, bools included."""
-    is_result = isinstance(verdict, int) and not isinstance(verdict, bool)
-    return int(verdict) if is_result else MavMissionResult.ACCEPTED
+    if isinstance(verdict, int) and not isinstance(verdict, bool):
+        return int(verdict)
+    return MavMissionResult.ACCEPTED
 
 
 def _type_of(kind: str) -> int:

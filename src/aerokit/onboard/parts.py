@@ -31,7 +31,9 @@ DEFINITION_PATH = "/camera_definition.xml"
 class DefinedSettings(DefinedParameterServer):
     """Settings of a `CameraDriver` with a definition file."""
 
-    def __init__(self, host: ComponentHost, definition: CameraDefinition, on_change: Callable[[str, SettingValue], Any]):
+    def __init__(
+        self, host: ComponentHost, definition: CameraDefinition, on_change: Callable[[str, SettingValue], Any]
+    ):
         self._on_change = on_change
         super().__init__(host, definition)
 

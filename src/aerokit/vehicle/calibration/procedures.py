@@ -38,7 +38,9 @@ POSES = {
     AccelcalVehiclePos.NOSEUP: CalibrationPose.NOSE_UP,
     AccelcalVehiclePos.BACK: CalibrationPose.BACK,
 }
-ACCELEROMETER_CANNOT_CANCEL = "ArduPilot cannot cancel it: it waits for the next pose, and cannot be armed, until it reboots"
+ACCELEROMETER_CANNOT_CANCEL = (
+    "ArduPilot cannot cancel it: it waits for the next pose, and cannot be armed, until it reboots"
+)
 
 
 async def px4_by_status_texts(run: CalibrationRun, *params: float) -> AsyncGenerator[CalibrationStep, None]:
@@ -180,6 +182,9 @@ async def ardupilot_compass(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
             percents[message.compass_id] = message.completion_pct
         has_changed = True
 
+    def has_news() -> bool:
+        return has_changed
+
     def is_complete() -> bool:
         compasses = [number for number in range(8) if compass_mask >> number & 1]
         return bool(compasses) and all(number in reports for number in compasses)
@@ -191,7 +196,7 @@ async def ardupilot_compass(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
             cleanup.callback(run.session.rates.request(kind, REPORT_HZ, is_optional=True))
         yield run.step(0.0, "turn the vehicle slowly in all directions, about each of its axes")
         while not is_complete():
-            await run.wait(lambda: has_changed)
+            await run.wait(has_news)
             has_changed = False
             progress = min(percents.values(), default=0) / 100
             yield run.step(progress, "turn the vehicle slowly in all directions, about each of its axes")

@@ -281,7 +281,7 @@ def _split(jpeg: bytes) -> tuple[list[bytes], bytes]:
 
 
 def _segments(jpeg: bytes) -> Iterator[bytes]:
-    """Yield each segment in front of the image data: FF, marker, 2 bytes of length (which count themselves), content."""
+    """Yield each segment before the image data: FF, marker, length in 2 bytes, content. The length includes these 2."""
     start = 2
     while jpeg[start + 1 : start + 2] != bytes((SCAN,)):
         length = int.from_bytes(jpeg[start + 2 : start + 4], "big")

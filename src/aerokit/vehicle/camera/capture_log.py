@@ -86,7 +86,7 @@ class CaptureLog:
         self._highest: _Entry | None = None
         self._outlier: _Entry | None = None
         self._failed: _Entry | None = None
-        # Number of pictures, from CAMERA_CAPTURE_STATUS and indices. The count is used once the camera has reported one.
+        # Number of pictures, from CAMERA_CAPTURE_STATUS and indices. It is used once the camera has reported a number.
         self._count, self._is_count_used = 0, False
         self._count_boot_ms = 0
         # Loop time of the last reset: earlier captures belong to another log.

@@ -66,7 +66,7 @@ class Shutter:
         return None
 
     async def take_photo(self, timeout: float) -> Capture:
-        """Take one photo and return its capture, which is requested if it was lost; errors as for `Camera.take_photo`."""
+        """Take one photo and return its capture, which is requested if lost; errors as for `Camera.take_photo`."""
         async with self._lock:
             series = self.link.latest_order("series")
             before = await self.reliable_status()

@@ -260,7 +260,9 @@ class Settings:
         assert definition is not None
         # A value that is never allowed is refused before anything is sent.
         definition.checked(name, value, self._values())
-        to_read = [setting for setting in definition.dependencies(name) if self._must_be_read(definition.settings[setting])]
+        to_read = [
+            setting for setting in definition.dependencies(name) if self._must_be_read(definition.settings[setting])
+        ]
         if name not in self._known and not defined.write_only:
             to_read.append(name)
         answers = await self._read(to_read, idle_timeout_s) if to_read else {}

@@ -60,6 +60,4 @@ class Gripper(ReadOnly):
             has_begun = text == BEGINS[action]
             return text == ENDS[action] or (has_begun and since_acknowledgement_s >= EPM_WAIT_S)
 
-        await order.send_until_text(
-            context, self._number, topic=topic, is_done=has_moved, timeout=GRIP_TIMEOUT_S
-        )
+        await order.send_until_text(context, self._number, topic=topic, is_done=has_moved, timeout=GRIP_TIMEOUT_S)

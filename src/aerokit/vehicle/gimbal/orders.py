@@ -180,8 +180,15 @@ class GimbalOrders:
         yaw_from_nose = yaw if from_nose else math.remainder(yaw - heading, 360.0)
         if not await self.send_mount_mode(order, MavMountMode.MAVLINK_TARGETING, pitch, roll, yaw_from_nose):
             yaw_from_north = yaw + heading if from_nose else yaw
-            centidegrees = (round(angle * 100) for angle in (pitch, roll, yaw_from_north))
-            self.session.send(MountControl(self.session.system_id, self.manager_id, *centidegrees, 0))
+            message = MountControl(
+                self.session.system_id,
+                self.manager_id,
+                input_a=round(pitch * 100),
+                input_b=round(roll * 100),
+                input_c=round(yaw_from_north * 100),
+                save_position=0,
+            )
+            self.session.send(message)
 
     def ask_in_background(self, message_id: int) -> None:
         """Request a message from the manager once; errors are ignored."""
@@ -198,7 +205,7 @@ class GimbalOrders:
         )
 
     async def wait_for(self, value: Callable[[], object], message_type: type[Message], within_s: float) -> None:
-        """Wait until ``value()`` is not None, for at most ``within_s`` seconds; checked at each message of this type."""
+        """Wait until ``value()``, checked at each message of this type, is not None; at most ``within_s`` seconds."""
         done = asyncio.Event()
 
         def check(_: Message) -> None:

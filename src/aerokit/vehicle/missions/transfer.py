@@ -169,8 +169,8 @@ class PlanChannel:
             raise
         finally:
             if not exchange.done and connection.is_open:
-                for message in exchange.cancellation():
-                    connection.send(message)
+                for cancellation in exchange.cancellation():
+                    connection.send(cancellation)
 
     def _describe_items_on_vehicle(
         self, exchange: MissionExchange[Any], *, is_silent: bool = False, refused_item: int | None = None
@@ -237,7 +237,7 @@ class PlanTransfer(Generic[PlanT]):
 
     async def upload(self, plan: PlanT, method: str, *, only_changes: bool, verify: bool) -> None:
         items = plan.to_items()
-        if self._offset:  # Older firmware might take another position in item 0 as its home.
+        if self._offset:  # The vehicle's own home, because older firmware might take another one in item 0 as its home.
             items = with_home(items, self._context.home)
         if len(items) == self._offset:  # The plan is empty, except for home.
             await self.clear()
@@ -366,9 +366,7 @@ class PlanTransfer(Generic[PlanT]):
         return True
 
     def _changed_seqs(self, items: Sequence[MissionItem]) -> list[int] | None:
-        """Return the item numbers (seq) of the items that differ from the vehicle's; None if it has unknown items or
-        another number of items.
-        """
+        """Return the seqs of changed items; None if the vehicle's items are unknown, or there are more or fewer."""
         vehicle_items = self._cache.items
         if vehicle_items is None or len(vehicle_items) != len(items):
             return None

@@ -230,8 +230,10 @@ class ParameterAccess:
         )
         if len(names) > MAX_READS_UNBOOSTED:
             boost_after_s = 0.0
+        elif probe:
+            boost_after_s = BOOST_DELAY_S
         else:
-            boost_after_s = BOOST_DELAY_S if probe else math.inf
+            boost_after_s = math.inf
         with self._boosted(after_s=boost_after_s):
             return await transfers.run(exchange)
 
