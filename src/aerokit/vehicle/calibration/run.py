@@ -62,7 +62,7 @@ class CalibrationRun:
         self._why_not_cancelled = ""
         self._started_at = math.inf
         self._cancelled_at: float | None = None
-        self._cancel_order = ExitStack()
+        self._cancel_order_stack = ExitStack()
         self._sent_cancel: SentCommand | None = None
         self._has_rebooted = self._is_abandoned = False
         self._ended = asyncio.Event()
@@ -122,7 +122,7 @@ class CalibrationRun:
         """Register that the calibration has ended on the vehicle."""
         if not self._ended.is_set():
             self._ended.set()
-            self._cancel_order.close()
+            self._cancel_order_stack.close()
             if self.is_running:
                 self._runs.remove(self)
                 self.context.on_finish.remove(self.abandon)
@@ -150,8 +150,8 @@ class CalibrationRun:
             return
         arbiter = self.context.arbiter
         # The arbiter ends this order when another party takes over, and the cancel command is then not repeated.
-        order = self._cancel_order.enter_context(arbiter.auxiliary_order())
-        self._sent_cancel = self._cancel_order.enter_context(arbiter.sending(order))
+        order = self._cancel_order_stack.enter_context(arbiter.auxiliary_order())
+        self._sent_cancel = self._cancel_order_stack.enter_context(arbiter.sending(order))
         if self.session.connection.is_open and arbiter.is_known:
             self._send_cancel(*self._cancel_command)
         self.session.background.start(self._confirm_cancel, "aerokit calibration")

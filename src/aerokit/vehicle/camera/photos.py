@@ -109,7 +109,7 @@ class Shutter:
 
     def _checked(self, capture: Capture) -> Capture:
         if capture.success is False:
-            raise OperationRejected(f"{self.link.describe()} could not take_photo the picture")
+            raise OperationRejected(f"{self.link.describe()} could not take the picture")
         return capture
 
     async def order_photo(self, before: CameraStatus | None, *, is_repeated: bool = False) -> CommandTimeout | None:

@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from aerokit.vehicle.missions.context import PlanContext
 
 ResultT = TypeVar("ResultT")
-
 # Seconds after a refusal in which the texts that explain it may arrive.
 REFUSAL_TEXT_DELAY_S = 0.3
 
@@ -193,10 +192,8 @@ class PlanChannel:
 
 
 PLAN_NAMES = ("mission", "fence", "rally points")
-
 # MISSION_CURRENT, which has the checksum, is sent at 1 Hz.
 CHECKSUM_INTERVAL_S = 1.0
-
 # The extra messages of a partial upload cost about as much as this many items.
 PART_OVERHEAD_ITEMS = 4
 
@@ -397,8 +394,8 @@ class PlanTransfer(Generic[PlanT]):
         """Raise VerificationFailed unless the items read back are those that were sent. Both are keyed by seq."""
         differences = []
         if len(sent) != len(received):
-            received_count, sent_count = max(0, len(received) - self._offset), len(sent) - self._offset
-            differences = [f"there are {received_count} items instead of {sent_count}"]
+            received_count = max(0, len(received) - self._offset)
+            differences = [f"there are {received_count} items instead of {len(sent) - self._offset}"]
         is_single_precision = self._channel.is_single_precision
         for seq in sorted(sent.keys() & received.keys()):
             if seq >= self._offset:
