@@ -288,8 +288,9 @@ class ArduCopter(ArduPilot):
 
     def take_off(self, altitude_relative_m: float, home_altitude_amsl_m: float | None, *, is_vtol: bool) -> TakeOff:
         # The vehicle stays in GUIDED after the take-off.
+        params = (0, 0, 0, 0, 0, 0, altitude_relative_m)
         guided = self.modes.find("GUIDED")
-        return TakeOff(guided, MavCmd.NAV_TAKEOFF, (0, 0, 0, 0, 0, 0, altitude_relative_m), None)
+        return TakeOff(mode=guided, command=MavCmd.NAV_TAKEOFF, params=params, mode_after=None)
 
     def landed_state_of(self, heartbeat: Heartbeat) -> int | None:
         # STANDBY means on the ground, ACTIVE in the air. During a failsafe, CRITICAL replaces both.
@@ -334,8 +335,9 @@ class ArduPlane(ArduPilot):
         # A QuadPlane climbs in GUIDED. A plane armed in TAKEOFF climbs to its parameter TKOFF_ALT.
         if self._can_hover(is_vtol):
             params = (0, 0, 0, 0, 0, 0, altitude_relative_m)
-            return TakeOff(self.modes.find("GUIDED"), MavCmd.NAV_TAKEOFF, params, None)
-        return TakeOff(self.modes.find("TAKEOFF"), None, (), None)
+            guided = self.modes.find("GUIDED")
+            return TakeOff(mode=guided, command=MavCmd.NAV_TAKEOFF, params=params, mode_after=None)
+        return TakeOff(mode=self.modes.find("TAKEOFF"), command=None, params=(), mode_after=None)
 
     def landed_state_of(self, heartbeat: Heartbeat) -> int | None:
         return _landed_state(heartbeat)

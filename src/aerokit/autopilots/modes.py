@@ -84,6 +84,7 @@ class ModeTable:
         for number, extra_name in extra.items():
             if _key(extra_name) == key:
                 return number
+        # The mode number is in "MODE 42", or is the whole text.
         digits = key[len(_PREFIX_OF_NUMBER) :] if key.startswith(_PREFIX_OF_NUMBER) else key
         if digits.isdecimal():
             return self._check(int(digits))

@@ -226,7 +226,8 @@ class Px4(Autopilot):
         if home_altitude_amsl_m is None:
             raise InvalidArgument("take-off on PX4 needs the altitude of home: NAV_TAKEOFF is above mean sea level")
         params = (NAN, 0, 0, NAN, NAN, NAN, home_altitude_amsl_m + altitude_relative_m)
-        return TakeOff(None, MavCmd.NAV_TAKEOFF, params, self.modes.find("LOITER"))
+        loiter = self.modes.find("LOITER")
+        return TakeOff(mode=None, command=MavCmd.NAV_TAKEOFF, params=params, mode_after=loiter)
 
     def return_altitude_parameters(self, *, is_vtol: bool) -> tuple[tuple[str, float], ...]:
         return () if self._cannot_fly else (("RTL_RETURN_ALT", 1.0),)

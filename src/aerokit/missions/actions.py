@@ -52,7 +52,8 @@ def delay(duration_s: float) -> MissionItem:
         raise InvalidArgument(
             "duration_s = 0 is not allowed: it must be above 0, because ArduPilot then uses a time of day instead"
         )
-    return action_item(MavCmd.NAV_DELAY, in_range("duration_s", duration_s, 0, _MAX_DURATION_S), -1.0, -1.0, -1.0)
+    no_time_of_day = (-1.0, -1.0, -1.0)
+    return action_item(MavCmd.NAV_DELAY, in_range("duration_s", duration_s, 0, _MAX_DURATION_S), *no_time_of_day)
 
 
 def delay_until(hour: int, minute: int = 0, second: int = 0) -> MissionItem:
@@ -62,7 +63,7 @@ def delay_until(hour: int, minute: int = 0, second: int = 0) -> MissionItem:
     """
     return action_item(
         MavCmd.NAV_DELAY,
-        -1.0,
+        -1.0,  # no duration
         whole_number("hour", hour, 0, 23),
         whole_number("minute", minute, 0, 59),
         whole_number("second", second, 0, 59),

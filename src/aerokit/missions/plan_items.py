@@ -58,7 +58,7 @@ def _reset_items(pattern: JsonValue) -> list[MissionItem]:
 
 
 def _approach(pattern: JsonValue, frame: MavFrame, place: JsonValue) -> MissionItem:
-    # The approach is a descent in a circle, which is left tangentially, or a waypoint. Older files have circles only.
+    # Either a waypoint, or a descent in a circle that is left tangentially. Older files have only circles.
     if not _flag(pattern, "useLoiterToAlt", default=True):
         return MissionItem(MavCmd.NAV_WAYPOINT, frame, 0.0, 0.0, 0.0, math.nan, *_place(place))
     radius = pattern["loiterRadius"].number(0)
@@ -197,12 +197,12 @@ def _read_item(value: JsonValue, ids: dict[int, int]) -> MissionItem:
     command, frame = value["command"].integer(0, 0xFFFF), value["frame"].integer(0, 0xFF)
     params = value["params"].elements(7)
     numbers = [param.number(null=True) for param in params]
-    if xy_scale(command, frame) == 10_000_000:
+    if xy_scale(command, frame) == 10_000_000:  # These calls raise an error for coordinates out of range.
         params[4].number(-90, 90, null=True)
         params[5].number(-180, 180, null=True)
     if command == MavCmd.DO_JUMP:
         numbers[0] = _jump_target(params[0], ids)
-    if math.isnan(numbers[6]) and has_place(command):
+    if math.isnan(numbers[6]) and has_place(command):  # `params` has no altitude.
         frame, numbers[6] = _planned_altitude(value, frame)
     param1, param2, param3, param4, latitude, longitude, z = numbers
     x, y = (from_degrees(number, command, frame) for number in (latitude, longitude))

@@ -72,11 +72,11 @@ class CommandRequest:
         """
         frame = self._command.altitude_frame
         latitude, longitude, altitude = self.params[4:]
-        known = altitude if math.isfinite(altitude) else None
+        altitude_m = altitude if math.isfinite(altitude) else None
         if frame in _ABSOLUTE:
-            return Position(latitude, longitude, altitude_amsl_m=known)
+            return Position(latitude, longitude, altitude_amsl_m=altitude_m)
         if frame in _RELATIVE:
-            return Position(latitude, longitude, altitude_relative_m=known)
+            return Position(latitude, longitude, altitude_relative_m=altitude_m)
         raise InvalidArgument(f"frame = {frame} is not allowed: a global MAV_FRAME")
 
     def report_progress(self, percent: int) -> None:

@@ -248,6 +248,7 @@ class _Store:
         return self._parameters._rows[name].type
 
     def problem(self, name: str, value: object, type: int) -> tuple[int, int] | None:  # noqa: A002
+        """Return the MAV_PARAM_ERROR and the PARAM_ACK for a value that is refused; None for an allowed value."""
         row = self._parameters._rows[name]
         if row.metadata.read_only:
             return MavParamError.READ_ONLY, ParamAck.FAILED

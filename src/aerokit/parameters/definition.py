@@ -279,7 +279,7 @@ def _check_range(setting: SettingDefinition, value: object) -> SettingValue:
             raise InvalidArgument(f"{setting.name} = {short_repr(value)} is not allowed: True or False")
         return bool(number)
     low, high, step = setting.minimum, setting.maximum, setting.step
-    # Equal 32-bit floats count as equal to a limit.
+    # A value that equals a limit as a 32-bit float is allowed.
     is_below = low is not None and number < low and not settings_equal(number, low)
     is_above = high is not None and number > high and not settings_equal(number, high)
     if is_below or is_above:
@@ -338,7 +338,7 @@ def _compare(value: SettingValue, operator: str, text: str) -> bool:
     number = _number(text)
     if number is None:
         return False
-    # Not by ==, because 32-bit floats may differ in the bits beyond their precision.
+    # Not by ==, because a value that was sent as a 32-bit float differs a little from the decimal number in the file.
     is_equal = settings_equal(value, number)
     if operator in ("=", "!="):
         return is_equal == (operator == "=")

@@ -80,7 +80,7 @@ def parameter_of(message: ParamValue, bytewise: bool) -> Parameter:
     """Convert a PARAM_VALUE to a parameter without a default. If it is not part of a list, the index is None."""
     index = None if message.param_index == UNKNOWN_INDEX else message.param_index
     type_ = ParameterType.from_wire(message.param_type)
-    return Parameter(message.param_id, value_of(message, bytewise), type_, None, index)
+    return Parameter(message.param_id, value_of(message, bytewise), type_, default=None, index=index)
 
 
 def set_message(

@@ -190,7 +190,7 @@ def _ardupilot_xml(root: Element) -> Iterator[ParameterMetadata]:
             fields = {field.get("name", ""): field.text or "" for field in param.iter("field")}
             low, high = _range(fields.get("Range", ""))
             yield ParameterMetadata(
-                param.attrib["name"].rpartition(":")[2],
+                param.attrib["name"].rpartition(":")[2],  # without the vehicle type in "ArduCopter:RTL_SPEED"
                 short_description=param.get("humanName", ""),
                 description=param.get("documentation", ""),
                 unit=fields.get("Units", ""),

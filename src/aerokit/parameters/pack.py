@@ -188,14 +188,14 @@ def read_entry(data: bytes, position: int, previous_name: bytes) -> PackEntry | 
 
 
 def _parameters(data: bytes, with_defaults: bool, index: int) -> Iterator[Parameter]:
-    position, previous_name = HEADER.size, b""
-    while (position := _skip_padding(data, position)) < len(data):
+    position, previous_name = _skip_padding(data, HEADER.size), b""
+    while position < len(data):
         entry = read_entry(data, position, previous_name)
         if entry is None:
             _damaged(position, "it ends inside an entry")
         default = entry.value if entry.default is None and with_defaults else entry.default
         yield Parameter(_text(entry.name, position), entry.value, entry.type, default, index)
-        position, previous_name, index = entry.end, entry.name, index + 1
+        position, previous_name, index = _skip_padding(data, entry.end), entry.name, index + 1
 
 
 def _skip_padding(data: bytes, position: int) -> int:

@@ -211,7 +211,14 @@ def _by_name() -> Mapping[str, tuple[Rename, ...]]:
     two_way: dict[str, Rename] = {}
     for vehicles, divisor, pairs in GROUPS:
         for old, new in _pairs(pairs):
-            rename = Rename(old, new, divisor, old in INVERTED, vehicles, OTHER_NEW_NAMES.get(new, ()))
+            rename = Rename(
+                old,
+                new,
+                divisor,
+                is_inverted=old in INVERTED,
+                vehicles=vehicles,
+                other_new=OTHER_NEW_NAMES.get(new, ()),
+            )
             two_way.update(dict.fromkeys(rename.names, rename))
     for since, vehicles, divisor, pairs in OLDER:
         for old, new in _pairs(pairs):

@@ -293,6 +293,7 @@ async def radio_by_channels(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
                 highs[number] = max(pulse, highs.get(number, pulse))
 
         cleanup.callback(cell.observe(lambda _, value: on_channels(value), every_arrival=True))
+        # Execution continues behind each `yield` when the person has confirmed the step.
         yield run.step(0.0, "move all sticks and switches to all their ends, then continue", needs_confirmation=True)
         yield run.step(
             0.5, "centre the sticks, with the throttle at its lowest, then continue", needs_confirmation=True

@@ -78,42 +78,46 @@ def from_image(message: CameraImageCaptured, camera: int, received_at: float) ->
     quaternion = (w, x, y, z) if math.isfinite(length) and length > 0 else None
     roll, pitch, yaw = (None, None, None) if quaternion is None else _euler(quaternion)
     return Capture(
-        camera,
-        message.image_index,
-        message.capture_result == 1,
-        received_at,
-        _utc(message.time_utc),
-        place_of(message.lat, message.lon, message.alt / 1000, message.relative_alt / 1000),
-        quaternion,
-        roll,
-        pitch,
-        yaw,
-        message.file_url,
+        camera=camera,
+        index=message.image_index,
+        success=message.capture_result == 1,
+        received_at=received_at,
+        taken_at=_utc(message.time_utc),
+        place=place_of(message.lat, message.lon, message.alt / 1000, message.relative_alt / 1000),
+        quaternion=quaternion,
+        roll_deg=roll,
+        pitch_deg=pitch,
+        yaw_deg=yaw,
+        file_url=message.file_url,
     )
 
 
 def from_feedback(message: CameraFeedback, camera: int, received_at: float) -> Capture:
     """Decode ArduPilot's CAMERA_FEEDBACK, which counts from 1."""
-    angles = _angles(message.roll, message.pitch, message.yaw)
+    roll, pitch, yaw = _angles(message.roll, message.pitch, message.yaw)
     return Capture(
-        camera,
-        (message.img_idx - 1) % FEEDBACK_INDEX_RANGE,
-        True,
-        received_at,
-        _utc(message.time_usec),
-        place_of(message.lat, message.lng, message.alt_msl, message.alt_rel),
-        _quaternion_of(*angles),
-        *angles,
-        "",
+        camera=camera,
+        index=(message.img_idx - 1) % FEEDBACK_INDEX_RANGE,
+        success=True,
+        received_at=received_at,
+        taken_at=_utc(message.time_usec),
+        place=place_of(message.lat, message.lng, message.alt_msl, message.alt_rel),
+        quaternion=_quaternion_of(roll, pitch, yaw),
+        roll_deg=roll,
+        pitch_deg=pitch,
+        yaw_deg=yaw,
+        file_url="",
     )
 
 
 def from_trigger(message: CameraTrigger, camera: int, received_at: float, telemetry: Telemetry) -> Capture:
     """Decode PX4's CAMERA_TRIGGER. It has no position, so position and attitude of the vehicle are used."""
     position, attitude = telemetry.position.latest, telemetry.attitude.latest
-    angles: tuple[float | None, float | None, float | None] = (None, None, None)
+    roll: float | None = None
+    pitch: float | None = None
+    yaw: float | None = None
     if attitude is not None:
-        angles = _angles(attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg)
+        roll, pitch, yaw = _angles(attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg)
     place = None
     if position is not None:
         place = Position(
@@ -123,15 +127,17 @@ def from_trigger(message: CameraTrigger, camera: int, received_at: float, teleme
             position.altitude_relative_m,
         )
     return Capture(
-        camera,
-        message.seq,
-        None,
-        received_at,
-        _utc(message.time_usec),
-        place,
-        _quaternion_of(*angles),
-        *angles,
-        "",
+        camera=camera,
+        index=message.seq,
+        success=None,
+        received_at=received_at,
+        taken_at=_utc(message.time_usec),
+        place=place,
+        quaternion=_quaternion_of(roll, pitch, yaw),
+        roll_deg=roll,
+        pitch_deg=pitch,
+        yaw_deg=yaw,
+        file_url="",
     )
 
 
@@ -155,7 +161,7 @@ def _euler(quaternion: Quaternion) -> tuple[float, float, float]:
     length = math.sqrt(sum(value * value for value in quaternion))
     w, x, y, z = (value / length for value in quaternion)
     sine = max(-1.0, min(1.0, 2 * (w * y - z * x)))
-    if abs(sine) > MAX_PITCH_SINE:
+    if abs(sine) > MAX_PITCH_SINE:  # Roll and yaw turn about the same axis, so the whole turn counts as yaw.
         roll, yaw = 0.0, -2 * math.copysign(1, sine) * math.atan2(x, w)
     else:
         roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))

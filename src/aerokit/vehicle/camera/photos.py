@@ -70,7 +70,7 @@ class Shutter:
         async with self._lock:
             series = self.link.latest_order("series")
             before = await self.reliable_status()
-            known = {capture.index for capture in self.log.captures()}
+            known_indices = {capture.index for capture in self.log.captures()}
             error: CommandTimeout | None = None
             with CaptureQueue(self.log.cell) as new_captures, anyio.move_on_after(timeout):
                 attempts, error = 1, await self.order_photo(before)
@@ -78,34 +78,38 @@ class Shutter:
                     while capture := new_captures.pop():
                         # The camera may use the index of a failed picture again.
                         is_old = before is not None and capture.index < before.image_count
-                        if not is_old or capture.index not in known:
+                        if not is_old or capture.index not in known_indices:
                             return self._checked(capture)
                     round_trip_s = self.link.round_trip_s or 0.0
                     if await new_captures.wait(max(CHECK_INTERVAL_S, 2.0 * round_trip_s)):
                         continue
-                    now = await self.status()
-                    if now is None:
+                    status = await self.status()
+                    if status is None:
                         continue
-                    if before is None:
-                        # The order was accepted, so the newest picture is the one that was ordered.
-                        newest = now.image_count - 1
-                        is_missed = error is None and not now.is_capturing and newest >= 0 and newest not in known
-                        missed = await self.log.fetch(newest) if is_missed else None
-                    elif now.image_count > before.image_count:
-                        missed = await self.log.fetch(before.image_count)
-                    elif self.link.latest_order("series") is not series:
-                        continue  # A series was started or stopped, so the count of pictures proves nothing.
-                    elif error is not None and attempts < MAX_ORDER_ATTEMPTS and not now.is_capturing:
-                        # The camera reported after the order that it had taken no picture, so the order was lost.
-                        attempts, error = attempts + 1, await self.order_photo(before, is_repeated=True)
-                        continue
-                    else:
-                        continue
+                    missed = await self._fetch_missed(before, status, known_indices, is_accepted=error is None)
                     if missed is not None:
                         return self._checked(missed)
+                    # If a series was started or stopped meanwhile, the number of pictures proves nothing.
+                    is_series_unchanged = self.link.latest_order("series") is series
+                    was_lost = error is not None and is_series_unchanged and _has_taken_none(before, status)
+                    if was_lost and attempts < MAX_ORDER_ATTEMPTS:
+                        attempts, error = attempts + 1, await self.order_photo(before, is_repeated=True)
             raise error or self.link.timeout_error(
                 f"accepted the order, but reported no picture within {timeout:g} s; it may have taken one"
             )
+
+    async def _fetch_missed(
+        self, before: CameraStatus | None, status: CameraStatus, known_indices: set[int], *, is_accepted: bool
+    ) -> Capture | None:
+        """Request the capture of the ordered picture, if the status shows that it was taken."""
+        if before is not None:
+            was_taken = status.image_count > before.image_count
+            return await self.log.fetch(before.image_count) if was_taken else None
+        # Without a status from before an accepted order, the newest picture counts as the ordered one.
+        newest = status.image_count - 1
+        if is_accepted and not status.is_capturing and newest >= 0 and newest not in known_indices:
+            return await self.log.fetch(newest)
+        return None
 
     def _checked(self, capture: Capture) -> Capture:
         if capture.success is False:
@@ -148,10 +152,10 @@ class Shutter:
             return
 
         async def has_started() -> bool | None:
-            now = await self.reliable_status()
-            if now is None or before is None:
+            status = await self.reliable_status()
+            if status is None or before is None:
                 return None
-            return now.is_in_series or now.is_capturing or now.image_count > before.image_count
+            return status.is_in_series or status.is_capturing or status.image_count > before.image_count
 
         command = (START, self.link.device, seconds, count, 0)
         await self.link.order_once(order, lambda: self.link.command(*command, order=order, attempts=1), has_started)
@@ -159,6 +163,11 @@ class Shutter:
     @property
     def stop_command(self) -> tuple[float, ...]:
         return (TRIGGER, 0, -1, 0, 0) if self.link.is_trigger else (STOP, self.link.device)
+
+
+def _has_taken_none(before: CameraStatus | None, status: CameraStatus) -> bool:
+    """Return True if the camera certainly has taken no picture between the two reports, and is taking none."""
+    return before is not None and status.image_count <= before.image_count and not status.is_capturing
 
 
 class PhotoInterval:
@@ -327,12 +336,12 @@ class PhotoInterval:
 
     async def _check_silence(self, silent_checks: int) -> None:
         """Request missed captures, or raise the error if the camera has ended the series or reports nothing more."""
-        now = await self._shutter.status(2.0 * CHECK_INTERVAL_S)
+        status = await self._shutter.status(2.0 * CHECK_INTERVAL_S)
         self._collect()
-        is_ahead = now is not None and self._next is not None and now.image_count > self._next
-        if now is not None and is_ahead and self._is_plausible(now.image_count - 1):
+        is_ahead = status is not None and self._next is not None and status.image_count > self._next
+        if status is not None and is_ahead and self._is_plausible(status.image_count - 1):
             await self._fetch_missing()
-        elif now is not None and not (now.is_in_series or now.is_capturing or self._waiting or self._failed):
+        elif status is not None and not (status.is_in_series or status.is_capturing or self._waiting or self._failed):
             raise OperationRejected(
                 f"{self._link.describe()} ended the series after {self._delivered + self._missed} pictures"
             )

@@ -247,7 +247,8 @@ class Component(ReadOnly):
             CommandRejected: the component refused.
             OperationTimeout: the message did not arrive.
         """
-        with self._session.subscriber.subscribe((message_type,), 100, "drop_oldest", None) as answers:
+        subscriber = self._session.subscriber
+        with subscriber.subscribe((message_type,), capacity=100, overflow="drop_oldest", rate_hz=None) as answers:
             refusal: CommandRejected | None = None
             with anyio.move_on_after(timeout):
                 for _ in range(REQUEST_ATTEMPTS):

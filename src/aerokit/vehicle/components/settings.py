@@ -189,8 +189,8 @@ class Settings:
                         on_progress=on_progress,
                     )
                     listed = await transfers.run(exchange)
-                    # Values in `_known` are newer than those in the list, because `_store` has recorded every message.
                     unlisted = {name: setting for name, setting in self._known.items() if name not in listed}
+                    # Values in `_known` are newer than those in the list, because `_store` has recorded every message.
                     self._known = {name: self._known.get(name, listed[name]) for name in listed} | unlisted
                     self._is_complete = True
                 return self.table

@@ -381,12 +381,13 @@ def _content_of(source: str | os.PathLike[str]) -> bytes:
 
 def _parse_entry(text: bytes) -> FileEntry | None:
     """Parse one entry of a listing; None for entries to skip."""
-    kind, rest = text[:1], text[1:].decode("utf-8", "replace")
-    if kind == b"D" and rest not in (".", ".."):
-        return FileEntry(rest.partition("\t")[0], None, True)
+    kind = text[:1]
+    name, _, size_text = text[1:].decode("utf-8", "replace").partition("\t")
+    if kind == b"D" and name not in (".", ".."):
+        return FileEntry(name, size=None, is_directory=True)
     if kind == b"F":
-        name, _, size = rest.partition("\t")
-        return FileEntry(name, int(size) if size.isascii() and size.isdigit() else None, False)
+        size = int(size_text) if size_text.isascii() and size_text.isdigit() else None
+        return FileEntry(name, size=size, is_directory=False)
     return None
 
 

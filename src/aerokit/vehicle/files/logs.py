@@ -360,7 +360,11 @@ async def log_path(
             entries = await files.list(directory, idle_timeout_s=idle_timeout_s)
         except FileError:
             continue
-        numbered = {int(match[1]): entry for entry in entries if (match := ARDUPILOT_NAME.fullmatch(entry.name))}
+        numbered: dict[int, FileEntry] = {}
+        for entry in entries:
+            match = ARDUPILOT_NAME.fullmatch(entry.name)
+            if match is not None:
+                numbered[int(match[1])] = entry
         if numbered:
             return _numbered_path(directory, numbered, log, has_grown)
         if any(entry.is_directory for entry in entries):

@@ -109,10 +109,11 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         return self
 
     async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
-        if self._stopped is None and (reason := self._takeover()):
+        reason = self._takeover() if self._stopped is None else None
+        if reason:
             self._stop(reason, hold=False)
         if self._stopped is None:
-            zero = self._zero_rates_command()  # created before `_end`, which lets the first gimbal change
+            zero = self._zero_rates_command()  # Before `_end`: afterwards, the first gimbal may be another one.
             self._end()
             self._stopped = SetpointStreamStopped("the block of these rates has ended")
             if error is None:

@@ -76,7 +76,7 @@ class PlanContext:
         self.lock: asyncio.Lock = asyncio.Lock()
         # The index is the MAV_MISSION_TYPE.
         self.caches: tuple[PlanCache, PlanCache, PlanCache] = (PlanCache(), PlanCache(), PlanCache())
-        self._current: Frame | None = None
+        self._current: Frame | None = None  # the last MISSION_CURRENT, decoded when it is needed
         session = vehicle_context.session
         session.at_close(
             session.connection.bus.attach_frames(MissionCurrent, self._on_current, system_id=session.system_id)
@@ -166,7 +166,7 @@ class MissionTracker:
         session.on_reboot.append(self.forget)
 
     @property
-    def last(self) -> int | None:
+    def last_item(self) -> int | None:
         """Index of the last item; None while the number of items is unknown."""
         count = self.count.latest
         return count - 1 if count else None
@@ -204,7 +204,7 @@ class MissionTracker:
             self.count.set(reported.total, self._source)
         self.progress.set(MissionProgress(current, self.count.latest, reported.state), self._source)
         self.current.set(current, self._source)
-        if current is not None and current == self.last:
+        if current is not None and current == self.last_item:
             self._last_item_current_at = self._session.connection.now()
         if current != before:
             self._detect_second_approach(before, current)

@@ -76,18 +76,20 @@ class MissionEndDetector:
         return has_landed if is_on_ground else is_reported
 
     def _is_end_reported(self) -> bool:
+        """Return True if the vehicle reports the end, be it a landing or a fall."""
         if self._tracker.is_complete:
+            # ArduPilot reports completion at home, PX4 already when it begins to return.
             at_home = self._ends_in_air and (self._session.autopilot.mission_completes_at_home or self._is_home)
             return not self._ends_by_landing or self._is_on_ground or at_home
         # ArduPlane returns in another mode than its mission mode, which stops the mission.
         if self._ends_in_air and self._is_landing:
             return self._is_on_ground or self._is_home
-        self._return_began_at = None
+        self._return_began_at = None  # The vehicle is not returning.
         if self._session.telemetry.is_confirmed_disarmed and self._is_landing:
             return True
         progress = self._tracker.progress.latest
         reports_state = progress is not None and progress.state != MissionState.UNKNOWN
-        last = self._tracker.last
+        last = self._tracker.last_item
         return not reports_state and last is not None and self._tracker.reached == last
 
     def failure(self, order: Order | None, *, is_paused: bool) -> str | None:
@@ -95,7 +97,8 @@ class MissionEndDetector:
         session, now = self._session, self._session.connection.now()
         if self._vehicle_context.arbiter.newest not in (self._order, order):
             return "another order was given"
-        if self._is_on_ground and (fall := self._ground.fall()):
+        fall = self._ground.fall() if self._is_on_ground else None
+        if fall:
             return f"{fall}, {self.describe()}"
         if self._ground.is_pending:
             return None
@@ -126,7 +129,7 @@ class MissionEndDetector:
     def _is_landing(self) -> bool:
         """True if the vehicle has changed from the mission mode to the mode of its last item (land or return)."""
         mode = self._session.telemetry.mode.latest
-        current, last = self._tracker.current.latest, self._tracker.last
+        current, last = self._tracker.current.latest, self._tracker.last_item
         return self._ends_by_landing and current is not None and current == last and mode in self._landing_modes
 
     @property

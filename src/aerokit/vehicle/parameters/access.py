@@ -123,7 +123,7 @@ class ParameterAccess:
                 is_temporary = isinstance(error, RemoteProtocolError) or (
                     isinstance(error, FileError) and error.code == MavFtpErr.NOSESSIONSAVAILABLE
                 )
-                self._has_pack = None if is_temporary else False
+                self._has_pack = None if is_temporary else False  # None: try the file again next time.
         await self._download_list(idle_timeout_s, on_progress)
 
     @contextmanager

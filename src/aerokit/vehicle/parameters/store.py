@@ -78,8 +78,10 @@ class ParameterStore:
 
     def replaced_value(self, name: str) -> int | float | None:
         """Return the value marked by `mark_replaced`, while messages with it are ignored."""
-        value, until = self._replaced.get(name, (0, 0.0))
-        return value if self._transfers.connection.now() < until else None
+        if name not in self._replaced:
+            return None
+        value, ignored_until = self._replaced[name]
+        return value if self._transfers.connection.now() < ignored_until else None
 
     def attach(self) -> Detach:
         transfers = self._transfers

@@ -55,11 +55,11 @@ class ResolvedParameter(Snapshot):
 def resolve_known(name: str, known: Mapping[str, Parameter]) -> ResolvedParameter | None:
     """Return the known parameter that has this name or another name of the same parameter; None if unknown."""
     if name in known:
-        return ResolvedParameter(name, known[name], False)
+        return ResolvedParameter(name, known[name], is_fresh=False)
     from aerokit.parameters.renames import resolve_rename
 
     renamed = resolve_rename(name, known)
-    return None if renamed is None else ResolvedParameter(name, known[renamed.name], False, renamed)
+    return None if renamed is None else ResolvedParameter(name, known[renamed.name], is_fresh=False, renamed=renamed)
 
 
 class NameResolver:

@@ -344,9 +344,10 @@ class NtripClient:
     async def _report_position(self) -> None:
         """Send the position to the caster every 10 s; while it is unknown, look for it every second."""
         with self._session.streaming("position", "gps"):
-            while (writer := self._writer) is not None:
-                if sentence := gga_sentence(self._session):
-                    writer.write(sentence)
+            while self._writer is not None:
+                sentence = gga_sentence(self._session)
+                if sentence:
+                    self._writer.write(sentence)
                 await anyio.sleep(POSITION_INTERVAL_S if sentence else POSITION_POLL_INTERVAL_S)
 
     def _close(self) -> None:
