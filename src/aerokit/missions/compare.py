@@ -174,28 +174,26 @@ def _convert(letter: str, value: float) -> Iterator[float]:
 
 
 def _convert_special(letter: str, value: float) -> Iterator[float]:
-    if letter == "f":
+    whole = math.trunc(value)
+    if letter == "f":  # 32-bit float
         yield struct.unpack("<f", struct.pack("<f", value))[0]
-    elif letter == "c":
-        yield float(min(255, math.trunc(value))) if value >= 0 else 0.0
-    elif letter == "U":
-        yield float(math.trunc(value) & 0xFFFF)
-    elif letter == "y":
+    elif letter == "c":  # 0 to 255
+        yield float(max(0, min(255, whole)))
+    elif letter == "U":  # 16 bits that wrap
+        yield float(whole & 0xFFFF)
+    elif letter == "y":  # heading
         yield value % 360.0
-    elif letter == "k":
+    elif letter == "k":  # centimetres
         yield math.trunc(value * 100.0) / 100.0
-    elif letter == "h" and abs(value) <= 65_504:
+    elif letter == "h" and abs(value) <= 65_504:  # 16-bit float, whose maximum is 65504
         yield struct.unpack("<e", struct.pack("<e", value))[0]
-    elif letter == "n":
-        yield math.trunc(value * 256.0) / 256.0 if 0 < value < 1 else float(min(255, math.trunc(value)))
-    elif letter in "rR":
-        yield math.copysign(_radius(abs(value), letter == "R"), value)
-
-
-def _radius(metres: float, in_a_byte: bool) -> float:
-    if not in_a_byte:
-        return float(math.trunc(metres))
-    return float(math.trunc(metres) if metres <= 255 else 10 * min(255, math.trunc(metres / 10)))
+    elif letter == "n":  # at most 255; below 1 in steps of 1/256
+        yield math.trunc(value * 256.0) / 256.0 if 0 < value < 1 else float(min(255, whole))
+    elif letter == "r":  # metres
+        yield float(whole)
+    elif letter == "R":  # metres in a byte, above 255 m in tens
+        radius = math.trunc(abs(value)) if abs(value) <= 255 else 10 * min(255, math.trunc(abs(value) / 10))
+        yield math.copysign(radius, value)
 
 
 ALTITUDE_TOLERANCE_M = 0.011  # ArduPilot stores altitudes in whole centimetres

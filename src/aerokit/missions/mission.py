@@ -248,7 +248,8 @@ def _place(item: MissionItem, index: int) -> Position:
         raise RemoteProtocolError(f"item {index} ({item.name}): {error}") from error
     # Only a return point has an altitude; `_return_item` writes 0 in the frame GLOBAL if it is unknown.
     has_altitude = item.command == MavCmd.NAV_FENCE_RETURN_POINT and (item.z != 0 or item.frame != MavFrame.GLOBAL)
-    return item.position or place if has_altitude else place
+    position_with_altitude = item.position if has_altitude else None
+    return position_with_altitude or place
 
 
 class RallyPoints(_ItemSequence):

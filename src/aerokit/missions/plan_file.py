@@ -147,8 +147,10 @@ def _check_required(document: JsonValue) -> None:
 def _missing_fields(plan: Any) -> Iterator[tuple[str, list[str]]]:
     """Yield each object of a plan with the names of the required fields that it lacks."""
     mission, fence, rally = (_member(plan, key) for key in ("mission", "geoFence", "rallyPoints"))
-    is_empty = mission is None and fence is None and rally is None
-    yield _missing_in("the document", plan, "fileType", "version", *(["mission"] if is_empty else []))
+    document_keys = ["fileType", "version"]
+    if mission is None and fence is None and rally is None:
+        document_keys.append("mission")
+    yield _missing_in("the document", plan, *document_keys)
     yield _missing_in("mission", mission, "version", "items")
     for path, item in _entries("mission.items", _member(mission, "items")):
         if _member(item, "type") == "SimpleItem":
@@ -263,7 +265,7 @@ def _required_place(value: JsonValue) -> Position:
 
 
 def _read_place(value: JsonValue, *, altitude: str) -> Position | None:
-    # Null coordinates mean no position.
+    """Return the place; None if coordinates are null. ``altitude`` tells its reference: "amsl" or "relative"."""
     elements = value.elements(2, 3)
     latitude, longitude = elements[0].number(-90, 90, null=True), elements[1].number(-180, 180, null=True)
     if math.isnan(latitude) or math.isnan(longitude):
@@ -295,7 +297,7 @@ def _update_mission(document: dict[str, Any], plan: Plan, old: Plan | None) -> N
     mission = document.setdefault("mission", {})
     if not mission:
         mission.update({"globalPlanAltitudeMode": 1, "items": [], "version": 2})
-        old = None
+        old = None  # There is nothing to keep.
     if old is None or plan.mission.items != old.mission.items:
         groups = read_entries(JsonValue(mission["items"], "plan", "mission.items").elements())
         mission["items"] = merged_entries(mission["items"], groups, plan.mission.items)

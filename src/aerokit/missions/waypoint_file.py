@@ -117,18 +117,18 @@ class _Row:
 
     def item(self) -> MissionItem:
         has_degrees = xy_scale(self.command, self.frame) == 10_000_000
-        latitude = self._number("latitude", 90.0 if has_degrees else math.inf, nan=True)
-        longitude = self._number("longitude", 180.0 if has_degrees else math.inf, nan=True)
+        latitude = self._number("latitude", 90.0 if has_degrees else math.inf, may_be_nan=True)
+        longitude = self._number("longitude", 180.0 if has_degrees else math.inf, may_be_nan=True)
         return MissionItem(
             self.command,
             self.frame,
-            self._number("param1", nan=True),
-            self._number("param2", nan=True),
-            self._number("param3", nan=True),
-            self._number("param4", nan=True),
+            self._number("param1", may_be_nan=True),
+            self._number("param2", may_be_nan=True),
+            self._number("param3", may_be_nan=True),
+            self._number("param4", may_be_nan=True),
             x=from_degrees(latitude, self.command, self.frame),
             y=from_degrees(longitude, self.command, self.frame),
-            z=self._number("altitude", nan=True),
+            z=self._number("altitude", may_be_nan=True),
             autocontinue=bool(self._integer("autocontinue", 0xFF)),
         )
 
@@ -138,13 +138,13 @@ class _Row:
             raise FileFormatError(f"{self.where}: {column} = {text!r}: expected a whole number from 0 to {high}")
         return int(text)
 
-    def _number(self, column: str, limit: float = math.inf, *, nan: bool = False) -> float:
+    def _number(self, column: str, limit: float = math.inf, *, may_be_nan: bool = False) -> float:
         text = self.texts[_COLUMNS.index(column)]
         try:
             value = float(text) if "_" not in text else math.inf  # float() would accept 1_000.
         except ValueError:
             value = math.inf
-        if math.isinf(value) or (math.isnan(value) and not nan) or abs(value) > limit:
+        if math.isinf(value) or (math.isnan(value) and not may_be_nan) or abs(value) > limit:
             bounds = f" from {-limit:g} to {limit:g}" if math.isfinite(limit) else ""
             raise FileFormatError(f"{self.where}: {column} = {text!r}: expected a number{bounds}")
         return value

@@ -160,15 +160,15 @@ def convert_from_ardupilot(items: Iterable[MissionItem], here: tuple[float, floa
     0°, 0° for the current position. It is replaced by the destination of the previous item, in the first item by
     ``here`` (latitude and longitude in degrees, None if unknown).
     """
-    place = None if here is None else (round(here[0] * 1e7), round(here[1] * 1e7))
+    current_xy = None if here is None else (round(here[0] * 1e7), round(here[1] * 1e7))
     for item in items:
         if item.frame in GLOBAL_FRAMES and not has_place(item.command):
             item = item.replace(frame=int(MavFrame.MISSION))
         if item.command in DESTINATIONS and item.frame in GLOBAL_FRAMES:
-            if place is not None and item.x == item.y == 0:
-                item = item.replace(x=place[0], y=place[1])
+            if current_xy is not None and item.x == item.y == 0:
+                item = item.replace(x=current_xy[0], y=current_xy[1])
             elif DEFAULT_XY not in (item.x, item.y):
-                place = round(item.x), round(item.y)
+                current_xy = round(item.x), round(item.y)
         yield item
 
 

@@ -354,13 +354,15 @@ def _shot(photo: Photo, time_boot_ms: int, unix_time: float) -> Shot:
     known_angles = [math.radians(angle) for angle in angles if angle is not None]
     message = partial(
         CameraImageCaptured,
-        time_boot_ms,
-        round(unix_time * 1e6),
-        0,
-        0 if place is None else round(place.latitude_deg * 1e7),
-        0 if place is None else round(place.longitude_deg * 1e7),
-        0 if place is None or place.altitude_amsl_m is None else round(place.altitude_amsl_m * 1000),
-        0 if place is None or place.altitude_relative_m is None else round(place.altitude_relative_m * 1000),
-        UNKNOWN_ATTITUDE if len(known_angles) < 3 else quaternion_from_euler(*known_angles),
+        time_boot_ms=time_boot_ms,
+        time_utc=round(unix_time * 1e6),
+        camera_id=0,
+        lat=0 if place is None else round(place.latitude_deg * 1e7),
+        lon=0 if place is None else round(place.longitude_deg * 1e7),
+        alt=0 if place is None or place.altitude_amsl_m is None else round(place.altitude_amsl_m * 1000),
+        relative_alt=0
+        if place is None or place.altitude_relative_m is None
+        else round(place.altitude_relative_m * 1000),
+        q=UNKNOWN_ATTITUDE if len(known_angles) < 3 else quaternion_from_euler(*known_angles),
     )
     return lambda **fields: message(**{"file_url": photo.url, **fields})

@@ -56,8 +56,9 @@ class EventSender:
         self._host.call_later(SEQUENCE_INTERVAL_S, self._send_sequence)
 
     def _on_request(self, request: m.RequestEvent, channel: Channel) -> None:
-        count = (request.last_sequence - request.first_sequence & 0xFFFF) + 1
-        requested = {request.first_sequence + number & 0xFFFF for number in range(min(count, MAX_STORED_EVENTS))}
+        # Sequence numbers have 16 bits, and wrap around.
+        count = ((request.last_sequence - request.first_sequence) & 0xFFFF) + 1
+        requested = {(request.first_sequence + i) & 0xFFFF for i in range(min(count, MAX_STORED_EVENTS))}
         stored = [event for event in self._sent if event.sequence in requested]
         for event in stored:
             self._host.send(event, channel)

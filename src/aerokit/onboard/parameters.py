@@ -276,6 +276,7 @@ def _as_stored(limit: float | None, default: ParameterValue) -> float | None:
 
 
 def _metadata_entry(row: _Row) -> dict[str, Any]:
+    """Return the entry of a parameter in the metadata file, without empty fields."""
     metadata = row.metadata
     entry: dict[str, Any] = {
         "name": metadata.name,

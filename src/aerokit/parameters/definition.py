@@ -366,19 +366,16 @@ class _Reader:
             setting = self._setting(node)
             if setting is not None:
                 settings.setdefault(setting.name, setting)
+        translations: dict[str, Mapping[str, str]] = {}
+        for node in root.iterfind("localization/locale"):
+            texts = {text.get("original", ""): text.get("translated", "") for text in node.iterfind("strings")}
+            translations[node.get("name", "")] = MappingProxyType(texts)
         return CameraDefinition(
             vendor=_text(None if head is None else head.find("vendor")),
             model=_text(None if head is None else head.find("model")),
             version=_int_or_zero("" if head is None else head.get("version", "")),
             settings=MappingProxyType(settings),
-            translations=MappingProxyType(
-                {
-                    node.get("name", ""): MappingProxyType(
-                        {text.get("original", ""): text.get("translated", "") for text in node.iterfind("strings")}
-                    )
-                    for node in root.iterfind("localization/locale")
-                }
-            ),
+            translations=MappingProxyType(translations),
         )
 
     def _setting(self, node: Element) -> SettingDefinition | None:

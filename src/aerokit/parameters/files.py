@@ -133,7 +133,9 @@ def parameter_file_text(
     rows = sorted(_rows(values), key=lambda row: row[0])
     if not rows:
         raise InvalidArgument("there are no parameters to write")
-    lines = [f"# {line}".rstrip() for comment in comments for line in comment.splitlines() or [""]]
+    lines: list[str] = []
+    for comment in comments:
+        lines += [f"# {line}".rstrip() for line in comment.splitlines() or [""]]  # An empty comment is an empty line.
     if format == "qgroundcontrol":
         lines += ["# Vehicle-Id Component-Id Name Value Type"]
         lines += [f"{system_id}\t{component_id}\t{name}\t{value}\t{int(kind)}" for name, value, kind in rows]

@@ -142,7 +142,7 @@ def pack_for_download(
             values.append(parameter.default)
         name, code = parameter.name.encode(), _code_of(parameter)
         entry = _entry(name, previous_name, code, *values)
-        # Bytes at the end of the entry that must be in one block, and how many of them would be in the next block.
+        # The value (and its default) at the end of the entry must not be split between two blocks.
         unsplit_size = _CODES[code][1].size * (len(values) if whole_defaults else 1)
         size_in_next_block = (len(file) + len(entry)) % block_size
         if 0 < size_in_next_block < unsplit_size:

@@ -3394,7 +3394,7 @@ class Camera(TwinOf["AsyncCamera"]):
         return self._loop.run(self.aio.load_captures, timeout=timeout)
 
     def read_picture(self, capture: Capture) -> bytes:
-        """Read the file of a picture by MAVFTP_URL, if its ``file_url`` begins with ``mftp:`` or ``/``; at most 16 MB.
+        """Read the file of a picture by MAVFTP, if its ``file_url`` begins with ``mftp:`` or ``/``; at most 16 MB.
 
         Raises:
             NotSupported: the capture has another URL, or none. Nothing was sent.

@@ -145,7 +145,7 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
         raise self._link.timeout_error(f"did not report {not_reported} within {timeout:g} s")
 
     async def read_picture(self, capture: Capture) -> bytes:
-        """Read the file of a picture by MAVFTP_URL, if its ``file_url`` begins with ``mftp:`` or ``/``; at most 16 MB.
+        """Read the file of a picture by MAVFTP, if its ``file_url`` begins with ``mftp:`` or ``/``; at most 16 MB.
 
         Raises:
             NotSupported: the capture has another URL, or none. Nothing was sent.

@@ -284,11 +284,12 @@ class PhotoInterval:
         """Sort the received captures into those to deliver and those that failed, and drop implausible indices."""
         while capture := self._new_captures.pop():
             first = self._first_after_reset(capture)
-            if first is not None:
+            if first is not None:  # The series goes on with the new indices.
                 self._known_reset_at = self._log.reset_at
                 self._next, self._is_start_guessed = first.index, False
                 self._newest, self._newest_at = first.index, self._link.now()
                 self._waiting = {first.index: first}
+            # Without a status, the first capture determines the start, unless a later one shows that it was corrupt.
             if self._next is None or self._contradicts_guess(capture.index):
                 self._next, self._is_start_guessed = capture.index, self._next is None
                 self._newest = capture.index - 1

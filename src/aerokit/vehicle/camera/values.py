@@ -208,12 +208,14 @@ def place_of(
 
 
 def information_of(message: m.CameraInformation, number: int) -> CameraInformation:
+    # Major, minor, patch and dev version, one byte each, lowest byte first.
     version = message.firmware_version
+    firmware = ".".join(str(version >> shift & 0xFF) for shift in (0, 8, 16, 24)) if version else ""
     return CameraInformation(
         number=number,
         vendor=_text(message.vendor_name),
         model=_text(message.model_name),
-        firmware=".".join(str(version >> shift & 0xFF) for shift in (0, 8, 16, 24)) if version else "",
+        firmware=firmware,
         focal_length_mm=_positive(message.focal_length),
         sensor_width_mm=_positive(message.sensor_size_h),
         sensor_height_mm=_positive(message.sensor_size_v),

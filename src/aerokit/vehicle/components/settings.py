@@ -268,7 +268,8 @@ class Settings:
         answers = await self._read(to_read, idle_timeout_s) if to_read else {}
         self._missing |= {read for read, answer in answers.items() if isinstance(answer, ParameterRejected)}
         if name in answers:
-            _setting_or_raise(answers[name])
+            _setting_or_raise(answers[name])  # The component may not have this setting.
+        # Checked again, because the values that were just read may exclude the setting or restrict it.
         checked_value = definition.checked(name, value, self._values())
         known = self._known.get(name)
         kind = defined.wire_type if known is None else known.type

@@ -119,7 +119,7 @@ class FileChannel:
                 await self._close(file.session, path, idle_timeout_s)
                 if attempt == MAX_OPEN_ATTEMPTS:
                     raise
-            except (OperationTimeout, ConnectionClosed, LinkError):  # An answer to closing is not to be expected.
+            except (OperationTimeout, ConnectionClosed, LinkError):  # The vehicle would not answer now.
                 self._close_soon(file.session, path)
                 raise
             except Exception:

@@ -189,7 +189,7 @@ class Files:
             f"write {path}",
             timeout=timeout,
             idle_timeout_s=idle_timeout_s,
-            missing=lambda: ((0, len(data)),),  # An incomplete write leaves nothing usable.
+            missing=lambda: ((0, len(data)),),  # After a failure, the whole file must be written again.
         ):
             await channel.with_file(
                 MavFtpOpcode.CREATEFILE,

@@ -407,6 +407,7 @@ async def _list_in(files: Files, directory: str, idle_timeout_s: float) -> tuple
 
 
 def _numbered_path(directory: str, entries: dict[int, FileEntry], log: LogEntry, has_grown: bool) -> str | None:
+    """Return the path of a log among ArduPilot's numbered files; log 1 is the file with the lowest number."""
     number = min(entries) + log.id - 1
     entry = entries.get(number)
     if entry is None or entry.size is None:

@@ -151,7 +151,7 @@ def _describe_state(orders: GimbalOrders, since: float) -> str:
     if device.failures:
         text += f", it reports {device.describe_failures()}"
     if device.manager_information is not None:
-        limits = information_of(device.device_id, orders.manager_id, device.manager_information, None)
+        limits = information_of(device.device_id, orders.manager_id, device.manager_information, device=None)
         text += f", its limits are pitch {_format_limits(limits.pitch_deg)}, yaw {_format_limits(limits.yaw_deg)}"
     return text
 
@@ -340,13 +340,19 @@ class PointingMixin(GimbalMixin):
         device = self._orders.device
         if device.manager_information is None or not device.checks_limits:
             return
-        limits = information_of(device.device_id, self._orders.manager_id, device.manager_information, None)
-        checks = (("pitch_deg", pitch, limits.pitch_deg), ("yaw_deg", yaw, limits.yaw_deg))
-        for name, angle, allowed in (*checks, ("roll_deg", roll or None, limits.roll_deg)):
-            if angle is None or allowed is None or allowed[1] - allowed[0] >= 360:
+        limits = information_of(device.device_id, self._orders.manager_id, device.manager_information, device=None)
+        checks = (
+            ("pitch_deg", pitch, limits.pitch_deg),
+            ("yaw_deg", yaw, limits.yaw_deg),
+            ("roll_deg", roll or None, limits.roll_deg),  # A roll of 0 is always allowed.
+        )
+        for name, angle, allowed in checks:
+            if angle is None or allowed is None:
                 continue
+            lowest, highest = allowed
             # The same yaw may be written as −90 or 270.
             turns = (-360, 0, 360) if name == "yaw_deg" else (0,)
-            if not any(allowed[0] <= angle + turn <= allowed[1] for turn in turns):
-                text = f"{self._orders.name} turns from {allowed[0]:g} to {allowed[1]:g}"
+            is_allowed = any(lowest <= angle + turn <= highest for turn in turns)
+            if not is_allowed and highest - lowest < 360:
+                text = f"{self._orders.name} turns from {lowest:g} to {highest:g}"
                 raise InvalidArgument(f"{name} = {angle:g} is not allowed: {text}")

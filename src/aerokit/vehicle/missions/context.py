@@ -193,6 +193,7 @@ class MissionTracker:
             cell.close(error)
 
     def _on_current(self, _: MissionProgress | None, reported: MissionProgress) -> None:
+        """Set the cells from MISSION_CURRENT, with the item numbers of the program, which do not count home."""
         before = self.current.latest
         current = None if reported.current is None else reported.current - self._offset
         if current is not None and current < 0:  # item 0 of ArduPilot, which is home

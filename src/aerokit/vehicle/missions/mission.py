@@ -55,17 +55,18 @@ class MissionEndDetector:
         session = vehicle_context.session
         self._vehicle_context, self._session = vehicle_context, session
         self._tracker, self._mode = tracker, mode
-        self._order = vehicle_context.arbiter.newest
-        last = items[-1].command if items else None
-        self._ends_by_landing = last in LANDING_COMMANDS
-        self._ends_in_air = last == MavCmd.NAV_RETURN_TO_LAUNCH and not session.autopilot.lands_after_return
+        self._order = vehicle_context.arbiter.newest  # the newest order when the wait began
+        last_command = items[-1].command if items else None
+        is_return = last_command == MavCmd.NAV_RETURN_TO_LAUNCH
+        self._ends_by_landing = last_command in LANDING_COMMANDS
+        self._ends_in_air = is_return and not session.autopilot.lands_after_return
         self._return_began_at: float | None = None
         self._landing_modes = tuple(
             session.autopilot.mode_for(purpose, is_vtol=session.telemetry.is_vtol) for purpose in ("return", "land")
         )
         self._grace_until = session.connection.now() + MODE_GRACE_S
         self._was_in_mode = False
-        self._left_at: float | None = None
+        self._left_at: float | None = None  # when the vehicle was first seen disarmed, or in an unexpected mode
         self._ground = GroundCheck(session)
 
     def has_ended(self) -> bool:
@@ -100,7 +101,7 @@ class MissionEndDetector:
         fall = self._ground.fall() if self._is_on_ground else None
         if fall:
             return f"{fall}, {self.describe()}"
-        if self._ground.is_pending:
+        if self._ground.is_pending:  # `has_ended` has not decided yet whether this is a landing.
             return None
         is_in_mode = session.telemetry.is_in(self._mode)
         self._was_in_mode = self._was_in_mode or is_in_mode

@@ -60,7 +60,7 @@ class MissionStallDetector:
             self._stall = StallDetector(self._session)
             return None
         should_move = self._should_move(current)
-        standstill = self._stall()
+        standstill = self._stall()  # for 12 s
         if standstill is not None and self._stall.follows_fast_descent and (should_move or self._is_on_ground):
             return standstill
         if not should_move or current != self._item:

@@ -282,7 +282,7 @@ class PlanTransfer(Generic[PlanT]):
             return True
         # ArduPilot clears the old mission before it reads the file, and refuses to do so while it flies the mission.
         is_flying = is_upload and self._type == 0 and self._context.is_flying_mission
-        return has_ftp and self._cache.has_file is not False and not is_flying
+        return has_ftp and self._cache.has_file is not False and not is_flying  # `has_file` is None until tried.
 
     def _on_file_error(self, error: Exception, method: str) -> None:
         """Transfer no files from now on. Raise the error if the caller chose files, or if files have worked before."""

@@ -94,6 +94,7 @@ class ParameterAccess:
         idle_timeout_s: float,
         on_progress: OnProgress | None,
     ) -> ParameterTable:
+        """Return the whole list: the known one, a cached one with the vehicle's hash, or a new one."""
         async with self._downloading:
             if self.store.is_complete and not refresh:
                 return self.store.table
@@ -300,7 +301,7 @@ class ParameterAccess:
                 idle_timeout_s=idle_timeout_s,
                 on_progress=on_progress,
             )
-            # Recently written parameters are read back.
+            # Recently written parameters are read back, and many reads need the raised rate.
             boost_after_s = 0.0 if len(recent) > MAX_READS_UNBOOSTED else math.inf
             with self._boosted(after_s=boost_after_s):
                 answers = await transfers.run(exchange)

@@ -115,14 +115,13 @@ class ParameterStore:
         if message.param_id == HASH_NAME or not message.param_id:
             return
         received = parameter_of(message, self.bytewise)
-        name, old, new = received.name, self._known.get(received.name), received
+        name, old = received.name, self._known.get(received.name)
         if old is None and len(self._known) >= MAX_PARAMETERS:
             return
         replaced_value = self.replaced_value(name)
         if old is not None and replaced_value is not None and same_value(received.value, replaced_value):
-            return
-        if old is not None:
-            new = merge_update(old, received, self.bytewise)
+            return  # a late message, from before the last write
+        new = received if old is None else merge_update(old, received, self.bytewise)
         self._known[name], self._table = new, None
         self.updates += 1
         self.count = message.param_count

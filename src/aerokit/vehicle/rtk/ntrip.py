@@ -339,7 +339,7 @@ class NtripClient:
                 if b"ENDSOURCETABLE" in data or len(text) > MAX_TABLE_SIZE:
                     break
         rows = [line.split(";") for line in text.decode("latin-1").splitlines() if line.startswith("STR;")]
-        return {printable(row[1]): row[11:12] == ["1"] for row in rows if len(row) > 1}
+        return {printable(row[1]): len(row) > 11 and row[11] == "1" for row in rows if len(row) > 1}
 
     async def _report_position(self) -> None:
         """Send the position to the caster every 10 s; while it is unknown, look for it every second."""
