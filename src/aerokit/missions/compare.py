@@ -295,6 +295,7 @@ def _same_number(expected: MissionItem, actual: MissionItem, field: str, storage
     if _close(value, actual_value):
         return True
     if field == "param4" and expected.command in _HEADING_IS_PARAM4 and storage in (ItemStorage.PX4, ItemStorage.ANY):
+        # A heading, for which 359.9995 and 0 are close.
         turn = abs(value - actual_value) % 360.0
         if min(turn, 360.0 - turn) <= HEADING_TOLERANCE_DEG:
             return True

@@ -75,7 +75,7 @@ def parse_plan(text: str, name: str = "plan") -> Plan:
         Fence() if fence is None else _read_fence(fence),
         RallyPoints() if rally is None else _read_rally(rally),
         *_read_numbers(mission),
-        text,
+        source=text,
     )
 
 

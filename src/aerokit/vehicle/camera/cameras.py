@@ -270,6 +270,7 @@ class Cameras:
             return 0
         is_from_autopilot = frame.component_id == self._session.component_id
         number = device if is_from_autopilot else frame.component_id
+        # The numbers 1 to 6 belong to the autopilot's cameras, and no others do.
         if (number in AUTOPILOT_CAMERA_IDS) != is_from_autopilot or number == 0:
             return 0
         numbers = self.cell.latest or ()

@@ -367,7 +367,7 @@ async def log_path(
                 numbered[int(match[1])] = entry
         if numbered:
             return _numbered_path(directory, numbered, log, has_grown)
-        if any(entry.is_directory for entry in entries):
+        if any(entry.is_directory for entry in entries):  # PX4 has a directory for each day or session.
             logs = await _list_in(files, directory, idle_timeout_s)
             has_size = log.id < len(logs) and logs[log.id].size == log.size
             return logs[log.id].path if has_size else None

@@ -291,6 +291,7 @@ class PlanTransfer(Generic[PlanT]):
         self._cache.has_file = False
 
     async def _send_items(self, items: Sequence[MissionItem], method: str, *, verify: bool) -> None:
+        """Send all items; read them back to verify them, or if the vehicle's answers to the upload were ambiguous."""
         result = await self._channel.send(items)
         self._cache.set(items, self._context.now())
         if (result.is_confirmed and not verify) or await self._has_checksum_of(items):
