@@ -44,7 +44,8 @@ class EventSender:
         self._sequence = (self._sequence + 1) & 0xFFFF
         levels = severity << 4 | severity  # the level for logs, and the level for other programs
         time_ms, data = self._host.time_boot_ms, bytes(arguments).ljust(MAX_ARGUMENT_BYTES, b"\0")
-        event = m.Event(0, 0, event_id, time_ms, self._sequence, levels, data)
+        destination = (0, 0)  # all components
+        event = m.Event(*destination, event_id, time_ms, self._sequence, levels, data)
         self._sent.append(event)
         self._host.send(event)
         if is_first:

@@ -137,7 +137,7 @@ class DirectoryFiles:
             except (OSError, FileFault):
                 if path not in self._memory:
                     raise
-        if self._root is None or path in self._memory:
+        if self._root is None or path in self._memory:  # Raises if the path is in neither of them.
             sizes.update(self._memory.entries(path))
         return sorted(sizes.items())
 

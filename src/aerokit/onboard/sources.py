@@ -158,7 +158,8 @@ class ComponentSources:
         angles = (math.radians(right_deg), math.radians(down_deg))
         kind = LandingTargetType.LIGHT_BEACON
         frame = MavFrame.BODY_FRD
-        self._send(m.LandingTarget(self._time_us(), target_number, frame, *angles, distance_m, 0.0, 0.0, type=kind))
+        size = (0.0, 0.0)  # unknown
+        self._send(m.LandingTarget(self._time_us(), target_number, frame, *angles, distance_m, *size, type=kind))
 
     def send_corrections(self, rtcm: bytes) -> None:
         """Send GNSS corrections (RTCM 3) in GPS_RTCM_DATA messages.

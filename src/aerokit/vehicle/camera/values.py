@@ -313,7 +313,7 @@ def tracked_place_of(message: m.CameraTrackingGeoStatus) -> TrackedPlace:
     heading = finite_or_none(message.hdg)
     return TrackedPlace(
         is_active=bool(message.tracking_status & TrackingFlags.ACTIVE),
-        place=place_of(message.lat, message.lon, message.alt, None),
+        place=place_of(message.lat, message.lon, message.alt, altitude_relative_m=None),
         horizontal_accuracy_m=finite_or_none(message.h_acc),
         vertical_accuracy_m=finite_or_none(message.v_acc),
         north_m_s=finite_or_none(message.vel_n),

@@ -55,6 +55,7 @@ SET_SERVO = SimpleOrder("set_servo", MavCmd.DO_SET_SERVO, (SERVO, PULSE), Effect
 REPEAT_SERVO = SimpleOrder("repeat_servo", MavCmd.DO_REPEAT_SERVO, (SERVO, PULSE, COUNT, PERIOD))
 SET_RELAY = SimpleOrder("set_relay", MavCmd.DO_SET_RELAY, (RELAY, ON), Effect("RelayStatus", _is_switched))
 REPEAT_RELAY = SimpleOrder("repeat_relay", MavCmd.DO_REPEAT_RELAY, (RELAY, COUNT, PERIOD))
+GEAR_DOWN, GEAR_UP = 0, 1
 LANDING_GEAR = SimpleOrder("landing_gear", MavCmd.AIRFRAME_CONFIGURATION, (ALL_GEARS, Argument("up", 0, 1)))
 LIGHTS = SimpleOrder("set_lights", MavCmd.ILLUMINATOR_ON_OFF, (ON,), Effect("IlluminatorStatus", _is_lit))
 PARACHUTE = SimpleOrder("parachute", MavCmd.DO_PARACHUTE, (Argument("action", 0, 2),))
@@ -176,7 +177,7 @@ class Actuators(ReadOnly):
         # Old reports count too, because a vehicle on the ground stands on its gear until it reports a take-off.
         if telemetry.landed_state.latest == MavLandedState.ON_GROUND or telemetry.is_confirmed_disarmed:
             raise OperationRejected("raise_landing_gear: the vehicle is disarmed or on the ground; nothing was sent")
-        await LANDING_GEAR.send(self._context, 1, topic="landing gear")
+        await LANDING_GEAR.send(self._context, GEAR_UP, topic="landing gear")
 
     async def lower_landing_gear(self) -> None:
         """Deploy the landing gear; returns at the acknowledgement.
@@ -184,7 +185,7 @@ class Actuators(ReadOnly):
         Raises:
             NotSupported, CommandRejected, CommandTimeout: as for ``raise_landing_gear``.
         """
-        await LANDING_GEAR.send(self._context, 0, topic="landing gear")
+        await LANDING_GEAR.send(self._context, GEAR_DOWN, topic="landing gear")
 
     async def set_lights(self, on: bool, *, component_id: int = MavComponent.ILLUMINATOR) -> None:
         """Switch an illuminator, and return when ILLUMINATOR_STATUS reports it (MAV_CMD_ILLUMINATOR_ON_OFF).

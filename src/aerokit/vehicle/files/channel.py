@@ -76,7 +76,7 @@ class FileChannel:
                     for session in tuple(self._closing):
                         await self._finish_closing(session, idle_timeout_s)
                     yield
-        except OperationTimeout:
+        except OperationTimeout:  # a TimeoutError from inside the operation
             raise
         except TimeoutError:
             raise FileTimeout(f"{description}: not done within {timeout:g} s", missing=missing()) from None
@@ -288,7 +288,7 @@ class LogChannel:
                     except BaseException:
                         self._end()
                         raise
-        except OperationTimeout:
+        except OperationTimeout:  # a TimeoutError from inside the operation
             raise
         except TimeoutError:
             raise FileTimeout(f"{description}: not done within {timeout:g} s", missing=missing()) from None

@@ -251,7 +251,7 @@ class GimbalControl:
         orders = self._orders
         params = orders.control_params(is_primary=self._is_primary)
         try:
-            await orders.send(None, CONFIGURE, *params)
+            await orders.send(None, CONFIGURE, *params)  # Taking control belongs to no order.
         except CommandRejected as error:
             if error.result == MavResult.UNSUPPORTED:
                 orders.raise_not_supported("has no gimbal manager whose control could be taken")

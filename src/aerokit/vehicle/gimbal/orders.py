@@ -179,6 +179,7 @@ class GimbalOrders:
         heading = 0.0 if attitude is None else attitude.yaw_deg
         yaw_from_nose = yaw if from_nose else math.remainder(yaw - heading, 360.0)
         if not await self.send_mount_mode(order, MavMountMode.MAVLINK_TARGETING, pitch, roll, yaw_from_nose):
+            # MOUNT_CONTROL, for older firmware, has a yaw from north.
             yaw_from_north = yaw + heading if from_nose else yaw
             message = MountControl(
                 self.session.system_id,

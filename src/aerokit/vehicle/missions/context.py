@@ -153,7 +153,9 @@ class MissionTracker:
         self.is_complete: bool = False
         self._reached_at = self._last_item_current_at = -math.inf
         self._is_approached_again = False
+        # True if the vehicle has flown the mission since its last end.
         self._was_active = False
+        # Until this time, a report of completion may be about the previous flight.
         self._stale_until = -math.inf
         telemetry = session.telemetry
         session.at_close(

@@ -386,6 +386,7 @@ class MissionControl(VehiclePlan["Mission"]):
         return None if progress is None else progress.current
 
     async def _enter_mode(self, mode: Mode, order: Order, timeout: float) -> None:
+        """Enter the mission mode by MISSION_START, or by a mode change if the vehicle does not support this command."""
         vehicle_context, session = self._vehicle_context, self._session
         if not session.autopilot.mission_starts_by_command:
             await vehicle_context.sender.change_mode(mode, order, timeout, reported_since=order.given_at)
@@ -393,7 +394,9 @@ class MissionControl(VehiclePlan["Mission"]):
         try:
             with vehicle_context.arbiter.changing_mode():
                 await vehicle_context.sender.send_long(order, MavCmd.MISSION_START, modes=(mode,))
-                await vehicle_context.sender.await_mode(mode, order, [], timeout, order.given_at)
+                await vehicle_context.sender.await_mode(
+                    mode, order, refusals=[], timeout=timeout, reported_since=order.given_at
+                )
         except CommandRejected as error:
             if error.result != MavResult.UNSUPPORTED:
                 raise

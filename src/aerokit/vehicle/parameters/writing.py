@@ -308,9 +308,9 @@ class ParameterWriter:
     def _result(self, plan: _PlannedWrite, answers: Mapping[str, ParameterAnswer]) -> ParameterWrite:
         name, requested, answer = plan.resolved.requested, plan.requested, answers[plan.to_send.name]
         outcome = outcome_of(plan.to_send, plan.old, answer)
-        if not isinstance(outcome, str) or not isinstance(answer, Parameter):
-            error = outcome if isinstance(outcome, AerokitError) else ParameterRejected(name, name=name)
-            return _failed_write(name, requested, plan.resolved.as_requested(plan.old), error)
+        if isinstance(outcome, AerokitError):
+            return _failed_write(name, requested, plan.resolved.as_requested(plan.old), outcome)
+        assert isinstance(answer, Parameter)  # For all other answers, the outcome is an error.
         written = plan.resolved.as_requested(answer)
         notes = (plan.resolved.note, self._note_of(plan.to_send.name, answer.value))
         note = "; ".join(filter(None, notes))
