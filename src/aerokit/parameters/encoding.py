@@ -169,6 +169,7 @@ def number_text(value: float) -> str:
     if value == int(value) and abs(value) < 1e9:
         return "-0.0" if str(value) == "-0.0" else str(int(value))  # int() would lose the sign of -0.0.
     number = to_float32(value)
+    # Nine digits identify every 32-bit float.
     candidates = (f"{number:.{digits}g}" for digits in range(6, 10))
     return next(text for text in candidates if to_float32(float(text)) == number)
 
