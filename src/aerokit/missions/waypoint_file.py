@@ -70,7 +70,8 @@ def parse_waypoints(text: str, name: str = "waypoints") -> Mission:
     ]
     if not rows or version[2] != "110" or not rows[0].is_home():
         return Mission([row.item() for row in rows])
-    return Mission(shift_jumps([row.item() for row in rows[1:]], -1), rows[0].home())
+    home = rows[0].home()
+    return Mission(shift_jumps([row.item() for row in rows[1:]], -1), home)
 
 
 def format_waypoints(mission: Mission, *, version: int = 110) -> str:

@@ -381,9 +381,9 @@ def _content_of(source: str | os.PathLike[str]) -> bytes:
 
 def _parse_entry(text: bytes) -> FileEntry | None:
     """Parse one entry of a listing; None for entries to skip."""
-    kind = text[:1]
-    name, _, size_text = text[1:].decode("utf-8", "replace").partition("\t")
-    if kind == b"D" and name not in (".", ".."):
+    kind, name_and_size = text[:1], text[1:].decode("utf-8", "replace")
+    name, _, size_text = name_and_size.partition("\t")
+    if kind == b"D" and name_and_size not in (".", ".."):
         return FileEntry(name, size=None, is_directory=True)
     if kind == b"F":
         size = int(size_text) if size_text.isascii() and size_text.isdigit() else None
