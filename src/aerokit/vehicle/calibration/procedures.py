@@ -48,7 +48,7 @@ async def px4_by_status_texts(run: CalibrationRun, *params: float) -> AsyncGener
     await run.begin(CANCEL_ALL)
     telemetry, now = run.session.telemetry, run.session.connection.now
     reports: deque[CalibrationReport] = deque()
-    calibrating_at = math.inf
+    calibrating_at = math.inf  # when the vehicle last reported that it calibrates
     with ExitStack() as cleanup:
 
         def on_text(text: str) -> None:
@@ -71,7 +71,7 @@ async def px4_by_status_texts(run: CalibrationRun, *params: float) -> AsyncGener
             if not reports:
                 run.finish()
                 raise OperationTimeout(
-                    f"{run.what}: the vehicle has ended the calibration, but its status text with the result was lost;"
+                    f"{run.call_name}: the vehicle has ended the calibration, but its status text with the result was lost;"
                     f" {run.session.describe_link()}"
                 )
             report = reports.popleft()
@@ -149,7 +149,7 @@ async def _restore(run: CalibrationRun, name: str, value: float) -> None:
             return
     logger.warning(
         "%s was left early; perhaps %s was not restored to %g: set it, or the motors get full throttle at boot",
-        run.what,
+        run.call_name,
         name,
         value,
     )
@@ -160,7 +160,7 @@ async def _read_parameter(run: CalibrationRun, name: str) -> float:
         return (await run.parameters().read(name)).value
     except ParameterRejected:
         firmware = run.session.autopilot.firmware
-        raise NotSupported(f"{run.what}: this {firmware} vehicle has no parameter {name}") from None
+        raise NotSupported(f"{run.call_name}: this {firmware} vehicle has no parameter {name}") from None
 
 
 async def ardupilot_compass(run: CalibrationRun, *_: float) -> AsyncGenerator[CalibrationStep, None]:

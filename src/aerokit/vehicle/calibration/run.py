@@ -55,7 +55,7 @@ class CalibrationRun:
         self.session: VehicleSession = context.session
         self.sensor: str = sensor
         self.parameters: Callable[[], Parameters] = parameters
-        self.what: str = f"calibrate.{sensor}"  # the call, for error texts
+        self.call_name: str = f"calibrate.{sensor}"  # for error texts
         self._runs = runs  # all runs of this vehicle that may be in progress
         self.step: partial[CalibrationStep] = partial(CalibrationStep, sensor)
         self._cancel_command: tuple[float, ...] | None = None  # MAV_CMD and its parameters
@@ -76,9 +76,9 @@ class CalibrationRun:
         autopilot = self.session.autopilot
         if not autopilot.calibration_protocol:
             raise NotSupported(
-                f"{self.what}: aerokit does not know how to calibrate {autopilot.firmware}; nothing was sent"
+                f"{self.call_name}: aerokit does not know how to calibrate {autopilot.firmware}; nothing was sent"
             )
-        self.session.check_disarmed(self.what, is_current=self.context.arbiter.is_known)
+        self.session.check_disarmed(self.call_name, is_current=self.context.arbiter.is_known)
 
     async def begin(self, cancel: tuple[float, ...] | None, why_not_cancelled: str = "") -> None:
         """Wait until no other calibration is being cancelled, then register this calibration as running.
@@ -92,7 +92,7 @@ class CalibrationRun:
         await anyio.lowlevel.checkpoint()
         for run in tuple(self._runs):
             if not run._is_abandoned:
-                raise BusyError(f"{self.what}: {run.what} is in progress; nothing was sent")
+                raise BusyError(f"{self.call_name}: {run.call_name} is in progress; nothing was sent")
             await run.wait_cancelled()
         self.check_ready()
         self._cancel_command, self._why_not_cancelled = cancel, why_not_cancelled
@@ -144,7 +144,7 @@ class CalibrationRun:
             return
         self._is_abandoned = True
         if self._why_not_cancelled:
-            logger.warning("%s was left early: %s", self.what, self._why_not_cancelled)
+            logger.warning("%s was left early: %s", self.call_name, self._why_not_cancelled)
         if self._cancel_command is None or self._has_rebooted or self.session.is_closed:
             self.finish()
             return
@@ -166,10 +166,10 @@ class CalibrationRun:
         with anyio.move_on_after(MAX_CANCEL_ATTEMPTS * CANCEL_INTERVAL_S):
             await self._ended.wait()
         if self._why_not_cancelled:
-            raise NotSupported(f"{self.what}: {self._why_not_cancelled}")
+            raise NotSupported(f"{self.call_name}: {self._why_not_cancelled}")
         if not self._ended.is_set():
             raise OperationTimeout(
-                f"{self.what}: the vehicle did not confirm the cancellation; {self.session.describe_link()}"
+                f"{self.call_name}: the vehicle did not confirm the cancellation; {self.session.describe_link()}"
             )
 
     def _send_cancel(self, command: float, *params: float) -> None:
@@ -196,7 +196,7 @@ class CalibrationRun:
                     return
                 if self.context.arbiter.is_known:
                     self._send_cancel(*self._cancel_command)
-            logger.warning("%s: the vehicle did not confirm the cancellation", self.what)
+            logger.warning("%s: the vehicle did not confirm the cancellation", self.call_name)
         except (ConnectionClosed, LinkLost):  # The vehicle can no longer be reached.
             pass
         finally:
@@ -226,7 +226,7 @@ class CalibrationRun:
         """Wait for the vehicle's next report. Raises as `await_progress`."""
         await await_progress(
             self.session,
-            self.what,
+            self.call_name,
             is_done=lambda: bool(is_ready()),
             trouble=self._failure_reason,
             describe=lambda: timeout_text,
@@ -248,4 +248,4 @@ class CalibrationRun:
 
     def failure(self, reason: str) -> OperationRejected:
         """Return the error of a calibration that failed, with the vehicle's texts."""
-        return OperationRejected(f"{self.what}: {reason}", reasons=self.session.texts_since(self._started_at))
+        return OperationRejected(f"{self.call_name}: {reason}", reasons=self.session.texts_since(self._started_at))

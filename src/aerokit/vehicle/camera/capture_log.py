@@ -83,6 +83,7 @@ class CaptureLog:
         self._link = link
         self._by_index: dict[int, _Entry] = {}
         self._requested: set[int] = set()
+        # The entry with the highest plausible index, the last one far above it, and the last failed picture.
         self._highest: _Entry | None = None
         self._outlier: _Entry | None = None
         self._failed: _Entry | None = None
@@ -91,6 +92,7 @@ class CaptureLog:
         self._count_boot_ms = 0
         # Loop time of the last reset: earlier captures belong to another log.
         self.reset_at: float = -math.inf
+        # True if the camera sends CAMERA_IMAGE_CAPTURED, which makes CAMERA_TRIGGER superfluous.
         self._has_images = False
         self.cell: StateCell[Capture] = link.new_cell(
             "camera.capture", "CAMERA_IMAGE_CAPTURED, CAMERA_FEEDBACK or CAMERA_TRIGGER"

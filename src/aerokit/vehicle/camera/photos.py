@@ -134,7 +134,7 @@ class Shutter:
         except CommandRejected as error:
             if error.result != MavResult.UNSUPPORTED or self.link.is_trigger:
                 raise
-            try:
+            try:  # The camera may support the older command.
                 await self._send_digicam_control()
             except CommandRejected:
                 raise error from None

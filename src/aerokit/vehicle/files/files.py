@@ -300,7 +300,9 @@ class Files:
         async def read_file(file: RemoteFile) -> None:
             if file.size < into.start:  # shorter than what an interrupted download has already read
                 raise _ShorterError
-            if file.size < into.position and not is_virtual(path):
+            if file.size < into.position and not is_virtual(
+                path
+            ):  # The vehicle had closed it, and it was opened again.
                 raise RemoteProtocolError(f"read {path}: the file became shorter during the read")
             transfer = FtpDownload(
                 channel.client,

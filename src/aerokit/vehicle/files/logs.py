@@ -396,11 +396,11 @@ async def _list_in(files: Files, directory: str, idle_timeout_s: float) -> tuple
     except FileError:
         return ()
     matches = [PX4_LINE.fullmatch(line) for line in text.decode("utf-8", "replace").splitlines()]
-    logs = [
-        ListedLog(number, int(match[1]), int(match[2]), f"{directory}/{match[3].partition('/log/')[2]}")
-        for number, match in enumerate(matches)
-        if match is not None
-    ]
+    logs = []
+    for number, match in enumerate(matches):
+        if match is not None:
+            path_below_directory = match[3].partition("/log/")[2]
+            logs.append(ListedLog(number, int(match[1]), int(match[2]), f"{directory}/{path_below_directory}"))
     if len(logs) < len(matches):  # A file with other lines is not PX4's list.
         return ()
     return tuple(logs)

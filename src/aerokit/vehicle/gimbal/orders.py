@@ -170,7 +170,8 @@ class GimbalOrders:
                 return True
         if not order.is_newest:  # A newer order was given during the wait for the answer.
             return True
-        self.session.send(MountConfigure(self.session.system_id, self.manager_id, mode, 1, 1, 1))
+        stabilized = {"stab_roll": 1, "stab_pitch": 1, "stab_yaw": 1}
+        self.session.send(MountConfigure(self.session.system_id, self.manager_id, mode, **stabilized))
         return False
 
     async def send_mount_angles(self, order: Order, pitch: float, roll: float, yaw: float, *, from_nose: bool) -> None:

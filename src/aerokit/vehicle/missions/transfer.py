@@ -253,8 +253,7 @@ class PlanTransfer(Generic[PlanT]):
     async def clear(self) -> None:
         self._cache.forget(self._context.now())
         await self._channel.clear()
-        received = await self._channel.receive(only=())  # only the count
-        remaining = received.count - self._offset
+        remaining = (await self._channel.receive(only=())).count - self._offset  # Requests only the count.
         if remaining > 0:
             self._raise_mismatch((f"the vehicle still has items: {remaining}",))
 
