@@ -71,8 +71,8 @@ async def px4_by_status_texts(run: CalibrationRun, *params: float) -> AsyncGener
             if not reports:
                 run.finish()
                 raise OperationTimeout(
-                    f"{run.call_name}: the vehicle has ended the calibration, but its status text with the result was lost;"
-                    f" {run.session.describe_link()}"
+                    f"{run.call_name}: the vehicle has ended the calibration, but its status text with the result was"
+                    f" lost; {run.session.describe_link()}"
                 )
             report = reports.popleft()
             if report.kind in ("failed", "cancelled"):
