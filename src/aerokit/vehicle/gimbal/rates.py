@@ -109,10 +109,11 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         return self
 
     async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
-        if self._stopped is None and (reason := self._takeover()):
+        reason = self._takeover() if self._stopped is None else None
+        if reason:
             self._stop(reason, hold=False)
         if self._stopped is None:
-            zero = self._zero()
+            zero = self._zero_rates_command()  # Before `_end`: afterwards, the first gimbal may be another one.
             self._end()
             self._stopped = SetpointStreamStopped("the block of these rates has ended")
             if error is None:
@@ -137,8 +138,8 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         manager_id = self._orders.manager_id
         silent_for_s = min(self._orders.registry.silent_for_s(manager_id), self._now() - self._began_at)
         is_silent = manager_id != self._session.component_id and silent_for_s > SILENT_AFTER_S
-        silence = f"the gimbal's manager has been silent for {silent_for_s:.1f} s" if is_silent else None
-        return super()._why_stop(lag) or silence
+        manager_silence = f"the gimbal's manager has been silent for {silent_for_s:.1f} s" if is_silent else None
+        return super()._why_stop(lag) or manager_silence
 
     def _takeover(self) -> str | None:
         try:
@@ -149,19 +150,21 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         return SUPERSEDED if self._order is not None and not self._order.is_newest else None
 
     def _stop(self, reason: str, *, hold: bool = True) -> None:
-        zero = self._zero()
+        zero = self._zero_rates_command()
         super()._stop(reason, hold=hold)
         if hold:
             zero.send_soon()
         if self._taken is not None:
             self._stopped = self._taken
 
-    def _zero(self) -> ReleaseCommand:
+    def _zero_rates_command(self) -> ReleaseCommand:
         orders, order = self._orders, self._order
         params = (NAN, NAN, 0.0, 0.0, self._flags, 0, orders.gimbal_id_param)
-        return ReleaseCommand(
-            orders, PITCHYAW, params, lambda: order is not None and order.is_newest and not orders.is_taken
-        )
+
+        def is_still_due() -> bool:
+            return order is not None and order.is_newest and not orders.is_taken
+
+        return ReleaseCommand(orders, PITCHYAW, params, is_still_due)
 
     def _finish(self) -> None:
         self._stop("the block of the vehicle has ended")
