@@ -105,15 +105,17 @@ class _Rules:
 
     def check(self, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> None:
         rules = self._read() if self._by_name is None else self._by_name
-        rest = args[len(self._positional) :]
-        given = [
+        arguments = [
             *zip(self._positional, args),  # noqa: B905 - Python rejects surplus arguments itself
-            *((self._var_positional, value) for value in rest),
+            *((self._var_positional, value) for value in args[len(self._positional) :]),
             *kwargs.items(),
         ]
-        for name, value in given:
-            if name in rules and not rules[name][0](value):
-                raise _error(rules[name], name, value, dict(given).get("name"))
+        for name, value in arguments:
+            if name not in rules:
+                continue
+            is_allowed, _ = rules[name]
+            if not is_allowed(value):
+                raise _error(rules[name], name, value, vehicle_parameter=dict(arguments).get("name"))
 
     def _read(self) -> dict[str, Rule]:
         parameters = inspect.signature(self._function).parameters.values()
@@ -135,13 +137,16 @@ def _is_time(parameter: inspect.Parameter) -> bool:
     return str(parameter.annotation) in _SECONDS and name.endswith(("timeout", "_s")) and not is_speed
 
 
-def _error(rule: Rule, name: str, value: object, parameter: object) -> InvalidArgument:
-    """Describe an invalid argument. ``parameter`` is the argument called ``name``, which a ``value`` belongs to."""
+def _error(rule: Rule, name: str, value: object, vehicle_parameter: object) -> InvalidArgument:
+    """Create the error for an invalid argument.
+
+    ``vehicle_parameter`` is the argument ``name`` of the same call, if it has one: ``set(name="RTL_ALT", value="abc")``.
+    """
     check, allowed = rule
     hint = _hint(check, value)
-    if name == "value" and isinstance(parameter, str):  # set("RTL_ALT", "abc")
+    if name == "value" and isinstance(vehicle_parameter, str):
         return InvalidArgument(
-            f"value = {short_repr(value)} of {parameter[:40]} is not allowed: it must be {allowed}{hint}"
+            f"value = {short_repr(value)} of {vehicle_parameter[:40]} is not allowed: it must be {allowed}{hint}"
         )
     return InvalidArgument(f"{name} = {short_repr(value)} is not allowed: {allowed}{hint}")
 
@@ -156,10 +161,11 @@ def _hint(check: Check, value: object) -> str:
 
 
 def _rule(node: ast.expr, names: Mapping[str, Any]) -> Rule:
+    """Return the rule of an annotation. ``names`` are the globals of the module that has the annotation."""
     if isinstance(node, ast.BinOp):
-        (is_left, left), (is_right, right) = _rule(node.left, names), _rule(node.right, names)
-        return (lambda value: is_left(value) or is_right(value)), f"{left} or {right}"
-    if isinstance(node, ast.Constant):
+        (is_left, left_text), (is_right, right_text) = _rule(node.left, names), _rule(node.right, names)
+        return (lambda value: is_left(value) or is_right(value)), f"{left_text} or {right_text}"
+    if isinstance(node, ast.Constant):  # None is the only constant in our annotations.
         return _SIMPLE["None"]
     if isinstance(node, ast.Subscript):
         return _generic_rule(_name_of(node.value), node.slice, names)
@@ -167,22 +173,25 @@ def _rule(node: ast.expr, names: Mapping[str, Any]) -> Rule:
 
 
 def _name_of(node: ast.expr) -> str:
-    return node.attr if isinstance(node, ast.Attribute) else node.id if isinstance(node, ast.Name) else ""
+    """Return the last part of a name: ``Path`` for ``Path`` and ``pathlib.Path``; empty for other expressions."""
+    if isinstance(node, ast.Attribute):
+        return node.attr
+    return node.id if isinstance(node, ast.Name) else ""
 
 
 def _named_rule(name: str, names: Mapping[str, Any]) -> Rule:
     if name in _SIMPLE:
         return _SIMPLE[name]
-    found = names.get(name)
-    if isinstance(found, type):
-        return (lambda value: isinstance(value, found)), with_article(name)
-    if get_origin(found) is Literal:
-        choices = get_args(found)
+    annotated = names.get(name)
+    if isinstance(annotated, type):
+        return (lambda value: isinstance(value, annotated)), with_article(name)
+    if get_origin(annotated) is Literal:
+        choices = get_args(annotated)
         return partial(_is_one_of, choices), f"one of {', '.join(map(str, choices))}"
-    if isinstance(found, UnionType):
-        kinds = tuple(get_origin(kind) or kind for kind in get_args(found))
+    if isinstance(annotated, UnionType):
+        kinds = tuple(get_origin(kind) or kind for kind in get_args(annotated))
         return (lambda value: isinstance(value, kinds)), " or ".join(kind.__name__ for kind in kinds)
-    if name in ("Any", "object") or isinstance(found, TypeVar):
+    if name in ("Any", "object") or isinstance(annotated, TypeVar):
         return (lambda _: True), "anything"
     return partial(_has_class_name, name), with_article(name)
 
@@ -205,13 +214,15 @@ def _generic_rule(name: str, inner: ast.expr, names: Mapping[str, Any]) -> Rule:
 
 def _class_names(name: str, names: Mapping[str, Any]) -> tuple[str, ...]:
     """Return the names of the classes that ``type[name]`` allows; empty if it allows any class."""
-    found = names.get(name)
-    if not isinstance(found, TypeVar):
+    annotated = names.get(name)
+    if not isinstance(annotated, TypeVar):
         return () if name == "Any" else (name,)
-    bound = found.__bound__
-    if bound is None or isinstance(bound, type):
-        return () if bound is None else (bound.__name__,)
-    return tuple(bound.__forward_arg__.split(" | "))
+    bound = annotated.__bound__
+    if bound is None:
+        return ()
+    if isinstance(bound, type):
+        return (bound.__name__,)
+    return tuple(bound.__forward_arg__.split(" | "))  # a bound given as text: TypeVar(…, bound="Event | Message")
 
 
 def _is_one_of(choices: tuple[object, ...], value: object) -> bool:

@@ -47,10 +47,8 @@ class _Block(AbstractAsyncContextManager[T]):
             ) from None
         try:
             return await self._block.__aenter__()
-        except (
-            LinkOpenError,
-            InvalidArgument,
-        ) as error:  # the traceback inside this library does not help a user
+        except (LinkOpenError, InvalidArgument) as error:
+            # The traceback inside this library does not help a user.
             raise error.with_traceback(None) from error.__cause__
 
     async def __aexit__(
@@ -81,7 +79,7 @@ class _Block(AbstractAsyncContextManager[T]):
         )
 
 
-# Maps an attribute to the call that changes the reported value.
+# For error texts: maps a read-only attribute to the method call that changes the value on the vehicle.
 _SETTER_CALLS = {
     "mode": "set_mode({value})",
     "mode_name": "set_mode({value})",
@@ -103,12 +101,12 @@ class ReadOnly:
     """
 
     def __setattr__(self, name: str, value: object) -> None:
-        found = inspect.getattr_static(type(self), name, None)
-        is_setter = isinstance(found, property) and found.fset is not None
-        is_descriptor = hasattr(type(found), "__get__")
-        # A callable is a method that a mock replaces. Attributes without a descriptor are set in the constructor or by
-        # programs.
-        if name.startswith("_") or is_setter or callable(found) or not is_descriptor:
+        attribute = inspect.getattr_static(type(self), name, None)
+        is_setter = isinstance(attribute, property) and attribute.fset is not None
+        is_descriptor = hasattr(type(attribute), "__get__")
+        # A program may replace methods, e.g. by mocks. Attributes without a descriptor are set by the constructor or by
+        # the program.
+        if name.startswith("_") or is_setter or callable(attribute) or not is_descriptor:
             object.__setattr__(self, name, value)
             return
         text = f"{type(self).__name__}.{name} = {short_repr(value)} is not allowed"
