@@ -85,7 +85,9 @@ async def open_video(
     stream = VideoStream(uri, vehicle)
     for name, value in (options or {}).items():
         if not isinstance(name, str) or not isinstance(value, str):
-            raise InvalidArgument(f"options: {name!r} = {value!r} is not allowed: names and values of FFmpeg options are strings")
+            raise InvalidArgument(
+                f"options: {name!r} = {value!r} is not allowed: names and values of FFmpeg options are strings"
+            )
     defaults = LIVE_OPTIONS if "://" in uri else {}
     thread = _Reader(uri, {**defaults, **(options or {})}, (timeout, idle_timeout_s), stream)
     try:

@@ -140,7 +140,8 @@ def _is_time(parameter: inspect.Parameter) -> bool:
 def _error(rule: Rule, name: str, value: object, vehicle_parameter: object) -> InvalidArgument:
     """Create the error for an invalid argument.
 
-    ``vehicle_parameter`` is the argument ``name`` of the same call, if it has one: ``set(name="RTL_ALT", value="abc")``.
+    ``vehicle_parameter`` is the argument called ``name`` of the same call, if there is one, as in
+    ``set(name="RTL_ALT", value="abc")``.
     """
     check, allowed = rule
     hint = _hint(check, value)

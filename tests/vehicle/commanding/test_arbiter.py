@@ -245,8 +245,8 @@ def test_state_is_known_for_two_and_a_half_seconds() -> None:
     stage = Stage()
     for later, known in ((MODE_MAX_AGE_S, True), (0.1, False)):
         stage.now += later
-        assert stage.arbiter.is_known is known
-    assert not Stage(mode=None).arbiter.is_known
+        assert stage.arbiter.is_state_recent is known
+    assert not Stage(mode=None).arbiter.is_state_recent
 
 
 # --------------------------------------------------------------------------------- sendings

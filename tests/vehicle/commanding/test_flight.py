@@ -583,7 +583,7 @@ async def test_impact_is_detected_at_any_rate(rate_hz: float, flying: Flight) ->
             cell.set(Velocity(0.0, 0.0, sink), Source(1, 1, "the test"))
         assert not ground.confirms(seconds >= 3)
         await anyio.sleep(0.1)
-    assert "the vehicle hit the ground at" in (ground.trouble(lambda: None) or "")
+    assert "the vehicle hit the ground at" in (ground.failure_reason(lambda: None) or "")
 
 
 @pytest.mark.parametrize("moves_m_s", [0.0, 0.6])

@@ -78,7 +78,7 @@ class CalibrationRun:
             raise NotSupported(
                 f"{self.what}: aerokit does not know how to calibrate {autopilot.firmware}; nothing was sent"
             )
-        self.session.check_disarmed(self.what, is_current=self.context.arbiter.is_known)
+        self.session.check_disarmed(self.what, is_current=self.context.arbiter.is_state_recent)
 
     async def begin(self, cancel: tuple[float, ...] | None, why_not_cancelled: str = "") -> None:
         """Wait until no other calibration is being cancelled, then register this calibration as running.
@@ -152,7 +152,7 @@ class CalibrationRun:
         arbiter = self.context.arbiter
         # The arbiter ends this order when another party takes over, and the cancel command is then not repeated.
         self._sent = self._watch.enter_context(arbiter.sending(self._watch.enter_context(arbiter.auxiliary_order())))
-        if self.session.connection.is_open and arbiter.is_known:
+        if self.session.connection.is_open and arbiter.is_state_recent:
             self._send_cancel(*self._cancel)
         self.session.background.start(self._confirm_cancel, "aerokit calibration")
 
@@ -193,7 +193,7 @@ class CalibrationRun:
                 await self.session.wait_for_heartbeat(self._cancelled_at)
                 if self._has_rebooted or (self._sent is not None and self._sent.end):
                     return
-                if self.context.arbiter.is_known:
+                if self.context.arbiter.is_state_recent:
                     self._send_cancel(*self._cancel)
             logger.warning("%s: the vehicle did not confirm the cancellation", self.what)
         except (ConnectionClosed, LinkLost):
@@ -227,7 +227,7 @@ class CalibrationRun:
             self.session,
             self.what,
             is_done=lambda: bool(is_ready()),
-            trouble=self._trouble,
+            failure_reason=self._trouble,
             describe=lambda: missing,
             timeout=timeout,
         )

@@ -215,7 +215,7 @@ class Component(ReadOnly):
         on_progress: Callable[[int | None], None] | None = None,
     ) -> CommandAck:
         """Send any MAV_CMD as COMMAND_LONG and return the ACCEPTED ack, like :meth:`aerokit.Vehicle.command`."""
-        return await self._sender.answered(
+        return await self._sender.send_raw(
             self._session.commands.send_long,
             command,
             *params,

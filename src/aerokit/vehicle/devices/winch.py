@@ -177,7 +177,7 @@ class Winch(ReadOnly):
         effect = None if is_done is None else Effect("WinchStatus", is_done)
         await SimpleOrder(f"winch {action.name.lower()}", MavCmd.DO_WINCH, params, effect).send(
             self._context,
-            of=of,
+            device_order=of,
             topic=self._topic,
             component_id=self._component_id,
             timeout=timeout,

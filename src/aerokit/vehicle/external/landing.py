@@ -140,7 +140,7 @@ class TargetLanding:
     async def await_disarmed(self, order: Order, timeout: float | None, max_silence_s: float | None) -> None:
         """Wait until the vehicle is on the ground and disarmed."""
         telemetry, ground = self._session.telemetry, GroundCheck(self._session)
-        stays = self._context.sender.stays_until_disarmed(order)
+        stays = self._context.sender.landing_failure(order)
 
         def is_down() -> bool:
             height = height_above_home(self._session.telemetry)
@@ -159,7 +159,7 @@ class TargetLanding:
             self._session,
             "land_on",
             is_done=is_down,
-            trouble=lambda: ground.trouble(stays),
+            failure_reason=lambda: ground.failure_reason(stays),
             describe=describe,
             timeout=timeout,
             max_silence_s=max_silence_s,
