@@ -168,7 +168,7 @@ def sender(grounded: Flight) -> CommandSender:
 
 def awaits_answer(sender: CommandSender) -> bool:
     oldest = anyio.current_time() - PENDING_ACK_TIMEOUT_S
-    return any(at >= oldest for at in sender._under_way.get((1, BANNER), ()))
+    return any(at >= oldest for at in sender._pending_acks.get((1, BANNER), ()))
 
 
 async def test_unconfirmed_command_ack_is_expected_for_two_seconds(grounded: Flight, sender: CommandSender) -> None:

@@ -365,7 +365,7 @@ class LookActions(VehicleBase):
             OperationRejected: the mode changed, or a newer order was given, before the acknowledgement.
         """
         place = self._position.command_place(point_at(target))
-        if not self._session.commands.is_unknown(ROI_LOCATION) and await self._set_roi_location(place):
+        if not self._session.commands.is_unsupported(ROI_LOCATION) and await self._set_roi_location(place):
             return
         is_relative = place["frame"] == MavFrame.GLOBAL_RELATIVE_ALT_INT
         above_home_m = place["z"] if is_relative else place["z"] - self._position.home_altitude()
@@ -384,7 +384,7 @@ class LookActions(VehicleBase):
                 self._raise_if_superseded(order)
                 return False
             except CommandRejected:
-                if not self._session.commands.is_unknown(ROI_LOCATION):
+                if not self._session.commands.is_unsupported(ROI_LOCATION):
                     raise
                 self._raise_if_superseded(order)
                 return False

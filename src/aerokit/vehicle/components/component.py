@@ -370,7 +370,7 @@ class Components:
         self._statuses: dict[tuple[int, int], ComponentStatus] = {}
         session = context.session
         self.cell: StateCell[tuple[ComponentStatus, ...]] = session.connection.new_cell("components", "HEARTBEAT")
-        session.keep(self.cell)
+        session.register_cell(self.cell)
         bus = session.connection.bus
         session.at_close(bus.attach(m.Heartbeat, self._on_heartbeat, system_id=session.system_id))
         for message_type, field, kind in DEVICE_MESSAGES:

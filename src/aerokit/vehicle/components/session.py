@@ -52,13 +52,13 @@ class ComponentSession:
             session.system_id,
             component_id,
             self.rates,
-            keep=session.keep,
+            register_cell=session.register_cell,
             at_close=session.at_close,
         )
         version: StateCell[AutopilotVersion] = session.connection.new_cell(
             "version", f"AUTOPILOT_VERSION of component {component_id}"
         )
-        session.keep(version)
+        session.register_cell(version)
         self.transfers: Transfers = Transfers(
             session.connection,
             session.system_id,

@@ -182,8 +182,8 @@ class GimbalDevice:
         self._manager_rank = 0
         self._status_ms = 0
         self._system_id = context.session.system_id
-        context.session.keep(self.attitude)
-        context.session.keep(self.controllers)
+        context.session.register_cell(self.attitude)
+        context.session.register_cell(self.controllers)
 
     def _request_attitude(self, session: VehicleSession) -> Detach | None:
         """Request GIMBAL_DEVICE_ATTITUDE_STATUS from the autopilot, unless another component sends the attitude."""
