@@ -311,7 +311,8 @@ class ArmingActions(VehicleBase):
         if not force:
             self._session.check_disarmed("reboot")
         reboots_before = self._session.watch.reboots
-        self._session.link_watch.request_time()  # A reboot is recognised because the time since boot is shorter then.
+        # A reboot is recognised by a shorter time since boot, so the present one must be known.
+        self._session.link_watch.request_time()
         unanswered: CommandTimeout | None = None
         with self._session.watch.expecting_reboot():
             try:

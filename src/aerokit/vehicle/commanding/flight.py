@@ -100,7 +100,7 @@ class FlightActions(VehicleBase):
             with self._flight_cleanup.flying(order):
                 await self._await_altitude(altitude_m, timeout, max_silence_s, order)
         except (anyio.get_cancelled_exc_class(), OperationTimeout):
-            # The vehicle may have received the command.
+            # The vehicle may have received the command, so it is ordered to hold.
             self._flight_cleanup.hold_in_background(order)
             raise
         except CommandRejected as error:
@@ -353,5 +353,6 @@ class ModeActions(VehicleBase):
             return order.failsafe
         may_have_landed = self.telemetry.landed_state.latest != MavLandedState.IN_AIR
         if may_have_landed and self.telemetry.armed.updated_at < order.mode_lost_at:
-            return ""  # PX4 leaves LAND on disarming, and CURRENT_MODE may arrive before HEARTBEAT.
+            # PX4 leaves LAND when it disarms. CURRENT_MODE may report this before HEARTBEAT reports disarmed.
+            return ""
         return order.takeover_reason

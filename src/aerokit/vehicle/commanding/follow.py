@@ -264,7 +264,9 @@ class FollowStream(SteeringStream[TargetState]):
                 raise OperationRejected("follow: the vehicle's altitude above sea level is unknown; a hold was ordered")
             self._own_altitude_m = here.altitude_amsl_m
         elif target.altitude_amsl_m is None and target.altitude_relative_m is None:
-            raise InvalidArgument("height_m is not allowed: the target has no altitude; a hold was ordered")
+            raise InvalidArgument(
+                f"height_m = {self._place.height_m:g} is not allowed: the target has no altitude; a hold was ordered"
+            )
 
     # ------------------------------------------------------------------------------ the stream
 

@@ -124,12 +124,13 @@ class GroundCheck:
     def _has_settled(self, now: float, updated_at: float) -> bool:
         """Return True if the vehicle moves as on the ground; ``updated_at`` is the time of the last velocity."""
         reported_at = now if self._reported_at is None else self._reported_at
-        if now - updated_at > VELOCITY_MAX_AGE_S:  # Without velocities, the report that it has landed counts.
+        if now - updated_at > VELOCITY_MAX_AGE_S:
+            # Without a recent velocity, it is enough that the vehicle reports to be on the ground.
             return True
         if abs(self._down_m_s()) >= SETTLED_M_S:
             self._settled_since = math.inf
             height_m = height_above_home(self._session.telemetry)
-            # The velocity may be wrong. The vehicle stands if its height does not change.
+            # The reported velocity may be wrong: a vehicle whose height does not change stands on the ground.
             is_known = height_m is not None and self._reported_height_m is not None
             is_still = is_known and not _has_changed(self._reported_height_m, height_m, UNSETTLED_M)
             return is_still and now - reported_at >= UNSETTLED_S

@@ -213,7 +213,7 @@ class MessagingActions(VehicleBase):
         """
         if or_long and frame != MavFrame.GLOBAL:
             raise InvalidArgument(f"frame = {frame} is not allowed with or_long: MAV_FRAME_GLOBAL (0)")
-        frame_option = {} if or_long else {"frame": frame}  # `send_place` has no choice of frames.
+        frame_option = {} if or_long else {"frame": frame}  # `send_place` has a fixed frame.
         return await self._sender.send_raw(
             self._session.commands.send_place if or_long else self._session.commands.send_int,
             command,
@@ -257,7 +257,7 @@ class MessagingActions(VehicleBase):
             elif message.base_mode & CUSTOM_MODE_ENABLED:
                 modes = (self.autopilot.mode(message.custom_mode, message.base_mode, names),)
             self._arbiter.raw_order(subjects, modes=modes)
-        elif subjects:  # A set-point does not end the action in progress, but posted orders.
+        elif subjects:  # A set-point ends posted orders, but not the action in progress.
             self._arbiter.supersede(subjects)
 
     @contextmanager

@@ -319,7 +319,10 @@ class VehiclePosition:
         is_relative = relative_m is not None
         altitude = relative_m if relative_m is not None else amsl_m
         if altitude is None:
-            raise InvalidArgument("the target has no altitude, and the vehicle's own is not known")
+            raise InvalidArgument(
+                f"target = {target} is not allowed: it has no altitude, and the vehicle's own altitude is unknown; give"
+                " the target altitude_relative_m or altitude_amsl_m"
+            )
         check_range("altitude", altitude, -12_000, 100_000)
         if is_relative and not self.accepts_relative_altitude:
             altitude, is_relative = altitude + self.home_altitude(), False

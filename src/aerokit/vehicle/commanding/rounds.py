@@ -101,7 +101,7 @@ class RoundFlight:
             elif circle_m:
                 context.vehicle_position.record_circle(circle_m)
         except (anyio.get_cancelled_exc_class(), OperationTimeout):
-            # The vehicle may have received the command.
+            # The vehicle may have received the command, so it is ordered to hold.
             cleanup.hold_in_background(order)
             raise
         except OperationRejected:

@@ -56,7 +56,8 @@ class ValueStream(Generic[ValueT]):
     Subclasses implement entering and leaving the block, and what happens when the stream stops by itself.
     """
 
-    _NAME, _VALUE = "stream", "value"  # Nouns for the stream and its value in error texts.
+    # Nouns for the stream and its value in error texts.
+    _NAME, _VALUE = "stream", "value"
 
     def __init__(
         self,
@@ -142,7 +143,7 @@ class ValueStream(Generic[ValueT]):
 
     def _stop_reason(self, lag: float) -> str | None:
         """Return why the stream must stop, as a clause, else None; ``lag`` is the delay of this tick in seconds."""
-        # The program cannot supply values while the block is being entered.
+        # A value does not expire while the mode is changed, because the program cannot supply values then.
         age = 0.0 if self._is_changing_mode else self._now() - self._set_at
         if lag > self._max_lag_s:
             return f"the event loop was blocked for {lag:.1f} s"
@@ -253,7 +254,7 @@ class SteeringStream(ValueStream[ValueT]):
         """Leave the block while the stream is running."""
         self._end()
         self._stop_error = SetpointStreamStopped(f"the block of this {self._NAME} was left")
-        if exc is not None:  # An exception must not wait for the confirmation of the hold.
+        if exc is not None:  # An exception leaves the block at once, without waiting for the confirmation of the hold.
             self._hold()
         elif not self._context.arbiter.is_state_recent:
             # There may have been a takeover whose report was not received yet.

@@ -104,7 +104,7 @@ class TravelActions(VehicleBase):
                     target, arrival_radius_m, timeout, max_silence_s, order, mode, unacknowledged_target
                 )
         except (anyio.get_cancelled_exc_class(), OperationTimeout):
-            # The vehicle may have received the command.
+            # The vehicle may have received the command, so it is ordered to hold.
             self._flight_cleanup.hold_in_background(order)
             raise
         except CommandRejected:

@@ -156,6 +156,9 @@ class MeasurementEncoder:
         )
         ignore_flags = sum(flag for field, flag in optional_fields if field is None)
         week, week_ms = _gps_time(value.unix_time_s)
+        yaw_cdeg = 0  # means "no heading"; north is sent as 36000
+        if value.yaw_deg is not None:
+            yaw_cdeg = round(value.yaw_deg % 360 * 100) or 36000
         return (
             m.GpsInput(
                 self._time_us(value.measured_at),
@@ -174,7 +177,7 @@ class MeasurementEncoder:
                 value.horizontal_accuracy_m or 0.0,
                 value.vertical_accuracy_m or 0.0,
                 value.satellites,
-                0 if value.yaw_deg is None else round(value.yaw_deg % 360 * 100) or 36000,  # 0 means "no heading"
+                yaw_cdeg,
             ),
         )
 
@@ -221,7 +224,7 @@ class MeasurementEncoder:
         if value.variance_m2 is not None:
             covariance_cm2 = min(UNKNOWN_COVARIANCE - 1, round(value.variance_m2 * 1e4))
         time_ms = self._time_us(value.measured_at) // 1000 & 0xFFFFFFFF
-        sensor = (LASER, 0, ORIENTATIONS[value.direction])
+        sensor = (LASER, 0, ORIENTATIONS[value.direction])  # type, id, orientation
         quality = value.quality or 0  # 0 means "unknown"
         return (m.DistanceSensor(time_ms, *limits_cm, distance_cm, *sensor, covariance_cm2, signal_quality=quality),)
 
@@ -232,7 +235,7 @@ class MeasurementEncoder:
         check_range("number", value.number, 0, 255)
         distance = math.hypot(*offset)
         if not distance > 0:
-            raise InvalidArgument("the distance of the target is 0; it must be above 0")
+            raise InvalidArgument("forward_m = right_m = down_m = 0 is not allowed: the target must be at a distance")
         frame = MavFrame.LOCAL_FRD if value.is_level else MavFrame.BODY_FRD
         if self._session.autopilot.external.target_is_local:
             frame, offset = MavFrame.LOCAL_NED, self._in_local_frame(offset, is_level=value.is_level)

@@ -76,8 +76,10 @@ class _Stream:
         # Number of messages received, now and at the last checks.
         self.count = 0
         self.counts: deque[int] = deque([0], maxlen=WATCH_WINDOW + 1)
+        # When to request the stream again if none of its messages arrives.
         self.retry_interval_s = RETRY_INTERVAL_S
         self.retry_at = math.inf
+        # Number of requests in a row that were not answered, and the time of the next request after them.
         self.failures = 0
         self.next_attempt_at = -math.inf
         self.detach: Detach | None = None
@@ -295,9 +297,10 @@ class MessageRates:
         if stream.requested_hz is None or len(stream.counts) <= WATCH_WINDOW:
             return
         achieved_hz = stream.achieved_hz()
+        # No message arrived in the first period of the window.
         has_just_started = achieved_hz > 0 and stream.counts[0] == stream.counts[1]
         if has_just_started and not stream.is_slow:
-            return  # The rate of a stream that has just started is not known yet.
+            return
         # One message less is no sign of a slow stream: it may have arrived just outside of the window.
         min_messages = SLOW_FACTOR * stream.requested_hz * WATCH_WINDOW * WATCH_PERIOD_S - 1
         was_slow, stream.is_slow = stream.is_slow, achieved_hz * WATCH_WINDOW * WATCH_PERIOD_S < min_messages
@@ -359,6 +362,7 @@ class ComponentSubscriber:
             for message_type in message_types:
                 check_rate(message_type, rate_hz)
 
+        # Called when the program enters the block of the subscription.
         def attach(sink: Sink) -> list[Detach]:
             filtered_sink = sink if entire_system else self._of_component(sink)
             detach_callbacks = self._connection.attach(types, filtered_sink, system_id=self._system_id)
@@ -384,7 +388,7 @@ class ComponentSubscriber:
         if rate_hz is not None:
             release_previous = self._cell_rates.pop(message_type, None)
             self._cell_rates[message_type] = self._rates.request(message_type, rate_hz)
-            # Released after the new request, so that the message is needed at every moment.
+            # The previous rate is released after the new request, because a message that nothing needs is stopped.
             if release_previous is not None:
                 release_previous()
         return cell

@@ -20,7 +20,7 @@ RETRY_INTERVAL_S = 1.0
 # The key in SETUP_SIGNING that removes the vehicle's key.
 NO_KEY = bytes(32)
 
-# Time stamps of signatures count units of 10 microseconds.
+# The time stamp of a signature counts units of 10 microseconds.
 TIMESTAMP_TICKS_PER_S = 100_000
 
 

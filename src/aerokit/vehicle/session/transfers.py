@@ -114,7 +114,7 @@ class Transfers:
         try:
             with anyio.fail_after(timeout):
                 yield
-        except OperationTimeout:  # a time-out of the block's own, which is also a TimeoutError
+        except OperationTimeout:  # It was raised in the block, and is a TimeoutError, too.
             raise
         except TimeoutError:
             raise OperationTimeout(f"not done within {timeout:g} s; {self._describe()}") from None

@@ -195,7 +195,7 @@ class VehicleWatch:
         """Detect a reboot from a time since boot in milliseconds, ``clock`` being the message or field that has it."""
         now = self._now()
         milliseconds_before, read_at = self._last_times.get(clock, (milliseconds, now))
-        # The vehicle's clock is behind by at least this time, and by more if the earlier message was delayed.
+        # How far the vehicle's clock is behind its expected time, or more if the earlier message was delayed.
         behind_ms = 1000 * (frame.received_at - read_at) - (milliseconds - milliseconds_before)
         if self._expects_reboot and behind_ms > MIN_REBOOT_STEP_MS:
             self._on_reboot_detected(clock, milliseconds)
@@ -277,10 +277,9 @@ class LinkWatch:
         self._connection.send(Timesync(0, self._open_requests[-1]), to=self._system_id)
 
     def _on_timesync(self, message: Timesync) -> None:
-        """Process the autopilot's answer to our request. All other TIMESYNC messages are ignored.
+        """Process the autopilot's answer to our request.
 
-        Another component of the vehicle, such as a companion computer, may answer before the autopilot; its answer is
-        ignored.
+        All other TIMESYNC messages are ignored, for example the answer of a companion computer to the same request.
         """
         frame = message.received_frame
         if frame is None or frame.component_id != self._component_id:
@@ -288,7 +287,8 @@ class LinkWatch:
         if message.tc1 != 0 and message.ts1 in self._open_requests:
             self._open_requests.remove(message.ts1)
             now = self._connection.now()
-            if now - frame.received_at < CHECK_INTERVAL_S:  # Otherwise this program delayed the answer.
+            # A longer time between arrival and processing is a delay of this program, not of the link.
+            if now - frame.received_at < CHECK_INTERVAL_S:
                 self._round_trip_s = now - message.ts1 / 1e9
             self._on_answer(message.ts1 / 1e9, message.tc1 // 1_000_000)
 

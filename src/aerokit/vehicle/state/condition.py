@@ -162,7 +162,8 @@ def mode(message: messages.Heartbeat, context: Context) -> Mode:
 
 def current_mode(message: messages.CurrentMode, context: Context) -> Mode | None:
     """Return the flight mode in CURRENT_MODE. It arrives before the next HEARTBEAT, but lacks ``base_mode``."""
-    # Before the first HEARTBEAT, base_mode is unknown. custom_mode may be 0 if the vehicle has no custom modes.
+    # A custom_mode of 0 is a mode or not set, so HEARTBEAT must report it. The mode also depends on base_mode, which is
+    # unknown before the first HEARTBEAT.
     if not message.custom_mode or context.before is None:
         return None
     return context.autopilot.mode(message.custom_mode, context.base_mode, context.mode_names)

@@ -212,13 +212,14 @@ def batteries(message: messages.BatteryStatus, context: Context) -> tuple[Batter
     cells_mv = [millivolts for millivolts in message.voltages if millivolts != U16]
     # 0 means that a cell from 11 to 14 is absent, because these fields are an extension of the message.
     cells_mv += [millivolts for millivolts in message.voltages_ext if millivolts not in (0, U16)]
-    is_pack = len(cells_mv) == 1 or FULL_CELL in cells_mv
+    # A battery whose cells are not measured reports its total voltage as one "cell", or as several; see FULL_CELL.
+    is_only_total = len(cells_mv) == 1 or FULL_CELL in cells_mv
     battery = Battery(
         message.id,
         sum(cells_mv) / 1e3 if cells_mv else None,
         current(message.current_battery, context.autopilot),
         known(message.battery_remaining, unknown=-1),
-        () if is_pack else tuple(millivolts / 1e3 for millivolts in cells_mv),
+        () if is_only_total else tuple(millivolts / 1e3 for millivolts in cells_mv),
         divided(message.temperature, 100, unknown=I16),
         message.current_consumed if message.current_consumed >= 0 else None,
         message.energy_consumed / 36 if message.energy_consumed >= 0 else None,
@@ -298,8 +299,8 @@ YAW_IN_VEHICLE_FRAME = GimbalDeviceFlags.YAW_IN_VEHICLE_FRAME.value
 
 YAW_IN_EARTH_FRAME = GimbalDeviceFlags.YAW_IN_EARTH_FRAME.value
 
-# If the sine of the pitch exceeds this, the camera points straight up or down, and roll and yaw have the same axis.
-STRAIGHT = 0.99999
+# If the sine of the pitch exceeds this, the camera points straight up or down.
+MIN_SINE_STRAIGHT = 0.99999
 
 
 class GimbalAttitude(Snapshot):
@@ -343,6 +344,7 @@ def from_device(message: GimbalDeviceAttitudeStatus, heading: float | None) -> G
     ``heading`` in degrees. While both are unknown, ``yaw_deg`` stays relative to the nose.
     """
     pitch, roll, yaw = _euler(message.q)
+    # Older gimbals send neither these flags nor ``delta_yaw``, which is an extension of the message.
     has_delta = message.flags & (YAW_IN_VEHICLE_FRAME | YAW_IN_EARTH_FRAME) and math.isfinite(message.delta_yaw)
     if has_delta and message.delta_yaw:  # PX4 also sends 0 when the difference is unknown.
         nose_deg: float | None = math.degrees(message.delta_yaw)
@@ -367,13 +369,16 @@ def _is_from_nose(flags: int) -> bool:
 
 
 def _euler(quaternion: tuple[float, ...]) -> tuple[float, float, float]:
-    """Return pitch, roll and yaw in degrees. If the camera points straight up or down, roll is 0."""
+    """Return pitch, roll and yaw in degrees; NaN for an invalid quaternion.
+
+    If the camera points straight up or down, roll and yaw have the same axis; roll is then 0.
+    """
     length = math.sqrt(sum(component * component for component in quaternion))
     if not length > 0:
         return math.nan, math.nan, math.nan
     w, x, y, z = (component / length for component in quaternion)
     sine = max(-1.0, min(1.0, 2 * (w * y - z * x)))  # of the pitch; rounding may exceed 1
-    if abs(sine) > STRAIGHT:
+    if abs(sine) > MIN_SINE_STRAIGHT:
         return (
             math.degrees(math.asin(sine)),
             0.0,

@@ -211,8 +211,8 @@ class StreamedMessage:
             self._decode_from = frame.received_at + MAX_DECODE_DELAY_S
             # Observers must be called in the loop's thread, so another thread must not decode the frame.
             with self._lock:
-                if self.pending:  # Earlier frames first.
-                    self.catch_up()
+                if self.pending:
+                    self.catch_up()  # Earlier frames must be applied first.
                 self._apply(frame, message)
             return
         instance, instance_at = 0, self._instance_at

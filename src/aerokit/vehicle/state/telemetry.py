@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 # Seconds for which a fallback message is ignored after a better message.
 FALLBACK_DELAY_S = 2.0
-# Limit for a vehicle that sends invalid AVAILABLE_MODES.
+# Limit to the memory that a vehicle with invalid AVAILABLE_MODES can fill.
 MAX_MODE_NAMES = 256
 
 Handler = Callable[[Any, Source], None]
@@ -189,7 +189,7 @@ class Telemetry(States):
 
     def _handle(self, handler: Handler, message: Message, source: Source, frame: Frame | None) -> None:
         """Process a message. Its values get the time at which its frame arrived, regardless of when it is decoded."""
-        # A handler may read a cell, and thereby decode another message.
+        # Calls may be nested: a handler may read a cell, and thereby decode another message.
         outer_arrived_at = self._arrived_at
         self._arrived_at = None if frame is None else frame.received_at
         try:
