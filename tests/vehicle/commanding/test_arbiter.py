@@ -462,8 +462,8 @@ def test_posted_mode_after_order_is_no_takeover() -> None:
 def test_device_order_withdrawn_is_not_the_newest() -> None:
     """Then only the previous order is the newest again."""
     arbiter = Stage().arbiter
-    first = arbiter.of_device("video", may_be_withdrawn=True)
-    second = arbiter.of_device("video", may_be_withdrawn=True)
+    first = arbiter.device_order("video", may_be_withdrawn=True)
+    second = arbiter.device_order("video", may_be_withdrawn=True)
     assert (first.is_newest, second.is_newest) == (False, True)
     second.withdraw()
     assert (first.is_newest, second.is_newest) == (True, False)

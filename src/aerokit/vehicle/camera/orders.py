@@ -94,7 +94,7 @@ class CameraOrders:
         return ("camera", self.component.component_id, self.device, subject)
 
     def begin_order(self, subject: str) -> Order:
-        return self._context.arbiter.of_device(self.topic(subject), may_be_withdrawn=True)
+        return self._context.arbiter.device_order(self.topic(subject), may_be_withdrawn=True)
 
     def latest_order(self, subject: str) -> Order | None:
         return self._context.arbiter.latest(self.topic(subject))

@@ -103,7 +103,7 @@ class CommandArbiter:
         self._ordered_since_disarmed.update(topics)
         self._register(Order(self._now(), next(self._order_numbers), self._is_newest), topics)
 
-    def of_device(self, topic: Topic, *, may_be_withdrawn: bool = False) -> Order:
+    def device_order(self, topic: Topic, *, may_be_withdrawn: bool = False) -> Order:
         """Create an order about a device. It supersedes earlier orders; if it is withdrawn, they become valid again."""
         order = Order(self._now(), next(self._order_numbers), self._is_newest, ended_by=(topic,))
         order.previous = self.latest(topic) if may_be_withdrawn else None
@@ -191,7 +191,7 @@ class CommandArbiter:
         is_steering = subjects[0] != "arm"
         if is_steering:
             self._notify_steering()
-            if self.newest is not None:
+            if self.newest is not None:  # The mode of the posted order is no takeover by another party.
                 self.newest.expect(modes)
         self._supersede_arming(armed)
         now = self._now()
@@ -273,7 +273,7 @@ class CommandArbiter:
         no takeover.
         """
         order = self.current
-        if order is not None and order.was_refused:
+        if order is not None and order.was_refused:  # The vehicle continues its previous task.
             return order.was_flown_before
         return order is not None and not order.takeover_reason and not order.failsafe
 
@@ -281,6 +281,7 @@ class CommandArbiter:
     def current(self) -> Order | None:
         """The program's present order to the armed vehicle: the newest steering order, or the order that armed it."""
         newest = self.newest
+        # A steering order that was given before the vehicle armed belongs to an earlier flight.
         return newest if newest is not None and newest.given_at >= self._armed_at else self._armed_by_program
 
     def clear_failsafe(self) -> None:

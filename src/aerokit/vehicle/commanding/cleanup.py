@@ -197,9 +197,8 @@ class FlightCleanup:
                     return
                 await self._session.wait_for_heartbeat()
                 if not order.end and not self._session.telemetry.is_confirmed_disarmed:
-                    with (
-                        self._task.protected()
-                    ):  # This task itself gives the newer order, which must not cancel the task.
+                    # A new steering order cancels the task, but not if the task itself gives it.
+                    with self._task.protected():
                         order = self._arbiter.order(*order.modes, mode)
                     await self.stop_in(mode, order)
                 return
@@ -296,7 +295,7 @@ class ArmCleanup:
 
     def watch(self, order: Order, was_armed: bool) -> None:
         """Start monitoring: the abandoned arm command may have been received, or may still arrive."""
-        self._session.connection.discard_unsent()
+        self._session.connection.discard_unsent()  # The command must not be sent from now on.
         self._task.start(partial(self._watch_arming, order, was_armed, self._arbiter.arming_orders))
 
     async def _watch_arming(self, order: Order, was_armed: bool, arming_orders_before: int) -> None:

@@ -148,7 +148,10 @@ class PathFlight:
 
 
 class TurnCounter:
-    """Counts turns around a centre, while the vehicle is near the circle and flies in the right direction."""
+    """Counts turns around a centre while the vehicle is near the circle.
+
+    Turns in the wrong direction are subtracted.
+    """
 
     def __init__(self, radius_m: float, *, clockwise: bool) -> None:
         self._radius_m, self._direction = radius_m, 1 if clockwise else -1

@@ -89,6 +89,7 @@ class FlightActions(VehicleBase):
             raise OperationRejected(
                 f"take_off: the vehicle is already {IN_THE_AIR[landed.latest]}: use go_to() to climb; nothing was sent"
             )
+        # The modes that the vehicle may report during the take-off.
         modes = (
             plan.mode,
             plan.mode_after,
@@ -143,7 +144,7 @@ class FlightActions(VehicleBase):
         Earlier messages may describe the previous flight.
         """
         here, landed = self.telemetry.position.latest, self.telemetry.landed_state
-        # With NaN, which is not less than any altitude, only the landed state counts.
+        # No altitude is greater than NaN, so only the landed state counts while the position is unknown.
         start_m = math.nan if here is None else self._position.altitude_relative()
         state_before = landed.latest
 

@@ -278,7 +278,7 @@ class FollowStream(SteeringStream[TargetState]):
             state = self._tracker.read()
             if state is not None:
                 self._replace_value(state)
-                self._set_at = state.at
+                self._set_at = state.at  # The value expires by the age of the target's position.
         except (Exception, asyncio.CancelledError) as error:
             # The program's function raises CancelledError if it reads the result of a cancelled task.
             self._end_reason = f"the position of the target raised {error!r}"
@@ -293,16 +293,16 @@ class FollowStream(SteeringStream[TargetState]):
 
     def _encode_place(self, state: TargetState) -> Message:
         """Return the set-point for this moment, assuming that the target keeps its velocity between two positions."""
-        seconds_since = max(0.0, min(self._now() - state.since, self._valid_for_s))
+        moved_for_s = max(0.0, min(self._now() - state.since, self._valid_for_s))
         north_m_s, east_m_s, down_m_s = state.velocity
         if math.hypot(north_m_s, east_m_s) >= MIN_COURSE_SPEED_M_S:
             self._course_deg = math.degrees(math.atan2(east_m_s, north_m_s))
         bearing = math.radians(self._bearing_deg + (self._course_deg if self._place.from_course else 0.0))
         distance_m = self._place.distance_m
         place = state.position.offset(
-            north_m=distance_m * math.cos(bearing) + north_m_s * seconds_since,
-            east_m=distance_m * math.sin(bearing) + east_m_s * seconds_since,
-            up_m=(self._place.height_m or 0.0) - down_m_s * seconds_since,
+            north_m=distance_m * math.cos(bearing) + north_m_s * moved_for_s,
+            east_m=distance_m * math.sin(bearing) + east_m_s * moved_for_s,
+            up_m=(self._place.height_m or 0.0) - down_m_s * moved_for_s,
         )
         if self._place.height_m is None:
             place = place.replace(altitude_amsl_m=self._own_altitude_m, altitude_relative_m=None)

@@ -252,6 +252,7 @@ class Order:
             # An earlier order of the program has taken effect, so only another party can restore the mode before it.
             self._accepted_modes -= self._modes_before
         elif not was_reported_before or at < self._any_mode_until:
+            # The first report of a mode, or perhaps the effect of a raw command.
             if was_reported_before and number not in self._accepted_modes:
                 self.unexplained = f"the mode changed to {mode}"
             self._accepted_modes.add(number)

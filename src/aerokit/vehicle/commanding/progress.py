@@ -259,8 +259,8 @@ class VehiclePosition:
             if place is None:
                 continue
             degrees = abs(place.latitude_deg - here.latitude_deg) + abs(place.longitude_deg - here.longitude_deg)
-            # This upper limit of the distance saves time, because a mission may have thousands of places and the exact
-            # distance is slow to compute.
+            # The upper limit of the distance is compared first, because the exact distance is slow to compute and a
+            # mission may have thousands of places.
             if degrees * MAX_METRES_PER_DEGREE < max_distance_m:
                 continue
             distance_m = self.distance_to(place)

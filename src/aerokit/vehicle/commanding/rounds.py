@@ -154,6 +154,7 @@ class RoundFlight:
             detach()
 
     def _is_flown_since(self, started: float) -> bool:
+        """Return True if the rounds are flown; without rounds, if the vehicle is in place."""
         is_known = self._context.vehicle_position.is_known_since(started)
         return is_known and self._count() >= self._rounds and (self._rounds > 0 or self._is_in_place)
 

@@ -61,6 +61,7 @@ class OrderSender:
             try:
                 await send(command, *params, order_status=sent, **options)
             except CommandRejected as error:
+                # The vehicle may refuse a repetition because the command has already taken effect.
                 if not sent.is_confirmed:
                     order.was_refused = True
                     await self._session.wait_for_status_texts()
@@ -86,6 +87,7 @@ class OrderSender:
 
     async def send_arm(self, order: Order, armed: bool, *, force: bool = False) -> None:
         """Send the command to arm or disarm."""
+        # `ArmCleanup` must not take the ack of an earlier command for the ack of this one.
         self._session.commands.forget_result(MavCmd.COMPONENT_ARM_DISARM)
         params = (float(armed), FORCE if force else 0)
         await self.send_long(order, MavCmd.COMPONENT_ARM_DISARM, *params, armed=armed)
@@ -102,11 +104,13 @@ class OrderSender:
         started = self._session.connection.now()
         was_in_doubt = self._arbiter.mode_is_in_doubt
         with self._session.refusals_of(MavCmd.DO_SET_MODE) as refusals, self._arbiter.changing_mode():
+            # All four attempts must fit into the time-out.
             await self.request_mode(mode, order, attempt_timeout=min(1.0, timeout / 4))
             now = self._session.connection.now()
             if was_in_doubt:
                 reported_since = now
             await self.await_mode(mode, order, refusals, timeout - (now - started), reported_since)
+            # The mode is reported, so the modes of earlier orders cannot follow.
             self._arbiter.mode_settles_at = -math.inf
 
     async def request_mode(
@@ -138,7 +142,7 @@ class OrderSender:
             if error.result != MavResult.UNSUPPORTED:
                 raise
             self.raise_if_ended(order)
-            if not self._arbiter.is_state_recent:
+            if not self._arbiter.is_state_recent:  # A takeover may not have been reported yet.
                 raise
             self._session.send(request.legacy(self._session.system_id))
 

@@ -122,7 +122,7 @@ class SimpleOrder(Snapshot):
         if component_id in (None, context.session.component_id):
             self.check_supported(context)
         if topic is not None and device_order is None:
-            device_order = context.arbiter.of_device(topic)
+            device_order = context.arbiter.device_order(topic)
         with context.arbiter.auxiliary_order(device_order) as order:
             await context.sender.send_long(order, self.command, *params, component_id=component_id)
         if self.effect is not None:
@@ -142,7 +142,7 @@ class SimpleOrder(Snapshot):
 
         Raises as :meth:`send`; also OperationRejected if ``is_refusal(text)``.
         """
-        order, now = context.arbiter.of_device(topic), context.session.connection.now
+        order, now = context.arbiter.device_order(topic), context.session.connection.now
         texts: list[str] = []
         detach = context.session.telemetry.status_text.observe(
             lambda _, status_text: texts.append(status_text.text), every_arrival=True

@@ -306,10 +306,9 @@ class SteeringStream(ValueStream[ValueT]):
 
 
 class TakeoverCheck:
-    """Refuses a mode change if the vehicle has got another order meanwhile.
+    """Refuses a mode change if another party has changed the mode, or the program has given another order, meanwhile.
 
-    This is so if, since the creation of this object, another party has changed the mode or the program has given
-    another order.
+    "Meanwhile" is the time since the creation of this object.
     """
 
     def __init__(self, context: VehicleContext, next_mode: Mode) -> None:

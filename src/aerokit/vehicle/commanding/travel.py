@@ -33,6 +33,9 @@ if TYPE_CHECKING:
 # Bits of POSITION_TARGET_TYPEMASK that make the vehicle ignore all fields but the position.
 POSITION_ONLY = 0x0DF8
 
+# param1 and param3 of DO_CHANGE_SPEED.
+GROUND_SPEED, KEEP_THROTTLE = 1, -1
+
 # Interval at which a target that is not acknowledged is sent again.
 RESEND_S = 1.0
 
@@ -96,8 +99,8 @@ class TravelActions(VehicleBase):
             is_under_way = True
             if speed_m_s is not None and not self._speeds_by_reposition:
                 # ArduPilot applies the speed only once the vehicle is on its way.
-                await self._sender.send_long(order, MavCmd.DO_CHANGE_SPEED, 1, speed_m_s, -1)
-            if heading_deg is not None and math.isnan(yaw):
+                await self._sender.send_long(order, MavCmd.DO_CHANGE_SPEED, GROUND_SPEED, speed_m_s, KEEP_THROTTLE)
+            if heading_deg is not None and math.isnan(yaw):  # MAV_CMD_DO_REPOSITION cannot set the heading.
                 await self._sender.send_long(order, MavCmd.CONDITION_YAW, heading_deg % 360)
             with self._flight_cleanup.flying(order):
                 await self._await_arrival(
@@ -189,7 +192,7 @@ class TravelActions(VehicleBase):
             CommandRejected: the vehicle refused.
         """
         check_range("speed_m_s", speed_m_s, 0, 1000, above=True)
-        await self._sender.auxiliary_command(MavCmd.DO_CHANGE_SPEED, 1, speed_m_s, -1)
+        await self._sender.auxiliary_command(MavCmd.DO_CHANGE_SPEED, GROUND_SPEED, speed_m_s, KEEP_THROTTLE)
 
     async def set_heading(
         self,
@@ -295,7 +298,7 @@ class TravelActions(VehicleBase):
         home = self.telemetry.home
         with self._arbiter.auxiliary_order() as order:
             if place is None:
-                await self._sender.send_long(order, MavCmd.DO_SET_HOME, 1)
+                await self._sender.send_long(order, MavCmd.DO_SET_HOME, 1)  # 1: the present position
             else:
                 # The command takes altitudes above mean sea level only.
                 amsl_place = point_at(place).replace(altitude_relative_m=None)
@@ -316,7 +319,7 @@ class TravelActions(VehicleBase):
 
     def _check_can_turn(self, heading_deg: float | None) -> None:
         if heading_deg is not None and not self._turns_by_reposition and not self.autopilot.condition_yaw:
-            raise NotSupported(f"{self.autopilot.firmware} has no command for a region of interest; nothing was sent")
+            raise NotSupported(f"{self.autopilot.firmware} has no command to turn to a heading; nothing was sent")
 
     @property
     def _speeds_by_reposition(self) -> bool:
@@ -396,7 +399,7 @@ class LookActions(VehicleBase):
 
     @contextmanager
     def _new_roi_order(self) -> Iterator[Order]:
-        with self._arbiter.auxiliary_order(self._arbiter.of_device(ROI)) as order:
+        with self._arbiter.auxiliary_order(self._arbiter.device_order(ROI)) as order:
             yield order
 
     @staticmethod

@@ -240,7 +240,7 @@ class Actuators(ReadOnly):
             stop = (number, PERCENT, 0, 0, 1)
         session.check_disarmed("test_motor", is_current=arbiter.is_state_recent)
         # On ArduPilot, a new test ends the test of another motor.
-        order = arbiter.of_device("motor test" if command == MavCmd.DO_MOTOR_TEST else f"motor test {number}")
+        order = arbiter.device_order("motor test" if command == MavCmd.DO_MOTOR_TEST else f"motor test {number}")
         spins_until = order.given_at + duration_s
         try:
             await SimpleOrder("test_motor", command, start).send(self._context, device_order=order)

@@ -85,7 +85,7 @@ class Winch(ReadOnly):
         check_range("length_m", length_m, -MAX_LENGTH_M, MAX_LENGTH_M)
         check_range("rate_m_s", rate_m_s, 0, MAX_RATE_M_S, above=True)
         self._check_supported(_A.RELATIVE_LENGTH_CONTROL)
-        order = self._context.arbiter.of_device(
+        order = self._context.arbiter.device_order(
             self._topic
         )  # A newer order that is given while the next line waits ends this order.
         start = await receive_once(self._context, m.WinchStatus, self._component_id)

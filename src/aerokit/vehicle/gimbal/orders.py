@@ -109,7 +109,7 @@ class GimbalOrders:
             )
 
     def begin_order(self) -> Order:
-        return self.context.arbiter.of_device(self.device.topic)
+        return self.context.arbiter.device_order(self.device.topic)
 
     async def send_claiming_control(self, command: int, send: Callable[[], Awaitable[None]]) -> None:
         """Send a command. If the manager denies it because we are not in control, claim control and send it again."""

@@ -85,7 +85,10 @@ class CommandSender:
         order_status: OrderStatus | None = None,
         is_sent: bool = False,
     ) -> CommandAck:
-        """Send a COMMAND_LONG with param1 to param7 and return its ACCEPTED ack; see :meth:`Vehicle.command`."""
+        """Send a COMMAND_LONG with param1 to param7 and return its ACCEPTED ack; see :meth:`Vehicle.command`.
+
+        ``is_sent`` is True if `send_unconfirmed` has just sent the command, so that only repetitions are sent.
+        """
         target = self._component_id if component_id is None else component_id
         message = command_long(self._system_id, target, command, params)
         options = (attempts, attempt_timeout, progress_timeout, on_progress, order_status, is_sent)
@@ -141,10 +144,8 @@ class CommandSender:
 
     def is_for_us(self, ack: CommandAck) -> bool:
         """Return True if the ack is addressed to us. Targets are 0 in MAVLink 1 and in old firmware."""
-        return ack.target_system in (0, self._connection.source_system) and ack.target_component in (
-            0,
-            self._connection.source_component,
-        )
+        is_for_our_system = ack.target_system in (0, self._connection.source_system)
+        return is_for_our_system and ack.target_component in (0, self._connection.source_component)
 
     def last_result(self, command: int, component_id: int | None = None) -> int | None:
         """Return the last MAV_RESULT received for this command, even if the call that sent it was cancelled."""
@@ -256,6 +257,7 @@ class CommandSender:
         is_answer = (run is not None or key in self._pending_acks) and self.is_for_us(ack)
         if is_answer and ack.result != MavResult.IN_PROGRESS:
             self._results[key] = ack.result
+            # An ack without a target may be for another ground station.
             if ack.result == MavResult.ACCEPTED and ack.target_system == self._connection.source_system:
                 self._accepted_at[key] = self._connection.now()
         if run is not None:

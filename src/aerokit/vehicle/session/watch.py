@@ -36,7 +36,8 @@ if TYPE_CHECKING:
 REBOOT_STEP_MS = 3000
 # The decreased time must persist for this long and in at least two messages, because one message may be late.
 REBOOT_CONFIRM_S = 0.2
-# The same limit after an accepted reboot command. A boot takes longer than this; messages are delayed by less.
+# While a reboot is expected, a clock that is behind by more than this shows the reboot. A boot takes longer than this;
+# messages are delayed by less.
 MIN_REBOOT_STEP_MS = 2000
 # Seconds of reports from which the speed of a simulation's clock is computed; before that, it counts as real time.
 CLOCK_SPAN_S = 5.0
@@ -176,12 +177,12 @@ class VehicleWatch:
         self._state_watch.mark_lost(event.at)
 
     def _on_boot_time(self, frame: Frame) -> None:
-        """Read ``time_boot_ms`` at the start of the payload."""
+        """Read ``time_boot_ms`` at the start of the payload, which begins at byte 9 of ``body``."""
         if frame.component_id == self._component_id:
             self._record_time(frame, "time_boot_ms", int.from_bytes(frame.body[9:13], "little"))
 
     def _on_system_time(self, frame: Frame) -> None:
-        """Read ``time_boot_ms``, which follows ``time_unix_usec`` in the payload."""
+        """Read ``time_boot_ms``, which follows the 8 bytes of ``time_unix_usec`` in the payload."""
         if frame.component_id == self._component_id:
             self._record_time(frame, "time_boot_ms", int.from_bytes(frame.body[17:21], "little"))
 
