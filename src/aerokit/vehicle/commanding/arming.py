@@ -284,7 +284,7 @@ class ArmingActions(VehicleBase):
             raise HeartbeatTimeout(f"arm(): {self._session.describe_link()}; the arm command was not sent")
 
     async def _wait_until_armable(self) -> None:
-        """Wait until SYS_STATUS, a few times a second, reports whether the vehicle can arm in its new mode."""
+        """Wait briefly until SYS_STATUS no longer reports that the pre-arm checks fail, after a change of the mode."""
         sensors = self.telemetry.sensors
         with self._session.streaming("sensors"), anyio.move_on_after(MODE_READY_TIMEOUT_S):
             since = self.connection.now()

@@ -18,7 +18,8 @@ from aerokit.connection.cells import Source, StateCell
 from aerokit.errors import FileFormatError, FileTimeout, InvalidArgument, OperationRejected
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd
-from aerokit.vehicle.session.rates import ComponentSubscriber, MessageRates
+from aerokit.vehicle.session.rates import MessageRates
+from aerokit.vehicle.session.subscriber import ComponentSubscriber
 from aerokit.vehicle.session.transfers import Transfers
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from aerokit._internal.values import Snapshot
 from aerokit.connection.cells import Source, StateCell
 from aerokit.mavlink.enums import GimbalDeviceErrorFlags, GimbalManagerCapFlags
 from aerokit.mavlink.messages import GimbalDeviceAttitudeStatus
-from aerokit.vehicle.session.rates import SUBSCRIPTION_HZ, WatchedStream
+from aerokit.vehicle.session.subscriber import SUBSCRIPTION_HZ, WatchedStream
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator

@@ -36,7 +36,8 @@ from aerokit.mavlink.messages import (
     HomePosition,
 )
 from aerokit.vehicle.session.commands import CommandSender
-from aerokit.vehicle.session.rates import ComponentSubscriber, MessageRates, WatchedStream
+from aerokit.vehicle.session.rates import MessageRates
+from aerokit.vehicle.session.subscriber import ComponentSubscriber, WatchedStream
 from aerokit.vehicle.session.transfers import Transfers
 from aerokit.vehicle.session.watch import LinkWatch, VehicleWatch
 from aerokit.vehicle.state.field import MESSAGE_IDS
