@@ -91,8 +91,9 @@ class ArmingActions(VehicleBase):
                 else:
                     await changes.next(min(timeout, request_at - self.connection.now()))
             return
-        # A dictionary, because ArduPilot repeats its texts.
+        # ArduPilot repeats its texts, so duplicates are removed.
         recent_texts = dict.fromkeys(self._health.arming_texts(self.connection.now() - PREARM_REPORT_INTERVAL_S))
+        # Nothing is missing if the vehicle became ready just after the last check.
         still_missing = [*self._health.missing_for_flight(), *recent_texts] or ["nothing"]
         missing = "\n  - ".join([*still_missing, *self._health.unarmable_mode()])
         raise OperationTimeout(

@@ -272,7 +272,7 @@ class OrderSender:
         """Send a raw command of the program by ``send``, a method of `CommandSender`; return the acknowledgement."""
         started = self._session.connection.now()
         if retries is None:
-            # Other commands are sent once, because a repetition would execute them twice if only the ack was lost.
+            # Only requests are repeated. A repetition would execute another command twice if just its ack was lost.
             retries = MAX_ATTEMPTS - 1 if command in REQUEST_COMMANDS else 0
         check_range("retries", retries, 0, 1000)
         options["attempts"] = 1 + retries

@@ -165,7 +165,7 @@ def distance_sensors(message: messages.DistanceSensor, context: Context) -> tupl
         message.orientation,
         message.min_distance / 100,
         message.max_distance / 100,
-        quality if quality > INVALID_QUALITY else None,
+        quality if quality > INVALID_QUALITY else None,  # 0 means "unknown"
     )
     return _replaced(context.before, sensor, _id_of)
 
@@ -189,6 +189,8 @@ def _gps_receiver(message: messages.GpsRawInt | messages.Gps2Raw, index: int) ->
     has_fix = message.fix_type >= GpsFixType.TYPE_2D_FIX
     coordinates = valid_coordinates(message.lat, message.lon) if has_fix else None
     latitude, longitude = coordinates or (None, None)
+    # A yaw of 0 means that the receiver reports none, U16 that it has none at present.
+    yaw_deg = None if message.yaw in (0, U16) else message.yaw % NORTH_CDEG / 100
     return GpsReceiver(
         index,
         enum_member(GpsFixType, message.fix_type),
@@ -203,7 +205,7 @@ def _gps_receiver(message: messages.GpsRawInt | messages.Gps2Raw, index: int) ->
         divided(message.h_acc, 1000, unknown=0),
         divided(message.v_acc, 1000, unknown=0),
         divided(message.vel_acc, 1000, unknown=0),
-        None if message.yaw in (0, U16) else message.yaw % NORTH_CDEG / 100,
+        yaw_deg,
     )
 
 

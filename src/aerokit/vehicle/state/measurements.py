@@ -184,7 +184,7 @@ def odometry(message: messages.Odometry) -> Odometry:
         _scaled(RAD_DEG, message.rollspeed, message.pitchspeed, message.yawspeed),
         _covariance(message.pose_covariance),
         _covariance(message.velocity_covariance),
-        message.quality or None,
+        message.quality or None,  # 0 means "unknown"
     )
 
 
