@@ -104,8 +104,8 @@ class ReadOnly:
         attribute = inspect.getattr_static(type(self), name, None)
         is_setter = isinstance(attribute, property) and attribute.fset is not None
         is_descriptor = hasattr(type(attribute), "__get__")
-        # A program may replace methods, e.g. by mocks. Attributes without a descriptor are set by the constructor or by
-        # the program.
+        # Allowed are: replacing a method, e.g. by a mock, and attributes without a descriptor, which the constructor or
+        # the program sets.
         if name.startswith("_") or is_setter or callable(attribute) or not is_descriptor:
             object.__setattr__(self, name, value)
             return

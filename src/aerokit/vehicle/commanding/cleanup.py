@@ -295,7 +295,7 @@ class ArmCleanup:
 
     def watch(self, order: Order, was_armed: bool) -> None:
         """Start monitoring: the abandoned arm command may have been received, or may still arrive."""
-        self._session.connection.discard_unsent()  # The command must not be sent from now on.
+        self._session.connection.discard_unsent()  # An arm command that is still unsent must not be sent later.
         self._task.start(partial(self._watch_arming, order, was_armed, self._arbiter.arming_orders))
 
     async def _watch_arming(self, order: Order, was_armed: bool, arming_orders_before: int) -> None:

@@ -56,7 +56,7 @@ class VehicleContext:
         if mode is not None and mode == hold_mode:
             where = "holding in"
         elif telemetry.is_armed and telemetry.landed_state.latest == MavLandedState.ON_GROUND:
-            where = "on the ground in"  # A copter in LAND disarms some seconds after the touchdown.
+            where = "on the ground in"  # A copter in LAND stays armed for some seconds after the touchdown.
         else:
             where = "in"
         if telemetry.is_armed:

@@ -93,7 +93,7 @@ class FollowedTarget:
         position, velocity = telemetry.position, telemetry.velocity.latest
         if position.latest is None or not math.isfinite(position.age):
             return
-        # By its age, because the target's connection may have another clock.
+        # The time is computed from the age, because the target's connection may have another clock.
         received_at = self._now() - position.age
         speeds = ZERO if velocity is None else (velocity.north_m_s, velocity.east_m_s, velocity.down_m_s)
         # The target's altitude is relative to its own home, which may be higher or lower than the follower's.

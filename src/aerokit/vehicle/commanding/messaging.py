@@ -212,7 +212,7 @@ class MessagingActions(VehicleBase):
         ``frame`` must then be 0. Other arguments and errors are those of :meth:`command`.
         """
         if or_long and frame != MavFrame.GLOBAL:
-            raise InvalidArgument(f"frame = {frame} is not allowed with or_long: MAV_FRAME_GLOBAL (0)")
+            raise InvalidArgument(f"frame = {frame} is not allowed with or_long: it must be MAV_FRAME_GLOBAL (0)")
         frame_option = {} if or_long else {"frame": frame}  # `send_place` has a fixed frame.
         return await self._sender.send_raw(
             self._session.commands.send_place if or_long else self._session.commands.send_int,
@@ -250,7 +250,7 @@ class MessagingActions(VehicleBase):
             self._arbiter.record_own_arming(message.param1 == 1)
         elif subjects and isinstance(message, (CommandInt, CommandLong, SetMode)):
             names = self.telemetry.mode_names
-            modes: tuple[Mode, ...] = ()  # Any mode may be the effect.
+            modes: tuple[Mode, ...] = ()  # An empty tuple: any mode may be the effect of the message.
             if isinstance(message, (CommandInt, CommandLong)):
                 params = (message.param1, message.param2, message.param3, message.param4)
                 modes = self.autopilot.modes_of_command(message.command, params, names)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 __all__ = ["PostedOrder"]
 
 POLL_INTERVAL_S = 0.05
-# Mode changes that the vehicle rejects temporarily.
+# Attempts, and seconds between them, for a mode change that the vehicle rejects temporarily.
 MAX_MODE_ATTEMPTS, MODE_RETRY_INTERVAL_S = 4, 0.5
 
 

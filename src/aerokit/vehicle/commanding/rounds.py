@@ -235,7 +235,7 @@ class RoundFlight:
                 await self._supply(stream, flight.advance(SETPOINT_INTERVAL_S))
                 if flight.is_on_path:
                     self._count()
-            # The vehicle follows the set-point with a delay.
+            # The vehicle follows the set-point with a delay, so it reaches the end later.
             give_up_at = self._session.connection.now() + END_TIMEOUT_S
             while self._count() < self._rounds - LAG_ROUNDS:
                 if self._session.connection.now() > give_up_at:

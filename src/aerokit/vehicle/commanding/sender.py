@@ -142,7 +142,7 @@ class OrderSender:
             if error.result != MavResult.UNSUPPORTED:
                 raise
             self.raise_if_ended(order)
-            if not self._arbiter.is_state_recent:  # A takeover may not have been reported yet.
+            if not self._arbiter.is_state_recent:  # During a silence, a takeover may not have been reported yet.
                 raise
             self._session.send(request.legacy(self._session.system_id))
 

@@ -262,7 +262,9 @@ class CommandSender:
                 self._accepted_at[key] = self._connection.now()
         if run is not None:
             run.receive(ack)
-        elif key in self._pending_acks and ack.result != MavResult.IN_PROGRESS:  # An IN_PROGRESS precedes the last ack.
+        elif (
+            key in self._pending_acks and ack.result != MavResult.IN_PROGRESS
+        ):  # After IN_PROGRESS, another ack is due.
             self._pending_acks[key].pop(0)
             if not self._pending_acks[key]:
                 del self._pending_acks[key]

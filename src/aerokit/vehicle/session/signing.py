@@ -59,7 +59,7 @@ def _check_vehicle(session: VehicleSession) -> None:
 def _message(session: VehicleSession, signing: Signing | None) -> SetupSigning:
     if signing is None:
         return SetupSigning(session.system_id, session.component_id, NO_KEY, 0)
-    # A second ahead: if the vehicle began with a time stamp older than that of this frame, its own frames would be
-    # rejected as replayed.
+    # The time stamp is a second ahead: if it were older than that of this frame, the frames that the vehicle signs from
+    # now on would be rejected as replayed.
     timestamp = signing.timestamp_now(session.connection.unix_time()) + TIMESTAMP_TICKS_PER_S
     return SetupSigning(session.system_id, session.component_id, signing.key.secret, timestamp)
