@@ -32,6 +32,7 @@ ClassT = TypeVar("ClassT")
 Check = Callable[[Any], bool]
 Rule = tuple[Check, str]
 
+# Rules by the name in the annotation.
 _SIMPLE: dict[str, Rule] = {
     "float": (lambda value: isinstance(value, Real), "a number"),
     "int": (lambda value: isinstance(value, Integral), "a whole number"),
@@ -57,6 +58,7 @@ def _is_above_zero(value: Any) -> bool:
         return False
 
 
+# Rules for parameters that denote a time, by the annotation.
 _SECONDS: dict[str, Rule] = {
     "float": (_is_above_zero, "seconds above 0"),
     "float | None": (lambda value: value is None or _is_above_zero(value), "seconds above 0, or None"),
@@ -118,10 +120,11 @@ class _Rules:
                 raise _error(rules[name], name, value, vehicle_parameter=dict(arguments).get("name"))
 
     def _read(self) -> dict[str, Rule]:
+        """Compute the rules from the signature of the function."""
         parameters = inspect.signature(self._function).parameters.values()
-        rules = {p.name: self._rule(p) for p in parameters if p.annotation is not p.empty}
-        self._positional = tuple(p.name for p in parameters if p.kind is p.POSITIONAL_OR_KEYWORD)
-        self._var_positional = next((p.name for p in parameters if p.kind is p.VAR_POSITIONAL), "")
+        rules = {param.name: self._rule(param) for param in parameters if param.annotation is not param.empty}
+        self._positional = tuple(param.name for param in parameters if param.kind is param.POSITIONAL_OR_KEYWORD)
+        self._var_positional = next((param.name for param in parameters if param.kind is param.VAR_POSITIONAL), "")
         self._by_name = rules
         return rules
 
@@ -181,6 +184,7 @@ def _name_of(node: ast.expr) -> str:
 
 
 def _named_rule(name: str, names: Mapping[str, Any]) -> Rule:
+    """Return the rule of an annotation that is a single name."""
     if name in _SIMPLE:
         return _SIMPLE[name]
     annotated = names.get(name)
@@ -198,6 +202,7 @@ def _named_rule(name: str, names: Mapping[str, Any]) -> Rule:
 
 
 def _generic_rule(name: str, inner: ast.expr, names: Mapping[str, Any]) -> Rule:
+    """Return the rule of the annotation ``name[inner]``."""
     if name in _SIMPLE:  # e.g. Callable[[int], None] or PathLike[str]
         return _SIMPLE[name]
     parts = inner.elts if isinstance(inner, ast.Tuple) else [inner]

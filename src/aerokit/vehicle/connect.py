@@ -114,7 +114,7 @@ async def connect(
         ConnectFailed: no heartbeat of the requested vehicle arrived in time; the error text says what was received
             instead.
     """
-    _check(system_id, timeout, rates, address.bus.dialect if isinstance(address, Connection) else dialect)
+    _check_arguments(system_id, timeout, rates, address.bus.dialect if isinstance(address, Connection) else dialect)
     if isinstance(address, Connection):
         if record is not None:
             raise InvalidArgument("record = … is not allowed here: the connection is open; use its record()")
@@ -182,7 +182,7 @@ async def _shared(connection: Connection, hub: Hub | None) -> AsyncIterator[None
         yield
 
 
-def _check(
+def _check_arguments(
     system_id: int | None, timeout: float, rates: Mapping[type[Message], float] | None, dialect: Dialect
 ) -> None:
     if system_id is not None and not 1 <= system_id <= 255:
@@ -192,7 +192,7 @@ def _check(
     for message_type, hz in (rates or {}).items():
         check_rate(message_type, hz)
         if dialect.get(message_type.ID) is not message_type:
-            raise InvalidArgument(f"{message_type.NAME} is not in the dialect {dialect.name!r}")
+            raise InvalidArgument(f"rates: {message_type.NAME} is not in the dialect {dialect.name!r}")
 
 
 @asynccontextmanager
@@ -291,12 +291,13 @@ class _Search:
         """Count the heartbeats of an autopilot other than component 1; return True after ``MIN_LONE_HEARTBEATS``."""
         source = (frame.system_id, frame.component_id)
         counts = self._lone_heartbeats
-        if source not in counts and len(counts) >= MAX_ROUTES:
+        if source not in counts and len(counts) >= MAX_ROUTES:  # A faulty sender may use many ids.
             return False
         counts[source] = counts.get(source, 0) + 1
         return counts[source] >= MIN_LONE_HEARTBEATS
 
     def abort(self, error: Exception) -> None:
+        """End the search without a vehicle, because the connection has ended."""
         if not self._ended.is_set():
             self._error = copy_exception(error)
             self._ended.set()
@@ -355,7 +356,7 @@ async def vehicles_on(
                 vehicles[system_id] = vehicle
                 if on_found is not None:
                     on_found(vehicle)
-                await asyncio.Event().wait()
+                await asyncio.Event().wait()  # until `vehicles_on` ends and cancels this task
         except AerokitError as error:
             # The vehicle fell silent again, the program is connected to it already, or the connection has ended.
             logger.info("system %d was not connected: %s", system_id, error)

@@ -154,12 +154,12 @@ class ArmingActions(VehicleBase):
             self.connection.send(Statustext(MavSeverity.INFO, reason, 0, 0))
         started = self.connection.now()
         try:
-            await self._arm_where_allowed(mode is None, force, timeout, max_silence_s)
+            await self._arm_with_fallback_mode(mode is None, force, timeout, max_silence_s)
         except CommandRejected as error:
             reasons = await self._health.arming_reasons(started)
             raise self._session.with_reasons(error, started, reasons) from None
 
-    async def _arm_where_allowed(
+    async def _arm_with_fallback_mode(
         self, may_change_mode: bool, force: bool, timeout: float, max_silence_s: float | None
     ) -> None:
         """Arm in the present mode; after a refusal there, change a mode that a parameter may exclude from arming."""
@@ -256,6 +256,7 @@ class ArmingActions(VehicleBase):
                     f"arm: the vehicle is armed already, in {self.telemetry.mode_name}; nothing was sent"
                 )
             return arming_mode
+        # A stream has its own mode, and the mode that a booting vehicle reports may still change.
         is_booting = self.telemetry.system_status.latest in BOOTING
         if (
             self._flight_cleanup.stop_stream is not None
@@ -320,6 +321,7 @@ class ArmingActions(VehicleBase):
                 await self._order_reboot(force)
             except CommandTimeout as error:
                 unanswered = error
+            # A command without an answer was probably lost, so the reboot is not awaited for the whole time-out.
             with anyio.move_on_after(timeout if unanswered is None else min(timeout, ARM_WATCH_S)):
                 await self._await_reboot(reboots_before)
                 return

@@ -149,14 +149,14 @@ class Health:
         """Return failing sensors and failing pre-arm checks.
 
         If the vehicle reports that it can be armed, failing sensors are left out, because they are not required (for
-        example an RC receiver on PX4). In a mode that does not allow arming, PX4 evaluates the requirements of that
-        mode, which say nothing about arming. PX4 reports a missing RC receiver as failing even in modes that do not
-        require a receiver.
+        example an RC receiver on PX4). PX4 reports a missing RC receiver as failing even in modes that do not require a
+        receiver.
         """
         failing: list[str] = []
         sensors = self._telemetry.sensors.latest
-        is_about_other_mode = self._autopilot.prearm_depends_on_mode and self.unarmable_mode()
-        if sensors is not None and sensors.prearm_checks_pass is not True and not is_about_other_mode:
+        # PX4 then reports the requirements of the present mode, in which it cannot arm.
+        is_meaningless = self._autopilot.prearm_depends_on_mode and self.unarmable_mode()
+        if sensors is not None and sensors.prearm_checks_pass is not True and not is_meaningless:
             failing += [f"{name} is not healthy (SYS_STATUS)" for name in sensors.failing if self._is_required(name)]
             if sensors.prearm_checks_pass is False:
                 failing.append("the vehicle's pre-arm checks do not pass (SYS_STATUS)")

@@ -213,6 +213,7 @@ class ManeuverActions(VehicleBase):
         center = self.telemetry.position.fresh(POSITION_MAX_AGE_S) if target is None else travel_target(target)
         if radius_m is None:
             counter, command = None, int(MavCmd.DO_REPOSITION)
+            # The speed, the radius and the yaw are left to the vehicle.
             params: tuple[float, ...] = (-1.0, float(MavDoRepositionFlags.CHANGE_MODE), 0.0, math.nan)
             mode = self._sender.mode_for("loiter", self.autopilot.reposition_purpose)
         else:
@@ -280,6 +281,7 @@ class ManeuverActions(VehicleBase):
             mode = self._sender.mode_for(operation, "hold") if self._is_on_wings else orbit_mode
             return MavCmd.DO_ORBIT, params, mode
         if self.autopilot.circles_by == "reposition":
+            # The speed is left to the vehicle. param4 is the direction of the circle (GCS_MAVLink_Plane.cpp).
             params = (-1.0, float(MavDoRepositionFlags.CHANGE_MODE), radius_m, 0.0 if clockwise else 1.0)
             return MavCmd.DO_REPOSITION, params, self._sender.mode_for(operation, "setpoint")
         raise NotSupported(f"{operation}: {self.autopilot.firmware} cannot circle a place; nothing was sent")

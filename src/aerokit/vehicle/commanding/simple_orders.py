@@ -201,6 +201,7 @@ class SimpleOrder(Snapshot):
 
         detach = session.connection.bus.attach(message_type, on_message, system_id=session.system_id)
         try:
+            # A vehicle that refuses requests for the message may still stream it.
             if await _has_message(context, message_type.ID, target) or reports:
                 await await_progress(
                     session,
@@ -244,7 +245,7 @@ async def receive_once(
         await session.commands.send_long(
             MavCmd.REQUEST_MESSAGE, message_type.ID, component_id=target, attempts=1, attempt_timeout=1.0
         )
-        while True:
+        while True:  # Other components may send this message, too.
             message = await messages.get(1.0)
             if message.received_frame is None or message.received_frame.component_id == target:
                 return message

@@ -93,7 +93,7 @@ async def _learn_version(commands: CommandSender, telemetry: Telemetry) -> None:
 
 
 async def _request(commands: CommandSender, message_id: int, *, attempt_timeout: float = 1.0) -> bool:
-    """Request one message once; return True if there was an ack, including a refusal."""
+    """Request one message, twice if necessary; return True if there was an ack, including a refusal."""
     try:
         await commands.send_long(MavCmd.REQUEST_MESSAGE, message_id, attempts=2, attempt_timeout=attempt_timeout)
     except CommandTimeout:
@@ -282,7 +282,7 @@ class VehicleSession:
             if text.severity <= MavSeverity.WARNING or self.autopilot.is_refusal(text.text)
         ]
         return CommandRejected(
-            str(error).partition("\n")[0],
+            str(error).partition("\n")[0],  # without the list of reasons, which the constructor adds again
             command=error.command,
             result=error.result,
             reasons=self.deduplicate_reasons(*error.reasons, *texts, *reasons),
