@@ -235,7 +235,7 @@ class Order:
     # -------------------------------------------------------------------- vehicle reports
 
     def on_mode(self, mode: Mode, at: float) -> None:
-        """Process the mode reported at this time.
+        """Process the mode reported at this time; the class describes the kinds of modes.
 
         Once one of the order's own modes was reported, a return to the mode before the order is a takeover.
         """
@@ -243,11 +243,11 @@ class Order:
         is_change = was_reported_before and number != self._mode_now
         if number in self._own_modes:
             self.is_confirmed = self.is_confirmed or is_change
-            if is_change or not self._requires_mode_change:
-                if at >= self._settles_at:
-                    self._accepted_modes.clear()
-                else:  # A mode that the program ordered shortly before may still appear.
-                    self._accepted_modes -= self._modes_before
+            has_taken_effect = is_change or not self._requires_mode_change
+            if has_taken_effect and at >= self._settles_at:
+                self._accepted_modes.clear()
+            elif has_taken_effect:  # A mode that the program ordered shortly before may still appear.
+                self._accepted_modes -= self._modes_before
         elif number in self._expected_modes & self._accepted_modes and at >= self._settles_at:
             # An earlier order of the program has taken effect, so only another party can restore the mode before it.
             self._accepted_modes -= self._modes_before
@@ -257,6 +257,7 @@ class Order:
                 self.unexplained = f"the mode changed to {mode}"
             self._accepted_modes.add(number)
         elif number not in self._accepted_modes and self._ends_on_mode_change:
+            # The pilot or a failsafe has changed the mode.
             if not self.has_lost_mode:
                 self.mode_lost_at = at
             self.has_lost_mode = True

@@ -242,7 +242,7 @@ class MessageRates:
                 rates_by_group[group] = self._rate_of_group(group)
             stream.mark_requested(self._connection.now(), stream.needed_hz)
         for group, hz in rates_by_group.items():
-            if hz > 0:  # Other groups may be in use by another ground station.
+            if hz > 0:  # A rate of 0 would stop a group that another ground station may use.
                 rate = math.ceil(hz)
                 self._connection.send(RequestDataStream(self._system_id, self._component_id, group, rate, 1))
 

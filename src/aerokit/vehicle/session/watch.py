@@ -200,11 +200,11 @@ class VehicleWatch:
         behind_ms = 1000 * (frame.received_at - read_at) - (milliseconds - milliseconds_before)
         if self._expects_reboot and behind_ms > MIN_REBOOT_STEP_MS:
             self._on_reboot_detected(clock, milliseconds)
-        elif milliseconds + REBOOT_STEP_MS >= milliseconds_before:
+        elif milliseconds + REBOOT_STEP_MS >= milliseconds_before:  # no reboot
             self._last_times[clock] = (milliseconds, now)
             if self._first_time is None and clock == "time_boot_ms":
                 self._first_time = (milliseconds, now)
-            if self._decreased_times:
+            if self._decreased_times:  # An earlier decrease came from a late message.
                 self._decreased_times.pop(clock, None)
         elif self._is_decrease_confirmed(clock, milliseconds):
             self._on_reboot_detected(clock, milliseconds)
