@@ -194,8 +194,8 @@ def _named_rule(name: str, names: Mapping[str, Any]) -> Rule:
         choices = get_args(annotated)
         return partial(_is_one_of, choices), f"one of {', '.join(map(str, choices))}"
     if isinstance(annotated, UnionType):
-        kinds = tuple(get_origin(kind) or kind for kind in get_args(annotated))
-        return (lambda value: isinstance(value, kinds)), " or ".join(kind.__name__ for kind in kinds)
+        types = tuple(get_origin(member) or member for member in get_args(annotated))
+        return (lambda value: isinstance(value, types)), " or ".join(allowed.__name__ for allowed in types)
     if name in ("Any", "object") or isinstance(annotated, TypeVar):
         return (lambda _: True), "anything"
     return partial(_has_class_name, name), with_article(name)
@@ -208,8 +208,8 @@ def _generic_rule(name: str, inner: ast.expr, names: Mapping[str, Any]) -> Rule:
     parts = inner.elts if isinstance(inner, ast.Tuple) else [inner]
     rules = [_rule(part, names) for part in parts]
     if name == "type":
-        kinds = _class_names(_name_of(parts[0]), names)
-        return partial(_is_class, kinds), f"a class{' of ' if kinds else ''}{' or '.join(kinds)}"
+        class_names = _class_names(_name_of(parts[0]), names)
+        return partial(_is_class, class_names), f"a class{' of ' if class_names else ''}{' or '.join(class_names)}"
     if name == "Mapping":
         (is_key, _), (is_value, description) = rules
         return partial(_is_mapping, is_key, is_value), f"a mapping whose values are each {description}"
@@ -254,10 +254,10 @@ def _are_items(is_item: Check, value: object) -> bool:
     return not isinstance(value, (list, tuple, set, frozenset)) or all(map(is_item, value))
 
 
-def check_kind(name: str, value: object, kind: type) -> None:
-    """Raise InvalidArgument unless ``value`` is an instance of ``kind``. Used if the annotation is a type variable."""
-    if not isinstance(value, kind):
-        raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: {with_article(kind.__name__)}")
+def check_kind(name: str, value: object, expected_type: type) -> None:
+    """Raise InvalidArgument unless ``value`` is an instance of this type. Used if the annotation is a type variable."""
+    if not isinstance(value, expected_type):
+        raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: {with_article(expected_type.__name__)}")
 
 
 def check_range(name: str, value: float, minimum: float, maximum: float, *, above: bool = False) -> None:

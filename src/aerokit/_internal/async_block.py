@@ -52,9 +52,9 @@ class _Block(AbstractAsyncContextManager[T]):
             raise error.with_traceback(None) from error.__cause__
 
     async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+        self, error_type: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> bool | None:
-        return await self._block.__aexit__(kind, error, traceback)
+        return await self._block.__aexit__(error_type, error, traceback)
 
     def __await__(self) -> None:
         raise self._misused("await")

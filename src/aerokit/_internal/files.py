@@ -93,14 +93,14 @@ def read_text(path: str | os.PathLike[str]) -> str:
 
 
 class PartFile:
-    """A download in progress: ``<to>.part`` always holds the beginning of the complete file, until :meth:`finish`.
+    """A download in progress: until :meth:`finish`, ``<destination>.part`` holds the beginning of the complete file.
 
     ``mark`` is inserted before ``.part``, so that a download continues only the partial file that has the same mark.
     """
 
-    def __init__(self, to: str | os.PathLike[str], mark: str = "") -> None:
-        self._to = os.fspath(to)
-        self.path: Path = Path(f"{self._to}{mark}.part")
+    def __init__(self, destination: str | os.PathLike[str], mark: str = "") -> None:
+        self._destination = os.fspath(destination)
+        self.path: Path = Path(f"{self._destination}{mark}.part")
         """Path of the partial file."""
 
     @property
@@ -127,4 +127,4 @@ class PartFile:
 
     def finish(self) -> None:
         """Rename the partial file to its final name, replacing any existing file."""
-        os.replace(self.path, self._to)
+        os.replace(self.path, self._destination)

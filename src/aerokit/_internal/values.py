@@ -26,7 +26,7 @@ class _SnapshotType(type):
 
     def __new__(mcs, name: str, bases: tuple[type, ...], namespace: dict[str, Any]) -> _SnapshotType:
         annotations: dict[str, str] = namespace.get("__annotations__", {})
-        own_fields = tuple(field for field, kind in annotations.items() if not kind.startswith("ClassVar"))
+        own_fields = tuple(field for field, annotation in annotations.items() if not annotation.startswith("ClassVar"))
         defaults = {field: value for base in bases for field, value in getattr(base, "_defaults", {}).items()}
         defaults.update({field: namespace.pop(field) for field in own_fields if field in namespace})
         fields = (*(field for base in bases for field in getattr(base, "__match_args__", ())), *own_fields)

@@ -308,8 +308,8 @@ class _Search:
         if self._found is None:
             assert self._error is not None
             raise self._error
-        found, self._found = self._found, None
-        return found
+        result, self._found = self._found, None  # The caller closes the vehicle from now on.
+        return result
 
     def close(self) -> None:
         """Close the vehicle if the caller was cancelled before it received the result."""
@@ -363,9 +363,9 @@ async def vehicles_on(
 
     async def search() -> None:
         try:
-            async for found in connection.vehicles():
-                if found.system_id not in vehicles:
-                    tasks.start(partial(stay_connected, found.system_id))
+            async for event in connection.vehicles():
+                if event.system_id not in vehicles:
+                    tasks.start(partial(stay_connected, event.system_id))
         except AerokitError as error:
             logger.info("the search for vehicles has ended: %s", error)
 

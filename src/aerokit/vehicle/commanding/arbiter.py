@@ -395,10 +395,10 @@ class CommandArbiter:
         for order in self._active_orders():
             order.on_system_status(state)
 
-    def _on_armed(self, before: bool | None, armed: bool) -> None:
-        if before and not armed:
+    def _on_armed(self, armed_before: bool | None, armed: bool) -> None:
+        if armed_before and not armed:
             self._ordered_since_disarmed.clear()
-        if armed and not before:
+        if armed and not armed_before:
             self._on_arming()
         if not armed:
             self._disarmed_at = self._telemetry.armed.updated_at

@@ -110,9 +110,11 @@ class PathFlight:
         if self._flown_m >= length_m:
             self.is_on_path, self._present_speed_m_s, self._flown_m = True, 0.0, length_m
         fraction = self._flown_m / length_m if length_m else 1.0
-        north, east, down = (begin + fraction * way for begin, way in zip(self._start, to_path, strict=True))
+        north, east, down = (
+            begin + fraction * component for begin, component in zip(self._start, to_path, strict=True)
+        )
         speed = self._present_speed_m_s
-        north_m_s, east_m_s, down_m_s = (speed * way / length_m if length_m else 0.0 for way in to_path)
+        north_m_s, east_m_s, down_m_s = (speed * component / length_m if length_m else 0.0 for component in to_path)
         return self._setpoint((north, east), down, (north_m_s, east_m_s, down_m_s), (0.0, 0.0))
 
     def _advance_on_path(self, seconds: float) -> TrajectorySetpoint:

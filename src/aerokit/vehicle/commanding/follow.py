@@ -64,13 +64,13 @@ class FollowPlace(Snapshot):
 class TargetState(Snapshot):
     """Position of the target with its velocity (north, east, down in m/s).
 
-    ``since`` is the time at which this position was first reported, ``at`` the time of its last report.
+    ``reported_at`` is the time of the last report of this position, ``first_reported_at`` the time of its first report.
     """
 
     position: Position
     velocity: tuple[float, float, float]
-    at: float
-    since: float
+    reported_at: float
+    first_reported_at: float
 
 
 class FollowedTarget:
@@ -111,17 +111,17 @@ class FollowedTarget:
         """
         if not isinstance(position, Position):
             raise InvalidArgument(f"position = {short_repr(position)} is not allowed: a Position")
-        before, now = self.latest, self._now()
-        if before is not None and now - before.at < MIN_INTERVAL_S:
+        latest, now = self.latest, self._now()
+        if latest is not None and now - latest.reported_at < MIN_INTERVAL_S:
             return
-        if before is None:
+        if latest is None:
             self.latest = TargetState(position, ZERO, now, now)
-        elif position == before.position:
-            is_moving = now - before.since <= OVERDUE_INTERVALS * self._interval_s
-            self.latest = TargetState(position, before.velocity if is_moving else ZERO, now, before.since)
+        elif position == latest.position:
+            is_moving = now - latest.first_reported_at <= OVERDUE_INTERVALS * self._interval_s
+            self.latest = TargetState(position, latest.velocity if is_moving else ZERO, now, latest.first_reported_at)
         else:
-            self._interval_s = now - before.since
-            velocity = _mean_velocity(before.position, position, self._interval_s)
+            self._interval_s = now - latest.first_reported_at
+            velocity = _mean_velocity(latest.position, position, self._interval_s)
             is_jump = math.hypot(*velocity) > MAX_TARGET_SPEED_M_S
             self.latest = TargetState(position, ZERO if is_jump else velocity, now, now)
 
@@ -247,7 +247,7 @@ class FollowStream(SteeringStream[TargetState]):
         until = self._now() + self._valid_for_s
         while True:
             state = self._tracker.read()
-            if state is not None and self._now() - state.at <= self._valid_for_s:
+            if state is not None and self._now() - state.reported_at <= self._valid_for_s:
                 return state
             if self._now() > until or self._end_reason:
                 reason = self._end_reason or f"no position of the target was known within {self._valid_for_s:g} s"
@@ -278,7 +278,7 @@ class FollowStream(SteeringStream[TargetState]):
             state = self._tracker.read()
             if state is not None:
                 self._replace_value(state)
-                self._set_at = state.at  # The value expires by the age of the target's position.
+                self._set_at = state.reported_at  # The value expires by the age of the target's position.
         except (Exception, asyncio.CancelledError) as error:
             # The program's function raises CancelledError if it reads the result of a cancelled task.
             self._end_reason = f"the position of the target raised {error!r}"
@@ -293,7 +293,7 @@ class FollowStream(SteeringStream[TargetState]):
 
     def _encode_place(self, state: TargetState) -> Message:
         """Return the set-point for this moment, assuming that the target keeps its velocity between two positions."""
-        moved_for_s = max(0.0, min(self._now() - state.since, self._valid_for_s))
+        moved_for_s = max(0.0, min(self._now() - state.first_reported_at, self._valid_for_s))
         north_m_s, east_m_s, down_m_s = state.velocity
         if math.hypot(north_m_s, east_m_s) >= MIN_COURSE_SPEED_M_S:
             self._course_deg = math.degrees(math.atan2(east_m_s, north_m_s))

@@ -46,13 +46,15 @@ class Health:
         return [*missing, *self._out_of_date(), *self._failing()]
 
     def _out_of_date(self) -> list[str]:
-        """Return the states that are too old to describe the present."""
+        """Return the states that are too too_old to describe the present."""
         telemetry = self._telemetry
         is_lost = self._session.watch.link_state.latest is LinkState.LOST
-        last = f"the last one {self._session.heartbeat_age:.1f} s ago{', the link is lost' if is_lost else ''}"
-        heartbeats = [f"heartbeats ({last})"] if is_lost or self._session.watch.is_silent else []
+        last_heartbeat = (
+            f"the last_heartbeat one {self._session.heartbeat_age:.1f} s ago{', the link is lost' if is_lost else ''}"
+        )
+        heartbeats = [f"heartbeats ({last_heartbeat})"] if is_lost or self._session.watch.is_silent else []
         cells = (telemetry.sensors, telemetry.estimator, telemetry.position)
-        old = [
+        too_old = [
             f"{cell.name} (no {cell.waits_for} for {cell.age:.0f} s)"
             for cell in cells
             if HEALTH_MAX_AGE_S < cell.age < math.inf
@@ -62,7 +64,7 @@ class Health:
             for cell in cells
             if cell.is_known and cell.updated_at < self._restored_at and cell.age <= HEALTH_MAX_AGE_S
         ]
-        return [*heartbeats, *old, *from_before_silence]
+        return [*heartbeats, *too_old, *from_before_silence]
 
     async def why_not_armable(self) -> list[str]:
         """Return why arming would be refused now. The vehicle is requested to run its checks if it supports that."""

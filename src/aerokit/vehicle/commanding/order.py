@@ -234,8 +234,8 @@ class Order:
 
     # -------------------------------------------------------------------- vehicle reports
 
-    def on_mode(self, mode: Mode, at: float) -> None:
-        """Process the mode reported at this time; the class describes the kinds of modes.
+    def on_mode(self, mode: Mode, reported_at: float) -> None:
+        """Process the mode reported reported_at this time; the class describes the kinds of modes.
 
         Once one of the order's own modes was reported, a return to the mode before the order is a takeover.
         """
@@ -244,14 +244,14 @@ class Order:
         if number in self._own_modes:
             self.is_confirmed = self.is_confirmed or is_change
             has_taken_effect = is_change or not self._requires_mode_change
-            if has_taken_effect and at >= self._settles_at:
+            if has_taken_effect and reported_at >= self._settles_at:
                 self._accepted_modes.clear()
             elif has_taken_effect:  # A mode that the program ordered shortly before may still appear.
                 self._accepted_modes -= self._modes_before
-        elif number in self._expected_modes & self._accepted_modes and at >= self._settles_at:
+        elif number in self._expected_modes & self._accepted_modes and reported_at >= self._settles_at:
             # An earlier order of the program has taken effect, so only another party can restore the mode before it.
             self._accepted_modes -= self._modes_before
-        elif not was_reported_before or at < self._any_mode_until:
+        elif not was_reported_before or reported_at < self._any_mode_until:
             # The first report of a mode, or perhaps the effect of a raw command.
             if was_reported_before and number not in self._accepted_modes:
                 self.unexplained = f"the mode changed to {mode}"
@@ -259,7 +259,7 @@ class Order:
         elif number not in self._accepted_modes and self._ends_on_mode_change:
             # The pilot or a failsafe has changed the mode.
             if not self.has_lost_mode:
-                self.mode_lost_at = at
+                self.mode_lost_at = reported_at
             self.has_lost_mode = True
             self.takeover_reason = self.takeover_reason or f"the mode changed to {mode}"
         self._mode_now = number
@@ -273,12 +273,12 @@ class Order:
             self.failsafe = self.failsafe or failsafe_text(state)
         self._state_before = state
 
-    def on_armed(self, armed: bool, at: float) -> None:
+    def on_armed(self, armed: bool, reported_at: float) -> None:
         """Process the armed state reported by HEARTBEAT."""
-        before, self._armed_now = self._armed_now, armed
-        if before is not None and before is not armed and armed is self.armed:
+        armed_before, self._armed_now = self._armed_now, armed
+        if armed_before is not None and armed_before is not armed and armed is self.armed:
             self.is_confirmed = True
-        elif before and not armed and self._ends_on_disarm:
+        elif armed_before and not armed and self._ends_on_disarm:
             self.takeover_reason = self.takeover_reason or "the vehicle disarmed"
 
     def on_reboot(self) -> None:
@@ -333,13 +333,13 @@ class SentCommand:
         if armed is not None and self.arms is not None and armed is not self.arms:
             self._is_overruled = True
 
-    def on_mode(self, mode: Mode, at: float) -> None:
+    def on_mode(self, mode: Mode, reported_at: float) -> None:
         """Process the reported mode."""
-        before, self._mode_now = self._mode_now, mode.custom_mode
-        self._is_reported = self._is_reported or (self._mode_now != before and self._mode_now in self._modes)
+        mode_before, self._mode_now = self._mode_now, mode.custom_mode
+        self._is_reported = self._is_reported or (self._mode_now != mode_before and self._mode_now in self._modes)
 
-    def on_armed(self, armed: bool, at: float) -> None:
+    def on_armed(self, armed: bool, reported_at: float) -> None:
         """Process the reported armed state."""
-        before, self._armed_now = self._armed_now, armed
-        self._is_reported = self._is_reported or (armed is not before and armed is self.arms)
-        self.heartbeat_at = at
+        armed_before, self._armed_now = self._armed_now, armed
+        self._is_reported = self._is_reported or (armed is not armed_before and armed is self.arms)
+        self.heartbeat_at = reported_at

@@ -227,8 +227,8 @@ class RoundFlight:
         return heading
 
     async def _stream(self, flight: PathFlight, order: Order) -> None:
-        first, limits = flight.advance(0.0), {"valid_for_s": VALID_FOR_S, "max_lag_s": VALID_FOR_S}
-        stream = Guided(self._context).trajectory(first, rate_hz=SETPOINT_RATE_HZ, **limits)
+        initial, limits = flight.advance(0.0), {"valid_for_s": VALID_FOR_S, "max_lag_s": VALID_FOR_S}
+        stream = Guided(self._context).trajectory(initial, rate_hz=SETPOINT_RATE_HZ, **limits)
         stream._prepared_order = order
         async with stream:
             while not flight.is_complete:

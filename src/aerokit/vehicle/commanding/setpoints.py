@@ -192,9 +192,9 @@ class SetpointEncoder:
                 vectors.append(ZERO)
                 mask |= ignore_bits
         position, velocity, acceleration = vectors
-        parts = (*position, *velocity, *acceleration)
-        check_finite("set-point", *parts)
-        return SetPositionTargetLocalNed(self._time_ms(), *self._address, frame, mask, *parts, yaw, yaw_rate)
+        vector_fields = (*position, *velocity, *acceleration)
+        check_finite("set-point", *vector_fields)
+        return SetPositionTargetLocalNed(self._time_ms(), *self._address, frame, mask, *vector_fields, yaw, yaw_rate)
 
     def body_velocity(self, setpoint: BodyVelocitySetpoint) -> Message:
         """Return SET_POSITION_TARGET_LOCAL_NED with a velocity in MAV_FRAME_BODY_NED.

@@ -274,11 +274,11 @@ class MeasurementEncoder:
         telemetry = self._session.telemetry
         if max(telemetry.attitude.age, telemetry.local_position.age) > POSITION_MAX_AGE_S:
             raise ValueUnknownError("landing target: the vehicle's attitude or local position is unknown, or too old")
-        attitude, here = telemetry.attitude.value, telemetry.local_position.value
+        attitude, own_position = telemetry.attitude.value, telemetry.local_position.value
         if is_level:  # The axes of the offset turn with the vehicle, but do not tilt.
             attitude = Attitude(0.0, 0.0, attitude.yaw_deg)
         north, east, down = rotate(attitude.quaternion, offset)
-        return (here.north_m + north, here.east_m + east, here.down_m + down)
+        return (own_position.north_m + north, own_position.east_m + east, own_position.down_m + down)
 
     def _time_us(self, measured_at: float | None) -> int:
         """Return the time stamp in microseconds; None stands for now."""
@@ -288,9 +288,9 @@ class MeasurementEncoder:
         return int(seconds * 1e6)
 
 
-def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
+def multiply(left: Quaternion, right: Quaternion) -> Quaternion:
     """Return the product of two quaternions (w, x, y, z)."""
-    (aw, ax, ay, az), (bw, bx, by, bz) = a, b
+    (aw, ax, ay, az), (bw, bx, by, bz) = left, right
     return (
         aw * bw - ax * bx - ay * by - az * bz,
         aw * bx + ax * bw + ay * bz - az * by,
@@ -299,10 +299,11 @@ def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
     )
 
 
-def rotate(q: Quaternion, vector: Vector) -> Vector:
+def rotate(quaternion: Quaternion, vector: Vector) -> Vector:
     """Return a vector rotated by a unit quaternion."""
-    conjugate = (q[0], -q[1], -q[2], -q[3])
-    _, x, y, z = multiply(multiply(q, (0.0, *vector)), conjugate)
+    w, x, y, z = quaternion
+    conjugate = (w, -x, -y, -z)
+    _, x, y, z = multiply(multiply(quaternion, (0.0, *vector)), conjugate)
     return (x, y, z)
 
 

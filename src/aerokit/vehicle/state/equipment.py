@@ -269,10 +269,10 @@ def servo_outputs(message: messages.ServoOutputRaw, context: Context) -> ServoOu
     frame = message.received_frame
     count = 8 if frame is not None and frame.version == 1 else OUTPUTS_PER_PORT
     outputs: tuple[int, ...] = _SERVOS(message)[:count]
-    before: tuple[int, ...] = () if context.before is None else context.before.outputs_us
-    first = message.port * OUTPUTS_PER_PORT
-    missing = (0,) * (first - len(before))  # outputs of earlier ports that were not received yet
-    return ServoOutputs((*before[:first], *missing, *outputs, *before[first + count :]))
+    known_outputs: tuple[int, ...] = () if context.before is None else context.before.outputs_us
+    first_index = message.port * OUTPUTS_PER_PORT
+    missing = (0,) * (first_index - len(known_outputs))  # outputs of earlier ports that were not received yet
+    return ServoOutputs((*known_outputs[:first_index], *missing, *outputs, *known_outputs[first_index + count :]))
 
 
 def vibration(message: messages.Vibration) -> Vibration:

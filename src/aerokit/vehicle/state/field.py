@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-MESSAGE_IDS = {row[0]: message_id for message_id, row in messages.INDEX.items()}
+MESSAGE_IDS = {class_name: message_id for message_id, (class_name, *_) in messages.INDEX.items()}
 """Maps the name of a message class to the message id, without importing the class."""
 
 
