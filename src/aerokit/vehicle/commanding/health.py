@@ -32,7 +32,7 @@ class Health:
         session.at_close(session.connection.bus.attach_event(LinkRestored, self._on_restored))
 
     def _on_restored(self, event: LinkRestored) -> None:
-        """Discard states received before a silence, because the vehicle may have rebooted."""
+        """Distrust states received before the link was restored, because the vehicle may have rebooted meanwhile."""
         self._restored_at = event.at
 
     def missing_for_flight(self) -> list[str]:
@@ -46,12 +46,11 @@ class Health:
         return [*missing, *self._out_of_date(), *self._failing()]
 
     def _out_of_date(self) -> list[str]:
-        """Return the states that are too too_old to describe the present."""
+        """Return the states that are too old to describe the present."""
         telemetry = self._telemetry
         is_lost = self._session.watch.link_state.latest is LinkState.LOST
-        last_heartbeat = (
-            f"the last_heartbeat one {self._session.heartbeat_age:.1f} s ago{', the link is lost' if is_lost else ''}"
-        )
+        lost_link = ", the link is lost" if is_lost else ""
+        last_heartbeat = f"the last one {self._session.heartbeat_age:.1f} s ago{lost_link}"
         heartbeats = [f"heartbeats ({last_heartbeat})"] if is_lost or self._session.watch.is_silent else []
         cells = (telemetry.sensors, telemetry.estimator, telemetry.position)
         too_old = [

@@ -235,7 +235,7 @@ class Order:
     # -------------------------------------------------------------------- vehicle reports
 
     def on_mode(self, mode: Mode, reported_at: float) -> None:
-        """Process the mode reported reported_at this time; the class describes the kinds of modes.
+        """Process the mode reported at this time; the class describes the kinds of modes.
 
         Once one of the order's own modes was reported, a return to the mode before the order is a takeover.
         """

@@ -306,10 +306,7 @@ class SteeringStream(ValueStream[ValueT]):
 
 
 class TakeoverCheck:
-    """Refuses a mode change if another party has changed the mode, or the program has given another order, meanwhile.
-
-    "Meanwhile" is the time since the creation of this object.
-    """
+    """Refuses a mode change if the mode was changed, or another order was given, since the creation of this object."""
 
     def __init__(self, context: VehicleContext, next_mode: Mode) -> None:
         telemetry, autopilot = context.session.telemetry, context.session.autopilot

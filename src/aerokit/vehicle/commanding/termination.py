@@ -16,7 +16,7 @@ ShutdownIntent = Literal["shut down"]
 
 ANSWER_TIMEOUT_S = 3.0
 SHUTDOWN = 2
-"""param1 of PREFLIGHT_REBOOT_SHUTDOWN."""
+"""param1 of PREFLIGHT_REBOOT_SHUTDOWN that switches the autopilot off."""
 SEND_ONCE: dict[str, Any] = {"attempts": 1, "attempt_timeout": ANSWER_TIMEOUT_S}
 
 

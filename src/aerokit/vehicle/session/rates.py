@@ -227,8 +227,9 @@ class MessageRates:
         self._publish_unavailable(stream, result_name(error.result))
 
     def _request_by_group(self) -> None:
-        """Request groups of messages by REQUEST_DATA_STREAM. It has no ack, so :meth:`watch` repeats it if nothing
-        arrives.
+        """Request groups of messages by REQUEST_DATA_STREAM.
+
+        This message has no ack, so :meth:`watch` repeats it if nothing arrives.
         """
         rates_by_group: dict[int, float] = {}
         for stream in self._streams.values():

@@ -353,7 +353,7 @@ class VehicleSession:
         ]
 
     def _attach_watched_streams(self) -> None:
-        """Make the messages that have no default rate be requested while one of their cells is watched."""
+        """For each message without a default rate: request it while one of its cells is watched."""
         for name, state in STATES.items():
             cell = self.telemetry.cells[name]
             for source in state.sources:
