@@ -167,8 +167,8 @@ class Guided:
             NotSupported: this firmware ignores the message, or its version is not known yet. Nothing was sent.
         """
         session = self._context.session
-        until, version = session.autopilot.actuators_until, session.telemetry.version.latest
-        if until is None or version is None or version.number[:2] >= until:
+        version, supported_before = session.telemetry.version.latest, session.autopilot.actuators_until
+        if supported_before is None or version is None or version.number[:2] >= supported_before:
             version_text = "of unknown version" if version is None else str(version.firmware)
             raise NotSupported(
                 f"{session.autopilot.firmware} {version_text} ignores SET_ACTUATOR_CONTROL_TARGET; only PX4 before 1.14"

@@ -133,6 +133,7 @@ class CommandSender:
             is_supported = error.result not in UNSUPPORTED_RESULTS
             if is_supported or (order_status is not None and order_status.end):
                 raise
+        # The place is param5 to param7 of a COMMAND_LONG, in degrees.
         first_params = (*params, *(0.0,) * (4 - len(params)))
         return await self.send_long(command, *first_params, x * 1e-7, y * 1e-7, z, order_status=order_status, **options)
 

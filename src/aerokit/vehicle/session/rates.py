@@ -116,6 +116,7 @@ class MessageRates:
         self._has_due_streams = asyncio.Event()
         # True if the vehicle does not support SET_MESSAGE_INTERVAL, so that groups of messages are requested.
         self._uses_groups = False
+        # Number of calls of `request_again`.
         self._reset_count = 0
 
     def request(self, message_type: type[Message], hz: float, *, is_optional: bool = False) -> Detach:
@@ -264,6 +265,7 @@ class MessageRates:
     # ------------------------------------------------------------------------------ watching
 
     def _watch(self, stream: _Stream) -> None:
+        """Record how many messages have arrived; request the stream again, or report it as slow, if necessary."""
         stream.counts.append(stream.count)
         if stream.requested_hz is None or stream.requested_hz <= 0 or stream.is_refused:
             return

@@ -63,8 +63,9 @@ EAGER_REQUESTS, EAGER_INTERVAL_S = 4, 0.3
 
 
 async def learn_constants(connection: Connection, commands: CommandSender, telemetry: Telemetry) -> None:
-    """Request version, home, origin and modes until they are known, and again after each reboot. Runs until the link
-    closes.
+    """Request version, home and origin until they are known, and again after each reboot; request the modes once.
+
+    Runs until the link closes.
     """
     has_requested_modes = False
     await _learn_version(commands, telemetry)

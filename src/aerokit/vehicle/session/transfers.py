@@ -152,6 +152,7 @@ class Transfers:
                 if self._request_version is not None:
                     await self._request_version()
                 await self._version.wait_until(lambda _: True)
+            # An autopilot's version may still arrive, because the session requests it again and again.
             self._is_version_unavailable = self._request_version is not None and not self._version.is_known
         version = self._version.latest
         return None if version is None else version.capabilities

@@ -216,7 +216,7 @@ class StreamedMessage:
                 self._apply(frame, message)
             return
         instance, instance_at = 0, self._instance_at
-        # MAVLink 2 truncates zeros at the end of the payload.
+        # MAVLink 2 truncates zeros at the end of the payload, so a missing byte is 0.
         if instance_at is not None and len(frame.body) > instance_at:
             instance = frame.body[instance_at]
         self.pending[instance] = message or frame

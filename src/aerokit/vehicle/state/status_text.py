@@ -67,11 +67,13 @@ class StatusTextAssembler:
         self._recent.clear()
 
     def _add_chunk(self, message: Statustext, chunk: bytes, now: float) -> Iterator[StatusText]:
+        """Add a chunk to its text, and yield the texts that are complete or truncated now."""
         key = (_sender(message), message.id)
         text = self._incomplete.get(key)
         if text is not None and message.chunk_seq < text.next_seq:
             if message.chunk_seq == text.next_seq - 1 and text.last_chunk == chunk:
                 return  # The same chunk was already received by another link.
+            # Another text with the same id has begun, so the end of this one was lost.
             yield self._incomplete.pop(key).truncated(now)
             text = None
         if text is None:
