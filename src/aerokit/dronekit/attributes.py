@@ -27,7 +27,7 @@ from aerokit.dronekit.values import (
 )
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import EkfStatusFlags, MavProtocolCapability
-from aerokit.vehicle.state.movement import place
+from aerokit.vehicle.state.movement import valid_coordinates
 
 if TYPE_CHECKING:
     from aerokit.dronekit.mavlink import MAVConnection
@@ -103,7 +103,7 @@ class Locations(HasObservers, LocationPrivates):
 
 def _place_of(message: m.GlobalPositionInt) -> tuple[float | None, float | None]:
     """Return latitude and longitude in degrees, or None without a fix."""
-    return place(message.lat, message.lon) or (None, None)
+    return valid_coordinates(message.lat, message.lon) or (None, None)
 
 
 class VehicleAttributes(VehicleCore):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from aerokit.events import VehicleRecovered, VehicleSilent
 from aerokit.fleets.events import MemberBack, MemberFailed, MemberLost, MemberReclaimed, MemberTakenOver
 from aerokit.mavlink.enums import MavState
-from aerokit.vehicle.commanding.order import FAILSAFE_STATES, is_worse
+from aerokit.vehicle.commanding.order import FAILSAFE_STATES, is_worse_failsafe
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -150,7 +150,7 @@ class Member:
         state = vehicle.system_status.latest
         if state not in FAILSAFE_STATES:
             self._ignored_failsafe = None
-        elif state is not None and is_worse(state, self._ignored_failsafe):
+        elif state is not None and is_worse_failsafe(state, self._ignored_failsafe):
             return f"it is in a failsafe (MAV_STATE {MavState(state).name})"
         has_ended_mission = "mission" in vars(vehicle) and vehicle.mission.explains_mode
         if has_ended_mission or self._current_control() == self._control_when_reclaimed:

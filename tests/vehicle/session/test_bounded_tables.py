@@ -80,7 +80,7 @@ def test_status_text_open_table_is_bounded() -> None:
     texts = StatusTextAssembler()
     for number in range(1, 5000):
         texts.receive(Statustext(6, "x" * 50, id=number, chunk_seq=0), 0.0)
-    assert len(texts._open) == MAX_OPEN
+    assert len(texts._incomplete) == MAX_OPEN
 
 
 def test_peers_of_a_simulated_vehicle() -> None:

@@ -144,7 +144,7 @@ async def ardupilot_escs(run: CalibrationRun, *_: float) -> AsyncGenerator[Calib
 async def _restore(run: CalibrationRun, name: str, value: float) -> None:
     """Restore the parameter that starts the calibration at boot; log a warning if this is not confirmed."""
     with anyio.CancelScope(shield=True), anyio.move_on_after(RESTORE_TIMEOUT_S), suppress(AerokitError):
-        if run.context.arbiter.is_known:  # Nothing is sent to a silent vehicle.
+        if run.context.arbiter.is_state_recent:  # Nothing is sent to a silent vehicle.
             await run.parameters().set(name, value)
             return
     logger.warning(

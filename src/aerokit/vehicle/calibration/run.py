@@ -78,7 +78,7 @@ class CalibrationRun:
             raise NotSupported(
                 f"{self.call_name}: aerokit does not know how to calibrate {autopilot.firmware}; nothing was sent"
             )
-        self.session.check_disarmed(self.call_name, is_current=self.context.arbiter.is_known)
+        self.session.check_disarmed(self.call_name, is_current=self.context.arbiter.is_state_recent)
 
     async def begin(self, cancel: tuple[float, ...] | None, why_not_cancelled: str = "") -> None:
         """Wait until no other calibration is being cancelled, then register this calibration as running.
@@ -152,7 +152,7 @@ class CalibrationRun:
         # The arbiter ends this order when another party takes over, and the cancel command is then not repeated.
         order = self._cancel_order_stack.enter_context(arbiter.auxiliary_order())
         self._sent_cancel = self._cancel_order_stack.enter_context(arbiter.sending(order))
-        if self.session.connection.is_open and arbiter.is_known:
+        if self.session.connection.is_open and arbiter.is_state_recent:
             self._send_cancel(*self._cancel_command)
         self.session.background.start(self._confirm_cancel, "aerokit calibration")
 
@@ -194,7 +194,7 @@ class CalibrationRun:
                 is_taken_over = self._sent_cancel is not None and bool(self._sent_cancel.end)
                 if self._has_rebooted or is_taken_over:
                     return
-                if self.context.arbiter.is_known:
+                if self.context.arbiter.is_state_recent:
                     self._send_cancel(*self._cancel_command)
             logger.warning("%s: the vehicle did not confirm the cancellation", self.call_name)
         except (ConnectionClosed, LinkLost):  # The vehicle can no longer be reached.
@@ -228,7 +228,7 @@ class CalibrationRun:
             self.session,
             self.call_name,
             is_done=lambda: bool(is_ready()),
-            trouble=self._failure_reason,
+            failure_reason=self._failure_reason,
             describe=lambda: timeout_text,
             timeout=timeout,
         )

@@ -186,7 +186,7 @@ class Cameras:
         self._first = Camera(self._first_link)
         # True once `first` has returned `_first`: from then on it always returns the same object.
         self._is_first_in_use = False
-        session.keep(self.cell)
+        session.register_cell(self.cell)
         bus = session.connection.bus
         for message_type, callback in (
             (m.Heartbeat, self._on_heartbeat),

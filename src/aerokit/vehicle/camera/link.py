@@ -209,7 +209,7 @@ class CameraLink(CameraOrders):
 
     def new_cell(self, name: str, waits_for: str) -> StateCell[Any]:
         cell: StateCell[Any] = self._session.connection.new_cell(name, waits_for)
-        self._session.keep(cell)
+        self._session.register_cell(cell)
         return cell
 
     def polled_cell(self, name: str, message_type: type[Message], period_s: float) -> StateCell[Any]:

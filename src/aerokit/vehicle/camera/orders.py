@@ -82,7 +82,7 @@ class CameraOrders:
     def heartbeat_at(self) -> float:
         """Loop time of the camera's last HEARTBEAT; -inf while the vehicle is silent."""
         received_at = self._session.connection.last_heartbeat_at(self._session.system_id, self.component.component_id)
-        return received_at if self._context.arbiter.is_known else -math.inf
+        return received_at if self._context.arbiter.is_state_recent else -math.inf
 
     @property
     def on_finish(self) -> list[Callable[[], None]]:
@@ -95,7 +95,7 @@ class CameraOrders:
 
     def begin_order(self, subject: str) -> Order:
         """Begin an order, which ends the previous order about this subject."""
-        return self._context.arbiter.of_device(self.topic(subject), may_be_withdrawn=True)
+        return self._context.arbiter.device_order(self.topic(subject), may_be_withdrawn=True)
 
     def latest_order(self, subject: str) -> Order | None:
         return self._context.arbiter.latest(self.topic(subject))

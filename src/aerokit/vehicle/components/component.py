@@ -217,7 +217,7 @@ class Component(ReadOnly):
         on_progress: Callable[[int | None], None] | None = None,
     ) -> CommandAck:
         """Send any MAV_CMD as COMMAND_LONG and return the ACCEPTED ack, like :meth:`aerokit.Vehicle.command`."""
-        return await self._sender.answered(
+        return await self._sender.send_raw(
             self._session.commands.send_long,
             command,
             *params,
@@ -374,7 +374,7 @@ class Components:
         self._statuses: dict[tuple[int, int], ComponentStatus] = {}
         session = context.session
         self.cell: StateCell[tuple[ComponentStatus, ...]] = session.connection.new_cell("components", "HEARTBEAT")
-        session.keep(self.cell)
+        session.register_cell(self.cell)
         bus = session.connection.bus
         session.at_close(bus.attach(m.Heartbeat, self._on_heartbeat, system_id=session.system_id))
         for message_type, field, kind in DEVICE_MESSAGES:

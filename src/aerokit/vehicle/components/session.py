@@ -18,7 +18,8 @@ from aerokit.connection.cells import Source, StateCell
 from aerokit.errors import FileFormatError, FileTimeout, InvalidArgument, OperationRejected
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd
-from aerokit.vehicle.session.rates import ComponentSubscriber, MessageRates
+from aerokit.vehicle.session.rates import MessageRates
+from aerokit.vehicle.session.subscriber import ComponentSubscriber
 from aerokit.vehicle.session.transfers import Transfers
 
 if TYPE_CHECKING:
@@ -52,13 +53,13 @@ class ComponentSession:
             session.system_id,
             component_id,
             self.rates,
-            keep=session.keep,
+            register_cell=session.register_cell,
             at_close=session.at_close,
         )
         version: StateCell[AutopilotVersion] = session.connection.new_cell(
             "version", f"AUTOPILOT_VERSION of component {component_id}"
         )
-        session.keep(version)
+        session.register_cell(version)
         self.transfers: Transfers = Transfers(
             session.connection,
             session.system_id,

@@ -238,19 +238,19 @@ class Actuators(ReadOnly):
         else:
             command, start = MavCmd.DO_MOTOR_TEST, (number, PERCENT, throttle_percent, duration_s, 1)
             stop = (number, PERCENT, 0, 0, 1)
-        session.check_disarmed("test_motor", is_current=arbiter.is_known)
+        session.check_disarmed("test_motor", is_current=arbiter.is_state_recent)
         # On ArduPilot, a new test ends the test of another motor.
-        order = arbiter.of_device("motor test" if command == MavCmd.DO_MOTOR_TEST else f"motor test {number}")
+        order = arbiter.device_order("motor test" if command == MavCmd.DO_MOTOR_TEST else f"motor test {number}")
         spins_until = order.given_at + duration_s
         try:
-            await SimpleOrder("test_motor", command, start).send(self._context, of=order)
+            await SimpleOrder("test_motor", command, start).send(self._context, device_order=order)
             await anyio.sleep(duration_s)
             armed, ended_at = session.telemetry.armed, session.connection.now()
             await await_progress(
                 session,
                 "test_motor",
                 is_done=lambda: armed.latest is False and armed.updated_at > ended_at,
-                trouble=lambda: None if order.is_newest else "another motor test was started",
+                failure_reason=lambda: None if order.is_newest else "another motor test was started",
                 describe=lambda: "the vehicle still reports armed",
                 timeout=TEST_END_TIMEOUT_S,
             )
@@ -260,7 +260,7 @@ class Actuators(ReadOnly):
             # After the end of the test, no stop command is sent, because it would start another test, which arms the
             # motors.
             is_spinning = session.connection.now() < spins_until
-            if is_spinning and order.is_newest and arbiter.is_known and session.connection.is_open:
+            if is_spinning and order.is_newest and arbiter.is_state_recent and session.connection.is_open:
                 session.commands.send_unconfirmed(command, *stop)
             raise
 

@@ -86,7 +86,7 @@ class Winch(ReadOnly):
         check_range("rate_m_s", rate_m_s, 0, MAX_RATE_M_S, above=True)
         self._check_supported(WinchActions.RELATIVE_LENGTH_CONTROL)
         # The order begins before the wait for a status, so that a newer order given during this wait ends it.
-        order = self._context.arbiter.of_device(self._topic)
+        order = self._context.arbiter.device_order(self._topic)
         start = await receive_once(self._context, m.WinchStatus, self._component_id)
 
         def has_reached_length(status: m.WinchStatus) -> bool:
@@ -179,7 +179,7 @@ class Winch(ReadOnly):
         effect = None if is_done is None else Effect("WinchStatus", is_done)
         await SimpleOrder(f"winch {action.name.lower()}", MavCmd.DO_WINCH, params, effect).send(
             self._context,
-            of=order,
+            device_order=order,
             topic=self._topic,
             component_id=self._component_id,
             timeout=timeout,

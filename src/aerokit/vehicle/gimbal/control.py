@@ -54,7 +54,7 @@ class ReleaseCommand:
         """Send the command and wait for the acknowledgement; raise OperationTimeout if the vehicle is silent."""
         if not self._is_still_due():
             return
-        if not self._orders.context.arbiter.is_known:
+        if not self._orders.context.arbiter.is_state_recent:
             self.send_soon()
             raise OperationTimeout(
                 f"{description}: not sent yet, because the vehicle is silent; it will be sent at the next HEARTBEAT;"
@@ -67,7 +67,7 @@ class ReleaseCommand:
         """Send the command without waiting, e.g. when a block exits by an error or cancellation."""
         if not self._session.connection.is_open or self._session.is_closed or not self._is_still_due():
             return
-        is_sent = self._orders.context.arbiter.is_known
+        is_sent = self._orders.context.arbiter.is_state_recent
         if is_sent:
             self._send()
 

@@ -11,7 +11,7 @@ from aerokit._internal.values import Snapshot
 from aerokit.connection.cells import Source, StateCell
 from aerokit.mavlink.enums import GimbalDeviceErrorFlags, GimbalManagerCapFlags
 from aerokit.mavlink.messages import GimbalDeviceAttitudeStatus
-from aerokit.vehicle.session.rates import SUBSCRIPTION_HZ, WatchedStream
+from aerokit.vehicle.session.subscriber import SUBSCRIPTION_HZ, WatchedStream
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -182,8 +182,8 @@ class GimbalDevice:
         self._manager_rank = 0
         self._status_ms = 0
         self._system_id = context.session.system_id
-        context.session.keep(self.attitude)
-        context.session.keep(self.controllers)
+        context.session.register_cell(self.attitude)
+        context.session.register_cell(self.controllers)
 
     def _request_attitude(self, session: VehicleSession) -> Detach | None:
         """Request GIMBAL_DEVICE_ATTITUDE_STATUS from the autopilot, unless another component sends the attitude."""

@@ -110,7 +110,7 @@ class GimbalOrders:
             )
 
     def begin_order(self) -> Order:
-        return self.context.arbiter.of_device(self.device.topic)
+        return self.context.arbiter.device_order(self.device.topic)
 
     async def send_claiming_control(self, command: int, send: Callable[[], Awaitable[None]]) -> None:
         """Send a command. If the manager denies it because we are not in control, claim control and send it again."""
@@ -126,7 +126,7 @@ class GimbalOrders:
 
     async def send_pitch_yaw(self, order: Order, pitch: float, yaw: float, *rates: float, flags: int) -> bool:
         """Send MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW in degrees; return False if the manager does not support it."""
-        if self.session.commands.is_unknown(PITCHYAW, self.manager_id):
+        if self.session.commands.is_unsupported(PITCHYAW, self.manager_id):
             return False
         pitch_rate, yaw_rate = rates or (NAN, NAN)
         params = (pitch, yaw, pitch_rate, yaw_rate, flags, 0, self.gimbal_id_param)
@@ -160,7 +160,7 @@ class GimbalOrders:
 
     async def send_mount_mode(self, order: Order, mode: int, pitch: float = 0, roll: float = 0, yaw: float = 0) -> bool:
         """Send DO_MOUNT_CONTROL. Older firmware gets the mode by MOUNT_CONFIGURE instead; return False then."""
-        if not self.session.commands.is_unknown(MOUNT, self.manager_id):
+        if not self.session.commands.is_unsupported(MOUNT, self.manager_id):
             try:
                 await self.send(order, MOUNT, pitch, roll, yaw, 0, 0, 0, mode)
             except CommandRejected as error:

@@ -300,11 +300,11 @@ class MissionControl(VehiclePlan["Mission"]):
                 session,
                 "mission.wait_finished",
                 is_done=end.has_ended,
-                trouble=lambda: end.failure(self._order, is_paused=self._is_paused),
+                failure_reason=lambda: end.failure(self._order, is_paused=self._is_paused),
                 describe=end.describe,
                 timeout=timeout,
                 max_silence_s=max_silence_s,
-                stillness=MissionStallDetector(session, self._tracker, mode, items, lambda: self._is_paused),
+                stall_reason=MissionStallDetector(session, self._tracker, mode, items, lambda: self._is_paused),
             )
 
     @property

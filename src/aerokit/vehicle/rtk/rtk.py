@@ -89,7 +89,7 @@ class Rtk:
         self._corrections: StateCell[Corrections] = StateCell(
             "rtk.corrections", context.session.connection.now, "corrections by rtk.send or rtk.ntrip"
         )
-        self._session.keep(self._corrections)
+        self._session.register_cell(self._corrections)
         self._messages = self._bytes = 0
         self._recent: deque[tuple[float, int]] = deque()  # time and size of each message in the window
 
