@@ -402,10 +402,10 @@ def _commands_of(mission: Mission, own_ids: tuple[int, int]) -> tuple[Command, .
 def _item_of(cmd: Command, index: int) -> MissionItem:
     try:
         command, frame = int(cmd.command), int(cmd.frame)
-        params = [float(getattr(cmd, name)) for name in PARAM_FIELDS]
+        param1, param2, param3, param4 = (float(getattr(cmd, name)) for name in PARAM_FIELDS)
         x, y = (_wire_number(value, command, frame) for value in (cmd.x, cmd.y))
         z, autocontinue = float(cmd.z), bool(cmd.autocontinue)
-        return MissionItem(command, frame, *params, x, y, z, autocontinue)
+        return MissionItem(command, frame, param1, param2, param3, param4, x, y, z, autocontinue)
     except (TypeError, ValueError, OverflowError) as error:
         raise InvalidArgument(f"commands[{index}] is not allowed: {error}, in {cmd}") from None
 
