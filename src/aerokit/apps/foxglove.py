@@ -184,7 +184,7 @@ class _TopicChannels:
     def send_again(self, topic: str) -> None:
         """Send the current value of a topic again, for a new viewer. Texts are sent from the buffer."""
         if not topic.endswith("/log"):
-            self._sent_at.pop(topic, None)  # so that `publish` takes the current value for new
+            self._sent_at.pop(topic, None)  # so that `publish` sends the current value
 
     def on_message(self, message: Message) -> None:
         frame = message.received_frame

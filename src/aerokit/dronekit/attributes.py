@@ -55,7 +55,7 @@ class Locations(HasObservers, LocationPrivates):
     def __init__(self, vehicle: VehicleCore) -> None:
         self._core = core = core_of(vehicle)
         super().__init__(core.handler.listener_thread)
-        self._has_altitude = False  # until a message has an altitude other than 0
+        self._has_altitude = False  # True after the first altitude other than 0
         own_listeners, on_global, on_local = self._dk_listeners, self._on_global_position, self._on_local_position
         self._global = core.on(m.GlobalPositionInt, on_global, "location", *GLOBAL_FRAMES, listeners=own_listeners)
         self._local = core.on(m.LocalPositionNed, on_local, "location", LOCAL_FRAME, listeners=own_listeners)

@@ -154,7 +154,7 @@ class ChannelsOverride(_ChannelDict):
         self._core = core_of(vehicle)
         self.count = MIN_CHANNELS
         """Number of channels that can be overridden."""
-        self._released: set[str] = set()  # channels above 8 among them are released again with every message
+        self._released: set[str] = set()  # those above 8 are released again with every message
         self._changing = threading.RLock()
 
     def __setitem__(self, channel: str | int, value: float | None) -> None:

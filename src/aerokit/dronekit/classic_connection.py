@@ -28,9 +28,9 @@ logger: logging.Logger = logging.getLogger("dronekit.mavlink")
 
 vehicle_logger: logging.Logger = logging.getLogger("dronekit")
 
-CLOSE_TIMEOUT_S = 2.0  # for which close() waits for the answers to recent orders
+CLOSE_TIMEOUT_S = 2.0  # maximum time for which close() waits for the answers to recent orders
 
-SHARED_KINDS = {"disarm": "arm"}  # so that arming and disarming orders replace each other
+SHARED_KINDS = {"disarm": "arm"}  # an order replaces the previous one of its kind; disarming also replaces arming
 
 CoroutineFunction = Callable[..., Awaitable[object]]
 
@@ -243,7 +243,7 @@ class BackgroundCalls:
 
 
 def _call_after_tasks(function: Callable[..., object], *args: Any) -> None:
-    # Tasks that earlier calls created in this loop iteration send their first messages in the next, before `function`.
+    # Tasks that earlier calls have just created send their first messages before `function` is called.
     asyncio.get_running_loop().call_soon(function, *args)
 
 

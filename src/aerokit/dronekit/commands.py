@@ -247,7 +247,7 @@ class CommandSequence:
             items = list(self._state.items)
             position = len(items) if index == len(items) else _checked_index(index, len(items))
             command.seq = position + 1
-            items[position : position + 1] = [command]  # also appends
+            items[position : position + 1] = [command]  # appends if `position` is the end
             self._state = self._state.replace(items=tuple(items), is_changed=True)
 
     def rows(self) -> tuple[Command, ...]:

@@ -89,7 +89,7 @@ class LatestMessage(Generic[MessageT]):
         self._announced_names: set[str] = set()
         self._handlers: list[Callable[[MessageT], object]] = []
         self._latest: Frame | MessageT | None = None  # a frame until it is decoded
-        self._decoded: MessageT | None = None  # of the latest frame, or of an earlier one
+        self._decoded: MessageT | None = None  # from the latest frame, or from an earlier one
         self.component_id = 0
         """Component id of the autopilot; messages of other components are ignored."""
 
@@ -225,7 +225,7 @@ class Core:
         """Start receiving once the vehicle is connected (loop thread). The loop gets weak references only."""
         self.aio_or_none, self._tasks = aio, tasks
         self.handler.target_system = aio.system_id
-        _ = aio.parameters  # created first, so that the parameter table has a value before our handlers are called
+        _ = aio.parameters  # created first, so that it receives each PARAM_VALUE before our handlers do
         for message_type, latest in self._latest.items():
             latest.component_id = aio.component_id
             aio.connection.bus.attach_lazily(message_type, weak_callback(latest.on_frame), system_id=aio.system_id)
@@ -296,7 +296,7 @@ class VehicleCore(HasObservers):
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
-        # Only properties of our classes: a program's subclass keeps its own as they are.
+        # Only properties of our own classes are wrapped; those of a program's subclass stay as they are.
         if cls.__module__.startswith("aerokit."):
             for name, member in list(vars(cls).items()):
                 if isinstance(member, property) and not name.startswith("_"):

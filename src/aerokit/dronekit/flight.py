@@ -327,7 +327,7 @@ class FlightMethods(VehicleAttributes):
                 return True
             # Asks is_done again, because the effect may have arrived together with the failure.
             if order.done() and order.exception() is not None and not is_done():
-                self._dk.check_link()  # a lost link is the better reason
+                self._dk.check_link()  # raises if the link is lost, which is the more useful error
                 raise TimeoutError(f"{failure_text}: {order.exception()}") from order.exception()
             return False
 

@@ -117,7 +117,7 @@ class Listeners:
                     logger.exception("Exception in %s handler for %s", self.kind, attr_name)
 
     def _keep_owner(self) -> None:
-        # These listeners refer to their owner, which so stays alive even if the program has dropped it.
+        # These listeners refer to their owner, so it stays alive while it has any, even if the program has dropped it.
         if self._thread is not None:
             self._thread.keep(self, has_listeners=bool(self.by_name))
 

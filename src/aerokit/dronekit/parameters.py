@@ -38,8 +38,8 @@ VERSION_TIMEOUT_S = 1.0  # time to wait for AUTOPILOT_VERSION, which shows wheth
 READ_TIMEOUT_S = 30.0
 RETRY_DELAY_S = 1.0
 
-MIN_ATTEMPT_S = 1.0  # longer on slow links
-LAST_WAIT_SHARE = 0.5  # of an attempt's time, for which the answer to the last attempt is awaited
+MIN_ATTEMPT_S = 1.0  # on slow links ROUND_TRIPS round trips, if longer
+LAST_WAIT_SHARE = 0.5  # the answer to the last attempt is awaited for this share of an attempt's time
 ROUND_TRIPS = 3
 
 ROUNDING = 0.01  # ArduPilot adds this value before it truncates a number to an integer
@@ -115,7 +115,7 @@ class ParameterDownload:
             return False
         if any(isinstance(answer, Parameter) for answer in answers):
             return True
-        # A code is the vehicle's own report; without one, only the answer is missing.
+        # With a code, the vehicle itself has reported the parameter missing; without one, it did not answer.
         return all(isinstance(answer, ParameterRejected) and answer.code is not None for answer in answers)
 
 
@@ -257,12 +257,12 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
         """
         if isinstance(name, str) and (value := self._values.get(name.upper())) is not None:
             return value
-        found = self._find(name, waits=bool(wait_ready))
-        if found is None:
+        resolved = self._find(name, waits=bool(wait_ready))
+        if resolved is None:
             return default
-        if found.renamed is not None:
-            warn_of_rename(found.renamed)
-        return float(found.as_requested(found.parameter).value)
+        if resolved.renamed is not None:
+            warn_of_rename(resolved.renamed)
+        return float(resolved.as_requested(resolved.parameter).value)
 
     def __contains__(self, name: object) -> bool:
         return self._find(name) is not None
@@ -309,12 +309,12 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
         if wait_ready:
             self.wait_ready()
         vehicle_name, converted = name, number
-        found = self._values.find(name)
-        if found is not None:
-            vehicle_name = found.name
-            if found.renamed is not None:
-                converted = found.renamed.to_vehicle(number)  # not rounded: set_parameter converts to integers
-                warn_of_rename(found.renamed)
+        resolved = self._values.find(name)
+        if resolved is not None:
+            vehicle_name = resolved.name
+            if resolved.renamed is not None:
+                converted = resolved.renamed.to_vehicle(number)  # not rounded: set_parameter converts to integers
+                warn_of_rename(resolved.renamed)
         core = self._core
         if retries <= 0:
             core.order(f"parameter {vehicle_name}", set_parameter, core.aio, vehicle_name, converted, 0)
@@ -341,11 +341,11 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
             return None
         name = name.upper()
         is_settled = self._is_settled  # read before find(), because the last values may arrive between both
-        found = self._values.find(name)
-        if found is None and waits and not is_settled and _is_valid_name(name):
+        resolved = self._values.find(name)
+        if resolved is None and waits and not is_settled and _is_valid_name(name):
             self._core.run(self._wait_for, name)
-            found = self._values.find(name)
-        return found
+            resolved = self._values.find(name)
+        return resolved
 
     @property
     def _is_settled(self) -> bool:

@@ -26,7 +26,7 @@ KINDS = {"copter": "copter", "solo": "copter", "plane": "plane", "rover": "rover
 START_TIMEOUT_S = 30.0
 USUAL_ADDRESSES = ("tcpin:127.0.0.1:5760", "udpout:127.0.0.1:14550")
 
-_next_instance = 0  # number of the next SITL object that is created without one
+_next_instance = 0  # number of the next SITL object created without a number
 _vehicle_for_program: ServedVehicle | None = None  # started by the runner before the program (--sim)
 
 
@@ -154,7 +154,7 @@ class SITL:
         if options.instance is not None:
             self.instance = options.instance
         kind, speedup, addresses = self._kind, speedup or options.speedup, [self._address()]
-        if _vehicle_for_program is not None:  # the program's own vehicle replaces it, and is like it
+        if _vehicle_for_program is not None:  # the new vehicle replaces it; by default with its kind and speed
             kind = kind or _vehicle_for_program.kind
             speedup = speedup or _vehicle_for_program.speedup
             addresses += USUAL_ADDRESSES[1:]

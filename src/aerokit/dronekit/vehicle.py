@@ -251,7 +251,8 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         return self._handler.master
 
     def _is_mode_available(self, mode_code: int, base_mode: int = 0) -> bool:
-        return not mode_name(self._dk.aio, mode_code).endswith(f" {mode_code}")  # an unknown mode's name has its number
+        # The name of an unknown mode ends with its number.
+        return not mode_name(self._dk.aio, mode_code).endswith(f" {mode_code}")
 
     def _dk_begin(self, aio: AsyncVehicle, tasks: BackgroundTasks) -> None:
         """Start receiving in the loop iteration in which the vehicle was found. Uses weak references only."""

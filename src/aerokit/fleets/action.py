@@ -75,7 +75,7 @@ class FleetAction:
         self._stopped: dict[str, Exception] = {}
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self._orders: dict[str, PolicyOrder] = {}
-        # System id and name of the member whose failure the policy has answered; None while the others continue.
+        # System id and name of the member to whose failure the policy reacted; None while the others continue.
         self._failed_first: tuple[int, str] | None = None
         self._order_errors: dict[str, str] = {}
         self._pending_orders = 0
@@ -154,7 +154,7 @@ class FleetAction:
             if member.name not in self._stopped:
                 self._fail(member, error)
         except asyncio.CancelledError:
-            # Members that have failed or were stopped are cancelled here; any other cancellation is the caller's.
+            # This class cancels members that have failed or were stopped; any other cancellation is the caller's.
             if member.name not in self._stopped and member.name not in self._failed:
                 raise
         else:

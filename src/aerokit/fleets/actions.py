@@ -49,10 +49,10 @@ class Actions(SelectionBase):
         if isinstance(action, str):
             for member in self:
                 _method(member, action)  # an unknown name fails before any member has started
-            name = method = action
+            name = method_name = action
 
             async def execute(member: Member) -> Any:
-                return await _method(member, method)(*arguments, **options)
+                return await _method(member, method_name)(*arguments, **options)
 
         else:
             if arguments or options:

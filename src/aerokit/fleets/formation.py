@@ -223,7 +223,7 @@ class Following:
                 while not self._stop_if_leader_lost():
                     stream.set(self._setpoint(member))
                     await anyio.sleep(self._period_s)
-                await asyncio.Event().wait()  # until cancelled: leaving the stream so makes the vehicle hold
+                await asyncio.Event().wait()  # until cancelled, which makes the vehicle hold
         finally:
             # Deferred until the action has recorded this follower's failure. The end of the action would be too late,
             # because it also waits until the policy's orders, such as landing the others, are done.
@@ -243,7 +243,7 @@ class Following:
                 self._check_leader()
                 position_of(self._leader, LEADER_MAX_AGE_S)
             except (OperationRejected, ValueUnknownError) as error:
-                holding = self._action.active  # because their streams are cancelled below
+                holding = self._action.active  # the end of their streams, below, makes them hold
                 skipped = {
                     member.name: member.status if member.reason else "it does not follow"
                     for member in self._followers

@@ -55,7 +55,7 @@ class Member:
         self.reason: str = ""
         """The cause of the state; empty while it is ACTIVE."""
         self._lost_at = 0.0
-        # The vehicle's newest order and its mode at the time of `reclaim`. As long as both last, they are no takeover.
+        # The vehicle's newest order and its mode at the time of `reclaim`; no takeover while neither has changed.
         self._control_when_reclaimed: tuple[object, object] | None = None
         # MAV_STATE at the time of `reclaim`. A failsafe that was active then does not count as a takeover.
         self._ignored_failsafe: int | None = None
@@ -91,7 +91,7 @@ class Member:
             bus.attach_event(VehicleSilent, self._on_silent),
             bus.attach_event(VehicleRecovered, self._on_recovered),
             vehicle.mode.observe(self._refresh_soon),
-            # On every HEARTBEAT, even if CURRENT_MODE has already reported its mode: it also reports arming and state.
+            # On every HEARTBEAT, because it reports the state too, which may change while mode and arming do not.
             vehicle.armed.observe(self._refresh_soon, every_arrival=True),
             vehicle.connection.on_end(self._on_connection_end),
         ]

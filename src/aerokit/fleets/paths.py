@@ -122,7 +122,7 @@ def min_path_distance(path: Path, other: Path, *, slack_s: float = math.inf, bel
             if other_leg[0].t_s - slack_s > leg[1].t_s or other_leg[1].t_s + slack_s < leg[0].t_s:
                 continue
             if _lower_bound(leg, other_leg) >= min(best.distance_m, below_m):
-                if best.distance_m == math.inf:  # the first legs whose times match: at least `below_m` apart
+                if best.distance_m == math.inf:  # the first legs whose times match; they are at least `below_m` apart
                     best = Approach(below_m, leg[0].t_s, other_leg[0].t_s)
                 continue
             approach = _closest(leg, other_leg, slack_s)

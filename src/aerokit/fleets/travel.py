@@ -69,7 +69,7 @@ class Travel(SelectionBase):
         if speed_m_s is not None:
             check_range("speed_m_s", speed_m_s, 0, 1000, above=True)
         positions = self._resolve_targets(targets)
-        # A function has targets for available members only; all are named, so that the result lists the others.
+        # A function gives targets to available members only; all are named, so that the result lists the others too.
         names = tuple(self.members) if callable(targets) else tuple(positions)
         for name, target in positions.items():
             self.members[name].vehicle._position.check_reach(f"targets[{name!r}]", [target], max_distance_m)

@@ -207,6 +207,7 @@ async def run_fly(options: argparse.Namespace) -> int:
         items = getattr(plan, part).to_items()
         if items:
             emit_items(options, part, items, "in the file")
+    # `_connect_and_fly` adds its flight to `flights`, so that the flight's state is known after an interrupt.
     interrupts, flights = InterruptStack(), list[PlanFlight]()
     with on_interrupt(interrupts.interrupt):
         code = await interrupts.run(lambda: _connect_and_fly(options, plan, interrupts, flights))

@@ -210,7 +210,7 @@ class Parser(argparse.ArgumentParser):
         super().error(message)
 
 
-# Actions of the library that are no commands, because a command ends before the action does.
+# Actions of the library for which there is no command.
 _ARMING_WORDS = ("arm", "disarm", "takeoff", "take_off", "take-off", "land", "goto", "go_to", "rtl")
 
 

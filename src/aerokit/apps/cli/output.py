@@ -149,7 +149,7 @@ def _rewrite_for_commands(record: logging.LogRecord) -> bool:
         record.msg = "disconnected from vehicle %d: %s"
     if str(record.msg).startswith("the event loop was blocked") and isinstance(record.args, tuple):
         record.msg = "this computer was busy for %.1f s: no messages or heartbeats were processed"
-        record.args = record.args[:1]
+        record.args = record.args[:1]  # the new text has one placeholder
     return True
 
 

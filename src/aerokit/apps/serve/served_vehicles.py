@@ -59,7 +59,7 @@ class ServedVehicles:
     def __init__(self, source: Connection | Vehicle | Mapping[int, Vehicle]) -> None:
         self.events: deque[dict[str, Any]] = deque(maxlen=MAX_EVENTS)
         self._texts: dict[int, deque[dict[str, Any]]] = {}
-        self._tracks: dict[int, list[tuple[Position, bool]]] = {}  # True: after a gap
+        self._tracks: dict[int, list[tuple[Position, bool]]] = {}  # True: the first after a gap
         # The failing sensors for which the arming checks were requested last, and the time of that request.
         self._requested_for: dict[Vehicle, tuple[str, ...]] = {}
         self._requested_at: dict[Vehicle, float] = {}

@@ -85,7 +85,7 @@ class CsvTable:
 
     def add(self, unix_s: float, values: Sequence[Any]) -> None:
         """Add a row; the time is ISO 8601 in UTC with microseconds."""
-        # Numbers are most of the values; calling _csv_cell for them would take longer. NaN is unequal to itself.
+        # Most values are numbers; calling _csv_cell for them would take longer. `value == value` is False for NaN.
         cells = [value if type(value) in _NUMBER_TYPES and value == value else _csv_cell(value) for value in values]
         self._writer.writerow([_iso_time(unix_s), *cells])
         if len(self._lines) >= _LINES_PER_FLUSH:

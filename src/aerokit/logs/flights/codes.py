@@ -109,7 +109,7 @@ _ERROR_DETAILS: Mapping[tuple[int, int], str] = {
     (18, 2): "glitch",
 }
 
-# Subsystems whose error code is a number: of the refused mode, of the other estimator, and bits of fence types.
+# Subsystems whose error code is the number of the refused mode, the number of the new estimator, and fence bits.
 _MODE_CHANGE, _ESTIMATOR_SWITCH, _FENCE = 10, 24, 9
 # Bits of AC_FENCE_TYPE.
 _FENCE_TYPES = {

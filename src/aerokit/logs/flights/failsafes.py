@@ -19,7 +19,7 @@ _SAME_KIND_GAP_S = 8.0
 # Evidence of the kind "general" belongs to the failsafe of specific evidence if they are at most this time apart.
 _GENERAL_GAP_S = 3.0
 _REACTION_TIMEOUT_S = 12.0
-# Values of this time before a failsafe are shown.
+# Values measured at most this time before a failsafe are shown with it.
 _BEFORE_S = 10.0
 # A change this soon after a failsafe is the autopilot's, even if the log does not contain its cause.
 _AUTOPILOT_REACTION_S = 3.0

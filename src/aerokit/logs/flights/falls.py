@@ -113,7 +113,7 @@ def _stays_at_height(flight: FlightLog, time_s: float, height_m: float) -> bool:
 
 def _reasons(flight: FlightLog, begin_s: float, end_s: float) -> list[str]:
     """Return the log's evidence of a fall: disarming in the air, and texts."""
-    # Disarming may begin the descent; at its end, the impact disarms.
+    # Only disarming that may have caused the descent counts; at its end, the impact disarms.
     reasons = [
         "disarmed in the air"
         for armed_s, disarmed_s in flight.armed

@@ -153,7 +153,7 @@ class BinReader(_RowReader):
 
     def _next(self, reader: Any) -> Any:
         try:
-            with redirect_stdout(sys.stderr):  # see opened_bin
+            with redirect_stdout(sys.stderr):  # pymavlink prints there; stdout is for JSON
                 return reader.recv_msg()
         except Exception as error:  # pymavlink raises arbitrary errors for a damaged row
             self.notes.append(f"damaged at byte {reader.offset}; the rest was skipped: {error}")
@@ -226,7 +226,10 @@ class UlogReader(_RowReader):
     def entries(self, on_bytes: Callable[[int], object]) -> Iterator[LogRecord]:
         """Yield all rows of all topics, ordered by time."""
         try:
-            with self.path.open("rb") as file, redirect_stdout(sys.stderr):  # see opened_bin
+            with (
+                self.path.open("rb") as file,
+                redirect_stdout(sys.stderr),
+            ):  # pymavlink prints there; stdout is for JSON
                 log = import_module("pyulog").ULog(file)
         except Exception as error:  # pyulog raises arbitrary errors for other files
             raise FileFormatError(f"{self.path} is not a PX4 log: {error}") from error

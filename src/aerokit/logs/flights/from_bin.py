@@ -134,7 +134,7 @@ class _Tables:
             raise FileFormatError(
                 f"{reader.filehandle.name} has no row with a time (TimeUS): it is empty, or from before 2015"
             )
-        _, time_us = min(first_rows)  # not the minimum of the times, which could be that of a damaged row
+        _, time_us = min(first_rows)  # not the lowest time, which could be from a damaged row
         return int(time_us)
 
 

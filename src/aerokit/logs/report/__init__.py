@@ -79,7 +79,7 @@ def write_report(
         raise InvalidArgument(f"{target_path} exists; use force (--force) to replace it")
     flights = [read_flight(path, system_id=system_id, on_progress=on_progress) for path in logs]
     statistics = [statistics_of(flight) for flight in flights]
-    summaries = [summary(flight, of_flight) for flight, of_flight in zip(flights, statistics, strict=True)]
+    summaries = [summary(flight, values) for flight, values in zip(flights, statistics, strict=True)]
     write_atomically(target_path, _render(flights, statistics, summaries))
     return Report(
         target_path,
