@@ -220,7 +220,7 @@ class ChannelsOverride(_ChannelDict):
         self._released = released
 
     def _checked(self, overrides: Mapping[Any, float | None]) -> dict[str, int]:
-        """Return the values by channel number as a string, with 0 for a channel to release."""
+        """Return the values by channel number (a string); 0 releases the channel."""
         checked: dict[str, int] = {}
         for channel, value in overrides.items():
             number = int(channel)

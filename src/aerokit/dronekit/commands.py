@@ -387,7 +387,7 @@ def _mission_of(commands: Sequence[Command], vehicle: AsyncVehicle) -> Mission:
     """Convert commands to a mission for this vehicle; InvalidArgument names a field that is not a number."""
     items: Iterable[MissionItem] = [_item_of(command, index) for index, command in enumerate(commands)]
     if not vehicle.autopilot.home_is_item_0:
-        # ArduPilot takes a place of zeros for the current position; other autopilots need its coordinates.
+        # ArduPilot takes coordinates 0, 0 for the current position; other autopilots need the actual coordinates.
         here = vehicle.telemetry.position.latest or vehicle.telemetry.home.latest
         items = convert_from_ardupilot(items, None if here is None else (here.latitude_deg, here.longitude_deg))
     return Mission(shift_jumps(items, -1))

@@ -109,7 +109,8 @@ async def take_off(vehicle: AsyncVehicle, modes: tuple[Mode, ...], command: int,
 async def go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: float) -> None:
     """Send DO_REPOSITION; if it is unsupported, send SET_POSITION_TARGET_GLOBAL_INT.
 
-    The altitude is above home, or above sea level if the autopilot's reposition command uses that (PX4).
+    Latitude and longitude are in 1e-7 degrees; the altitude is above home, or above sea level if the autopilot's
+    reposition command uses that (PX4).
     """
     is_amsl = vehicle.autopilot.repositions_amsl
     flags = MavDoRepositionFlags.CHANGE_MODE if is_amsl else 0

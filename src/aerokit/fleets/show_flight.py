@@ -416,6 +416,7 @@ async def _fly_track(
 
 
 def _setpoint(path: Path, at_s: float, lead_s: float, position: LocalPoint) -> VelocitySetpoint:
+    """Return the path's velocity ``lead_s`` later, plus a correction towards the path's position at this time."""
     planned, _ = state_at(path, at_s)
     _, velocity = state_at(path, at_s + lead_s)
     speed = math.hypot(*velocity)

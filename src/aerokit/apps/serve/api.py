@@ -196,7 +196,7 @@ def _parameters(operation: Operation) -> Iterable[dict[str, Any]]:
 def _failures(operation: Operation) -> dict[str, Any]:
     if operation.is_open:
         return {}
-    impossible = set() if operation.order or operation.body else {"413", "415"}  # without a body
+    impossible = set() if operation.order or operation.body else {"413", "415"}  # only with a body
     problem = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
     return {
         status: {"description": text, "content": problem}
