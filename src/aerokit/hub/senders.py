@@ -35,7 +35,7 @@ MIN_LOOP_FRAMES = 8
 
 MAX_RECENT_FRAMES = 1 << 15
 
-# Offsets in the body of a HEARTBEAT.
+# Offsets in `Frame.body` of a HEARTBEAT, whose payload follows nine bytes of header.
 _TYPE = 9 + 4
 _AUTOPILOT = 9 + 5
 _GROUND_STATION = int(MavType.GCS)

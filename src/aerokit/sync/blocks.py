@@ -63,7 +63,7 @@ class BlockingContext:
     Using one with ``await`` or ``async with`` closes it and raises TypeError.
     """
 
-    _opened_by: str  # name of the function
+    _opened_by: str  # name of the function that opens this object
 
     def close(self) -> None:
         """Close the object. Idempotent."""
@@ -357,7 +357,7 @@ class VehicleTwin(OpenedTwin["Vehicle"]):
     def __exit__(self, exc_type: Any, exc: Any, traceback: Any) -> None:
         is_hold_pending = self.aio.is_hold_pending
         self.close()
-        # The asynchronous context warns on an exception, but did not get this one.
+        # The asynchronous context would warn about the exception, but did not get it.
         if exc is not None and not is_hold_pending:
             warn_if_left_flying(self.aio)
 

@@ -75,7 +75,7 @@ class FleetTwin(OpenedTwin["AsyncFleet"]):
     def __exit__(self, exc_type: Any, exc: Any, traceback: Any) -> None:
         without_hold = [vehicle for vehicle in self.aio.vehicles.values() if not vehicle.is_hold_pending]
         self.close()
-        if exc is not None:  # the asynchronous context warns on an exception, but did not get this one
+        if exc is not None:  # the asynchronous context would warn about it, but did not get it
             for vehicle in without_hold:
                 warn_if_left_flying(vehicle)
 

@@ -309,7 +309,7 @@ class _Calls:
 
     def __init__(self) -> None:
         self.context = contextvars.Context()
-        self.is_aborted = False  # LoopThread.__init__ failed
+        self.is_aborted = False  # True if LoopThread.__init__ failed
         self._end = asyncio.Event()
         self._tasks: dict[asyncio.Task[None], _Call[Any]] = {}
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -368,7 +368,7 @@ class _Call(ThreadFuture[T]):
         super().__init__()
         self._function = function
         self._cancellation = Cancellation()
-        self.is_scheduled = False  # scheduled on the loop
+        self.is_scheduled = False  # True once the loop was told to start it
         self.has_started = False
 
     def cancel(self) -> None:

@@ -183,7 +183,7 @@ class ClassMember:
     node: ast.FunctionDef | ast.AsyncFunctionDef | None
     returns: ast.expr | None
     text: str | None
-    is_cell: bool = False  # a declared state
+    is_cell: bool = False  # True for a declared state
 
 
 def members_of(twin: Twin) -> list[ClassMember]:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 # Silence after which a link is not alive. Probes are answered twice a second.
 PROBED_TIMEOUT_S = 1.0
 
-# Silence after which a link without answers, or a costly link, is not alive: two missing heartbeats.
+# Silence (two missing heartbeats) after which a link without answers to probes, or a costly link, counts as dead.
 UNPROBED_TIMEOUT_S = 2.5
 
 # Consecutive matching clock samples that prove that a second link leads to the same vehicle.

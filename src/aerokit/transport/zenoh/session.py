@@ -138,7 +138,7 @@ class NetworkLink(BaseLink):
     def __init__(self, address: str) -> None:
         super().__init__(address)
         self._session: Any = None
-        self._declared: list[Any] = []  # declarations end when they are garbage-collected
+        self._declared: list[Any] = []  # kept, because a declaration ends when it is garbage-collected
         self._queue: LoopQueue[Callable[[], object]] | None = None
         self._timer: asyncio.TimerHandle | None = None
 
