@@ -77,15 +77,12 @@ def _images(camera: CameraDevice, command: ReceivedCommand | None) -> Iterable[M
 
     Param 2 is the first index (-1: all images), param 3 the last index (0: only the first image, -1: to the end).
     """
-    images = camera.captures.images
     if command is None:
-        return images[-1:]
+        return camera.captures.images[-1:]
     first, last = whole(command.param2), whole(command.param3)
     if first < 0:
-        return list(images)
-    if last == _TO_THE_END:
-        return images[first:]
-    return images[first : max(first, last) + 1]
+        return list(camera.captures.images)
+    return camera.captures.between(first, None if last == _TO_THE_END else max(first, last))
 
 
 def _streams(camera: CameraDevice, number: int) -> list[m.VideoStreamInformation]:

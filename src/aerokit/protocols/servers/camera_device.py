@@ -162,7 +162,9 @@ class Captures:
     def __init__(self, camera: CameraDevice) -> None:
         self._camera = camera
         self.images: list[CameraImageCaptured] = []
-        """Images since the image log was last cleared, by image index."""
+        """The last images since the image log was cleared, at most ``max_images``."""
+        self.dropped_count: int = 0
+        """Number of older images that the log no longer has; the image index of the first one in it."""
         self.interval_s: float = 0.0
         """Interval of the series."""
         self._remaining = 0  # images that the series has not begun yet; -1: no limit
@@ -202,6 +204,17 @@ class Captures:
     def clear(self) -> None:
         """Clear the image log; the next index is 0."""
         self.images.clear()
+        self.dropped_count = 0
+
+    @property
+    def image_count(self) -> int:
+        """Number of images since the image log was cleared; the next image index."""
+        return self.dropped_count + len(self.images)
+
+    def between(self, first: int, last: int | None) -> list[CameraImageCaptured]:
+        """Return the images with these indices, up to the newest if ``last`` is None."""
+        end = None if last is None else max(0, last + 1 - self.dropped_count)
+        return self.images[max(0, first - self.dropped_count) : end]
 
     def _begin_image(self, series: int) -> None:
         """Take the next image of a series, and schedule the one after it."""
@@ -224,7 +237,7 @@ class Captures:
         if series != self._series:
             return
         self._is_exposing = False
-        camera, index = self._camera, len(self.images)
+        camera, index = self._camera, self.image_count
         url = None if shot is None else camera.store_image(shot(image_index=index, capture_result=1))
         make_image = camera.failed_shot() if shot is None else shot
         if url is None:
@@ -233,7 +246,9 @@ class Captures:
         else:
             image = make_image(image_index=index, capture_result=1, file_url=url)
             self.images.append(image)
-            del self.images[: len(self.images) - camera.max_images]
+            if len(self.images) > camera.max_images:
+                del self.images[0]
+                self.dropped_count += 1
         camera.host.send(image)
         if not self._remaining:
             camera.host.send(self.status())
@@ -279,7 +294,7 @@ class Captures:
             image_interval=self.interval_s if is_series else 0.0,
             recording_time_ms=round(recording_s * 1000),
             available_capacity=camera.free_mib,
-            image_count=len(self.images),
+            image_count=self.image_count,
         )
 
 
