@@ -56,7 +56,8 @@ class ComponentMissions:
         """Decorator: ``function(kind, items)`` accepts or refuses each upload, before it is stored and acknowledged.
 
         To refuse a list, the function returns False or a MAV_MISSION_RESULT, or raises InvalidArgument, which becomes
-        the result INVALID and a status text. It may be a coroutine function. An empty list is a request to clear the list.
+        the result INVALID and a status text. It may be a coroutine function. An empty list is a request to clear the
+        list.
         """
         self._on_upload = function
         return function
