@@ -245,7 +245,7 @@ class Routes:
         return [evicted]
 
     def _peers_of_duplicate_autopilots(self, system_id: int) -> set[Peer]:
-        """Return the peers that send as the autopilot of this system although another peer owns its route."""
+        """Return the peers reported as duplicates: they send as the autopilot, but another peer owns its route."""
         autopilot = system_id, MavComponent.AUTOPILOT1
         return {
             peer

@@ -123,7 +123,7 @@ class Switch:
                     self._on_error(port, error)
 
     def _admitted(self, port: Port, framer: Framer, frames: list[Frame]) -> tuple[list[Frame], list[Frame]]:
-        """Return the frames that the sender may send, without signatures, and the out-of-order frames among them."""
+        """Return the frames that the sender may send, without their signatures, and the out-of-order ones among them."""
         admitted: list[Frame] = []
         late: list[Frame] = []
         gateway, guard, peer = port.gateway, port.guard, port.peer
@@ -131,7 +131,7 @@ class Switch:
             frame = received if gateway is None else gateway.admitted(received, self.unix_time())
             if frame is None:
                 continue
-            # With one peer, only heartbeats (0) are checked.
+            # The guard records every heartbeat (0). A single peer has no rival, so its other frames need no check.
             must_check = guard is not None and (guard.is_shared or frame.message_id == 0)
             if guard is not None and must_check and not guard.admits(frame, framer, peer):
                 port.counters.dropped["foreign"] += 1

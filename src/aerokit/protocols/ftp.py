@@ -166,13 +166,13 @@ def path_bytes(path: str) -> bytes:
         InvalidArgument: the path is empty, not encodable as UTF-8, contains NUL, or is longer than 238 bytes.
     """
     if not isinstance(path, str):
-        raise InvalidArgument(f"path = {path!r} is not allowed: a string")
+        raise InvalidArgument(f"path = {path!r} is not allowed: it must be a string")
     try:
         encoded = path.encode()
     except UnicodeEncodeError:
-        raise InvalidArgument(f"path = {path!r} is not allowed: a string that UTF-8 can encode") from None
+        raise InvalidArgument(f"path = {path!r} cannot be encoded as UTF-8") from None
     if not encoded or b"\0" in encoded:
-        raise InvalidArgument(f"path = {path!r} is not allowed: a non-empty string without NUL")
+        raise InvalidArgument(f"path = {path!r} is not allowed: it must be a non-empty string without NUL")
     if len(encoded) > PATH_SIZE:
         raise InvalidArgument(
             f"path = {path!r} is not allowed: {len(encoded)} bytes, at most {PATH_SIZE} fit into a message"

@@ -88,7 +88,7 @@ class _Burst(NamedTuple):
         last_offset = self.offset + (blocks - 1) * DATA_SIZE
         if not last_offset <= reply.offset <= last_offset + DATA_SIZE:
             return None
-        # ArduPilot's NAK has the offset of the last block if this block was full.
+        # The NAK has the offset of the end of the file. After a full block, ArduPilot sends the block's start instead.
         return reply.offset if reply.offset > last_offset else last_offset + DATA_SIZE
 
 
@@ -236,7 +236,7 @@ class FtpDownload(FtpExchange[int]):
 
     def _add(self, offset: int, data: bytes, now: float) -> None:
         if self._size is not None:
-            data = data[: self._size - offset]  # the file may have grown
+            data = data[: self._size - offset]  # The file may have grown; later blocks are ignored before.
         try:
             is_new = self._into.add(offset, data)
         except Exception as error:  # the disk is full, for example

@@ -209,7 +209,11 @@ class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTi
 
 
 class NamedReads(NamedRequests[ValueT]):
-    """Read some values by name. If the `PROBE` is answered, but a name is not, its result is a ParameterRejected."""
+    """Read some values by name.
+
+    A name that is not answered results in a ParameterRejected if the component answered `PROBE`, a request that every
+    component with parameters answers.
+    """
 
     unknown_text: ClassVar[str]  # for example "the vehicle has no parameter"
     _is_probe_wanted = False

@@ -48,7 +48,8 @@ class MultiLink(Link):
     Args:
         factories: functions that create the links, called for the first and every later attempt to open them.
         costly: indices of links that are used only when the others fail.
-        survives_loss: True to report an interruption instead of a loss while all links are lost.
+        survives_loss: if all links are lost, True keeps this link open, reports an interruption and reopens the links
+            as soon as possible; False reports this link as lost for good.
     """
 
     is_multilink = True

@@ -109,7 +109,8 @@ class HardwareId(NamedTuple):
     """Hardware id from AUTOPILOT_VERSION; all zeros mean none.
 
     ArduPilot sends the processor's serial number as ``uid2`` (on Linux and in simulation the machine id), and no
-    ``uid``. PX4 sends both; in simulation they are a constant and the system id. Equal or missing ids prove nothing.
+    ``uid``. PX4 sends both; in simulation ``uid2`` is a constant and ``uid`` the system id. So only different ids
+    prove something: that there are two vehicles.
     https://mavlink.io/en/messages/common.html#AUTOPILOT_VERSION
     """
 

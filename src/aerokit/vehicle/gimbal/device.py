@@ -235,7 +235,7 @@ class GimbalDevice:
         self.controllers.set(GimbalControllers(primary, secondary), self._source(message))
 
     def update_manager(self, component_id: int, rank: int, *, is_gone: bool) -> None:
-        """Choose between two managers: the one with the higher rank, or the earlier one unless it is gone."""
+        """Record a manager of this gimbal: it replaces the present one if its rank is higher, or if that one is gone."""
         if self.manager_id == component_id:
             self._manager_rank = max(self._manager_rank, rank)
         elif self.manager_id is None or rank > self._manager_rank or is_gone:
