@@ -58,7 +58,7 @@ def test_range_limits_are_inclusive(value: float, above: bool) -> None:
 
 @pytest.mark.parametrize(("value", "above"), NOT_ALLOWED)
 def test_range_limits_exceeded_raise(value: float, above: bool) -> None:
-    with pytest.raises(InvalidArgument, match=r"^it = .* is not allowed: .*0 to 1000$"):
+    with pytest.raises(InvalidArgument, match=r"^it = .* is not allowed: .*0 (to|and at most) 1000$"):
         check_range("it", value, 0, 1000, above=above)
 
 

@@ -235,7 +235,7 @@ class GimbalDevice:
         self.controllers.set(GimbalControllers(primary, secondary), self._source(message))
 
     def update_manager(self, component_id: int, rank: int, *, is_gone: bool) -> None:
-        """Record a manager of this gimbal: it replaces the present one if its rank is higher, or if that one is gone."""
+        """Record a manager. It replaces the present manager if it has a higher rank, or if the present one is gone."""
         if self.manager_id == component_id:
             self._manager_rank = max(self._manager_rank, rank)
         elif self.manager_id is None or rank > self._manager_rank or is_gone:

@@ -198,7 +198,7 @@ class Telemetry(States):
             self._arrived_at = outer_arrived_at
 
     def _handler(self, class_name: str) -> Handler:
-        """Return the handler for a message class: it updates the state cells of all values that the message contains."""
+        """Return the handler for a message class: it updates the state cells of all values in the message."""
         special_handlers: Mapping[str, Handler] = {
             "AvailableModes": self._on_available_modes,
             "Statustext": self._on_status_text,
