@@ -182,7 +182,7 @@ class ArduPilotGimbal:
 
     def _on_global_position(self, message: GlobalPositionInt, _: Channel) -> None:
         if sender_of(message)[0] == self._followed:
-            place = self._vehicle.point(message.lat, message.lon, message.alt * 1e-3, MavFrame.GLOBAL)
+            place = self._vehicle.world_point(message.lat, message.lon, message.alt * 1e-3, MavFrame.GLOBAL)
             self._follows = self._follows if place is None else place
 
     def set_control(self, sender: tuple[int, int], system: int, component: int) -> bool:

@@ -183,7 +183,7 @@ class SimulatedPlane(PlaneHost):
         """Fly to a place and circle there. Param 3 is the radius; param 4 other than 0 means anticlockwise."""
         if command.is_long:  # COMMAND_LONG does not specify the altitude frame that ArduPilot requires here.
             return MavResult.UNSUPPORTED
-        point = self.point(*command.place(), command.z, command.altitude_frame)
+        point = self.world_point(*command.place(), command.z, command.altitude_frame)
         if point is None:
             return MavResult.DENIED
         if self.mode is not self.guided and not whole(command.param2) & MavDoRepositionFlags.CHANGE_MODE:

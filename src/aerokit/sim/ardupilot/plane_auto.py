@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import AttitudeTargetTypemask as Mask
-from aerokit.mavlink.enums import HeadingType, MavCmd, MavFrame, MavResult, MavSeverity, PlaneMode, SpeedType
+from aerokit.mavlink.enums import HeadingType, MavFrame, MavResult, MavSeverity, PlaneMode, SpeedType
+from aerokit.mavlink.enums import MavCmd as Cmd
 from aerokit.mavlink.enums import PositionTargetTypemask as PositionMask
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.mission_run import MissionMode, horizontal_distance
@@ -21,7 +22,6 @@ from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandHandler, ReceivedCommand, whole
 from aerokit.sim.motion import Ned, euler_from_quaternion, wrap_pi
 
-_C = MavCmd
 _FLY, _LOITER, _CLIMB, _LAND = range(4)
 _REACHED_HEIGHT_M = 5.0
 _ON_CIRCLE_SHARE = 1.3
@@ -43,16 +43,16 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         self._condition_from = 0.0
         self._start: Ned = (0.0, 0.0, 0.0)
         self.handlers: dict[int, Callable[[MissionItem], None]] = {
-            _C.NAV_TAKEOFF: lambda item: self._go(item, _CLIMB),
-            **dict.fromkeys((_C.NAV_WAYPOINT, _C.NAV_SPLINE_WAYPOINT), lambda item: self._go(item, _FLY)),
-            **dict.fromkeys((_C.NAV_LOITER_UNLIM, _C.NAV_LOITER_TIME), self._loiter),
-            **dict.fromkeys((_C.NAV_LOITER_TURNS, _C.NAV_LOITER_TO_ALT), self._loiter),
-            _C.NAV_LAND: self._land,
-            _C.NAV_RETURN_TO_LAUNCH: self._return,
-            _C.CONDITION_DELAY: self._wait,
-            _C.DO_CHANGE_SPEED: self._change_speed,
-            _C.DO_SET_HOME: self._set_home,
-            **dict.fromkeys((_C.DO_LAND_START, _C.DO_RETURN_PATH_START, _C.DO_FENCE_ENABLE), lambda _: None),
+            Cmd.NAV_TAKEOFF: lambda item: self._go(item, _CLIMB),
+            **dict.fromkeys((Cmd.NAV_WAYPOINT, Cmd.NAV_SPLINE_WAYPOINT), lambda item: self._go(item, _FLY)),
+            **dict.fromkeys((Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LOITER_TIME), self._loiter),
+            **dict.fromkeys((Cmd.NAV_LOITER_TURNS, Cmd.NAV_LOITER_TO_ALT), self._loiter),
+            Cmd.NAV_LAND: self._land,
+            Cmd.NAV_RETURN_TO_LAUNCH: self._return,
+            Cmd.CONDITION_DELAY: self._wait,
+            Cmd.DO_CHANGE_SPEED: self._change_speed,
+            Cmd.DO_SET_HOME: self._set_home,
+            **dict.fromkeys((Cmd.DO_LAND_START, Cmd.DO_RETURN_PATH_START, Cmd.DO_FENCE_ENABLE), lambda _: None),
         }
 
     @property
@@ -115,7 +115,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
     def is_complete(self, index: int, item: MissionItem) -> bool:
         if self.vehicle.mode is not self or not self.vehicle.is_armed or not self._is_done(index, item):
             return False
-        if item.command <= _C.NAV_LAST:
+        if item.command <= Cmd.NAV_LAST:
             self.vehicle.send(m.MissionItemReached(index))
         return True
 
@@ -130,23 +130,23 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
 
     def _is_done(self, index: int, item: MissionItem) -> bool:
         plane, command = self.vehicle, item.command
-        if command == _C.NAV_TAKEOFF:
+        if command == Cmd.NAV_TAKEOFF:
             assert self._place is not None
             is_high = plane.wing.down <= self._place[2]
             return is_high and self._report(f"Takeoff complete at {plane.altitude_m:.2f}m")
-        if command in (_C.NAV_WAYPOINT, _C.NAV_SPLINE_WAYPOINT):
+        if command in (Cmd.NAV_WAYPOINT, Cmd.NAV_SPLINE_WAYPOINT):
             return self._has_passed(index)
-        if command == _C.NAV_LOITER_TIME:
+        if command == Cmd.NAV_LOITER_TIME:
             return plane.now - self._since >= item.param1 and self._report("Loiter time complete")
-        if command == _C.NAV_LOITER_TURNS:
+        if command == Cmd.NAV_LOITER_TURNS:
             return self._turned >= 2 * math.pi * item.param1 and self._report("Loiter orbits complete")
-        if command == _C.NAV_LOITER_TO_ALT:
+        if command == Cmd.NAV_LOITER_TO_ALT:
             assert self._place is not None
             is_at_height = abs(plane.wing.down - self._place[2]) < _REACHED_HEIGHT_M
             return is_at_height and self._is_on_circle and self._report("Loiter to alt complete")
-        if command == _C.CONDITION_DELAY:
+        if command == Cmd.CONDITION_DELAY:
             return plane.now - self._condition_from > max(0.0, item.param1)
-        if command in (_C.NAV_LOITER_UNLIM, _C.NAV_LAND, _C.NAV_RETURN_TO_LAUNCH):
+        if command in (Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LAND, Cmd.NAV_RETURN_TO_LAUNCH):
             return False
         self.warn_if_unknown(item)
         return True
@@ -168,7 +168,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
     def _go(self, item: MissionItem, manoeuvre: int) -> None:
         wing, before = self.vehicle.wing, self._place
         self._start = wing.place
-        point = self.vehicle.point(int(item.x), int(item.y), item.z, item.frame) or self._start
+        point = self.vehicle.world_point(int(item.x), int(item.y), item.z, item.frame) or self._start
         north, east = self._start[:2] if (item.x, item.y) == (0, 0) else point[:2]
         down = point[2] if item.z != 0 else (wing.down if before is None else before[2])
         self._place, self._manoeuvre = (north, east, down), manoeuvre
@@ -176,12 +176,12 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
 
     def _loiter(self, item: MissionItem) -> None:
         self._go(item, _LOITER)
-        self.radius: float = item.param2 if item.command == _C.NAV_LOITER_TO_ALT else item.param3
+        self.radius: float = item.param2 if item.command == Cmd.NAV_LOITER_TO_ALT else item.param3
 
     def _land(self, item: MissionItem) -> None:
         self._go(item, _LAND)
         wing, plane = self.vehicle.wing, self.vehicle
-        point = plane.point(int(item.x), int(item.y), item.z, item.frame)
+        point = plane.world_point(int(item.x), int(item.y), item.z, item.frame)
         north, east = self._start[:2] if point is None or (item.x, item.y) == (0, 0) else point[:2]
         self._landing = PlaneLanding(plane, (north, east, wing.ground_down if point is None else point[2]))
         plane.info(f"Landing approach start at {plane.altitude_m:.1f}m")
@@ -202,7 +202,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         plane = self.vehicle
         point: Ned | None = plane.wing.place
         if item.param1 != 1:  # On Plane, unlike on Copter, zeros are a position.
-            point = plane.point(int(item.x), int(item.y), item.z, item.frame)
+            point = plane.world_point(int(item.x), int(item.y), item.z, item.frame)
         if point is not None:
             plane.navigation.set_home(point, lock=False)
 
@@ -311,7 +311,7 @@ class PlaneSetpoints:
         plane = self._plane
         if not self._is_guided:
             return
-        point = plane.point(0, 0, message.alt, message.coordinate_frame)
+        point = plane.world_point(0, 0, message.alt, message.coordinate_frame)
         if point is None:
             plane.info(f"Unknown mavlink coordinate frame {message.coordinate_frame}")
             plane.send_text(MavSeverity.WARNING, "Invalid coord frame in SET_POSTION_TARGET_GLOBAL_INT")
@@ -334,10 +334,10 @@ def guided_commands(plane: PlaneHost) -> dict[int, CommandHandler]:
         return handle
 
     return {
-        _C.GUIDED_CHANGE_SPEED: in_guided(_change_speed),
-        _C.GUIDED_CHANGE_ALTITUDE: in_guided(_change_altitude),
-        _C.GUIDED_CHANGE_HEADING: in_guided(_change_heading),
-        _C.DO_CHANGE_ALTITUDE: lambda command: _change_target_altitude(plane, command),
+        Cmd.GUIDED_CHANGE_SPEED: in_guided(_change_speed),
+        Cmd.GUIDED_CHANGE_ALTITUDE: in_guided(_change_altitude),
+        Cmd.GUIDED_CHANGE_HEADING: in_guided(_change_heading),
+        Cmd.DO_CHANGE_ALTITUDE: lambda command: _change_target_altitude(plane, command),
     }
 
 
@@ -355,7 +355,7 @@ def _change_altitude(plane: PlaneHost, guided: PlaneGuided, command: ReceivedCom
 
     The firmware refuses the altitudes 0 and -1.
     """
-    point = plane.point(0, 0, command.z, command.altitude_frame)
+    point = plane.world_point(0, 0, command.z, command.altitude_frame)
     if command.z in _INVALID_ALTITUDES or point is None:
         return MavResult.DENIED
     guided.change_altitude(point[2], abs(command.param3) or _UNLIMITED_M_S)
@@ -377,7 +377,7 @@ def _change_heading(_: PlaneHost, guided: PlaneGuided, command: ReceivedCommand)
 
 def _change_target_altitude(plane: PlaneHost, command: ReceivedCommand) -> int:
     """Change the altitude: param 1 in metres, param 2 a MAV_FRAME. Accepted in every mode, but only GUIDED uses it."""
-    point = plane.point(0, 0, command.param1, whole(command.param2))
+    point = plane.world_point(0, 0, command.param1, whole(command.param2))
     if point is None:
         return MavResult.DENIED
     guided = plane.mode_of(PlaneGuided)

@@ -7,7 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol, cast
 
-from aerokit.mavlink.enums import MavCmd, MavFrame, MavResult, SpeedType
+from aerokit.mavlink.enums import MavCmd as Cmd
+from aerokit.mavlink.enums import MavFrame, MavResult, SpeedType
 from aerokit.mavlink.messages import (
     MissionItemReached,
     SetAttitudeTarget,
@@ -89,7 +90,7 @@ class GuidedSetpoints:
 
     def _on_global(self, message: SetPositionTargetGlobalInt, _: Channel) -> None:
         frame = message.coordinate_frame
-        point = self.vehicle.point(message.lat_int, message.lon_int, message.alt, frame)
+        point = self.vehicle.world_point(message.lat_int, message.lon_int, message.alt, frame)
         if point is not None or not Setpoint.of(message).has_position:
             self._apply(message, point, has_yaw=self.GLOBAL_YAW)
 
@@ -155,7 +156,7 @@ class RoverSubVehicle(ArduPilotVehicle):
         self.motion.step(dt, powered=self.motors.is_armed and not self.faults.motor_failed)
 
     def make_commands(self) -> dict[int, CommandHandler]:
-        return {**common_commands(self), MavCmd.DO_CHANGE_SPEED: self._change_speed}
+        return {**common_commands(self), Cmd.DO_CHANGE_SPEED: self._change_speed}
 
     def _change_speed(self, command: ReceivedCommand) -> int:
         if command.param1 in (SpeedType.CLIMB_SPEED, SpeedType.DESCENT_SPEED):
@@ -167,12 +168,11 @@ class RoverSubVehicle(ArduPilotVehicle):
         return MavResult.ACCEPTED
 
 
-_C = MavCmd
-_WAYPOINTS = frozenset({_C.NAV_WAYPOINT, _C.NAV_LOITER_UNLIM, _C.NAV_LOITER_TIME})
-_HOME = _C.NAV_RETURN_TO_LAUNCH
+_WAYPOINTS = frozenset({Cmd.NAV_WAYPOINT, Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LOITER_TIME})
+_HOME = Cmd.NAV_RETURN_TO_LAUNCH
 _WITHOUT_EFFECT = (
-    _C.DO_SET_ROI, _C.DO_SET_ROI_LOCATION, _C.DO_SET_ROI_NONE, _C.DO_FENCE_ENABLE, _C.DO_GUIDED_LIMITS,
-    _C.CONDITION_DISTANCE,
+    Cmd.DO_SET_ROI, Cmd.DO_SET_ROI_LOCATION, Cmd.DO_SET_ROI_NONE, Cmd.DO_FENCE_ENABLE, Cmd.DO_GUIDED_LIMITS,
+    Cmd.CONDITION_DISTANCE,
 )  # fmt: skip
 
 
@@ -189,9 +189,9 @@ class RoverSubAuto(MissionMode):
         self._wait_until = 0.0
         self.handlers: dict[int, Callable[[MissionItem], None]] = {
             **dict.fromkeys((*_WAYPOINTS, _HOME), self._go),
-            **dict.fromkeys((_C.NAV_DELAY, _C.CONDITION_DELAY), self._wait),
-            _C.DO_CHANGE_SPEED: self._change_speed,
-            _C.DO_SET_HOME: lambda item: set_home_from(vehicle, item),
+            **dict.fromkeys((Cmd.NAV_DELAY, Cmd.CONDITION_DELAY), self._wait),
+            Cmd.DO_CHANGE_SPEED: self._change_speed,
+            Cmd.DO_SET_HOME: lambda item: set_home_from(vehicle, item),
             **dict.fromkeys(_WITHOUT_EFFECT, lambda _: None),
         }
 
@@ -255,12 +255,12 @@ class RoverSubAuto(MissionMode):
     def _is_done(self, index: int, item: MissionItem) -> bool:
         command, now = item.command, self.vehicle.now
         if command in _WAYPOINTS:
-            return self._has_stayed(index, item) and command != _C.NAV_LOITER_UNLIM
+            return self._has_stayed(index, item) and command != Cmd.NAV_LOITER_UNLIM
         if command == _HOME:
             return self._place is None or self.has_arrived(self._place)
-        if command in (_C.NAV_DELAY, _C.CONDITION_DELAY):
+        if command in (Cmd.NAV_DELAY, Cmd.CONDITION_DELAY):
             return now >= self._wait_until
-        if command == _C.CONDITION_DISTANCE:
+        if command == Cmd.CONDITION_DISTANCE:
             return horizontal_distance(self.vehicle, self._place) < item.param1
         self.warn_if_unknown(item)
         return True
@@ -281,7 +281,7 @@ class RoverSubAuto(MissionMode):
         if item.command == _HOME:
             self._place, self._stops = vehicle.navigation.home or here, True
             return
-        point = vehicle.point(int(item.x), int(item.y), item.z, item.frame)
+        point = vehicle.world_point(int(item.x), int(item.y), item.z, item.frame)
         north, east = here[:2] if point is None or (item.x, item.y) == (0, 0) else point[:2]
         self._place = (north, east, here[2] if point is None or item.z == 0 else point[2])
         following = next(vehicle.mission.navigation_from(vehicle.mission.nav_index + 1), None)
@@ -289,7 +289,7 @@ class RoverSubAuto(MissionMode):
 
     def _wait(self, item: MissionItem) -> None:
         self._wait_until = self.vehicle.now + max(0.0, item.param1)
-        if item.command == _C.NAV_DELAY:
+        if item.command == Cmd.NAV_DELAY:
             self._place = None
             self.vehicle.info(f"Delaying {int(item.param1)} sec")
 

@@ -8,13 +8,15 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import (
     FailureType,
     FailureUnit,
-    MavCmd,
     MavFrame,
     MavModeFlag,
     MavResult,
     MavSeverity,
     MavType,
     MavVtolState,
+)
+from aerokit.mavlink.enums import (
+    MavCmd as Cmd,
 )
 from aerokit.sim.commands import CommandHandler, CommandProgress, ReceivedCommand, whole
 from aerokit.sim.px4 import modes
@@ -23,19 +25,18 @@ from aerokit.sim.px4.modes import Px4Mode
 from aerokit.sim.px4.payload import gimbal_commands
 from aerokit.sim.px4.telemetry import available_modes
 
-_C = MavCmd
 # Commands that are accepted without a visible effect.
 _ACCEPTED = (
-    _C.NAV_ROI, _C.NAV_VTOL_TAKEOFF, _C.DO_SET_ACTUATOR, _C.DO_SET_ROI_LOCATION, _C.DO_SET_ROI_WPNEXT_OFFSET,
-    _C.DO_SET_ROI_NONE, _C.DO_SET_ROI, _C.DO_SET_SAFETY_SWITCH_STATE,
+    Cmd.NAV_ROI, Cmd.NAV_VTOL_TAKEOFF, Cmd.DO_SET_ACTUATOR, Cmd.DO_SET_ROI_LOCATION, Cmd.DO_SET_ROI_WPNEXT_OFFSET,
+    Cmd.DO_SET_ROI_NONE, Cmd.DO_SET_ROI, Cmd.DO_SET_SAFETY_SWITCH_STATE,
 )  # fmt: skip
 
 # Commands without an answer, because their modules do not run in this configuration.
 _UNANSWERED = (
-    _C.NAV_DELAY, _C.DO_DIGICAM_CONTROL, _C.DO_MOUNT_CONFIGURE, _C.DO_MOUNT_CONTROL, _C.DO_SET_CAM_TRIGG_DIST,
-    _C.DO_SET_CAM_TRIGG_INTERVAL, _C.PREFLIGHT_UAVCAN, _C.REQUEST_CAMERA_INFORMATION, _C.SET_CAMERA_MODE,
-    _C.SET_CAMERA_ZOOM, _C.SET_CAMERA_FOCUS, _C.DO_GIMBAL_MANAGER_PITCHYAW, _C.DO_GIMBAL_MANAGER_CONFIGURE,
-    _C.DO_TRIGGER_CONTROL, _C.DO_WINCH,
+    Cmd.NAV_DELAY, Cmd.DO_DIGICAM_CONTROL, Cmd.DO_MOUNT_CONFIGURE, Cmd.DO_MOUNT_CONTROL, Cmd.DO_SET_CAM_TRIGG_DIST,
+    Cmd.DO_SET_CAM_TRIGG_INTERVAL, Cmd.PREFLIGHT_UAVCAN, Cmd.REQUEST_CAMERA_INFORMATION, Cmd.SET_CAMERA_MODE,
+    Cmd.SET_CAMERA_ZOOM, Cmd.SET_CAMERA_FOCUS, Cmd.DO_GIMBAL_MANAGER_PITCHYAW, Cmd.DO_GIMBAL_MANAGER_CONFIGURE,
+    Cmd.DO_TRIGGER_CONTROL, Cmd.DO_WINCH,
 )  # fmt: skip
 
 _GRIP_DURATION_S = 1.3
@@ -49,14 +50,14 @@ _ACTUATORS, _FIRST_OUTPUT_FUNCTION = (range(1, 13), range(33, 41)), 1000
 def other_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
     handlers: dict[int, CommandHandler] = dict.fromkeys(_ACCEPTED, lambda _: MavResult.ACCEPTED)
     handlers |= dict.fromkeys(_UNANSWERED, lambda _: None)
-    handlers[_C.DO_LAND_START] = lambda _: MavResult.CANCELLED
-    handlers[_C.CONTROL_HIGH_LATENCY] = lambda _: _refuse_high_latency(px4)
-    handlers[_C.INJECT_FAILURE] = lambda command: _inject_failure(px4, command)
-    handlers[_C.LOGGING_START] = lambda command: px4.log_stream.start(command)
-    handlers[_C.LOGGING_STOP] = lambda command: px4.log_stream.stop(command)
-    handlers[_C.DO_GRIPPER] = lambda _: CommandProgress((_UNKNOWN_PROGRESS,), _GRIP_DURATION_S)
-    handlers[_C.ACTUATOR_TEST] = lambda command: _test_actuator(px4, command)
-    handlers[_C.PREFLIGHT_STORAGE] = lambda command: _store(px4, command)
+    handlers[Cmd.DO_LAND_START] = lambda _: MavResult.CANCELLED
+    handlers[Cmd.CONTROL_HIGH_LATENCY] = lambda _: _refuse_high_latency(px4)
+    handlers[Cmd.INJECT_FAILURE] = lambda command: _inject_failure(px4, command)
+    handlers[Cmd.LOGGING_START] = lambda command: px4.log_stream.start(command)
+    handlers[Cmd.LOGGING_STOP] = lambda command: px4.log_stream.stop(command)
+    handlers[Cmd.DO_GRIPPER] = lambda _: CommandProgress((_UNKNOWN_PROGRESS,), _GRIP_DURATION_S)
+    handlers[Cmd.ACTUATOR_TEST] = lambda command: _test_actuator(px4, command)
+    handlers[Cmd.PREFLIGHT_STORAGE] = lambda command: _store(px4, command)
     return handlers
 
 
@@ -110,26 +111,26 @@ def px4_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
         **other_commands(px4),
         **px4.camera_trigger.commands(),
         **gimbal_commands(px4.gimbal),
-        MavCmd.COMPONENT_ARM_DISARM: flight.arm_or_disarm,
-        MavCmd.DO_SET_MODE: flight.set_mode,
-        MavCmd.NAV_TAKEOFF: flight.take_off,
-        MavCmd.DO_SET_STANDARD_MODE: flight.set_standard_mode,
-        MavCmd.NAV_LAND: flight.land,
-        MavCmd.NAV_LAND_LOCAL: flight.land_precisely,
-        MavCmd.DO_ORBIT: flight.orbit,
-        MavCmd.DO_VTOL_TRANSITION: flight.transition,
-        MavCmd.DO_AUTOTUNE_ENABLE: flight.tune,
-        MavCmd.DO_CHANGE_ALTITUDE: flight.change_altitude,
-        MavCmd.DO_FLIGHTTERMINATION: flight.terminate,
-        MavCmd.NAV_RETURN_TO_LAUNCH: flight.return_to_launch,
-        MavCmd.DO_REPOSITION: flight.reposition,
-        MavCmd.DO_CHANGE_SPEED: flight.change_speed,
-        MavCmd.MISSION_START: flight.start_mission,
-        MavCmd.DO_SET_HOME: flight.set_home,
-        MavCmd.EXTERNAL_WIND_ESTIMATE: px4.external.set_wind,
-        MavCmd.PREFLIGHT_CALIBRATION: lambda command: px4.calibration.command(command),
-        MavCmd.RUN_PREARM_CHECKS: flight.run_prearm_checks,
-        MavCmd.PREFLIGHT_REBOOT_SHUTDOWN: flight.reboot,
+        Cmd.COMPONENT_ARM_DISARM: flight.arm_or_disarm,
+        Cmd.DO_SET_MODE: flight.set_mode,
+        Cmd.NAV_TAKEOFF: flight.take_off,
+        Cmd.DO_SET_STANDARD_MODE: flight.set_standard_mode,
+        Cmd.NAV_LAND: flight.land,
+        Cmd.NAV_LAND_LOCAL: flight.land_precisely,
+        Cmd.DO_ORBIT: flight.orbit,
+        Cmd.DO_VTOL_TRANSITION: flight.transition,
+        Cmd.DO_AUTOTUNE_ENABLE: flight.tune,
+        Cmd.DO_CHANGE_ALTITUDE: flight.change_altitude,
+        Cmd.DO_FLIGHTTERMINATION: flight.terminate,
+        Cmd.NAV_RETURN_TO_LAUNCH: flight.return_to_launch,
+        Cmd.DO_REPOSITION: flight.reposition,
+        Cmd.DO_CHANGE_SPEED: flight.change_speed,
+        Cmd.MISSION_START: flight.start_mission,
+        Cmd.DO_SET_HOME: flight.set_home,
+        Cmd.EXTERNAL_WIND_ESTIMATE: px4.external.set_wind,
+        Cmd.PREFLIGHT_CALIBRATION: lambda command: px4.calibration.command(command),
+        Cmd.RUN_PREARM_CHECKS: flight.run_prearm_checks,
+        Cmd.PREFLIGHT_REBOOT_SHUTDOWN: flight.reboot,
     }
 
 
@@ -356,9 +357,9 @@ _ACKNOWLEDGED_ONLY = frozenset({m.Heartbeat.ID})
 def message_requests(px4: Px4Vehicle) -> dict[int, CommandHandler]:
     requests = _Requests(px4)
     handlers: dict[int, CommandHandler] = {
-        MavCmd.REQUEST_MESSAGE: requests.request_message,
-        MavCmd.SET_MESSAGE_INTERVAL: requests.set_interval,
-        MavCmd.GET_MESSAGE_INTERVAL: requests.get_interval,
+        Cmd.REQUEST_MESSAGE: requests.request_message,
+        Cmd.SET_MESSAGE_INTERVAL: requests.set_interval,
+        Cmd.GET_MESSAGE_INTERVAL: requests.get_interval,
     }
     for command, message_id in _LEGACY_REQUESTS.items():
         handlers[command] = lambda request, message_id=message_id: requests.send_now(message_id, request)  # type: ignore[misc]
@@ -367,11 +368,11 @@ def message_requests(px4: Px4Vehicle) -> dict[int, CommandHandler]:
 
 # Commands that request a single message.
 _LEGACY_REQUESTS = {
-    MavCmd.REQUEST_AUTOPILOT_CAPABILITIES: m.AutopilotVersion.ID,
-    MavCmd.REQUEST_PROTOCOL_VERSION: m.ProtocolVersion.ID,
-    MavCmd.REQUEST_STORAGE_INFORMATION: m.StorageInformation.ID,
-    MavCmd.REQUEST_FLIGHT_INFORMATION: m.FlightInformation.ID,
-    MavCmd.GET_HOME_POSITION: m.HomePosition.ID,
+    Cmd.REQUEST_AUTOPILOT_CAPABILITIES: m.AutopilotVersion.ID,
+    Cmd.REQUEST_PROTOCOL_VERSION: m.ProtocolVersion.ID,
+    Cmd.REQUEST_STORAGE_INFORMATION: m.StorageInformation.ID,
+    Cmd.REQUEST_FLIGHT_INFORMATION: m.FlightInformation.ID,
+    Cmd.GET_HOME_POSITION: m.HomePosition.ID,
 }
 
 

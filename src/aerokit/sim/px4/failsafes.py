@@ -13,7 +13,8 @@ from collections.abc import Iterator, Sequence
 from enum import IntEnum
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavBatteryChargeState, MavCmd, MavMissionType, MavSeverity, MavType
+from aerokit.mavlink.enums import MavBatteryChargeState, MavMissionType, MavSeverity, MavType
+from aerokit.mavlink.enums import MavCmd as Cmd
 from aerokit.missions import MissionItem
 from aerokit.sim.channel import Channel
 from aerokit.sim.motion import Ned
@@ -21,9 +22,8 @@ from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.links import NO_STATION, OUTSIDE, TOO_FAR, TOO_HIGH
 from aerokit.sim.px4.modes import HOLD, LAND, MISSION, OFFBOARD, ORBIT, RTL, Px4Mode
 
-_C = MavCmd
-_POLYGONS = {_C.NAV_FENCE_POLYGON_VERTEX_INCLUSION: True, _C.NAV_FENCE_POLYGON_VERTEX_EXCLUSION: False}
-_CIRCLES = {_C.NAV_FENCE_CIRCLE_INCLUSION: True, _C.NAV_FENCE_CIRCLE_EXCLUSION: False}
+_POLYGONS = {Cmd.NAV_FENCE_POLYGON_VERTEX_INCLUSION: True, Cmd.NAV_FENCE_POLYGON_VERTEX_EXCLUSION: False}
+_CIRCLES = {Cmd.NAV_FENCE_CIRCLE_INCLUSION: True, Cmd.NAV_FENCE_CIRCLE_EXCLUSION: False}
 _NO_ACTION, _WARNING = 0, 1
 
 
@@ -87,13 +87,13 @@ class Px4Fence:
             if item.command in _POLYGONS:
                 count = max(1, int(item.param1))
                 corners = [self._place(item) for item in items[index : index + count]]
-                yield _POLYGONS[MavCmd(item.command)], _is_in_polygon(corners, north, east)
+                yield _POLYGONS[Cmd(item.command)], _is_in_polygon(corners, north, east)
                 index += count
                 continue
             if item.command in _CIRCLES:
                 centre = self._place(item)
                 inside = math.dist(centre, (north, east)) <= item.param1
-                yield _CIRCLES[MavCmd(item.command)], inside
+                yield _CIRCLES[Cmd(item.command)], inside
             index += 1
 
     def _items(self) -> Sequence[MissionItem]:

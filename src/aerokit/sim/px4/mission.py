@@ -9,26 +9,26 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from aerokit.mavlink.enums import MavCmd, MavFrame, MavSeverity, MavType, MissionState
+from aerokit.mavlink.enums import MavCmd as Cmd
+from aerokit.mavlink.enums import MavFrame, MavSeverity, MavType, MissionState
 from aerokit.mavlink.messages import MissionItemReached
 from aerokit.missions import MissionItem
 from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.modes import HOLD, LAND, MISSION, RTL, TAKEOFF
 
-_C = MavCmd
-_TAKE_OFFS = (_C.NAV_TAKEOFF, _C.NAV_VTOL_TAKEOFF)
-_LANDINGS = (_C.NAV_LAND, _C.NAV_VTOL_LAND)
+_TAKE_OFFS = (Cmd.NAV_TAKEOFF, Cmd.NAV_VTOL_TAKEOFF)
+_LANDINGS = (Cmd.NAV_LAND, Cmd.NAV_VTOL_LAND)
 _WITH_PLACE = (
-    _C.NAV_WAYPOINT,
-    _C.NAV_LOITER_UNLIM,
-    _C.NAV_LOITER_TIME,
-    _C.NAV_LOITER_TO_ALT,
+    Cmd.NAV_WAYPOINT,
+    Cmd.NAV_LOITER_UNLIM,
+    Cmd.NAV_LOITER_TIME,
+    Cmd.NAV_LOITER_TO_ALT,
     *_TAKE_OFFS,
     *_LANDINGS,
 )
 # Commands that can be uploaded, but make a mission invalid.
-_STORED_ONLY = (_C.CONDITION_DELAY, _C.CONDITION_DISTANCE, _C.NAV_FENCE_RETURN_POINT)
-_VTOL = (_C.NAV_VTOL_TAKEOFF, _C.NAV_VTOL_LAND)
+_STORED_ONLY = (Cmd.CONDITION_DELAY, Cmd.CONDITION_DISTANCE, Cmd.NAV_FENCE_RETURN_POINT)
+_VTOL = (Cmd.NAV_VTOL_TAKEOFF, Cmd.NAV_VTOL_LAND)
 _MAX_FIRST_DISTANCE_M = 10_000.0
 
 
@@ -40,7 +40,7 @@ def rejection(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
     for number, item in enumerate(items, start=1):
         if item.command in _STORED_ONLY:
             return f"item {number}: unsupported cmd: {item.command:d}"
-        if item.command == _C.NAV_LAND and number == 1 and px4.is_landed:
+        if item.command == Cmd.NAV_LAND and number == 1 and px4.is_landed:
             return "starts with landing"
         if item.command in _TAKE_OFFS:
             if _height(px4, item) <= 0.0:
@@ -76,7 +76,7 @@ def _height(px4: Px4Host, item: MissionItem) -> float:
 def _landing_problem(items: Sequence[MissionItem]) -> str | None:
     start = approach = -1
     for index, item in enumerate(items):
-        if item.command == _C.DO_LAND_START:
+        if item.command == Cmd.DO_LAND_START:
             if start >= 0:
                 return "more than one land start."
             start = index
@@ -84,7 +84,7 @@ def _landing_problem(items: Sequence[MissionItem]) -> str | None:
             if index == 0:
                 return "starts with land waypoint."
             approach = index - 1
-        elif item.command == _C.NAV_RETURN_TO_LAUNCH and 0 <= start < index:
+        elif item.command == Cmd.NAV_RETURN_TO_LAUNCH and 0 <= start < index:
             return "land start item before RTL item not possible."
     return "invalid land start." if start > approach else None
 
@@ -114,14 +114,14 @@ def warning(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
 _REPEATS = 10
 _HEIGHT_REACHED_M = 0.8
 _PLACES = (
-    _C.NAV_WAYPOINT,
-    _C.NAV_LOITER_UNLIM,
-    _C.NAV_LOITER_TIME,
-    _C.NAV_LOITER_TO_ALT,
+    Cmd.NAV_WAYPOINT,
+    Cmd.NAV_LOITER_UNLIM,
+    Cmd.NAV_LOITER_TIME,
+    Cmd.NAV_LOITER_TO_ALT,
     *_TAKE_OFFS,
     *_LANDINGS,
 )
-_STAYING = (_C.NAV_WAYPOINT, _C.NAV_LOITER_TIME)
+_STAYING = (Cmd.NAV_WAYPOINT, Cmd.NAV_LOITER_TIME)
 _MAX_JUMPS = 100
 _ACTIVE_MODES = (MISSION, TAKEOFF, LAND)
 
@@ -236,10 +236,10 @@ class Px4Mission:
             if item is None:
                 self._finish()
                 return
-            if item.command in _PLACES or item.command == _C.NAV_DELAY:
+            if item.command in _PLACES or item.command == Cmd.NAV_DELAY:
                 self._aim(item)
                 return
-            if item.command == _C.DO_JUMP:
+            if item.command == Cmd.DO_JUMP:
                 self.current = self._jump(item)
                 continue
             self._do(item)
@@ -249,9 +249,9 @@ class Px4Mission:
 
     def _do(self, item: MissionItem) -> None:
         px4 = self._px4
-        if item.command == _C.DO_CHANGE_SPEED and item.param2 > 0:
+        if item.command == Cmd.DO_CHANGE_SPEED and item.param2 > 0:
             px4.flight.speed_m_s = min(item.param2, px4.flight.top_speed_m_s)
-        elif item.command == _C.NAV_RETURN_TO_LAUNCH:
+        elif item.command == Cmd.NAV_RETURN_TO_LAUNCH:
             px4.call_later(0.0, self._return)
 
     def _return(self) -> None:
@@ -273,7 +273,7 @@ class Px4Mission:
     def _aim(self, item: MissionItem) -> None:
         px4, motion = self._px4, self._px4.motion
         self._phase = "go"
-        if item.command == _C.NAV_DELAY:
+        if item.command == Cmd.NAV_DELAY:
             px4.flight.stay_here()
             return
         target = self._place(item)
@@ -296,7 +296,7 @@ class Px4Mission:
             px4.info(f"Climb to {px4.home[2] - down:.1f} meters above home")
 
     def _has_heading(self, item: MissionItem) -> bool:
-        return item.command == _C.NAV_WAYPOINT and math.isfinite(item.param4)
+        return item.command == Cmd.NAV_WAYPOINT and math.isfinite(item.param4)
 
     def _place(self, item: MissionItem) -> tuple[float, float, float]:
         """Return the position of an item. For PX4, latitude and longitude 0 are an ordinary position."""
@@ -332,19 +332,19 @@ class Px4Mission:
                 self._begin_item()
 
     def _is_at_target(self, item: MissionItem) -> bool:
-        if item.command == _C.NAV_DELAY:
+        if item.command == Cmd.NAV_DELAY:
             return True
         motion, (north, east, down) = self._px4.motion, self._px4.flight.target
         radius = self._px4.parameters["NAV_ACC_RAD"]
-        if item.command == _C.NAV_WAYPOINT and item.param2 > 0:
+        if item.command == Cmd.NAV_WAYPOINT and item.param2 > 0:
             radius = item.param2
         near = math.hypot(north - motion.north, east - motion.east) <= radius
         return near and abs(down - motion.down) <= _HEIGHT_REACHED_M
 
     def _is_done(self, item: MissionItem) -> bool:
-        if item.command == _C.NAV_LOITER_UNLIM:
+        if item.command == Cmd.NAV_LOITER_UNLIM:
             return False
-        waits = item.command in _STAYING or item.command == _C.NAV_DELAY
+        waits = item.command in _STAYING or item.command == Cmd.NAV_DELAY
         return self._px4.now - self._arrived_at >= (item.param1 if waits else 0.0)
 
     def on_landed(self) -> None:

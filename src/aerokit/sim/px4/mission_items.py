@@ -9,30 +9,31 @@ import struct
 import zlib
 from collections.abc import Callable, Sequence
 
-from aerokit.mavlink.enums import MavCmd, MavFrame, MavMissionResult, MavMissionType, MavRoi
+from aerokit.mavlink.enums import MavCmd as Cmd
+from aerokit.mavlink.enums import MavFrame as Frame
+from aerokit.mavlink.enums import MavMissionResult, MavMissionType, MavRoi
 from aerokit.missions import MissionItem
 from aerokit.sim.missions import float32
 
-_C, _F = MavCmd, MavFrame
 _DATA = pkgutil.get_data(__name__, "mission_commands.csv")
 assert _DATA is not None
 _ROWS = list(csv.DictReader(_DATA.decode().splitlines()))
 # Command in a global frame → storage types of params 1 to 4, see `_CONVERSIONS`.
-_PLACES = {int(MavCmd[row["command"]]): row["with_place"] for row in _ROWS if row["with_place"]}
+_PLACES = {int(Cmd[row["command"]]): row["with_place"] for row in _ROWS if row["with_place"]}
 # Commands in MAV_FRAME_MISSION, of which all seven params are stored.
-_WITHOUT_PLACE = frozenset(int(MavCmd[row["command"]]) for row in _ROWS if row["without_place"] == "1")
+_WITHOUT_PLACE = frozenset(int(Cmd[row["command"]]) for row in _ROWS if row["without_place"] == "1")
 
-_ROI_COMMANDS = (_C.NAV_ROI, _C.DO_SET_ROI)
+_ROI_COMMANDS = (Cmd.NAV_ROI, Cmd.DO_SET_ROI)
 _ROI_WITH_PLACE = (MavRoi.NONE, MavRoi.LOCATION)
 _ROI_WITHOUT_PLACE = (MavRoi.NONE, MavRoi.WPNEXT, MavRoi.WPINDEX)
 _INT_FRAMES: dict[int, int] = {
-    _F.GLOBAL_INT: _F.GLOBAL,
-    _F.GLOBAL_RELATIVE_ALT_INT: _F.GLOBAL_RELATIVE_ALT,
+    Frame.GLOBAL_INT: Frame.GLOBAL,
+    Frame.GLOBAL_RELATIVE_ALT_INT: Frame.GLOBAL_RELATIVE_ALT,
 }
 _AS_INT = {plain: int_frame for int_frame, plain in _INT_FRAMES.items()}
-_POLYGONS = (_C.NAV_FENCE_POLYGON_VERTEX_INCLUSION, _C.NAV_FENCE_POLYGON_VERTEX_EXCLUSION)
+_POLYGONS = (Cmd.NAV_FENCE_POLYGON_VERTEX_INCLUSION, Cmd.NAV_FENCE_POLYGON_VERTEX_EXCLUSION)
 _NO_MISSION_COMMANDS = frozenset(
-    {*_POLYGONS, _C.NAV_FENCE_CIRCLE_INCLUSION, _C.NAV_FENCE_CIRCLE_EXCLUSION, _C.NAV_RALLY_POINT}
+    {*_POLYGONS, Cmd.NAV_FENCE_CIRCLE_INCLUSION, Cmd.NAV_FENCE_CIRCLE_EXCLUSION, Cmd.NAV_RALLY_POINT}
 )
 _INT_MIN = -(1 << 31)
 _PI = float32(math.pi)
@@ -46,9 +47,9 @@ def stored(item: MissionItem, mission_type: int, *, is_int: bool = True) -> Miss
     ``is_int`` is True for a MISSION_ITEM_INT, the only message in which PX4 accepts the frames 5 and 6.
     """
     frame = _INT_FRAMES.get(item.frame, item.frame) if is_int else item.frame
-    if frame in (_F.GLOBAL, _F.GLOBAL_RELATIVE_ALT):
+    if frame in (Frame.GLOBAL, Frame.GLOBAL_RELATIVE_ALT):
         kept = _with_place(item, frame)
-    elif frame == _F.MISSION:
+    elif frame == Frame.MISSION:
         kept = _without_place(item)
     else:
         return MavMissionResult.UNSUPPORTED_FRAME
@@ -88,10 +89,10 @@ def _floats(item: MissionItem) -> bytes:
 
 def _as_fence_point(item: MissionItem) -> MissionItem:
     """Return position, size and altitude of a fence item; PX4 does not store its altitude frame."""
-    if item.frame == _F.MISSION:
+    if item.frame == Frame.MISSION:
         return MissionItem(item.command, item.frame, item.param1, z=item.z, autocontinue=False)
     place = {"x": item.x, "y": item.y, "z": item.z}
-    return MissionItem(item.command, _F.GLOBAL, item.param1, **place, autocontinue=False)
+    return MissionItem(item.command, Frame.GLOBAL, item.param1, **place, autocontinue=False)
 
 
 def _with_place(item: MissionItem, frame: int) -> MissionItem | int:
@@ -102,7 +103,7 @@ def _with_place(item: MissionItem, frame: int) -> MissionItem | int:
     if command in _ROI_COMMANDS:
         if _whole(item.param1) not in _ROI_WITH_PLACE:
             return MavMissionResult.INVALID_PARAM1
-        command = _C.DO_SET_ROI
+        command = Cmd.DO_SET_ROI
     numbers = (item.param1, item.param2, item.param3, item.param4)
     one, two, three, four = (_CONVERSIONS[kind](number) for kind, number in zip(layout, numbers, strict=True))
     return item.replace(command=command, frame=frame, param1=one, param2=two, param3=three, param4=four)
@@ -112,15 +113,15 @@ def _without_place(item: MissionItem) -> MissionItem | int:
     if item.command not in _WITHOUT_PLACE:
         return MavMissionResult.UNSUPPORTED
     one, two, command = item.param1, item.param2, item.command
-    if command == _C.DO_JUMP:
+    if command == Cmd.DO_JUMP:
         jump = _whole(one) & 0xFFFF
         one, two = float(jump - 0x10000 if jump & 0x8000 else jump), float(_whole(two) & 0xFFFF)
     if command in _ROI_COMMANDS:
         if _whole(one) not in _ROI_WITHOUT_PLACE:
             return MavMissionResult.INVALID_PARAM1
-        command = _C.DO_SET_ROI
+        command = Cmd.DO_SET_ROI
     x, y = (_rounded(float32(number)) for number in (item.x, item.y))
-    return item.replace(command=command, frame=_F.MISSION, param1=one, param2=two, x=x, y=y)
+    return item.replace(command=command, frame=Frame.MISSION, param1=one, param2=two, x=x, y=y)
 
 
 def _whole(value: float) -> int:

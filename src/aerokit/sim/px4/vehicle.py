@@ -7,7 +7,8 @@ from collections.abc import Callable
 from typing import ClassVar
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavCmd, MavType
+from aerokit.mavlink.enums import MavCmd as Cmd
+from aerokit.mavlink.enums import MavType
 from aerokit.mavlink.message import Message
 from aerokit.missions import MissionItem
 from aerokit.sim.channel import Channel
@@ -62,7 +63,7 @@ class SimulatedPx4(Px4Vehicle):
     def _on_set_mode(self, request: m.SetMode, channel: Channel) -> None:
         main, sub = modes.mode_from_custom(request.custom_mode)
         command = ReceivedCommand(
-            MavCmd.DO_SET_MODE, request.base_mode, main, sub, 0, 0, 0, 0, None, channel, sender_of(request)
+            Cmd.DO_SET_MODE, request.base_mode, main, sub, 0, 0, 0, 0, None, channel, sender_of(request)
         )
         self.commands.answer(command, set_mode(self, request.base_mode, (main, sub)))
 
@@ -208,10 +209,9 @@ class Px4PlaneFlight(Px4Flight):
         return away <= abs(self.radius_m) + self._plane.parameters["NAV_ACC_RAD"]
 
 
-_C = MavCmd
-_TAKE_OFFS = (_C.NAV_TAKEOFF, _C.NAV_VTOL_TAKEOFF)
-_LANDINGS = (_C.NAV_LAND, _C.NAV_VTOL_LAND)
-_CIRCLES = (_C.NAV_LOITER_UNLIM, _C.NAV_LOITER_TIME, _C.NAV_LOITER_TO_ALT)
+_TAKE_OFFS = (Cmd.NAV_TAKEOFF, Cmd.NAV_VTOL_TAKEOFF)
+_LANDINGS = (Cmd.NAV_LAND, Cmd.NAV_VTOL_LAND)
+_CIRCLES = (Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LOITER_TIME, Cmd.NAV_LOITER_TO_ALT)
 _TURN_S = 2.0
 
 
@@ -229,8 +229,8 @@ class Px4PlaneMission(Px4Mission):
     def _aim(self, item: MissionItem) -> None:
         super()._aim(item)
         flight = self._plane.flight
-        radius = {_C.NAV_LOITER_UNLIM: item.param3, _C.NAV_LOITER_TIME: item.param3}.get(
-            MavCmd(item.command), item.param2 if item.command == _C.NAV_LOITER_TO_ALT else 0.0
+        radius = {Cmd.NAV_LOITER_UNLIM: item.param3, Cmd.NAV_LOITER_TIME: item.param3}.get(
+            Cmd(item.command), item.param2 if item.command == Cmd.NAV_LOITER_TO_ALT else 0.0
         )
         default = self._plane.parameters["NAV_LOITER_RAD"]
         flight.radius_m = radius if radius and math.isfinite(radius) else default
@@ -260,7 +260,7 @@ class Px4PlaneMission(Px4Mission):
 
     def _go(self, item: MissionItem) -> None:
         flight = self._plane.flight
-        if item.command in _CIRCLES or item.command == _C.NAV_DELAY:
+        if item.command in _CIRCLES or item.command == Cmd.NAV_DELAY:
             flight.circle()
         else:
             flight.fly_straight()
@@ -277,11 +277,11 @@ class Px4PlaneMission(Px4Mission):
             self._begin_item()
 
     def _is_at_target(self, item: MissionItem) -> bool:
-        if item.command == _C.NAV_DELAY:
+        if item.command == Cmd.NAV_DELAY:
             return True
         plane, motion = self._plane, self._plane.motion
         north, east, down = plane.flight.target
-        radius = max(plane.parameters["NAV_ACC_RAD"], item.param2 if item.command == _C.NAV_WAYPOINT else 0.0)
+        radius = max(plane.parameters["NAV_ACC_RAD"], item.param2 if item.command == Cmd.NAV_WAYPOINT else 0.0)
         radius = max(radius, _TURN_S * motion.airspeed_m_s)
         if item.command in _CIRCLES:
             radius += abs(plane.flight.radius_m)
