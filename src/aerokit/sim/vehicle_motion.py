@@ -55,7 +55,7 @@ class FixedWing(Motion):
 
     def __init__(self, rng: random.Random, wing: WingLimits | None = None, wind: SimulatedWind | None = None) -> None:
         super().__init__(rng, wind=wind)
-        self.wing: WingLimits = wing if wing is not None else WingLimits()
+        self.wing_limits: WingLimits = wing if wing is not None else WingLimits()
         self.throttle: float = 0.0
         """Engine throttle, 0 to 1."""
         self._speed = 0.0
@@ -65,14 +65,14 @@ class FixedWing(Motion):
 
     def bank_and_climb(self, airspeed: float, bank: float, climb: float) -> None:
         """Hold airspeed (m/s), bank angle (rad, positive right) and climb rate (m/s)."""
-        limit = self.wing.bank_rad
+        limit = self.wing_limits.bank_rad
         self._wanted_airspeed = airspeed
         self._wanted_bank = max(-limit, min(limit, bank))
-        self._wanted_climb = max(-self.wing.sink_m_s, min(self.wing.climb_m_s, climb))
+        self._wanted_climb = max(-self.wing_limits.sink_m_s, min(self.wing_limits.climb_m_s, climb))
 
     def head(self, course: float, airspeed: float, climb: float, *, turn_rate: float = 0.0) -> None:
         """Fly a ground course (rad from north) with wind correction; ``turn_rate`` is its change in rad/s."""
-        speed = max(self._speed, self.wing.airspeed_min_m_s)
+        speed = max(self._speed, self.wing_limits.airspeed_min_m_s)
         wind_north, wind_east = self._air_movement()
         crosswind = -wind_north * math.sin(course) + wind_east * math.cos(course)
         # Limited, so that the plane still has a heading in a crosswind that is faster than the plane.
@@ -129,7 +129,7 @@ class FixedWing(Motion):
         self.roll_out()
 
     def _lifts_off(self, *, powered: bool) -> bool:
-        return powered and self._wanted_climb > 0.0 and self._speed >= self.wing.airspeed_min_m_s
+        return powered and self._wanted_climb > 0.0 and self._speed >= self.wing_limits.airspeed_min_m_s
 
     def _roll_on_ground(self, dt: float, *, powered: bool) -> None:
         wanted_speed = self._wanted_airspeed if powered else 0.0
@@ -142,7 +142,7 @@ class FixedWing(Motion):
         self._advance(dt)
 
     def _fly(self, dt: float, *, powered: bool) -> None:
-        wing = self.wing
+        wing = self.wing_limits
         wanted_climb = self._wanted_climb if powered else -wing.glide_sink_m_s
         wanted_speed = max(wing.airspeed_min_m_s, min(wing.airspeed_max_m_s, self._wanted_airspeed))
         self._approach_speed(wanted_speed if powered else _GLIDE_SPEED_FACTOR * wing.airspeed_min_m_s, dt)
@@ -169,8 +169,8 @@ class FixedWing(Motion):
         self.roll = self.pitch = 0.0
 
     def _approach_speed(self, wanted: float, dt: float) -> None:
-        deceleration = self.wing.roll_out_m_s2 if self.is_on_ground else self.wing.acceleration_m_s2
-        self._speed += max(-deceleration * dt, min(self.wing.acceleration_m_s2 * dt, wanted - self._speed))
+        deceleration = self.wing_limits.roll_out_m_s2 if self.is_on_ground else self.wing_limits.acceleration_m_s2
+        self._speed += max(-deceleration * dt, min(self.wing_limits.acceleration_m_s2 * dt, wanted - self._speed))
 
     def _bank(self, wanted: float, dt: float) -> None:
         step = (wanted - self.roll) * min(1.0, dt / _BANK_TIME_CONSTANT_S)

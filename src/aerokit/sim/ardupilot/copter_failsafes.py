@@ -285,7 +285,7 @@ class CopterFence(ArduPilotFence[CopterHost]):
     CHECKS_DISARMED: ClassVar[bool] = True
     MITIGATION: ClassVar[int] = FenceMitigate.NONE
 
-    def act(self, new: int) -> None:
+    def act(self, new_breaches: int) -> None:
         """Disarm on the ground; execute FENCE_ACTION in the air."""
         vehicle = self.vehicle
         action = int(vehicle.parameters["FENCE_ACTION"])
@@ -293,11 +293,11 @@ class CopterFence(ArduPilotFence[CopterHost]):
             if action != REPORT_ONLY:
                 vehicle.arming.disarm()
             return
-        self.report("breached", new)
+        self.report("breached", new_breaches)
         if action == REPORT_ONLY:
             return
         modes = _FENCE_ACTIONS.get(action, _FENCE_ACTIONS[1])
-        if self.beyond_m(new) > _LAND_BEYOND_M:
+        if self.beyond_m(new_breaches) > _LAND_BEYOND_M:
             modes = (CopterMode.LAND,)
         self.caused_mode: bool = any(vehicle.set_mode(mode) for mode in modes)
 

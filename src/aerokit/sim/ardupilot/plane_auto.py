@@ -37,11 +37,11 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         super().__init__(plane)
         self._manoeuvre = _LOITER
         self._landing: PlaneLanding | None = None
-        self._since = math.nan
+        self._on_circle_since = math.nan
         self._turned = 0.0
         self._last_bearing = 0.0
         self._condition_from = 0.0
-        self._start: Ned = (0.0, 0.0, 0.0)
+        self._leg_start: Ned = (0.0, 0.0, 0.0)
         self.handlers: dict[int, Callable[[MissionItem], None]] = {
             Cmd.NAV_TAKEOFF: lambda item: self._go(item, _CLIMB),
             **dict.fromkeys((Cmd.NAV_WAYPOINT, Cmd.NAV_SPLINE_WAYPOINT), lambda item: self._go(item, _FLY)),
@@ -101,10 +101,10 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         if self._place is None:
             return
         bearing = math.atan2(wing.east - self._place[1], wing.north - self._place[0])
-        if not math.isnan(self._since):
+        if not math.isnan(self._on_circle_since):
             self._turned += abs(wrap_pi(bearing - self._last_bearing))
         elif self._is_on_circle:
-            self._since = self.vehicle.now
+            self._on_circle_since = self.vehicle.now
         self._last_bearing = bearing
 
     @property
@@ -133,17 +133,17 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         if command == Cmd.NAV_TAKEOFF:
             assert self._place is not None
             is_high = plane.wing.down <= self._place[2]
-            return is_high and self._report(f"Takeoff complete at {plane.altitude_m:.2f}m")
+            return self._report_if(is_high, f"Takeoff complete at {plane.altitude_m:.2f}m")
         if command in (Cmd.NAV_WAYPOINT, Cmd.NAV_SPLINE_WAYPOINT):
             return self._has_passed(index)
         if command == Cmd.NAV_LOITER_TIME:
-            return plane.now - self._since >= item.param1 and self._report("Loiter time complete")
+            return self._report_if(plane.now - self._on_circle_since >= item.param1, "Loiter time complete")
         if command == Cmd.NAV_LOITER_TURNS:
-            return self._turned >= 2 * math.pi * item.param1 and self._report("Loiter orbits complete")
+            return self._report_if(self._turned >= 2 * math.pi * item.param1, "Loiter orbits complete")
         if command == Cmd.NAV_LOITER_TO_ALT:
             assert self._place is not None
             is_at_height = abs(plane.wing.down - self._place[2]) < _REACHED_HEIGHT_M
-            return is_at_height and self._is_on_circle and self._report("Loiter to alt complete")
+            return self._report_if(is_at_height and self._is_on_circle, "Loiter to alt complete")
         if command == Cmd.CONDITION_DELAY:
             return plane.now - self._condition_from > max(0.0, item.param1)
         if command in (Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LAND, Cmd.NAV_RETURN_TO_LAUNCH):
@@ -151,28 +151,33 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         self.warn_if_unknown(item)
         return True
 
-    def _report(self, text: str) -> bool:
-        self.vehicle.info(text)
-        return True
+    def _report_if(self, is_done: bool, text: str) -> bool:
+        """Send the text if the command is done; return ``is_done``."""
+        if is_done:
+            self.vehicle.info(text)
+        return is_done
 
     def _has_passed(self, index: int) -> bool:
         """Return True within WP_RADIUS of the waypoint, or once the plane has passed it."""
         assert self._place is not None
-        wing, (north, east, _), start = self.vehicle.wing, self._place, self._start
+        wing, (north, east, _), start = self.vehicle.wing, self._place, self._leg_start
         distance = horizontal_distance(self.vehicle, self._place)
         if distance <= self.vehicle.parameters["WP_RADIUS"]:
-            return self._report(f"Reached waypoint #{index} dist {int(distance)}m")
-        along = (north - start[0]) * (wing.north - north) + (east - start[1]) * (wing.east - east)
-        return along > 0 and self._report(f"Passed waypoint #{index} dist {int(distance)}m")
+            return self._report_if(True, f"Reached waypoint #{index} dist {int(distance)}m")
+        # The dot product of the leg and the way from the waypoint to the plane is positive beyond the waypoint.
+        beyond = (north - start[0]) * (wing.north - north) + (east - start[1]) * (wing.east - east)
+        return self._report_if(beyond > 0, f"Passed waypoint #{index} dist {int(distance)}m")
 
     def _go(self, item: MissionItem, manoeuvre: int) -> None:
-        wing, before = self.vehicle.wing, self._place
-        self._start = wing.place
-        point = self.vehicle.world_point(int(item.x), int(item.y), item.z, item.frame) or self._start
-        north, east = self._start[:2] if (item.x, item.y) == (0, 0) else point[:2]
-        down = point[2] if item.z != 0 else (wing.down if before is None else before[2])
+        """Start a leg. Zero coordinates mean those of the plane; a zero altitude means that of the previous leg."""
+        self._leg_start = self.vehicle.wing.place
+        point = self.vehicle.world_point(int(item.x), int(item.y), item.z, item.frame) or self._leg_start
+        north, east = self._leg_start[:2] if (item.x, item.y) == (0, 0) else point[:2]
+        down = point[2]
+        if item.z == 0:
+            down = self._leg_start[2] if self._place is None else self._place[2]
         self._place, self._manoeuvre = (north, east, down), manoeuvre
-        self._since, self._turned, self.radius = math.nan, 0.0, 0.0
+        self._on_circle_since, self._turned, self.radius = math.nan, 0.0, 0.0
 
     def _loiter(self, item: MissionItem) -> None:
         self._go(item, _LOITER)
@@ -182,7 +187,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         self._go(item, _LAND)
         wing, plane = self.vehicle.wing, self.vehicle
         point = plane.world_point(int(item.x), int(item.y), item.z, item.frame)
-        north, east = self._start[:2] if point is None or (item.x, item.y) == (0, 0) else point[:2]
+        north, east = self._leg_start[:2] if point is None or (item.x, item.y) == (0, 0) else point[:2]
         self._landing = PlaneLanding(plane, (north, east, wing.ground_down if point is None else point[2]))
         plane.info(f"Landing approach start at {plane.altitude_m:.1f}m")
 
@@ -215,6 +220,8 @@ _INVALID_ALTITUDES = (0.0, -1.0)
 
 @dataclass(frozen=True)
 class _TimedValue:
+    """A value of a set-point, and when it was received."""
+
     value: float
     since: float
 
@@ -251,33 +258,37 @@ class PlaneGuided(PlaneNavigatingMode):
 
     def set_attitude(self, message: m.SetAttitudeTarget) -> None:
         """Follow bank, pitch and throttle if the mask selects them. The mask bit of a rate selects the angle."""
-        ignored, now = message.type_mask, self.vehicle.now
+        mask, now = message.type_mask, self.vehicle.now
         roll, pitch, _ = euler_from_quaternion(*message.q)
-        whole = not ignored & Mask.ATTITUDE_IGNORE and ignored & _RATES == _RATES
-        if whole or not ignored & Mask.BODY_ROLL_RATE_IGNORE:
+        selects_all_angles = not mask & Mask.ATTITUDE_IGNORE and mask & _RATES == _RATES
+        if selects_all_angles or not mask & Mask.BODY_ROLL_RATE_IGNORE:
             self._bank = _TimedValue(roll, now)
-        if whole or not ignored & Mask.BODY_PITCH_RATE_IGNORE:
+        if selects_all_angles or not mask & Mask.BODY_PITCH_RATE_IGNORE:
             self._pitch = _TimedValue(pitch, now)
-        if not ignored & Mask.THROTTLE_IGNORE:
+        if not mask & Mask.THROTTLE_IGNORE:
             self._throttle = _TimedValue(max(0.0, min(1.0, message.thrust)), now)
 
     def update(self, dt: float) -> None:
         wing, now = self.vehicle.wing, self.vehicle.now
-        banks, pitches, throttles = (
+        has_bank, has_pitch, has_throttle = (
             now - target.since < _ATTITUDE_TIMEOUT_S for target in (self._bank, self._pitch, self._throttle)
         )
-        if self.vehicle.is_landed or not (banks or pitches or throttles or self._course is not None):
+        has_target = has_bank or has_pitch or has_throttle or self._course is not None
+        if self.vehicle.is_landed or not has_target:
             super().update(dt)
             return
-        speed = 2.0 * self._throttle.value * self.vehicle.cruise_m_s if throttles else self.airspeed
+        limits = wing.wing_limits
+        speed = 2.0 * self._throttle.value * self.vehicle.cruise_m_s if has_throttle else self.airspeed
         climb = wing.climb_to(wing.down if self._place is None else self._place[2])
         climb = max(-self._climb_limit, min(self._climb_limit, climb))
-        if pitches:
-            climb = max(-wing.wing.sink_m_s, min(wing.wing.climb_m_s, speed * math.sin(self._pitch.value)))
-        if not banks and self._course is not None:
+        if has_pitch:
+            climb = max(
+                -wing.wing_limits.sink_m_s, min(wing.wing_limits.climb_m_s, speed * math.sin(self._pitch.value))
+            )
+        if not has_bank and self._course is not None:
             wing.head(self._course, speed, climb)
             return
-        bank = max(-wing.wing.bank_rad, min(wing.wing.bank_rad, self._bank.value)) if banks else 0.0
+        bank = max(-limits.bank_rad, min(limits.bank_rad, self._bank.value)) if has_bank else 0.0
         wing.bank_and_climb(speed, bank, climb)
 
 
