@@ -20,10 +20,8 @@ from aerokit.sim.ardupilot.copter_modes import CopterHost, CopterRtl, CopterTake
 from aerokit.sim.ardupilot.mission_run import MissionMode, horizontal_distance, set_home_from
 from aerokit.sim.motion import Ned, wrap_pi
 
-_STOPPED_M = 0.3
-_ON_CIRCLE_M = 3.0
-_TAKE_OFF_WITHOUT_THROTTLE = 2
-_RAISED_THROTTLE = 1100
+_STOPPED_M, _ON_CIRCLE_M = 0.3, 3.0
+_TAKE_OFF_WITHOUT_THROTTLE, _RAISED_THROTTLE = 2, 1100  # bit of AUTO_OPTIONS, and µs
 
 
 class _Leg(Protocol):
@@ -144,10 +142,8 @@ class _DescendLeg:
         self._copter.descend()
 
 
-_ALLOW_ARMING = 1
-_CONTINUE_AFTER_LAND = 4
-_HEADING_REACHED_RAD = math.radians(2.0)
-_MIN_TAKE_OFF_M = 1.0
+_ALLOW_ARMING, _CONTINUE_AFTER_LAND = 1, 4  # bits of AUTO_OPTIONS and of MIS_OPTIONS
+_HEADING_REACHED_RAD, _MIN_TAKE_OFF_M = math.radians(2.0), 1.0
 # A waypoint without delay is passed without a stop if one of these commands follows.
 _PASSED_BEFORE = frozenset(
     {Cmd.NAV_WAYPOINT, Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LOITER_TIME, Cmd.NAV_SPLINE_WAYPOINT, Cmd.NAV_PAYLOAD_PLACE}
@@ -174,8 +170,7 @@ class CopterAuto(MissionMode):
         super().__init__(copter)
         self.climb: float = 0.0
         self.descent: float = 0.0  # Limits in m/s.
-        # Without a leg, AUTO holds the position.
-        self._leg: _Leg | None = None
+        self._leg: _Leg | None = None  # AUTO holds the position without a leg.
         self._last_reached = 0
         self._reached_at = self._condition_from = self._delay_until = 0.0
         self._list_version = -1
@@ -329,10 +324,9 @@ class CopterAuto(MissionMode):
     def _has_stayed(self, index: int, seconds: float) -> bool:
         if not self._is_leg_complete:
             return False
-        now = self.vehicle.now
-        self._reached_at = self._reached_at or now
+        self._reached_at = self._reached_at or self.vehicle.now
         # The firmware counts whole seconds (mode_auto.cpp, verify_nav_wp).
-        if math.floor(now - self._reached_at) < seconds:
+        if math.floor(self.vehicle.now - self._reached_at) < seconds:
             return False
         self.vehicle.info(f"Reached command #{index}")
         return True
@@ -377,18 +371,16 @@ class CopterAuto(MissionMode):
         stops = item.command not in (Cmd.NAV_WAYPOINT, Cmd.NAV_SPLINE_WAYPOINT) or item.param1 > 0
         if not stops:
             following = next(run.navigation_from(run.nav_index + 1), None)
-            _, following_item = following or (0, None)
-            stops = following_item is None or following_item.command not in _PASSED_BEFORE
+            stops = following is None or following[1].command not in _PASSED_BEFORE
         self._go(self._place(item), stops=stops)
 
     def _take_off(self, item: MissionItem) -> None:
         copter, down = self.vehicle, self.vehicle.motion.down
         point = copter.world_point(0, 0, item.z, item.frame)
-        requested_down = down if point is None else point[2]
-        # Never descend; from the ground, climb at least this much.
-        highest_allowed_down = down - (_MIN_TAKE_OFF_M if copter.is_landed else 0.0)
         copter.yaw.hold()
-        target_down = min(highest_allowed_down, requested_down)
+        # Never descend; from the ground, climb at least this much.
+        min_climb = _MIN_TAKE_OFF_M if copter.is_landed else 0.0
+        target_down = min(down - min_climb, down if point is None else point[2])
         self._leg = _ClimbLeg(self, copter.ground_or_home_down - target_down)
 
     def _circle(self, item: MissionItem) -> None:

@@ -282,9 +282,7 @@ class PlaneGuided(PlaneNavigatingMode):
         climb = wing.climb_to(wing.down if self._place is None else self._place[2])
         climb = max(-self._climb_limit, min(self._climb_limit, climb))
         if has_pitch:
-            climb = max(
-                -wing.wing_limits.sink_m_s, min(wing.wing_limits.climb_m_s, speed * math.sin(self._pitch.value))
-            )
+            climb = max(-limits.sink_m_s, min(limits.climb_m_s, speed * math.sin(self._pitch.value)))
         if not has_bank and self._course is not None:
             wing.head(self._course, speed, climb)
             return

@@ -110,9 +110,8 @@ class _Surface(_AltHold):
         if self.vehicle.is_at_surface:
             self.vehicle.set_mode(SubMode.ALT_HOLD)
         else:
-            self.vehicle.motion.seek_velocity(
-                *self.horizontal_velocity_from_sticks(), -self.vehicle.parameters["WPNAV_SPEED_UP"] / 100.0
-            )
+            climb = self.vehicle.parameters["WPNAV_SPEED_UP"] / 100.0
+            self.vehicle.motion.seek_velocity(*self.horizontal_velocity_from_sticks(), -climb)
 
 
 class SubAuto(RoverSubAuto):

@@ -44,7 +44,7 @@ _TUNING_STEP_S, _TUNING_PROGRESS = 2.0, (0, 20, 40, 60, 80, 95)
 _TRANSITION_S, _NO_TRANSITION = 4.0, frozenset({modes.TAKEOFF, modes.LAND, modes.RTL, modes.ORBIT})
 _UNKNOWN_PROGRESS = 255
 _STORAGE_ACTIONS = range(5)
-_ACTUATORS, _FIRST_OUTPUT_FUNCTION = (range(1, 13), range(33, 41)), 1000
+_MOTORS, _SERVOS, _FIRST_OUTPUT_FUNCTION = range(1, 13), range(33, 41), 1000
 
 
 def other_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
@@ -72,10 +72,10 @@ def _inject_failure(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
     """Acknowledge a failure of the motors or the battery, like SIH. The failure has no effect."""
     if not px4.parameters.get("SYS_FAILURE_EN", 0):
         return MavResult.DENIED
-    unit, kind = whole(command.param1), whole(command.param2)
+    unit, failure_type = whole(command.param1), whole(command.param2)
     if unit not in _FAILURES:
         return None
-    return MavResult.ACCEPTED if kind in _FAILURES[FailureUnit(unit)] else MavResult.UNSUPPORTED
+    return MavResult.ACCEPTED if failure_type in _FAILURES[FailureUnit(unit)] else MavResult.UNSUPPORTED
 
 
 def _refuse_high_latency(px4: Px4Vehicle) -> int:
@@ -88,7 +88,7 @@ def _test_actuator(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
     if px4.is_armed:
         return MavResult.DENIED
     function = whole(command.x)
-    is_known = any(function in numbers for numbers in _ACTUATORS) or function >= _FIRST_OUTPUT_FUNCTION
+    is_known = function in _MOTORS or function in _SERVOS or function >= _FIRST_OUTPUT_FUNCTION
     return MavResult.ACCEPTED if is_known else None
 
 
@@ -101,6 +101,7 @@ def _store(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
 
 _FORCE_MAGIC = 21196.0
 _ALIASES: dict[Px4Mode, Px4Mode] = {(modes.AUTO, 0): modes.MISSION, modes.ORBIT: modes.POSITION}
+# _NAN_AS_INT: the upper half of a double NaN.
 _INT32_MAX, _NAN_AS_INT = 0x7FFFFFFF, 0x7FF80000
 
 
@@ -137,12 +138,13 @@ def px4_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
 def refusal_by_place(command: ReceivedCommand, *, checks_frame: bool) -> int | None:
     """Return the MAV_RESULT of an invalid position or frame; None if the command is valid."""
     if command.is_long:
-        is_left_open = all(_INT32_MAX - 128 < value <= _INT32_MAX + 256 for value in (command.x, command.y))
-        return MavResult.DENIED if is_left_open else None
+        # INT32_MAX as float32, which is rounded to a multiple of 128.
+        is_int32_max = all(_INT32_MAX - 128 < value <= _INT32_MAX + 256 for value in (command.x, command.y))
+        return MavResult.DENIED if is_int32_max else None
     if command.x == command.y == _NAN_AS_INT:
         return MavResult.DENIED
-    is_wrong = checks_frame and command.frame != MavFrame.GLOBAL_INT
-    return MavResult.COMMAND_UNSUPPORTED_MAV_FRAME if is_wrong else None
+    is_wrong_frame = checks_frame and command.frame != MavFrame.GLOBAL_INT
+    return MavResult.COMMAND_UNSUPPORTED_MAV_FRAME if is_wrong_frame else None
 
 
 def set_mode(px4: Px4Vehicle, base_mode: int, mode: Px4Mode) -> int:
@@ -151,8 +153,8 @@ def set_mode(px4: Px4Vehicle, base_mode: int, mode: Px4Mode) -> int:
         return MavResult.TEMPORARILY_REJECTED
     mode = _ALIASES.get(mode, mode)
     if mode not in modes.SELECTABLE:
-        what = "auto" if mode[0] == modes.AUTO else "main"
-        px4.send_text(MavSeverity.CRITICAL, f"Unsupported {what} mode")
+        level = "auto" if mode[0] == modes.AUTO else "main"
+        px4.send_text(MavSeverity.CRITICAL, f"Unsupported {level} mode")
         return MavResult.ACCEPTED if px4.version.startswith("1.16") else MavResult.TEMPORARILY_REJECTED
     return _change(px4, mode)
 
@@ -171,15 +173,15 @@ class _Flight:
 
     def arm_or_disarm(self, command: ReceivedCommand) -> int | None:
         force = command.param2 == _FORCE_MAGIC
-        wanted = round(command.param1) if math.isfinite(command.param1) else None
-        if wanted == 1:
-            done = self._px4.arming.arm()  # PX4 checks external arm commands even if they are forced.
-        elif wanted == 0:
-            done = self._px4.arming.disarm("external command", force=force)
+        arm = round(command.param1) if math.isfinite(command.param1) else None
+        if arm == 1:
+            is_done = self._px4.arming.arm()  # PX4 checks external arm commands even if they are forced.
+        elif arm == 0:
+            is_done = self._px4.arming.disarm("external command", force=force)
         else:
             self._px4.send_text(MavSeverity.CRITICAL, f"Unsupported ARM_DISARM param: {command.param1:.3f}")
             return None
-        return MavResult.ACCEPTED if done else MavResult.TEMPORARILY_REJECTED
+        return MavResult.ACCEPTED if is_done else MavResult.TEMPORARILY_REJECTED
 
     def set_mode(self, command: ReceivedCommand) -> int:
         """Set a mode and acknowledge twice: PX4's link module always accepts, then the commander sends the result."""
@@ -269,8 +271,9 @@ class _Flight:
         north, east, down = self._destination(command)
         radius = command.param1 if math.isfinite(command.param1) else orbit.radius_m
         speed = abs(command.param2) if math.isfinite(command.param2) else orbit.speed_m_s
-        if px4.VEHICLE_TYPE == MavType.FIXED_WING:
-            px4.flight.target, result = (north, east, down), self._change(modes.HOLD)
+        if px4.VEHICLE_TYPE == MavType.FIXED_WING:  # A plane circles its target in HOLD.
+            px4.flight.target = (north, east, down)
+            result = self._change(modes.HOLD)
             px4.flight.radius_m = radius
             return result
         if not orbit.plan(radius, speed, (north, east), down):
@@ -295,15 +298,15 @@ class _Flight:
 
     def transition(self, command: ReceivedCommand) -> int | None:
         """Report a transition, then the state of param 1. A vehicle that is not a VTOL does not answer."""
-        px4, wanted = self._px4, whole(command.param1)
+        px4, requested_state = self._px4, whole(command.param1)
         if not px4.vtol_state:
             return None
-        if wanted not in (MavVtolState.MC, MavVtolState.FW) or px4.mode in _NO_TRANSITION:
+        if requested_state not in (MavVtolState.MC, MavVtolState.FW) or px4.mode in _NO_TRANSITION:
             return MavResult.TEMPORARILY_REJECTED
-        is_forward = wanted == MavVtolState.FW
-        if px4.vtol_state != wanted:
+        is_forward = requested_state == MavVtolState.FW
+        if px4.vtol_state != requested_state:
             px4.vtol_state = MavVtolState.TRANSITION_TO_FW if is_forward else MavVtolState.TRANSITION_TO_MC
-            px4.call_later(_TRANSITION_S, lambda: setattr(px4, "vtol_state", wanted))
+            px4.call_later(_TRANSITION_S, lambda: setattr(px4, "vtol_state", requested_state))
         return MavResult.ACCEPTED
 
     def change_altitude(self, command: ReceivedCommand) -> int:
@@ -346,7 +349,8 @@ class _Flight:
             return MavResult.ACCEPTED
         if self._px4.is_armed or command.param1 not in (1.0, 2.0):
             return MavResult.DENIED
-        self._px4.call_later(0.2, self._px4.restart if command.param1 == 1.0 else self._px4.shut_down)
+        action = self._px4.restart if command.param1 == 1.0 else self._px4.shut_down
+        self._px4.call_later(0.2, action)  # The acknowledgement is sent first.
         return MavResult.ACCEPTED
 
 

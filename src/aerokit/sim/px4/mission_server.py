@@ -69,8 +69,8 @@ class Px4MissionServer(MissionServer):
         self.requests_int: bool = not px4.version.startswith("1.16")
 
     def _link(self, channel: Channel) -> _Link:
-        fresh = _Link(_NO_PARTNER, channel, 0, 0, 0, 0.0, 0.0, self.requests_int)
-        return self._links.setdefault(channel, fresh)
+        unused = _Link(_NO_PARTNER, channel, 0, 0, 0, 0.0, 0.0, self.requests_int)
+        return self._links.setdefault(channel, unused)
 
     def reset(self) -> None:
         super().reset()
@@ -89,13 +89,13 @@ class Px4MissionServer(MissionServer):
         """Store a whole list and return the MAV_MISSION_RESULT. PX4 has no such operation."""
         if mission_type not in _CAPACITIES or start or not clear:
             return Result.ERROR
-        good: list[MissionItem] = []
+        stored_items: list[MissionItem] = []
         for item in items:
-            kept = stored(item, mission_type)
-            if isinstance(kept, int):
-                return kept
-            good.append(kept)
-        self._store(mission_type, good, checksum(items))
+            stored_item = stored(item, mission_type)
+            if isinstance(stored_item, int):
+                return stored_item
+            stored_items.append(stored_item)
+        self._store(mission_type, stored_items, checksum(items))
         return Result.ACCEPTED
 
     def capacity(self, mission_type: int) -> int:
@@ -158,13 +158,14 @@ class Px4MissionServer(MissionServer):
         item = self.item(link.mission_type, seq)
         assert item is not None
         link.requested_at = self._px4.now
-        to, kind, current = link.client, link.mission_type, self._px4.mission.current == seq
-        given = as_downloaded(item, as_int=link.uses_int)
+        client, kind, is_current = link.client, link.mission_type, self._px4.mission.current == seq
+        downloaded = as_downloaded(item, as_int=link.uses_int)
         if link.uses_int:
-            message: AnyItem = item_message_int(given, seq, to, kind, current=current)
+            message: AnyItem = item_message_int(downloaded, seq, client, kind, current=is_current)
         else:
-            scale = 1e-7 if item.frame != MavFrame.MISSION else 1.0
-            message = item_message_float(given, (item.x * scale, item.y * scale), seq, to, kind, int(current))
+            scale = 1.0 if item.frame == MavFrame.MISSION else 1e-7
+            place = (item.x * scale, item.y * scale)
+            message = item_message_float(downloaded, place, seq, client, kind, int(is_current))
         self._px4.send(message, link.channel)
 
     def _watch(self, upload: ListUpload) -> None:
@@ -198,8 +199,8 @@ class Px4MissionServer(MissionServer):
         link = self._link(channel)
         if link.next == self.count(link.mission_type):
             link.state = TransferState.IDLE
-        same = link.client == sender_of(request) and link.mission_type == request.mission_type
-        if link.state is TransferState.GETTING or (link.state is TransferState.SENDING and not same):
+        is_same_transfer = link.client == sender_of(request) and link.mission_type == request.mission_type
+        if link.state is TransferState.GETTING or (link.state is TransferState.SENDING and not is_same_transfer):
             self._px4.info("Mission download request ignored, already active")
             return
         count = self.count(request.mission_type)
@@ -290,22 +291,25 @@ class Px4MissionServer(MissionServer):
         elif link.state is TransferState.IDLE and link.next == message.seq + 1:  # The client missed the answer.
             self._acknowledge(link.client, link.mission_type, Result.ACCEPTED, channel, link.opaque_id)
         else:
-            why = "No transfer" if link.state is TransferState.IDLE else "Busy"
-            self._warn(f"IGN MISSION_ITEM: {why}")
+            reason = "No transfer" if link.state is TransferState.IDLE else "Busy"
+            self._warn(f"IGN MISSION_ITEM: {reason}")
             self._answer(link, Result.ERROR)
 
     def _put(self, upload: ListUpload, message: AnyItem) -> int:
         link, item = self._link(upload.channel), item_from(message)
         is_int = isinstance(message, m.MissionItemInt)
-        place = item if is_int else item.replace(x=float(item.x), y=float(item.y))
-        whole = item if is_int or item.frame == MavFrame.MISSION else item.replace(x=_e7(item.x), y=_e7(item.y))
-        kept = stored(whole, link.mission_type, is_int=is_int)
-        if isinstance(kept, int):
-            if kept != Result.ERROR:
+        item_in_e7 = item
+        if not is_int and item.frame != MavFrame.MISSION:
+            item_in_e7 = item.replace(x=_e7(item.x), y=_e7(item.y))
+        stored_item = stored(item_in_e7, link.mission_type, is_int=is_int)
+        if isinstance(stored_item, int):
+            if stored_item != Result.ERROR:
                 self._warn("IGN MISSION_ITEM: Invalid item")
-            return kept
-        link.opaque_id = checksum([place], link.opaque_id)
-        link.items.append(kept)
+            return stored_item
+        # The checksum covers the values as received: floats of a MISSION_ITEM.
+        received = item if is_int else item.replace(x=float(item.x), y=float(item.y))
+        link.opaque_id = checksum([received], link.opaque_id)
+        link.items.append(stored_item)
         if message.current:
             link.current = message.seq
         return Result.ACCEPTED
@@ -337,4 +341,5 @@ class Px4MissionServer(MissionServer):
 
 
 def _e7(degrees: float) -> int:
+    """Convert to degrees times 1e7; 0 for values that may not fit 32 bits."""
     return round(degrees * 1e7) if abs(degrees) < 200 else 0
