@@ -169,7 +169,7 @@ class Channel:
         self.version = version
         self.streams: Streams = Streams()
         self._wanted = wanted
-        self._own = (system_id, component_id)
+        self._own_ids = (system_id, component_id)
         self.reader: MessageReader = MessageReader(wanted)
         """Decodes incoming bytes; vehicles on one link may share a reader."""
         self._encoders: dict[tuple[int, int], FrameEncoder] = {}
@@ -197,7 +197,7 @@ class Channel:
         """Return a frame with the sender's next sequence number; empty if MAVLink 1 has no such message."""
         if self.version == 1 and message.ID > 255:
             return b""
-        sender = self._own if sender is None else sender
+        sender = self._own_ids if sender is None else sender
         encoder = self._encoders.get(sender)
         if encoder is None:
             encoder = self._encoders[sender] = FrameEncoder(*sender, version=self.version)

@@ -72,7 +72,7 @@ class Faults:
     mute_parameters: set[str] = field(default_factory=set)
     commands: dict[int, CommandFault] = field(default_factory=dict)
 
-    if not TYPE_CHECKING:  # a type checker reports misspelled names, so hide this method from it
+    if not TYPE_CHECKING:  # A type checker that sees this method does not report misspelled names.
 
         def __setattr__(self, name: str, value: object) -> None:
             # A misspelled fault would otherwise be accepted and change nothing.

@@ -170,13 +170,13 @@ class ArduPilotLogServer(LogServer):
             self._vehicle.info("Log download in progress")
             return
         first, last = max(1, request.start), min(len(self.logs), request.end)
-        if not self.logs:
+        if not self.logs:  # The answer is then a single empty entry with number 0.
             first = last = 0
         numbers = range(first, last + 1)
         self.transfer([lambda number=number: self._entry(number, last) for number in numbers], channel)  # type: ignore[misc]
 
     def _entry(self, number: int, last: int) -> LogEntry:
-        if number == 0:  # The answer without logs.
+        if number == 0:
             return LogEntry(0, 0, 0, 0, 0)
         log = self.logs[number - 1]
         return LogEntry(number, len(self.logs), last, log.time_utc, log.size)

@@ -77,7 +77,8 @@ HOME = (-35.363261, 149.165230, 584.09)
 GRAVITY_M_S2 = 9.80665
 _DRAG_PER_S = 0.33  # Deceleration divided by airspeed: a 450 mm quadrotor leans 20 degrees at 10 m/s.
 _VELOCITY_TIME_CONSTANT_S = 0.3
-_LEAN_KEPT_PER_S = (1.0 - 0.02 / 0.15) ** 50  # 50 steps of 0.02 s with a time constant of 0.15 s.
+# Part of a lean error that remains after a second: 50 steps of 0.02 s with a time constant of 0.15 s.
+_LEAN_KEPT_PER_S = (1.0 - 0.02 / 0.15) ** 50
 _TURN_GAIN_PER_S = 2.0
 _TERMINAL_SPEED_M_S = 25.0
 _APPROACH_PER_S, _MAX_APPROACH_M_S = 0.8, 1.5
@@ -301,10 +302,10 @@ class Motion:
         return north, east, down
 
     def _acceleration_from_lean(self, roll: float, pitch: float) -> tuple[float, float]:
-        lean = self.limits.lean_rad
+        max_lean = self.limits.lean_rad
         forward, right = (
-            -GRAVITY_M_S2 * math.tan(_clamp(pitch, lean)),
-            GRAVITY_M_S2 * math.tan(_clamp(roll, lean)),
+            -GRAVITY_M_S2 * math.tan(_clamp(pitch, max_lean)),
+            GRAVITY_M_S2 * math.tan(_clamp(roll, max_lean)),
         )
         cos_yaw, sin_yaw = math.cos(self.yaw), math.sin(self.yaw)
         drag_north, drag_east = self._drag()

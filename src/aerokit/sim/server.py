@@ -323,9 +323,9 @@ async def simulated_link(
 
     ``latency_s`` delays both directions, in seconds of the loop's clock.
     """
-    near, far = memory_link_pair(latency_s=latency_s)
-    async with SimulatorServer(vehicles, far, speedup=speedup):
-        yield near
+    near_end, far_end = memory_link_pair(latency_s=latency_s)
+    async with SimulatorServer(vehicles, far_end, speedup=speedup):
+        yield near_end
 
 
 @asynccontextmanager

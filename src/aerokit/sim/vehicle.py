@@ -141,23 +141,25 @@ class SimulatedVehicle:
 
     def step(self, now: float) -> None:
         """Run everything that is due up to ``now``."""
-        if not self._is_on and math.isnan(self.booted_at):
+        if self._was_never_on:
             self.now = now
             self.power_on()
         if self.faults.frozen:
             self._skip_to(now)
             return
         while (due := self.next_due) <= now:
-            if due > self.now:
-                self.now = due
+            self.now = max(due, self.now)
             self._run_due(due)
-        if now > self.now:
-            self.now = now
+        self.now = max(now, self.now)
+
+    @property
+    def _was_never_on(self) -> bool:
+        return math.isnan(self.booted_at)
 
     @property
     def next_due(self) -> float:
         """Time of the next event; infinity if there is none."""
-        if not self._is_on and math.isnan(self.booted_at):
+        if self._was_never_on:
             return self.now
         if self.faults.frozen:
             return self.now + TICK_S  # `step` must follow the time even while nothing happens.

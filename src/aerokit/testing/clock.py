@@ -139,7 +139,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         Return True if any ran.
         """
         sources, ready, has_run = self._sources, self._ready, False  # type: ignore[attr-defined]
-        is_alone = self._can_skip_polls
+        can_skip_polls = self._can_skip_polls
         while sources and not ready:
             earliest_due, earliest = math.inf, sources[0][1]
             for next_due, handle in sources:
@@ -152,7 +152,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
             earliest._run()
             has_run = True
             self._iterations += 1
-            if self._iterations >= _POLL_EVERY or not is_alone:  # Sockets are polled before every jump.
+            if self._iterations >= _POLL_EVERY or not can_skip_polls:  # Sockets are polled before every jump.
                 break
         return has_run
 

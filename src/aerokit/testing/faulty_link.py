@@ -395,7 +395,8 @@ class _DeliveryQueue:
         now = max(self.loop.time(), self._waiting[0][0])  # A timer may fire slightly early.
         try:
             while self._waiting and self._waiting[0][0] <= now:
-                heappop(self._waiting)[2]()
+                _, _, action = heappop(self._waiting)
+                action()
         finally:  # If an action raises, the loop reports the exception, and the other actions still run.
             if self._waiting:
                 self._schedule()

@@ -227,6 +227,7 @@ class SimulatedFleet(Sequence[Flight]):
 def _side_by_side(
     kinds: Sequence[str], spacing_m: float, *, system_id: int = 1, seed: int = 0, **options: Any
 ) -> list[SimulatedVehicle]:
+    """Create a vehicle of each kind: the first at its home, the others in a row to the east of it."""
     vehicles: list[Any] = []
     for number, kind in enumerate(kinds):
         if vehicles:

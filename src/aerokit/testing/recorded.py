@@ -167,16 +167,16 @@ class RecordedMissions(MissionServer):
         return results[min(number, len(results) - 1)]
 
 
-def _item_message(item: AnyItem, seq: int, to: tuple[int, int], as_float: bool) -> AnyItem:
+def _item_message(item: AnyItem, seq: int, client: tuple[int, int], as_float: bool) -> AnyItem:
     """Convert a recorded item to the message that the client requests: MISSION_ITEM or MISSION_ITEM_INT."""
     scale = 1.0 if item.frame == MavFrame.MISSION else 1e7  # With MAV_FRAME_MISSION, x and y are not degrees.
     is_float = isinstance(item, m.MissionItem)
     if as_float:
         place = (item.x, item.y) if is_float else (item.x / scale, item.y / scale)
-        return item_message_float(item_from(item), place, seq, to, item.mission_type, item.current)
+        return item_message_float(item_from(item), place, seq, client, item.mission_type, item.current)
     x, y = (round(item.x * scale), round(item.y * scale)) if is_float else (int(item.x), int(item.y))
     params = (item.param1, item.param2, item.param3, item.param4)
-    header = (*to, seq, item.frame, item.command, item.current, item.autocontinue)
+    header = (*client, seq, item.frame, item.command, item.current, item.autocontinue)
     return m.MissionItemInt(*header, *params, x, y, item.z, item.mission_type)
 
 

@@ -236,7 +236,6 @@ class Calibrations:
             vehicle.info("Initialising ArduPilot")
             text = "Trim OK: roll=0.00 pitch=0.00 yaw=0.00"
             return CommandProgress((), _TRIM_S, finish=lambda: vehicle.info(text))
-
         if command.x == _Accelerometers.SIMPLE:
             if vehicle.now - self._accelerometers_at < _MIN_ACCELEROMETERS_INTERVAL_S:
                 return MavResult.TEMPORARILY_REJECTED

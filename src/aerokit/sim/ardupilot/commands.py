@@ -338,7 +338,9 @@ class GimbalCommands:
                 return Result.FAILED
             gimbal.point(roll, pitch, yaw, from_north=False)
             return Result.ACCEPTED
-        if mode == MavMountMode.GPS_POINT and (command.x or command.y or not command.param1):
+        # The firmware refuses a position in params 1 and 2, which AP 4.2 accepted (AP_Mount_Backend.cpp).
+        has_place_in_params = command.param1 and not command.x and not command.y
+        if mode == MavMountMode.GPS_POINT and not has_place_in_params:
             place = (whole(command.x), whole(command.y), float(whole(command.param4)))
             gimbal.look_at(self._vehicle.world_point(*place, MavFrame.GLOBAL_RELATIVE_ALT))
             return Result.ACCEPTED

@@ -249,13 +249,14 @@ class SimulatedCopter(CopterHost):
         is_upwards = command.z > self.navigation.altitude_above_home
         if not (self.motors.is_armed and self.is_landed and is_upwards):
             return MavResult.FAILED
-        is_accepted = self.mode.take_off(command.z, must_navigate=command.param3 == 0.0)
+        must_navigate = command.param3 == 0.0  # Param 3 is 1 if the pilot may control the horizontal position.
+        is_accepted = self.mode.take_off(command.z, must_navigate=must_navigate)
         return MavResult.ACCEPTED if is_accepted else MavResult.FAILED
 
     def may_go_to(self, place: Ned) -> bool:
         if not self.fence.contains(place):
             return False
-        self.yaw.default()  # A new target ends a commanded heading.
+        self.yaw.apply_default()  # A new target ends a commanded heading.
         return True
 
     def _change_speed(self, command: ReceivedCommand) -> int:
@@ -282,7 +283,7 @@ class SimulatedCopter(CopterHost):
             return MavResult.FAILED
         # The sign of a relative angle (param 4) is its direction already.
         direction = 0 if command.param4 else int(command.param3)
-        self.yaw.fixed(heading, math.radians(command.param2), direction)
+        self.yaw.turn_to(heading, math.radians(command.param2), direction)
         return MavResult.ACCEPTED
 
     def _pause_or_continue(self, command: ReceivedCommand) -> int:

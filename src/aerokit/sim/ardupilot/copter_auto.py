@@ -168,8 +168,8 @@ class CopterAuto(MissionMode):
 
     def __init__(self, copter: CopterHost) -> None:
         super().__init__(copter)
-        self.climb: float = 0.0
-        self.descent: float = 0.0  # Limits in m/s.
+        self.climb: float = 0.0  # Limit in m/s.
+        self.descent: float = 0.0  # Limit in m/s.
         self._leg: _Leg | None = None  # AUTO holds the position without a leg.
         self._last_reached = 0
         self._reached_at = self._condition_from = self._delay_until = 0.0
@@ -238,7 +238,7 @@ class CopterAuto(MissionMode):
         self.wait_for_origin()
         return True
 
-    def mission_started(self) -> None:
+    def on_mission_started(self) -> None:
         self._upcoming_changed()  # remembers the commands
 
     def update(self, dt: float) -> None:
@@ -317,7 +317,7 @@ class CopterAuto(MissionMode):
         if command == Cmd.CONDITION_DISTANCE:
             return horizontal_distance(self.vehicle, self.destination) < max(0.0, item.param1)
         if command == Cmd.CONDITION_YAW:
-            return self.vehicle.yaw.keep_fixed(_HEADING_REACHED_RAD)
+            return self.vehicle.yaw.turn_to_last_heading(_HEADING_REACHED_RAD)
         self.warn_if_unknown(item)
         return True
 
@@ -363,7 +363,7 @@ class CopterAuto(MissionMode):
         self._reached_at = 0.0
         self.is_paused: bool = False
         if not self.vehicle.yaw.has_region_of_interest:
-            self.vehicle.yaw.default()
+            self.vehicle.yaw.apply_default()
         self._leg = _FlyLeg(self, place, stops=stops)
 
     def _fly(self, item: MissionItem) -> None:
@@ -412,7 +412,7 @@ class CopterAuto(MissionMode):
         if item.param4 > 0:  # The angle is relative, so that its sign is the direction.
             heading = self.vehicle.motion.yaw + math.copysign(heading, direction or 1.0)
             direction = 0
-        self.vehicle.yaw.fixed(wrap_pi(heading), math.radians(item.param2), direction)
+        self.vehicle.yaw.turn_to(wrap_pi(heading), math.radians(item.param2), direction)
 
     def _change_speed(self, item: MissionItem) -> None:
         if item.param2 <= 0:

@@ -47,7 +47,7 @@ class CopterArming(ArduPilotArming[CopterHost]):
             reasons.append("Need Alt Estimate")
         return reasons
 
-    def armed(self) -> None:
+    def on_armed(self) -> None:
         self.vehicle.path.reset()
 
     def final_reasons(self) -> list[str]:
@@ -177,7 +177,8 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
         if self._disarm_if_landed(name):
             return _NONE
         if mode.is_landing:
-            if self.battery_is_low and self.battery.priority <= self.BATTERY_PRIORITIES.index(_LAND):
+            is_landing_for_battery = self.battery.priority <= self.BATTERY_PRIORITIES.index(_LAND)
+            if self.battery_is_low and is_landing_for_battery:
                 return self._report_continuation(f"{name} + Battery", "Continuing Landing", _LAND)
             if self._has_option(_IF_LANDING):
                 return self._report_continuation(name, "Continuing Landing", _LAND)
@@ -299,9 +300,9 @@ class CopterFence(ArduPilotFence[CopterHost]):
         modes = _FENCE_ACTIONS.get(action, _FENCE_ACTIONS[1])
         if self.beyond_m(new_breaches) > _LAND_BEYOND_M:
             modes = (CopterMode.LAND,)
-        self.caused_mode: bool = any(vehicle.set_mode(mode) for mode in modes)
+        self.caused_mode: bool = any(vehicle.set_mode(mode) for mode in modes)  # until one is not refused
 
-    def cleared(self) -> None:
+    def on_cleared(self) -> None:
         if not self.vehicle.is_landed:
             self.vehicle.send_text(MavSeverity.NOTICE, "Fence breach cleared")
 
@@ -310,8 +311,8 @@ class CopterFence(ArduPilotFence[CopterHost]):
             return None
         return MavSeverity.WARNING, f"Mode change to {mode.name} failed: in fence recovery"
 
-    def mode_changed(self) -> None:
+    def on_mode_changed(self) -> None:
         """Suspend the fence's actions for ten seconds, unless FENCE_ACTION only reports."""
-        super().mode_changed()
+        super().on_mode_changed()
         if self.vehicle.parameters["FENCE_ACTION"] != REPORT_ONLY:
             self.recover_by_hand()

@@ -42,12 +42,14 @@ class CopterGuided(CopterModeBase):
     def __init__(self, copter: CopterHost) -> None:
         super().__init__(copter)
         self.submode: GuidedSubmode = GuidedSubmode.VELOCITY
+        # Limits in m/s.
         self.speed: float = 0.0
         self.climb: float = 0.0
-        self.descent: float = 0.0  # Limits in m/s.
+        self.descent: float = 0.0
+        # Targets in the world frame: north, east, down.
         self.position: Ned = _ZERO
         self.velocity: Ned = _ZERO
-        self.acceleration: Ned = _ZERO  # Targets in the world frame: north, east, down.
+        self.acceleration: Ned = _ZERO
         self._attitude = (0.0, 0.0)
         self._body_rates: tuple[float, float] | None = None
         self._attitude_climb = 0.0
@@ -132,7 +134,7 @@ class CopterGuided(CopterModeBase):
         self._take_off, self.is_taking_off = None, False
         self.speed = copter.speed_limit("WPNAV_SPEED")
         self.climb, self.descent = copter.speed_limit("WPNAV_SPEED_UP"), copter.speed_limit("WPNAV_SPEED_DN")
-        copter.yaw.default()
+        copter.yaw.apply_default()
 
     def update(self, dt: float) -> None:
         copter = self.vehicle
@@ -254,11 +256,11 @@ class CopterSetpoints:
         if not self._guided.set_target(position, velocity, acceleration):
             return False
         if setpoint.yaw is not None:
-            yaw.fixed(setpoint.yaw + (motion.yaw if rotate else 0.0))
+            yaw.turn_to(setpoint.yaw + (motion.yaw if rotate else 0.0))
         elif setpoint.yaw_rate is not None:
             yaw.turn(setpoint.yaw_rate)
         else:
-            yaw.default()
+            yaw.apply_default()
         return True
 
     def _on_attitude(self, target: SetAttitudeTarget, _: Channel) -> None:

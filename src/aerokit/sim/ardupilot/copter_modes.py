@@ -25,13 +25,13 @@ class AutoYaw:
         self._roi: tuple[float, float] | None = None
         self._heading = 0.0
         self._rate = 0.0
-        """Turn rate of `turn`, or of `fixed` while the commanded direction is the longer way, else 0."""
+        """Turn rate of `turn`, or of `turn_to` while the commanded direction is the longer way, else 0."""
 
     def hold(self) -> None:
         self._control = self._hold
         self._copter.motion.turn(0.0)
 
-    def default(self, *, returning: bool = False) -> None:
+    def apply_default(self, *, returning: bool = False) -> None:
         """Apply WP_YAW_BEHAVIOR: hold (0), look ahead (1), look ahead except when returning home (2).
 
         Every new guided target calls this, which ends a commanded heading or region of interest.
@@ -42,18 +42,18 @@ class AutoYaw:
         else:
             self.hold()
 
-    def fixed(self, heading: float, rate: float = 0.0, direction: int = 0) -> None:
+    def turn_to(self, heading: float, rate: float = 0.0, direction: int = 0) -> None:
         """Turn to a heading (radians). ``rate`` 0 is the default rate, ``direction`` 1 clockwise, -1 anticlockwise."""
         motion = self._copter.motion
         self._heading, self._control = wrap_pi(heading), self._go_to_heading
         self._rate = 0.0
         offset = wrap_pi(self._heading - motion.yaw)
         is_longer_way = direction and math.copysign(1, offset) != direction
-        if is_longer_way and abs(offset) > _HEADING_TOLERANCE_RAD:
+        if is_longer_way and abs(offset) > _HEADING_TOLERANCE_RAD:  # `Motion.face` turns the shorter way.
             self._rate = direction * (rate or motion.limits.turn_rate_rad_s)
 
-    def keep_fixed(self, tolerance: float) -> bool:
-        """Turn to the last `fixed` heading again; return True within ``tolerance`` radians of it."""
+    def turn_to_last_heading(self, tolerance: float) -> bool:
+        """Turn to the last `turn_to` heading again; return True within ``tolerance`` radians of it."""
         self._control = self._go_to_heading
         return abs(wrap_pi(self._heading - self._copter.motion.yaw)) <= tolerance
 
@@ -70,7 +70,7 @@ class AutoYaw:
         gimbal = self._copter.gimbal
         gimbal.look_at(point)
         if point is None:
-            self.default()
+            self.apply_default()
         elif not gimbal.is_fitted:
             self._roi = point[:2]
             self._control = self._look_at_roi
@@ -315,7 +315,7 @@ class CopterRtl(CopterModeBase):
         north, east, down = self._place
         distance = math.hypot(north - copter.motion.north, east - copter.motion.east)
         self._return_down = min(down, home[2] - self._return_altitude(distance))
-        copter.yaw.default(returning=True)
+        copter.yaw.apply_default(returning=True)
         return True
 
     def _return_altitude(self, distance: float) -> float:
@@ -372,7 +372,7 @@ class CopterSmartRtl(CopterModeBase):
             return False
         self._way_back, self.is_landing = self.vehicle.path.take_way_back(), False
         self._raise_last(_SMART_RTL_EXTRA_ALTITUDE_M)  # The copter lands from there.
-        self.vehicle.yaw.default(returning=True)
+        self.vehicle.yaw.apply_default(returning=True)
         return True
 
     def _raise_last(self, metres: float) -> None:

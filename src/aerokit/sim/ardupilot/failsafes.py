@@ -315,17 +315,18 @@ class ArduPilotArming(Generic[HostT]):
             return False
         if self.checks_nothing and not force:
             vehicle.send_text(MavSeverity.WARNING, "Warning: Arming Checks Disabled")
-        vehicle.fence.armed()
+        vehicle.fence.on_armed()
+        # Home moves to the place of arming, unless a command has set it.
         if vehicle.navigation.home is not None and not vehicle.navigation.home_is_locked:
             vehicle.navigation.set_home(vehicle.motion.place, lock=False)
         vehicle.info(self.ARMED_TEXT)
         vehicle.motors.set_armed(True, vehicle.now)
         vehicle.mode.enter(force=False)  # The mode begins anew, because it was entered while disarmed.
         vehicle.set_ticking(True)
-        self.armed()
+        self.on_armed()
         return True
 
-    def armed(self) -> None:
+    def on_armed(self) -> None:
         """Called after arming."""
 
     def disarm(self, *, force: bool = True) -> bool:
@@ -335,10 +336,10 @@ class ArduPilotArming(Generic[HostT]):
             return True
         if not self.needs_arming or (not force and not vehicle.is_landed):
             return False
-        vehicle.fence.disarmed()
+        vehicle.fence.on_disarmed()
         vehicle.info(self.DISARMED_TEXT)
         vehicle.motors.set_armed(False, vehicle.now)
-        vehicle.mission.disarmed()
+        vehicle.mission.on_disarmed()
         return True
 
 

@@ -150,7 +150,7 @@ class ArduPilotFence(Generic[HostT]):
         self.caused_mode: bool = False  # True while the present mode is the result of FENCE_ACTION.
         self._enabling_parameters = (0, 0)  # FENCE_ENABLE and FENCE_AUTOENABLE, as followed last.
         self._new_breach_m: dict[int, float] = {}  # Metres beyond a breached limit that count as a new breach.
-        self._floor_by_hand: bool | None = None  # The lower limit as a command enabled or disabled it.
+        self._floor_enabled_by_command: bool | None = None  # The lower limit as a command enabled or disabled it.
         self._recovering_since = -math.inf
         self._reported_at = self._checked_at = -math.inf
         self._zones = FenceZones((), vehicle.frame)
@@ -185,11 +185,14 @@ class ArduPilotFence(Generic[HostT]):
         enforced = present and self.enabled != 0 and self.vehicle.parameters["FENCE_ACTION"] != REPORT_ONLY
         return present, enforced, not (present and self.breached)
 
-    def enable(self, on: bool, kinds: int = _ALL, *, by_hand: bool = True) -> int:
-        """Enable (``on``) or disable kinds of fences that are configured; return the kinds that changed."""
+    def enable(self, on: bool, kinds: int = _ALL, *, by_command: bool = True) -> int:
+        """Enable (``on``) or disable kinds of fences that are configured; return the kinds that changed.
+
+        ``by_command`` is False if the firmware does it, which a later command can override.
+        """
         kinds &= self.configured
-        if by_hand and kinds & _MIN_ALT:
-            self._floor_by_hand = on
+        if by_command and kinds & _MIN_ALT:
+            self._floor_enabled_by_command = on
         previous = self.enabled
         if on:
             self.enabled |= kinds
@@ -211,16 +214,16 @@ class ArduPilotFence(Generic[HostT]):
             return MavResult.FAILED
         return MavResult.ACCEPTED
 
-    def armed(self) -> None:
+    def on_armed(self) -> None:
         """Enable the fence if FENCE_AUTOENABLE is 3."""
         if self._value("FENCE_AUTOENABLE") == _WHEN_ARMED:
-            self._floor_by_hand = None
-            self.report("auto-enabled", self.enable(True, _ALL & ~_MIN_ALT, by_hand=False))
+            self._floor_enabled_by_command = None
+            self.report("auto-enabled", self.enable(True, _ALL & ~_MIN_ALT, by_command=False))
 
-    def disarmed(self) -> None:
+    def on_disarmed(self) -> None:
         """Disable the fence if FENCE_AUTOENABLE is 3."""
         if self._value("FENCE_AUTOENABLE") == _WHEN_ARMED:
-            self.report("auto-disabled", self.enable(False, by_hand=False))
+            self.report("auto-disabled", self.enable(False, by_command=False))
 
     def _follow_parameters(self) -> None:
         parameters = (int(self.vehicle.parameters["FENCE_ENABLE"]), int(self._value("FENCE_AUTOENABLE")))
@@ -236,13 +239,13 @@ class ArduPilotFence(Generic[HostT]):
         self._follow_parameters()
         if not self.enabled and not self.configured & _MIN_ALT:
             return
-        is_due = vehicle.now - self._checked_at > self.PERIOD_S - 1e-6
+        is_due = vehicle.now - self._checked_at > self.PERIOD_S - 1e-6  # tolerates rounding errors
         if not is_due or not (self.CHECKS_DISARMED or vehicle.is_armed):
             return
         self._checked_at, breached_before = vehicle.now, self.breached
         new_breaches = self._check() if vehicle.navigation.home is not None else 0
         if breached_before and not self.breached:
-            self.cleared()
+            self.on_cleared()
         is_recovering = vehicle.now - self._recovering_since < _RECOVERY_S
         if new_breaches and vehicle.is_armed and not is_recovering:
             self.act(new_breaches)
@@ -251,18 +254,18 @@ class ArduPilotFence(Generic[HostT]):
         """Compare the position with all active limits; return the kinds with a new breach."""
         vehicle = self.vehicle
         may_be_low = vehicle.mode.is_landing or vehicle.is_landed or not vehicle.is_armed
-        if may_be_low and self._floor_by_hand is not True and self.enabled & _MIN_ALT:
-            self.report("auto-disabled", self.enable(False, _MIN_ALT, by_hand=False))
+        if may_be_low and self._floor_enabled_by_command is not True and self.enabled & _MIN_ALT:
+            self.report("auto-disabled", self.enable(False, _MIN_ALT, by_command=False))
         new_breaches = 0
         for kind, beyond_m in self._beyond(vehicle.motion.place).items():
-            if self.active & kind and self._is_new_breach(kind, beyond_m):
+            if self.active & kind and self._update_breach(kind, beyond_m):
                 new_breaches |= kind
         if not may_be_low:
             self._raise_floor()
         return new_breaches
 
-    def _is_new_breach(self, kind: int, beyond_m: float) -> bool:
-        """Record a new breach or the end of a breach. A breach that grows by the backup distance counts as new."""
+    def _update_breach(self, kind: int, beyond_m: float) -> bool:
+        """Record the state of a limit; return True for a new breach. One that grows by the backup distance is new."""
         if beyond_m < 0.0 or (kind == _POLYGON and beyond_m == 0.0):
             self._clear(kind)
             return False
@@ -288,12 +291,12 @@ class ArduPilotFence(Generic[HostT]):
     def _raise_floor(self) -> None:
         """Enable the lower limit once the vehicle is above it by FENCE_MARGIN."""
         enable, auto_enable = self._enabling_parameters
-        is_wanted = self.configured & _MIN_ALT and self._floor_by_hand is not False and (enable or auto_enable > 1)
-        if not is_wanted or self.active & _MIN_ALT:
+        is_enabled_in_flight = self.configured & _MIN_ALT and (enable or auto_enable > 1)
+        if not is_enabled_in_flight or self._floor_enabled_by_command is False or self.active & _MIN_ALT:
             return
         floor = self._value("FENCE_ALT_MIN") + self.vehicle.parameters["FENCE_MARGIN"]
         if self.vehicle.altitude_m >= floor:
-            self.enable(True, _MIN_ALT, by_hand=False)
+            self.enable(True, _MIN_ALT, by_command=False)
             self.vehicle.send_text(MavSeverity.NOTICE, "Min Alt fence enabled (auto enable)")
 
     def contains(self, place: Ned) -> bool:
@@ -322,14 +325,14 @@ class ArduPilotFence(Generic[HostT]):
     def act(self, new_breaches: int) -> None:
         """React to a new breach of these kinds while armed."""
 
-    def cleared(self) -> None:
+    def on_cleared(self) -> None:
         """Called when the last breach has ended."""
 
     def refusal(self, mode: ArduPilotMode) -> tuple[int, str] | None:
         """Return severity and text of the refusal if the fence forbids the mode, else None."""
         return None
 
-    def mode_changed(self) -> None:
+    def on_mode_changed(self) -> None:
         """Called after every mode change."""
         self.caused_mode = False
 
@@ -369,6 +372,7 @@ class ArduPilotFence(Generic[HostT]):
         return next((text for failed, text in self._arming_checks() if failed), None)
 
     def _arming_checks(self) -> tuple[tuple[bool, str], ...]:
+        """Return for each check, in the order of the firmware, whether it fails, and its text."""
         parameters = self.vehicle.parameters
         radius, margin = parameters["FENCE_RADIUS"], parameters["FENCE_MARGIN"]
         high, low = self._value("FENCE_ALT_MAX"), self._value("FENCE_ALT_MIN")

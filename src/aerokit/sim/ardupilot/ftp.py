@@ -97,6 +97,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         """Close nothing: an idle session ends when another request needs it."""
 
     def _answer(self, peer: FtpPeer, request: FtpPacket) -> None:
+        """Refuse requests of another session while one has an open file, unless that session is idle."""
         is_close = request.opcode in (Op.TERMINATESESSION, Op.RESETSESSION)
         if peer.sessions and request.session not in peer.sessions and not is_close:
             if not self._is_idle():
@@ -181,7 +182,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
     def _send_next(self, peer: FtpPeer, session: FtpSession, request: FtpPacket, number: int) -> None:
         """Send the block with this number and schedule the next. No other request is processed until the burst ends."""
         block_size = request.size or DATA_SIZE
-        offset, sequence = request.offset + number * block_size, request.sequence + 1 + number & 0xFFFF
+        offset, sequence = request.offset + number * block_size, (request.sequence + 1 + number) & 0xFFFF
         refusal = request.refuse(MavFtpErr.EOF)
         try:
             data = session.file.read(offset, block_size)
@@ -200,7 +201,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         self._reply(peer, block)
         # The firmware has already advanced its last reply when it repeats this reply or refuses to read on.
         next_offset = offset + len(data) if is_short else offset
-        peer.reply = block.replace(sequence=sequence + 1 & 0xFFFF, offset=next_offset)
+        peer.reply = block.replace(sequence=(sequence + 1) & 0xFFFF, offset=next_offset)
         next_step = self._end_burst if is_last else partial(self._send_next, peer, session, request, number + 1)
         self._host.call_later(self.burst_interval_s, next_step)
 

@@ -129,7 +129,7 @@ class ArduPilotGimbal:
         return replace(target, roll=roll, pitch=pitch, yaw=yaw)
 
     def _angles_to(self, place: Ned | None) -> MountTarget:
-        """Return the angles to a position; the current target if ``place`` or the vehicle's position is unknown."""
+        """Return the angles to a position; the last ones if ``place`` or the vehicle's position is unknown."""
         motion = self._vehicle.motion
         if place is not None and self._vehicle.navigation.has_position:
             north, east, down = place[0] - motion.north, place[1] - motion.east, place[2] - motion.down
@@ -222,7 +222,7 @@ class ArduPilotGimbal:
             self.point(*angles, from_north=from_north)
         elif not any(map(math.isnan, rates)):
             self.turn(*rates, from_north=from_north)
-        elif all(map(math.isnan, (*angles[1:], *rates[1:]))):
+        elif all(map(math.isnan, (*angles[1:], *rates[1:]))):  # no pitch and yaw: a client changes only the lock
             self.is_yaw_locked = from_north
         else:
             return MavResult.FAILED

@@ -117,6 +117,7 @@ class CommandList(ItemList):
 
     def _write(self, seq: int, stored_item: MissionItem) -> int:
         count = len(self._commands)
+        # A list with space for home alone accepts nothing, not even item 0, which is ignored.
         if seq > count or max(seq, 1) >= self.capacity:
             return MavMissionResult.ERROR
         if seq == count:

@@ -52,7 +52,7 @@ class MissionMode(ArduPilotMode):
         self.is_waiting: bool = False  # True from entering the mode until the mission starts.
         self.handlers: dict[int, Callable[[MissionItem], None]] = {}
 
-    def disarmed(self) -> None:
+    def on_disarmed(self) -> None:
         """Called after the motors have stopped."""
         # Disarming restarts an unfinished mission, which then waits on the ground.
         if self.vehicle.mode is self:
@@ -72,9 +72,9 @@ class MissionMode(ArduPilotMode):
         if self.is_waiting and vehicle.mode is self and vehicle.navigation.origin is not None:
             self.is_waiting = False
             vehicle.mission.start_or_resume()
-            self.mission_started()
+            self.on_mission_started()
 
-    def mission_started(self) -> None:
+    def on_mission_started(self) -> None:
         """Called after the mission has started or resumed in this mode."""
 
     def is_complete(self, index: int, item: MissionItem) -> bool:
@@ -110,10 +110,10 @@ class MissionRun:
         self._list = vehicle.missions.commands
         self._state = MissionState.NOT_STARTED
         self.nav_index: int = 0  # Index of the navigation command that runs or will be resumed.
-        self._nav: MissionItem | None = None  # The running navigation command.
+        self._running_nav: MissionItem | None = None  # The running navigation command.
         # The running "do" or "condition" command with its index, and the index of the last one that was started.
-        self._do: tuple[int, MissionItem] | None = None
-        self._do_index = 0
+        self._running_do: tuple[int, MissionItem] | None = None
+        self._last_do_index = 0
         self._jumps: dict[int, int] = {}  # Number of jumps done, by index of the jump command.
 
     @property
@@ -169,7 +169,7 @@ class MissionRun:
 
     def _next_navigation(self, index: int) -> tuple[int, MissionItem] | None:
         for _ in range(1 + _MAX_STEPS):
-            command = self._next(index, counts=False)
+            command = self._next(index, count_jumps=False)
             if command is None or is_navigation(command[1]):
                 return command
             index = command[0] + 1
@@ -186,12 +186,12 @@ class MissionRun:
             self._start()
         else:
             self._state = MissionState.ACTIVE
-            self.set_current(self._do[0] if self._do is not None else self.nav_index)
+            self.set_current(self._running_do[0] if self._running_do is not None else self.nav_index)
 
     def _start(self) -> None:
         self._state = MissionState.ACTIVE
         self.reset()
-        if not self._advance():
+        if not self._start_next_navigation():
             self._complete()
 
     def stop(self) -> None:
@@ -201,12 +201,12 @@ class MissionRun:
 
     def reset(self) -> None:
         """Reset progress and jump counters, e.g. because the vehicle was disarmed."""
-        self.nav_index, self._nav, self._do, self._do_index = 0, None, None, 0
+        self.nav_index, self._running_nav, self._running_do, self._last_do_index = 0, None, None, 0
         self._jumps.clear()
 
-    def disarmed(self) -> None:
+    def on_disarmed(self) -> None:
         self.reset()
-        self._vehicle.call_later(0.0, self._mode.disarmed)
+        self._vehicle.call_later(0.0, self._mode.on_disarmed)
 
     def clear(self) -> None:
         """Called when the mission has been cleared."""
@@ -217,12 +217,12 @@ class MissionRun:
         """Continue from this command; return False if it does not exist."""
         if index >= self._list.count or self._list.count == 1:
             return False
-        self._do, self._do_index, self._nav = None, 0, None
+        self._running_do, self._last_do_index, self._running_nav = None, 0, None
         if index == 0 or self._state == MissionState.COMPLETE:
             self._jumps.clear()
         index = max(index, _FIRST)
         if self.is_running:
-            is_started = self._advance(index)
+            is_started = self._start_next_navigation(index)
             if not is_started:
                 self._complete()
             return is_started
@@ -231,16 +231,16 @@ class MissionRun:
     def _set_resume_index(self, index: int) -> bool:
         """Set the command at which a stopped mission will resume; return False if there is none from ``index`` on."""
         for _ in range(_MAX_STEPS):
-            command = self._next(index, counts=True)
+            command = self._next(index, count_jumps=True)
             if command is None:
                 break
             command_index, item = command
             if is_navigation(item):
-                self.nav_index, self._nav = command
+                self.nav_index, self._running_nav = command
                 self._state = MissionState.NOT_STARTED
                 return True
-            if self._do is None:
-                self._do, self._do_index = command, command_index
+            if self._running_do is None:
+                self._running_do, self._last_do_index = command, command_index
             index = command_index + 1
         self.nav_index = 0
         return False
@@ -249,22 +249,22 @@ class MissionRun:
         """Check whether the running commands are complete, and start the next commands."""
         if not self.is_running or not self._list.count:
             return
-        if self._nav is None or self._is_complete(self.nav_index, self._nav):
-            self._nav = None
-            if not self._advance():
+        if self._running_nav is None or self._is_complete(self.nav_index, self._running_nav):
+            self._running_nav = None
+            if not self._start_next_navigation():
                 self._complete()
                 return
-        if self._do is None:
-            self._advance_do()
-        elif self._is_complete(*self._do):
-            self._do = None
+        if self._running_do is None:
+            self._start_next_do()
+        elif self._is_complete(*self._running_do):
+            self._running_do = None
 
-    def _advance(self, start: int = 0) -> bool:
+    def _start_next_navigation(self, start: int = 0) -> bool:
         """Start the next navigation command, and the first other command before it."""
         index = start or (self.nav_index + 1 if self.nav_index else _FIRST)
-        self._do, self._do_index = None, 0
+        self._running_do, self._last_do_index = None, 0
         for _ in range(_MAX_STEPS):
-            command = self._next(index, counts=True)
+            command = self._next(index, count_jumps=True)
             if command is None:
                 return False
             command_index, item = command
@@ -272,22 +272,22 @@ class MissionRun:
             if is_navigation(item):
                 self.nav_index = command_index
                 if self._begin(command_index, item):
-                    self._nav = item
+                    self._running_nav = item
                     return True
-            elif self._do is None:
-                self._do, self._do_index = command, command_index
+            elif self._running_do is None:
+                self._running_do, self._last_do_index = command, command_index
                 self._begin(command_index, item)
         return False
 
-    def _advance_do(self) -> None:
+    def _start_next_do(self) -> None:
         """Start the next "do" command before the next navigation command."""
-        if not self._do_index:
+        if not self._last_do_index:
             return
-        command = self._next(self._do_index + 1, counts=False)
+        command = self._next(self._last_do_index + 1, count_jumps=False)
         if command is None or is_navigation(command[1]):
-            self._do_index = 0
+            self._last_do_index = 0
             return
-        self._do, self._do_index = command, command[0]
+        self._running_do, self._last_do_index = command, command[0]
         self._begin(*command)
 
     def _begin(self, index: int, item: MissionItem) -> bool:
@@ -304,8 +304,11 @@ class MissionRun:
         self._state = MissionState.COMPLETE
         self._mode.end_mission()
 
-    def _next(self, index: int, *, counts: bool) -> tuple[int, MissionItem] | None:
-        """Return the first command from ``index`` on, following jumps. ``counts`` decrements their repetitions."""
+    def _next(self, index: int, *, count_jumps: bool) -> tuple[int, MissionItem] | None:
+        """Return the first command from ``index`` on, following jumps.
+
+        With ``count_jumps``, each jump uses up one of its repetitions; else the call only looks ahead.
+        """
         first_jump = 0
         for _ in range(_MAX_JUMPS):
             item = self._list.command(index)
@@ -314,11 +317,11 @@ class MissionRun:
             if item.command not in (Cmd.DO_JUMP, Cmd.DO_JUMP_TAG):
                 return index, item
             target = self._target(item)
-            is_endless = not counts and first_jump == index
+            is_endless = not count_jumps and first_jump == index
             if self._list.command(target) is None or is_endless:
                 return None
             first_jump = first_jump or index
-            index = target if self._jumps_now(index, int(item.param2), counts=counts) else index + 1
+            index = target if self._jumps_now(index, int(item.param2), count_jumps=count_jumps) else index + 1
         return None
 
     def _target(self, item: MissionItem) -> int:
@@ -330,14 +333,14 @@ class MissionRun:
                 return index
         return 0
 
-    def _jumps_now(self, index: int, times: int, *, counts: bool) -> bool:
+    def _jumps_now(self, index: int, times: int, *, count_jumps: bool) -> bool:
         """Return True if the jump at ``index`` has repetitions left."""
         jumps_done = self._jumps.get(index, 0)
         if times != _UNLIMITED and jumps_done >= times:
-            if counts:
+            if count_jumps:
                 self._jumps.pop(index, None)  # The next execution of this command jumps ``times`` times again.
             return False
-        if counts:
+        if count_jumps:
             self._jumps[index] = jumps_done + 1
             total = "unlimited" if times == _UNLIMITED else str(times)
             self._vehicle.info(f"Mission: {index} Jump {jumps_done + 1}/{total}")

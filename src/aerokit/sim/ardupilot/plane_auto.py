@@ -67,7 +67,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         """Start or resume the mission; without a mission change to RTL."""
         plane = self.vehicle
         if plane.mode is self and plane.is_armed and plane.mission.is_running:
-            return True
+            return True  # Arming in AUTO enters the mode again.
         super().enter(force=force)
         self._manoeuvre = _LOITER
         plane.call_later(0.0, self._begin if plane.mission.is_present else self._return_at_once)
@@ -77,7 +77,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         if self.vehicle.mode is self and not self.vehicle.mission.is_running:
             self.vehicle.mission.start_or_resume()
 
-    def disarmed(self) -> None:
+    def on_disarmed(self) -> None:
         """Does nothing: disarming has already reset the progress."""
 
     def update(self, dt: float) -> None:
@@ -97,6 +97,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
             self._count_turns()
 
     def _count_turns(self) -> None:
+        """Add up the angle that the plane has turned around the place since it reached the circle."""
         wing = self.vehicle.wing
         if self._place is None:
             return
@@ -163,7 +164,8 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         wing, (north, east, _), start = self.vehicle.wing, self._place, self._leg_start
         distance = horizontal_distance(self.vehicle, self._place)
         if distance <= self.vehicle.parameters["WP_RADIUS"]:
-            return self._report_if(True, f"Reached waypoint #{index} dist {int(distance)}m")
+            self.vehicle.info(f"Reached waypoint #{index} dist {int(distance)}m")
+            return True
         # The dot product of the leg and the way from the waypoint to the plane is positive beyond the waypoint.
         beyond = (north - start[0]) * (wing.north - north) + (east - start[1]) * (wing.east - east)
         return self._report_if(beyond > 0, f"Passed waypoint #{index} dist {int(distance)}m")

@@ -82,11 +82,11 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         is_bad = self._is_radio_bad()
         bad_for = self._radio_bad.seconds(is_bad, plane.now)
         if not is_bad:
-            self._set_radio(False)
+            self._set_radio(is_lost=False)
         elif plane.parameters["THR_FAILSAFE"] == 1 and bad_for >= _COUNT_S - 1e-6:
-            self._set_radio(True)
+            self._set_radio(is_lost=True)
 
-    def _set_radio(self, is_lost: bool) -> None:
+    def _set_radio(self, *, is_lost: bool) -> None:
         if is_lost != self.radio:
             self.radio = is_lost
             self.warn(f"Throttle failsafe {'on' if is_lost else 'off'}")
@@ -140,8 +140,9 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
 
     def _check_end_of_long(self) -> None:
         parameters = self.vehicle.parameters
-        name = "FS_LONG_TIMEOUT" if parameters["FS_SHORT_ACTN"] == _SHORT_DISABLED else "FS_SHORT_TIMEOUT"
-        if self.state == _GCS and self.ground_station_silence < parameters[name]:
+        has_short = parameters["FS_SHORT_ACTN"] != _SHORT_DISABLED
+        timeout = parameters["FS_SHORT_TIMEOUT" if has_short else "FS_LONG_TIMEOUT"]
+        if self.state == _GCS and self.ground_station_silence < timeout:
             self.ground_station: bool = False
             self._end_long("GCS Failsafe Off")
         elif self.state == _LONG and not self.radio:
@@ -152,6 +153,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         self.warn(text)
 
     def _start_long(self, state: int) -> None:
+        """Execute FS_LONG_ACTN, which has other effects in piloted modes, in RTL and in missions."""
         plane = self.vehicle
         plane.rc.release_overrides()
         self.state = state
@@ -190,8 +192,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
             if lands and self._land_by_mission():
                 return
             preferred = (PlaneMode.AUTOLAND,) if action == _AUTOLAND_OR_RTL else ()
-            if not self.vehicle.mode.is_landing:
-                self.change_to(*preferred, PlaneMode.RTL)
+            self.change_to(*preferred, PlaneMode.RTL)
 
     def refuse_termination(self) -> None:
         """Send the reason why the flight is not terminated: AFS_ENABLE is 0, or AFS_TERM_ACTION is not set."""
@@ -272,7 +273,7 @@ class PlaneFence(ArduPilotFence[PlaneHost]):
         north, east = next(points, home[:2])
         return (north, east, home[2] - height)
 
-    def cleared(self) -> None:
+    def on_cleared(self) -> None:
         if self.vehicle.is_armed and not self.caused_mode:
             self.vehicle.send_text(MavSeverity.NOTICE, "Fence breach cleared")
 
@@ -281,8 +282,8 @@ class PlaneFence(ArduPilotFence[PlaneHost]):
             return None
         return MavSeverity.NOTICE, f"Mode change to {mode.name} denied, in fence recovery"
 
-    def mode_changed(self) -> None:
-        super().mode_changed()
+    def on_mode_changed(self) -> None:
+        super().on_mode_changed()
         self.recover_by_hand()
 
     @property

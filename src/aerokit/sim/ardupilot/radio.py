@@ -96,10 +96,10 @@ class ArduPilotRadio:
             return
         vehicle.failsafes.ground_station_seen_at = vehicle.now
         for index in range(_OVERRIDABLE):
-            value = getattr(override, f"chan{index + 1}_raw")
-            if value == _UNCHANGED or (value == 0 and index >= len(self._sticks)):
+            value, is_upper = getattr(override, f"chan{index + 1}_raw"), index >= len(self._sticks)
+            if value == _UNCHANGED or (value == 0 and is_upper):  # In an upper channel, 0 means unchanged, too.
                 continue
-            if value == _RELEASE_UPPER and index >= len(self._sticks):
+            if value == _RELEASE_UPPER and is_upper:
                 value = 0
             self._overrides[index] = (value, vehicle.now)
 
@@ -128,7 +128,7 @@ class ArduPilotJoystick:
 
     def sticks(self, axes: m.ManualControl) -> Mapping[int, int]:
         """Return pulses in microseconds by channel index; 0 releases a channel."""
-        if axes.z < 0:
+        if axes.z < 0:  # Copter has no negative thrust (GCS_MAVLink_Copter.cpp).
             return {}
         return {
             _ROLL: self.pulse(_ROLL, axes.y),

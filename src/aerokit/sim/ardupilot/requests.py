@@ -136,7 +136,7 @@ class ArduPilotMessageRequests:
             if stream in self._groups:
                 self._stream_group(stream, rate, channel, self._vehicle.now)
                 self._store_rate(f"{self._prefix(channel)}{_RATE_PARAMETERS[stream]}", rate)
-        if requested == Stream.ALL:
+        if requested == Stream.ALL:  # ADSB is a further group, without messages in the simulation.
             self._store_rate(f"{self._prefix(channel)}ADSB", rate)
 
     def start_channel(self, channel: Channel, first: float) -> None:
@@ -161,7 +161,7 @@ class ArduPilotMessageRequests:
         vehicle, parameters = self._vehicle, self._vehicle.parameters
         if name not in parameters or parameters[name] == rate:
             return
-        saved, _ = self._saved.get(name, (parameters[name], rate))
+        saved, _ = self._saved.get(name, (parameters[name], rate))  # The value before the first change since boot.
         parameters[name] = rate
         if vehicle.KIND == "plane":
             vehicle.announce_parameter(name)

@@ -58,7 +58,7 @@ class RoverArming(ArduPilotArming[RoverHost]):
             reasons.append("Mode not armable")
         return reasons
 
-    def armed(self) -> None:
+    def on_armed(self) -> None:
         self.vehicle.path.reset()
 
     def disarm(self, *, force: bool = True) -> bool:
@@ -195,8 +195,8 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
     def _check_wheels(self) -> None:
         """Detect a rover that does not move although its mode drives it (FS_CRASH_CHECK)."""
         rover, action = self.vehicle, int(self.vehicle.parameters["FS_CRASH_CHECK"])
-        tries = rover.is_armed and rover.mode.number in _DRIVES_ITSELF and rover.faults.motor_failed
-        is_stuck = bool(action) and tries and rover.motion.ground_speed_m_s < _STUCK_M_S
+        tries_to_drive = rover.is_armed and rover.mode.number in _DRIVES_ITSELF and rover.faults.motor_failed
+        is_stuck = bool(action) and tries_to_drive and rover.motion.ground_speed_m_s < _STUCK_M_S
         if self._stuck.seconds(is_stuck, rover.now) >= _STUCK_S:
             self._stuck.reset()
             self.warn("Crash: Going to HOLD", MavSeverity.EMERGENCY)
@@ -228,10 +228,11 @@ class RoverFence(ArduPilotFence[RoverHost]):
         elif action == _TERMINATE:
             vehicle.arming.disarm()
         else:
-            self.caused_mode: bool = any(vehicle.set_mode(mode) for mode in _MODES.get(action, ()))
+            modes = _MODES.get(action, ())
+            self.caused_mode: bool = any(vehicle.set_mode(mode) for mode in modes)  # until one is not refused
 
-    def mode_changed(self) -> None:
-        super().mode_changed()
+    def on_mode_changed(self) -> None:
+        super().on_mode_changed()
         self.recover_by_hand()
 
 

@@ -163,8 +163,8 @@ class RoverSubVehicle(ArduPilotVehicle):
     def _change_speed(self, command: ReceivedCommand) -> int:
         if command.param1 in (SpeedType.CLIMB_SPEED, SpeedType.DESCENT_SPEED):
             return MavResult.DENIED
-        kinds = (SpeedType.AIRSPEED, SpeedType.GROUNDSPEED)
-        if not self.mode.can_change_speed or command.param1 not in kinds or not command.param2 > 0:
+        horizontal_speeds = (SpeedType.AIRSPEED, SpeedType.GROUNDSPEED)
+        if not self.mode.can_change_speed or command.param1 not in horizontal_speeds or not command.param2 > 0:
             return MavResult.FAILED
         cast("Any", self.mode).speed = command.param2
         return MavResult.ACCEPTED

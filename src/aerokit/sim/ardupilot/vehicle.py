@@ -276,7 +276,7 @@ class ArduPilotVehicle(ArduPilotHost):
         self.motion.settle()  # The fall after a reboot in flight is not simulated.
         self._reset()
         for channel in self.channels:
-            channel.closes_clients = True
+            channel.closes_clients = True  # The TCP server of the firmware ends, too.
         self.reboot(_REBOOT_SILENCE_S)
 
     def send_text(self, severity: int, text: str) -> None:
@@ -307,7 +307,7 @@ class ArduPilotVehicle(ArduPilotHost):
             return False
         self.mode.leave()
         self.mode = mode
-        self.fence.mode_changed()
+        self.fence.on_mode_changed()
         self.call_later(0.0, lambda: self.send_built(m.Heartbeat.ID))
         return True
 

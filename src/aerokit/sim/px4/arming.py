@@ -104,9 +104,11 @@ class Px4Calibration:
         if sides_done == len(_SIDES):
             self._end(run_number)
             return
-        self._send_later(_side_texts(self._sensor, sides_done), _SIDE_INTERVAL_S)
+        texts = _side_texts(self._sensor, sides_done)
+        self._send_later(texts, _SIDE_INTERVAL_S)
         if math.isfinite(self.side_s):
-            self._px4.call_later(6 * _SIDE_INTERVAL_S + self.side_s, lambda: self._end_side(sides_done, run_number))
+            delay_s = len(texts) * _SIDE_INTERVAL_S + self.side_s
+            self._px4.call_later(delay_s, lambda: self._end_side(sides_done, run_number))
 
     def _end_side(self, sides_done: int, run_number: int) -> None:
         if self.is_running and run_number == self._run_number:

@@ -211,7 +211,7 @@ class Px4Vehicle(Px4Host):
         self.gimbal.start()
         self.call_later(0.3 * self._boot_time_s, self._warn_while_booting)
         self.mission.start()
-        self.failsafes.listen()
+        self.failsafes.listen()  # again, because a restart has created new failsafes
         self.failsafes.start()
         self.call_later(self._boot_time_s, self._set_ready)
 
@@ -284,7 +284,7 @@ class Px4Vehicle(Px4Host):
         self.is_in_failsafe = False
         self.intended_mode = mode
         self.failsafes.override()
-        # A request for the current mode starts its work again.
+        # A request for the current mode restarts the mission, or holds the current position.
         if mode == self.mode == modes.MISSION:
             self.mission.enter()
         elif mode == self.mode:

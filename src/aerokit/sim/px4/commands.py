@@ -155,6 +155,7 @@ def set_mode(px4: Px4Vehicle, base_mode: int, mode: Px4Mode) -> int:
     if mode not in modes.SELECTABLE:
         level = "auto" if mode[0] == modes.AUTO else "main"
         px4.send_text(MavSeverity.CRITICAL, f"Unsupported {level} mode")
+        # PX4 1.16 accepts an unknown mode, but does not enter it.
         return MavResult.ACCEPTED if px4.version.startswith("1.16") else MavResult.TEMPORARILY_REJECTED
     return _change(px4, mode)
 

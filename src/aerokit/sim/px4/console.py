@@ -39,8 +39,9 @@ class Px4Shell:
         output = line + self._output(line.decode(errors="replace").strip()) + b"pxh> "
         for start in range(0, len(output), _PIECE):
             piece = output[start : start + _PIECE]
-            target = sender_of(message)
-            reply = m.SerialControl(10, SerialControlFlag.REPLY, 0, 0, len(piece), piece.ljust(_PIECE, b"\0"), *target)
+            shell, is_reply = SerialControlDev.DEV_SHELL, SerialControlFlag.REPLY
+            data = piece.ljust(_PIECE, b"\0")
+            reply = m.SerialControl(shell, is_reply, 0, 0, len(piece), data, *sender_of(message))
             self._px4.send(reply, channel)
 
     def _output(self, command: str) -> bytes:

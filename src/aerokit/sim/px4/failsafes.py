@@ -161,9 +161,9 @@ class Px4Failsafes:
         self._battery_at_arming = MavBatteryChargeState.OK
         self._reported_battery_level = MavBatteryChargeState.OK
         self._breaches: list[str] = []
-        # Failures by cause with their actions, including those that have ended but still act, and the present causes.
+        # Actions by cause. A cause that has ended stays here while its action lasts.
         self._active: dict[str, FailsafeAction] = {}
-        self._failing: frozenset[str] = frozenset()
+        self._failing: frozenset[str] = frozenset()  # Causes that exist at present.
         self._holds_until = -math.inf
         self._is_overridden = False  # True after the user has changed the mode during a failsafe.
 
@@ -294,7 +294,7 @@ class Px4Failsafes:
         self._breaches = breaches
         if not breaches:
             return Action.NONE
-        return _FENCE_ACTIONS.get(round(self._px4.parameters["GF_ACTION"]), Action.WARN) if breaches else Action.NONE
+        return _FENCE_ACTIONS.get(round(self._px4.parameters["GF_ACTION"]), Action.WARN)
 
     def check(self) -> None:
         """Check for failures and execute the action; does nothing after a flight termination."""

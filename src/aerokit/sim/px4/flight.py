@@ -161,7 +161,7 @@ class Px4Flight:
         elif mode == modes.ORBIT:
             self.orbit.update()
         elif mode == modes.TERMINATION:
-            pass
+            pass  # The motors are off.
         else:
             self.go()
 

@@ -69,7 +69,7 @@ class Px4Sticks:
         self.yaw = yaw
         self.throttle = throttle
         self._moved_at = self._px4.now
-        if were_fresh:
+        if were_fresh:  # The first positions after a silence are no movement.
             largest = max(abs(new - old) for new, old in zip((roll, pitch, yaw, throttle), previous, strict=True))
             self._px4.on_sticks_moved(largest)
 

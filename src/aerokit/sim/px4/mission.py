@@ -164,7 +164,7 @@ class Px4Mission:
             self._state = MissionState.NO_MISSION
         elif self.is_finished:
             self._state = MissionState.COMPLETE
-        elif self.mode == 1:
+        elif self._px4.mode in _ACTIVE_MODES:
             self._state = MissionState.ACTIVE
         elif self.reached >= 0:
             self._state = MissionState.PAUSED

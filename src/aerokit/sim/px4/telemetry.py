@@ -6,8 +6,8 @@ import math
 from collections.abc import Callable
 
 from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import EstimatorStatusFlags as Ekf
 from aerokit.mavlink.enums import (
-    EstimatorStatusFlags,
     GpsFixType,
     MavAutopilot,
     MavBatteryFunction,
@@ -44,12 +44,12 @@ _MODE_PROPERTIES: dict[modes.Px4Mode, int] = {
     modes.POSITION: 0,
     modes.TERMINATION: MavModeProperty.ADVANCED | MavModeProperty.NOT_USER_SELECTABLE,
 }
-_F = EstimatorStatusFlags
+
 _ALL_BUT_STILL = (
-    _F.ATTITUDE | _F.VELOCITY_HORIZ | _F.VELOCITY_VERT | _F.POS_HORIZ_REL | _F.POS_HORIZ_ABS | _F.POS_VERT_ABS
-) | (_F.POS_VERT_AGL | _F.PRED_POS_HORIZ_REL | _F.PRED_POS_HORIZ_ABS)
-_BOOT_FLAGS = _F.ATTITUDE | _F.VELOCITY_VERT | _F.POS_VERT_ABS | _F.POS_VERT_AGL | _F.CONST_POS_MODE
-_POSITION_FLAGS = _F.VELOCITY_HORIZ | _F.POS_HORIZ_REL | _F.POS_HORIZ_ABS | _F.PRED_POS_HORIZ_ABS
+    Ekf.ATTITUDE | Ekf.VELOCITY_HORIZ | Ekf.VELOCITY_VERT | Ekf.POS_HORIZ_REL | Ekf.POS_HORIZ_ABS | Ekf.POS_VERT_ABS
+) | (Ekf.POS_VERT_AGL | Ekf.PRED_POS_HORIZ_REL | Ekf.PRED_POS_HORIZ_ABS)
+_BOOT_FLAGS = Ekf.ATTITUDE | Ekf.VELOCITY_VERT | Ekf.POS_VERT_ABS | Ekf.POS_VERT_AGL | Ekf.CONST_POS_MODE
+_POSITION_FLAGS = Ekf.VELOCITY_HORIZ | Ekf.POS_HORIZ_REL | Ekf.POS_HORIZ_ABS | Ekf.PRED_POS_HORIZ_ABS
 
 
 def _heartbeat(px4: Px4Vehicle) -> m.Heartbeat:
@@ -91,10 +91,10 @@ def _sys_status(px4: Px4Vehicle) -> m.SysStatus:
 def _estimator_status(px4: Px4Vehicle) -> m.EstimatorStatus:
     flags = _ALL_BUT_STILL
     if not px4.is_armed:
-        flags |= _F.CONST_POS_MODE
+        flags |= Ekf.CONST_POS_MODE
     if not px4.has_position:
         flags &= ~_POSITION_FLAGS
-        flags |= _F.POS_HORIZ_REL if px4.external.has_vision else 0
+        flags |= Ekf.POS_HORIZ_REL if px4.external.has_vision else 0
     if not px4.is_ready:
         flags = _BOOT_FLAGS
     ratio = 0.02 if px4.is_ready else math.nan  # Test ratio of velocity, position and magnetometer.
@@ -116,17 +116,17 @@ def _battery_status(px4: Px4Vehicle) -> m.BatteryStatus:
     battery = px4.battery
     voltages = (round(battery.voltage_v * 1000), *(0xFFFF,) * 9)
     return m.BatteryStatus(
-        0,
-        MavBatteryFunction.ALL,
-        MavBatteryType.LIPO,
-        32767,
-        voltages,
-        -100,
-        0,
-        -1,
-        int(battery.percent),
-        0,
-        px4.failsafes.battery_state,
+        id=0,
+        battery_function=MavBatteryFunction.ALL,
+        type=MavBatteryType.LIPO,
+        temperature=32767,  # Unknown. Current and energy are not measured either.
+        voltages=voltages,
+        current_battery=-100,
+        current_consumed=0,
+        energy_consumed=-1,
+        battery_remaining=int(battery.percent),
+        time_remaining=0,
+        charge_state=px4.failsafes.battery_state,
     )
 
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import StorageStatus
+from aerokit.mavlink.enums import MavEstimatorType, MavFrame, MavOdidStatus, StorageStatus
 from aerokit.mavlink.message import Message
 from aerokit.sim.motion import GRAVITY_M_S2, quaternion_from_euler
 from aerokit.sim.px4.base import Px4Vehicle
@@ -59,25 +59,25 @@ def _remote_location(px4: Px4Vehicle) -> m.OpenDroneIdLocation | None:
     place = px4.frame.to_global(motion.north, motion.east, motion.down)
     course = round(math.degrees(math.atan2(motion.velocity_east, motion.velocity_north)) % 360.0) % 360 * 100
     return m.OpenDroneIdLocation(
-        0,
-        0,
-        _BROADCAST_ID,
-        1 if px4.is_landed else 2,
-        course,
-        round(motion.ground_speed_m_s * 100),
-        round(-motion.velocity_down * 100),
-        place.latitude_e7,
-        place.longitude_e7,
-        place.altitude_m,
-        place.altitude_m,
-        0,
-        px4.altitude_m,
-        12,
-        5,
-        0,
-        3,
-        65535.0,
-        0,
+        target_system=0,
+        target_component=0,
+        id_or_mac=_BROADCAST_ID,
+        status=MavOdidStatus.GROUND if px4.is_landed else MavOdidStatus.AIRBORNE,
+        direction=course,
+        speed_horizontal=round(motion.ground_speed_m_s * 100),
+        speed_vertical=round(-motion.velocity_down * 100),
+        latitude=place.latitude_e7,
+        longitude=place.longitude_e7,
+        altitude_barometric=place.altitude_m,
+        altitude_geodetic=place.altitude_m,
+        height_reference=0,
+        height=px4.altitude_m,
+        horizontal_accuracy=12,
+        vertical_accuracy=5,
+        barometer_accuracy=0,
+        speed_accuracy=3,
+        timestamp=65535.0,
+        timestamp_accuracy=0,
     )
 
 
@@ -87,21 +87,21 @@ def _remote_system(px4: Px4Vehicle) -> m.OpenDroneIdSystem | None:
     home = px4.frame.to_global(*px4.home)
     seconds = max(0, int(px4.unix_time) - _REMOTE_ID_EPOCH)
     return m.OpenDroneIdSystem(
-        0,
-        0,
-        _BROADCAST_ID,
-        0,
-        0,
-        home.latitude_e7,
-        home.longitude_e7,
-        1,
-        0,
-        -1000.0,
-        -1000.0,
-        0,
-        0,
-        home.altitude_m,
-        seconds,
+        target_system=0,
+        target_component=0,
+        id_or_mac=_BROADCAST_ID,
+        operator_location_type=0,
+        classification_type=0,
+        operator_latitude=home.latitude_e7,
+        operator_longitude=home.longitude_e7,
+        area_count=1,
+        area_radius=0,
+        area_ceiling=-1000.0,
+        area_floor=-1000.0,
+        category_eu=0,
+        class_eu=0,
+        operator_altitude_geo=home.altitude_m,
+        timestamp=seconds,
     )
 
 
@@ -204,8 +204,8 @@ def _odometry(px4: Px4Vehicle) -> m.Odometry:
     rates = (motion.roll_rate, motion.pitch_rate, motion.yaw_rate)
     return m.Odometry(
         px4.time_boot_us,
-        1,
-        1,
+        MavFrame.LOCAL_NED,
+        MavFrame.LOCAL_NED,
         motion.north,
         motion.east,
         motion.down,
@@ -214,9 +214,9 @@ def _odometry(px4: Px4Vehicle) -> m.Odometry:
         *rates,
         _COVARIANCE,
         _COVARIANCE,
-        0,
-        8,
-        0,
+        reset_counter=0,
+        estimator_type=MavEstimatorType.AUTOPILOT,
+        quality=0,
     )
 
 

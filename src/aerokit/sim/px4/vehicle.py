@@ -120,7 +120,7 @@ class Px4PlaneFlight(Px4Flight):
             self._return()
         elif mode == modes.MISSION:
             mission.update()
-        elif mode == modes.OFFBOARD and math.isfinite(sum(plane.offboard.position)):
+        elif mode == modes.OFFBOARD and all(map(math.isfinite, plane.offboard.position)):
             self.target = plane.offboard.position
             self.circle()
         elif mode in modes.STICK_MODES and plane.sticks.are_fresh:
